@@ -25,8 +25,8 @@ from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.self_calibrated import D2_SHARE, OPEN_LOOP, OWN_SHARE
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.evaluation.consistency import d2_rows, driven_d2, driving_products
 from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, signal_error
+from pdhef_logtool.evaluation.metrics.d2 import d2_rows, driven_d2, driving_products
 from pdhef_logtool.records.errors import PdhefError, SimulationError
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack

@@ -11,6 +11,7 @@ from rich.padding import Padding
 from rich.text import Text
 
 from pdhef_logtool.cli.console import table
+from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison
 from pdhef_logtool.results.comparison_words import (
@@ -20,7 +21,6 @@ from pdhef_logtool.results.comparison_words import (
     one_signal_a_drive,
     paired_text,
     percent,
-    shown_unit,
     verdict_text,
 )
 from pdhef_logtool.sinks.junit import Case, cases_bytes
@@ -81,7 +81,7 @@ def _print_drives(one: ComparedFigure, console: Console) -> None:
     changed = [d for d in one.drives if d.a != d.b]
     if not changed:
         return
-    unit, factor = shown_unit(one.unit)
+    unit, factor = read_unit(one.unit)
     shown = changed if len(changed) <= 2 * _MOST_DRIVES else [*changed[:_MOST_DRIVES], *changed[-_MOST_DRIVES:]]
     made = table("drive", f">A {unit}", f">B {unit}", ">change", fold=1)
     for place, drive in enumerate(shown):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from rich.measure import Measurement
 from rich.padding import Padding
@@ -13,6 +13,8 @@ from rich.table import Table
 from rich.text import Text
 
 from pdhef_logtool.cli.console import cell, table
+from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.shown import all_shown
 from pdhef_logtool.results.opened_run import PAGE_FILE
@@ -23,40 +25,47 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from pdhef_logtool.drive.slim import SlimResult
+    from pdhef_logtool.evaluation.metrics.metric import Metric
     from pdhef_logtool.evaluation.thresholds import Verdict
     from pdhef_logtool.results.summary import RunSummary
     from pdhef_logtool.runs.pipeline import RunResult
     from pdhef_logtool.sinks.report import LogOutcome
 
 _Report: TypeAlias = Mapping[str, Any]
-#: Head, signal, segment, metric, factor to the shown unit, digits.
-_Column: TypeAlias = tuple[str, str, str, str, float, int]
+#: Signal, segment and metric.
+_Key: TypeAlias = tuple[str, str, str]
 
-_COLUMNS: tuple[_Column, ...] = (
-    ("sideslip\nRMSE °", "sideslip_rad", "all", "rmse", DEGREES, 3),
-    ("\np95 °", "sideslip_rad", "all", "p95_abs", DEGREES, 3),
-    ("\nmax °", "sideslip_rad", "all", "max_abs", DEGREES, 2),
-    ("\nlag ms", "sideslip_rad", "all", "lag_s", 1e3, 0),
-    ("in 95 %\nband", "sideslip_rad", "all", "coverage95", 1.0, 2),
-    ("v_y\nRMSE m/s", "vy_m_s", "all", "rmse", 1.0, 3),
-    ("v_x\nRMSE m/s", "vx_m_s", "all", "rmse", 1.0, 3),
-    ("yaw rate\nRMSE °/s", "yaw_rate_rad_s", "all", "rmse", DEGREES, 3),
-    ("a_y\nRMSE m/s²", "ay_m_s2", "all", "rmse", 1.0, 3),
-    ("1 s lateral\nRMSE m", "lateral_1s_m", "all", "rmse", 1.0, 3),
-    ("linear\nRMSE °", "sideslip_rad", "linear", "rmse", DEGREES, 3),
-    ("nonlinear\nRMSE °", "sideslip_rad", "nonlinear", "rmse", DEGREES, 3),
-    ("\nNIS/dof", "state", "all", "nis_ratio", 1.0, 2),
-)
-#: Where there is no truth: no column of errors.
-_WITHOUT_TRUTH: tuple[_Column, ...] = (
-    ("sideslip: RMS\nfrom {main} °", "sideslip_rad", "all", "from_main", DEGREES, 3),
-    ("v_y against sensors\nd2 m/s", "vy_m_s", "all", "d2", 1.0, 3),
-    ("surprise\nNIS/dof", "state", "all", "nis_ratio", 1.0, 2),
-)
-#: What a narrow terminal does without, first to last.
-_LEAVE_FIRST = (
-    *("v_x\nRMSE m/s", "\nmax °", "1 s lateral\nRMSE m", "v_y\nRMSE m/s", "\np95 °", "a_y\nRMSE m/s²", "\nNIS/dof"),
-    *("\nlag ms", "linear\nRMSE °", "yaw rate\nRMSE °/s", "nonlinear\nRMSE °"),
+
+class _Column(NamedTuple):
+    """A figure by which estimators are told apart: its head, what it is of, factor to the unit shown, digits."""
+
+    head: str
+    signal: str
+    segment: str
+    metric: str
+    factor: float
+    digits: int
+
+    @property
+    def key(self) -> _Key:
+        return self.signal, self.segment, self.metric
+
+
+_NIS_RATIO = _Column("\nNIS/dof", "state", "all", "nis_ratio", 1.0, 2)
+#: What the narrowest terminal shows, and what a narrow one leaves out first, behind all that is not named here.
+_KEPT: tuple[_Key, ...] = (("sideslip_rad", "all", "rmse"), ("sideslip_rad", "all", "coverage95"))
+_LEAVE_LAST: tuple[_Key, ...] = (
+    ("vx_m_s", "all", "rmse"),
+    ("sideslip_rad", "all", "max_abs"),
+    ("lateral_1s_m", "all", "rmse"),
+    ("vy_m_s", "all", "rmse"),
+    ("sideslip_rad", "all", "p95_abs"),
+    ("ay_m_s2", "all", "rmse"),
+    _NIS_RATIO.key,
+    ("sideslip_rad", "all", "lag_s"),
+    ("sideslip_rad", "linear", "rmse"),
+    ("yaw_rate_rad_s", "all", "rmse"),
+    ("sideslip_rad", "nonlinear", "rmse"),
 )
 #: Channels that are named where several share a loss, and checks where several are undecided.
 _MOST_PLACES, _MOST_UNDECIDED = 3, 4
@@ -318,15 +327,48 @@ def _figures(report: _Report) -> dict[tuple[str, str, str, str], float | None]:
 def _table(report: _Report, console: Console) -> Table:
     """Return the figures of the estimators that are shown, in as many columns as the terminal is wide enough for."""
     values, shown = _figures(report), _shown(report)
-    asked = _COLUMNS if report["truth"]["available"] else _WITHOUT_TRUTH
     names = [e["name"] for e in shown]
-    columns = [c for c in asked if any(values.get((name, *c[1:4])) is not None for name in names)]
-    for leave in (None, *_LEAVE_FIRST):
-        columns = [c for c in columns if c[0] != leave]
+    asked = _columns(truth=report["truth"]["available"])
+    columns = [c for c in asked if any(values.get((name, *c.key)) is not None for name in names)]
+    others = [c.key for c in columns if c.key not in (*_KEPT, *_LEAVE_LAST)] if report["truth"]["available"] else []
+    for leave in (None, *others, *_LEAVE_LAST):
+        columns = [c for c in columns if c.key != leave]
         made = _table_of(report, shown, columns, values)
         if Measurement.get(console, console.options.update(max_width=10_000), made).maximum <= console.width:
             break
     return made
+
+
+def _columns(*, truth: bool) -> list[_Column]:
+    """Return the columns of figures: what the metrics ask for, by signal, beside those that are made of two."""
+    metrics = registered()
+    asked = [(signal, metric) for metric in metrics.values() for signal in metric.terminal]
+    signals = [*dict.fromkeys(signal for signal, _ in asked)]
+    columns, topped = [], set[str]()
+    for signal, metric in sorted(asked, key=lambda a: (signals.index(a[0]), a[1].unit == "1")):  # shares last
+        top = "" if signal in topped or signal == "state" else LABELS[signal]
+        topped.add(signal)
+        columns.append(_column(metric, signal, "all", top))
+    if truth:
+        rmse = metrics["rmse"]
+        columns += [_column(rmse, "sideslip_rad", segment, segment) for segment in ("linear", "nonlinear")]
+        return [*columns, _NIS_RATIO]
+    apart = _column(metrics["disagreement_rms"], "sideslip_rad", "all", "")
+    of_sensors = _column(metrics["d2"], "vy_m_s", "all", "v_y against sensors")
+    return [
+        apart._replace(head="sideslip: RMS\nfrom {main} °", metric="from_main"),
+        of_sensors,
+        _NIS_RATIO._replace(head=f"surprise{_NIS_RATIO.head}"),
+        *columns,
+    ]
+
+
+def _column(metric: Metric, signal: str, segment: str, top: str) -> _Column:
+    unit, factor = read_unit(metric.unit_of(signal))
+    label = metric.head(signal)
+    if not top and not unit:  # in two lines, as the others
+        top, _, label = label.rpartition(" ")
+    return _Column(f"{top}\n{label}", signal, segment, metric.name, factor, metric.digits)
 
 
 def _table_of(
@@ -337,13 +379,13 @@ def _table_of(
 ) -> Table:
     dependent, answer = report["truth"]["not_independent"], report["answer"]
     main = "" if answer is None else answer["main"]
-    heads = [c[0].format(main=main) + (" †" if c[1] in dependent else "") for c in columns]
+    heads = [c.head.format(main=main) + (" †" if c.signal in dependent else "") for c in columns]
     made = table("\nestimator", *(f">{head}" for head in heads))
     for column in made.columns:
         column.no_wrap = True
     for estimator in shown:
         name = estimator["name"]
-        figures = (cell(values.get((name, *c[1:4])), c[4], c[5]) for c in columns)
+        figures = (cell(values.get((name, *c.key)), c.factor, c.digits) for c in columns)
         made.add_row(name + ("" if estimator["causal"] else " *"), *figures)
     return made
 

@@ -7,14 +7,13 @@ car's own answer stand between the others, which can be late by much before that
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pdhef_logtool.drive.correlation import has_peak_within, on_common_grid
 from pdhef_logtool.drive.truth import differentiate, estimate_truth_latency
-from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
 
 #: How late the second of two sound signals is after the first, s. On simulated and recorded drives wheels are -10 to
@@ -82,21 +81,6 @@ def _sensor(name: str) -> str:
 def _together(name: str, signals: Mapping[str, Channel]) -> tuple[str, ...]:
     """Return the signal alone, or all wheels where it is one of them."""
     return tuple(n for n in signals if n == name or (n.startswith("wheel_speed_") and _sensor(name) == "wheels"))
-
-
-def delay_checks(late: Sequence[LateSensor]) -> list[Check]:
-    """Return a failed check for each signal that is late."""
-    return [
-        Check(
-            f"{name}.delay",
-            name,
-            "failed",
-            sensor.evidence,
-            f"latency_s = {sensor.delay_s:.3f} more in the mapping" + ("" if sensor.exact else ", at least"),
-        )
-        for sensor in late
-        for name in sensor.names
-    ]
 
 
 _Pair = tuple[str, Channel, Channel, tuple[str, str], tuple[float, float], bool]

@@ -15,7 +15,9 @@ from functools import cached_property
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
-from pdhef_logtool.drive.checks import check_drive, explained_factors
+from pdhef_logtool.drive.checks import check_drive
+from pdhef_logtool.drive.checks.by_relations import explained_factors
+from pdhef_logtool.drive.checks.mounting import MOUNTING
 from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
 from pdhef_logtool.drive.delays import LateSensor, late_sensors
 from pdhef_logtool.drive.faulty_samples import without_faulty_samples
@@ -45,7 +47,7 @@ from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, read_signals
 from pdhef_logtool.mapping.frames import Placement, placement_of
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
-from pdhef_logtool.records.checks import Check, Verdict
+from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
 
 #: Mean accelerations below are no gravity: the sensor's software took it off.
@@ -313,7 +315,7 @@ class Survey:
 
     @cached_property
     def checks(self) -> tuple[Check, ...]:
-        """The checks of the mounting with those of :func:`~pdhef_logtool.drive.checks.check_drive`."""
+        """The checks of the mounting with those of :func:`~pdhef_logtool.drive.checks.running.check_drive`."""
         channels = self.channels
         found = check_drive(
             channels.signals,
@@ -516,13 +518,12 @@ def mounting_checks(mapping: Mapping, mounting: Mounting, triads: tuple[Triad | 
         right = np.allclose(mounting.rows[i], mounting.named[i], atol=1e-3)
         if right:
             if mounting.confident:
-                checks.append(Check(f"{name}.mounting", name, "passed", mounting.evidence))
+                checks.append(MOUNTING.passed(mounting.evidence, name))
             continue
         source = turned[name]
-        remedy = f"in the mapping: field = {_shown(source.field)}, scale = {_shown(source.scale)}"
         evidence = f"{mounting.text}: {mounting.evidence}"
-        verdict: Verdict = "failed" if mounting.confident else "undecided"
-        checks.append(Check(f"{name}.mounting", name, verdict, evidence, remedy))
+        check = MOUNTING.failed(evidence, name, field=_shown(source.field), scale=_shown(source.scale))
+        checks.append(check if mounting.confident else replace(check, verdict="undecided"))
     return checks
 
 

@@ -14,17 +14,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.checks import (
-    LEVER_M,
-    MOST_LEVER_M,
-    SURE,
-    SensorErrors,
-    ay_delay,
-    explained_factors,
-    is_turned,
-    sensor_errors,
-    sideslip_offset,
-)
+from pdhef_logtool.drive.checks.ay_place import LEVER_M, MOST_LEVER_M
+from pdhef_logtool.drive.checks.by_relations import explained_factors
+from pdhef_logtool.drive.checks.fitting import SURE
+from pdhef_logtool.drive.checks.sensor_errors import SensorErrors, ay_delay, sensor_errors
+from pdhef_logtool.drive.checks.truth_sideslip import is_turned, sideslip_offset
 from pdhef_logtool.drive.measured import drive_columns
 from pdhef_logtool.drive.mounting import Survey, scaled_source, turned_signals
 from pdhef_logtool.drive.truth import LATE_GYRO_S, LatencyEstimate, TruthTrack

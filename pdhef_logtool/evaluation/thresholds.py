@@ -15,40 +15,17 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from pdhef_logtool.evaluation.consistency import SENSORS
-from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, MetricRow
+from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.evaluation.metrics.sensor_residuals import SENSORS
 from pdhef_logtool.evaluation.segments import SEGMENTS
+from pdhef_logtool.evaluation.units import SIGNALS, typed_unit
 from pdhef_logtool.records.documents import checked, read_toml, unknown
 from pdhef_logtool.records.errors import UsageError
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1)]
 Outcome: TypeAlias = Literal["pass", "fail", "not evaluated", "skipped"]
-
-#: Metrics in the unit of their signal; those of ``_OTHER_UNITS`` have one of their own.
-_ERROR_METRICS = ("rmse", "mae", "bias", "p95_abs", "max_abs", "residual_rms", "residual_bias", "disagreement_rms")
-_OTHER_UNITS = {
-    "rmse_relative": "1",
-    "coverage95": "1",
-    "availability": "1",
-    "lag_s": "s",
-    "nees": "1",
-    "nis": "1",
-    "nis_dof": "1",
-    "nis_autocorrelation": "1",
-    "d2": "m/s",
-    "diverged": "1",
-    "not_independent": "1",
-}
-METRICS = (*_ERROR_METRICS, *_OTHER_UNITS)
-SIGNALS: dict[str, str] = {**SCORED_SIGNALS, "position_m": "m", "lateral_1s_m": "m", "state": "1"}
-#: Units that people may write limits in, by the unit of metrics.parquet, with the factor to it.
-_CONVERSIONS: dict[tuple[str, str], float] = {
-    ("deg", "rad"): math.pi / 180.0,
-    ("deg/s", "rad/s"): math.pi / 180.0,
-    ("ms", "s"): 1e-3,
-    ("%", "1"): 1e-2,
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +168,7 @@ def _read_table(raw: object, where: str, problems: list[str]) -> Threshold | Non
     before = len(problems)
     for key, value, known in (
         ("signal", table.signal, tuple(SIGNALS)),
-        ("metric", table.metric, METRICS),
+        ("metric", table.metric, tuple(registered())),
         ("segment", table.segment, SEGMENTS),
     ):
         if value not in known:
@@ -214,12 +191,14 @@ def unit_of(signal: str, metric: str, unit: str | None, where: str, problems: li
 
     ``unit``: what the entry says; None: that of metrics.parquet.
     """
-    native = _OTHER_UNITS.get(metric) or SIGNALS[signal]
-    factor = 1.0 if unit in (None, native) else _CONVERSIONS.get((unit, native))
-    if factor is None:
-        allowed = [native, *(u for u, of in _CONVERSIONS if of == native)]
-        problems.append(f"{where}.unit: {signal} {metric} is in {' or '.join(allowed)}, not {unit!r}")
-    return unit or native, factor or 1.0
+    native = registered()[metric].unit_of(signal)
+    typed, factor = typed_unit(native)
+    if unit is None or unit == native:
+        return native, 1.0
+    if unit != typed:
+        allowed = " or ".join(dict.fromkeys((native, typed)))
+        problems.append(f"{where}.unit: {signal} {metric} is in {allowed}, not {unit!r}")
+    return unit, 1.0 / factor
 
 
 def check_thresholds(thresholds: Sequence[Threshold], rows: Sequence[MetricRow], *, log: str) -> list[Verdict]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.reports.charts import Charts, Cloud, Interval
 from pdhef_logtool.reports.colours import FAULT, PLAIN
 from pdhef_logtool.reports.page import render
@@ -18,7 +19,6 @@ from pdhef_logtool.results.comparison_words import (
     one_signal_a_drive,
     paired_text,
     percent,
-    shown_unit,
     verdict_text,
 )
 
@@ -76,7 +76,7 @@ def _draw(found: Comparison, charts: Charts) -> None:
     if asked or others:
         charts.intervals("changes", "Median change, 95 % interval", "%", [*asked, *others], zero=0.0)
     one = found.figures[0]
-    unit, factor = shown_unit(one.unit)
+    unit, factor = read_unit(one.unit)
     a, b = (np.array([getattr(d, side) for d in one.drives]) * factor for side in "ab")
     known = (a > 0.0) & (b > 0.0)
     if known.any():
@@ -93,7 +93,7 @@ def _interval(one: ComparedFigure, colour: str) -> Interval:
 
 def _drives(one: ComparedFigure) -> dict[str, Any]:
     """Return the table of the drives of the first figure, those at both ends where there are many."""
-    unit, factor = shown_unit(one.unit)
+    unit, factor = read_unit(one.unit)
     half = _MOST_DRIVES // 2
     shown = one.drives if len(one.drives) <= _MOST_DRIVES else (*one.drives[:half], *one.drives[-half:])
     left_out = len(one.drives) - len(shown)

@@ -9,7 +9,7 @@ from typing import Any
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.reports.charts import Charts
 from pdhef_logtool.reports.drive_figures import DriveFigures, Roles, drive_figures
-from pdhef_logtool.reports.drive_tables import HEADS, by_segment, consistency, disagreements, residuals, scores
+from pdhef_logtool.reports.drive_tables import by_segment, consistency, definitions, disagreements, residuals, scores
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
 from pdhef_logtool.sinks.report import reasons_line
@@ -94,7 +94,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         consistency=consistency(report, roles),
         residuals=residuals(report),
         apart={} if roles is None else disagreements(report, roles),
-        heads=HEADS,
+        definitions=definitions(report),
         estimators=_estimators(report),
         checks=sorted(report.get("checks") or (), key=lambda c: ("failed", "undecided", "passed").index(c["verdict"])),
         losses=(report.get("losses") or ())[:_MOST_ROWS],

@@ -1,4 +1,4 @@
-"""The tables of one drive, from its report.json: figures over the whole drive, angles in degrees."""
+"""The tables of one drive, from its report.json: figures over the whole drive, in the units that people read."""
 
 from __future__ import annotations
 
@@ -6,27 +6,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pdhef_logtool.records.geometry import DEGREES
+from pdhef_logtool.evaluation.metrics.metric import OfSignal
+from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.evaluation.units import LABELS, SCORED_SIGNALS, SIGNALS, read_unit
 from pdhef_logtool.reports.drive_figures import Roles
 
-SIGNALS = {"sideslip_rad": "sideslip", "vy_m_s": "v_y", "yaw_rate_rad_s": "yaw rate", "vx_m_s": "v_x", "ay_m_s2": "a_y"}
-#: Figures of a signal as columns: metric and head.
-_SCORES = (("rmse", "RMSE"), ("mae", "mean"), ("p95_abs", "95 %"), ("max_abs", "largest"), ("bias", "bias"))
-HEADS = tuple(head for _, head in _SCORES)
-_SHOWN = {"rad": (DEGREES, "°"), "rad/s": (DEGREES, "°/s")}
-
 _Row = Mapping[str, Any]
+#: NIS and its degrees of freedom, which tables show as one ratio.
+_RATIO = ("nis", "nis_dof")
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """The figures of one estimator: ``values`` in the order of :data:`HEADS`, shares, and how many stamps."""
+    """The figures of one estimator: ``values`` by column in the unit that people read, and how many stamps."""
 
     name: str
     causal: bool
     values: Sequence[float | None]
-    coverage: float | None
-    availability: float | None
     n: int
 
 
@@ -37,6 +33,7 @@ class ScoreTable:
     name: str
     unit: str
     independent: bool
+    heads: Sequence[str]
     rows: Sequence[Score]
 
 
@@ -52,12 +49,10 @@ class SegmentScore:
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """What an estimator says of itself: NIS over its degrees of freedom, its autocorrelation, d2 in m/s."""
+    """Figures of estimators as a whole: ``rows`` of a name and its values, in the unit that people read."""
 
-    name: str
-    nis: float | None
-    autocorrelation: float | None
-    d2_m_s: float | None
+    heads: Sequence[str]
+    rows: Sequence[tuple[str, Sequence[float | None]]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,26 +69,27 @@ def scores(report: Mapping[str, Any], roles: Roles) -> list[ScoreTable]:
     """Return the errors over the whole drive, a table a signal, the answer first."""
     causal = {e["name"]: bool(e["causal"]) for e in report["estimators"]}
     tables = []
-    for signal, name in SIGNALS.items():
+    for signal in SCORED_SIGNALS:
         found = _by_estimator(report, signal)
         order = [n for n in (roles.main, roles.rival, *roles.others) if "rmse" in found.get(n, {})]
         if not order:
             continue
-        unit = found[order[0]]["rmse"]["unit"]
-        factor, shown = _SHOWN.get(unit, (1.0, unit))
-        rows = [
-            Score(
-                n,
-                causal[n],
-                [_value(found[n], metric, factor) for metric, _ in _SCORES],
-                _value(found[n], "coverage95"),
-                _value(found[n], "availability"),
-                found[n]["rmse"]["n"],
-            )
-            for n in order
+        shown = [
+            m
+            for m in registered().values()
+            if isinstance(m.function, OfSignal) and any(m.name in found[n] for n in order)
         ]
-        tables.append(ScoreTable(name, shown, signal not in report["truth"]["not_independent"], rows))
-    return tables
+        rows = [Score(n, causal[n], [_read(found[n], m.name) for m in shown], found[n]["rmse"]["n"]) for n in order]
+        unit = read_unit(found[order[0]]["rmse"]["unit"])[0]
+        independent = signal not in report["truth"]["not_independent"]
+        tables.append(ScoreTable(LABELS[signal], unit, independent, [m.head() for m in shown], rows))
+    return sorted(tables, key=lambda t: [*LABELS.values()].index(t.name))
+
+
+def definitions(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Return label, name and definition of each metric of a report."""
+    names = {m["metric"] for m in report["metrics"]}
+    return [(m.label, m.name, m.definition.replace("`", "")) for m in registered().values() if m.name in names]
 
 
 def by_segment(report: Mapping[str, Any], roles: Roles) -> list[SegmentScore]:
@@ -108,29 +104,33 @@ def by_segment(report: Mapping[str, Any], roles: Roles) -> list[SegmentScore]:
     ]
 
 
-def consistency(report: Mapping[str, Any], roles: Roles | None) -> list[Consistency]:
-    """Return what needs no truth, of each estimator that has any of it."""
-    state, lateral = _by_estimator(report, "state"), _by_estimator(report, "vy_m_s")
+def consistency(report: Mapping[str, Any], roles: Roles | None) -> Consistency | None:
+    """Return the figures that estimators have as a whole; None where no estimator has any."""
+    names = () if roles is None else (roles.main, roles.rival, *roles.others)
+    by_signal = {signal: _by_estimator(report, signal) for signal in SIGNALS}
+    shown = [
+        (signal, m)
+        for m in registered().values()
+        for signal, found in by_signal.items()
+        if not isinstance(m.function, OfSignal) and m.function is not None and m.name not in _RATIO
+        if any(_read(found.get(name, {}), m.name) is not None for name in names)
+    ]
     rows = []
-    for name in () if roles is None else (roles.main, roles.rival, *roles.others):
-        own = state.get(name, {})
-        nis, dof = _value(own, "nis"), _value(own, "nis_dof")
-        row = Consistency(
-            name,
-            nis / dof if nis is not None and dof else None,
-            _value(own, "nis_autocorrelation"),
-            _value(lateral.get(name, {}), "d2"),
-        )
-        if (row.nis, row.autocorrelation, row.d2_m_s) != (None, None, None):
-            rows.append(row)
-    return rows
+    for name in names:
+        nis, dof = (_read(by_signal["state"].get(name, {}), metric) for metric in _RATIO)
+        ratio = nis / dof if nis is not None and dof else None
+        values = [ratio, *(_read(by_signal[signal].get(name, {}), m.name) for signal, m in shown)]
+        if any(value is not None for value in values):
+            rows.append((name, values))
+    heads = ["NIS / dof", *(m.head(signal) for signal, m in shown)]
+    return Consistency(heads, rows) if rows else None
 
 
 def residuals(report: Mapping[str, Any]) -> list[Residual]:
     """Return the residuals of the sensors."""
-    found = [(s, _by_estimator(report, s).get("sensors", {})) for s in SIGNALS]
+    found = [(s, _by_estimator(report, s).get("sensors", {})) for s in LABELS]
     return [
-        Residual(SIGNALS[s], _value(own, "residual_rms"), _value(own, "residual_bias"), own["residual_rms"]["unit"])
+        Residual(LABELS[s], _value(own, "residual_rms"), _value(own, "residual_bias"), own["residual_rms"]["unit"])
         for s, own in found
         if "residual_rms" in own
     ]
@@ -155,6 +155,12 @@ def _by_estimator(report: Mapping[str, Any], signal: str) -> dict[str, dict[str,
     return found
 
 
-def _value(rows: Mapping[str, _Row], key: str, factor: float = 1.0) -> float | None:
+def _value(rows: Mapping[str, _Row], key: str) -> float | None:
     value = rows[key]["value"] if key in rows else None
-    return None if value is None else float(value) * factor
+    return None if value is None else float(value)
+
+
+def _read(rows: Mapping[str, _Row], key: str) -> float | None:
+    """Return a figure in the unit that people read."""
+    value = _value(rows, key)
+    return None if value is None else value * read_unit(rows[key]["unit"])[1]

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.reports.charts import Charts, Cloud, Interval
 from pdhef_logtool.reports.colours import INK, PLAIN, colour
@@ -19,13 +20,6 @@ from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
 
 #: Keys of the figures of the page.
 FIGURES = ("medians", "spread", "against")
-#: What signals are called, the factor to the unit that a person reads, and that unit.
-_SHOWN = {
-    "sideslip_rad": ("sideslip", math.degrees(1.0), "°"),
-    "vy_m_s": ("v_y", 1.0, "m/s"),
-    "yaw_rate_rad_s": ("yaw rate", math.degrees(1.0), "°/s"),
-    "vx_m_s": ("v_x", 1.0, "m/s"),
-}
 #: Rows of tables that a run can make as long as it likes, keys that are told, and bars of a histogram at most.
 MOST_ROWS, _MOST_KEYS, _MOST_BARS = 1000, 12, 40
 #: Errors beyond this quantile of the drives are counted in the last bar.
@@ -197,10 +191,10 @@ def _rows(distributions: Sequence[Distribution]) -> list[_Row]:
     """Return rows with median, its bounds, the tenths at both ends, and the largest."""
     rows = []
     for d in distributions:
-        name, factor, unit = _SHOWN[d.signal]
+        unit, factor = read_unit(d.unit)
         told = d.median.value, d.median.low, d.median.high, d.quantile(0.1), d.quantile(0.9), float(d.values[-1])
-        rows.append(_Row(name, unit, d.estimator, d.drives, tuple(x * factor for x in told)))
-    return sorted(rows, key=lambda r: [name for name, _, _ in _SHOWN.values()].index(r.signal))
+        rows.append(_Row(LABELS[d.signal], unit, d.estimator, d.drives, tuple(x * factor for x in told)))
+    return sorted(rows, key=lambda r: [*LABELS.values()].index(r.signal))
 
 
 def _space_rows(space: Space) -> tuple[list[str], list[tuple[str, list[SpaceCell]]], int, int]:

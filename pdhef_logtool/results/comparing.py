@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.evaluation.consistency import SENSORS
+from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.evaluation.metrics.sensor_residuals import SENSORS
 from pdhef_logtool.evaluation.segments import SEGMENTS
-from pdhef_logtool.evaluation.thresholds import SIGNALS
+from pdhef_logtool.evaluation.units import SIGNALS
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.results.changed_signals import ChangedSignal, changed_signals
 from pdhef_logtool.results.gate import MAIN, Figure, Gate
@@ -37,13 +38,6 @@ _GRAVITY: tuple[FigureVerdict, ...] = ("worse", "no figure", "cannot tell", "not
 #: Rows of metrics.parquet that are in memory at once.
 _ROWS = 1 << 18
 _FIGURE = ["estimator", "signal", "segment", "metric", "value", "n", "unit"]
-#: Shown beside what was asked for: what else a change of an estimator shows in.
-_OTHERS = (
-    *(Figure(signal=signal) for signal in SIGNALS if signal not in ("sideslip_rad", "state")),
-    *(Figure(metric=metric) for metric in ("p95_abs", "max_abs")),
-    *(Figure(segment=segment) for segment in SEGMENTS if segment != "all"),
-    Figure(signal="vy_m_s", metric="d2"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -426,11 +420,28 @@ def _share(a: float, b: float) -> float | None:
     return None if a == 0.0 else b / a - 1.0
 
 
+def _others() -> list[Figure]:
+    """Return what a change of an estimator shows in: RMSE by signal and segment, and what else tables show."""
+    shown = [
+        Figure(signal=signal, metric=metric.name)
+        for metric in registered().values()
+        for signal in dict.fromkeys((*metric.terminal, *metric.brief))
+        if metric.best == "lower" and metric.name != "rmse"
+    ]
+    return [
+        *(Figure(signal=signal) for signal in SIGNALS if signal not in ("sideslip_rad", "state")),
+        *(figure for figure in shown if figure.signal == "sideslip_rad"),
+        *(Figure(segment=segment) for segment in SEGMENTS if segment != "all"),
+        *(figure for figure in shown if figure.signal != "sideslip_rad"),
+    ]
+
+
 def _beside(asked: Sequence[Figure]) -> list[Figure]:
+    """Return the figures that are shown beside those asked for."""
     keys = {(f.signal, f.metric, f.segment) for f in asked}
     return [
         replace(f, estimator=asked[0].estimator)
-        for f in (Figure(), *_OTHERS)
+        for f in (Figure(), *_others())
         if (f.signal, f.metric, f.segment) not in keys
     ]
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 
-from pdhef_logtool.records.geometry import DEGREES
+from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.results.changed_signals import ChangedSignal
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison
 from pdhef_logtool.results.paired_change import LEAST_CLUSTERS
 from pdhef_logtool.sinks.base import TRUTH
 
-_SHOWN_UNITS = {"rad": ("°", DEGREES), "rad/s": ("°/s", DEGREES), "m/s^2": ("m/s²", 1.0), "1": ("", 1.0)}
 _COLUMN_UNITS = {"rad": "rad", "rad_s": "rad/s", "m_s": "m/s", "m_s2": "m/s^2"}
 _BY = {"signals": "what their signals held", "content": "their files", "name": "their names alone"}
 
@@ -67,11 +66,6 @@ def interval_text(one: ComparedFigure) -> str:
     return f"{percent(low)} to {percent(high)}" if math.isfinite(one.change.low) else "-"
 
 
-def shown_unit(unit: str) -> tuple[str, float]:
-    """Return the unit that people read for one of metrics.parquet, and the factor to it."""
-    return _SHOWN_UNITS.get(unit, (unit, 1.0))
-
-
 def unit_of_column(column: str) -> str:
     """Return the unit of a column of estimates.parquet by its name."""
     plain = column.replace("_std", "")
@@ -91,7 +85,7 @@ def one_signal_a_drive(found: Comparison) -> list[ChangedSignal]:
 
 def largest_text(one: ChangedSignal) -> str:
     """Return the largest difference with its unit."""
-    unit, factor = shown_unit(unit_of_column(one.signal))
+    unit, factor = read_unit(unit_of_column(one.signal))
     return "-" if one.largest is None else f"{one.largest * factor:.3g} {unit}".strip()
 
 

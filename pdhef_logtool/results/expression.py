@@ -27,7 +27,7 @@ from typing import Any, NoReturn, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS
+from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.records.tracks import TRACK_COLUMNS

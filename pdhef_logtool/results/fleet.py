@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 #: Name of the estimate that each drive's report calls its answer.
 ANSWER = "answer"
 #: Errors that are told, in order: signal and unit.
-SIGNALS = {"sideslip_rad": "rad", "vy_m_s": "m/s", "yaw_rate_rad_s": "rad/s", "vx_m_s": "m/s"}
+SIGNALS = {s: SCORED_SIGNALS[s] for s in ("sideslip_rad", "vy_m_s", "yaw_rate_rad_s", "vx_m_s")}
 JUDGED = "sideslip_rad"
 #: Of fewer drives no interval is told.
 LEAST_DRIVES = 5

@@ -10,16 +10,13 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.segments import SEGMENTS
-from pdhef_logtool.evaluation.thresholds import SIGNALS, unit_of
+from pdhef_logtool.evaluation.thresholds import unit_of
+from pdhef_logtool.evaluation.units import LABELS, SIGNALS
 from pdhef_logtool.records.documents import checked, read_toml, unknown
 from pdhef_logtool.records.errors import UsageError
 
-#: Metrics of which less is better and 0 is best: those that a ratio says something of.
-RATIO_METRICS = (
-    *("rmse", "mae", "p95_abs", "max_abs", "rmse_relative"),
-    *("residual_rms", "disagreement_rms", "d2"),
-)
 #: What stands for A's main estimator of each drive.
 MAIN = "main"
 _SHARE = re.compile(r"\s*([0-9]*\.?[0-9]+)\s*(%?)\s*")
@@ -48,9 +45,9 @@ class Figure:
 
     @property
     def short(self) -> str:
-        """``sideslip rmse`` or ``sideslip, braking``, for the axis of a figure."""
-        name = re.sub(r"_(rad|rad_s|m|m_s|m_s2)$", "", self.signal)
-        what = name if self.metric == "rmse" and self.segment != "all" else f"{name} {self.metric}"
+        """``sideslip RMSE`` or ``sideslip, braking``, for the axis of a figure."""
+        name = LABELS[self.signal]
+        what = name if self.metric == "rmse" and self.segment != "all" else f"{name} {registered()[self.metric].label}"
         return what if self.segment == "all" else f"{what}, {self.segment}"
 
 
@@ -126,7 +123,9 @@ def _read_figure(raw: object, where: str, problems: list[str]) -> Figure | None:
 
 def figure_problems(signal: str, metric: str, segment: str, where: str = "") -> list[str]:
     """Return what is wrong with the words of a figure."""
-    choices = (("signal", signal, tuple(SIGNALS)), ("metric", metric, RATIO_METRICS), ("segment", segment, SEGMENTS))
+    # Less is better, and 0 is best: those that a ratio says something of.
+    compared = tuple(name for name, one in registered().items() if one.best == "lower")
+    choices = (("signal", signal, tuple(SIGNALS)), ("metric", metric, compared), ("segment", segment, SEGMENTS))
     return [f"{where}{key} = {unknown(value, known)}" for key, value, known in choices if value not in known]
 
 

@@ -229,7 +229,8 @@ def write_verdicts(junit: Path | None, results: Sequence[LogResult]) -> None:
     from pdhef_logtool.sinks.junit import write_junit
 
     if junit is not None:
-        write_junit(junit, {r.outcome.log: r.verdicts or () for r in results})
+        checks = {r.outcome.log: (r.report or {}).get("checks", ()) for r in results}
+        write_junit(junit, {r.outcome.log: r.verdicts or () for r in results}, checks)
 
 
 def run_log(

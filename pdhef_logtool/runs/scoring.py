@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.drive.reading import Drive
@@ -15,8 +14,8 @@ from pdhef_logtool.runs.self_calibrating import log_sensors
 from pdhef_logtool.sinks.base import TRUTH, Event
 
 if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.consistency import LogSensors
     from pdhef_logtool.evaluation.metrics import MetricRow
+    from pdhef_logtool.evaluation.metrics.d2 import LogSensors
     from pdhef_logtool.evaluation.reasons import ReasonFacts
 
 
@@ -52,8 +51,9 @@ def evaluate(
     names : of the estimators. read : returns the track of a name, ``truth`` too; None if there is none.
     signals : what the estimators saw. sensors : as the log calibrated them; None: as the car's file says.
     """
-    from pdhef_logtool.evaluation.consistency import d2_rows, disagreement_rows, sensor_rows, whiteness_rows
-    from pdhef_logtool.evaluation.metrics import Scorer, state_rows
+    from pdhef_logtool.evaluation.metrics import Scorer
+    from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive
+    from pdhef_logtool.evaluation.metrics.scoring import drive_rows, track_rows
     from pdhef_logtool.evaluation.reasons import summarise_reasons
     from pdhef_logtool.evaluation.segments import moving_mask, segment_masks
 
@@ -70,20 +70,15 @@ def evaluate(
     if truth is not None:
         scorer = Scorer(truth, masks, log=stem, low_speed_m_s=slow, not_independent=drive.plan.dependent)
     tracks = {name: track for name in names if (track := read(name)) is not None}
-    of_d2 = d2_rows([*tracks.values()], signals, masks, log=stem, low_speed_m_s=slow, sensors=sensors)
+    of_drive = drive_rows(EvaluatedDrive(stem, tracks, truth, signals, masks, slow, sensors))
     for name, track in tracks.items():
         if moving.any() and not _known_at(track, moving):
             silent.append(name)
-        rows += state_rows(track, masks, log=stem) if scorer is None else scorer.rows(track)
-        rows += whiteness_rows(track, masks, log=stem)
-        rows += [r for r in of_d2 if r.estimator == name]
+        rows += track_rows(track, None, masks, log=stem) if scorer is None else scorer.rows(track)
+        rows += of_drive.pop(name, ())
         reasons[name] = summarise_reasons(track)
         events += diverged_events(track)
-    if truth is None:
-        for a, b in combinations(names, 2):
-            pair = [t for t in (read(a), read(b)) if t is not None]
-            rows += disagreement_rows(pair, masks, log=stem, low_speed_m_s=slow)
-    rows += sensor_rows(signals, masks, log=stem, low_speed_m_s=slow)
+    rows += [row for of_one in of_drive.values() for row in of_one]
     return Evaluation(rows, sorted(events, key=in_time), reasons, tuple(silent), bool(moving.any()))
 
 

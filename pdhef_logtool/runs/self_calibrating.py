@@ -24,7 +24,7 @@ from pdhef_logtool.runs import guard
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.consistency import LogSensors
+    from pdhef_logtool.evaluation.metrics.d2 import LogSensors
     from pdhef_logtool.self_calibration.calibration import SelfCalibration
     from pdhef_logtool.self_calibration.driving import Driving
 
@@ -100,8 +100,8 @@ def _d2_of(drive: Drive, estimators: Sequence[Estimator], sensors: LogSensors) -
 
     The windows have a fixed length. NaN where it cannot be told.
     """
-    from pdhef_logtool.evaluation.consistency import d2_rows, driven_d2, driving_products
     from pdhef_logtool.evaluation.metrics import ALL
+    from pdhef_logtool.evaluation.metrics.d2 import d2_rows, driven_d2, driving_products
 
     slow = drive.car.vehicle.low_speed_blend_m_s
     carries: list[Any] = [None] * len(estimators)
@@ -143,7 +143,7 @@ def log_sensors(vehicle: VehicleParameters, calibration: SelfCalibration | None)
 
     What is refused for its tyres is no worse for its sensors.
     """
-    from pdhef_logtool.evaluation.consistency import LogSensors
+    from pdhef_logtool.evaluation.metrics.d2 import LogSensors
 
     if calibration is None or not calibration.parameters:
         gain = 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2

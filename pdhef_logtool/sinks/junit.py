@@ -1,4 +1,7 @@
-"""JUnit XML of verdicts: one testsuite a log, one testcase a threshold and estimator, as CI systems read it."""
+"""JUnit XML of verdicts: one testsuite a log, one testcase a threshold and estimator, as CI systems read it.
+
+Checks that did not pass are properties of the log's testsuite: they close no gate.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeAlias
 
 from pdhef_logtool.evaluation.thresholds import Verdict
 from pdhef_logtool.records.files import write_bytes
@@ -28,22 +32,42 @@ class Case:
     output: str | None = None
 
 
-def write_junit(path: Path, verdicts: Mapping[str, Sequence[Verdict]]) -> None:
-    """Write the verdicts by log through a temporary name; raises OutputError."""
-    write_bytes(path, junit_bytes(verdicts))
+#: By log the checks of its report.
+_Checks: TypeAlias = Mapping[str, Sequence[Mapping[str, Any]]]
 
 
-def junit_bytes(verdicts: Mapping[str, Sequence[Verdict]]) -> bytes:
+def write_junit(path: Path, verdicts: Mapping[str, Sequence[Verdict]], checks: _Checks | None = None) -> None:
+    """Write verdicts and checks by log through a temporary name; raises OutputError."""
+    write_bytes(path, junit_bytes(verdicts, checks))
+
+
+def junit_bytes(verdicts: Mapping[str, Sequence[Verdict]], checks: _Checks | None = None) -> bytes:
     """Return JUnit XML in UTF-8; the same verdicts give the same bytes, so that there is no time of day in it."""
-    return cases_bytes({log: [_case(verdict) for verdict in of_log] for log, of_log in verdicts.items()})
+    cases = {log: [_case(verdict) for verdict in of_log] for log, of_log in verdicts.items()}
+    return cases_bytes(cases, {log: _check_properties(of_log) for log, of_log in (checks or {}).items()})
 
 
-def cases_bytes(suites: Mapping[str, Sequence[Case]]) -> bytes:
-    """Return JUnit XML of testcases by suite, as :func:`junit_bytes`."""
+def _check_properties(checks: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Return the checks that did not pass as properties."""
+    return {
+        f"check {c['name']}": f"{'waived' if c['waived'] else c['verdict']}: {c['evidence']}"
+        for c in checks
+        if c["verdict"] != "passed"
+    }
+
+
+def cases_bytes(
+    suites: Mapping[str, Sequence[Case]], properties: Mapping[str, Mapping[str, str]] | None = None
+) -> bytes:
+    """Return JUnit XML of testcases, and of properties, by suite, as :func:`junit_bytes`."""
     everything = [case for of_suite in suites.values() for case in of_suite]
     root = ET.Element("testsuites", {"name": "pdhef", **_counts(everything)})
     for name, of_suite in suites.items():
         suite = ET.SubElement(root, "testsuite", {"name": _text(name), **_counts(of_suite)})
+        if own := (properties or {}).get(name):
+            element = ET.SubElement(suite, "properties")
+            for key, value in own.items():
+                ET.SubElement(element, "property", {"name": _text(key), "value": _text(value)})
         for case in of_suite:
             _add_case(suite, case)
     ET.indent(root)

@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S, Cell
 from pdhef_logtool.evaluation.reasons import ReasonFacts, SensorFault
 from pdhef_logtool.evaluation.standing import Standing
+from pdhef_logtool.evaluation.units import typed_unit
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.compiled_sources import compiled_digest
@@ -350,8 +352,8 @@ def _is_shown(metric: Mapping[str, Any], main: str) -> bool:
     signal, name = metric["signal"], metric["metric"]
     if metric["segment"] != "all":
         return signal == "sideslip_rad" and name == "rmse" and metric["segment"] in ("linear", "nonlinear")
-    own = name == "rmse" and (signal == "sideslip_rad" or metric["estimator"] == main)
-    return own or (name == "coverage95" and signal == "sideslip_rad") or name in ("nis", "nis_dof", "d2")
+    of_main = name == "rmse" and metric["estimator"] == main
+    return of_main or (name in registered() and signal in registered()[name].brief)
 
 
 def _rounded(cell: Mapping[str, Any]) -> dict[str, Any]:
@@ -526,7 +528,7 @@ def _truth_lines(truth: Mapping[str, Any]) -> list[str]:
 
 def _metric_table(signal: str, rows: Sequence[Mapping[str, Any]], not_causal: set[str]) -> list[str]:
     metrics = list(dict.fromkeys((m["metric"], m["unit"]) for m in rows))
-    shown = [(name, unit, _SHOWN_UNITS.get(unit, (unit, 1.0))) for name, unit in metrics]
+    shown = [(name, unit, typed_unit(unit) if unit in ("rad", "rad/s") else (unit, 1.0)) for name, unit in metrics]
     heads = [name if unit[0] in ("", "1") else f"{name} [{unit[0]}]" for name, _, unit in shown]
     lines = [
         f"## {signal}",
@@ -545,9 +547,6 @@ def _metric_table(signal: str, rows: Sequence[Mapping[str, Any]], not_causal: se
         mark = " (not causal)" if estimator in not_causal else ""
         lines.append(f"| {estimator}{mark} | {segment} | " + " | ".join(cells) + " |")
     return [*lines, ""]
-
-
-_SHOWN_UNITS = {"rad": ("deg", math.degrees(1.0)), "rad/s": ("deg/s", math.degrees(1.0))}
 
 
 def _number(value: float | None, factor: float) -> str:

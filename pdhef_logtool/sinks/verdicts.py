@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from pdhef_logtool.evaluation.bootstrap import Interval
 from pdhef_logtool.evaluation.standing import JUDGED_SIGNALS, LEAST_BLOCKS, Standing
-from pdhef_logtool.records.geometry import DEGREES
+from pdhef_logtool.evaluation.units import SCORED_SIGNALS, read_unit
 from pdhef_logtool.sinks.answer import NO_SIDESLIP_RAD, SAME
 
 if TYPE_CHECKING:
@@ -21,14 +21,6 @@ if TYPE_CHECKING:
 #: ``same``: the interval of the difference lies within :data:`~pdhef_logtool.sinks.answer.SAME` of the rival's error.
 #: ``undecided``: it holds 0, or there is none. ``alone``: no other physics ran.
 Outcome: TypeAlias = Literal["better", "worse", "same", "undecided", "alone", "none"]
-
-#: By signal the factor to the unit that a person reads, and that unit.
-_SHOWN = {
-    "sideslip_rad": (DEGREES, "°"),
-    "vy_m_s": (1.0, " m/s"),
-    "yaw_rate_rad_s": (DEGREES, "°/s"),
-    "vx_m_s": (1.0, " m/s"),
-}
 
 
 def verdicts_of(
@@ -112,8 +104,14 @@ def _outcome(found: Standing) -> Outcome:
     return "better" if difference.high < 0.0 else "undecided"
 
 
+def _unit(signal: str) -> tuple[str, float]:
+    """Return the unit that people read as it follows a number, and the factor to it."""
+    unit, factor = read_unit(SCORED_SIGNALS[signal])
+    return unit if unit.startswith("°") else f" {unit}", factor
+
+
 def _error(found: Standing) -> str:
-    factor, unit = _SHOWN[found.signal]
+    unit, factor = _unit(found.signal)
     assert found.rmse is not None
     shown = _number(found.rmse.value * factor)
     if math.isfinite(found.rmse.low):
@@ -127,7 +125,7 @@ def _error(found: Standing) -> str:
 def _against(found: Standing, outcome: Outcome) -> str:
     if outcome == "alone":
         return "no other filter on physics alone ran beside it"
-    factor, unit = _SHOWN[found.signal]
+    unit, factor = _unit(found.signal)
     assert found.rival_rmse is not None and found.difference is not None and found.rmse is not None
     beside = f"{found.rival} ({_number(found.rival_rmse * factor)}{unit})"
     if outcome == "same":

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.estimators.table import SPECS
-from pdhef_logtool.evaluation.metrics import position_error
+from pdhef_logtool.evaluation.dead_reckoned import position_error
 from pdhef_logtool.records.geometry import dead_reckon, wrap_angle
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack

@@ -8,7 +8,7 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.parallel_physics import filter_of
-from pdhef_logtool.evaluation.metrics import lag_s
+from pdhef_logtool.evaluation.metrics.lag import lag_s
 from pdhef_logtool.learning.network.residuals import join_rows, residual_windows
 from pdhef_logtool.learning.network.train_command import HISTORY_FILE
 from pdhef_logtool.records.signals import FloatArray

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.drive.checks import SensorErrors
+from pdhef_logtool.drive.checks.sensor_errors import SensorErrors
 from pdhef_logtool.drive.mounting import Survey, survey_log
 from pdhef_logtool.drive.proposals import _of_frames
 from pdhef_logtool.logs.drive_log import TopicInfo

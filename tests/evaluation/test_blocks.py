@@ -12,10 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.evaluation import blocks, metrics
+from pdhef_logtool.evaluation import blocks
 from pdhef_logtool.evaluation.blocks import ErrorSums, SegmentMasks, median_step_ns, packed
-from pdhef_logtool.evaluation.consistency import disagreement_rows, sensor_rows, whiteness_rows
-from pdhef_logtool.evaluation.metrics import lateral_errors_after_one_second, position_error, score_track, state_rows
+from pdhef_logtool.evaluation.dead_reckoned import lateral_errors_after_one_second, position_error
+from pdhef_logtool.evaluation.metrics import lag, nees, score_track
+from pdhef_logtool.evaluation.metrics.disagreement import disagreement_rows
+from pdhef_logtool.evaluation.metrics.innovations import state_rows
+from pdhef_logtool.evaluation.metrics.sensor_residuals import sensor_rows
+from pdhef_logtool.evaluation.metrics.whiteness import whiteness_rows
 from pdhef_logtool.evaluation.reasons import summarise_reasons
 from pdhef_logtool.evaluation.segments import find_intervals, moving_mask, segment_masks
 from pdhef_logtool.records.reasons import REASONS
@@ -162,7 +166,7 @@ def test_figures_do_not_know_the_blocks(seed, rows):
     paths = position_error(a, truth), lateral_errors_after_one_second(a, truth)
     reasons, step_ns = summarise_reasons(a), median_step_ns(signals)
     assert step_ns == np.median(np.diff(signals.stamps_ns))
-    with blocks_of(rows), patch.object(metrics, "NEES_ROWS", 50):
+    with blocks_of(rows), patch.object(nees, "NEES_ROWS", 50):
         assert_same_rows(figures(), expected)
         np.testing.assert_array_equal(position_error(a, truth), paths[0])
         np.testing.assert_array_equal(lateral_errors_after_one_second(a, truth), paths[1])
@@ -210,7 +214,7 @@ def test_masks_take_a_bit_each_and_refuse_another_shape():
 def test_scoring_a_stored_track_holds_few_columns(tmp_path, monkeypatch):
     monkeypatch.setattr(track_store, "ROWS_HELD", 0)
     signals, truth, estimate, _ = drive(3, seconds=2400.0)
-    with TrackStore(tmp_path / "tracks") as store, patch.object(metrics, "LAG_SPAN_NS", 10**10):
+    with TrackStore(tmp_path / "tracks") as store, patch.object(lag, "LAG_SPAN_NS", 10**10):
         expected = score_track(estimate, truth, {}, log="drive", low_speed_m_s=3.0)
         masks = segment_masks(signals, truth, VEHICLE)
         for track in (truth, estimate):

@@ -7,8 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pdhef_logtool.evaluation.consistency import disagreement_rows, innovation_rows, sensor_rows, whiteness_rows
 from pdhef_logtool.evaluation.metrics import MetricRow, score_track
+from pdhef_logtool.evaluation.metrics.disagreement import disagreement_rows
+from pdhef_logtool.evaluation.metrics.innovations import state_rows
+from pdhef_logtool.evaluation.metrics.sensor_residuals import sensor_rows
+from pdhef_logtool.evaluation.metrics.whiteness import whiteness_rows
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
 
@@ -85,7 +88,7 @@ def test_white_and_coloured_innovations():
         track = make_track("ukf", STAMPS, nis=nis, nis_dof=dof)
         (row,) = whiteness_rows(track, EVERYTHING, log="drive")
         assert row.value == pytest.approx(expected, abs=slack)
-        rows = {r.metric: r.value for r in innovation_rows(track, EVERYTHING, log="drive")}
+        rows = {r.metric: r.value for r in state_rows(track, EVERYTHING, log="drive")}
         assert rows["nis"] == pytest.approx(2.0, rel=0.1)
         assert rows["nis_dof"] == 2.0
     assert whiteness_rows(make_track("zero", STAMPS), EVERYTHING, log="drive") == []

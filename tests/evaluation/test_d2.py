@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.evaluation import blocks
-from pdhef_logtool.evaluation.consistency import LogSensors, d2_rows, driven_d2, driving_products
 from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.evaluation.metrics.d2 import LogSensors, d2_rows, driven_d2, driving_products
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.runs.guard import FACTOR, distrust

@@ -8,16 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.evaluation.bootstrap import block_bootstrap_difference, block_bootstrap_interval
-from pdhef_logtool.evaluation.metrics import (
-    Scorer,
-    lag_s,
-    lateral_errors_after_one_second,
-    nees,
-    position_error,
-    score_track,
-    state_rows,
-    summarise_errors,
-)
+from pdhef_logtool.evaluation.dead_reckoned import lateral_errors_after_one_second, position_error
+from pdhef_logtool.evaluation.metrics import Scorer, score_track
+from pdhef_logtool.evaluation.metrics.errors import summarise_errors
+from pdhef_logtool.evaluation.metrics.innovations import state_rows
+from pdhef_logtool.evaluation.metrics.lag import lag_s
+from pdhef_logtool.evaluation.metrics.nees import nees
 from pdhef_logtool.records.tracks import StateTrack, make_track
 
 T0 = 1_700_000_000_000_000_000

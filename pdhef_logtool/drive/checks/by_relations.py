@@ -1,0 +1,190 @@
+"""``SIGNAL.sign``, ``unit``, ``axis``: each signal by relations to others (:mod:`~pdhef_logtool.drive.relations`).
+
+Where they contradict one another, the smallest mistake that explains all of them says which signals fail.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from pdhef_logtool.drive.checks.kind import CheckKind
+from pdhef_logtool.drive.measured import WHEEL_SPEEDS, Measured
+from pdhef_logtool.drive.relations import (
+    Mistake,
+    Relation,
+    best_explanation,
+    contradicting,
+    known_mistakes,
+    smallest_explanations,
+)
+from pdhef_logtool.records.checks import Check
+
+_LACKS = {
+    "ax_m_s2": "speeding up and braking, on straights",
+    "speed_m_s": "a wheel speed, an accelerometer or truth to hold it against, and speeding up or bends",
+}
+_BENDS = "bends to both sides at speed"
+
+
+def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int = 2) -> dict[str, tuple[float, str]]:
+    """Return by signal the factor that undoes its wrong unit or sign, with the evidence, where only one explains it.
+
+    ``most``: mistakes at once that are believed.
+    """
+    relations = measured.relations
+    groups = measured.groups(mounting_is_known=mounting_is_known)
+    explanations = smallest_explanations(relations, known_mistakes(list(measured.columns), groups))
+    chosen = best_explanation(relations, explanations)
+    if chosen is None or len(chosen) > most or not all(m.is_exact for m in chosen):
+        return {}
+    bad = [r for r in relations if r.tells and not r.accepts()]
+    found = {}
+    for mistake in chosen:
+        for name, factor in mistake.factors.items():
+            evidence = next((r.evidence for r in bad if name in r.powers), "")
+            found[name] = (factor, f"{mistake.words}: {evidence}")
+    return found
+
+
+def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Check, ...]:
+    """Judge sign, unit and field of every signal that a relation is about."""
+    columns, relations = measured.columns, measured.relations
+    groups = measured.groups(mounting_is_known=mounting_is_known)
+    names = [n for n in columns if n in measured.topics or n in _JUDGED_TRUTH]
+    if "truth.sideslip_rad" in names and "truth.vy_m_s" in names:  # which is v_x times its tangent
+        names.remove("truth.vy_m_s")
+    explanations = smallest_explanations(relations, known_mistakes(list(columns), groups))
+    blamed, suspected = _mistakes_by_signal(explanations)
+    culprits = set() if explanations else contradicting(relations)
+    checks: list[Check] = []
+    for name in names:
+        mine = [r for r in relations if name in r.powers]
+        telling = [r for r in mine if r.tells]
+        bad = [r for r in telling if not r.accepts()]
+        good = [r for r in telling if r.accepts()]
+        stray = [r for r in mine if r.unrelated and not _is_cleared(name, r, relations)]
+        if stray:
+            checks.append(_stray(name, stray[0]))
+        if name in blamed or name in suspected:
+            found = _blamed(name, blamed.get(name) or suspected[name], bad or telling)
+            is_sure = name in blamed and not (bad and all(r.is_vague for r in bad))
+            checks += found if is_sure else [replace(c, verdict="undecided") for c in found]
+        elif name in culprits:
+            checks.append(_unexplained(name, bad))
+        elif good or (bad and explanations):
+            best = max(telling if explanations else good, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
+            checks += [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
+        elif bad:
+            checks.append(_contradicted(name, bad[0], culprits))
+        elif not stray:
+            checks.append(_not_excited(name, mine))
+    return tuple(checks)
+
+
+def _mistakes_by_signal(
+    explanations: Sequence[tuple[Mistake, ...]],
+) -> tuple[dict[str, list[Mistake]], dict[str, list[Mistake]]]:
+    """Return by signal the mistakes of the likeliest explanations, and those of others that explain it as well."""
+    least = min((_likelihood(e) for e in explanations), default=())
+    blamed: dict[str, list[Mistake]] = {}
+    suspected: dict[str, list[Mistake]] = {}
+    for chosen in explanations:
+        found = blamed if _likelihood(chosen) == least else suspected
+        for mistake in chosen:
+            for name in mistake.factors:
+                if mistake not in found.setdefault(name, []):
+                    found[name].append(mistake)
+    return blamed, suspected
+
+
+def _likelihood(explanation: tuple[Mistake, ...]) -> tuple[int, int]:
+    """Return how many signals an explanation has wrong, the wheels as one, and how seldom those are."""
+    signals = {"wheels" if n.startswith("wheel_speed") else n for m in explanation for n in m.factors}
+    seldom = max((_OFTEN_WRONG.index(n) if n in _OFTEN_WRONG else len(_OFTEN_WRONG) for n in signals), default=0)
+    return len(signals), seldom
+
+
+#: Of signals that explain a contradiction equally well the first is blamed: no standard says how a steering angle
+#: counts, and an axis of an IMU is turned more often than the sign of a gyro that is read from the right one.
+_OFTEN_WRONG = ("steering_wheel_rad", "steer_rad", "wheels", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
+
+
+def _unexplained(name: str, bad: Sequence[Relation]) -> Check:
+    """Return the check of a signal that contradicts others by what is no known unit or sign."""
+    first = next((r for r in bad if not r.is_close), bad[0])
+    if first.is_close:
+        remedy = "no unit or sign explains it: the car may slide, or a sensor may fail for a while"
+        return UNIT.undecided(first.evidence, name, remedy)
+    remedy = "no single mistake explains it: look at the field, unit and sign of " + " and ".join(first.powers)
+    return UNIT.failed(first.evidence, name, remedy=remedy)
+
+
+def _contradicted(name: str, relation: Relation, culprits: set[str]) -> Check:
+    others = " and ".join(sorted(culprits & set(relation.powers)))
+    return UNIT.undecided(relation.evidence, name, f"needs {others} that is right")
+
+
+_JUDGED_TRUTH = (*(f"truth.{n}" for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2")),)
+
+
+def _is_cleared(name: str, stray: Relation, relations: Sequence[Relation]) -> bool:
+    """Return whether another relation shows the signal to be right, and none does so for the others of the pair."""
+
+    def shown(signal: str) -> bool:
+        return any(r.tells and r.accepts() and signal in r.powers and r.powers != stray.powers for r in relations)
+
+    paces = {"speed_m_s", WHEEL_SPEEDS, "truth.vx_m_s"}
+    others = [n for n in stray.powers if n != name and n not in paces]
+    return name in paces or (shown(name) and not all(shown(n) for n in others))
+
+
+def _stray(name: str, relation: Relation) -> Check:
+    evidence = f"{relation.text}: one moves and the other does not with it, correlation {relation.correlation:.2f}"
+    return AXIS.failed(evidence, name, signal_name=name)
+
+
+def _blamed(name: str, mistakes: Sequence[Mistake], relations: Sequence[Relation]) -> list[Check]:
+    kinds = {m.kind for m in mistakes}
+    wrong = [c for a, c in (("sign", SIGN), ("unit", UNIT)) if any(a in k for k in kinds)]
+    words = " or ".join(dict.fromkeys(m.words for m in mistakes))
+    evidence = "; ".join(r.evidence for r in relations[:2])
+    factors = {f for m in mistakes if (f := m.factors.get(name)) is not None}
+    remedy = f"perhaps {words}"
+    if len(factors) == 1:
+        remedy += f": multiply its scale in the mapping by {factors.pop():.6g}"
+    return [kind.failed(evidence, name, remedy=remedy) for kind in wrong]
+
+
+def _not_excited(name: str, relations: Sequence[Relation]) -> Check:
+    lacks = _LACKS.get(name, _BENDS)
+    if not relations:
+        evidence = "nothing in the log says what it should be"
+    else:
+        best = max(relations, key=lambda r: abs(r.correlation))
+        evidence = f"{best.text}: correlation {best.correlation:.2f} over {best.samples:.0f} independent samples"
+    return SIGN.undecided(evidence, name, f"needs {lacks}")
+
+
+SIGN = CheckKind(
+    "SIGNAL.sign",
+    compares="a_y with v r, steering with curvature, v̇ with a_x, wheel speeds, wheel differences and the truth's path "
+    "with the signals that they go with",
+    fails="they contradict the signal by its sign",
+    remedy="{remedy}",
+    lacks=f"needs {_BENDS}",
+    function=lambda drive: drive.related,
+)
+UNIT = CheckKind(
+    "SIGNAL.unit",
+    compares="the same as `SIGNAL.sign`",
+    fails="they contradict the signal by a factor",
+    remedy="{remedy}",
+)
+AXIS = CheckKind(
+    "SIGNAL.axis",
+    compares="the signal with what it must go with, and an accelerometer's mean with gravity",
+    fails="it does not go with it, or gravity is in it",
+    remedy="map another field or axis to {signal_name}",
+)
+CHECKS = (SIGN, UNIT, AXIS)

@@ -1,0 +1,103 @@
+"""What a check is: a record that one file of this package exports, its words, and the drive that it judges."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.drive.delays import LateSensor
+from pdhef_logtool.drive.measured import Measured
+from pdhef_logtool.drive.truth import LatencyEstimate
+from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.signals import FloatArray
+
+#: Stands in a name for each signal that the check judges.
+SIGNAL = "SIGNAL"
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True, slots=True)
+class CheckKind:
+    """One check, as its file registers it.
+
+    Attributes
+    ----------
+    name : by which a person waives it, ``SUBJECT.ASPECT``; the subject is :data:`SIGNAL` where it judges several.
+    compares, fails : what is compared, and where it fails, for the documentation.
+    remedy : what to do where it fails; fields in braces are filled in.
+    lacks : what a drive lacks that leaves it undecided.
+    function : yields the checks of a drive; none where the drive has nothing that it compares. None: it is called from
+        elsewhere, or the function of another kind of its file yields both.
+    """
+
+    name: str
+    compares: str
+    fails: str
+    remedy: str = ""
+    lacks: str = ""
+    function: Callable[[CheckedDrive], Iterable[Check]] | None = None
+
+    def passed(self, evidence: str, signal: str = "") -> Check:
+        """Return that it passed; ``signal``: which one, where it judges several."""
+        name = self._name(signal)
+        return Check(name, name.rpartition(".")[0], "passed", evidence)
+
+    def failed(self, evidence: str, signal: str = "", **fields: object) -> Check:
+        """Return that it failed, with its remedy."""
+        name = self._name(signal)
+        return Check(name, name.rpartition(".")[0], "failed", evidence, self.remedy.format(**fields))
+
+    def undecided(self, evidence: str, signal: str = "", lacks: str = "") -> Check:
+        """Return that the drive does not decide it; ``lacks``: other words for what it lacks."""
+        name = self._name(signal)
+        return Check(name, name.rpartition(".")[0], "undecided", evidence, lacks or self.lacks)
+
+    def judged(self, good: bool, evidence: str, signal: str = "", **fields: object) -> Check:
+        """Return that it passed or failed."""
+        return self.passed(evidence, signal) if good else self.failed(evidence, signal, **fields)
+
+    def _name(self, signal: str) -> str:
+        return self.name.replace(SIGNAL, signal)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CheckedDrive:
+    """What checks judge.
+
+    Attributes
+    ----------
+    measured : columns [N] on one grid, SI, by signal; those of truth begin with ``truth.``.
+    vehicle : of the file, or the default one, which is no ``has_file``.
+    latency : of the truth against the gyro, or the gyro's own. late : sensors that are late without truth.
+    has_truth : whether the truth at the CG is known.
+    related : checks of signals by the relations between them. found : the checks so far.
+    """
+
+    measured: Measured
+    vehicle: VehicleParameters
+    has_file: bool
+    latency: LatencyEstimate | None
+    late: tuple[LateSensor, ...]
+    has_truth: bool
+    related: tuple[Check, ...]
+    found: list[Check] = field(default_factory=list)
+    _shared: dict[Callable[[CheckedDrive], object], object] = field(default_factory=dict)
+
+    @property
+    def speed(self) -> FloatArray | None:
+        """The column that stands for the speed [N]."""
+        name = self.measured.speed_name
+        return None if name is None else self.measured.columns[name]
+
+    @property
+    def wrong(self) -> set[str]:
+        """The signals that relations show to be wrong."""
+        return {c.subject for c in self.related if c.verdict == "failed"}
+
+    def once(self, make: Callable[[CheckedDrive], _T]) -> _T:
+        """Return what ``make`` returns for this drive; it is called once."""
+        if make not in self._shared:
+            self._shared[make] = make(self)
+        return self._shared[make]  # type: ignore[return-value]

@@ -1,0 +1,71 @@
+"""``SIGNAL.level``: gravity on an axis of the accelerometer that should be level."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2
+from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind
+from pdhef_logtool.drive.columns import derivative, independent_samples, median_known
+from pdhef_logtool.drive.relations import gentle_at
+from pdhef_logtool.records.checks import Check
+
+#: What of an accelerometer's mean driving does not explain. Grade and crossfall of a whole drive are 3 % at most
+#: (0.3 m/s^2), a production sensor's bias less than that; 0.8 m/s^2 is a tilt of 4.7 degrees, half of g another axis.
+LEVEL_M_S2 = 0.8
+OTHER_AXIS_M_S2 = 5.0
+#: Independent samples of gentle driving from which on a mean is a tilt or a bias, and no manoeuvre: 10 s.
+LEVEL_SAMPLES = 20.0
+
+
+def _levels(drive: CheckedDrive) -> Iterator[Check]:
+    columns, speed, sensors = drive.measured.columns, drive.speed, drive.vehicle.sensors
+    driving_is_known = not drive.wrong & {"yaw_rate_rad_s", "ay_m_s2", drive.measured.speed_name}
+    yaw = columns.get("yaw_rate_rad_s")
+    for name in ("ax_m_s2", "ay_m_s2"):
+        if name not in columns:
+            continue
+        driven, at_ease = np.zeros_like(columns[name]), np.ones(columns[name].shape[0], np.bool_)
+        if speed is not None and yaw is not None:
+            # Where the car slides, speed and yaw rate no longer say what accelerates it.
+            at_ease = gentle_at(yaw * speed, at_ease) & gentle_at(columns[name] - median_known(columns[name]), at_ease)
+        if speed is not None and name == "ax_m_s2":
+            driven = derivative(speed)
+        elif speed is not None and yaw is not None:
+            driven = yaw * speed
+        rest = columns[name] - driven
+        known = np.isfinite(rest)
+        if independent_samples(int(np.count_nonzero(known))) < 6.0:
+            rest, known = columns[name], np.isfinite(columns[name])
+        if independent_samples(int(np.count_nonzero(known))) < 2.0:
+            continue
+        told = independent_samples(int(np.count_nonzero(known & at_ease))) >= LEVEL_SAMPLES
+        use = known & at_ease if told else known
+        bias = sensors.ax_bias_m_s2 if name == "ax_m_s2" else sensors.ay_bias_m_s2
+        check = _level(name, float(np.mean(rest[use])) - bias, float(np.mean(columns[name][use])) - bias)
+        if (driving_is_known and told) or check.name == f"{name}.axis":
+            yield check
+
+
+def _level(name: str, rest: float, mean: float) -> Check:
+    # A wrong sign or unit of the speed makes the rest wrong, not the mean: both must stand out.
+    size = min(abs(rest), abs(mean))
+    evidence = f"mean {mean:.2f} m/s^2, of which driving leaves {rest:.2f}"
+    if size > OTHER_AXIS_M_S2:
+        return Check(f"{name}.axis", name, "failed", f"{evidence}: that is gravity", "map a level axis of the sensor")
+    if size > LEVEL_M_S2:
+        return LEVEL.failed(evidence, name, tilt=math.degrees(math.asin(size / GRAVITY_M_S2)))
+    return LEVEL.passed(evidence, name)
+
+
+LEVEL = CheckKind(
+    "SIGNAL.level",
+    compares="the mean of an accelerometer with what driving explains of it",
+    fails="more than 0.8 m/s² are left: a tilt of 4.7 degrees, or a bias; beyond 5 m/s² `axis` fails",
+    remedy="the sensor is tilted by {tilt:.1f} deg, which belongs in the mapping, or has a bias: a fit's matter",
+    function=_levels,
+)
+CHECKS = (LEVEL,)

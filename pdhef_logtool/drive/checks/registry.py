@@ -1,0 +1,44 @@
+"""Every check of signals, truth and vehicle file, in the order in which they are made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from importlib import import_module
+from types import MappingProxyType
+
+from pdhef_logtool.drive.checks.kind import CheckKind
+
+#: Files of this package that export ``CHECKS``. A new check: a file, and its name here.
+MODULES = (
+    "fault",
+    "mounting",
+    "by_relations",
+    "level",
+    "truth_sideslip",
+    "ay_place",
+    "ay_gain",
+    "ay_delay",
+    "yaw_rate_gain",
+    "yaw_rate_delay",
+    "late_sensors",
+    "wheel_radius",
+    "steering",
+    "mass",
+)
+
+
+def registered() -> Mapping[str, CheckKind]:
+    """Return the checks by name; their files are imported at the first call."""
+    return _load(MODULES)
+
+
+@cache
+def _load(modules: tuple[str, ...]) -> Mapping[str, CheckKind]:
+    found: dict[str, CheckKind] = {}
+    for module in modules:
+        for kind in import_module(f"pdhef_logtool.drive.checks.{module}").CHECKS:
+            if kind.name in found:
+                raise ValueError(f"check {kind.name!r} of {module}.py is registered twice")
+            found[kind.name] = kind
+    return MappingProxyType(found)

@@ -1,0 +1,76 @@
+"""Makes all registered checks of a drive."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
+from pdhef_logtool.drive.checks.by_relations import relation_checks
+from pdhef_logtool.drive.checks.fault import fault_check
+from pdhef_logtool.drive.checks.kind import CheckedDrive
+from pdhef_logtool.drive.checks.registry import registered
+from pdhef_logtool.drive.delays import LateSensor
+from pdhef_logtool.drive.faulty_samples import without_faulty_samples
+from pdhef_logtool.drive.measured import Measured, measure
+from pdhef_logtool.drive.truth import LatencyEstimate, TruthTrack
+from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.signals import Channel
+
+_BADNESS = {"passed": 0, "undecided": 1, "failed": 2}
+
+
+def check_drive(
+    signals: Mapping[str, Channel],
+    truth: Mapping[str, Channel] | None = None,
+    derived: TruthTrack | None = None,
+    vehicle: VehicleParameters | None = None,
+    *,
+    latency: LatencyEstimate | None = None,
+    late: Sequence[LateSensor] = (),
+    mounting_is_known: bool = False,
+    measured: Measured | None = None,
+) -> tuple[Check, ...]:
+    """Return the checks of mapped signals, of the truth and of the vehicle file; nothing that they decide is a guess.
+
+    What contradicts is looked at again without the samples that a sensor fault has spoilt.
+
+    Parameters
+    ----------
+    signals, truth : by name, SI, as mapped. derived : truth at the CG.
+    vehicle : its file is held against the drive; None, or the default car: there is none.
+    latency : of the truth against the gyro, or the gyro's own. late : sensors that are late without truth.
+    mounting_is_known : gravity has shown that the IMU is not upside down.
+    measured : what :func:`~pdhef_logtool.drive.measured.measure` makes of the channels, where that is known.
+    """
+
+    def checks_of(measured: Measured) -> tuple[Check, ...]:
+        drive = CheckedDrive(
+            measured=measured,
+            vehicle=vehicle or default_vehicle(),
+            has_file=vehicle not in (None, default_vehicle()),
+            latency=latency,
+            late=tuple(late),
+            has_truth=derived is not None,
+            related=relation_checks(measured, mounting_is_known=mounting_is_known),
+        )
+        return _all_checks(drive)
+
+    found = checks_of(measure(signals, truth, derived) if measured is None else measured)
+    if all(check.verdict != "failed" for check in found):
+        return found
+    sound, shares = without_faulty_samples(signals, vehicle or default_vehicle())
+    if not shares:
+        return found
+    faults = (fault_check(name, share) for name, share in shares.items())
+    return (*(c for c in faults if c.verdict == "failed"), *checks_of(measure(sound, truth, derived)))
+
+
+def _all_checks(drive: CheckedDrive) -> tuple[Check, ...]:
+    for kind in registered().values():
+        if kind.function is not None:
+            drive.found.extend(kind.function(drive))
+    unique: dict[str, Check] = {}
+    for check in drive.found:  # of two of a name the worse counts
+        if check.name not in unique or _BADNESS[check.verdict] > _BADNESS[unique[check.name].verdict]:
+            unique[check.name] = check
+    return tuple(unique.values())

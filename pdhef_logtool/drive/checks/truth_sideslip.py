@@ -1,0 +1,88 @@
+"""``truth.sideslip_rad``: whether the truth's heading and velocity belong together; sideslip is 0 on straights."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from pdhef_logtool.drive.checks.fitting import SURE, fit
+from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind
+from pdhef_logtool.drive.columns import moving_at
+from pdhef_logtool.drive.relations import gentle_at
+from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.signals import FloatArray
+
+#: Truth stands wrong by more than what tyres and crossfall make of straight driving, and is known to a third of it.
+SIDESLIP_OFFSET_RAD = math.radians(0.15)
+#: No car drives sideways: half of its moving time beyond that, the heading and the velocity do not belong together.
+SIDEWAYS_RAD = math.radians(20.0)
+
+
+def _checks(drive: CheckedDrive) -> list[Check]:
+    columns = drive.measured.columns
+    if not drive.has_truth or not all(f"truth.{n}" in columns for n in ("vx_m_s", "vy_m_s")):
+        return []
+    vx, vy = columns["truth.vx_m_s"], columns["truth.vy_m_s"]
+    sideslip = np.arctan2(vy, vx)
+    moving = moving_at(np.hypot(vx, vy))
+    known = moving & np.isfinite(sideslip)
+    if not known.any():
+        return []
+    typical = float(np.median(np.abs(sideslip[known])))
+    evidence = f"its median size is {math.degrees(typical):.1f} deg where the car moves"
+    frame = FRAME.judged(typical <= SIDEWAYS_RAD, evidence)
+    offset = _offset_check(columns) if frame.verdict == "passed" else None
+    return [frame] if offset is None else [frame, offset]
+
+
+def sideslip_offset(columns: Mapping[str, FloatArray]) -> tuple[float, float] | None:
+    """Return the truth's sideslip at no curvature and no lateral force, with its standard error; None: too little."""
+    rate, ay = (columns.get(n) for n in ("yaw_rate_rad_s", "ay_m_s2"))
+    vx, vy = (columns.get(f"truth.{n}") for n in ("vx_m_s", "vy_m_s"))
+    if rate is None or ay is None or vx is None or vy is None:
+        return None
+    moving = moving_at(np.hypot(vx, vy))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        regressors = [np.ones_like(vx), rate / vx, ay]
+    found = fit(np.arctan2(vy, vx), regressors, gentle_at(rate * vx, moving))
+    return None if found is None else (float(found[0][0]), float(found[1][0]))
+
+
+def is_turned(offset_rad: float, error_rad: float) -> bool:
+    """Return whether an offset of the truth's sideslip is one, and not tyres, crossfall or chance."""
+    return abs(offset_rad) > max(SIDESLIP_OFFSET_RAD, SURE * error_rad)
+
+
+def _offset_check(columns: Mapping[str, FloatArray]) -> Check | None:
+    """Return the check of the truth's sideslip on straights; None without IMU."""
+    if "yaw_rate_rad_s" not in columns or "ay_m_s2" not in columns:
+        return None
+    found = sideslip_offset(columns)
+    if found is None:
+        return OFFSET.undecided("too little gentle driving")
+    offset, error = found
+    evidence = f"{math.degrees(offset):.2f} +- {math.degrees(error):.2f} deg are left where the car goes straight"
+    if is_turned(offset, error):
+        return OFFSET.failed(evidence)
+    if abs(offset) + 2.0 * error < 2.0 * SIDESLIP_OFFSET_RAD:
+        return OFFSET.passed(evidence)
+    return OFFSET.undecided(evidence)
+
+
+FRAME = CheckKind(
+    "truth.sideslip_rad.frame",
+    compares="the truth's heading with its velocity",
+    fails="its sideslip is above 20 degrees for half of the moving time",
+    remedy="heading and velocity do not belong together: look at frames, signs and units of the truth",
+    function=_checks,
+)
+OFFSET = CheckKind(
+    "truth.sideslip_rad.offset",
+    compares="the truth's sideslip on straights with 0",
+    fails="it is off by 0.15 degrees",
+    remedy="the truth's heading is turned: a tyre, a crossfall or a bias of a_y makes less of that",
+    lacks="needs straights and bends",
+)
+CHECKS = (FRAME, OFFSET)

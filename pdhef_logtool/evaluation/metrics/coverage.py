@@ -1,0 +1,41 @@
+"""``coverage95``: whether intervals contain the truth as often as they claim."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pdhef_logtool.evaluation.metrics.metric import Figure, Metric, OfSignal, Reference, SignalBlock
+from pdhef_logtool.evaluation.track_errors import NORMAL_95
+from pdhef_logtool.records.tracks import StateTrack
+
+
+class _Coverage:
+    def __init__(self, reference: Reference, _estimate: StateTrack, _signal: str) -> None:
+        self._counts = {segment: np.zeros(2, dtype=np.int64) for segment in reference.masks}
+
+    def add(self, block: SignalBlock) -> None:
+        if block.std is None:
+            return
+        known = block.scored & np.isfinite(block.std)
+        covered = known & (np.abs(block.error) <= NORMAL_95 * block.std)
+        for segment, mask in block.inside.items():
+            self._counts[segment] += np.count_nonzero(mask & known), np.count_nonzero(mask & covered)
+
+    def of(self, segment: str) -> dict[str, Figure]:
+        known, covered = self._counts[segment].tolist()
+        return {"coverage95": (covered / known, known)} if known else {}
+
+
+METRICS = (
+    Metric(
+        "coverage95",
+        "in 95 % band",
+        "share of stamps with abs e ≤ 1.96 σ; σ² is the estimate's variance plus the truth's if known",
+        OfSignal(_Coverage),
+        best=0.95,
+        unit="1",
+        digits=2,
+        terminal=("sideslip_rad",),
+        brief=("sideslip_rad",),
+    ),
+)

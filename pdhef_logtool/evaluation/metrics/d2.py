@@ -1,0 +1,154 @@
+"""``d2``: how far an estimated v_y strays from accelerometer and gyro over two seconds; it needs no truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdhef_logtool.evaluation.blocks import SegmentSums, blocks_with_halo, packed
+from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, OfDrive
+from pdhef_logtool.evaluation.metrics.sensor_residuals import MAX_STEP_S, carried_speed
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
+
+D2_SPAN_S = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class LogSensors:
+    """What a log's own sensors were found to have, against the vehicle that its signals were read with.
+
+    Attributes
+    ----------
+    ay_bias_m_s2, yaw_rate_bias_rad_s : what they read too much. ay_gain : of body roll. lever_m : of a_y ahead of the
+        centre of gravity. superelevation : share of v_x r that the road's bank carries.
+    """
+
+    ay_bias_m_s2: float = 0.0
+    yaw_rate_bias_rad_s: float = 0.0
+    ay_gain: float = 1.0
+    lever_m: float = 0.0
+    superelevation: float = 0.0
+
+
+def _rows(drive: EvaluatedDrive) -> list[MetricRow]:
+    return d2_rows(
+        [*drive.tracks.values()],
+        drive.signals,
+        drive.masks,
+        log=drive.log,
+        low_speed_m_s=drive.low_speed_m_s,
+        sensors=drive.sensors,
+    )
+
+
+def d2_rows(
+    tracks: Sequence[StateTrack],
+    signals: Signals,
+    masks: Mapping[str, BoolArray],
+    *,
+    log: str,
+    low_speed_m_s: float,
+    sensors: LogSensors,
+) -> list[MetricRow]:
+    """Return ``d2`` of estimators at the same stamps as the signals [N], a row a segment; none where v_y is not."""
+    masks = packed(masks, len(signals))
+    found = [SegmentSums() for _ in tracks]
+    for first, a, b, end in blocks_with_halo(signals, D2_SPAN_S + MAX_STEP_S, 1):
+        core, inside = slice(a - first, b - first), dict(masks.rows(a, b))
+        driven = _Driven(signals.rows(first, end), low_speed_m_s, sensors)
+        for track, sums in zip(tracks, found, strict=True):
+            residual = driven.residual(track.rows(first, end))[core]
+            sums.add(inside, residual, residual**2)
+    return [
+        MetricRow(log, track.name, "vy_m_s", segment, "d2", float(np.sqrt(squares / n)), "m/s", n)
+        for track, sums in zip(tracks, found, strict=True)
+        for segment, (n, (_, squares)) in sums.totals().items()
+    ]
+
+
+def driving_products(
+    track: StateTrack, signals: Signals, *, low_speed_m_s: float, sensors: LogSensors
+) -> tuple[FloatArray, float]:
+    """Return what :func:`driven_d2` needs of a window, to be added up: integrals over time [4, 4], and how long, s.
+
+    They are of the products of the changes over 2 s of v_y, v_x r and a_y, and of the residual that d2 squares.
+    """
+    driven = _Driven(signals, low_speed_m_s, sensors)
+    vy = driven.carried_vy(track)
+    rows = np.stack([*map(driven.change, (vy, driven.turn, signals.ay_m_s2)), driven.residual(track)])
+    step_s = np.minimum(np.diff(signals.stamps_ns, prepend=signals.stamps_ns[:1]) * 1e-9, MAX_STEP_S)
+    known = np.isfinite(rows).all(axis=0)
+    rows, step_s = rows[:, known], step_s[known]
+    return np.stack([(rows * row * step_s).sum(axis=1) for row in rows]), float(step_s.sum())
+
+
+def driven_d2(products: FloatArray, seconds: float) -> float:
+    """Return that part of d2 in m/s which goes with v_y, v_x r and a_y: what the model is wrong by as the car turns.
+
+    The rest is the road's: a bank moves a_y and says nothing of the estimate. What the rest would
+    explain by chance, with 2 s as one sample, is believed the less. NaN for less than five of them.
+    """
+    if seconds < 5.0 * D2_SPAN_S:
+        return float("nan")
+    of_residual = products[:-1, -1]
+    fit = float(of_residual @ np.linalg.pinv(products[:-1, :-1], hermitian=True) @ of_residual)
+    explained = min(max(fit, 0.0), float(products[-1, -1]))
+    chance = len(of_residual) * D2_SPAN_S / seconds * (float(products[-1, -1]) - explained)
+    believed = explained**2 / (explained + chance) if explained > 0.0 else 0.0
+    return float(np.sqrt(believed / seconds))
+
+
+class _Driven:
+    """What d2 needs of the signals [N] of a part of a drive, whichever estimate is held against them.
+
+    Attributes
+    ----------
+    turn : v_x r as far as no bank carries it, [N] in m/s².
+    """
+
+    def __init__(self, signals: Signals, low_speed_m_s: float, sensors: LogSensors) -> None:
+        t = signals.stamps_ns
+        speed = carried_speed(signals)
+        rate = signals.yaw_rate_rad_s - sensors.yaw_rate_bias_rad_s
+        self.turn = (1.0 - sensors.superelevation) * speed * rate
+        rising = (signals.ay_m_s2 - sensors.ay_bias_m_s2) / sensors.ay_gain - self.turn
+        self._fast = speed > low_speed_m_s
+        self._of_lever = sensors.lever_m / sensors.ay_gain * rate
+        gained, breaks, steps = np.zeros(len(t)), np.zeros(len(t)), np.diff(t) * 1e-9
+        broken = ~np.isfinite(rising[1:] + rising[:-1]) | (steps > MAX_STEP_S)
+        gained[1:] = np.cumsum(np.where(broken, 0.0, 0.5 * (rising[1:] + rising[:-1]) * steps))
+        breaks[1:] = np.cumsum(broken)
+        earlier = np.searchsorted(t, t - round(D2_SPAN_S * 1e9), side="right") - 1
+        self._before = i = np.maximum(earlier, 0)
+        self._whole = (earlier >= 0) & (breaks[i] == breaks) & (t - t[i] <= round((D2_SPAN_S + MAX_STEP_S) * 1e9))
+        self._gained = gained - gained[i]
+
+    def carried_vy(self, track: StateTrack) -> FloatArray:
+        """Return v_y [N] of an estimate with the lever's share of ∫ a_y; NaN where it does not count."""
+        return np.where(track.valid & self._fast, track.vy_m_s, np.nan) + self._of_lever
+
+    def change(self, values: FloatArray) -> FloatArray:
+        """Return by how much values [N] changed in 2 s, [N]; NaN where that cannot be told."""
+        return np.where(self._whole, values - values[self._before], np.nan)
+
+    def residual(self, track: StateTrack) -> FloatArray:
+        """Return v_y(t) − v_y(t − 2 s) − ∫ (a_y − v_x r) dt, [N]; NaN where it cannot be told."""
+        return self.change(self.carried_vy(track)) - self._gained
+
+
+METRICS = (
+    Metric(
+        "d2",
+        "d2",
+        "signal `vy_m_s`: RMS of the change of the estimated v_y over 2 s minus the integral of a_y − v_x r, above the "
+        "low-speed blend; a_y without bias, roll gain, lever arm and bank as the log has them; large with a wrong "
+        "model. `kinematic` integrates the same, so that its d2 shows nothing",
+        OfDrive(_rows),
+        best="lower",
+        unit="m/s",
+        brief=("vy_m_s",),
+    ),
+)

@@ -1,0 +1,41 @@
+"""Every metric of the tool, in the order in which figures are written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from importlib import import_module
+from types import MappingProxyType
+
+from pdhef_logtool.evaluation.metrics.metric import Metric
+
+#: Files of this package that export ``METRICS``. A new metric: a file, and its name here.
+MODULES = (
+    "availability",
+    "errors",
+    "coverage",
+    "lag",
+    "nees",
+    "innovations",
+    "whiteness",
+    "d2",
+    "disagreement",
+    "sensor_residuals",
+    "independence",
+)
+
+
+def registered() -> Mapping[str, Metric]:
+    """Return the metrics by name; their files are imported at the first call."""
+    return _load(MODULES)
+
+
+@cache
+def _load(modules: tuple[str, ...]) -> Mapping[str, Metric]:
+    found: dict[str, Metric] = {}
+    for module in modules:
+        for metric in import_module(f"pdhef_logtool.evaluation.metrics.{module}").METRICS:
+            if metric.name in found:
+                raise ValueError(f"metric {metric.name!r} of {module}.py is registered twice")
+            found[metric.name] = metric
+    return MappingProxyType(found)

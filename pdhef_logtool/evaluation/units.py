@@ -1,0 +1,41 @@
+"""Scored signals with their labels and units, and the units in which people read and type figures: the one place."""
+
+from __future__ import annotations
+
+from pdhef_logtool.records.geometry import DEGREES
+
+#: Signals compared sample by sample, with their unit.
+SCORED_SIGNALS: dict[str, str] = {
+    "vx_m_s": "m/s",
+    "vy_m_s": "m/s",
+    "yaw_rate_rad_s": "rad/s",
+    "sideslip_rad": "rad",
+    "ay_m_s2": "m/s^2",
+}
+#: Every signal of metrics.parquet, with its unit. ``state``: all of an estimate.
+SIGNALS: dict[str, str] = {**SCORED_SIGNALS, "position_m": "m", "lateral_1s_m": "m", "state": "1"}
+#: What people call them, in the order of tables.
+LABELS = {
+    "sideslip_rad": "sideslip",
+    "vy_m_s": "v_y",
+    "yaw_rate_rad_s": "yaw rate",
+    "vx_m_s": "v_x",
+    "ay_m_s2": "a_y",
+    "position_m": "position",
+    "lateral_1s_m": "1 s lateral",
+    "state": "state",
+}
+#: By unit of metrics.parquet: the unit that people read, and the factor to it.
+_READ = {"rad": ("°", DEGREES), "rad/s": ("°/s", DEGREES), "m/s^2": ("m/s²", 1.0), "s": ("ms", 1e3), "1": ("", 1.0)}
+#: The same in letters, as people type it.
+_TYPED = {"rad": ("deg", DEGREES), "rad/s": ("deg/s", DEGREES), "s": ("ms", 1e3), "1": ("%", 100.0)}
+
+
+def read_unit(unit: str) -> tuple[str, float]:
+    """Return the unit that people read for one of metrics.parquet, and the factor to it."""
+    return _READ.get(unit, (unit, 1.0))
+
+
+def typed_unit(unit: str) -> tuple[str, float]:
+    """Return the unit that people type for one of metrics.parquet, and the factor to it."""
+    return _TYPED.get(unit, (unit, 1.0))

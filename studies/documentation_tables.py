@@ -1,0 +1,37 @@
+"""Tables of the documentation that are made of the code when the site is built: a hook of MkDocs.
+
+In a page, ``<!-- table: metrics -->`` becomes the table of all metrics, ``<!-- table: checks -->`` that of all checks.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from pdhef_logtool.drive.checks import registry as checks
+from pdhef_logtool.evaluation.metrics import registry as metrics
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Return a page with its tables; raises KeyError for one of an unknown name."""
+    return re.sub(r"<!-- table: (\w+) -->", lambda found: "\n".join(_TABLES[found[1]]()), markdown)
+
+
+def _metrics() -> Iterator[str]:
+    yield "| metric | label | unit | best | definition |"
+    yield "| --- | --- | --- | --- | --- |"
+    for m in metrics.registered().values():
+        unit = "that of the signal" if m.unit is None else m.unit
+        yield f"| `{m.name}` | {m.label} | {unit} | {m.direction or '–'} | {m.definition} |"
+
+
+def _checks() -> Iterator[str]:
+    yield "| check | compares | fails where | remedy |"
+    yield "| --- | --- | --- | --- |"
+    for kind in checks.registered().values():
+        remedy = re.sub(r"{\w+(:[^}]*)?}", "…", kind.remedy)
+        yield f"| `{kind.name}` | {kind.compares} | {kind.fails} | {'–' if remedy == '…' else remedy} |"
+
+
+_TABLES: dict[str, Callable[[], Iterator[str]]] = {"metrics": _metrics, "checks": _checks}

@@ -1,0 +1,102 @@
+"""A check is one file and one line: the example of the package's docstring, added that way, is in every output."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import sys
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from pdhef_logtool.cli.run_tables import render_run
+from pdhef_logtool.drive import checks
+from pdhef_logtool.drive.checks import registry
+from pdhef_logtool.drive.checks.registry import registered
+from pdhef_logtool.inspection import inspect_log
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.fleet import run_logs
+from studies.documentation_tables import on_page_markdown
+
+NAME = "speed_m_s.range"
+DOCS = Path(__file__).parents[2] / "docs"
+LIMITS = '[[threshold]]\nsignal = "sideslip_rad"\nmetric = "rmse"\nmax = 90\nunit = "deg"\n'
+
+
+@pytest.fixture
+def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Add the example, which fails above 100 m/s, at 1 m/s as a file beside the package's and as a line of its list."""
+    example = re.sub(r"^    ", "", str(checks.__doc__).partition("::\n\n")[2], flags=re.MULTILINE)
+    (tmp_path / "checks").mkdir()
+    (tmp_path / "checks" / "speed_range.py").write_text(example.replace("100.0", "1.0"), encoding="utf-8")
+    monkeypatch.setattr(checks, "__path__", [*checks.__path__, str(tmp_path / "checks")])
+    monkeypatch.setattr(registry, "MODULES", (*registry.MODULES, "speed_range"))
+    yield NAME
+    sys.modules.pop(f"{checks.__name__}.speed_range", None)
+    registry.__dict__["_load"].cache_clear()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("waived", [False, True])
+def test_a_check_is_in_report_terminal_page_junit_and_can_be_waived(
+    toy: str, sample_logs_dir: Path, tmp_path: Path, waived: bool
+) -> None:
+    (tmp_path / "thresholds.toml").write_text(LIMITS, encoding="utf-8")
+    config = RunConfig(
+        car=sample_logs_dir / "vehicle.toml",
+        estimators=("zero",),
+        annotate="none",
+        thresholds=tmp_path / "thresholds.toml",
+        waived=(toy,) if waived else (),
+    )
+    result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config, junit=tmp_path / "junit.xml")
+    assert result.exit_code == (0 if waived else 3)
+    folder = tmp_path / "out" / "logs" / "dlc"
+    (check,) = (c for c in json.loads((folder / "report.json").read_text())["checks"] if c["name"] == toy)
+    assert re.fullmatch(r"the fastest speed is \d+\.\d m/s", check["evidence"])
+    assert check == {
+        "name": toy,
+        "subject": "speed_m_s",
+        "verdict": "failed",
+        "evidence": check["evidence"],
+        "remedy": "check the scale of the speed, which should be in m/s",
+        "waived": waived,
+    }
+    console = Console(width=200, record=True, file=io.StringIO(), highlight=False, markup=False)
+    render_run(result, console)
+    word = "waived" if waived else "FAILED"
+    assert f"{word}: {toy}: {check['evidence']} Remedy: {check['remedy']}" in console.export_text()
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert f'<td class="failed">{toy}{" (waived)" if waived else ""}</td><td>{check["evidence"]}</td>' in page
+    (found,) = ET.parse(tmp_path / "junit.xml").getroot().iterfind(f".//property[@name='check {toy}']")
+    assert found.attrib["value"] == f"{word.lower()}: {check['evidence']}"
+
+
+def test_inspect_shows_it(toy: str, sample_logs_dir: Path) -> None:
+    found = inspect_log(sample_logs_dir / "dlc.mcap")
+    assert [c.verdict for c in found.checks if c.name == toy] == ["failed"]
+
+
+def test_the_documentation_lists_it(toy: str) -> None:
+    found = on_page_markdown((DOCS / "formats.md").read_text(encoding="utf-8"))
+    for kind in registered().values():
+        assert f"| `{kind.name}` | {kind.compares} | {kind.fails} |" in found
+    assert f"| `{toy}` | the fastest speed with what road cars reach |" in found
+
+
+def test_a_name_is_registered_once(toy: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "MODULES", (*registry.MODULES, "speed_range"))
+    with pytest.raises(ValueError, match=f"{toy}.*registered twice"):
+        registered()
+
+
+def test_names_of_checks_are_registered(sample_logs_dir: Path) -> None:
+    patterns = [re.escape(name).replace("SIGNAL", r"[\w.]+") for name in registered()]
+    for log in ("dlc", "sweep", "faults"):
+        found = inspect_log(sample_logs_dir / f"{log}.mcap").checks
+        assert found
+        assert all(any(re.fullmatch(p, c.name) for p in patterns) for c in found)

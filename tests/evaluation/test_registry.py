@@ -1,0 +1,126 @@
+"""A metric is one file and one line: the example of the package's docstring, added that way, is in every output."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import polars as pl
+import pytest
+from mcap.reader import make_reader
+from rich.console import Console
+
+from pdhef_logtool.cli.compare_tables import render_comparison
+from pdhef_logtool.cli.run_tables import render_run
+from pdhef_logtool.evaluation import metrics
+from pdhef_logtool.evaluation.metrics import registry
+from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.reports.comparison import comparison_page
+from pdhef_logtool.results.comparing import compare_runs
+from pdhef_logtool.results.gate import gate_from_dict
+from pdhef_logtool.results.opened_run import open_run
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.fleet import run_logs
+from pdhef_logtool.runs.pipeline import RunResult
+from studies.documentation_tables import on_page_markdown
+
+NAME, LABEL = "interval_width", "interval width"
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Add the example as a file beside the package's and as a line of its list; return its name."""
+    folder = tmp_path_factory.mktemp("metrics")
+    example = re.sub(r"^    ", "", str(metrics.__doc__).partition("::\n\n")[2], flags=re.MULTILINE)
+    (folder / f"{NAME}.py").write_text(example, encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(metrics, "__path__", [*metrics.__path__, str(folder)])
+        patch.setattr(registry, "MODULES", (*registry.MODULES, NAME))
+        yield NAME
+    sys.modules.pop(f"{metrics.__name__}.{NAME}", None)
+
+
+@pytest.fixture(scope="module")
+def result(toy: str, sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+    out = tmp_path_factory.mktemp("out")
+    limits = f'[[threshold]]\nsignal = "sideslip_rad"\nmetric = "{toy}"\nmax = 0.001\nunit = "deg"\n'
+    (out / "thresholds.toml").write_text(limits, encoding="utf-8")
+    config = RunConfig(
+        car=sample_logs_dir / "vehicle.toml",
+        estimators=("physics", "zero"),
+        annotate="sidecar",
+        thresholds=out / "thresholds.toml",
+    )
+    return run_logs([str(sample_logs_dir / "dlc.mcap")], out / "out", config)
+
+
+def test_figures_are_in_parquet_json_and_mcap(toy: str, result: RunResult) -> None:
+    assert result.place is not None
+    folder = Path(result.place) / "logs" / "dlc"
+    rows = pl.read_parquet(folder / "metrics.parquet").filter(metric=toy, estimator="physics")
+    assert dict(zip(rows["signal"], rows["unit"], strict=True)) == {
+        "vx_m_s": "m/s",
+        "vy_m_s": "m/s",
+        "yaw_rate_rad_s": "rad/s",
+        "sideslip_rad": "rad",
+    }
+    (row,) = rows.filter(signal="sideslip_rad", segment="all").iter_rows(named=True)
+    assert 0.0 < row["value"] < 1.0
+    report = json.loads((folder / "report.json").read_text())
+    assert row["value"] in [m["value"] for m in report["metrics"] if m["metric"] == toy]
+    with (folder / "annotated.mcap").open("rb") as file:
+        (record,) = (m.metadata for m in make_reader(file).iter_metadata() if m.name == "pdhef.metrics")
+    assert record[f"physics/sideslip_rad/all/{toy}"] == f"{row['value']!r} rad n={row['n']}"
+
+
+def test_it_has_a_column_in_the_terminal_and_on_the_page_with_its_definition(toy: str, result: RunResult) -> None:
+    console = Console(width=200, record=True, file=io.StringIO(), highlight=False, markup=False)
+    render_run(result, console)
+    text = console.export_text()
+    assert re.search(r"interval\s*\n?.*width °", text)
+    page = (Path(str(result.place)) / "logs" / "dlc" / "report.html").read_text(encoding="utf-8")
+    assert f'<th class="n">{LABEL}</th>' in page
+    assert registered()[toy].definition in page
+
+
+def test_thresholds_and_compare_accept_it(toy: str, result: RunResult) -> None:
+    verdicts = {v.estimator: v for v in result.verdicts}
+    assert verdicts["physics"].outcome == "fail"
+    assert verdicts["physics"].threshold.label == f"sideslip_rad {toy} (all) <= 0.001 deg"
+    gate = gate_from_dict({"figure": [{"metric": toy, "max_regression": "5%"}]}, where="gate.toml")
+    run = open_run(str(result.place))
+    found = compare_runs(run, run, gate)
+    (figure,) = found.figures
+    assert (figure.verdict, figure.unit, figure.figure.short) == ("equal", "rad", f"sideslip {LABEL}")
+    changed = replace(found, changed=1)
+    console = Console(width=120, record=True, file=io.StringIO())
+    render_comparison(changed, console)
+    assert f"sideslip_rad {toy} (all)" in console.export_text()
+    assert toy.encode() in comparison_page(changed)
+
+
+def test_the_documentation_defines_it(toy: str) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text(encoding="utf-8")
+    found = on_page_markdown(text)
+    for metric in registered().values():
+        assert f"| `{metric.name}` |" in found
+        assert metric.definition in found
+    assert f"| `{toy}` | {LABEL} | that of the signal | lower |" in found
+
+
+def test_units_of_all_figures_are_those_that_the_metrics_name(result: RunResult) -> None:
+    rows = result.results[0].rows
+    assert {(r.metric, r.signal, r.unit) for r in rows} == {
+        (r.metric, r.signal, registered()[r.metric].unit_of(r.signal)) for r in rows
+    }
+
+
+def test_a_name_is_registered_once(toy: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "MODULES", (*registry.MODULES, toy))
+    with pytest.raises(ValueError, match="registered twice"):
+        registered()
