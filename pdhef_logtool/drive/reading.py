@@ -18,7 +18,6 @@ from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace
-from pdhef_logtool.logs.slim_log import SlimLog
 from pdhef_logtool.mapping import ChosenMapping, Mapping, check_mapping, choose_mapping, merge_losses
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import EstimatorError, UsageError
@@ -105,7 +104,7 @@ class Drive:
     @property
     def file(self) -> str:
         """Name of the file or folder; of a slim log that of the one that it stands for."""
-        return self.log.record.file if isinstance(self.log, SlimLog) else self.path.name
+        return self.path.name if self.log.slim is None else self.log.slim.record.file
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -128,8 +127,8 @@ class Drive:
 
         Of a slim log it is that of the one that it stands for.
         """
-        if isinstance(self.log, SlimLog):
-            return self.log.record.identity
+        if self.log.slim is not None:
+            return self.log.slim.record.identity
         self._sha256 = self._sha256 or identity_of(LogInput(self.path, self.name))
         return self._sha256
 
@@ -280,8 +279,8 @@ def read_drive(
         for ambiguity in chosen.ambiguities:
             told(str(ambiguity))
         remarks += chosen.remarks
-        if isinstance(opened, SlimLog):
-            remarks.append(f"a slim log stands for {opened.record.file}")
+        if opened.slim is not None:
+            remarks.append(f"a slim log stands for {opened.slim.record.file}")
         used = chosen.mapping
         if adjust is not None:
             used = adjust(opened, used, told)

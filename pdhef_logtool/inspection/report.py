@@ -19,9 +19,8 @@ from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_pro
 from pdhef_logtool.inspection.step_statistics import DelayStatistics, StepStatistics, ValueStatistics
 from pdhef_logtool.inspection.uses import uses_of
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
-from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import Wanted
-from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, TopicInfo, windows
+from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, LogIndex, TopicInfo, windows
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping import (
@@ -244,10 +243,12 @@ def inspect_log(
     """
     if not whole:
         with closing(open_log(path, budget, msgs, Wanted(frozenset(), above_bytes=WHOLE_BYTES))) as log:
-            assert isinstance(log, ColumnarLog)
-            long = log.far or log.end_ns - log.start_ns > 2 * WINDOW_NS  # a shorter one is mostly read anyway
-            by_index = long and log.by_index and log.size > WHOLE_BYTES
-            found = inspect_drive_log(log, mapping, prefer_truth=prefer_truth, by_index=by_index)
+            index = log.index
+            # Most of a shorter one is read anyway.
+            long = index is not None and (index.far or log.end_ns - log.start_ns > 2 * WINDOW_NS)
+            if index is not None and not (long and index.size > WHOLE_BYTES):
+                index = None
+            found = inspect_drive_log(log, mapping, prefer_truth=prefer_truth, index=index)
             damaged = any(loss.severity == "lost" for loss in log.lost)
             if found.sample is None or not (damaged or found.sample.chunks > MOST_SAMPLED * found.sample.of_chunks):
                 return found
@@ -260,9 +261,9 @@ def inspect_drive_log(
     given: Mapping | None = None,
     *,
     prefer_truth: Literal["perfect", "rtk"] = "perfect",
-    by_index: bool = False,
+    index: LogIndex | None = None,
 ) -> Inspection:
-    """Do what :func:`inspect_log` does with a log that is open already; ``by_index`` looks at a sample of it."""
+    """Do what :func:`inspect_log` does with a log that is open already; with its ``index`` a sample of it is read."""
     ambiguities: tuple[Ambiguity, ...] = ()
     candidates: tuple[Candidate, ...] = ()
     if given is None:
@@ -273,7 +274,7 @@ def inspect_drive_log(
         mapping = given
     mapping = resolve_mapping(log, mapping)
     head = (log.start_ns, min(log.end_ns, log.start_ns + WINDOW_NS))
-    look = _sample_look(log, mapping, head) if by_index and isinstance(log, ColumnarLog) else _whole_look(log)
+    look = _whole_look(log) if index is None else _sample_look(log, index, mapping, head)
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
     looked_at = survey_log(log, mapping, clocks, head)
     mapping = looked_at.mapping
@@ -333,13 +334,13 @@ class _Look:
     Attributes
     ----------
     windows : [start, end) that are read. stamps : topics whose times are read there.
-    by_index : the log whose indexes tell the times of all topics; None: what is read tells them.
+    by_index : the index that tells the times of all topics; None: what is read tells them.
     sample : says what was looked at in the end; None: all of the log is.
     """
 
     windows: Iterable[tuple[int, int]]
     stamps: tuple[str, ...]
-    by_index: ColumnarLog | None = None
+    by_index: LogIndex | None = None
     sample: Callable[[], Sample] | None = None
 
 
@@ -347,16 +348,16 @@ def _whole_look(log: DriveLog) -> _Look:
     return _Look(windows(log.start_ns, log.end_ns, WINDOW_NS, log.occupied), tuple(t.name for t in log.topics))
 
 
-def _sample_look(log: ColumnarLog, mapping: Mapping, head: tuple[int, int]) -> _Look:
+def _sample_look(log: DriveLog, index: LogIndex, mapping: Mapping, head: tuple[int, int]) -> _Look:
     """Look at what the clocks are fitted to, evenly over the log. With the head, which is checked, it is expected."""
     mapped = {source.topic for source in mapping.sources()}
     spread = survey_windows(log.start_ns, log.end_ns) if log.end_ns > head[1] else [head]
-    log.expect(mapped, [head, *spread])
+    index.expect(mapped, [head, *spread])
 
     def sample() -> Sample:
-        return Sample(*log.looked_at, times="sample" if log.far else "index")
+        return Sample(*index.looked_at, times="sample" if index.far else "index")
 
-    return _Look(spread, tuple(sorted(log.beside(mapped))), None if log.far else log, sample)
+    return _Look(spread, tuple(sorted(index.beside(mapped))), None if index.far else index, sample)
 
 
 # ---------------------------------------------------------------------------------------------- gathering

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, Sour
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import IntArray, Loss
+
+if TYPE_CHECKING:
+    from pdhef_logtool.logs.formats import LogFile
 
 # What the files of each format begin with.
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -340,6 +344,11 @@ class FileContainer(Container):
         except BaseException:
             self.source.close()
             raise
+
+    @classmethod
+    def open(cls, file: LogFile) -> Self:
+        """Open a file of this format."""
+        return cls(file.path, file.place, file.meter)
 
     def _open(self) -> None:
         """Walk the file. What escapes the walk loses the rest of the file from there on."""

@@ -14,13 +14,10 @@ from itertools import chain, takewhile
 from pathlib import Path
 
 from pdhef_logtool.logs.byte_source import require_regular
+from pdhef_logtool.logs.formats import COMPRESSED_SUFFIXES, ROSBAG2_METADATA, log_suffixes
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.records.errors import UsageError
 
-#: Suffixes that a search through folders takes for logs; a file that is named outright may have any.
-LOG_SUFFIXES = (".mcap", ".bag", ".db3")
-COMPRESSED_SUFFIXES = (".zstd", ".zst")
-ROSBAG2_METADATA = "metadata.yaml"
 #: Stems are folder names on whatever system the outputs go to.
 _STEM_BYTES = 100
 _NOT_IN_NAMES = frozenset('<>:"/\\|?*')
@@ -74,7 +71,7 @@ def find_logs(arguments: Logs) -> list[LogInput]:
         places = list(_expand(argument))
         if not places:
             raise UsageError(
-                expected="at least one log (.mcap, .bag, .db3 or a rosbag2 folder)",
+                expected=f"at least one log ({', '.join(log_suffixes())} or a rosbag2 folder)",
                 got="none",
                 where=str(place_of(argument)),
                 remedy="name a log, a folder that holds some, or a glob pattern in quotes",
@@ -238,7 +235,7 @@ def _bare_name(name: str) -> str:
     bare = name
     for suffix in COMPRESSED_SUFFIXES:
         bare = bare.removesuffix(suffix)
-    for suffix in LOG_SUFFIXES:
+    for suffix in log_suffixes():
         if bare.endswith(suffix) and bare != suffix:
             return bare.removesuffix(suffix)
     return name
