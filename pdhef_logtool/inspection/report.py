@@ -19,6 +19,7 @@ from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_pro
 from pdhef_logtool.inspection.step_statistics import DelayStatistics, StepStatistics, ValueStatistics
 from pdhef_logtool.inspection.uses import uses_of
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
+from pdhef_logtool.logs.byte_account import checksummed_share
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, LogIndex, TopicInfo, windows
 from pdhef_logtool.logs.open_log import open_log
@@ -158,6 +159,7 @@ class Inspection:
     ambiguities, notes : of the mapping. candidates : fields that were weighed for it.
     checks : what physics says of signals and truth. proposals : corrections of the mapping that are certain.
     lost : every loss and note of reading. sample : what was looked at; None: everything.
+    checksummed_share : which share of the bytes that were read a verified checksum covers; None where none was read.
     """
 
     path: str
@@ -177,6 +179,7 @@ class Inspection:
     lost: tuple[Loss, ...]
     candidates: tuple[Candidate, ...] = ()
     sample: Sample | None = None
+    checksummed_share: float | None = None
 
     @property
     def uses(self) -> MappingABC[str, str]:
@@ -214,6 +217,7 @@ class Inspection:
             "checks": self.checks,
             "proposals": [{"subject": p.subject, "home": p.home, "evidence": p.evidence} for p in self.proposals],
             "lost": self.lost,
+            "checksummed_share": self.checksummed_share,
             "candidates": self.candidates,
             **self.uses,
         }
@@ -321,6 +325,7 @@ def inspect_drive_log(
         lost=merge_losses([log.lost, reading]),
         candidates=candidates,
         sample=None if look.sample is None else look.sample(),
+        checksummed_share=checksummed_share(log.byte_ledgers),
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from pdhef_logtool.logs.budget import BudgetError
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.byte_source import SourceError
-from pdhef_logtool.logs.container import Block, ChannelRecord, Container, Span, told
+from pdhef_logtool.logs.container import UNVERIFIED, Block, ChannelRecord, Container, Span, told
 from pdhef_logtool.logs.decoding import (
     ChannelDecoder,
     channel_schema,
@@ -171,7 +171,8 @@ class ColumnarLog(DriveLog):
     @property
     def index(self) -> ColumnarLog | None:
         """The log itself where everything but the content of chunks is known, and nothing of it is odd."""
-        return self if all(container.by_index for container in self.containers) and not self.lost else None
+        sound = all(container.by_index for container in self.containers)
+        return self if sound and all(loss.kind == UNVERIFIED for loss in self.lost) else None
 
     def metadata(self) -> dict[str, str]:
         """Return the entries of metadata records by ``key`` and ``record.key``, and rosbag2's ``custom_data``."""

@@ -27,6 +27,8 @@ ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
 SQLITE_MAGIC = b"SQLite format 3\0"
 #: Log times above this (unsigned in the file) cannot be held in int64 and are set to it.
 MAX_TIME_NS = int(np.iinfo(np.int64).max) - 1
+#: Kind of the note that a checksum of a file was not verified, as not all that it covers was read.
+UNVERIFIED = "unverified"
 _LOSSES_OF_A_KIND = 20  # of one file; what comes behind them is told as one
 _IDS_TOLD = 5
 _TOLD_CHARACTERS = 300
