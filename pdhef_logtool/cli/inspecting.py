@@ -42,9 +42,7 @@ def inspect(
     from pdhef_logtool.inspection import fields_of_log, inspect_log, render_fields, render_inspection
     from pdhef_logtool.inspection import write_mapping as write_mapping_file
     from pdhef_logtool.logs.discovery import one_place
-    from pdhef_logtool.mapping import load_mapping
 
-    chosen = None if config.mapping is None else load_mapping(config.mapping)
     reading = config.read_options
     if topic is not None and not fields:
         raise UsageError(expected="one log", got=f"{log} and {topic}", where="LOG", remedy="a topic goes with --fields")
@@ -53,7 +51,7 @@ def inspect(
         console.finish(found, render_fields, as_json, exit_code=EXIT_OK)
     inspection = inspect_log(
         one_place(log),
-        chosen,
+        config.mapping,
         prefer_truth=reading.prefer_truth,
         budget=reading.limits,
         msgs=reading.msgs,
@@ -79,12 +77,10 @@ def map_(
 
     from pdhef_logtool.inspection import ask_mapping, inspect_log, write_mapping
     from pdhef_logtool.logs.discovery import one_place
-    from pdhef_logtool.mapping import load_mapping
 
-    chosen = None if config.mapping is None else load_mapping(config.mapping)
     reading = config.read_options
     inspection = inspect_log(
-        one_place(log), chosen, prefer_truth=reading.prefer_truth, budget=reading.limits, msgs=reading.msgs
+        one_place(log), config.mapping, prefer_truth=reading.prefer_truth, budget=reading.limits, msgs=reading.msgs
     )
     if sys.stdin.isatty() and sys.stderr.isatty():
         answers = ask_mapping(inspection, _ask, console.say)

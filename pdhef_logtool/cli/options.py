@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import re
 from collections.abc import Callable
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -37,17 +36,6 @@ AnySplit = Annotated[bool, Option("--any-split", help="Take drives of every spli
 Jobs = Annotated[int, Option("--jobs", "-j", help="Processes at work; changes no number.")]
 
 
-def _check_local(output: object) -> None:
-    """Raise UsageError for a URL where only a folder or file can be; as a path it has lost a slash."""
-    if isinstance(output, Path) and (found := _URL.match(str(output))) and not Path(found[1]).exists():
-        raise UsageError(
-            expected="a place on this machine",
-            got=str(output).replace(":/", "://", 1),
-            where="--output",
-            remedy="pdhef run alone writes to a URL",
-        )
-
-
 def local_folder(argument: str) -> Path:
     """Return the folder that an argument names; raises UsageError for a URL, as the command writes there."""
     from pdhef_logtool.records.object_store import ObjectFolder, is_url
@@ -64,7 +52,6 @@ def local_folder(argument: str) -> Path:
 
 
 _Text = str | None
-_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+:)/.")
 _File = Path | None
 #: The shared options by the name of the configuration's entry, in the order of the help.
 _OPTIONS: dict[str, Any] = {
@@ -149,7 +136,10 @@ def command(
 
         @functools.wraps(function)
         def run_command(**values: Any) -> None:
-            _check_local(values.get("output"))
+            if isinstance(output := values.get("output"), Path):
+                from pdhef_logtool.records.outputs import local_path
+
+                values["output"] = local_path(output)
             if "config" in given:
                 values["config"] = run_config({key: values.pop(key) for key in taken})
             function(**values)

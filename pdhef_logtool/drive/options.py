@@ -47,6 +47,11 @@ class ReadOptions:
     cache: str | None = None
     cache_max_gb: float | None = None
 
+    def __post_init__(self) -> None:
+        """Take places as texts or paths."""
+        object.__setattr__(self, "msgs", None if self.msgs is None else Path(self.msgs))
+        object.__setattr__(self, "cache", None if self.cache is None else str(self.cache))
+
     @property
     def use_speed(self) -> bool:
         """Whether the filters use the speed sensor after their start."""

@@ -17,8 +17,8 @@ from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace
-from pdhef_logtool.mapping import ChosenMapping, Mapping, check_mapping, choose_mapping, merge_losses
+from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.mapping import ChosenMapping, Mapping, check_mapping, choose_mapping, mapping_of, merge_losses
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.ledger import SampleCount, damage
@@ -231,8 +231,8 @@ class Drive:
 
 def read_drive(
     log: LogInput | LogPlace | str,
-    car: Car,
-    mapping: Mapping | None = None,
+    car: Car | Path | str,
+    mapping: Mapping | Path | str | None = None,
     options: ReadOptions = _AS_IT_IS,
     *,
     tell: Tell = lambda _text: None,
@@ -245,7 +245,7 @@ def read_drive(
     ----------
     log : a file, folder or URL; a :class:`LogInput` brings the name that the drive has beside others, and may bring
         a slice.
-    mapping : None recognises types.
+    car : or what :meth:`Car.load` takes. mapping : or its file; None recognises types.
     tell : called with ``NAME: text`` for all that a user must know of the drive; :attr:`Drive.notes` has it too.
     adjust : changes the mapping in effect.
     require_sensors : False reads a log without an IMU, or without any recognised signal, for its truth alone.
@@ -262,7 +262,9 @@ def read_drive(
     ...     [len(window.signals.stamps_ns) for window in drive.windows()], drive.losses
     ([951], ())
     """
-    log_input = log if isinstance(log, LogInput) else one_log(log.url if isinstance(log, RemotePlace) else str(log))
+    car = car if isinstance(car, Car) else Car.load(car)
+    mapping = mapping_of(mapping)
+    log_input = log if isinstance(log, LogInput) else one_log(log)
     if log_input.span_s is not None:
         start_s, end_s = log_input.span_s
         options = replace(options, start=f"{start_s:.9f}", end=f"{end_s:.9f}")
@@ -313,11 +315,11 @@ def _reopened(log: DriveLog, mapping: Mapping, slice_ns: tuple[int, int], option
     return opened
 
 
-def one_log(argument: str) -> LogInput:
+def one_log(argument: LogPlace | str) -> LogInput:
     """Return the log that a file, folder or pattern stands for; raises UsageError unless it is one."""
-    inputs = find_logs([argument])
+    inputs = find_logs(argument)
     if len(inputs) != 1:
-        raise UsageError(expected="one log", got=f"{len(inputs)} of them", where=argument)
+        raise UsageError(expected="one log", got=f"{len(inputs)} of them", where=str(argument))
     return inputs[0]
 
 

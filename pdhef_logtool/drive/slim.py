@@ -14,7 +14,7 @@ from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
 from pdhef_logtool.logs.slim_copy import copy_topics, write_record
 from pdhef_logtool.logs.slim_log import FORMAT, SlimRecord
 from pdhef_logtool.logs.writer import McapLogWriter
-from pdhef_logtool.mapping import Mapping, load_mapping
+from pdhef_logtool.mapping import Mapping, mapping_of
 from pdhef_logtool.mapping.frames import holds_fixed_frames
 from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, LogError, PdhefError
@@ -77,7 +77,7 @@ def slim_logs(
     UsageError, MappingError : There is no log, the mapping is wrong, or an output would replace an input.
     """
     inputs = find_logs(arguments)
-    sources = None if mapping is None else load_mapping(mapping)
+    sources = mapping_of(mapping)
     targets = [output / f"{log.stem}.mcap" for log in inputs]
     check_no_input([*(log.local for log in inputs), mapping], targets)
     items = [(log, target, sources, options) for log, target in zip(inputs, targets, strict=True)]

@@ -34,6 +34,7 @@ from pdhef_logtool.mapping import (
     check_mapping,
     clock_key,
     fit_clocks,
+    mapping_of,
     mapping_to_toml,
     merge_losses,
     read_signals,
@@ -225,15 +226,15 @@ class Inspection:
 
 
 def inspect_log(
-    path: LogPlace,
-    mapping: Mapping | None = None,
+    path: LogPlace | str,
+    mapping: Mapping | Path | str | None = None,
     *,
     prefer_truth: Literal["perfect", "rtk"] = "perfect",
     budget: Budget = DEFAULT_BUDGET,
-    msgs: Path | None = None,
+    msgs: Path | str | None = None,
     whole: bool = False,
 ) -> Inspection:
-    """Look a log through and report on it; without a mapping the well-known types are recognised.
+    """Look a log through and report on it; without a mapping (or its file) the well-known types are recognised.
 
     Of a large MCAP whose index agrees with itself values are looked at in a part of the chunks (``sample``), unless
     ``whole``; if anything is wrong in them, or little is left, all of it is read. Memory is bounded by windows of ten
@@ -245,6 +246,7 @@ def inspect_log(
     LogError : The file is no log.
     MappingError : The mapping names what the log does not hold.
     """
+    mapping = mapping_of(mapping)
     if not whole:
         with closing(open_log(path, budget, msgs, Wanted(frozenset(), above_bytes=WHOLE_BYTES))) as log:
             index = log.index

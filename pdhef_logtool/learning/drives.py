@@ -23,7 +23,7 @@ from pdhef_logtool.drive.windows import DrivePlan
 from pdhef_logtool.learning.noise.search import scorable_stamps
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import load_mapping
+from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
 from pdhef_logtool.records.outputs import check_no_input
 from pdhef_logtool.records.signals import Loss
@@ -114,7 +114,7 @@ def check_file_output(inputs: Sequence[LogInput], config: RunConfig, output: Pat
 
 def open_mapping(config: RunConfig) -> SignalMapping | None:
     """Return the mapping that is configured, None without."""
-    return None if config.mapping is None else load_mapping(config.mapping)
+    return mapping_of(config.mapping)
 
 
 def record_head(kind: str, version: int, settings: LearnSettings, car: Car) -> dict[str, Any]:

@@ -12,11 +12,12 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, takewhile
 from pathlib import Path
+from typing import TypeAlias
 
 from pdhef_logtool.logs.byte_source import require_regular
 from pdhef_logtool.logs.formats import COMPRESSED_SUFFIXES, ROSBAG2_METADATA, log_suffixes
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
-from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.errors import LogError, UsageError
 
 #: Stems are folder names on whatever system the outputs go to.
 _STEM_BYTES = 100
@@ -49,8 +50,8 @@ class LogInput:
         return self.path.parent if isinstance(self.path, Path) else None
 
 
-#: Logs as people name them, or as a command has found and cut them.
-Logs = Sequence[str] | Sequence[LogInput]
+#: A log or several, as people name them, or as a command has found and cut them.
+Logs: TypeAlias = "str | LogPlace | Sequence[str | LogPlace] | Sequence[LogInput]"
 
 
 def find_logs(arguments: Logs) -> list[LogInput]:
@@ -65,9 +66,11 @@ def find_logs(arguments: Logs) -> list[LogInput]:
     UsageError : An argument stands for no log at all. LogError : A store cannot be searched.
     """
     found: dict[str, LogPlace] = {}
-    if already := [a for a in arguments if isinstance(a, LogInput)]:
+    several = [arguments] if isinstance(arguments, str | Path | RemotePlace) else arguments
+    if already := [a for a in several if isinstance(a, LogInput)]:
         return already
-    for argument in chain.from_iterable(map(_lines, map(str, arguments))):
+    named = (a.url if isinstance(a, RemotePlace) else str(a) for a in several)
+    for argument in chain.from_iterable(map(_lines, named)):
         places = list(_expand(argument))
         if not places:
             raise UsageError(
@@ -132,10 +135,15 @@ def identity_of(log: LogInput) -> str:
 
     Raises
     ------
-    LogError : It is neither a folder nor a regular file, or an object that cannot be asked for.
+    LogError : It is neither a folder nor a regular file, cannot be read, or is an object that cannot be asked for.
     """
     if isinstance(log.path, Path):
-        return hash_log(log.path)
+        try:
+            return hash_log(log.path)
+        except OSError as error:
+            got = error.strerror or str(error)
+            remedy = "check the path and its permissions"
+            raise LogError(expected="a readable log", got=got, where=str(log.path), remedy=remedy) from error
     from pdhef_logtool.logs.remote_source import RemoteSource
 
     source = RemoteSource(log.path, head_bytes=1)

@@ -51,7 +51,7 @@ _FOLDER_KINDS = {**_KINDS, "mcap": "rosbag2-mcap"}
 
 
 def open_log(
-    path: LogPlace | str, budget: Budget = DEFAULT_BUDGET, msgs: Path | None = None, wanted: Wanted = EVERYTHING
+    path: LogPlace | str, budget: Budget = DEFAULT_BUDGET, msgs: Path | str | None = None, wanted: Wanted = EVERYTHING
 ) -> DriveLog:
     """Open a log, recognised by its content.
 

@@ -41,6 +41,8 @@ Time = Annotated[str, Field(max_length=64), BeforeValidator(_as_text)]
 Names = Annotated[
     tuple[str, ...], Field(strict=False), BeforeValidator(lambda v: v.split(",") if isinstance(v, str) else v)
 ]
+#: A file or folder, as a path or a text.
+File = Annotated[Path, Field(strict=False)]
 Keep = Literal["metrics", "estimates", "full"]
 Friction = Annotated[float, Field(ge=POSSIBLE_FRICTION[0], le=POSSIBLE_FRICTION[1])]
 
@@ -78,9 +80,9 @@ class RunConfig:
     """
 
     estimators: Names | None = None
-    car: Path | None = None
-    cars: Path | None = None
-    mapping: Path | None = None
+    car: File | None = None
+    cars: File | None = None
+    mapping: File | None = None
     start: Time | None = None
     end: Time | None = None
     annotate: Literal["full", "sidecar", "none"] | None = None
@@ -90,13 +92,13 @@ class RunConfig:
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
     window_s: Annotated[float, Field(ge=1, le=1e9)] = WINDOW_S
     budget: Annotated[float, Field(gt=0, le=1e6)] = 1.0
-    msgs: Path | None = None
-    thresholds: Path | None = None
-    network: Path | None = None
-    intervals: Path | None = None
+    msgs: File | None = None
+    thresholds: File | None = None
+    network: File | None = None
+    intervals: File | None = None
     calibrate: Literal["off", "log", "pool"] = "log"
     waived: Names = ()
-    cache: str | None = None
+    cache: Annotated[str, BeforeValidator(lambda v: str(v) if isinstance(v, Path) else v)] | None = None
     cache_max_gb: Annotated[float, Field(gt=0)] | None = None
 
     @property

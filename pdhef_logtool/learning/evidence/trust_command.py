@@ -50,6 +50,7 @@ from pdhef_logtool.learning.evidence.trust import (
 from pdhef_logtool.learning.noise.tune_drives import MIN_SCORED_STAMPS
 from pdhef_logtool.logs.discovery import Logs, find_logs
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.outputs import local_path
 from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS
 from pdhef_logtool.residual_model.service import RememberingNetwork
@@ -102,7 +103,7 @@ class TrustResult(LearnResult):
 
 def trust(
     arguments: Logs,
-    output: Path,
+    output: Path | str,
     settings: LearnSettings,
     *,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
@@ -123,6 +124,7 @@ def trust(
     EstimatorError
         No drive can be scored.
     """
+    output = local_path(output)
     config = settings.config
     car = open_car(config, output, warn)
     if car.residual_network is None:

@@ -61,7 +61,7 @@ from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.files import write_bytes
-from pdhef_logtool.records.outputs import OutputFolder, check_no_input
+from pdhef_logtool.records.outputs import OutputFolder, check_no_input, local_path
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.sinks.report import json_bytes
@@ -146,7 +146,7 @@ class _Course:
 
 def learn(
     arguments: Logs,
-    output: Path,
+    output: Path | str,
     settings: CourseSettings,
     *,
     fresh: bool = False,
@@ -170,6 +170,7 @@ def learn(
     EstimatorError
         There is too little driving with truth.
     """
+    output = local_path(output)
     config = settings.config
     _check(settings, output)
     given = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)

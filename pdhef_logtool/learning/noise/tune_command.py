@@ -50,6 +50,7 @@ from pdhef_logtool.learning.noise.tune_drives import Benches, TuneSetup, choose_
 from pdhef_logtool.learning.plots import new_figure, png_bytes
 from pdhef_logtool.logs.discovery import Logs, find_logs
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.outputs import local_path
 from pdhef_logtool.sinks.report import json_bytes
 
 FORMAT = "pdhef-tuning"
@@ -124,7 +125,7 @@ class TuneResult(LearnResult):
 
 def tune(
     arguments: Logs,
-    output: Path,
+    output: Path | str,
     settings: TuneSettings,
     *,
     jobs: int = 1,
@@ -146,6 +147,7 @@ def tune(
     EstimatorError
         No drive can be scored.
     """
+    output = local_path(output)
     config = settings.config
     if settings.trials < MIN_TRIALS:
         raise UsageError(expected=f"at least {MIN_TRIALS} trials", got=str(settings.trials), where="--trials")
