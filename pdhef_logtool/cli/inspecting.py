@@ -46,11 +46,12 @@ def inspect(
     reading = config.read_options
     if topic is not None and not fields:
         raise UsageError(expected="one log", got=f"{log} and {topic}", where="LOG", remedy="a topic goes with --fields")
+    place = one_place(log, private_redirects=config.allow_private_redirects)
     if fields:
-        found = fields_of_log(one_place(log), topic, budget=reading.limits, msgs=reading.msgs)
+        found = fields_of_log(place, topic, budget=reading.limits, msgs=reading.msgs)
         console.finish(found, render_fields, as_json, exit_code=EXIT_OK)
     inspection = inspect_log(
-        one_place(log),
+        place,
         config.mapping,
         prefer_truth=reading.prefer_truth,
         budget=reading.limits,
@@ -79,8 +80,13 @@ def map_(
     from pdhef_logtool.logs.discovery import one_place
 
     reading = config.read_options
+    place = one_place(log, private_redirects=config.allow_private_redirects)
     inspection = inspect_log(
-        one_place(log), config.mapping, prefer_truth=reading.prefer_truth, budget=reading.limits, msgs=reading.msgs
+        place,
+        config.mapping,
+        prefer_truth=reading.prefer_truth,
+        budget=reading.limits,
+        msgs=reading.msgs,
     )
     if sys.stdin.isatty() and sys.stderr.isatty():
         answers = ask_mapping(inspection, _ask, console.say)

@@ -101,6 +101,13 @@ _OPTIONS: dict[str, Any] = {
     "waived": Annotated[
         list[str] | None, Option("--waive", metavar="NAME", help="A failed check that does not count; repeatable.")
     ],
+    "allow_private_redirects": Annotated[
+        bool | None,
+        Option(
+            "--allow-private-redirects",
+            help="Follow redirects of web servers to other hosts of this machine and its network: docs/remote.md.",
+        ),
+    ],
     "vehicle": Annotated[_File, Option("--vehicle", "-v", hidden=True)],
     "model": Annotated[_File, Option(hidden=True)],
     "calibration": Annotated[_File, Option(hidden=True)],
@@ -120,10 +127,12 @@ def command(
     group : commands to add it to.
     examples, notes : what stands below the options: lines as they are typed, and paragraphs.
     name : that of the command; None = the function's.
-    shared : shared options beside --mapping, --prefer-truth, --msgs and --budget, which every ``config`` takes.
+    shared : shared options beside --mapping, --prefer-truth, --msgs, --budget and --allow-private-redirects, which
+        every ``config`` takes.
     car : what --car means to the command, which then has --start and --end too; empty = it has no car.
     """
     wanted = f"mapping prefer_truth budget msgs {shared} {'car vehicle start end' if car else ''}".split()
+    wanted.append("allow_private_redirects")
     wanted += ["cache_max_gb"] * ("cache" in wanted)
     taken = {key: option for key, option in _OPTIONS.items() if key in wanted}
     if car:

@@ -264,7 +264,7 @@ def read_drive(
     """
     car = car if isinstance(car, Car) else Car.load(car)
     mapping = mapping_of(mapping)
-    log_input = log if isinstance(log, LogInput) else one_log(log)
+    log_input = log if isinstance(log, LogInput) else one_log(log, options)
     if log_input.span_s is not None:
         start_s, end_s = log_input.span_s
         options = replace(options, start=f"{start_s:.9f}", end=f"{end_s:.9f}")
@@ -315,9 +315,9 @@ def _reopened(log: DriveLog, mapping: Mapping, slice_ns: tuple[int, int], option
     return opened
 
 
-def one_log(argument: LogPlace | str) -> LogInput:
+def one_log(argument: LogPlace | str, options: ReadOptions = _AS_IT_IS) -> LogInput:
     """Return the log that a file, folder or pattern stands for; raises UsageError unless it is one."""
-    inputs = find_logs(argument)
+    inputs = find_logs(argument, private_redirects=options.allow_private_redirects)
     if len(inputs) != 1:
         raise UsageError(expected="one log", got=f"{len(inputs)} of them", where=str(argument))
     return inputs[0]

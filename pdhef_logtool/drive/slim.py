@@ -76,7 +76,7 @@ def slim_logs(
     ------
     UsageError, MappingError : There is no log, the mapping is wrong, or an output would replace an input.
     """
-    inputs = find_logs(arguments)
+    inputs = find_logs(arguments, private_redirects=options.allow_private_redirects)
     sources = mapping_of(mapping)
     targets = [output / f"{log.stem}.mcap" for log in inputs]
     check_no_input([*(log.local for log in inputs), mapping], targets)

@@ -54,12 +54,13 @@ class LogInput:
 Logs: TypeAlias = "str | LogPlace | Sequence[str | LogPlace] | Sequence[LogInput]"
 
 
-def find_logs(arguments: Logs) -> list[LogInput]:
+def find_logs(arguments: Logs, *, private_redirects: bool = False) -> list[LogInput]:
     """Expand what names logs to logs in a stable order; each log once. What was found stays as it is.
 
     A file or rosbag2 folder that is named outright is taken as it is, whether it is readable or not. Folders, and
     ``s3://bucket/prefix/``, are searched for logs by suffix; a rosbag2 folder of this machine counts as one log. Any
-    other URL is one log. ``@list.txt`` stands for the lines of a file.
+    other URL is one log. ``@list.txt`` stands for the lines of a file. ``private_redirects`` as for
+    :class:`~pdhef_logtool.logs.remote_place.RemotePlace`.
 
     Raises
     ------
@@ -71,7 +72,7 @@ def find_logs(arguments: Logs) -> list[LogInput]:
         return already
     named = (a.url if isinstance(a, RemotePlace) else str(a) for a in several)
     for argument in chain.from_iterable(map(_lines, named)):
-        places = list(_expand(argument))
+        places = list(_expand(argument, private_redirects))
         if not places:
             raise UsageError(
                 expected=f"at least one log ({', '.join(log_suffixes())} or a rosbag2 folder)",
@@ -93,8 +94,10 @@ def with_free_stem(log: LogInput, taken: Container[str]) -> LogInput:
     return replace(log, stem=next(stem for stem in made if as_taken(stem) not in taken))
 
 
-def one_place(argument: str) -> LogPlace:
+def one_place(argument: str, *, private_redirects: bool = False) -> LogPlace:
     """Return the place that an argument names outright; ``@list.txt`` may stand for it.
+
+    ``private_redirects`` as for :class:`~pdhef_logtool.logs.remote_place.RemotePlace`.
 
     Raises
     ------
@@ -103,7 +106,7 @@ def one_place(argument: str) -> LogPlace:
     lines = list(_lines(argument))
     if len(lines) != 1:
         raise UsageError(expected="one log", got=f"{len(lines)} of them", where=argument)
-    return place_of(lines[0])
+    return place_of(lines[0], private_redirects=private_redirects)
 
 
 def _lines(argument: str) -> Iterator[str]:
@@ -172,8 +175,8 @@ def hash_log(path: Path) -> str:
     return total.hexdigest()
 
 
-def _expand(argument: str) -> Iterator[LogPlace]:
-    place = place_of(argument)
+def _expand(argument: str, private_redirects: bool) -> Iterator[LogPlace]:
+    place = place_of(argument, private_redirects=private_redirects)
     if isinstance(place, RemotePlace):
         yield from (
             _search_store(place) if place.scheme == "s3" and (not place.key or argument.endswith("/")) else (place,)

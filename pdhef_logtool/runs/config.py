@@ -42,7 +42,7 @@ Names = Annotated[
     tuple[str, ...], Field(strict=False), BeforeValidator(lambda v: v.split(",") if isinstance(v, str) else v)
 ]
 #: A file or folder, as a path or a text.
-File = Annotated[Path, Field(strict=False)]
+File = Annotated[Path, BeforeValidator(lambda v: Path(v) if isinstance(v, str) else v)]
 Keep = Literal["metrics", "estimates", "full"]
 Friction = Annotated[float, Field(ge=POSSIBLE_FRICTION[0], le=POSSIBLE_FRICTION[1])]
 
@@ -77,6 +77,7 @@ class RunConfig:
     calibrate : a car without evidence, without truth: on each ``log`` for itself, on the ``pool`` of all, or ``off``.
     cache : folder or URL of slim logs, which stand for logs that were read before; changes no number.
     cache_max_gb : what the cache may hold, in GB, if it is a folder: what was not used for longest goes; None = any.
+    allow_private_redirects : whether a web server may redirect to other hosts of this machine and its network.
     """
 
     estimators: Names | None = None
@@ -100,6 +101,7 @@ class RunConfig:
     waived: Names = ()
     cache: Annotated[str, BeforeValidator(lambda v: str(v) if isinstance(v, Path) else v)] | None = None
     cache_max_gb: Annotated[float, Field(gt=0)] | None = None
+    allow_private_redirects: bool = False
 
     @property
     def read_options(self) -> ReadOptions:
@@ -125,7 +127,7 @@ class RunConfig:
     def to_dict(self) -> dict[str, Any]:
         """Return the configuration as JSON-able values; files by name only, so that no machine's paths get out."""
         document = asdict(self)
-        del document["cache"], document["cache_max_gb"]
+        del document["cache"], document["cache_max_gb"], document["allow_private_redirects"]
         document["waived"] = list(self.waived)
         document |= {"annotate": self.annotation, "keep": self.kept}
         document["estimators"] = None if self.estimators is None else list(self.estimators)

@@ -86,7 +86,18 @@ _KEPT = ("metrics", "estimates", "full")
 _PRELOAD = ("pdhef_logtool.runs.*", "pdhef_logtool.logs.*", "pdhef_logtool.sinks.parquet", *FILTERS)
 #: Entries of the configuration that change no figure and no file that is kept, or are told apart by themselves.
 _NO_SETTING = frozenset(
-    {"keep", "annotate", "cache", "cache_max_gb", "window_s", "car", "cars", "network", "intervals"}
+    {
+        "keep",
+        "annotate",
+        "cache",
+        "cache_max_gb",
+        "allow_private_redirects",
+        "window_s",
+        "car",
+        "cars",
+        "network",
+        "intervals",
+    }
 )
 _FILES = ("mapping", "msgs", "thresholds", "cars")
 _READERS = 16
@@ -193,7 +204,7 @@ def run_logs(
     else:
         stored, output = None, Path(output)
     junit = None if junit is None else Path(junit)
-    inputs = find_logs(arguments)
+    inputs = find_logs(arguments, private_redirects=config.allow_private_redirects)
     cars = RunCars.of(config, warn)
     mapping = mapping_of(config.mapping)
     thresholds = read_thresholds(config, junit)

@@ -103,7 +103,7 @@ def score_log(
     ------
     PdhefError : There is no estimate, no truth, or nothing of the log can be used.
     """
-    log_input = one_log(argument)
+    log_input = one_log(argument, config.read_options)
     car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
     mapping = mapping_of(config.mapping)
     thresholds = read_thresholds(config, junit)

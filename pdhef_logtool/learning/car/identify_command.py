@@ -115,7 +115,7 @@ def identify(
     if config.car is None:
         warn(f"no --car: mass, geometry and priors are those of the default {start.name}")
     given = open_mapping(config)
-    logs = find_logs(arguments)
+    logs = find_logs(arguments, private_redirects=config.allow_private_redirects)
     check_file_output(logs, config, output)
 
     def read(vehicle: VehicleParameters) -> tuple[list[DriveRecord], list[FitDrive], list[FitDrive]]:

@@ -44,7 +44,7 @@ from pdhef_logtool.learning.evidence.calibrate import (
 from pdhef_logtool.learning.network.extract_command import MAX_VARIATION
 from pdhef_logtool.learning.noise.tune_command import HELD_OUT
 from pdhef_logtool.learning.variation import Variation, vary
-from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
+from pdhef_logtool.logs.discovery import LogInput, Logs
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.files import write_bytes
@@ -130,7 +130,7 @@ def calibrate(
     alone = output.suffix == ".json"
     car = open_car(config, None if alone else output, warn)
     mapping = open_mapping(config)
-    inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
+    inputs, splits = choose_drives(arguments, settings, REFUSED)
     check_file_output(inputs, config, output)
     if car.network is not None and "train" in splits.values():
         warn("drives of split train: a network is better there than in service, and its intervals will be too narrow")

@@ -48,7 +48,7 @@ from pdhef_logtool.learning.evidence.trust import (
     join_blocks,
 )
 from pdhef_logtool.learning.noise.tune_drives import MIN_SCORED_STAMPS
-from pdhef_logtool.logs.discovery import Logs, find_logs
+from pdhef_logtool.logs.discovery import Logs
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.outputs import local_path
 from pdhef_logtool.records.signals import BoolArray
@@ -131,7 +131,7 @@ def trust(
         got = "none" if car.network is None else f"one for {car.network.model}"
         raise UsageError(expected="a network", got=got, where="--network", remedy="give a folder of pdhef train")
     assert car.network is not None
-    inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
+    inputs, splits = choose_drives(arguments, settings, REFUSED)
     check_file_output(inputs, config, output)
     mapping = open_mapping(config)
 

@@ -55,7 +55,7 @@ from pdhef_logtool.learning.learn.steps import (
 )
 from pdhef_logtool.learning.noise.tune_command import REFUSED
 from pdhef_logtool.learning.stages import Stages
-from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
+from pdhef_logtool.logs.discovery import LogInput, Logs
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.documents import digest
@@ -177,7 +177,7 @@ def learn(
     check_output(given, output)
     if config.car is None:
         warn(f"no --car: mass, geometry and priors are those of the default {given.own.name}")
-    inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
+    inputs, splits = choose_drives(arguments, settings, REFUSED)
     read = [*(i.local for i in inputs), *(path for path in config.files if path != config.car)]
     check_no_input(read, [], [output])
     mapping = open_mapping(config)

@@ -248,7 +248,7 @@ def extract(
     output = local_path(output)
     settings.smoothing_half_s()
     _check_counts(jobs, settings)
-    inputs = find_logs(arguments)
+    inputs = find_logs(arguments, private_redirects=settings.config.allow_private_redirects)
     mapping = open_mapping(settings.config)
     work = list(_plan_jobs(inputs, output, settings, mapping, resume, warn))
     if splits is not None:
