@@ -19,7 +19,8 @@ class ByteLedger:
     unwanted : sound as far as is known, and never asked for: attachments, metadata, index, other topics' chunks.
     lost : damaged, cut, above the budget. Where the place of damage is not known, the record that tells of it.
     cut : the file ends before its time. What should follow is in no sum.
-    checksummed : of ``decoded``, the bytes that a checksum of the file covers and that agree with it.
+    checksummed : of ``decoded``, the bytes that a checksum of the file covers and that agree with it; None in a record
+        of an earlier version.
 
     In a database the rows' data count, one row behind the other; all else of the file is unwanted while rows can be
     read to the end, and lost where they cannot.
@@ -31,13 +32,14 @@ class ByteLedger:
     unwanted: int
     lost: int
     cut: bool
-    checksummed: int = 0
+    checksummed: int | None = None
 
 
 def checksummed_share(ledgers: Sequence[ByteLedger]) -> float | None:
-    """Return which share of the bytes that were read a verified checksum covers; None where none was read."""
+    """Return which share of the bytes that were read a verified checksum covers; None where that is not known."""
     decoded = sum(ledger.decoded for ledger in ledgers)
-    return sum(ledger.checksummed for ledger in ledgers) / decoded if decoded else None
+    known = [ledger.checksummed for ledger in ledgers if ledger.checksummed is not None]
+    return sum(known) / decoded if decoded and len(known) == len(ledgers) else None
 
 
 def checksum_text(share: float | None) -> str:

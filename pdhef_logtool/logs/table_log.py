@@ -93,7 +93,7 @@ class TableLog(DriveLog):
     @property
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:
         """The whole file as read."""
-        return (ByteLedger(str(self.path), self._size, self._size, 0, 0, bool(self._file.cut)),)
+        return (ByteLedger(str(self.path), self._size, self._size, 0, 0, bool(self._file.cut), checksummed=0),)
 
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
         """Return the columns of a table."""
