@@ -17,7 +17,9 @@ from rich.console import Console
 from pdhef_logtool.cli.app import app
 from pdhef_logtool.inspection import inspect_log, render_inspection
 from pdhef_logtool.logs.byte_account import ByteAccount, ByteLedger, checksummed_share
+from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
 
 T0 = 1_700_000_000_000_000_000
@@ -121,6 +123,36 @@ def test_a_run_reports_the_share(sample_logs_dir: Path, tmp_path: Path, capsys: 
     assert "A checksum of the file covers 9" in page
     kept = json.loads((Path(log["output"]) / "report.json").read_text())
     assert kept["ledger"] == ledger
+
+
+def test_a_log_that_is_read_in_part_from_a_server_says_what_was_not_verified(tmp_path: Path) -> None:
+    pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
+    from studies.counting_server import serving
+
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=4000, enable_crcs=False, enable_data_crcs=True)
+        writer.start()
+        schema = writer.register_schema(
+            "T", "jsonschema", b'{"type": "object", "properties": {"a": {"type": "number"}}}'
+        )
+        channels = [writer.register_channel(topic, "json", schema) for topic in ("/a", "/b")]
+        for i in range(2 * N):  # each chunk has one topic
+            writer.add_message(channels[i // N], T0 + i * 10_000_000, b'{"a": %d}' % i, T0 + i * 10_000_000)
+        writer.finish()
+    with serving(**{"log.mcap": path.read_bytes()}) as server:
+        place = RemotePlace(server.place("log.mcap"))
+        log = open_log(place, wanted=Wanted(frozenset({"/a"})))
+        assert [(loss.kind, loss.severity) for loss in log.lost] == [("unverified", "note")]
+        assert log.index is not None
+        assert len(log.read({"/a": ["a"]})["/a"]) == N
+        assert checksummed_share(log.byte_ledgers) == 0.0
+        log.close()
+        log = open_log(place)  # all of it
+        log.read({"/a": ["a"], "/b": ["a"]})
+        assert log.lost == ()
+        assert checksummed_share(log.byte_ledgers) == pytest.approx(1.0, abs=0.01)
+        log.close()
 
 
 def test_damage_of_a_summary_is_a_note(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import json
 import math
@@ -18,8 +19,12 @@ import pytest
 from pdhef_logtool import Car, ReadOptions, estimate, inspect_log, read_drive
 from pdhef_logtool.drive.slim import slim_log
 from pdhef_logtool.logs import formats
+from pdhef_logtool.logs.budget import Meter
 from pdhef_logtool.logs.discovery import LogInput, find_logs
+from pdhef_logtool.logs.drive_log import FieldInfo
+from pdhef_logtool.logs.formats import LogFile
 from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.table_log import Table, TableLog
 from pdhef_logtool.records.errors import LogError, MappingError, PdhefError
 
 G_M_S2 = 9.80665
@@ -152,6 +157,27 @@ def test_times_far_from_all_others_are_left_out(npz: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.usefixtures("_installed")
+def test_a_column_that_cannot_be_read_is_a_loss_and_the_others_are_read(npz: Path) -> None:
+    def load(path: str, rows: slice) -> np.ndarray:  # type: ignore[type-arg]
+        if path == "bad":
+            raise ValueError("a block of it is damaged")
+        return np.arange(5)[rows]
+
+    fields = tuple(FieldInfo(path, kind) for path, kind in (("good", "number"), ("bad", "number"), ("at", "time")))
+    table = Table("t", np.arange(5) * 10, fields, load)
+    log = TableLog(LogFile(npz, npz, Meter()), "toy", [table])
+    found = log.read({"t": ["good", "bad", "at"]}, 10, 40)["t"].fields
+    assert found["good"].tolist() == found["at"].tolist() == [1, 2, 3]
+    assert found["at"].dtype == np.int64
+    assert np.isnan(found["bad"]).all()
+    assert [(loss.kind, loss.severity, loss.where) for loss in log.lost] == [("bad-column", "lost", "t")]
+    with pytest.raises(LogError, match="ascending times"):
+        TableLog(LogFile(npz, npz, Meter()), "toy", [dataclasses.replace(table, stamps_ns=np.arange(5)[::-1])])
+    with pytest.raises(LogError, match="different names"):
+        TableLog(LogFile(npz, npz, Meter()), "toy", [table, dataclasses.replace(table)])
+
+
+@pytest.mark.usefixtures("_installed")
 def test_a_damaged_file_is_told_in_one_line(npz: Path, tmp_path: Path) -> None:
     (tmp_path / "cut.npz").write_bytes(npz.read_bytes()[:-500])
     with pytest.raises(LogError, match="a NumPy archive or a rosbag2 folder"):
@@ -199,6 +225,10 @@ def test_a_fleet_of_tables_runs_in_several_processes(package: Path, npz: Path, t
             "/pdhef/phy_ukf/state", "/pdhef/phy_ukf/odometry", "/pdhef/zero/state", "/pdhef/zero/odometry"
         }  # fmt: skip
         annotated.close()
+    code, _, said = _pdhef(package, "events", out, "--where", "vx_m_s > 1", "--clip", "--source", logs / "one")
+    assert "one__drive: clips hold our tracks only: the log has no messages to copy" in said
+    assert code == 3, said  # the source of the other drive is not there
+    assert list((out / "clips").iterdir())
 
 
 @pytest.mark.usefixtures("_installed")
