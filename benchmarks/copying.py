@@ -46,7 +46,8 @@ def annotate(path: Path) -> None:
 
 def copy_ours(path: Path, whole: bool, end_ns: int | None = None) -> None:
     """Copy the source alone, by chunks or by messages."""
-    log = open_log(path)
+    log = open_log(path).messages
+    assert log is not None
     with McapLogWriter(CACHE / "copy.mcap") as writer:
         channels = register_channels(writer, log)
         iterate = iterate_copy if whole else iterate_raw

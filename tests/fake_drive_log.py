@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_account import ByteLedger
-from pdhef_logtool.logs.drive_log import Columns, FieldInfo, TopicInfo
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, FieldInfo, TopicInfo
 from pdhef_logtool.logs.occupied_time import OccupiedTime
 from pdhef_logtool.records.signals import IntArray, Loss
 
@@ -26,7 +26,7 @@ class FakeTopic:
 
 
 @dataclass
-class FakeLog:
+class FakeLog(DriveLog):
     contents: dict[str, FakeTopic]
     path: Path = Path("memory.mcap")
     kind: str = "mcap"
@@ -68,12 +68,6 @@ class FakeLog:
                 out.append(FieldInfo(path, "number"))
         return tuple(out)
 
-    def unreadable(self, topic: str) -> str:
-        return ""
-
-    def borrowed(self, topic: str) -> tuple[Path, ...]:
-        return ()
-
     def first_messages(self, topic: str, most: int) -> list[object]:
         return list(self.contents[topic].examples[:most])
 
@@ -89,9 +83,6 @@ class FakeLog:
         self.reads.append({t: list(p) for t, p in requests.items()})
         wanted = {**dict.fromkeys(stamps, ()), **requests}
         return {name: self._columns(name, paths, start_ns, end_ns) for name, paths in wanted.items()}
-
-    def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:
-        return {name: self._columns(name, (), start_ns, end_ns) for name in self.contents}
 
     def close(self) -> None:
         pass

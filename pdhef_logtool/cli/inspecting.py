@@ -42,18 +42,17 @@ def inspect(
     from pdhef_logtool.inspection import fields_of_log, inspect_log, render_fields, render_inspection
     from pdhef_logtool.inspection import write_mapping as write_mapping_file
     from pdhef_logtool.logs.discovery import one_place
-    from pdhef_logtool.mapping import load_mapping
 
-    chosen = None if config.mapping is None else load_mapping(config.mapping)
     reading = config.read_options
     if topic is not None and not fields:
         raise UsageError(expected="one log", got=f"{log} and {topic}", where="LOG", remedy="a topic goes with --fields")
+    place = one_place(log, private_redirects=config.allow_private_redirects)
     if fields:
-        found = fields_of_log(one_place(log), topic, budget=reading.limits, msgs=reading.msgs)
+        found = fields_of_log(place, topic, budget=reading.limits, msgs=reading.msgs)
         console.finish(found, render_fields, as_json, exit_code=EXIT_OK)
     inspection = inspect_log(
-        one_place(log),
-        chosen,
+        place,
+        config.mapping,
         prefer_truth=reading.prefer_truth,
         budget=reading.limits,
         msgs=reading.msgs,
@@ -79,12 +78,15 @@ def map_(
 
     from pdhef_logtool.inspection import ask_mapping, inspect_log, write_mapping
     from pdhef_logtool.logs.discovery import one_place
-    from pdhef_logtool.mapping import load_mapping
 
-    chosen = None if config.mapping is None else load_mapping(config.mapping)
     reading = config.read_options
+    place = one_place(log, private_redirects=config.allow_private_redirects)
     inspection = inspect_log(
-        one_place(log), chosen, prefer_truth=reading.prefer_truth, budget=reading.limits, msgs=reading.msgs
+        place,
+        config.mapping,
+        prefer_truth=reading.prefer_truth,
+        budget=reading.limits,
+        msgs=reading.msgs,
     )
     if sys.stdin.isatty() and sys.stderr.isatty():
         answers = ask_mapping(inspection, _ask, console.say)

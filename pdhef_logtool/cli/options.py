@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import re
 from collections.abc import Callable
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -37,17 +36,6 @@ AnySplit = Annotated[bool, Option("--any-split", help="Take drives of every spli
 Jobs = Annotated[int, Option("--jobs", "-j", help="Processes at work; changes no number.")]
 
 
-def _check_local(output: object) -> None:
-    """Raise UsageError for a URL where only a folder or file can be; as a path it has lost a slash."""
-    if isinstance(output, Path) and (found := _URL.match(str(output))) and not Path(found[1]).exists():
-        raise UsageError(
-            expected="a place on this machine",
-            got=str(output).replace(":/", "://", 1),
-            where="--output",
-            remedy="pdhef run alone writes to a URL",
-        )
-
-
 def local_folder(argument: str) -> Path:
     """Return the folder that an argument names; raises UsageError for a URL, as the command writes there."""
     from pdhef_logtool.records.object_store import ObjectFolder, is_url
@@ -64,7 +52,6 @@ def local_folder(argument: str) -> Path:
 
 
 _Text = str | None
-_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+:)/.")
 _File = Path | None
 #: The shared options by the name of the configuration's entry, in the order of the help.
 _OPTIONS: dict[str, Any] = {
@@ -117,6 +104,13 @@ _OPTIONS: dict[str, Any] = {
     "waived": Annotated[
         list[str] | None, Option("--waive", metavar="NAME", help="A failed check that does not count; repeatable.")
     ],
+    "allow_private_redirects": Annotated[
+        bool | None,
+        Option(
+            "--allow-private-redirects",
+            help="Follow redirects of web servers to other hosts of this machine and its network: docs/remote.md.",
+        ),
+    ],
     "vehicle": Annotated[_File, Option("--vehicle", "-v", hidden=True)],
     "model": Annotated[_File, Option(hidden=True)],
     "calibration": Annotated[_File, Option(hidden=True)],
@@ -136,10 +130,12 @@ def command(
     group : commands to add it to.
     examples, notes : what stands below the options: lines as they are typed, and paragraphs.
     name : that of the command; None = the function's.
-    shared : shared options beside --mapping, --prefer-truth, --msgs and --budget, which every ``config`` takes.
+    shared : shared options beside --mapping, --prefer-truth, --msgs, --budget and --allow-private-redirects, which
+        every ``config`` takes.
     car : what --car means to the command, which then has --start and --end too; empty = it has no car.
     """
     wanted = f"mapping prefer_truth budget msgs {shared} {'car vehicle start end' if car else ''}".split()
+    wanted.append("allow_private_redirects")
     wanted += ["cache_max_gb"] * ("cache" in wanted)
     taken = {key: option for key, option in _OPTIONS.items() if key in wanted}
     if car:
@@ -152,7 +148,10 @@ def command(
 
         @functools.wraps(function)
         def run_command(**values: Any) -> None:
-            _check_local(values.get("output"))
+            if isinstance(output := values.get("output"), Path):
+                from pdhef_logtool.records.outputs import local_path
+
+                values["output"] = local_path(output)
             if "config" in given:
                 values["config"] = run_config({key: values.pop(key) for key in taken})
             function(**values)

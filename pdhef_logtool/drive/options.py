@@ -34,6 +34,7 @@ class ReadOptions:
     msgs : folder with definitions of message types that a log does not define.
     cache : folder or URL of slim logs, which stand for logs that were read before; changes no number.
     cache_max_gb : what the cache may hold, in GB, if it is a folder; None = any.
+    allow_private_redirects : whether a web server may redirect to other hosts of this machine and its network.
     """
 
     start: str | None = None
@@ -48,6 +49,12 @@ class ReadOptions:
     msgs: Path | None = None
     cache: str | None = None
     cache_max_gb: float | None = None
+    allow_private_redirects: bool = False
+
+    def __post_init__(self) -> None:
+        """Take places as texts or paths."""
+        object.__setattr__(self, "msgs", None if self.msgs is None else Path(self.msgs))
+        object.__setattr__(self, "cache", None if self.cache is None else str(self.cache))
 
     @property
     def use_speed(self) -> bool:

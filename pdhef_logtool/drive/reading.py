@@ -17,8 +17,7 @@ from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace
-from pdhef_logtool.logs.slim_log import SlimLog
+from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping import (
     ChosenMapping,
     ClockModel,
@@ -26,6 +25,7 @@ from pdhef_logtool.mapping import (
     check_mapping,
     choose_mapping,
     clock_key,
+    mapping_of,
     merge_losses,
 )
 from pdhef_logtool.records.checks import Check
@@ -114,7 +114,7 @@ class Drive:
     @property
     def file(self) -> str:
         """Name of the file or folder; of a slim log that of the one that it stands for."""
-        return self.log.record.file if isinstance(self.log, SlimLog) else self.path.name
+        return self.path.name if self.log.slim is None else self.log.slim.record.file
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -149,8 +149,8 @@ class Drive:
 
         Of a slim log it is that of the one that it stands for.
         """
-        if isinstance(self.log, SlimLog):
-            return self.log.record.identity
+        if self.log.slim is not None:
+            return self.log.slim.record.identity
         self._sha256 = self._sha256 or identity_of(LogInput(self.path, self.name))
         return self._sha256
 
@@ -253,8 +253,8 @@ class Drive:
 
 def read_drive(
     log: LogInput | LogPlace | str,
-    car: Car,
-    mapping: Mapping | None = None,
+    car: Car | Path | str,
+    mapping: Mapping | Path | str | None = None,
     options: ReadOptions = _AS_IT_IS,
     *,
     tell: Tell = lambda _text: None,
@@ -267,7 +267,7 @@ def read_drive(
     ----------
     log : a file, folder or URL; a :class:`LogInput` brings the name that the drive has beside others, and may bring
         a slice.
-    mapping : None recognises types.
+    car : or what :meth:`Car.load` takes. mapping : or its file; None recognises types.
     tell : called with ``NAME: text`` for all that a user must know of the drive; :attr:`Drive.notes` has it too.
     adjust : changes the mapping in effect.
     require_sensors : False reads a log without an IMU, or without any recognised signal, for its truth alone.
@@ -284,7 +284,9 @@ def read_drive(
     ...     [len(window.signals.stamps_ns) for window in drive.windows()], drive.losses
     ([951], ())
     """
-    log_input = log if isinstance(log, LogInput) else one_log(log.url if isinstance(log, RemotePlace) else str(log))
+    car = car if isinstance(car, Car) else Car.load(car)
+    mapping = mapping_of(mapping)
+    log_input = log if isinstance(log, LogInput) else one_log(log, options)
     if log_input.span_s is not None:
         start_s, end_s = log_input.span_s
         options = replace(options, start=f"{start_s:.9f}", end=f"{end_s:.9f}")
@@ -301,8 +303,8 @@ def read_drive(
         for ambiguity in chosen.ambiguities:
             told(str(ambiguity))
         remarks += chosen.remarks
-        if isinstance(opened, SlimLog):
-            remarks.append(f"a slim log stands for {opened.record.file}")
+        if opened.slim is not None:
+            remarks.append(f"a slim log stands for {opened.slim.record.file}")
         used = chosen.mapping
         if adjust is not None:
             used = adjust(opened, used, told)
@@ -335,11 +337,11 @@ def _reopened(log: DriveLog, mapping: Mapping, slice_ns: tuple[int, int], option
     return opened
 
 
-def one_log(argument: str) -> LogInput:
+def one_log(argument: LogPlace | str, options: ReadOptions = _AS_IT_IS) -> LogInput:
     """Return the log that a file, folder or pattern stands for; raises UsageError unless it is one."""
-    inputs = find_logs([argument])
+    inputs = find_logs(argument, private_redirects=options.allow_private_redirects)
     if len(inputs) != 1:
-        raise UsageError(expected="one log", got=f"{len(inputs)} of them", where=argument)
+        raise UsageError(expected="one log", got=f"{len(inputs)} of them", where=str(argument))
     return inputs[0]
 
 

@@ -5,24 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
-from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
-from pdhef_logtool.logs.open_log import metadata_of
 from pdhef_logtool.logs.slim_copy import copy_topics, write_record
 from pdhef_logtool.logs.slim_log import FORMAT, SlimRecord
 from pdhef_logtool.logs.writer import McapLogWriter
-from pdhef_logtool.mapping import Mapping, load_mapping
+from pdhef_logtool.mapping import Mapping, mapping_of
 from pdhef_logtool.mapping.frames import holds_fixed_frames
 from pdhef_logtool.records.documents import jsonable
-from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, PdhefError
+from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, LogError, PdhefError
 from pdhef_logtool.records.outputs import check_no_input
 from pdhef_logtool.records.supervisor import Tell, supervise
 from pdhef_logtool.records.version import __version__
+
+if TYPE_CHECKING:
+    from pdhef_logtool.logs.columnar_log import ColumnarLog
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +76,8 @@ def slim_logs(
     ------
     UsageError, MappingError : There is no log, the mapping is wrong, or an output would replace an input.
     """
-    inputs = find_logs(arguments)
-    sources = None if mapping is None else load_mapping(mapping)
+    inputs = find_logs(arguments, private_redirects=options.allow_private_redirects)
+    sources = mapping_of(mapping)
     targets = [output / f"{log.stem}.mcap" for log in inputs]
     check_no_input([*(log.local for log in inputs), mapping], targets)
     items = [(log, target, sources, options) for log, target in zip(inputs, targets, strict=True)]
@@ -116,10 +117,12 @@ def slim_log(
 
     Raises
     ------
-    PdhefError : Nothing of the log can be read, the mapping names what it lacks, or the file cannot be written.
+    PdhefError : Nothing of the log can be read, it has no messages to keep, the mapping names what it lacks, or the
+        file cannot be written.
     """
     whole = replace(options, start=None, end=None)
     with read_drive(replace(log, span_s=None), Car.load(None), mapping, whole, tell=tell) as drive:
+        _messages_of(drive)
         for _ in drive.windows(fill_friction=False):
             pass
         return write_slim(drive, target)
@@ -127,8 +130,7 @@ def slim_log(
 
 def write_slim(drive: Drive, target: Path) -> SlimRecord:
     """Write the slim log of a drive that was read from start to end, and return its record."""
-    log = drive.log
-    assert isinstance(log, ColumnarLog)
+    log = _messages_of(drive)
     lost, ledgers = log.lost, drive.byte_ledgers  # before the copy, which may look at more than a run does
     record = SlimRecord(
         format=FORMAT,
@@ -142,7 +144,7 @@ def write_slim(drive: Drive, target: Path) -> SlimRecord:
         topics=log.topics,
         losses=tuple(replace(x, where=drive.without_folder(x.where)) for x in lost),
         byte_ledgers=ledgers,
-        metadata=metadata_of(log, drive.options.limits),
+        metadata=log.metadata(),
         mapped=drive.chosen.to_dict(),
         signals_sha256=drive.signals_sha256,
         truth_sha256=drive.truth_sha256,
@@ -156,3 +158,15 @@ def write_slim(drive: Drive, target: Path) -> SlimRecord:
             writer.attachment(name, "text/plain", path.read_bytes(), 0, 0)
         write_record(writer, record)
     return record
+
+
+def _messages_of(drive: Drive) -> ColumnarLog:
+    log = drive.log.messages
+    if log is None:
+        raise LogError(
+            expected="a log of messages, which a slim log keeps",
+            got=f"a log of kind {drive.log.kind}, which has only columns",
+            where=str(drive.path),
+            remedy="read the log itself",
+        )
+    return log

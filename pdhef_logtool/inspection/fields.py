@@ -67,7 +67,7 @@ class FieldsOfLog:
 
 
 def fields_of_log(
-    path: LogPlace, topic: str | None = None, *, budget: Budget = DEFAULT_BUDGET, msgs: Path | None = None
+    path: LogPlace | str, topic: str | None = None, *, budget: Budget = DEFAULT_BUDGET, msgs: Path | str | None = None
 ) -> FieldsOfLog:
     """Read the numbers of a topic, or of all, in a few pieces of the log.
 

@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pdhef_logtool.inspection.report import Inspection, SignalReport, TopicReport
+from pdhef_logtool.logs.byte_account import checksum_text
 from pdhef_logtool.logs.occupied_time import shown_time
 from pdhef_logtool.mapping.candidates import Candidate
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS
@@ -29,6 +30,8 @@ def render_inspection(inspection: Inspection, console: Console) -> None:
         f"{inspection.kind}, {inspection.duration_s:.1f} s from {shown_time(inspection.start_ns)}, {messages} messages "
         f"on {len(inspection.topics)} topics"
     )
+    if text := checksum_text(inspection.checksummed_share):
+        console.print(text)
     if inspection.sample is not None:
         console.print(Text(str(inspection.sample), "cyan"))
     if inspection.topics:

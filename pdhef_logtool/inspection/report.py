@@ -19,9 +19,9 @@ from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_pro
 from pdhef_logtool.inspection.step_statistics import DelayStatistics, StepStatistics, ValueStatistics
 from pdhef_logtool.inspection.uses import uses_of
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
-from pdhef_logtool.logs.columnar_log import ColumnarLog
+from pdhef_logtool.logs.byte_account import checksummed_share
 from pdhef_logtool.logs.container import Wanted
-from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, TopicInfo, windows
+from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, LogIndex, TopicInfo, windows
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping import (
@@ -34,6 +34,7 @@ from pdhef_logtool.mapping import (
     check_mapping,
     clock_key,
     fit_clocks,
+    mapping_of,
     mapping_to_toml,
     merge_losses,
     read_signals,
@@ -159,6 +160,7 @@ class Inspection:
     ambiguities, notes : of the mapping. candidates : fields that were weighed for it.
     checks : what physics says of signals and truth. proposals : corrections of the mapping that are certain.
     lost : every loss and note of reading. sample : what was looked at; None: everything.
+    checksummed_share : which share of the bytes that were read a verified checksum covers; None where none was read.
     """
 
     path: str
@@ -178,6 +180,7 @@ class Inspection:
     lost: tuple[Loss, ...]
     candidates: tuple[Candidate, ...] = ()
     sample: Sample | None = None
+    checksummed_share: float | None = None
 
     @property
     def uses(self) -> MappingABC[str, str]:
@@ -215,6 +218,7 @@ class Inspection:
             "checks": self.checks,
             "proposals": [{"subject": p.subject, "home": p.home, "evidence": p.evidence} for p in self.proposals],
             "lost": self.lost,
+            "checksummed_share": self.checksummed_share,
             "candidates": self.candidates,
             **self.uses,
         }
@@ -222,15 +226,15 @@ class Inspection:
 
 
 def inspect_log(
-    path: LogPlace,
-    mapping: Mapping | None = None,
+    path: LogPlace | str,
+    mapping: Mapping | Path | str | None = None,
     *,
     prefer_truth: Literal["perfect", "rtk"] = "perfect",
     budget: Budget = DEFAULT_BUDGET,
-    msgs: Path | None = None,
+    msgs: Path | str | None = None,
     whole: bool = False,
 ) -> Inspection:
-    """Look a log through and report on it; without a mapping the well-known types are recognised.
+    """Look a log through and report on it; without a mapping (or its file) the well-known types are recognised.
 
     Of a large MCAP whose index agrees with itself values are looked at in a part of the chunks (``sample``), unless
     ``whole``; if anything is wrong in them, or little is left, all of it is read. Memory is bounded by windows of ten
@@ -242,12 +246,15 @@ def inspect_log(
     LogError : The file is no log.
     MappingError : The mapping names what the log does not hold.
     """
+    mapping = mapping_of(mapping)
     if not whole:
         with closing(open_log(path, budget, msgs, Wanted(frozenset(), above_bytes=WHOLE_BYTES))) as log:
-            assert isinstance(log, ColumnarLog)
-            long = log.far or log.end_ns - log.start_ns > 2 * WINDOW_NS  # a shorter one is mostly read anyway
-            by_index = long and log.by_index and log.size > WHOLE_BYTES
-            found = inspect_drive_log(log, mapping, prefer_truth=prefer_truth, by_index=by_index)
+            index = log.index
+            # Most of a shorter one is read anyway.
+            long = index is not None and (index.far or log.end_ns - log.start_ns > 2 * WINDOW_NS)
+            if index is not None and not (long and index.size > WHOLE_BYTES):
+                index = None
+            found = inspect_drive_log(log, mapping, prefer_truth=prefer_truth, index=index)
             damaged = any(loss.severity == "lost" for loss in log.lost)
             if found.sample is None or not (damaged or found.sample.chunks > MOST_SAMPLED * found.sample.of_chunks):
                 return found
@@ -260,9 +267,9 @@ def inspect_drive_log(
     given: Mapping | None = None,
     *,
     prefer_truth: Literal["perfect", "rtk"] = "perfect",
-    by_index: bool = False,
+    index: LogIndex | None = None,
 ) -> Inspection:
-    """Do what :func:`inspect_log` does with a log that is open already; ``by_index`` looks at a sample of it."""
+    """Do what :func:`inspect_log` does with a log that is open already; with its ``index`` a sample of it is read."""
     ambiguities: tuple[Ambiguity, ...] = ()
     candidates: tuple[Candidate, ...] = ()
     if given is None:
@@ -273,7 +280,7 @@ def inspect_drive_log(
         mapping = given
     mapping = resolve_mapping(log, mapping)
     head = (log.start_ns, min(log.end_ns, log.start_ns + WINDOW_NS))
-    look = _sample_look(log, mapping, head) if by_index and isinstance(log, ColumnarLog) else _whole_look(log)
+    look = _whole_look(log) if index is None else _sample_look(log, index, mapping, head)
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
     looked_at = survey_log(log, mapping, clocks, head)
     mapping = looked_at.mapping
@@ -320,6 +327,7 @@ def inspect_drive_log(
         lost=merge_losses([log.lost, reading]),
         candidates=candidates,
         sample=None if look.sample is None else look.sample(),
+        checksummed_share=checksummed_share(log.byte_ledgers),
     )
 
 
@@ -333,13 +341,13 @@ class _Look:
     Attributes
     ----------
     windows : [start, end) that are read. stamps : topics whose times are read there.
-    by_index : the log whose indexes tell the times of all topics; None: what is read tells them.
+    by_index : the index that tells the times of all topics; None: what is read tells them.
     sample : says what was looked at in the end; None: all of the log is.
     """
 
     windows: Iterable[tuple[int, int]]
     stamps: tuple[str, ...]
-    by_index: ColumnarLog | None = None
+    by_index: LogIndex | None = None
     sample: Callable[[], Sample] | None = None
 
 
@@ -347,16 +355,16 @@ def _whole_look(log: DriveLog) -> _Look:
     return _Look(windows(log.start_ns, log.end_ns, WINDOW_NS, log.occupied), tuple(t.name for t in log.topics))
 
 
-def _sample_look(log: ColumnarLog, mapping: Mapping, head: tuple[int, int]) -> _Look:
+def _sample_look(log: DriveLog, index: LogIndex, mapping: Mapping, head: tuple[int, int]) -> _Look:
     """Look at what the clocks are fitted to, evenly over the log. With the head, which is checked, it is expected."""
     mapped = {source.topic for source in mapping.sources()}
     spread = survey_windows(log.start_ns, log.end_ns) if log.end_ns > head[1] else [head]
-    log.expect(mapped, [head, *spread])
+    index.expect(mapped, [head, *spread])
 
     def sample() -> Sample:
-        return Sample(*log.looked_at, times="sample" if log.far else "index")
+        return Sample(*index.looked_at, times="sample" if index.far else "index")
 
-    return _Look(spread, tuple(sorted(log.beside(mapped))), None if log.far else log, sample)
+    return _Look(spread, tuple(sorted(index.beside(mapped))), None if index.far else index, sample)
 
 
 # ---------------------------------------------------------------------------------------------- gathering

@@ -21,9 +21,9 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import MAX_BYTES, Drive, Tell, WholeDrive, lost_texts
 from pdhef_logtool.drive.windows import DrivePlan
 from pdhef_logtool.learning.noise.search import scorable_stamps
-from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import load_mapping
+from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
 from pdhef_logtool.records.outputs import check_no_input
 from pdhef_logtool.records.signals import Loss
@@ -114,7 +114,7 @@ def check_file_output(inputs: Sequence[LogInput], config: RunConfig, output: Pat
 
 def open_mapping(config: RunConfig) -> SignalMapping | None:
     """Return the mapping that is configured, None without."""
-    return None if config.mapping is None else load_mapping(config.mapping)
+    return mapping_of(config.mapping)
 
 
 def record_head(kind: str, version: int, settings: LearnSettings, car: Car) -> dict[str, Any]:
@@ -129,9 +129,7 @@ def record_head(kind: str, version: int, settings: LearnSettings, car: Car) -> d
     }
 
 
-def choose_drives(
-    inputs: Sequence[LogInput], choice: LearnSettings, refusal: Refusal
-) -> tuple[list[LogInput], dict[str, str]]:
+def choose_drives(arguments: Logs, choice: LearnSettings, refusal: Refusal) -> tuple[list[LogInput], dict[str, str]]:
     """Return the logs to take, and by name the split that the manifest of a set beside a log gives it.
 
     Raises
@@ -139,6 +137,7 @@ def choose_drives(
     UsageError
         A drive is of a refused split, or none is left.
     """
+    inputs = find_logs(arguments, private_redirects=choice.config.allow_private_redirects)
     manifests = cache(set_manifest)
     splits = {i.stem: str(manifests(i.folder).get(i.path.name, {}).get("split") or "") for i in inputs}
     if choice.split is not None:

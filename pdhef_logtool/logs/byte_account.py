@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 _Extent = tuple[int, int]
@@ -19,6 +19,8 @@ class ByteLedger:
     unwanted : sound as far as is known, and never asked for: attachments, metadata, index, other topics' chunks.
     lost : damaged, cut, above the budget. Where the place of damage is not known, the record that tells of it.
     cut : the file ends before its time. What should follow is in no sum.
+    checksummed : of ``decoded``, the bytes that a checksum of the file covers and that agree with it; None in a record
+        of an earlier version.
 
     In a database the rows' data count, one row behind the other; all else of the file is unwanted while rows can be
     read to the end, and lost where they cannot.
@@ -30,6 +32,42 @@ class ByteLedger:
     unwanted: int
     lost: int
     cut: bool
+    checksummed: int | None = None
+
+
+def checksummed_share(ledgers: Sequence[ByteLedger]) -> float | None:
+    """Return which share of the bytes that were read a verified checksum covers; None where that is not known."""
+    decoded = sum(ledger.decoded for ledger in ledgers)
+    known = [ledger.checksummed for ledger in ledgers if ledger.checksummed is not None]
+    return sum(known) / decoded if decoded and len(known) == len(ledgers) else None
+
+
+def checksum_text(share: float | None) -> str:
+    """Return :func:`checksummed_share` as a sentence; empty where it is not known."""
+    if share is None:
+        return ""
+    if not share:
+        return "No checksum of the file covers the bytes that were read."
+    return f"A checksum of the file covers {100.0 * share:.3g} % of the bytes that were read, and agrees with them."
+
+
+class _Extents:
+    """Extents, of which neighbours are joined where they come one after the other."""
+
+    def __init__(self) -> None:
+        self._found: set[_Extent] = set()
+        self._last: _Extent = (0, 0)
+
+    def add(self, start: int, end: int) -> None:
+        if start == self._last[1]:
+            self._last = (self._last[0], end)
+        else:
+            self._found.add(self._last)
+            self._last = (start, end)
+
+    def __iter__(self) -> Iterator[_Extent]:
+        yield from self._found
+        yield self._last
 
 
 class ByteAccount:
@@ -43,17 +81,17 @@ class ByteAccount:
     def __init__(self, size: int) -> None:
         self.size = size
         self.cut = False
-        self._decoded: set[_Extent] = set()
+        self._decoded = _Extents()
+        self._verified = _Extents()
         self._lost: set[_Extent] = set()
-        self._last: _Extent = (0, 0)  # neighbours are joined as they come
 
     def decode(self, start: int, end: int) -> None:
         """Note that bytes [start, end) were read."""
-        if start == self._last[1]:
-            self._last = (self._last[0], end)
-            return
-        self._decoded.add(self._last)
-        self._last = (start, end)
+        self._decoded.add(start, end)
+
+    def verify(self, start: int, end: int) -> None:
+        """Note that bytes [start, end) agree with a checksum of the file."""
+        self._verified.add(start, end)
 
     def lose(self, start: int, end: int) -> None:
         """Note that bytes [start, end) are lost: at least one, wherever the file has any."""
@@ -68,8 +106,11 @@ class ByteAccount:
     def ledger(self, file: str) -> ByteLedger:
         """Add up what there is by now."""
         lost = self._covered(self._lost)
-        decoded = self._covered([*self._lost, *self._decoded, self._last]) - lost
-        return ByteLedger(file, self.size, decoded, self.size - decoded - lost, lost, self.cut)
+        decoded = self._covered([*self._lost, *self._decoded]) - lost
+        verified = self._covered([*self._lost, *self._verified]) - lost
+        either = self._covered([*self._lost, *self._decoded, *self._verified]) - lost
+        unwanted = self.size - decoded - lost
+        return ByteLedger(file, self.size, decoded, unwanted, lost, self.cut, decoded + verified - either)
 
     def _covered(self, extents: Iterable[_Extent]) -> int:
         """Return how many bytes of the file the extents cover together."""

@@ -7,13 +7,14 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
 from pdhef_logtool.logs.budget import BudgetError
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.byte_source import SourceError
-from pdhef_logtool.logs.container import Block, ChannelRecord, Container, Span, told
+from pdhef_logtool.logs.container import UNVERIFIED, Block, ChannelRecord, Container, Span, told
 from pdhef_logtool.logs.decoding import (
     ChannelDecoder,
     channel_schema,
@@ -22,7 +23,7 @@ from pdhef_logtool.logs.decoding import (
     missing_column,
 )
 from pdhef_logtool.logs.definitions import SHIPPED
-from pdhef_logtool.logs.drive_log import Columns, FieldInfo, TopicInfo
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, FieldInfo, TopicInfo, nearest
 from pdhef_logtool.logs.message_schema import (
     MessageSchema,
     MissingDefinitionError,
@@ -42,8 +43,8 @@ from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 _KEPT_SPANS, _KEPT_BYTES = 2, 8 << 20
 
 
-class ColumnarLog:
-    """See :class:`~pdhef_logtool.logs.drive_log.DriveLog`.
+class ColumnarLog(DriveLog):
+    """Messages of containers as columns; see :class:`~pdhef_logtool.logs.drive_log.DriveLog`.
 
     Parameters
     ----------
@@ -52,15 +53,23 @@ class ColumnarLog:
     containers : the log's files in order of recording.
     lost : damage found while the log was opened, beside the containers' own.
     distro : ROS distribution for types without definitions.
+    custom : metadata of the log beside the containers' records.
     """
 
     def __init__(
-        self, path: LogPlace, kind: str, containers: Sequence[Container], lost: Sequence[Loss] = (), distro: str = ""
+        self,
+        path: LogPlace,
+        kind: str,
+        containers: Sequence[Container],
+        lost: Sequence[Loss] = (),
+        distro: str = "",
+        custom: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self.path = path
         self.kind = kind
         self.containers = tuple(containers)
         self._opened_lost = tuple(lost)
+        self._custom = custom
         self.distro = distro
         self.definitions = SHIPPED  # of types that the log does not define; set before anything is read
         self._damaged: dict[tuple[int, int], Loss] = {}
@@ -97,16 +106,6 @@ class ColumnarLog:
                         counts[names[id_]] += n
         firsts = ((name, channels[0][1]) for name, channels in sorted(self._by_topic.items()))
         return tuple(TopicInfo(name, first.type_name, first.encoding, counts[name]) for name, first in firsts)
-
-    @property
-    def start_ns(self) -> int:
-        """First log time that counts; 0 for a log without messages."""
-        return self.occupied.start_ns
-
-    @property
-    def end_ns(self) -> int:
-        """Last log time that counts + 1; 0 for a log without messages."""
-        return self.occupied.end_ns
 
     @property
     def occupied(self) -> OccupiedTime:
@@ -165,9 +164,23 @@ class ColumnarLog:
             yield Loss("undecodable", what, container.channels[channel].topic, count=n)
 
     @property
-    def by_index(self) -> bool:
-        """Whether everything but the content of chunks is known, and nothing of it is odd."""
-        return all(container.by_index for container in self.containers) and not self.lost
+    def messages(self) -> ColumnarLog | None:
+        """The log itself."""
+        return self
+
+    @property
+    def index(self) -> ColumnarLog | None:
+        """The log itself where everything but the content of chunks is known, and nothing of it is odd."""
+        sound = all(container.by_index for container in self.containers)
+        return self if sound and all(loss.kind == UNVERIFIED for loss in self.lost) else None
+
+    def metadata(self) -> dict[str, str]:
+        """Return the entries of metadata records by ``key`` and ``record.key``, and rosbag2's ``custom_data``."""
+        found: dict[str, str] = {}
+        for container in self.containers:
+            for record in container.metadata_records():
+                found |= {**record.values, **{f"{record.name}.{key}": value for key, value in record.values.items()}}
+        return found | dict(self._custom)
 
     @property
     def far(self) -> bool:
@@ -428,7 +441,7 @@ class ColumnarLog:
         decoders: dict[tuple[int, int], ChannelDecoder] = {}
         problems: list[MappingError] = []
         if topic not in self._by_topic:
-            raise self._no_such_topic(topic)
+            raise nearest(topic, sorted(self._by_topic), "a topic of the log", self.path)
         for c, channel in self._by_topic[topic] if paths else ():
             schema = self.schema_of(c, channel)
             if isinstance(schema, SchemaError):
@@ -452,18 +465,6 @@ class ColumnarLog:
         selections = next(iter(decoders.values())).selections if decoders else ()
         self._plans[topic, paths] = _Plan(selections, decoders)
         return self._plans[topic, paths]
-
-    def _no_such_topic(self, topic: str) -> MappingError:
-        import difflib
-
-        names = sorted(self._by_topic)
-        near = difflib.get_close_matches(topic, names, n=3, cutoff=0.3) or names[:5]
-        return MappingError(
-            expected="a topic of the log",
-            got=repr(topic),
-            where=str(self.path),
-            remedy=f"nearest: {', '.join(near)}" if near else "the log has no topics",
-        )
 
     def _collect(self, plans: Mapping[str, _Plan], start_ns: int | None, end_ns: int | None) -> dict[str, Columns]:
         parts: dict[str, list[Columns]] = {topic: [] for topic in plans}

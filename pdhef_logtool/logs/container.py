@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -17,12 +18,17 @@ from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import IntArray, Loss
 
+if TYPE_CHECKING:
+    from pdhef_logtool.logs.formats import LogFile
+
 # What the files of each format begin with.
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
 SQLITE_MAGIC = b"SQLite format 3\0"
 #: Log times above this (unsigned in the file) cannot be held in int64 and are set to it.
 MAX_TIME_NS = int(np.iinfo(np.int64).max) - 1
+#: Kind of the note that a checksum of a file was not verified, as not all that it covers was read.
+UNVERIFIED = "unverified"
 _LOSSES_OF_A_KIND = 20  # of one file; what comes behind them is told as one
 _IDS_TOLD = 5
 _TOLD_CHARACTERS = 300
@@ -340,6 +346,11 @@ class FileContainer(Container):
         except BaseException:
             self.source.close()
             raise
+
+    @classmethod
+    def open(cls, file: LogFile) -> Self:
+        """Open a file of this format."""
+        return cls(file.path, file.place, file.meter)
 
     def _open(self) -> None:
         """Walk the file. What escapes the walk loses the rest of the file from there on."""

@@ -86,7 +86,7 @@ def _of_machine(prefixes: str, sources: str) -> Definitions:
     )
 
 
-def read_definitions(place: Path | None) -> Definitions:
+def read_definitions(place: Path | str | None) -> Definitions:
     """Find the definitions in a folder of ``.msg`` files, of packages, in a workspace, a zip file or a wheel.
 
     ``PACKAGE/msg/Name.msg`` and ``PACKAGE/Name.msg`` are ``PACKAGE/msg/Name``; a file that lies in the folder itself
@@ -100,6 +100,7 @@ def read_definitions(place: Path | None) -> Definitions:
     machine = _of_machine(prefixes, os.environ.get(_SOURCES, ""))
     if place is None:
         return machine
+    place = Path(place)
     archive = place if place.is_file() and zipfile.is_zipfile(place) else None
     if archive is None:
         files = _named(sorted(place.rglob("*.msg")) if place.is_dir() else (), place)

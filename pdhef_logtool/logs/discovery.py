@@ -12,15 +12,13 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, takewhile
 from pathlib import Path
+from typing import TypeAlias
 
 from pdhef_logtool.logs.byte_source import require_regular
+from pdhef_logtool.logs.formats import COMPRESSED_SUFFIXES, ROSBAG2_METADATA, log_suffixes
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
-from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.errors import LogError, UsageError
 
-#: Suffixes that a search through folders takes for logs; a file that is named outright may have any.
-LOG_SUFFIXES = (".mcap", ".bag", ".db3")
-COMPRESSED_SUFFIXES = (".zstd", ".zst")
-ROSBAG2_METADATA = "metadata.yaml"
 #: Stems are folder names on whatever system the outputs go to.
 _STEM_BYTES = 100
 _NOT_IN_NAMES = frozenset('<>:"/\\|?*')
@@ -52,29 +50,32 @@ class LogInput:
         return self.path.parent if isinstance(self.path, Path) else None
 
 
-#: Logs as people name them, or as a command has found and cut them.
-Logs = Sequence[str] | Sequence[LogInput]
+#: A log or several, as people name them, or as a command has found and cut them.
+Logs: TypeAlias = "str | LogPlace | Sequence[str | LogPlace] | Sequence[LogInput]"
 
 
-def find_logs(arguments: Logs) -> list[LogInput]:
+def find_logs(arguments: Logs, *, private_redirects: bool = False) -> list[LogInput]:
     """Expand what names logs to logs in a stable order; each log once. What was found stays as it is.
 
     A file or rosbag2 folder that is named outright is taken as it is, whether it is readable or not. Folders, and
     ``s3://bucket/prefix/``, are searched for logs by suffix; a rosbag2 folder of this machine counts as one log. Any
-    other URL is one log. ``@list.txt`` stands for the lines of a file.
+    other URL is one log. ``@list.txt`` stands for the lines of a file. ``private_redirects`` as for
+    :class:`~pdhef_logtool.logs.remote_place.RemotePlace`.
 
     Raises
     ------
     UsageError : An argument stands for no log at all. LogError : A store cannot be searched.
     """
     found: dict[str, LogPlace] = {}
-    if already := [a for a in arguments if isinstance(a, LogInput)]:
+    several = [arguments] if isinstance(arguments, str | Path | RemotePlace) else arguments
+    if already := [a for a in several if isinstance(a, LogInput)]:
         return already
-    for argument in chain.from_iterable(map(_lines, map(str, arguments))):
-        places = list(_expand(argument))
+    named = (a.url if isinstance(a, RemotePlace) else str(a) for a in several)
+    for argument in chain.from_iterable(map(_lines, named)):
+        places = list(_expand(argument, private_redirects))
         if not places:
             raise UsageError(
-                expected="at least one log (.mcap, .bag, .db3 or a rosbag2 folder)",
+                expected=f"at least one log ({', '.join(log_suffixes())} or a rosbag2 folder)",
                 got="none",
                 where=str(place_of(argument)),
                 remedy="name a log, a folder that holds some, or a glob pattern in quotes",
@@ -93,8 +94,10 @@ def with_free_stem(log: LogInput, taken: Container[str]) -> LogInput:
     return replace(log, stem=next(stem for stem in made if as_taken(stem) not in taken))
 
 
-def one_place(argument: str) -> LogPlace:
+def one_place(argument: str, *, private_redirects: bool = False) -> LogPlace:
     """Return the place that an argument names outright; ``@list.txt`` may stand for it.
+
+    ``private_redirects`` as for :class:`~pdhef_logtool.logs.remote_place.RemotePlace`.
 
     Raises
     ------
@@ -103,7 +106,7 @@ def one_place(argument: str) -> LogPlace:
     lines = list(_lines(argument))
     if len(lines) != 1:
         raise UsageError(expected="one log", got=f"{len(lines)} of them", where=argument)
-    return place_of(lines[0])
+    return place_of(lines[0], private_redirects=private_redirects)
 
 
 def _lines(argument: str) -> Iterator[str]:
@@ -135,10 +138,15 @@ def identity_of(log: LogInput) -> str:
 
     Raises
     ------
-    LogError : It is neither a folder nor a regular file, or an object that cannot be asked for.
+    LogError : It is neither a folder nor a regular file, cannot be read, or is an object that cannot be asked for.
     """
     if isinstance(log.path, Path):
-        return hash_log(log.path)
+        try:
+            return hash_log(log.path)
+        except OSError as error:
+            got = error.strerror or str(error)
+            remedy = "check the path and its permissions"
+            raise LogError(expected="a readable log", got=got, where=str(log.path), remedy=remedy) from error
     from pdhef_logtool.logs.remote_source import RemoteSource
 
     source = RemoteSource(log.path, head_bytes=1)
@@ -167,8 +175,8 @@ def hash_log(path: Path) -> str:
     return total.hexdigest()
 
 
-def _expand(argument: str) -> Iterator[LogPlace]:
-    place = place_of(argument)
+def _expand(argument: str, private_redirects: bool) -> Iterator[LogPlace]:
+    place = place_of(argument, private_redirects=private_redirects)
     if isinstance(place, RemotePlace):
         yield from (
             _search_store(place) if place.scheme == "s3" and (not place.key or argument.endswith("/")) else (place,)
@@ -238,7 +246,7 @@ def _bare_name(name: str) -> str:
     bare = name
     for suffix in COMPRESSED_SUFFIXES:
         bare = bare.removesuffix(suffix)
-    for suffix in LOG_SUFFIXES:
+    for suffix in log_suffixes():
         if bare.endswith(suffix) and bare != suffix:
             return bare.removesuffix(suffix)
     return name

@@ -1,18 +1,30 @@
-"""What every log reader offers: topics, field types, and columns of the fields asked for, in windows of log time."""
+"""The interface of log formats: topics, field types, and columns of the requested fields, in windows of log time.
+
+A format implements :class:`DriveLog`, or gives its columns to :class:`~pdhef_logtool.logs.table_log.TableLog`, and is
+listed in :mod:`~pdhef_logtool.logs.formats`. What only some logs can do (copies of messages, an index) is a capability:
+a property that is None by default.
+"""
 
 from __future__ import annotations
 
+import difflib
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.occupied_time import OccupiedTime
 from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import IntArray, Loss
+
+if TYPE_CHECKING:
+    from pdhef_logtool.logs.columnar_log import ColumnarLog
+    from pdhef_logtool.logs.slim_log import SlimLog
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +33,7 @@ class TopicInfo:
 
     name: str
     type_name: str
-    encoding: str  # "cdr" | "ros1" | "json" | "protobuf" | ...
+    encoding: str  # of its messages: "cdr" | "ros1" | "json" | "protobuf" | ...; of tables the kind of log
     messages: int
 
 
@@ -32,12 +44,14 @@ class FieldInfo:
     ``path`` is dotted (``linear_acceleration.x``); fixed arrays appear as ``name[i]`` per element when they have at
     most 16 elements, sequences as ``name[]``. ``kind`` is ``number``, ``bool``, ``string`` or ``time`` (a ROS
     builtin time, whose path names the whole struct, for example ``header.stamp``). ``code`` is NumPy's of a number in a
-    binary message (``f4``), empty where the encoding has no such types.
+    binary message (``f4``), empty where the encoding has no such types. ``unit`` is the text that the file gives
+    (``km/h``), empty where it gives none.
     """
 
     path: str
     kind: str
     code: str = field(default="", compare=False)
+    unit: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,59 +76,71 @@ class Columns:
         return int(self.log_time_ns.shape[0])
 
 
-class DriveLog(Protocol):
-    """A readable log. Instances come from :func:`pdhef_logtool.logs.open_log.open_log`."""
+class LogIndex(Protocol):
+    """What a sound index tells of a log before its messages are read."""
 
     @property
-    def path(self) -> LogPlace:
-        """The file, folder or object."""
+    def far(self) -> bool:
+        """Whether each read costs a network request."""
 
     @property
-    def kind(self) -> str:
-        """``mcap``, ``rosbag1``, ``rosbag2-sqlite3`` or ``rosbag2-mcap``."""
+    def size(self) -> int:
+        """Bytes of all files."""
 
     @property
+    def looked_at(self) -> tuple[int, int]:
+        """Number of chunks that were read, and of all chunks."""
+
+    def index_times(self, start_ns: int, end_ns: int) -> dict[str, IntArray]:
+        """Return each topic's log times in [start, end), ascending."""
+
+    def beside(self, topics: Collection[str]) -> frozenset[str]:
+        """Return the topics whose messages all lie in chunks that hold one of these: they cost no further read."""
+
+    def expect(self, topics: Collection[str], spans_ns: Sequence[tuple[int, int]]) -> None:
+        """Prepare to read these topics in [start, end) of each span."""
+
+
+class DriveLog(ABC):
+    """A readable log. Instances come from :func:`pdhef_logtool.logs.open_log.open_log`.
+
+    Attributes
+    ----------
+    path : file, folder or object.
+    kind : name of the format, for reports: ``mcap``, ``rosbag1``, ``rosbag2-sqlite3``, ``rosbag2-mcap``, ...
+    """
+
+    path: LogPlace
+    kind: str
+
+    @property
+    @abstractmethod
     def topics(self) -> tuple[TopicInfo, ...]:
         """All topics, by name."""
 
     @property
-    def start_ns(self) -> int:
-        """First log time that counts; 0 for a log without messages."""
-
-    @property
-    def end_ns(self) -> int:
-        """Last log time that counts + 1 (intervals are [start, end)); 0 for a log without messages."""
-
-    @property
+    @abstractmethod
     def occupied(self) -> OccupiedTime:
         """When the log was recorded; what was recorded at other times is never read."""
 
     @property
+    @abstractmethod
     def lost(self) -> tuple[Loss, ...]:
         """What could not be read, as far as is known by now (complete after a full read)."""
 
     @property
+    @abstractmethod
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:
         """Where the bytes of each file went, as far as is known by now."""
 
+    @abstractmethod
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
-        """Return the scalar leaves of a topic's schema; empty when the encoding carries none.
+        """Return the scalar leaves of a topic; empty where none is known.
 
         ``quiet`` only looks: a schema that does not parse is no loss then.
         """
 
-    def unreadable(self, topic: str) -> str:
-        """Return why no field of a topic is known; empty where one is."""
-
-    def borrowed(self, topic: str) -> tuple[Path, ...]:
-        """Return the files of an installed ROS that a topic's type is read by, as the log does not define it."""
-
-    def first_messages(self, topic: str, most: int) -> list[object]:
-        """Return the first messages of a topic whole, with their texts; what does not decode is left out.
-
-        ``value_at`` of ``message_schema`` reads places in them.
-        """
-
+    @abstractmethod
     def read(
         self,
         requests: Mapping[str, Sequence[str]],
@@ -124,17 +150,73 @@ class DriveLog(Protocol):
         quiet: bool = False,
         stamps: Collection[str] = (),
     ) -> dict[str, Columns]:
-        """Read the fields asked for of messages with log time in [start, end). Unasked topics are not decoded.
+        """Read the requested fields of messages with log time in [start, end). No other topic is decoded.
 
         ``quiet`` only looks: messages that do not decode are no loss then. ``stamps`` are further topics, of which
         only the times are read.
+
+        Raises
+        ------
+        MappingError : the log has no such topic, no such field, or cannot decode the topic.
         """
 
-    def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:
-        """Read only log and publish times of every topic (``fields`` empty); payloads are not decoded."""
-
+    @abstractmethod
     def close(self) -> None:
         """Release the files."""
+
+    @property
+    def start_ns(self) -> int:
+        """First log time that counts; 0 for a log without messages."""
+        return self.occupied.start_ns
+
+    @property
+    def end_ns(self) -> int:
+        """Last log time that counts + 1 (intervals are [start, end)); 0 for a log without messages."""
+        return self.occupied.end_ns
+
+    @property
+    def messages(self) -> ColumnarLog | None:
+        """The log as messages whose bytes can be copied to another file; None: it has columns only."""
+        return None
+
+    @property
+    def index(self) -> LogIndex | None:
+        """What an index tells; None: there is none, or none that is sound."""
+        return None
+
+    @property
+    def slim(self) -> SlimLog | None:
+        """The log as a slim log, with the record of its source; None: it is a source itself."""
+        return None
+
+    def metadata(self) -> dict[str, str]:
+        """Return what the log says of itself by ``key`` and ``record.key``."""
+        return {}
+
+    def unreadable(self, topic: str) -> str:
+        """Return why no field of a topic is known; empty where one is."""
+        del topic
+        return ""
+
+    def borrowed(self, topic: str) -> tuple[Path, ...]:
+        """Return the files of an installed ROS that a topic's type is read by, as the log does not define it."""
+        del topic
+        return ()
+
+    def first_messages(self, topic: str, most: int) -> list[object]:
+        """Return the first messages of a topic whole, with their texts; what does not decode is left out.
+
+        ``value_at`` of ``message_schema`` reads places in them.
+        """
+        del topic, most
+        return []
+
+
+def nearest(name: str, names: Sequence[str], expected: str, where: object) -> MappingError:
+    """Return the error for a topic or field that is not among these names."""
+    near = difflib.get_close_matches(name, names, n=3, cutoff=0.3) or list(names[:5])
+    remedy = f"nearest: {', '.join(near)}" if near else "the log has no topics"
+    return MappingError(expected=expected, got=repr(name), where=str(where), remedy=remedy)
 
 
 def windows(

@@ -34,6 +34,7 @@ from pdhef_logtool.logs.container import (
     EVERYTHING,
     MAX_TIME_NS,
     MCAP_MAGIC,
+    UNVERIFIED,
     Attachment,
     Block,
     ChannelRecord,
@@ -46,10 +47,10 @@ from pdhef_logtool.logs.container import (
     block_from_lists,
     told,
 )
-from pdhef_logtool.logs.mcap_index import RECORD, IndexedChunk, read_index
+from pdhef_logtool.logs.mcap_index import FOOTER, RECORD, IndexedChunk, read_index
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.type_names import ros2_type_name
-from pdhef_logtool.records.signals import IntArray
+from pdhef_logtool.records.signals import IntArray, Loss
 
 UintArray: TypeAlias = NDArray[np.uint64]
 
@@ -170,7 +171,7 @@ class McapContainer(FileContainer):
         self.far = self.source.far
         chunked = bool(self._extents) and all(extent.is_chunk for extent in self._extents)
         known = self._index_believed if self.far else self._walked.statistics is not None
-        self.by_index = chunked and known and not self._misled and not self.lost
+        self.by_index = chunked and known and not self._misled and all(x.kind == UNVERIFIED for x in self.lost)
 
     def _believed(self) -> dict[int, IndexedChunk | tuple[int, int]]:
         """Return the chunks and attachments that are not wanted by their place, and have all else fetched."""
@@ -289,6 +290,8 @@ class McapContainer(FileContainer):
             return self._scan(self.source.read(extent.at, extent.end - extent.at))
         record = self.source.read(extent.at, extent.index_end - extent.at)
         content = self.chunk_content(record, extent.end - extent.at)
+        if _chunk_head(record, extent.end - extent.at)[1]:  # its message indexes are held against its content
+            self.account.verify(extent.at, extent.index_end)
         block = _indexed_messages(content, record, extent.end - extent.at)
         block = self._scan(content) if block is None else block
         budget.check_messages(len(block), extent.end - extent.at)
@@ -394,11 +397,8 @@ class McapContainer(FileContainer):
         log_time = np.minimum(np.concatenate([times for _, times, _ in indexes]), np.uint64(MAX_TIME_NS))
         return channel, log_time.astype(np.int64)
 
-    def crc_up_to(self, end: int) -> int:
-        """Return the CRC of the file's first bytes."""
-        return self._crc(0, end)
-
-    def _crc(self, start: int, end: int) -> int:
+    def crc(self, start: int, end: int) -> int:
+        """Return the CRC-32 of bytes [start, end)."""
         crc: int = 0
         for at in range(start, end, _CRC_BLOCK_BYTES):
             crc = zlib.crc32(self.source.read(at, min(_CRC_BLOCK_BYTES, end - at)), crc)
@@ -433,10 +433,12 @@ class McapContainer(FileContainer):
         if place + 4 > end:
             raise SpanDamageError("it runs past its end")
         (crc,) = _U32.unpack(source.read(place, 4))
-        if crc and self._crc(at + 9, place) != crc:
+        if crc and self.crc(at + 9, place) != crc:
             self.lose("bad-attachment", f"attachment {name!r} has a wrong CRC", count=1)
             self.account.lose(at, end)
             return
+        if crc:
+            self.account.verify(at, end)
         self.add_attachment(at, end)
 
     def add_attachment(self, at: int, end: int) -> None:
@@ -538,6 +540,8 @@ class _Walk:
         self.cut_off = False
         self.data_end: tuple[int, int] | None = None  # extent of the record
         self.data_crc = 0
+        self.footer: tuple[int, int] | None = None  # extent of the record
+        self.bare_chunks = False  # whether any chunk has no CRC of its own
         self.run: tuple[int, int] | None = None  # extent of consecutive unchunked messages
         self.run_times = (0, 0)
         self.run_counts: Counter[int] = Counter()
@@ -569,7 +573,8 @@ class _Walk:
             return
         self._end_run()
         if opcode == _OP_CHUNK:
-            first, last, size, _ = _CHUNK.unpack(source.read(at + 9, _CHUNK.size))
+            first, last, size, crc = _CHUNK.unpack(source.read(at + 9, _CHUNK.size))
+            self.bare_chunks |= bool(size and not crc)
             self.chunk, self.index_end = (at, end), end
             self.head = (min(first, MAX_TIME_NS), min(last, MAX_TIME_NS), size)
             self.index_counts, self.index_at, self.index_sound = Counter(), [], True
@@ -581,6 +586,8 @@ class _Walk:
             of.note_metadata(at, end)
         elif opcode == _OP_STATISTICS and self.data_end:
             self._statistics(at, end)
+        elif opcode == Opcode.FOOTER and self.data_end:
+            self.footer = (at, end)
         elif opcode < _FIRST_PRIVATE and (opcode not in _SUMMARY_ONLY or not self.data_end):
             raise SpanDamageError(f"no record of kind {opcode} may stand here")
         elif opcode - _FIRST_PRIVATE == _OP_CHUNK and self._is_chunk(at, end):
@@ -688,15 +695,43 @@ class _Walk:
         self.of.account.decode(at, end)
 
     def _check_data(self) -> None:
-        """Check the CRC of the data section where nothing else protects the messages, or tells of missing ones."""
+        """Check the CRC of the data section where nothing else protects the messages, or tells of missing ones.
+
+        Where other damage was found already, it would tell nothing new.
+        """
         of = self.of
         if self.data_end is None or not self.data_crc or of.lost:
             return
-        protected = self.statistics is not None and all(extent.is_chunk for extent in of._extents)
-        if not protected and of.crc_up_to(self.data_end[0]) != self.data_crc:
-            what = "the CRC of the data section does not match: some messages are damaged or missing"
+        in_chunks = all(extent.is_chunk for extent in of._extents)
+        if self.statistics is not None and in_chunks and not self.bare_chunks:
+            return
+        if of._index_believed:
+            what = "the CRC of the data section was not verified, as not all of the log was read"
+            of.lost.append(Loss(UNVERIFIED, what, str(of.path), severity="note"))
+        elif of.crc(0, self.data_end[0]) == self.data_crc:
+            of.account.verify(0, self.data_end[1])
+        else:
+            what = (
+                "the CRC of the data section does not match: some messages are damaged or missing, and nothing tells "
+                "which; what can be decoded is used"
+            )
             of.lose("bad-data-crc", what)
             of.account.lose(*self.data_end)
+
+    def _check_summary(self) -> None:
+        """Check the CRC of the summary, from which no message is read: damage of it is a note."""
+        of = self.of
+        if self.data_end is None or self.footer is None or of.lost:
+            return
+        at, end = self.footer
+        _, _, start, _, crc = FOOTER.unpack(of.source.read(at, FOOTER.size))
+        if not crc or not self.data_end[1] <= start <= at:
+            return
+        if of.crc(start, at + FOOTER.size - 4) == crc:
+            of.account.verify(start, end)
+        else:
+            what = "the CRC of the summary does not match: its index is damaged, from which no message was read"
+            of.lost.append(Loss("bad-summary-crc", what, str(of.path), severity="note"))
 
     def _statistics(self, at: int, end: int) -> None:
         """Note how many messages the file claims by channel."""
@@ -766,6 +801,7 @@ class _Walk:
         if self.statistics is not None:
             of.check_statistics(*self.statistics)
             of.resolve_channels()
+        self._check_summary()
         of.drop_undeclared("channels {}")
 
 

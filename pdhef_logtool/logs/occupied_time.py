@@ -168,19 +168,7 @@ def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> Occ
     times : reads the times of a span. where : what losses call the log.
     """
     look = _look(containers, times)
-    pieces = [piece for of in look for piece in of.pieces()]
-    start, end, count = (np.array([p[i] for p in pieces], dtype=np.int64) for i in (0, 1, 2))
-    intervals, kept, stray = find_epochs(start, end, count)
-    left_out: dict[str, Counter[str]] = {}
-    losses = []
-    total = int(count.sum())
-    for reason, which in ((OUTLIER, stray), (OTHER_EPOCH, ~kept & ~stray)):
-        for i in np.flatnonzero(which).tolist():
-            for topic, n in pieces[i][3].items():
-                left_out.setdefault(topic, Counter())[reason] += n
-        if count[which].any():
-            rows = np.flatnonzero(which)
-            losses.append(_loss(reason, where, start[rows], end[rows], int(count[rows].sum()), total))
+    intervals, left_out, losses, total = _kept_epoch(look, where)
     cuts = _cuts(look, intervals)
     twice: list[IntArray] = []
     for c, span in ((c, span) for c, of in enumerate(containers) for span in of.spans) if cuts else ():
@@ -198,6 +186,34 @@ def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> Occ
         all_of_it = np.concatenate(twice)
         losses.append(_loss(TIME_JUMP, where, all_of_it, all_of_it + 1, all_of_it.size, total))
     return OccupiedTime(tuple(intervals), tuple(cuts), left_out, tuple(losses))
+
+
+def survey_stamps(stamps_ns: Mapping[str, IntArray], where: str) -> OccupiedTime:
+    """Find the times of a log from all log times [N] of each topic; ``where`` as for :func:`survey`."""
+    none = Span(0, 0, 0, {})
+    look = [_Looked(0, none, {0: t}, (np.zeros(len(s), np.int64), s)) for t, s in stamps_ns.items() if len(s)]
+    intervals, left_out, losses, _ = _kept_epoch(look, where)
+    return OccupiedTime(tuple(intervals), left_out=left_out, losses=tuple(losses))
+
+
+def _kept_epoch(
+    look: Sequence[_Looked], where: str
+) -> tuple[list[tuple[int, int]], dict[str, Counter[str]], list[Loss], int]:
+    """Return the intervals that are kept, the messages left out by topic and reason, their losses, and all messages."""
+    pieces = [piece for of in look for piece in of.pieces()]
+    start, end, count = (np.array([p[i] for p in pieces], dtype=np.int64) for i in (0, 1, 2))
+    intervals, kept, stray = find_epochs(start, end, count)
+    left_out: dict[str, Counter[str]] = {}
+    losses = []
+    total = int(count.sum())
+    for reason, which in ((OUTLIER, stray), (OTHER_EPOCH, ~kept & ~stray)):
+        for i in np.flatnonzero(which).tolist():
+            for topic, n in pieces[i][3].items():
+                left_out.setdefault(topic, Counter())[reason] += n
+        if count[which].any():
+            rows = np.flatnonzero(which)
+            losses.append(_loss(reason, where, start[rows], end[rows], int(count[rows].sum()), total))
+    return intervals, left_out, losses, total
 
 
 # ---- the look at the spans ----

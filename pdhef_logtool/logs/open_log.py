@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,6 @@ from pdhef_logtool.logs.compression import decompress_file, decompress_message
 from pdhef_logtool.logs.container import (
     EVERYTHING,
     MCAP_MAGIC,
-    ROSBAG1_MAGIC,
-    SQLITE_MAGIC,
     Attachment,
     Block,
     Container,
@@ -28,6 +27,16 @@ from pdhef_logtool.logs.container import (
 )
 from pdhef_logtool.logs.definitions import read_definitions
 from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.formats import (
+    COMPRESSED_SUFFIXES,
+    HEAD_BYTES,
+    ROSBAG2_METADATA,
+    ZSTD_MAGIC,
+    LogFile,
+    log_suffixes,
+    recognised_format,
+    what_is_a_log,
+)
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.logs.slim_log import SlimLog, slim_record
 from pdhef_logtool.records.documents import read_text
@@ -35,18 +44,18 @@ from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.files import scratch_folder
 from pdhef_logtool.records.signals import IntArray, Loss
 
-_ZSTD = b"\x28\xb5\x2f\xfd"
-_MAGIC_BYTES = 16
-_WHAT_IS_A_LOG = "an MCAP file, a ROS 1 bag, a rosbag2 database or a rosbag2 folder"
 _REMEDY = "give the recording itself"
+#: What a log of a container is called in reports, as a file and as a folder.
+_KINDS = {"mcap": "mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}
+_FOLDER_KINDS = {**_KINDS, "mcap": "rosbag2-mcap"}
 
 
 def open_log(
-    path: LogPlace | str, budget: Budget = DEFAULT_BUDGET, msgs: Path | None = None, wanted: Wanted = EVERYTHING
+    path: LogPlace | str, budget: Budget = DEFAULT_BUDGET, msgs: Path | str | None = None, wanted: Wanted = EVERYTHING
 ) -> DriveLog:
-    """Open a log, detected by its content.
+    """Open a log, recognised by its content.
 
-    MCAP, ROS 1 bag (2.0), rosbag2 SQLite database, each also as a zstd-compressed file; a rosbag2 folder with its
+    A file of one of the :mod:`~pdhef_logtool.logs.formats`, each also zstd-compressed; a rosbag2 folder with its
     ``metadata.yaml`` (split files are one log), or a folder that holds exactly one such file. Each file also by its URL
     (``https://``, ``s3://``). A slim log (:mod:`~pdhef_logtool.logs.slim_log`) reads like what it stands for.
 
@@ -63,20 +72,21 @@ def open_log(
     """
     definitions = read_definitions(msgs)
     log = _opened(place_of(path) if isinstance(path, str) else path, Meter(budget), wanted)
-    log.definitions = definitions
+    if log.messages is not None:
+        log.messages.definitions = definitions
     return log
 
 
-def _opened(path: LogPlace, meter: Meter, wanted: Wanted) -> ColumnarLog:
+def _opened(path: LogPlace, meter: Meter, wanted: Wanted) -> DriveLog:
     try:
         if isinstance(path, RemotePlace):
-            container = _open_remote(path, meter, wanted)
+            opened = _open_remote(path, meter, wanted)
         elif path.is_dir():
             return _open_folder(path, meter)
         elif not path.exists():
-            raise LogError(expected=_WHAT_IS_A_LOG, got="no such file", where=str(path), remedy="check the path")
+            raise LogError(expected=what_is_a_log(), got="no such file", where=str(path), remedy="check the path")
         else:
-            container = _open_file(path, meter)
+            opened = _open_file(path, meter)
     except OSError as error:
         raise LogError(
             expected="a readable file",
@@ -87,16 +97,17 @@ def _opened(path: LogPlace, meter: Meter, wanted: Wanted) -> ColumnarLog:
     except PdhefError:
         raise
     except Exception as error:
-        raise LogError(expected=_WHAT_IS_A_LOG, got=told(error)[1], where=str(path), remedy=_REMEDY) from error
+        raise LogError(expected=what_is_a_log(), got=told(error)[1], where=str(path), remedy=_REMEDY) from error
+    if isinstance(opened, DriveLog):
+        return opened
     try:
-        record = slim_record(container)
+        record = slim_record(opened)
     except BaseException:
-        container.close()
+        opened.close()
         raise
     if record is not None:
-        return SlimLog(path, container, record)
-    kind = {"mcap": "mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}[container.form]
-    return ColumnarLog(path, kind, [container], distro=container.distro)
+        return SlimLog(path, opened, record)
+    return ColumnarLog(path, _KINDS[opened.form], [opened], distro=opened.distro)
 
 
 def log_metadata(path: LogPlace, budget: Budget = DEFAULT_BUDGET) -> dict[str, str]:
@@ -106,68 +117,50 @@ def log_metadata(path: LogPlace, budget: Budget = DEFAULT_BUDGET) -> dict[str, s
     ------
     LogError : as for :func:`open_log`.
     """
-    log = open_log(path, budget, wanted=Wanted(frozenset()))
-    try:
-        return metadata_of(log, budget)
-    finally:
-        log.close()
-
-
-def metadata_of(log: DriveLog, budget: Budget = DEFAULT_BUDGET) -> dict[str, str]:
-    """Return what an open log says of itself, as :func:`log_metadata` does."""
-    assert isinstance(log, ColumnarLog)
-    if isinstance(log, SlimLog):
-        return dict(log.record.metadata)
-    found: dict[str, str] = {}
-    for container in log.containers:
-        for record in container.metadata_records():
-            found |= {**record.values, **{f"{record.name}.{key}": value for key, value in record.values.items()}}
-    if isinstance(log.path, Path) and is_log_folder(log.path):
-        custom = _read_metadata(log.path, budget).get("custom_data")
-        found |= {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}
-    return found
+    with closing(open_log(path, budget, wanted=Wanted(frozenset()))) as log:
+        return log.metadata()
 
 
 def is_log_folder(path: Path) -> bool:
     """Tell whether a folder is one log (a rosbag2 folder) rather than a folder of logs."""
-    return path.is_dir() and (path / "metadata.yaml").is_file()
+    return path.is_dir() and (path / ROSBAG2_METADATA).is_file()
 
 
 def looks_like_log(path: Path) -> bool:
-    """Tell by the first bytes whether a file can be a log, without opening it further."""
+    """Tell by the first bytes and the name whether a file can be a log, without opening it further."""
     if not path.is_file():
         return is_log_folder(path)
     with path.open("rb") as file:
-        head = file.read(_MAGIC_BYTES)
-    if head.startswith(_ZSTD):
-        return path.name.endswith((".mcap.zstd", ".db3.zstd", ".bag.zstd", ".mcap.zst", ".db3.zst", ".bag.zst"))
-    return head.startswith((MCAP_MAGIC, ROSBAG1_MAGIC, SQLITE_MAGIC))
+        head = file.read(HEAD_BYTES)
+    if head.startswith(ZSTD_MAGIC):
+        return path.suffix in COMPRESSED_SUFFIXES and path.stem.endswith(log_suffixes())
+    return recognised_format(head, path.name) is not None
 
 
-def _open_file(path: Path, meter: Meter) -> Container:
-    """Open one storage file."""
-    head = _head_of(path)
-    if head.startswith(_ZSTD):
+def _open_file(path: Path, meter: Meter) -> Container | DriveLog:
+    """Open one file."""
+    if _head_of(path).startswith(ZSTD_MAGIC):
         return _open_compressed(path, path, meter)
-    return _open_plain(path, path, head, meter)
+    return _open_plain(LogFile(path, path, meter))
 
 
-def _open_remote(place: RemotePlace, meter: Meter, wanted: Wanted) -> Container:
+def _open_remote(place: RemotePlace, meter: Meter, wanted: Wanted) -> Container | DriveLog:
     """Open an object; what has no index, or needs all of its file, is read from a copy that is fetched once."""
     from pdhef_logtool.logs.remote_source import RemoteSource
 
     source = RemoteSource(place)
     try:
-        head = source.read(0, min(_MAGIC_BYTES, source.size))
+        head = source.read(0, min(HEAD_BYTES, source.size))
         if head.startswith(MCAP_MAGIC):
             from pdhef_logtool.logs.mcap_log import McapContainer
 
             return McapContainer(source, place, meter, wanted)
-        if head.startswith((ROSBAG1_MAGIC, SQLITE_MAGIC, _ZSTD)):
+        if head.startswith(ZSTD_MAGIC):
             source.fetch_whole()
-        if head.startswith(_ZSTD):
-            return _CopiedContainer(_open_compressed(source.path, place, meter), source.close)
-        return _CopiedContainer(_open_plain(source.path, place, head, meter), source.close)
+            return _open_compressed(source.path, place, meter, source.close)
+        if recognised_format(head, source.path.name) is not None:
+            source.fetch_whole()
+        return _open_plain(LogFile(source.path, place, meter, source.close))
     except BaseException:
         source.close()
         raise
@@ -176,57 +169,54 @@ def _open_remote(place: RemotePlace, meter: Meter, wanted: Wanted) -> Container:
 def _head_of(path: Path) -> bytes:
     require_regular(path)
     with path.open("rb") as file:
-        return file.read(_MAGIC_BYTES)
+        return file.read(HEAD_BYTES)
 
 
-def _open_plain(path: Path, shown_path: LogPlace, head: bytes, meter: Meter) -> Container:
-    if head.startswith(MCAP_MAGIC):
-        from pdhef_logtool.logs.mcap_log import McapContainer
-
-        return McapContainer(path, shown_path, meter)
-    if head.startswith(ROSBAG1_MAGIC):
-        from pdhef_logtool.logs.rosbag1_log import Rosbag1Container
-
-        return Rosbag1Container(path, shown_path, meter)
-    if head.startswith(SQLITE_MAGIC):
-        from pdhef_logtool.logs.rosbag2_sqlite_log import SqliteContainer
-
-        return SqliteContainer(path, shown_path, meter)
-    got = "an empty file" if not head else "a file that is none of these"
-    raise LogError(expected=_WHAT_IS_A_LOG, got=got, where=str(shown_path), remedy=_REMEDY)
+def _open_plain(file: LogFile) -> Container | DriveLog:
+    head = _head_of(file.path)
+    found = recognised_format(head, file.path.name)
+    if found is None:
+        got = "a file that is none of these" if head else "an empty file"
+        raise LogError(expected=what_is_a_log(), got=got, where=str(file.place), remedy=_REMEDY)
+    opened = found.open(file)
+    return _CopiedContainer(opened, file) if isinstance(opened, Container) and file.is_copy else opened
 
 
-def _open_compressed(path: Path, shown_path: LogPlace, meter: Meter) -> Container:
-    """Decompress a file to a temporary one and open that."""
-    folder = scratch_folder()
+def _open_compressed(
+    path: Path, place: LogPlace, meter: Meter, release: Callable[[], None] = lambda: None
+) -> Container | DriveLog:
+    """Decompress a file to a temporary one and open that; ``release`` is called when the log is closed."""
+    stack = ExitStack()
+    stack.callback(release)
     try:
-        copy = Path(folder.name) / path.stem
+        copy = Path(stack.enter_context(scratch_folder())) / path.stem
         with meter.running(path.stat().st_size):
             cut = decompress_file(path, copy, meter)
-        return _CopiedContainer(_open_plain(copy, shown_path, _head_of(copy), meter), folder.cleanup, cut)
+        return _open_plain(LogFile(copy, place, meter, stack.close, cut))
     except BaseException:
-        folder.cleanup()
+        stack.close()
         raise
 
 
-def _open_folder(path: Path, meter: Meter) -> ColumnarLog:
-    if (path / "metadata.yaml").is_file():
+def _open_folder(path: Path, meter: Meter) -> DriveLog:
+    if is_log_folder(path):
         return _open_rosbag2_folder(path, meter)
     logs = [p for p in sorted(path.iterdir()) if p.is_file() and looks_like_log(p)]
     if len(logs) != 1:
         got = "a folder without a log" if not logs else f"a folder of {len(logs)} logs without metadata.yaml"
         raise LogError(
-            expected=_WHAT_IS_A_LOG, got=got, where=str(path), remedy="name one recording" if logs else _REMEDY
+            expected=what_is_a_log(), got=got, where=str(path), remedy="name one recording" if logs else _REMEDY
         )
-    container = _open_file(logs[0], meter)
-    kind = {"mcap": "rosbag2-mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}[container.form]
-    return ColumnarLog(path, kind, [container], distro=container.distro)
+    opened = _open_file(logs[0], meter)
+    if isinstance(opened, DriveLog):
+        return opened
+    return ColumnarLog(path, _FOLDER_KINDS[opened.form], [opened], distro=opened.distro)
 
 
 def _read_metadata(path: Path, budget: Budget) -> Mapping[str, Any]:
     from ruamel.yaml import YAML
 
-    file = path / "metadata.yaml"
+    file = path / ROSBAG2_METADATA
     budget.check("metadata_bytes", file.stat().st_size, str(file))
     try:
         document = YAML(typ="safe").load(read_text(file))
@@ -262,6 +252,11 @@ def _open_rosbag2_folder(path: Path, meter: Meter) -> ColumnarLog:
                 continue
             try:
                 container = _open_file(file, meter)
+                if not isinstance(container, Container):
+                    container.close()
+                    raise LogError(
+                        expected="a file of messages", got=f"a log of kind {container.kind}", where=str(file)
+                    )
             except LogError as error:
                 lost.append(Loss("bad-file", f"expected {error.expected}, got {error.got}", str(file)))
                 continue
@@ -276,10 +271,12 @@ def _open_rosbag2_folder(path: Path, meter: Meter) -> ColumnarLog:
         raise
     if not containers:
         remedy = lost[0].what if lost else "metadata.yaml names no file"
-        raise LogError(expected=_WHAT_IS_A_LOG, got="no readable storage file", where=str(path), remedy=remedy)
+        raise LogError(expected=what_is_a_log(), got="no readable storage file", where=str(path), remedy=remedy)
     distro = _text(information.get("ros_distro"))
     kind = "rosbag2-sqlite3" if forms == {"sqlite3"} else "rosbag2-mcap"
-    return ColumnarLog(path, kind, containers, lost, distro or containers[0].distro)
+    custom = information.get("custom_data")
+    about = {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}
+    return ColumnarLog(path, kind, containers, lost, distro or containers[0].distro, about)
 
 
 def _storage_file(folder: Path, name: str) -> Path | None:
@@ -346,18 +343,18 @@ class _Wrapped(Container):
 
 
 class _CopiedContainer(_Wrapped):
-    """A container of a copy that goes with it by ``remove``; ``cut`` says why copying stopped early."""
+    """A container of a copy, which is removed with it."""
 
-    def __init__(self, container: Container, remove: Callable[[], None], cut: str = "") -> None:
+    def __init__(self, container: Container, file: LogFile) -> None:
         super().__init__(container)
-        self._remove = remove
-        if cut:
-            self.container.lose("truncated", cut)
+        self._release = file.release
+        if file.cut:
+            self.container.lose("truncated", file.cut)
             self.account.cut = True
 
     def close(self) -> None:
         super().close()
-        self._remove()
+        self._release()
 
 
 class _Rosbag2Container(_Wrapped):

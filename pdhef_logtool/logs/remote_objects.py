@@ -149,21 +149,31 @@ def remote_object(place: RemotePlace) -> RemoteObject:
 
 
 class HttpObject(RemoteObject):
-    """An object of a web server. Proxies and ``netrc`` are the environment's."""
+    """An object of a web server, whose redirects are checked. Proxies and ``netrc`` are the environment's."""
 
     def __init__(self, place: RemotePlace) -> None:
         aiohttp = _imported("aiohttp", "http", place)
         import fsspec
 
         timeout = aiohttp.ClientTimeout(total=None, sock_connect=PATIENCE.connect_s, sock_read=PATIENCE.silence_s)
-        client = {"trust_env": True, "auto_decompress": False, "timeout": timeout}
-        super().__init__(place, fsspec.filesystem("http", client_kwargs=client))
+        client: dict[str, Any] = {"trust_env": True, "auto_decompress": False, "timeout": timeout}
+        options: dict[str, Any] = {}
+        if not place.private_redirects:
+            import yarl
+
+            from pdhef_logtool.logs.redirect_guard import guarded_client
+
+            client["origin"] = yarl.URL(place.url).raw_host or ""
+            options["get_client"] = guarded_client
+        super().__init__(place, fsspec.filesystem("http", client_kwargs=client, **options))
 
     @asynccontextmanager
     async def ask(self, start: int, end: int, pinned: ObjectState | None) -> AsyncIterator[Answer]:
         """See :class:`RemoteObject`."""
         import aiohttp
         import yarl
+
+        from pdhef_logtool.logs.redirect_guard import PrivateRedirectError
 
         headers = {"Range": f"bytes={start}-{end - 1}", "Accept-Encoding": "identity", **_conditions(pinned)}
         url = self.place.url
@@ -173,6 +183,12 @@ class HttpObject(RemoteObject):
             asked = yarl.URL(url, encoded=url.isascii() and url.isprintable() and " " not in url)
             async with session.get(asked, headers=headers) as response:
                 yield self._answer(response, start, end, pinned)
+        except PrivateRedirectError as error:
+            raise self.error(
+                f"a redirect to {error}, an address of this machine or its network",
+                "give the URL that it leads to, or allow it by --allow-private-redirects",
+                "an object, or a redirect to a public address",
+            ) from None
         except (aiohttp.InvalidURL, aiohttp.NonHttpUrlClientError, aiohttp.TooManyRedirects, ValueError):
             raise self.error("a URL that cannot be asked for", "check the URL") from None
         except (aiohttp.ClientConnectorCertificateError, aiohttp.ClientSSLError):

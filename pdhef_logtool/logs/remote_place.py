@@ -23,9 +23,13 @@ _OF_ACCESS = re.compile(
 
 @dataclass(frozen=True, repr=False)
 class RemotePlace:
-    """An object on a server. As text it has neither user, password nor query: these may give access to it."""
+    """An object on a server. As text it has neither user, password nor query: these may give access to it.
+
+    ``private_redirects``: whether its server may redirect to other hosts of this machine and its network.
+    """
 
     url: str
+    private_redirects: bool = False
 
     @cached_property
     def _parts(self) -> SplitResult:
@@ -83,8 +87,8 @@ class RemotePlace:
 LogPlace: TypeAlias = Path | RemotePlace
 
 
-def place_of(argument: str) -> LogPlace:
-    """Return the place that an argument names.
+def place_of(argument: str, *, private_redirects: bool = False) -> LogPlace:
+    """Return the place that an argument names; ``private_redirects`` as for :class:`RemotePlace`.
 
     Raises
     ------
@@ -93,7 +97,7 @@ def place_of(argument: str) -> LogPlace:
     found = _URL.match(argument)
     if found is None or Path(argument).exists():
         return Path(argument)
-    place = RemotePlace(argument)
+    place = RemotePlace(argument, private_redirects)
     try:
         known = place.scheme in SCHEMES and bool(place.host)
     except ValueError:  # a malformed server

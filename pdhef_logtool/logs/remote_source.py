@@ -342,15 +342,15 @@ class _Spool:
         self._folder.cleanup()
 
 
-#: By URL, in order of their last use.
-_spools: dict[str, _Spool] = {}
+#: By place, in order of their last use.
+_spools: dict[RemotePlace, _Spool] = {}
 _registry = Lock()
 
 
 def _acquire(place: RemotePlace, head_bytes: int) -> _Spool:
     with _registry:
-        spool = _spools.pop(place.url, None) or _Spool(place, remote_object(place))
-        _spools[place.url] = spool
+        spool = _spools.pop(place, None) or _Spool(place, remote_object(place))
+        _spools[place] = spool
         spool.users += 1
     try:
         spool.enter(head_bytes)
@@ -381,6 +381,6 @@ def _release(spool: _Spool) -> None:
 
 
 def _forget(spool: _Spool) -> None:
-    if _spools.get(spool.place.url) is spool:
-        del _spools[spool.place.url]
+    if _spools.get(spool.place) is spool:
+        del _spools[spool.place]
     spool.drop()

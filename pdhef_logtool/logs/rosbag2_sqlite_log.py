@@ -8,6 +8,7 @@ import tempfile
 from collections import Counter
 from itertools import accumulate, pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING, Self
 from urllib.parse import quote
 
 import numpy as np
@@ -29,6 +30,9 @@ from pdhef_logtool.logs.type_names import ros2_type_name
 from pdhef_logtool.records.files import scratch_folder
 from pdhef_logtool.records.signals import IntArray
 
+if TYPE_CHECKING:
+    from pdhef_logtool.logs.formats import LogFile
+
 _PAGE_ROWS = 8192
 _PAGE_BYTES = 4 << 20
 _STEPS_A_CHECK = 100_000  # of the database's machine, between looks at the time
@@ -47,6 +51,11 @@ class SqliteContainer(Container):
     form = "sqlite3"
     selective = True  # rows of other topics are not read
     remedy = "is it a rosbag2 recording?"
+
+    @classmethod
+    def open(cls, file: LogFile) -> Self:
+        """Open a file of this format."""
+        return cls(file.path, file.place, file.meter)
 
     def __init__(self, path: Path, shown_path: LogPlace | None = None, meter: Meter | None = None) -> None:
         require_regular(path, shown_path)

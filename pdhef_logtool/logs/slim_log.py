@@ -88,9 +88,18 @@ class SlimLog(ColumnarLog):
         self._extracted: tempfile.TemporaryDirectory[str] | None = None
 
     @property
-    def by_index(self) -> bool:
-        """False: it is small, and its index is not that of its source."""
-        return False
+    def index(self) -> None:
+        """None: the log is small, and its index is not that of its source."""
+        return None
+
+    @property
+    def slim(self) -> SlimLog:
+        """The log itself."""
+        return self
+
+    def metadata(self) -> dict[str, str]:
+        """Return what the source says of itself."""
+        return dict(self.record.metadata)
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:

@@ -16,12 +16,10 @@ import numpy as np
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog, in_window
 from pdhef_logtool.logs.container import Attachment, Block, ChannelRecord, MetadataRecord, RawChunk, Span
-from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.message_schema import SchemaError, parsing, ros_schema
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
-from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
 
 _LARGEST_ID = 0xFFFF
@@ -54,15 +52,14 @@ class SourceChannels:
     verbatim: frozenset[_Key] = frozenset()
 
 
-def source_profile(log: DriveLog) -> str:
+def source_profile(log: ColumnarLog) -> str:
     """Return the MCAP profile that a full copy should carry: the source's own, or ``ros2`` for bags."""
-    columnar = _columnar(log)
-    profiles = [getattr(c, "profile", "ros2") for c in columnar.containers]
+    profiles = [getattr(c, "profile", "ros2") for c in log.containers]
     return str(profiles[0]) if profiles else "ros2"
 
 
 def register_channels(
-    writer: McapLogWriter, log: DriveLog, *, leave_out: Callable[[str], bool] = lambda _topic: False
+    writer: McapLogWriter, log: ColumnarLog, *, leave_out: Callable[[str], bool] = lambda _topic: False
 ) -> SourceChannels:
     """Add every channel of a log to a writer but those whose topic is to be left out.
 
@@ -70,21 +67,20 @@ def register_channels(
     where the ids of split files contradict each other). A ROS 1 channel whose definition does not parse cannot be
     converted and is left out with a loss.
     """
-    columnar = _columnar(log)
     ids: dict[_Key, int] = {}
     converters: dict[_Key, Callable[[bytes], bytes | None]] = {}
     numbered: set[_Key] = set()
     lost: list[Loss] = []
     known: dict[tuple[object, ...], int] = {}
     verbatim: set[_Key] = set()
-    places = _Places(columnar)
-    for c, container in enumerate(columnar.containers):
+    places = _Places(log)
+    for c, container in enumerate(log.containers):
         same_file: set[int] = set()
         for channel in container.channels.values():
             if leave_out(channel.topic):
                 continue
             target = channel
-            if channel.encoding == "ros1" and columnar.kind == "rosbag1":
+            if channel.encoding == "ros1" and log.kind == "rosbag1":
                 try:
                     target, converters[(c, channel.id)], has_number = _as_ros2(channel)
                     if has_number:
@@ -149,7 +145,7 @@ class _Places:
 
 
 def iterate_raw(
-    log: DriveLog, channels: SourceChannels, start_ns: int | None = None, end_ns: int | None = None
+    log: ColumnarLog, channels: SourceChannels, start_ns: int | None = None, end_ns: int | None = None
 ) -> Iterator[RawMessage]:
     """Yield the messages of a log with log time in [start, end) in log-time order, with the copy's channel ids.
 
@@ -162,7 +158,7 @@ def iterate_raw(
 
 
 def iterate_copy(
-    log: DriveLog,
+    log: ColumnarLog,
     channels: SourceChannels,
     start_ns: int | None = None,
     end_ns: int | None = None,
@@ -175,11 +171,10 @@ def iterate_copy(
     declare nothing but channels with their own ids. They come in order of their first log times, and where they
     overlap in the order of the file.
     """
-    columnar = _columnar(log)
-    kept = [frozenset(id_ for of, id_ in channels.verbatim if of == c) for c in range(len(columnar.containers))]
+    kept = [frozenset(id_ for of, id_ in channels.verbatim if of == c) for c in range(len(log.containers))]
     spans = [
         (span.start_ns, c, span)
-        for c, container in enumerate(columnar.containers)
+        for c, container in enumerate(log.containers)
         for span in container.spans
         if (start_ns is None or span.end_ns > start_ns)
         and (end_ns is None or span.start_ns < end_ns)
@@ -188,7 +183,7 @@ def iterate_copy(
     spans.sort(key=lambda item: (item[0], item[1], item[2].index))
     if whole:
         spans = _in_file_order_where_overlapping(spans, kept)
-    for c, container in enumerate(columnar.containers):
+    for c, container in enumerate(log.containers):
         container.expect(span for _, of, span in spans if of == c)
     open_spans: list[tuple[int, int, int, int, _Cursor]] = []  # next log time, file, span, row: order of ties
     at = 0
@@ -196,10 +191,10 @@ def iterate_copy(
         while at < len(spans) and (not open_spans or spans[at][0] <= open_spans[0][0]):
             _, c, span = spans[at]
             at += 1
-            block = columnar.load(c, span)
+            block = log.load(c, span)
             if block is None:
                 continue
-            container = columnar.containers[c]
+            container = log.containers[c]
             if whole and isinstance(container, McapContainer):
                 chunk = container.raw_chunk(span, block, kept[c])
                 if chunk is not None and in_window(block.log_time_ns, start_ns, end_ns) is None:
@@ -253,15 +248,15 @@ def _in_file_order_where_overlapping(
     return ordered
 
 
-def iterate_attachments(log: DriveLog) -> Iterator[Attachment]:
+def iterate_attachments(log: ColumnarLog) -> Iterator[Attachment]:
     """Yield the attachments of a log."""
-    for container in _columnar(log).containers:
+    for container in log.containers:
         yield from container.attachments()
 
 
-def iterate_metadata(log: DriveLog) -> Iterator[MetadataRecord]:
+def iterate_metadata(log: ColumnarLog) -> Iterator[MetadataRecord]:
     """Yield the metadata records of a log."""
-    for container in _columnar(log).containers:
+    for container in log.containers:
         yield from container.metadata_records()
 
 
@@ -307,12 +302,6 @@ class _Cursor:
                 sequence = int.from_bytes(data[:4], "little")
             data = convert(data)
         return None if data is None else RawMessage(id_, log_time, publish_time & _UNSIGNED, sequence, data)
-
-
-def _columnar(log: DriveLog) -> ColumnarLog:
-    if not isinstance(log, ColumnarLog):
-        raise LogError(expected="a log opened from a file", got=type(log).__name__, where=str(log.path))
-    return log
 
 
 def _with_definition(channel: ChannelRecord) -> ChannelRecord:

@@ -19,6 +19,7 @@ from pdhef_logtool.mapping.clocks import clock_key as clock_key
 from pdhef_logtool.mapping.clocks import fit_clock_line as fit_clock_line
 from pdhef_logtool.mapping.clocks import fit_clocks as fit_clocks
 from pdhef_logtool.mapping.mapping_file import load_mapping as load_mapping
+from pdhef_logtool.mapping.mapping_file import mapping_of as mapping_of
 from pdhef_logtool.mapping.mapping_file import mapping_to_toml as mapping_to_toml
 from pdhef_logtool.mapping.recognition import Ambiguity as Ambiguity
 from pdhef_logtool.mapping.recognition import AutoMapping as AutoMapping

@@ -142,7 +142,7 @@ class _CanView:
     unflagged_may_be_extended: bool
 
 
-class CanSignalLog:
+class CanSignalLog(DriveLog):
     """A log with a view for each CAN signal; everything else is the log's own.
 
     ``short_frames`` counts what the last read dropped: :class:`Loss` by topic and message.
@@ -150,7 +150,7 @@ class CanSignalLog:
 
     def __init__(self, log: DriveLog, sources: Sequence[SignalSource], settings: CanSettings) -> None:
         self._log = log
-        self.path, self.kind, self.start_ns, self.end_ns = log.path, log.kind, log.start_ns, log.end_ns
+        self.path, self.kind = log.path, log.kind
         self._settings = settings
         self._views: dict[str, _CanView] = {}
         self.short_frames: tuple[Loss, ...] = ()
@@ -241,10 +241,6 @@ class CanSignalLog:
             found[topic] = read[topic] if view is None else self._view_columns(view, read, topic, paths, short)
         self.short_frames = tuple(short.values())
         return found
-
-    def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:
-        """Read only log and publish times of every topic of the log."""
-        return self._log.read_stamps(start_ns, end_ns)
 
     @property
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:

@@ -215,7 +215,7 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
             if info.path in known:
                 found.append((topic, role, info, known[info.path].meaning, True))
             elif not known or info.path.count(".") or vendors.is_export(topic.type_name):
-                meaning = meaning_of(topic.name, topic.type_name, info.path)
+                meaning = meaning_of(topic.name, topic.type_name, info.path, info.unit)
                 if meaning is not None:
                     found.append((topic, role, info, meaning, False))
     return found
@@ -244,7 +244,7 @@ def look(
         names = [path] if (topic.name, path) in read else [f"{path}[{i}]" for i in range(MOST_COLUMNS)]
         for name in names:
             seen = read.get((topic.name, name))
-            its = meaning if name == path else meaning_of(topic.name, topic.type_name, name)
+            its = meaning if name == path else meaning_of(topic.name, topic.type_name, name, info.unit)
             if its is None and meaning.quantity == "speed":
                 # One number of several under a name of one: which of them it is, values alone can tell.
                 its = replace(meaning, strength=0.5)

@@ -79,9 +79,9 @@ def recorded_mapping(log: SlimLog, prefer_truth: Literal["perfect", "rtk"]) -> C
 
 def recognise(log: DriveLog, *, prefer_truth: Literal["perfect", "rtk"]) -> AutoMapping:
     """Return what :func:`auto_map` recognises, or for a slim log what it was made with."""
-    if not isinstance(log, SlimLog):
+    if log.slim is None:
         return auto_map(log, prefer_truth=prefer_truth)
-    recorded = recorded_mapping(log, prefer_truth)
+    recorded = recorded_mapping(log.slim, prefer_truth)
     return AutoMapping(recorded.mapping, recorded.ambiguities, recorded.missing)
 
 
@@ -104,8 +104,8 @@ def choose_mapping(
         check_mapping(mapping, log)
         missing = tuple(n for n in ALIGNED_SIGNALS if n not in mapping.signals)
         return ChosenMapping(mapping, missing, prefer_truth, (), (*mapping.notes, *_borrowed(log, mapping)))
-    if isinstance(log, SlimLog):
-        return recorded_mapping(log, prefer_truth)
+    if log.slim is not None:
+        return recorded_mapping(log.slim, prefer_truth)
     found = auto_map(log, prefer_truth=prefer_truth)
     if require_signals and not found.mapping.signals:
         raise MappingError(

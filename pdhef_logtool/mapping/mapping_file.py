@@ -111,7 +111,12 @@ class _CanTable(BaseModel):
         return self
 
 
-def load_mapping(path: Path) -> Mapping:
+def mapping_of(given: Mapping | Path | str | None) -> Mapping | None:
+    """Return a mapping that is given as it is or by its file; None stays None. Raises MappingFileError."""
+    return load_mapping(given) if isinstance(given, Path | str) else given
+
+
+def load_mapping(path: Path | str) -> Mapping:
     """Read mapping.toml.
 
     Raises
@@ -119,6 +124,7 @@ def load_mapping(path: Path) -> Mapping:
     MappingFileError
         The file is missing, is no TOML, or holds wrong, unknown, missing or contradicting entries; all are named.
     """
+    path = Path(path)
     raw = read_toml(path, "a mapping TOML file", MappingFileError)
     return mapping_from_dict(raw, where=str(path), folder=path.parent)
 

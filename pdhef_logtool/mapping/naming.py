@@ -246,8 +246,11 @@ def unit_of(leaf: str, kind: str) -> tuple[str, float | None]:
     return "", None
 
 
-def meaning_of(topic: str, type_name: str, path: str) -> Meaning | None:
-    """Return what a field is by its name, its parents' and, where these say nothing of their own, its topic's."""
+def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Meaning | None:
+    """Return what a field is by its name, its parents' and, where these say nothing of their own, its topic's.
+
+    ``unit_text`` is the unit that the log gives (``km/h``, ``°/s``), empty where it gives none.
+    """
     parts = path.split(".")
     leaf = parts[-1]
     own = words_of(re.sub(r"\[\d*\]", "", leaf))
@@ -260,6 +263,7 @@ def meaning_of(topic: str, type_name: str, path: str) -> Meaning | None:
     index = re.search(r"\[(\d+)\]$", leaf)
     if _NOT_VALUES & set(own) or _NOT_VALUES & set(inner) - {"state", "status", "orientation"}:
         return None
+    named = f"{leaf}_{unit_text.replace('°', 'deg').replace('²', '2')}" if unit_text else leaf
     for strength, words in ((1.0, own), (0.9, (*inner, *own)), (0.7, (*outer, *inner, *own))):
         if strength < 0.8 and not _is_bare(own):
             break  # A topic's name says what its only number is, not what each of many is.
@@ -270,13 +274,13 @@ def meaning_of(topic: str, type_name: str, path: str) -> Meaning | None:
         corner = _corner(tuple(inner), ())
         if quantity == "speed" and corner:  # of the wheel that the struct around it is
             quantity, part = "wheel speed", corner
-        if quantity == "speed" and unit_of(leaf, "wheel rate")[0]:
+        if quantity == "speed" and unit_of(named, "wheel rate")[0]:
             return None  # of something that turns
-        unit, scale = unit_of(leaf, kind)
+        unit, scale = unit_of(named, kind)
         if not unit and len(parts) > 1:
             unit, scale = unit_of(parts[-2], kind)
         if kind == "speed" and not unit and quantity == "wheel speed":
-            unit, scale = unit_of(leaf, "wheel rate")
+            unit, scale = unit_of(named, "wheel rate")
             quantity = "wheel rate" if unit else quantity
         where = {1.0: leaf, 0.9: path}.get(strength, f"{topic} {path}")
         return Meaning(quantity, part, strength, unit, scale, f"{where!r} names it")

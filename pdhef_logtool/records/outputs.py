@@ -28,6 +28,7 @@ WORK = ".pdhef"
 LOCK_FILE = ".pdhef.lock"
 #: What versions before this left in a log's folder when they were killed.
 _FORMER = re.compile(r"\.tracks-\w{8}|\.[\w.]+\.partial|\.annotated\.mcap\.\d+\.part")
+_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+:)/.")
 _NO_LOCK = (errno.EBADF, errno.EINVAL, errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EISDIR)
 _POLL_S = 0.05
 #: To make a folder that a command beside this one may remove while it is empty.
@@ -298,6 +299,18 @@ class FolderLock:
         if is_alive(holder) is None:
             return f"if no command runs on any machine, remove {LOCK_FILE} in it, else "
         return f"it is process {holder.split('-')[1]}: "
+
+
+def local_path(place: Path | str) -> Path:
+    """Return an output's place on this machine; raises UsageError for a URL, which as a path has lost a slash."""
+    if (found := _URL.match(str(place))) and not Path(found[1]).exists():
+        raise UsageError(
+            expected="a place on this machine",
+            got=re.sub(":/+", "://", str(place), count=1),
+            where="--output",
+            remedy="pdhef run alone writes to a URL",
+        )
+    return Path(place)
 
 
 def check_no_input(inputs: Iterable[Path | None], files: Iterable[Path], folders: Iterable[Path] = ()) -> None:

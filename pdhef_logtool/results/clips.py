@@ -15,7 +15,7 @@ from pdhef_logtool.records.outputs import FolderTransaction, OutputFolder
 from pdhef_logtool.results.events import FoundEvent, FoundEvents
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
 from pdhef_logtool.sinks.base import TRUTH
-from pdhef_logtool.sinks.mcap import AnnotatedMcapSink
+from pdhef_logtool.sinks.mcap import NAMESPACE, AnnotatedMcapSink
 from pdhef_logtool.sinks.parquet import list_estimators, read_track
 
 #: Folder of the clips within those of a run; it holds those of the last search alone.
@@ -56,6 +56,8 @@ def write_clips(
                 failed = True
                 tell(f"{label}: no clip: {error}")
                 continue
+            if opened.messages is None or all(t.name.startswith(NAMESPACE) for t in opened.topics):
+                tell(f"{label}: clips hold our tracks only: the log has no messages to copy")
             try:
                 names += [
                     str(run.folder / CLIPS / name)

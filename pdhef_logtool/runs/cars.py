@@ -17,7 +17,7 @@ from pdhef_logtool.car.vehicle import Record
 from pdhef_logtool.drive.cached import cached
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.open_log import log_metadata
-from pdhef_logtool.mapping import load_mapping
+from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.runs.config import RunConfig
@@ -128,7 +128,7 @@ class RunCars:
         by_folder = self._by_folder(log)
         found = {} if by_folder is None else {f"folder {by_folder[0]}": by_folder[1]}
         if table.metadata:
-            mapping = None if self.config.mapping is None else load_mapping(self.config.mapping)
+            mapping = mapping_of(self.config.mapping)
             with cached(log, mapping, self.config.read_options, self.warn) as (read_from, _):
                 has = log_metadata(read_from.path, self.config.read_options.limits)
             found |= {f"{k} {has[k]}": cars[has[k]] for k, cars in table.metadata.items() if has.get(k) in cars}

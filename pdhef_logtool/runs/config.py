@@ -41,6 +41,8 @@ Time = Annotated[str, Field(max_length=64), BeforeValidator(_as_text)]
 Names = Annotated[
     tuple[str, ...], Field(strict=False), BeforeValidator(lambda v: v.split(",") if isinstance(v, str) else v)
 ]
+#: A file or folder, as a path or a text.
+File = Annotated[Path, BeforeValidator(lambda v: Path(v) if isinstance(v, str) else v)]
 Keep = Literal["metrics", "estimates", "full"]
 Friction = Annotated[float, Field(ge=POSSIBLE_FRICTION[0], le=POSSIBLE_FRICTION[1])]
 
@@ -76,12 +78,13 @@ class RunConfig:
     calibrate : a car without evidence, without truth: on each ``log`` for itself, on the ``pool`` of all, or ``off``.
     cache : folder or URL of slim logs, which stand for logs that were read before; changes no number.
     cache_max_gb : what the cache may hold, in GB, if it is a folder: what was not used for longest goes; None = any.
+    allow_private_redirects : whether a web server may redirect to other hosts of this machine and its network.
     """
 
     estimators: Names | None = None
-    car: Path | None = None
-    cars: Path | None = None
-    mapping: Path | None = None
+    car: File | None = None
+    cars: File | None = None
+    mapping: File | None = None
     start: Time | None = None
     end: Time | None = None
     annotate: Literal["full", "sidecar", "none"] | None = None
@@ -92,14 +95,15 @@ class RunConfig:
     window_s: Annotated[float, Field(ge=1, le=1e9)] = WINDOW_S
     clock: Literal["arrival", "stamp"] = "arrival"
     budget: Annotated[float, Field(gt=0, le=1e6)] = 1.0
-    msgs: Path | None = None
-    thresholds: Path | None = None
-    network: Path | None = None
-    intervals: Path | None = None
+    msgs: File | None = None
+    thresholds: File | None = None
+    network: File | None = None
+    intervals: File | None = None
     calibrate: Literal["off", "log", "pool"] = "log"
     waived: Names = ()
-    cache: str | None = None
+    cache: Annotated[str, BeforeValidator(lambda v: str(v) if isinstance(v, Path) else v)] | None = None
     cache_max_gb: Annotated[float, Field(gt=0)] | None = None
+    allow_private_redirects: bool = False
 
     @property
     def read_options(self) -> ReadOptions:
@@ -125,7 +129,7 @@ class RunConfig:
     def to_dict(self) -> dict[str, Any]:
         """Return the configuration as JSON-able values; files by name only, so that no machine's paths get out."""
         document = asdict(self)
-        del document["cache"], document["cache_max_gb"]
+        del document["cache"], document["cache_max_gb"], document["allow_private_redirects"]
         document["waived"] = list(self.waived)
         document |= {"annotate": self.annotation, "keep": self.kept}
         document["estimators"] = None if self.estimators is None else list(self.estimators)

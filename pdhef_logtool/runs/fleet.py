@@ -26,6 +26,7 @@ from pdhef_logtool.estimators.table import FILTERS
 from pdhef_logtool.logs.discovery import (
     RUN_FILE,
     LogInput,
+    Logs,
     as_taken,
     find_logs,
     folders_of,
@@ -33,7 +34,7 @@ from pdhef_logtool.logs.discovery import (
     identity_of,
     with_free_stem,
 )
-from pdhef_logtool.mapping import Mapping, load_mapping
+from pdhef_logtool.mapping import Mapping, mapping_of
 from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError
 from pdhef_logtool.records.files import writing
 from pdhef_logtool.records.object_store import is_url
@@ -85,7 +86,18 @@ _KEPT = ("metrics", "estimates", "full")
 _PRELOAD = ("pdhef_logtool.runs.*", "pdhef_logtool.logs.*", "pdhef_logtool.sinks.parquet", *FILTERS)
 #: Entries of the configuration that change no figure and no file that is kept, or are told apart by themselves.
 _NO_SETTING = frozenset(
-    {"keep", "annotate", "cache", "cache_max_gb", "window_s", "car", "cars", "network", "intervals"}
+    {
+        "keep",
+        "annotate",
+        "cache",
+        "cache_max_gb",
+        "allow_private_redirects",
+        "window_s",
+        "car",
+        "cars",
+        "network",
+        "intervals",
+    }
 )
 _FILES = ("mapping", "msgs", "thresholds", "cars")
 _READERS = 16
@@ -140,7 +152,7 @@ Work = Callable[[DriveTask, Tell], DriveEnd]
 
 
 def run_logs(
-    arguments: Sequence[str],
+    arguments: Logs,
     output: Path | str,
     config: RunConfig,
     *,
@@ -151,7 +163,7 @@ def run_logs(
     only: Sequence[str] = (),
     limits: Limits | None = None,
     full_worst: int | None = None,
-    junit: Path | None = None,
+    junit: Path | str | None = None,
     report: bool = True,
     work: Work | None = None,
     progress: Progress = lambda _text, _share: None,
@@ -191,9 +203,10 @@ def run_logs(
         output = stored.folder
     else:
         stored, output = None, Path(output)
-    inputs = find_logs(arguments)
+    junit = None if junit is None else Path(junit)
+    inputs = find_logs(arguments, private_redirects=config.allow_private_redirects)
     cars = RunCars.of(config, warn)
-    mapping = None if config.mapping is None else load_mapping(config.mapping)
+    mapping = mapping_of(config.mapping)
     thresholds = read_thresholds(config, junit)
     resume = resume or retry or bool(only)
     many = len(inputs) > FEW_LOGS
@@ -356,7 +369,7 @@ def _opened(task: DriveTask) -> tuple[RunCars, Mapping | None]:
         config = task.config
         _at_hand[task.run] = (
             RunCars.of(config, lambda _: None),
-            None if config.mapping is None else load_mapping(config.mapping),
+            mapping_of(config.mapping),
         )
     return _at_hand[task.run]
 

@@ -96,6 +96,7 @@ LOG_FILES = (
 STALE_FILES = (PAGE_FILE, METRICS_FILE, ESTIMATES_FILE, RECORDING_FILE)
 
 _SILENT = "{} has no valid row although the car moves"
+_NO_COPY = "annotated.mcap holds our topics only: a log of kind {} has no messages to copy"
 _ALL_SILENT = "no estimator has a valid row although the car moves"
 _NEVER_MOVES = "the car is never faster than {:g} m/s: there is nothing to score"
 #: Units of truth quantities that have no channel of their own name.
@@ -438,6 +439,8 @@ def _open_sinks(
             sinks.append(EstimatesSink(change.file(ESTIMATES_FILE)))
         if config.annotation != "none":
             source = drive.log if config.annotation == "full" else None
+            if source is not None and source.messages is None:
+                drive.remarks.append(_NO_COPY.format(source.kind))
             first = frozenset({shown.main, TRUTH})
             names = None if config.estimators else first
             unnamed = config.estimators == (ALL_ESTIMATORS,)

@@ -31,7 +31,7 @@ from pdhef_logtool.drive.windows import DrivePlan, sample_ledger
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.drive_log import DriveLog, windows
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import check_mapping, join_channels, load_mapping, merge_losses, read_signals
+from pdhef_logtool.mapping import check_mapping, join_channels, mapping_of, merge_losses, read_signals
 from pdhef_logtool.mapping.estimates import EstimateSource, choose_estimates, sources_of
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.ledger import Role, damage
@@ -103,9 +103,9 @@ def score_log(
     ------
     PdhefError : There is no estimate, no truth, or nothing of the log can be used.
     """
-    log_input = one_log(argument)
+    log_input = one_log(argument, config.read_options)
     car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
-    mapping = None if config.mapping is None else load_mapping(config.mapping)
+    mapping = mapping_of(config.mapping)
     thresholds = read_thresholds(config, junit)
     if config.car is None:
         slow = car.vehicle.low_speed_blend_m_s

@@ -80,7 +80,7 @@ class AnnotatedMcapSink(Sink):
     Parameters
     ----------
     path : where the finished file stands.
-    source : the log to copy in full; None for a sidecar that holds our topics alone.
+    source : the log to copy in full; None, or a log without messages, for a sidecar that holds our topics alone.
     names : of the tracks that are written; None: all.
     shown : of the tracks whose pose is written at every stamp; of others every 50 ms. None: all.
     thin : both state and pose of the others are written every :data:`LONG_STEP_NS` alone.
@@ -101,24 +101,26 @@ class AnnotatedMcapSink(Sink):
         thin: bool = False,
         span_ns: tuple[int, int] | None = None,
     ) -> None:
-        self._source = source
+        self._source = None if source is None else source.messages
         self._names, self._shown, self._thin = names, shown, thin
         self._last_ns: dict[str, int] = {}  # of the tracks that are not shown
         self._topics: dict[str, str] = {}
         self._window: dict[str, list[TopicBatch]] = {}
         self._raws: Iterator[RawMessage | RawChunk] = iter(())
         self._next: RawMessage | RawChunk | None = None
-        profile = "ros2" if source is None else source_profile(source)
+        profile = "ros2" if self._source is None else source_profile(self._source)
         self._writer = McapLogWriter(path, profile=profile, level=_LEVEL)
-        if source is None:
+        if self._source is None:
             return
         try:
-            channels = register_channels(self._writer, source, leave_out=lambda topic: topic.startswith(NAMESPACE))
+            channels = register_channels(
+                self._writer, self._source, leave_out=lambda topic: topic.startswith(NAMESPACE)
+            )
         except BaseException:
             self._writer.abort()
             raise
         self.lost = channels.lost
-        self._raws = iterate_copy(source, channels, *(span_ns or (None, None)))
+        self._raws = iterate_copy(self._source, channels, *(span_ns or (None, None)))
 
     def append(self, track: StateTrack) -> None:
         """Take one track of this window."""

@@ -20,7 +20,7 @@ from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_
 from pdhef_logtool.evaluation.reasons import ReasonFacts, SensorFault
 from pdhef_logtool.evaluation.standing import Standing
 from pdhef_logtool.evaluation.units import typed_unit
-from pdhef_logtool.logs.byte_account import ByteLedger
+from pdhef_logtool.logs.byte_account import ByteLedger, checksummed_share
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.compiled_sources import compiled_digest
 from pdhef_logtool.records.documents import jsonable
@@ -290,7 +290,11 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
         "metrics": [{name: getattr(m, name) for name in _METRIC_COLUMNS} for m in facts.metrics],
         "segments": list(facts.segments),
         "losses": list(facts.losses),
-        "ledger": {"bytes": list(facts.file_bytes), "samples": list(facts.samples)},
+        "ledger": {
+            "bytes": list(facts.file_bytes),
+            "checksummed_share": checksummed_share(facts.file_bytes),
+            "samples": list(facts.samples),
+        },
         "warnings": list(facts.warnings),
         "remarks": list(facts.remarks),
         "checks": list(facts.checks),
@@ -335,7 +339,11 @@ def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
         "estimators": [_brief_estimator(e, told) for e in report["estimators"]],
         "metrics": [m for m in report["metrics"] if m["estimator"] in told and _is_shown(m, answer["main"])],
         "segments": [s for s in report["segments"] if s["name"] in {f"{n} diverged" for n in told}][:_MOST_LISTED],
-        "ledger": {"bytes": report["ledger"]["bytes"][:_MOST_LISTED], "samples": _with_drops(report)},
+        "ledger": {
+            **report["ledger"],
+            "bytes": report["ledger"]["bytes"][:_MOST_LISTED],
+            "samples": _with_drops(report),
+        },
         "checks": [c for c in report["checks"] if c["verdict"] != "passed"],
     }
 

@@ -76,7 +76,7 @@ def test_same_log_and_a_changed_one(store, sample_logs_dir: Path) -> None:
     store.put_object(Bucket="cars", Key="a b/dlc+1.mcap", Body=file.read_bytes()[:-1])
     # Read bytes are held until they are wanted elsewhere: without them the store is asked again. Other tests of this
     # process may have left sources of their own.
-    remote_source._spools[str(log.path)].held = []
+    remote_source._spools[log.path].held = []
     with pytest.raises(SourceError, match="another one"):
         opened.read(asked)
     opened.close()

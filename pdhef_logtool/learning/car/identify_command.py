@@ -29,6 +29,7 @@ from pdhef_logtool.learning.drives import (
 from pdhef_logtool.logs.discovery import Logs, find_logs
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.outputs import local_path
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.runs.config import RunConfig
 
@@ -82,7 +83,7 @@ def _parameter(p: Identified) -> dict[str, Any]:
 
 def identify(
     arguments: Logs,
-    output: Path,
+    output: Path | str,
     config: RunConfig,
     *,
     holdout: float = 0.25,
@@ -105,6 +106,7 @@ def identify(
     EstimatorError
         There is too little driving with truth.
     """
+    output = local_path(output)
     if not 0.0 <= holdout < 0.9:
         raise UsageError(expected="a share from 0 to 0.9", got=f"{holdout:g}", where="--holdout")
     car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
@@ -113,7 +115,7 @@ def identify(
     if config.car is None:
         warn(f"no --car: mass, geometry and priors are those of the default {start.name}")
     given = open_mapping(config)
-    logs = find_logs(arguments)
+    logs = find_logs(arguments, private_redirects=config.allow_private_redirects)
     check_file_output(logs, config, output)
 
     def read(vehicle: VehicleParameters) -> tuple[list[DriveRecord], list[FitDrive], list[FitDrive]]:

@@ -73,7 +73,7 @@ def identify_without_truth(
     if config.car is None:
         warn(f"no --car: mass, geometry and priors are those of the default {start.name}")
     given = open_mapping(config)
-    logs = find_logs(arguments)
+    logs = find_logs(arguments, private_redirects=config.allow_private_redirects)
     check_file_output(logs, config, output)
     driving, records = [], []
     for number, log_input in enumerate(logs):

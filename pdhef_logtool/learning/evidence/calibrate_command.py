@@ -44,10 +44,11 @@ from pdhef_logtool.learning.evidence.calibrate import (
 from pdhef_logtool.learning.network.extract_command import MAX_VARIATION
 from pdhef_logtool.learning.noise.tune_command import HELD_OUT
 from pdhef_logtool.learning.variation import Variation, vary
-from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
+from pdhef_logtool.logs.discovery import LogInput, Logs
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.files import write_bytes
+from pdhef_logtool.records.outputs import local_path
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.estimating import estimate_windows
@@ -96,7 +97,7 @@ class CalibrateResult(LearnResult):
 
 def calibrate(
     arguments: Logs,
-    output: Path,
+    output: Path | str,
     settings: CalibrateSettings,
     *,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
@@ -117,6 +118,7 @@ def calibrate(
     EstimatorError
         There are too few drives with truth.
     """
+    output = local_path(output)
     config = settings.config
     if not 0.0 <= settings.spread <= MAX_VARIATION:
         raise UsageError(expected=f"a spread of 0 to {MAX_VARIATION:g}", got=str(settings.spread), where="--vary")
@@ -128,7 +130,7 @@ def calibrate(
     alone = output.suffix == ".json"
     car = open_car(config, None if alone else output, warn)
     mapping = open_mapping(config)
-    inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
+    inputs, splits = choose_drives(arguments, settings, REFUSED)
     check_file_output(inputs, config, output)
     if car.network is not None and "train" in splits.values():
         warn("drives of split train: a network is better there than in service, and its intervals will be too narrow")

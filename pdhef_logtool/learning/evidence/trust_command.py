@@ -49,8 +49,9 @@ from pdhef_logtool.learning.evidence.trust import (
     join_blocks,
 )
 from pdhef_logtool.learning.noise.tune_drives import MIN_SCORED_STAMPS
-from pdhef_logtool.logs.discovery import Logs, find_logs
+from pdhef_logtool.logs.discovery import Logs
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.outputs import local_path
 from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS
 from pdhef_logtool.residual_model.service import RememberingNetwork
@@ -103,7 +104,7 @@ class TrustResult(LearnResult):
 
 def trust(
     arguments: Logs,
-    output: Path,
+    output: Path | str,
     settings: LearnSettings,
     *,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
@@ -124,13 +125,14 @@ def trust(
     EstimatorError
         No drive can be scored.
     """
+    output = local_path(output)
     config = settings.config
     car = open_car(config, output, warn)
     if car.residual_network is None:
         got = "none" if car.network is None else f"one for {car.network.model}"
         raise UsageError(expected="a network", got=got, where="--network", remedy="give a folder of pdhef train")
     assert car.network is not None
-    inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
+    inputs, splits = choose_drives(arguments, settings, REFUSED)
     check_file_output(inputs, config, output)
     mapping = open_mapping(config)
 

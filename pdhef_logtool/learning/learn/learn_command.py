@@ -55,13 +55,13 @@ from pdhef_logtool.learning.learn.steps import (
 )
 from pdhef_logtool.learning.noise.tune_command import REFUSED
 from pdhef_logtool.learning.stages import Stages
-from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
+from pdhef_logtool.logs.discovery import LogInput, Logs
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.files import write_bytes
-from pdhef_logtool.records.outputs import OutputFolder, check_no_input
+from pdhef_logtool.records.outputs import OutputFolder, check_no_input, local_path
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.sinks.report import json_bytes
@@ -146,7 +146,7 @@ class _Course:
 
 def learn(
     arguments: Logs,
-    output: Path,
+    output: Path | str,
     settings: CourseSettings,
     *,
     fresh: bool = False,
@@ -170,13 +170,14 @@ def learn(
     EstimatorError
         There is too little driving with truth.
     """
+    output = local_path(output)
     config = settings.config
     _check(settings, output)
     given = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
     check_output(given, output)
     if config.car is None:
         warn(f"no --car: mass, geometry and priors are those of the default {given.own.name}")
-    inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
+    inputs, splits = choose_drives(arguments, settings, REFUSED)
     read = [*(i.local for i in inputs), *(path for path in config.files if path != config.car)]
     check_no_input(read, [], [output])
     mapping = open_mapping(config)

@@ -63,7 +63,7 @@ from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.errors import EstimatorError, PdhefError, UsageError
 from pdhef_logtool.records.files import writing
-from pdhef_logtool.records.outputs import OutputFolder, check_no_input
+from pdhef_logtool.records.outputs import OutputFolder, check_no_input, local_path
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.records.supervisor import supervise
 from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, NOMINAL_MODEL, PHYSICS_MODEL
@@ -219,7 +219,7 @@ class _Job:
 
 def extract(
     arguments: Logs,
-    output: Path,
+    output: Path | str,
     settings: ExtractSettings,
     *,
     jobs: int = 1,
@@ -245,9 +245,10 @@ def extract(
     PdhefError
         The only log cannot be used.
     """
+    output = local_path(output)
     settings.smoothing_half_s()
     _check_counts(jobs, settings)
-    inputs = find_logs(arguments)
+    inputs = find_logs(arguments, private_redirects=settings.config.allow_private_redirects)
     mapping = open_mapping(settings.config)
     work = list(_plan_jobs(inputs, output, settings, mapping, resume, warn))
     if splits is not None:

@@ -16,7 +16,7 @@ from pdhef_logtool.learning.network.fit import CHECKPOINT, PAPER_RECIPE, Epoch, 
 from pdhef_logtool.learning.plots import new_figure, png_bytes
 from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
 from pdhef_logtool.records.files import write_bytes
-from pdhef_logtool.records.outputs import OutputFolder, check_no_input
+from pdhef_logtool.records.outputs import OutputFolder, check_no_input, local_path
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
@@ -61,10 +61,10 @@ class TrainResult:
 
 
 def run_training(
-    dataset: Path,
-    output: Path,
+    dataset: Path | str,
+    output: Path | str,
     *,
-    init: Path | None = None,
+    init: Path | str | None = None,
     paper: bool = False,
     seed: int = 0,
     epochs: int | None = None,
@@ -89,6 +89,8 @@ def run_training(
     ModelError
         The dataset has no usable drives, or another training's checkpoint is in the way.
     """
+    dataset, output = Path(dataset), local_path(output)
+    init = None if init is None else Path(init)
     recipe = make_recipe(paper=paper, seed=seed, epochs=epochs, device=device)
     data = dataset_for(dataset, NOMINAL_MODEL if paper else PHYSICS_MODEL)
     bundle = None if init is None else open_model(init)

@@ -48,8 +48,9 @@ from pdhef_logtool.learning.noise.search import (
 )
 from pdhef_logtool.learning.noise.tune_drives import Benches, TuneSetup, choose_names
 from pdhef_logtool.learning.plots import new_figure, png_bytes
-from pdhef_logtool.logs.discovery import Logs, find_logs
+from pdhef_logtool.logs.discovery import Logs
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.outputs import local_path
 from pdhef_logtool.sinks.report import json_bytes
 
 FORMAT = "pdhef-tuning"
@@ -124,7 +125,7 @@ class TuneResult(LearnResult):
 
 def tune(
     arguments: Logs,
-    output: Path,
+    output: Path | str,
     settings: TuneSettings,
     *,
     jobs: int = 1,
@@ -146,6 +147,7 @@ def tune(
     EstimatorError
         No drive can be scored.
     """
+    output = local_path(output)
     config = settings.config
     if settings.trials < MIN_TRIALS:
         raise UsageError(expected=f"at least {MIN_TRIALS} trials", got=str(settings.trials), where="--trials")
@@ -153,7 +155,7 @@ def tune(
         raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
     car = open_car(config, output, warn)
     names = choose_names(settings.names, car)
-    inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
+    inputs, splits = choose_drives(arguments, settings, REFUSED)
     check_file_output(inputs, config, output)
     setup = TuneSetup(config, car, open_mapping(config), names)
     with Benches(setup, min(jobs, len(inputs))) as benches:

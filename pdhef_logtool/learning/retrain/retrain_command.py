@@ -186,7 +186,7 @@ def retrain(
     """
     config = settings.config
     car = open_car(config, None, warn)
-    inputs = find_logs(arguments)
+    inputs = find_logs(arguments, private_redirects=config.allow_private_redirects)
     read = [*(i.local for i in inputs), *config.files]
     check_no_input(read, [], [output / name for name in (WORK, ACCEPTED, REJECTED)])
     work = output / WORK

@@ -1,0 +1,118 @@
+"""The formats of logs: one entry says how files of a format are recognised and how they are opened.
+
+A package adds formats by entry points of the group ``pdhef.log_formats``, each of which is a :class:`LogFormat`.
+"""
+
+from __future__ import annotations
+
+import pkgutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pdhef_logtool.logs.budget import Meter
+from pdhef_logtool.logs.container import MCAP_MAGIC, ROSBAG1_MAGIC, SQLITE_MAGIC, Container
+from pdhef_logtool.logs.remote_place import LogPlace
+
+if TYPE_CHECKING:
+    from pdhef_logtool.logs.drive_log import DriveLog
+
+GROUP = "pdhef.log_formats"
+#: Bytes of a file's start by which its format is recognised.
+HEAD_BYTES = 16
+#: Suffixes of a file that is compressed as a whole, and what it begins with.
+COMPRESSED_SUFFIXES = (".zstd", ".zst")
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+ROSBAG2_METADATA = "metadata.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class LogFile:
+    """A file to open.
+
+    Attributes
+    ----------
+    path : on this machine. place : as the user named it; ``path`` may be a decompressed or downloaded copy.
+    meter : what reading may cost. release : to be called when the log is closed; removes a copy.
+    cut : why a copy does not have all of the file; empty where it does.
+    """
+
+    path: Path
+    place: LogPlace
+    meter: Meter
+    release: Callable[[], None] = lambda: None
+    cut: str = ""
+
+    @property
+    def is_copy(self) -> bool:
+        """Whether it is not the file itself."""
+        return self.path != self.place
+
+
+@dataclass(frozen=True, slots=True)
+class LogFormat:
+    """One format.
+
+    Attributes
+    ----------
+    title : for messages: ``an MCAP file``.
+    opener : ``package.module:function``, which opens a :class:`LogFile` as a log, or as a container of messages, and
+        raises LogError for a file that is none of this format.
+    suffixes : by which a search through folders takes files for logs.
+    magic : first bytes of every file; empty: a file is recognised by its suffix.
+    needs_suffix : whether files of other formats begin with the same bytes, so that the suffix must match too.
+    """
+
+    title: str
+    opener: str
+    suffixes: tuple[str, ...]
+    magic: bytes = b""
+    needs_suffix: bool = False
+
+    def recognises(self, head: bytes, name: str) -> bool:
+        """Tell by the first bytes and the name whether a file is of this format."""
+        if self.needs_suffix or not self.magic:
+            return head.startswith(self.magic) and name.lower().endswith(self.suffixes)
+        return head.startswith(self.magic)
+
+    def open(self, file: LogFile) -> DriveLog | Container:
+        """Open a file."""
+        opener: Callable[[LogFile], Any] = pkgutil.resolve_name(self.opener)
+        return opener(file)  # type: ignore[no-any-return]
+
+
+FORMATS = (
+    LogFormat("an MCAP file", f"{__package__}.mcap_log:McapContainer.open", (".mcap",), MCAP_MAGIC),
+    LogFormat("a ROS 1 bag", f"{__package__}.rosbag1_log:Rosbag1Container.open", (".bag",), ROSBAG1_MAGIC),
+    LogFormat("a rosbag2 database", f"{__package__}.rosbag2_sqlite_log:SqliteContainer.open", (".db3",), SQLITE_MAGIC),
+)
+
+
+@cache
+def _of_other_packages() -> tuple[LogFormat, ...]:
+    found = sorted(entry_points(group=GROUP), key=lambda entry: entry.name)
+    return tuple(entry.load() for entry in found)
+
+
+def _every_format() -> Iterator[LogFormat]:
+    """Yield all formats, those of other packages last, so that these are looked for only where they are needed."""
+    yield from FORMATS
+    yield from _of_other_packages()
+
+
+def recognised_format(head: bytes, name: str) -> LogFormat | None:
+    """Return the format of a file by its first :data:`HEAD_BYTES` and its name; None where it is no log."""
+    return next((f for f in _every_format() if f.recognises(head, name)), None)
+
+
+def log_suffixes() -> tuple[str, ...]:
+    """Return the suffixes by which files are taken for logs in a search through folders."""
+    return tuple(suffix for f in _every_format() for suffix in f.suffixes)
+
+
+def what_is_a_log() -> str:
+    """Return the formats in words."""
+    return f"{', '.join(f.title for f in _every_format())} or a rosbag2 folder"

@@ -1,0 +1,154 @@
+"""A log of columns without messages: what a format of tables (CSV, MDF, MAT, ...) gives its columns to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdhef_logtool.logs.byte_account import ByteLedger
+from pdhef_logtool.logs.container import told
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, FieldInfo, TopicInfo, nearest
+from pdhef_logtool.logs.formats import LogFile
+from pdhef_logtool.logs.occupied_time import OccupiedTime, survey_stamps
+from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.signals import IntArray, Loss
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Table:
+    """Columns that were recorded together, which become a topic.
+
+    Attributes
+    ----------
+    name : of the topic. type_name : what kind of source it is, where the file says so.
+    stamps_ns : int64 [N], log time, ascending; derived by the format.
+    fields : columns with their kinds and units; elements of an array are ``name[0]``, ``name[1]``, ...
+    load : returns rows of a column by its path: numbers [N], for kind ``time`` int64 nanoseconds [N]; for the path of
+        an array as a whole [N, k].
+    """
+
+    name: str
+    stamps_ns: IntArray
+    fields: tuple[FieldInfo, ...]
+    load: Callable[[str, slice], NDArray[Any]]
+    type_name: str = ""
+
+    @classmethod
+    def of_arrays(
+        cls, name: str, stamps_ns: IntArray, columns: Mapping[str, NDArray[Any]], units: Mapping[str, str] | None = None
+    ) -> Table:
+        """Return a table of numbers [N] that are in memory, with the unit of each column where one is known."""
+        units = units or {}
+        fields = tuple(FieldInfo(path, "number", unit=units.get(path, "")) for path in columns)
+        return cls(name, stamps_ns, fields, lambda path, rows: columns[path][rows])
+
+
+class TableLog(DriveLog):
+    """Tables as a log. It has no messages to copy, and one ledger entry: the file was read.
+
+    Parameters
+    ----------
+    file : that the tables come from; it is released when the log is closed.
+    kind : name of the format, for reports.
+    tables : one a topic. lost : what of the file could not be read.
+
+    Raises
+    ------
+    LogError : stamps of a table step back, or two tables have one name.
+    """
+
+    def __init__(self, file: LogFile, kind: str, tables: Sequence[Table], lost: Sequence[Loss] = ()) -> None:
+        self.path, self.kind = file.place, kind
+        self._file = file
+        self._tables = {table.name: table for table in sorted(tables, key=lambda table: table.name)}
+        wrong = [t.name for t in tables if self._tables[t.name] is not t or (t.stamps_ns[1:] < t.stamps_ns[:-1]).any()]
+        if wrong:
+            got = f"others: {', '.join(wrong)}"
+            raise LogError(expected="tables of different names with ascending times", got=got, where=str(self.path))
+        self._occupied = survey_stamps({name: t.stamps_ns for name, t in self._tables.items()}, str(self.path))
+        cut = [Loss("truncated", file.cut, str(self.path))] if file.cut else []
+        self._lost = [*lost, *cut, *self._occupied.losses]
+        self._unreadable: set[tuple[str, str]] = set()
+        self._size = file.path.stat().st_size
+
+    @property
+    def topics(self) -> tuple[TopicInfo, ...]:
+        """A topic for each table."""
+        return tuple(TopicInfo(t.name, t.type_name, self.kind, len(t.stamps_ns)) for t in self._tables.values())
+
+    @property
+    def occupied(self) -> OccupiedTime:
+        """When the log was recorded."""
+        return self._occupied
+
+    @property
+    def lost(self) -> tuple[Loss, ...]:
+        """What could not be read, as far as is known by now."""
+        return tuple(self._lost)
+
+    @property
+    def byte_ledgers(self) -> tuple[ByteLedger, ...]:
+        """The whole file as read."""
+        return (ByteLedger(str(self.path), self._size, self._size, 0, 0, bool(self._file.cut), checksummed=0),)
+
+    def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
+        """Return the columns of a table."""
+        del quiet
+        return self._tables[topic].fields if topic in self._tables else ()
+
+    def read(
+        self,
+        requests: Mapping[str, Sequence[str]],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        *,
+        quiet: bool = False,
+        stamps: Collection[str] = (),
+    ) -> dict[str, Columns]:
+        """Read columns of tables; see :class:`~pdhef_logtool.logs.drive_log.DriveLog`."""
+        for topic, paths in requests.items():
+            self._check(topic, paths)
+        window = (self.start_ns if start_ns is None else start_ns, self.end_ns if end_ns is None else end_ns)
+        with self._file.meter.running():
+            wanted = {**dict.fromkeys(stamps, ()), **requests}
+            return {topic: self._columns(self._tables[topic], paths, window, quiet) for topic, paths in wanted.items()}
+
+    def close(self) -> None:
+        """Release the file."""
+        self._file.release()
+
+    def _check(self, topic: str, paths: Sequence[str]) -> None:
+        if topic not in self._tables:
+            raise nearest(topic, list(self._tables), "a topic of the log", self.path)
+        names = [f.path for f in self._tables[topic].fields]
+        for path in paths:
+            if path not in names and not any(name.startswith(f"{path}[") for name in names):
+                raise nearest(path, names, f"a field of {topic}", self.path)
+
+    def _columns(self, table: Table, paths: Sequence[str], window: tuple[int, int], quiet: bool) -> Columns:
+        times = table.stamps_ns
+        spans = [(max(low, window[0]), min(high, window[1])) for low, high in self._occupied.intervals]
+        rows = [slice(*np.searchsorted(times, span).tolist()) for span in spans if span[0] < span[1]]
+        stamps = np.concatenate([np.empty(0, np.int64), *(times[r] for r in rows)])
+        columns = {p: self._column(table, p, rows, len(stamps), quiet) for p in dict.fromkeys(paths)}
+        return Columns(table.name, stamps, stamps, columns)
+
+    def _column(self, table: Table, path: str, rows: Sequence[slice], n: int, quiet: bool) -> NDArray[Any]:
+        """Load rows of a column. The boundary: whatever escapes the format is the loss of the column."""
+        is_time = any(f.path == path and f.kind == "time" for f in table.fields)
+        kind = np.dtype(np.int64 if is_time else np.float64)
+        try:
+            parts = [np.asarray(table.load(path, r)).astype(kind) for r in rows]
+            found = np.concatenate(parts) if parts else np.empty(0, kind)
+            if found.shape[0] != n:
+                raise ValueError(f"{found.shape[0]} values for {n} times")
+        except Exception as error:  # noqa: BLE001
+            if not quiet and (table.name, path) not in self._unreadable:
+                self._unreadable.add((table.name, path))
+                self._lost.append(Loss("bad-column", f"{path} cannot be read: {told(error)[1]}", table.name))
+            return np.zeros(n, kind) if is_time else np.full(n, np.nan)
+        return found

@@ -1,0 +1,241 @@
+"""A format of logs without messages, in a package of its own: one module and one entry make every command read it."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pdhef_logtool import Car, ReadOptions, estimate, inspect_log, read_drive
+from pdhef_logtool.drive.slim import slim_log
+from pdhef_logtool.logs import formats
+from pdhef_logtool.logs.budget import Meter
+from pdhef_logtool.logs.discovery import LogInput, find_logs
+from pdhef_logtool.logs.drive_log import FieldInfo
+from pdhef_logtool.logs.formats import LogFile
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.table_log import Table, TableLog
+from pdhef_logtool.records.errors import LogError, MappingError, PdhefError
+
+G_M_S2 = 9.80665
+TOPICS = {
+    "imu": {
+        "lateral_acceleration [g]": ("ay_m_s2", 1 / G_M_S2),
+        "longitudinal_acceleration [m/s²]": ("ax_m_s2", 1.0),
+        "yaw_rate [°/s]": ("yaw_rate_rad_s", math.degrees(1.0)),
+    },
+    "esp": {
+        "road_wheel_angle [deg]": ("steer_rad", math.degrees(1.0)),
+        **{f"wheel_speed_{w} [km/h]": (f"wheel_speed_{w}_m_s", 3.6) for w in ("fl", "fr", "rl", "rr")},
+    },
+}
+MAPPING = """
+[signals.ax_m_s2]
+topic = "imu"
+field = "longitudinal_acceleration"
+[signals.ay_m_s2]
+topic = "imu"
+field = "lateral_acceleration"
+scale = 9.80665
+[signals.yaw_rate_rad_s]
+topic = "imu"
+field = "yaw_rate"
+scale = 0.017453292519943295
+"""
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of an installed package that adds the format: a module and an entry point."""
+    folder = tmp_path_factory.mktemp("package")
+    shutil.copy(Path(__file__).with_name("npz_log.py"), folder)
+    about = folder / "npz_log-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: npz-log\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[pdhef.log_formats]\nnpz = npz_log:FORMAT\n")
+    return folder
+
+
+@pytest.fixture
+def _installed(package: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.syspath_prepend(str(package))
+    importlib.invalidate_caches()
+    formats._of_other_packages.cache_clear()
+    yield
+    formats._of_other_packages.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def npz(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a log of the format: the signals of a sample log, steering and wheels at half of the IMU's rate."""
+    columns: dict[str, np.ndarray] = {}  # type: ignore[type-arg]
+    with read_drive(sample_logs_dir / "dlc.mcap", Car.load("saloon")) as drive:
+        signals = drive.whole().signals
+        wheels = {f"wheel_speed_{w}_m_s": signals.speed_m_s for w in ("fl", "fr", "rl", "rr")}
+        for topic, fields in TOPICS.items():
+            rows = slice(10, -10, 1 if topic == "imu" else 2)  # the speed is known there
+            columns[f"{topic}/t [s]"] = signals.stamps_ns[rows] * 1e-9
+            for name, (signal, scale) in fields.items():
+                values = wheels[signal] if signal in wheels else getattr(signals, signal)
+                columns[f"{topic}/{name}"] = values[rows] * scale
+    path = tmp_path_factory.mktemp("logs") / "drive.npz"
+    np.savez(path, **columns)
+    return path
+
+
+@pytest.mark.usefixtures("_installed")
+def test_an_inspection_shows_tables_and_their_units(npz: Path) -> None:
+    found = inspect_log(npz)
+    assert found.kind == "npz"
+    assert [(t.name, t.encoding, round(t.rate_hz)) for t in found.topics] == [("esp", "npz", 50), ("imu", "npz", 100)]
+    taken = {name: report.topic for name, report in found.signals.items()}
+    assert taken == {signal: topic for topic, fields in TOPICS.items() for signal, _ in fields.values()}
+    with read_drive(npz, Car.load("saloon")) as drive:
+        scales = {s.name: s.scale for s in drive.mapping.sources()}
+    assert scales == pytest.approx({s: 1 / scale for f in TOPICS.values() for s, scale in f.values()})
+    assert found.lost == ()
+
+
+@pytest.mark.usefixtures("_installed")
+def test_a_drive_of_tables_is_estimated_in_windows(npz: Path) -> None:
+    tracks = []
+    for window_s in (2.0, 60.0):
+        with read_drive(npz, Car.load("saloon"), options=ReadOptions(window_s=window_s)) as drive:
+            tracks.append(estimate(drive, ["zero", "phy-ukf"]).tracks["phy-ukf"])
+            (ledger,) = drive.byte_ledgers
+            assert (ledger.size, ledger.decoded, ledger.lost) == (npz.stat().st_size, npz.stat().st_size, 0)
+    assert tracks[0].valid.any()
+    for name in ("sideslip_rad", "vx_m_s", "yaw_rate_rad_s"):
+        np.testing.assert_array_equal(*(getattr(t, name) for t in tracks))
+
+
+@pytest.mark.usefixtures("_installed")
+def test_what_a_log_without_messages_cannot_do_is_said(npz: Path, tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="has only columns"):
+        slim_log(LogInput(npz, "drive"), tmp_path / "slim.mcap", None, ReadOptions())
+    assert not (tmp_path / "slim.mcap").exists()
+    log = open_log(npz)
+    for topic, path in (("imo", "yaw_rate"), ("imu", "yaw_rates")):
+        with pytest.raises(MappingError, match=r"nearest: (imu|yaw_rate)"):
+            log.read({topic: [path]})
+    log.close()
+
+
+@pytest.mark.usefixtures("_installed")
+def test_a_compressed_file_and_a_folder_of_one_file_are_read_too(npz: Path, tmp_path: Path) -> None:
+    import zstandard
+
+    (tmp_path / "drive.npz.zst").write_bytes(zstandard.compress(npz.read_bytes()))
+    expected = open_log(npz).read({"imu": ["yaw_rate"]})["imu"]
+    for place in (tmp_path / "drive.npz.zst", tmp_path):
+        log = open_log(place)
+        found = log.read({"imu": ["yaw_rate"]})["imu"]
+        np.testing.assert_array_equal(found.fields["yaw_rate"], expected.fields["yaw_rate"])
+        log.close()
+
+
+@pytest.mark.usefixtures("_installed")
+def test_times_far_from_all_others_are_left_out(npz: Path, tmp_path: Path) -> None:
+    with np.load(npz) as archive:
+        columns = dict(archive)
+    columns["imu/t [s]"][0] = 5.0
+    np.savez(tmp_path / "stray.npz", **columns)
+    log, sound = open_log(tmp_path / "stray.npz"), open_log(npz)
+    assert (log.start_ns, log.end_ns) == (sound.start_ns, sound.end_ns)
+    assert [(loss.kind, loss.count, loss.severity) for loss in log.lost] == [("outlier", 1, "note")]
+    assert len(log.read({}, stamps=["imu"])["imu"]) == len(columns["imu/t [s]"]) - 1
+
+
+@pytest.mark.usefixtures("_installed")
+def test_a_column_that_cannot_be_read_is_a_loss_and_the_others_are_read(npz: Path) -> None:
+    def load(path: str, rows: slice) -> np.ndarray:  # type: ignore[type-arg]
+        if path == "bad":
+            raise ValueError("a block of it is damaged")
+        return np.arange(5)[rows]
+
+    fields = tuple(FieldInfo(path, kind) for path, kind in (("good", "number"), ("bad", "number"), ("at", "time")))
+    table = Table("t", np.arange(5) * 10, fields, load)
+    log = TableLog(LogFile(npz, npz, Meter()), "toy", [table])
+    found = log.read({"t": ["good", "bad", "at"]}, 10, 40)["t"].fields
+    assert found["good"].tolist() == found["at"].tolist() == [1, 2, 3]
+    assert found["at"].dtype == np.int64
+    assert np.isnan(found["bad"]).all()
+    assert [(loss.kind, loss.severity, loss.where) for loss in log.lost] == [("bad-column", "lost", "t")]
+    with pytest.raises(LogError, match="ascending times"):
+        TableLog(LogFile(npz, npz, Meter()), "toy", [dataclasses.replace(table, stamps_ns=np.arange(5)[::-1])])
+    with pytest.raises(LogError, match="different names"):
+        TableLog(LogFile(npz, npz, Meter()), "toy", [table, dataclasses.replace(table)])
+
+
+@pytest.mark.usefixtures("_installed")
+def test_a_damaged_file_is_told_in_one_line(npz: Path, tmp_path: Path) -> None:
+    (tmp_path / "cut.npz").write_bytes(npz.read_bytes()[:-500])
+    with pytest.raises(LogError, match="a NumPy archive or a rosbag2 folder"):
+        open_log(tmp_path / "cut.npz")
+
+
+def test_the_message_for_an_unknown_file_lists_the_formats(tmp_path: Path) -> None:
+    (tmp_path / "drive.npz").write_bytes(b"PK\x03\x04")
+    titles = ", ".join(f.title for f in formats.FORMATS)
+    with pytest.raises(PdhefError, match=f"expected {titles} or a rosbag2 folder"):
+        open_log(tmp_path / "drive.npz")
+
+
+def _pdhef(package: Path, *arguments: object) -> tuple[int, str, str]:
+    done = subprocess.run(
+        [sys.executable, "-m", "pdhef_logtool", *map(str, arguments)],
+        env={**os.environ, "PYTHONPATH": str(package)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    return done.returncode, done.stdout, done.stderr
+
+
+def test_a_fleet_of_tables_runs_in_several_processes(package: Path, npz: Path, tmp_path: Path) -> None:
+    logs = tmp_path / "logs"
+    for name in ("one", "two"):
+        (logs / name).mkdir(parents=True)
+        shutil.copy(npz, logs / name / "drive.npz")
+    with np.load(npz) as archive:
+        columns = dict(archive)
+    columns["imu/yaw_rate [°/s]"] = columns["imu/yaw_rate [°/s]"] * 1.01
+    np.savez(logs / "two" / "drive.npz", **columns)
+    out = tmp_path / "out"
+    code, _, said = _pdhef(package, "run", logs, "-o", out, "--car", "saloon", "-e", "zero,phy-ukf", "--jobs", "2")
+    assert code == 0, said
+    run = json.loads((out / "run.json").read_text())
+    assert [(log["log"], log["outcome"]) for log in run["logs"]] == [("one__drive", "ok"), ("two__drive", "ok")]
+    for log in run["logs"]:
+        folder = out / "logs" / log["log"]
+        report = json.loads((folder / "report.json").read_text())
+        assert report["log"]["kind"] == "npz"
+        assert "annotated.mcap holds our topics only: a log of kind npz has no messages to copy" in report["remarks"]
+        assert {m["metric"] for m in report["metrics"]} >= {"d2"}
+        assert (folder / "report.html").stat().st_size > 10_000
+        annotated = open_log(folder / "annotated.mcap")
+        assert {t.name for t in annotated.topics} == {
+            "/pdhef/phy_ukf/state", "/pdhef/phy_ukf/odometry", "/pdhef/zero/state", "/pdhef/zero/odometry"
+        }  # fmt: skip
+        annotated.close()
+    code, _, said = _pdhef(package, "events", out, "--where", "vx_m_s > 1", "--clip", "--source", logs / "one")
+    assert "one__drive: clips hold our tracks only: the log has no messages to copy" in said
+    assert code == 3, said  # the source of the other drive is not there
+    assert list((out / "clips").iterdir())
+
+
+@pytest.mark.usefixtures("_installed")
+def test_a_search_takes_files_of_the_format_and_a_mapping_file_names_their_columns(npz: Path, tmp_path: Path) -> None:
+    assert [log.path for log in find_logs([str(npz.parent)])] == [npz]
+    (tmp_path / "m.toml").write_text(MAPPING)
+    from pdhef_logtool import load_mapping
+
+    with read_drive(npz, Car.load("saloon"), load_mapping(tmp_path / "m.toml")) as drive:
+        assert drive.available >= {"ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"}

@@ -1,0 +1,136 @@
+"""Every file, folder and log that the Python API takes may be a text or a path; one log stands for a list of one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import pdhef_logtool as pdhef
+from pdhef_logtool.logs.definitions import read_definitions
+
+KINDS = [str, Path]
+MAPPING = '[signals.yaw_rate_rad_s]\ntopic = "/imu/data"\nfield = "angular_velocity.z"\n'
+FILES = ("car", "cars", "mapping", "msgs", "thresholds", "network", "intervals")
+
+
+@pytest.fixture(scope="module")
+def dlc(sample_logs_dir: Path) -> Path:
+    return sample_logs_dir / "dlc.mcap"
+
+
+@pytest.fixture
+def mapping(tmp_path: Path) -> Path:
+    (tmp_path / "m.toml").write_text(f"fill_recognised = true\n{MAPPING}")
+    return tmp_path / "m.toml"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("parameter", ["log", "car", "mapping", "msgs"])
+def test_read_drive(dlc: Path, sample_logs_dir: Path, mapping: Path, tmp_path: Path, kind: Any, parameter: str) -> None:
+    (tmp_path / "msgs").mkdir()
+    (tmp_path / "msgs" / "Any.msg").write_text("float64 a\n")
+    given: dict[str, Any] = {"log": dlc, "car": pdhef.Car.load("saloon"), "mapping": None}
+    options = {}
+    if parameter == "msgs":
+        options = {"options": pdhef.ReadOptions(msgs=kind(tmp_path / "msgs"))}
+    else:
+        places = {"log": dlc, "car": sample_logs_dir / "vehicle.toml", "mapping": mapping}
+        given[parameter] = kind(places[parameter])
+    with pdhef.read_drive(*given.values(), **options) as drive:
+        assert "yaw_rate_rad_s" in drive.available
+        assert (drive.mapping.origin == "file") == (parameter == "mapping")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_inspect_log(dlc: Path, mapping: Path, tmp_path: Path, kind: Any) -> None:
+    (tmp_path / "Any.msg").write_text("float64 a\n")
+    found = pdhef.inspect_log(kind(dlc), kind(mapping), msgs=kind(tmp_path))
+    assert set(found.signals) == {"yaw_rate_rad_s"}
+    assert set(pdhef.load_mapping(kind(mapping)).signals) == set(found.mapping.signals)
+    assert read_definitions(kind(tmp_path)).files == read_definitions(tmp_path).files
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_car_load(sample_logs_dir: Path, kind: Any) -> None:
+    car = pdhef.Car.load(kind(sample_logs_dir / "vehicle.toml"), network=kind("many-cars"), intervals=kind("none"))
+    assert car.network is not None
+    assert car.intervals is None
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("entry", FILES)
+def test_run_config_and_read_options(kind: Any, entry: str) -> None:
+    assert getattr(pdhef.RunConfig(**{entry: kind("a/b.toml")}), entry) == Path("a/b.toml")
+    assert pdhef.RunConfig(cache=kind("a")).read_options.cache == "a" == pdhef.ReadOptions(cache=kind("a")).cache
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_run(dlc: Path, mapping: Path, sample_logs_dir: Path, tmp_path: Path, kind: Any) -> None:
+    (tmp_path / "t.toml").write_text('[[threshold]]\nsignal = "sideslip_rad"\nmetric = "rmse"\nmax = 9.0\n')
+    config = pdhef.RunConfig(
+        estimators=("zero",), annotate="none", keep="metrics", mapping=kind(mapping),
+        car=kind(sample_logs_dir / "vehicle.toml"), thresholds=kind(tmp_path / "t.toml"),
+    )  # fmt: skip
+    result = pdhef.run(kind(dlc), kind(tmp_path / "out"), config, junit=kind(tmp_path / "j.xml"), report=False)
+    assert result.exit_code == 0
+    assert (tmp_path / "out" / "run.json").is_file()
+    assert (tmp_path / "j.xml").is_file()
+
+
+def _settings(name: str, config: pdhef.RunConfig) -> Any:
+    kinds = {
+        "identify": config, "tune": pdhef.TuneSettings(config=config), "trust": pdhef.LearnSettings(config=config),
+        "calibrate": pdhef.CalibrateSettings(config=config), "learn": pdhef.CourseSettings(config=config),
+        "extract": pdhef.ExtractSettings(config=config),
+    }  # fmt: skip
+    return kinds[name]
+
+
+def _ends(call: Callable[[], Any]) -> str:
+    """Return how a command ends whose log is not there."""
+    with pytest.raises(pdhef.PdhefError) as ended:
+        call()
+    return str(ended.value)
+
+
+@pytest.mark.parametrize("name", ["identify", "tune", "trust", "calibrate", "learn", "extract"])
+def test_what_learns(name: str, sample_logs_dir: Path, tmp_path: Path) -> None:
+    log = tmp_path / "none.mcap"
+    command = getattr(pdhef, name)
+    ends = set()
+    for number, kind in enumerate([*KINDS, *KINDS]):
+        arguments = kind(log) if number < len(KINDS) else [kind(log)]
+        config = pdhef.RunConfig(car=kind("saloon"), network=kind("many-cars"))
+        output = tmp_path / f"{number}" / "out"
+        ends.add(_ends(lambda: command(arguments, kind(output), _settings(name, config))))  # noqa: B023
+    assert len(ends) == 1
+    assert "no such file" in ends.pop().lower()
+
+
+@pytest.mark.parametrize("name", ["identify", "tune", "trust", "calibrate", "learn", "extract"])
+def test_a_url_is_no_place_for_what_is_learnt(name: str, dlc: Path) -> None:
+    config = pdhef.RunConfig(car=Path("saloon"))
+    ends = _ends(lambda: getattr(pdhef, name)([dlc], "s3://bucket/car", _settings(name, config)))
+    assert "expected a place on this machine, got s3://bucket/car" in ends
+
+
+def test_train(tmp_path: Path) -> None:
+    ends = {
+        _ends(lambda: pdhef.train(kind(tmp_path / "set"), kind(tmp_path / "out"), init=kind(tmp_path / "net")))  # noqa: B023
+        for kind in KINDS
+    }
+    assert len(ends) == 1
+    (tmp_path / "net").mkdir()
+    ends = {_ends(lambda: pdhef.train(tmp_path / "set", "s3://bucket/out", init=kind("default"))) for kind in KINDS}  # noqa: B023
+    assert len(ends) == 1
+
+
+def test_every_name_of_the_api_is_tested_or_takes_no_file() -> None:
+    tested = {"read_drive", "inspect_log", "load_mapping", "Car", "RunConfig", "ReadOptions", "run", "train"}
+    tested |= {"identify", "tune", "trust", "calibrate", "learn", "extract"}
+    of_drives = {"choose", "estimate", "estimate_windows", "score", "Drive"}
+    settings = {name for name in pdhef.__all__ if name.endswith("Settings")}
+    assert set(pdhef.__all__) == tested | of_drives | settings | {"PdhefError", "__version__"}
