@@ -34,7 +34,7 @@ from pdhef_logtool.logs.discovery import (
     with_free_stem,
 )
 from pdhef_logtool.mapping import Mapping, load_mapping
-from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError
+from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, WorkerError
 from pdhef_logtool.records.files import writing
 from pdhef_logtool.records.object_store import is_url
 from pdhef_logtool.records.outputs import OutputFolder
@@ -90,6 +90,7 @@ _NO_SETTING = frozenset(
 _FILES = ("mapping", "msgs", "thresholds", "cars")
 _READERS = 16
 _AGAIN = "they are tried again"
+_GOES_ON = "; --resume goes on"
 #: Begins the name of a file by which nodes know the output's folder.
 _MARK = ".nodes-"
 
@@ -244,6 +245,7 @@ def run_logs(
                 if fleet.done:
                     stop.add_note("--resume goes on")
                 stop.add_note(f"{fleet.done} of {len(planned)} logs are done")
+                _sweep_parts(output, {e.part for e in journal.entries.values()})
                 with suppress(PdhefError):
                     fleet.collect()
                     if stored is not None:
@@ -585,21 +587,25 @@ class _Fleet:
         """Yield how the tasks end, here or on a cluster."""
         work = self.work if self.stored is None else partial(stored_drive, self.stored.objects, self.work)
         ends = (
-            supervise(work, tasks, jobs=self.jobs, limits=self.limits, preload=_PRELOAD, progress=hear)
+            supervise(work, tasks, jobs=self.jobs, limits=self.limits, preload=_PRELOAD, progress=hear, warn=self.warn)
             if self.ray is None
             else self._on_cluster(work, tasks, self.ray)
         )
         with closing(ends):
-            for ended in ends:
-                result = ended.result
-                if isinstance(result, OutputError):
-                    if self.stored is not None:
-                        result.remedy += "; --resume goes on"
-                    raise result
-                if isinstance(result, StoredEnd):
-                    assert self.stored is not None
-                    result = self.stored.take(result)
-                yield Ended(ended.number, ended.item, result, ended.failure)
+            try:
+                for ended in ends:
+                    result = ended.result
+                    if isinstance(result, OutputError):
+                        if self.stored is not None:
+                            result.remedy += _GOES_ON
+                        raise result
+                    if isinstance(result, StoredEnd):
+                        assert self.stored is not None
+                        result = self.stored.take(result)
+                    yield Ended(ended.number, ended.item, result, ended.failure)
+            except WorkerError as error:
+                error.remedy += _GOES_ON
+                raise
 
     def _on_cluster(
         self, work: Callable[[DriveTask, Tell], Any], tasks: Iterator[DriveTask], address: str
