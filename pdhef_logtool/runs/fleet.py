@@ -34,6 +34,7 @@ from pdhef_logtool.logs.discovery import (
     with_free_stem,
 )
 from pdhef_logtool.mapping import Mapping, load_mapping
+from pdhef_logtool.records.documents import file_sha256
 from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, WorkerError
 from pdhef_logtool.records.files import writing
 from pdhef_logtool.records.object_store import is_url
@@ -42,6 +43,7 @@ from pdhef_logtool.records.processes import own_name
 from pdhef_logtool.records.ray_supervisor import supervise_on_ray
 from pdhef_logtool.records.supervisor import Ended, Limits, Tell, supervise
 from pdhef_logtool.results.opened_run import (
+    JOURNAL_FILE,
     LOGS,
     METRICS_FILE,
     PAGE_FILE,
@@ -52,7 +54,7 @@ from pdhef_logtool.results.opened_run import (
 )
 from pdhef_logtool.runs.cars import RunCars, car_record
 from pdhef_logtool.runs.config import Keep, RunConfig
-from pdhef_logtool.runs.journal import Entry, Journal, Place, changes, digest_of
+from pdhef_logtool.runs.journal import Entry, Journal, Place, changes, digest_of, outputs_digest
 from pdhef_logtool.runs.pipeline import (
     FEW_LOGS,
     LogResult,
@@ -90,6 +92,7 @@ _NO_SETTING = frozenset(
 _FILES = ("mapping", "msgs", "thresholds", "cars")
 _READERS = 16
 _AGAIN = "they are tried again"
+_DAMAGED = "their outputs are damaged"
 _GOES_ON = "; --resume goes on"
 #: Begins the name of a file by which nodes know the output's folder.
 _MARK = ".nodes-"
@@ -124,7 +127,7 @@ class DriveEnd:
     Attributes
     ----------
     identity : what its log is known by. car : :func:`~.cars.car_record`. part, error_rad : as in the journal.
-    warned : lines for people. again : whether a failure may be none the next time.
+    warned : lines for people. again : whether a failure may be none the next time. outputs : as in the journal.
     """
 
     outcome: LogOutcome
@@ -135,6 +138,7 @@ class DriveEnd:
     error_rad: float | None = None
     warned: tuple[str, ...] = ()
     again: bool = False
+    outputs: str | None = None
 
 
 Work = Callable[[DriveTask, Tell], DriveEnd]
@@ -218,6 +222,9 @@ def run_logs(
             if resume:
                 stored.fetch_journal()
         journal = Journal.read(output) if resume else Journal.of(output)
+        if journal.damaged:
+            lines = "1 line is" if journal.damaged == 1 else f"{journal.damaged} lines are"
+            say(f"{JOURNAL_FILE}: {lines} damaged or of another version: the drives of these are run again")
         planned = _plan(inputs, journal, twice=config.cars is not None, warn=warn)
         check_places([p.log for p in planned], output, config, mapping, junit, cars.paths)
         pools = _pools(planned, cars, mapping, config)
@@ -326,6 +333,7 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
         result.failed_checks,
         _error_of(result),
         tuple(warned),
+        outputs=outputs_digest(task.output / log_place(task.log.stem) / REPORT_FILE, task.output / part),
     )
 
 
@@ -340,7 +348,8 @@ def _page_of(output: Path, outcome: LogOutcome) -> list[str]:
     """Write the page of a drive; return what is wrong with it."""
     from pdhef_logtool.reports.pages import write_drive_page
 
-    log = OpenedLog(outcome.log, outcome.outcome, output / log_place(outcome.log), {"main": outcome.main})
+    entry = {"main": outcome.main, "files": outcome.files}
+    log = OpenedLog(outcome.log, outcome.outcome, output / log_place(outcome.log), entry)
     wrong = write_drive_page(log).wrong
     return [f"no page of {outcome.log}: {wrong}"] if wrong else []
 
@@ -534,6 +543,7 @@ class _Fleet:
     _said: set[str] = field(default_factory=set)
     _run: str = field(default_factory=lambda: f"{own_name()}-{next(_RUNS)}")
     _quiet: bool = False
+    _sound: dict[int, bool] = field(default_factory=dict)
 
     @property
     def done(self) -> int:
@@ -565,6 +575,10 @@ class _Fleet:
         todo = [p for p in chosen if reasons[p.log.stem] is not None]
         if names is None and self.journal.entries:
             self._tell_of(chosen, [r for r in reasons.values() if r], retry)
+        elif damaged := sum(
+            self._reason(p, "metrics", retry=False) == _DAMAGED for p in self.planned if p not in chosen
+        ):
+            self.say(f"{damaged} other drives are left out of the run until --resume: {_DAMAGED}")
         if not todo:
             return
         self._quiet = len(self.planned) > FEW_LOGS
@@ -655,7 +669,7 @@ class _Fleet:
         before = self.journal.entries.get(one.log.stem)
         failed = end.outcome.failed is not None and end.part is None
         entry = Entry(
-            one.log.stem, one.place, end.identity or one.identity, self.setting, car, keep, end.part,
+            one.log.stem, one.place, end.identity or one.identity, self.setting, car, keep, end.part, end.outputs,
             end.failed_checks, end.error_rad, failed, end.again, quarantined,
         )  # fmt: skip
         self.journal.add(entry, end.outcome)
@@ -686,7 +700,19 @@ class _Fleet:
         folder = self.output / log_place(entry.label)
         if not (folder / REPORT_FILE).is_file() or entry.part is None or not (self.output / entry.part).is_file():
             return "their outputs are gone"
-        return None
+        return None if self._is_sound(entry) else _DAMAGED
+
+    def _is_sound(self, entry: Entry) -> bool:
+        """Whether report and figures of a drive are as they were written; read once for each line of the journal."""
+        if entry.outputs is None:
+            return True
+        if entry.at not in self._sound:
+            paths = self.output / log_place(entry.label) / REPORT_FILE, self.output / str(entry.part)
+            try:
+                self._sound[entry.at] = outputs_digest(*paths) == entry.outputs
+            except OSError:
+                self._sound[entry.at] = False
+        return self._sound[entry.at]
 
     def _changes(self, entry: Entry) -> Iterator[str]:
         """Yield in words what a drive was run with that is not so now."""
@@ -738,15 +764,18 @@ class _Fleet:
         if not entries and remaining:
             return []
         results = [self._result(entry, folder) for entry, folder in entries]
-        join_metrics(self.output / METRICS_FILE, [r.figures_file for r in results if r.figures_file is not None])
+        metrics = self.output / METRICS_FILE
+        join_metrics(metrics, [r.figures_file for r in results if r.figures_file is not None])
+        cars = self.journal.cars | self._cars_now()  # a line that says what a car is may be damaged
         networks = {
-            None if (network := self.journal.cars[e.car]["network"]) is None else (network[0], network[1])
+            None if (network := cars[e.car]["network"]) is None else (network[0], network[1])
             for e, _ in entries
             if e.car is not None
         }
         only = networks.pop() if len(networks) == 1 else None
         network = None if only is None else {"name": only[0], "sha256": only[1]}
-        run = build_run(tool_versions(), self.config.to_dict(), network, [r.outcome for r in results], remaining)
+        files, outcomes = {METRICS_FILE: file_sha256(metrics)}, [r.outcome for r in results]
+        run = build_run(tool_versions(), self.config.to_dict(), network, outcomes, remaining, files)
         write_json(self.output / RUN_FILE, run)
         if remaining:
             (self.output / PAGE_FILE).unlink(missing_ok=True)  # it is of other drives

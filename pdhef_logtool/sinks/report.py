@@ -20,7 +20,7 @@ from pdhef_logtool.evaluation.reasons import ReasonFacts, SensorFault
 from pdhef_logtool.evaluation.standing import Standing
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.records.checks import Check
-from pdhef_logtool.records.documents import jsonable
+from pdhef_logtool.records.documents import jsonable, seal
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.signals import Loss
@@ -199,6 +199,7 @@ class LogOutcome:
 
     ``failed`` is the one-line reason if nothing came out; ``lost`` says what of the log could not be used.
     ``main``: the estimator that is the answer. ``folder`` of the log, below the one that holds all logs of the run.
+    ``files``: sha256 by name of the files in the log's folder that commands read back.
     """
 
     log: str
@@ -212,6 +213,7 @@ class LogOutcome:
     mapping_sha256: str | None = None
     main: str | None = None
     folder: str = ""
+    files: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def outcome(self) -> str:
@@ -358,8 +360,9 @@ def build_run(
     model: Mapping[str, str] | None,
     outcomes: Iterable[LogOutcome],
     remaining: int = 0,
+    files: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Return the document of run.json (schemas/run.schema.json).
+    """Return the document of run.json (schemas/run.schema.json), sealed.
 
     Parameters
     ----------
@@ -367,6 +370,7 @@ def build_run(
     config : the configuration in effect, as JSON-able values.
     model : ``name`` and ``sha256`` of the network; None when none ran, or not the same for all.
     outcomes : one a log. remaining : logs that are not done, for the run was ended.
+    files : sha256 by name of the files beside run.json that commands read back.
     """
     document = {
         "format": "pdhef.run",
@@ -375,6 +379,7 @@ def build_run(
         "config": dict(config),
         "model": None if model is None else dict(model),
         **({"remaining": remaining} if remaining else {}),
+        "files": dict(files or {}),
         "logs": [
             {
                 "log": o.log,
@@ -387,11 +392,12 @@ def build_run(
                 "outcome": o.outcome,
                 "main": o.main,
                 "car": o.car,
+                "files": o.files,
             }
             for o in outcomes
         ],
     }
-    return {key: jsonable(value) for key, value in document.items()}
+    return seal(document)
 
 
 def json_bytes(document: Mapping[str, Any], *, brief: bool = False) -> bytes:
