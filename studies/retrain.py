@@ -10,7 +10,6 @@ drives are sound each time. What is there from an interrupted call is taken.
 from __future__ import annotations
 
 import hashlib
-import json
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -22,11 +21,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pdhef_logtool.learning.network.dataset import MANIFEST, TARGETS
+from pdhef_logtool.learning.network.dataset import MANIFEST, TARGETS, read_manifest
 from pdhef_logtool.learning.network.extract_command import extract
 from pdhef_logtool.learning.retrain import retrain_command
 from pdhef_logtool.learning.retrain.retrain_command import RetrainResult, RetrainSettings, retrain
-from pdhef_logtool.records.documents import digest
+from pdhef_logtool.records.documents import digest, seal
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.sinks.report import write_json
 from studies.pages import options
@@ -87,7 +86,7 @@ def retrained(
 
 def corrupt_labels(dataset: Path, corrupt: Corrupt) -> dict[str, Any]:
     """Spoil the targets of every drive of a dataset, usable rows among themselves; return its manifest."""
-    document: dict[str, Any] = json.loads((dataset / MANIFEST).read_text(encoding="utf-8"))
+    document = read_manifest(dataset)
     for drive in document["drives"]:
         path = dataset / drive["file"]
         table, rng = pq.read_table(path, partitioning=None), np.random.default_rng(0)
@@ -101,7 +100,7 @@ def corrupt_labels(dataset: Path, corrupt: Corrupt) -> dict[str, Any]:
         drive["file_sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
     files = [d["file_sha256"] for d in document["drives"]]
     document["sha256"] = digest(files)
-    write_json(dataset / MANIFEST, document)
+    write_json(dataset / MANIFEST, seal(document))
     return document
 
 

@@ -24,6 +24,7 @@ from pdhef_logtool.car.parts import (
     Fit,
     FittedPhysics,
     FittedValues,
+    HistoryLine,
     Intervals,
     LearntOn,
     Noise,
@@ -32,7 +33,7 @@ from pdhef_logtool.car.parts import (
     physics_sha256,
 )
 from pdhef_logtool.car.vehicle import Record, VehicleParameters, default_vehicle
-from pdhef_logtool.records.documents import read_json, read_toml, validated
+from pdhef_logtool.records.documents import read_json, read_text, read_toml, validated
 from pdhef_logtool.records.errors import UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
@@ -391,8 +392,15 @@ def load_intervals(path: Path) -> Intervals:
 
 
 def read_history(folder: Path) -> list[dict[str, Any]]:
-    """Return the lines of a car's history, oldest first; none without."""
+    """Return the lines of a car's history, oldest first; none without. Raises VehicleError for a damaged one."""
     path = folder / HISTORY_FILE
     if not path.is_file():
         return []
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    expected = "lines that commands wrote"
+    try:
+        lines = [json.loads(line) for line in read_text(path).splitlines() if line.strip()]
+    except (OSError, ValueError, RecursionError) as error:
+        raise VehicleError(expected=expected, got=str(error), where=str(path)) from None
+    for number, line in enumerate(lines, start=1):
+        validated(HistoryLine, line, f"{path}, line {number}", VehicleError, expected=expected)
+    return lines

@@ -26,8 +26,9 @@ _PAD_S, _CLIP_PAD_S = 0.25, 5.0
     "pdhef compare before after --max-regression 5%",
     "pdhef compare before after --gate gate.toml --junit gate.xml --strict",
     "pdhef compare before after --cluster day --html change.html",
-    notes="Exit codes: 0 no regression, or nobody can tell; 1 no drive is in both; 3 drives without partner, and no "
-    "gate; 4 the gate is closed, or cannot tell with --strict. Without a gate a change alone closes nothing.",
+    notes="Exit codes: 0 no regression, or nobody can tell; 1 no drive is in both; 3 files of drives are damaged, or "
+    "drives have no partner and there is no gate; 4 the gate is closed, or cannot tell with --strict. Without a gate a "
+    "change alone closes nothing.",
 )
 def compare(
     a: Annotated[str, Argument(metavar="A", help="Outputs of the run that is the yardstick: folder or URL.")],
@@ -64,6 +65,8 @@ def compare(
     )
     asked = _gate(gate, max_regression, estimator, metric, allow_unpaired=allow_unpaired)
     found = compare_runs(open_run(a), open_run(b), asked, cluster=cluster, strict=strict)
+    for line in found.damaged:
+        console.warn(line)
     if junit is not None:
         write_comparison_junit(junit, found)
     if html is not None:
@@ -144,6 +147,8 @@ def events(
     check_no_input([] if is_url(output) else [Path(output)], [] if parquet is None else [parquet])
     run = open_run(output)
     found = find_events(run, condition, estimator=estimator, pad_s=pad_s)
+    for line in found.damaged:
+        console.warn(line)
     if clip:
         from pdhef_logtool.results.clips import write_clips
 

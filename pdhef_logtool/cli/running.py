@@ -14,7 +14,7 @@ import typer
 from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options
-from pdhef_logtool.records.errors import OutputError, UsageError
+from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 
 if TYPE_CHECKING:
     from pdhef_logtool.runs.config import RunConfig
@@ -193,7 +193,19 @@ def view(
     web: Annotated[bool, Option("--web", help="In the browser, for machines without a display.")] = False,
 ) -> None:
     """Open the recordings of a run in the Rerun viewer."""
-    recordings = find_recordings(output, log or ())
+    from pdhef_logtool.sinks.base import is_finished_recording
+
+    named = find_recordings(output, log or ())
+    recordings = [path for path in named if path == output or is_finished_recording(path)]
+    damaged = [
+        OutputError(expected="a finished recording", got="a damaged one", where=str(path), remedy="run the log again")
+        for path in named
+        if path not in recordings
+    ]
+    if not recordings:
+        raise damaged[0]
+    for error in damaged:
+        console.warn(str(error))
     if not web and not _has_display():
         raise UsageError(
             expected="a display to open the viewer on",
@@ -202,7 +214,7 @@ def view(
             remedy="add --web and open the address that it prints, or copy the .rrd files to a machine with a display",
         )
     console.say(f"opening {recordings[0] if len(recordings) == 1 else f'{len(recordings)} recordings of {output}'}")
-    raise typer.Exit(open_viewer(recordings, web=web))
+    raise typer.Exit(open_viewer(recordings, web=web) or (EXIT_PARTIAL if damaged else EXIT_OK))
 
 
 def _finish(result: RunResult, as_json: bool) -> NoReturn:

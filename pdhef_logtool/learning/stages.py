@@ -5,15 +5,16 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.drive.reading import Tell
-from pdhef_logtool.records.documents import digest
+from pdhef_logtool.records.documents import digest, read_sealed, seal
+from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.files import write_bytes, writing
 from pdhef_logtool.records.outputs import FolderTransaction
+from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES
 from pdhef_logtool.sinks.report import json_bytes
 
 STAGE_FILE = "step.json"
@@ -39,17 +40,16 @@ class Stages:
         work : does the stage in a folder, which then stands whole or not at all as ``NUMBER-NAME``.
         """
         key, folder = digest([name, basis]), self.place(number, name)
-        with suppress(OSError, ValueError, RecursionError, KeyError, TypeError):
-            document = json.loads((folder / STAGE_FILE).read_text(encoding="utf-8"))
-            if document["basis"] == key:
-                self.say(f"{name}: {document['shown']} (as found before)")
-                return dict(document["found"])
+        document = read_own(folder / STAGE_FILE, self.say)
+        if document is not None and document["basis"] == key:
+            self.say(f"{name}: {document['shown']} (as found before)")
+            return dict(document["found"])
         began = time.monotonic()
         self.progress(name, share)
         with writing(folder), FolderTransaction(folder, keep=False) as transaction:
             found = work(transaction.file("."))
             shown = self.shown(found)
-            write_bytes(transaction.file(STAGE_FILE), json_bytes({"basis": key, "shown": shown, "found": found}))
+            write_bytes(transaction.file(STAGE_FILE), json_bytes(seal({"basis": key, "shown": shown, "found": found})))
         self.say(f"{name}: {shown} ({time.monotonic() - began:.0f} s)")
         found_again: dict[str, Any] = json.loads(json_bytes(found))
         return found_again
@@ -57,3 +57,15 @@ class Stages:
     def place(self, number: int, name: str) -> Path:
         """Return the folder of a stage."""
         return self.folder / f"{number}-{name}"
+
+
+def read_own(file: Path, say: Tell, *, former: bool = False) -> dict[str, Any] | None:
+    """Return a sealed document of what a command can do again, None without one; a damaged one is said and left out."""
+    if not file.exists():
+        return None
+    try:
+        remedy = "it is found again"
+        return read_sealed(file, "what an earlier call found", OutputError, remedy, MAX_DOCUMENT_BYTES, former=former)
+    except OutputError as error:
+        say(str(error))
+        return None

@@ -1,4 +1,7 @@
-"""Documents that people write: read as TOML or JSON, checked by a pydantic model, or refused in one line; and ours."""
+"""Documents that people write: read as TOML or JSON, checked by a pydantic model, or refused in one line; and ours.
+
+A document of our own contains the digest of its other entries (:func:`seal`), by which its reader notices any change.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +27,8 @@ ModelT = TypeVar("ModelT")
 MAX_DEPTH = 32
 #: Twenty times the largest that is read.
 MAX_BYTES = 4 << 20
+#: The entry of a sealed document that is the digest of all others.
+DIGEST = "digest"
 #: TOML's whole numbers have 64 bits.
 _WHOLE = range(-(2**63), 2**64)
 
@@ -44,6 +49,47 @@ def read_json(
 ) -> dict[str, Any]:
     """Return the object of a JSON file; otherwise as :func:`read_toml`, and a list or a number is refused as well."""
     return _read(path, json.loads, what, error, remedy, max_bytes)
+
+
+def read_sealed(
+    path: Path,
+    what: str,
+    error: type[PdhefError],
+    remedy: str = "",
+    max_bytes: int = MAX_BYTES,
+    *,
+    former: bool = False,
+) -> dict[str, Any]:
+    """Return a document that :func:`seal` made, without its digest; otherwise as :func:`read_json`.
+
+    ``former``: whether earlier versions wrote it without a digest.
+
+    Raises
+    ------
+    PdhefError
+        Of class ``error``: also a document that is not as it was written.
+    """
+    document = read_json(path, what, error, remedy, max_bytes)
+    if not (former and DIGEST not in document) and not is_sealed(document):
+        raise error(expected=what, got="one that is not as it was written", where=str(path), remedy=remedy)
+    return {key: value for key, value in document.items() if key != DIGEST}
+
+
+def seal(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a JSON-able document with the digest of its entries."""
+    plain = jsonable(document)
+    return {**plain, DIGEST: digest(plain)}
+
+
+def is_sealed(document: Mapping[str, Any]) -> bool:
+    """Return whether a document is as :func:`seal` made it."""
+    return document.get(DIGEST) == digest({key: value for key, value in document.items() if key != DIGEST})
+
+
+def file_sha256(path: Path) -> str:
+    """Return the sha256 of a file's content; raises OSError."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _read(

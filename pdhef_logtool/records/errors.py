@@ -84,6 +84,10 @@ class OutputError(PdhefError):
     """An output cannot be written, or an output folder cannot be read back."""
 
 
+class WorkerError(PdhefError):
+    """Worker processes cannot be kept running."""
+
+
 class ModelError(PdhefError):
     """A model bundle is missing, wrong, or does not belong to its weights."""
 

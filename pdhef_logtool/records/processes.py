@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import time
 from functools import cache
 from pathlib import Path
 
@@ -24,12 +25,8 @@ def is_alive(name: str) -> bool | None:
     host, pid, start = name.split("-")
     if host != _host():
         return None
-    try:
-        os.kill(int(pid), 0)
-    except ProcessLookupError:
+    if _has_ended(int(pid)):
         return False
-    except (PermissionError, OverflowError):
-        pass
     # The number may have been given to another process since.
     return _start(int(pid)) in (None, int(start))
 
@@ -44,10 +41,36 @@ def _host() -> str:
     return hashlib.sha256(f"{platform.node()}:{space}".encode()).hexdigest()[:8]
 
 
+def wait_for_end(pid: int, most_s: float = 5.0) -> None:
+    """Wait until a process that was killed has ended; unlike ``os.waitpid``, it need not be a child of this one."""
+    until = time.monotonic() + most_s
+    while not _has_ended(pid) and time.monotonic() < until:
+        time.sleep(0.002)
+
+
+def _has_ended(pid: int) -> bool:
+    """Return whether a process is gone, or dead with its exit code not yet collected."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    except (PermissionError, OverflowError):
+        return False
+    return _stat(pid)[:1] in (["Z"], ["X"])
+
+
 def _start(pid: int) -> int | None:
     """Return when a process started, in the system's ticks; None where the system does not tell."""
     try:
-        # The name of the program, in brackets, may hold anything.
-        return int(Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()[19])
-    except (OSError, ValueError, IndexError):
+        return int(_stat(pid)[19])
+    except (ValueError, IndexError):
         return None
+
+
+def _stat(pid: int) -> list[str]:
+    """Return the fields of a process from its state on; none where the system does not tell."""
+    try:
+        # The name of the program, in brackets, may hold anything.
+        return Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].decode().split()
+    except OSError:
+        return []

@@ -2,7 +2,8 @@
 
 A worker lives as long as the run and has one thread. What dies, falls silent or takes too much memory costs the item
 in flight only: that is tried once more when nothing else runs, in a new process, and then given up and told. Workers
-come from a fork server (``fork_server.py``), a pipe each; they end when their parent does, however that ends.
+come from a fork server (``fork_server.py``), a pipe each; they end when their parent does, however that ends. A fork
+server that dies is restarted, a bounded number of times; its workers finish their items without it.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Generic, Self, TypeVar
 
-from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.errors import UsageError, WorkerError
 from pdhef_logtool.records.fork_server import FORK, ONE_THREAD, STATUS, ask, receive, send, split, told_error
+from pdhef_logtool.records.processes import wait_for_end
 from pdhef_logtool.records.shown import shown
 
 T = TypeVar("T")
@@ -40,6 +42,8 @@ _LONGEST_TICK_S = 5.0
 #: No allocation brings a worker further beyond its bound than this, however fast; allocators reserve more than needed.
 _RESERVED_BYTES = 2 << 30
 _TRIES = 2
+#: How often a fork server that died is replaced while the items of one list are worked on.
+_RESTARTS = 3
 #: A worker that does not take an item within this time does not listen.
 _SEND_S = 60.0
 
@@ -85,6 +89,7 @@ def supervise(
     limits: Limits = Limits(),
     preload: Sequence[str] = (),
     progress: Progress = lambda _number, _text, _share: None,
+    warn: Callable[[str], None] = lambda _text: None,
 ) -> Generator[Ended[T, R], None, None]:
     """Do the work on every item and yield how each ended, in the order of ending.
 
@@ -98,16 +103,18 @@ def supervise(
     preload : modules that the fork server imports: ``package.module``, ``package.*`` for all of a package, or
         ``package.module:function`` to call that too. ``pdhef_logtool.records.compiled:load_kept`` behind others
         loads their compiled code. They must leave no thread behind that is needed, and run no query (polars) or tensor.
+    warn : called with a line for people whenever the fork server is restarted.
 
     Raises
     ------
     UsageError : fewer jobs than one, or more on a system that cannot fork.
+    WorkerError : the fork server died more often than it is restarted.
     """
     if jobs < 1:
         raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
     if jobs == 1 and limits == Limits():
         return _in_this_process(work, items, progress)
-    return _in_processes(work, items, jobs, limits, preload, progress)
+    return _in_processes(work, items, jobs, limits, preload, progress, warn)
 
 
 def _in_this_process(
@@ -138,8 +145,9 @@ def _in_processes(  # positional: the arguments of `supervise`, which checked th
     limits: Limits,
     preload: Sequence[str],
     progress: Progress,
+    warn: Callable[[str], None],
 ) -> Generator[Ended[T, R], None, None]:
-    with Crew[T, R](work, jobs=jobs, limits=limits, preload=preload) as crew:
+    with Crew[T, R](work, jobs=jobs, limits=limits, preload=preload, warn=warn) as crew:
         yield from crew.each(items, progress)
 
 
@@ -179,6 +187,7 @@ class _Worker(Generic[T]):
             os.kill(self.pid, signal.SIGKILL)
         code = self.server.status(self.pid)
         if code is None:
+            wait_for_end(self.pid)
             return "the worker died"
         return f"the worker was killed (signal {-code})" if code < 0 else f"the worker ended with exit code {code}"
 
@@ -199,46 +208,57 @@ class _Server:
                 pass_fds=[theirs.fileno()],
                 env={**os.environ, **ONE_THREAD},
             )
-        self._hears = True
         self._preload = list(preload)
 
-    def start(self) -> bool:
+    def start(self) -> bool | None:
         """Wait until it has loaded what it is to load; return False if workers have something to compile.
+
+        Returns None if it died.
 
         Raises
         ------
-        RuntimeError : it could not.
+        RuntimeError : a module cannot be loaded.
         """
         try:
             send(self._control, self._preload)
             problem, warm = receive(self._control)
         except (EOFError, OSError):
-            problem, warm = f"the fork server ended with exit code {self._process.wait()}", False
+            return None
         if problem:
             raise RuntimeError(problem)
         return bool(warm)
 
+    def is_dead(self) -> bool:
+        """Return whether its side of the socket is closed, which precedes the end of whatever it has in hand."""
+        try:
+            return not self._control.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+
     def fork(self, number: int, channel: socket.socket) -> bool:
-        """Begin a worker on its channel; False if the server is dead."""
+        """Begin a worker on its channel; return False if the server is dead."""
         try:
             ask(self._control, FORK, number, [channel.fileno()])
         except OSError:
-            self._hears = False
-        return self._hears
+            if not self.is_dead():
+                raise
+            return False
+        return True
 
     def status(self, pid: int) -> int | None:
-        """Wait for a worker that ended and return its exit code, below zero a signal; None if nobody knows."""
-        if self._hears:
-            try:
-                ask(self._control, STATUS, pid)
-                return int(receive(self._control))
-            except (EOFError, OSError):
-                self._hears = False
-        return None
+        """Wait for a worker that ended and return its exit code, below zero a signal; None if the server is dead."""
+        try:
+            ask(self._control, STATUS, pid)
+            return int(receive(self._control))
+        except (EOFError, OSError):
+            return None
 
-    def end(self) -> None:
+    def end(self) -> int:
+        """End it and return its exit code, below zero a signal; with 0 its workers have ended too."""
         self._control.close()
-        self._process.wait()
+        return self._process.wait()
 
 
 class Crew(Generic[T, R]):
@@ -251,6 +271,7 @@ class Crew(Generic[T, R]):
         jobs: int,
         limits: Limits = Limits(),
         preload: Sequence[str] = (),
+        warn: Callable[[str], None] = lambda _text: None,
     ) -> None:
         if not hasattr(os, "fork"):
             raise UsageError(
@@ -260,7 +281,10 @@ class Crew(Generic[T, R]):
         self._orders = (pickle.dumps(work), None if most is None else most + _RESERVED_BYTES)
         self._jobs, self._limits, self._preload = jobs, limits, preload
         self._progress: Progress = lambda _number, _text, _share: None
+        self._warn = warn
         self._server: _Server | None = None
+        self._deaths = 0
+        self._returned: list[_Attempt[T]] = []
         self._workers: list[_Worker[T]] = []
         self._started = 0
         self._warm = True
@@ -275,9 +299,12 @@ class Crew(Generic[T, R]):
         self._selector.close()
         for worker in self._workers:
             worker.channel.close()
-        self._workers.clear()
         if self._server is not None:
-            self._server.end()
+            code = self._server.end()
+            for worker in self._workers:
+                if code or worker.server is not self._server:  # it is dead and has not ended it
+                    worker.end()
+        self._workers.clear()
 
     def each(
         self,
@@ -294,6 +321,8 @@ class Crew(Generic[T, R]):
             item has left in its process; that is gone when the process is lost.
         """
         self._progress = progress
+        self._deaths = 0
+        self._returned.clear()
         lost: list[_Attempt[T]] = []
         attempts = (_Attempt(n, item, place and place(item)) for n, item in enumerate(items))
         try:
@@ -323,7 +352,7 @@ class Crew(Generic[T, R]):
         while True:
             # What the first item has compiled, the others find.
             while self._busy() < (jobs if self._warm else 1):
-                coming = coming or next(attempts, None)
+                coming = coming or (self._returned.pop() if self._returned else next(attempts, None))
                 if coming is None or self._is_taken(coming):
                     break
                 attempt, coming = coming, None
@@ -361,16 +390,39 @@ class Crew(Generic[T, R]):
         ours, theirs = socket.socketpair()
         self._started += 1
         with theirs:
-            if self._server is None or not self._server.fork(self._started, theirs):
-                if self._server is not None:
-                    self._server.end()
-                self._server = _Server(self._preload)
-                self._warm = self._server.start()
-                self._server.fork(self._started, theirs)
+            while not (server := self._live_server()).fork(self._started, theirs):
+                pass
         ours.settimeout(_SEND_S)
-        worker = _Worker(ours, self._server, attempt, attempt.place)
+        worker = _Worker(ours, server, attempt, attempt.place)
         self._workers.append(worker)
         self._selector.register(ours, selectors.EVENT_READ, worker)
+
+    def _live_server(self) -> _Server:
+        """Return the fork server, started or restarted where it is necessary.
+
+        Raises
+        ------
+        WorkerError : it died more often than it is restarted.
+        """
+        while self._server is None or self._server.is_dead():
+            if self._server is not None:
+                self._note_death(self._server.end())
+            self._server = _Server(self._preload)
+            if (warm := self._server.start()) is not None:
+                self._warm = warm
+        return self._server
+
+    def _note_death(self, code: int) -> None:
+        self._deaths += 1
+        how = f"exit code {code}" if code >= 0 else f"signal {-code}"
+        if self._deaths > _RESTARTS:
+            raise WorkerError(
+                expected="a fork server that keeps running",
+                got=f"{self._deaths} that died, the last one by {how}",
+                where="worker processes",
+                remedy="find what kills them, for example the system for lack of memory",
+            )
+        self._warn(f"the fork server died ({how}): restart {self._deaths} of {_RESTARTS}, no item is lost")
 
     def _send(self, worker: _Worker[T]) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
         attempt = worker.attempt
@@ -429,10 +481,17 @@ class Crew(Generic[T, R]):
         return "there was no more memory" if most is None else f"took more than {most / 1e6:.0f} MB"
 
     def _lose(self, worker: _Worker[T], reason: str = "") -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
-        """End a worker; its item, if it has one, is lost for a reason, or for how the process ended."""
+        """End a worker; its item, if it has one, is lost for a reason, or for how the process ended.
+
+        An item of a worker that never started because the fork server died has not been tried: it is the next one.
+        """
         attempt, self._warm = worker.attempt, True
+        untried = worker.pid is None and worker.server.is_dead()
         how = self._end(worker)
-        if attempt is not None:
+        if attempt is not None and untried:
+            attempt.tries -= 1
+            self._returned.append(attempt)
+        elif attempt is not None:
             yield attempt, _failed(attempt, reason or how) if attempt.tries >= _TRIES else None
 
     def _end(self, worker: _Worker[T]) -> str:

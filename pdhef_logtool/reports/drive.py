@@ -49,10 +49,11 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrivePage:
-    """The page of a drive: the HTML, and the figures in it."""
+    """The page of a drive: the HTML, the figures in it, and what is wrong with a file that it lacks."""
 
     html: bytes
     charts: Charts
+    wrong: str = ""
 
 
 def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
@@ -63,20 +64,24 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
     report = log.report()
     if report is None or not isinstance(report.get("log"), dict):
         return DrivePage(render("failed.html", label=log.label, outcome=log.outcome, back=back), Charts())
-    figures, why_none = None, ""
+    figures, why_none, wrong = None, "", ""
     roles = roles_of(report)
     low_speed = report["vehicle"].get("low_speed_blend_m_s")
     if roles is None:
         why_none = "Nothing was estimated, so that there is nothing to draw."
-    elif (path := log.file(ESTIMATES_FILE)) is None:
-        why_none = f"{ESTIMATES_FILE} is not in the folder of this log; the figures of below are those of report.json."
     else:
         try:
-            figures = drive_figures(path, report, roles, _LOW_SPEED_M_S if low_speed is None else low_speed)
+            path = log.file(ESTIMATES_FILE)
+            slow = _LOW_SPEED_M_S if low_speed is None else low_speed
+            figures = None if path is None else drive_figures(path, report, roles, slow)
         except OutputError as error:
-            why_none = f"The figures cannot be drawn: {error}"
-        if figures is None and not why_none:
-            why_none = f"{ESTIMATES_FILE} has no row of {roles.main}."
+            wrong = f"the figures cannot be drawn: {error}"
+            why_none = f"{wrong[0].upper()}{wrong[1:]}"
+        else:
+            if path is None:
+                why_none = f"{ESTIMATES_FILE} is not in the folder of this log; the figures below are of report.json."
+            elif figures is None:
+                why_none = f"{ESTIMATES_FILE} has no row of {roles.main}."
     charts = Charts() if figures is None else figures.charts
     html = render(
         "drive.html",
@@ -108,7 +113,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         over_time=OVER_TIME,
         in_plane=IN_PLANE,
     )
-    return DrivePage(html, charts)
+    return DrivePage(html, charts, wrong)
 
 
 def roles_of(report: Mapping[str, Any]) -> Roles | None:

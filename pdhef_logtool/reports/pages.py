@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, OutputError
+from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, OutputError
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedLog, OpenedRun
 
@@ -23,7 +23,7 @@ PICTURES = "figures"
 
 @dataclass(frozen=True, slots=True)
 class WrittenPage:
-    """A page: its log (empty: that of the run), file, or None and what is wrong; ``pictures``: files of its figures."""
+    """A page: its log (empty: that of the run), file (None: it could not be made), what is wrong, files of pictures."""
 
     log: str
     file: Path | None
@@ -41,12 +41,15 @@ class WrittenPages:
 
     @property
     def wrong(self) -> tuple[str, ...]:
-        """A line for each page that could not be made."""
-        return tuple(f"no page of {p.log or 'the run'}: {p.wrong}" for p in (*self.pages, self.fleet) if p.wrong)
+        """A line for each page that could not be made, or not in full."""
+        pages = [p for p in (*self.pages, self.fleet) if p.wrong]
+        return tuple(f"{'no ' if p.file is None else ''}page of {p.log or 'the run'}: {p.wrong}" for p in pages)
 
     @property
     def exit_code(self) -> int:
-        """0 if every page was made, else 3."""
+        """0 if every page was made in full, 1 if none of a log was, else 3."""
+        if self.pages and all(p.file is None for p in self.pages):
+            return EXIT_FAILURE
         return EXIT_PARTIAL if self.wrong else EXIT_OK
 
     def to_dict(self) -> dict[str, Any]:
@@ -101,7 +104,11 @@ def write_drive_page(log: OpenedLog, *, png: bool = False) -> WrittenPage:
     """Write the page of a log; raises OutputError."""
     from pdhef_logtool.reports.drive import FIGURES, drive_page
 
-    return _write(log.folder, log.label, partial(drive_page, log, f"../../{PAGE_FILE}"), FIGURES, png=png)
+    def make() -> DrivePage:
+        with log.reading():
+            return drive_page(log, f"../../{PAGE_FILE}")
+
+    return _write(log.folder, log.label, make, FIGURES, png=png)
 
 
 def remove_pages(run: OpenedRun) -> None:
@@ -124,6 +131,7 @@ def _write(
 ) -> WrittenPage:
     try:
         page = make()
+        wrong = getattr(page, "wrong", "")
     except Exception as error:  # noqa: BLE001 (whatever a report holds, the others get their pages)
         shown = str(error) if isinstance(error, OutputError) else f"internal error, {type(error).__name__}: {error}"
         return WrittenPage(label, None, shown)
@@ -132,10 +140,10 @@ def _write(
     for old in _pictures(folder, keys):
         old.unlink(missing_ok=True)
     if not png:
-        return WrittenPage(label, path)
+        return WrittenPage(label, path, wrong)
     from pdhef_logtool.reports.pictures import write_pictures
 
-    return WrittenPage(label, path, pictures=write_pictures(page.charts, folder / PICTURES, label))
+    return WrittenPage(label, path, wrong, write_pictures(page.charts, folder / PICTURES, label))
 
 
 def _pictures(folder: Path, keys: Iterable[str]) -> list[Path]:

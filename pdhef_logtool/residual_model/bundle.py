@@ -217,7 +217,7 @@ def load_network(folder: Path, target: str) -> ModelBundle:
     document = read_json(folder / DOCUMENT_FILE, expected, ModelError)
     try:
         weights = load((folder / WEIGHTS_FILE).read_bytes())
-    except (OSError, ValueError, SafetensorError) as error:
+    except (OSError, ValueError, LookupError, TypeError, SafetensorError) as error:
         raise ModelError(expected=expected, got=str(error), where=where) from None
     if document.get("format") != FORMAT or document.get("version") != FORMAT_VERSION:
         got = f"{document.get('format')} {document.get('version')}"

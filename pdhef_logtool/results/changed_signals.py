@@ -40,7 +40,7 @@ def changed_signals(pair: Pair, estimator: str) -> Iterator[ChangedSignal]:
 
     Raises
     ------
-    polars.exceptions.PolarsError : A file is damaged.
+    OutputError : A file is damaged.
     """
     import polars as pl
 

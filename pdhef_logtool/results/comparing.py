@@ -6,7 +6,7 @@ import filecmp
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -117,6 +117,7 @@ class Comparison:
         same bit for bit.
     figures : those that were asked for or that the gate has. others : shown beside them; none where nothing changed.
     signals : where the tracks of the most changed drives part. followed : how many drives were looked at for it.
+    damaged : files of drives that could not be read, a line each.
     gated, allow_unpaired, strict : what closes the gate.
     """
 
@@ -131,6 +132,7 @@ class Comparison:
     others: tuple[ComparedFigure, ...] = ()
     signals: tuple[ChangedSignal, ...] = ()
     followed: int = 0
+    damaged: tuple[str, ...] = ()
     cluster: str | None = None
     gated: bool = False
     allow_unpaired: bool = False
@@ -176,9 +178,11 @@ class Comparison:
 
     @property
     def exit_code(self) -> int:
-        """4 where the gate is closed, 3 for drives without partner and no gate, else 0."""
+        """4 where the gate is closed, 3 for damaged files and for drives without partner and no gate, else 0."""
         if self.failures:
             return EXIT_GATE
+        if self.damaged:
+            return EXIT_PARTIAL
         return EXIT_PARTIAL if self.unpaired and not self.gated and not self.allow_unpaired else EXIT_OK
 
     def to_dict(self) -> dict[str, Any]:
@@ -201,6 +205,7 @@ class Comparison:
             "others": [f.to_dict() for f in self.others],
             "signals": [asdict(s) for s in self.signals],
             "followed": self.followed,
+            "damaged": self.damaged,
         }
 
 
@@ -217,7 +222,7 @@ def compare_runs(
 
     Raises
     ------
-    OutputError : No drive is in both runs, or a file is damaged.
+    OutputError : No drive is in both runs, or the figures of a run are damaged.
     UsageError : No drive knows the estimator, or the key.
     """
     pairing = pair_logs(a.logs, b.logs)
@@ -229,7 +234,8 @@ def compare_runs(
             remedy="run both on the same drives",
         )
     gated = any(f.limit is not None for f in gate.figures)
-    tables = _Tables(a, b, pairing.pairs)
+    damaged = _Damaged()
+    tables = _Tables(a, b, pairing.pairs, damaged)
     changed = tables.changed()
     found = Comparison(
         a=a.place,
@@ -246,27 +252,57 @@ def compare_runs(
         strict=strict,
     )
     if not changed and not gated:
-        return found
-    clusters = None if cluster is None else _clusters(pairing, cluster)
+        return replace(found, damaged=damaged.lines)
+    clusters = None if cluster is None else _clusters(pairing, cluster, damaged)
     figures = tuple(tables.compared(gate.figures, clusters))
     tables.check_estimators(figures)
     if not changed:
-        return replace(found, figures=figures)
+        return replace(found, figures=figures, damaged=damaged.lines)
     others = _corrected(tables.compared(_beside(gate.figures), clusters))
     followed = _most_changed(pairing.pairs, changed, figures[0])
     main = figures[0].figure.estimator
-    with _reading("estimates.parquet"):
-        signals = tuple(s for pair in followed for s in changed_signals(pair, tables.name_of(pair, main)))
-    return replace(found, figures=figures, others=others, signals=signals, followed=len(followed))
+    signals: list[ChangedSignal] = []
+    for pair in followed:
+        with damaged.noted(pair.a, pair.b):
+            signals += changed_signals(pair, tables.name_of(pair, main))
+    return replace(
+        found, figures=figures, others=others, signals=tuple(signals), followed=len(followed), damaged=damaged.lines
+    )
+
+
+class _Damaged:
+    """The files of drives that could not be read."""
+
+    def __init__(self) -> None:
+        self._lines: dict[str, None] = {}
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """A line a file."""
+        return tuple(self._lines)
+
+    @contextmanager
+    def noted(self, *logs: OpenedLog) -> Iterator[None]:
+        """Do without what is damaged of logs, and note it."""
+        try:
+            with ExitStack() as stack:
+                for log in logs:
+                    stack.enter_context(log.reading())
+                yield
+        except OutputError as error:
+            self._lines[str(error)] = None
 
 
 class _Tables:
     """The figures of two runs for their pairs, of which only what is asked for is read."""
 
-    def __init__(self, a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair]) -> None:
+    def __init__(self, a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair], damaged: _Damaged) -> None:
         self._runs = (a, b)
         self._pairs = pairs
-        self._main = [pair.a.main() for pair in pairs]
+        self._main = [""] * len(pairs)
+        for number, pair in enumerate(pairs):
+            with damaged.noted(pair.a):
+                self._main[number] = pair.a.main()
 
     def name_of(self, pair: Pair, estimator: str) -> str:
         """Return what ``estimator`` is called for a pair."""
@@ -276,6 +312,8 @@ class _Tables:
         """Return the drives of A of which any figure is not the same bit for bit."""
         import polars as pl
 
+        for run in self._runs:
+            run.metrics()  # raises for a damaged file
         a_file, b_file = (run.folder / METRICS_FILE for run in self._runs)
         if all(pair.a.label == pair.b.label for pair in self._pairs) and filecmp.cmp(a_file, b_file, shallow=False):
             return frozenset()
@@ -283,8 +321,7 @@ class _Tables:
         def hashed(rows: pl.LazyFrame) -> pl.LazyFrame:
             return rows.select("log", row=pl.struct(_FIGURE).hash()).group_by("log").agg(pl.col("row").sum(), pl.len())
 
-        with _reading(METRICS_FILE):
-            a, b = (_by_parts(run, hashed).group_by("log").agg(pl.col("row", "len").sum()) for run in self._runs)
+        a, b = (_by_parts(run, hashed).group_by("log").agg(pl.col("row", "len").sum()) for run in self._runs)
         pairs = pl.DataFrame({"log": [p.a.label for p in self._pairs], "b": [p.b.label for p in self._pairs]})
         both = pairs.join(a, on="log", how="left").join(b, left_on="b", right_on="log", how="left", suffix="_b")
         differs = pl.col("row").ne_missing(pl.col("row_b")) | pl.col("len").ne_missing(pl.col("len_b"))
@@ -337,8 +374,7 @@ class _Tables:
             missing -= {MAIN}
         if not missing:
             return
-        with _reading(METRICS_FILE):
-            frames = [run.metrics().select("estimator").unique().collect(engine="streaming") for run in self._runs]
+        frames = [run.metrics().select("estimator").unique().collect(engine="streaming") for run in self._runs]
         known = {name for frame in frames for name in frame["estimator"]}
         for name in sorted(missing - known):
             single = sorted(k for k in known if "~" not in k and k != SENSORS)
@@ -356,9 +392,8 @@ class _Tables:
             "segment": {"all", *(f.segment for f in figures)},
             "metric": {"not_independent", *(f.metric for f in figures)},
         }
-        with _reading(METRICS_FILE):
-            wanted = [pl.col(key).is_in(sorted(values)) for key, values in asked.items()]
-            return [_by_parts(run, lambda rows: rows.filter(*wanted).select("log", *_FIGURE)) for run in self._runs]
+        wanted = [pl.col(key).is_in(sorted(values)) for key, values in asked.items()]
+        return [_by_parts(run, lambda rows: rows.filter(*wanted).select("log", *_FIGURE)) for run in self._runs]
 
 
 def _by_parts(run: OpenedRun, query: Callable[[pl.LazyFrame], pl.LazyFrame]) -> pl.DataFrame:
@@ -458,11 +493,15 @@ def _most_changed(pairs: Sequence[Pair], changed: frozenset[str], figure: Compar
     return sorted(known, key=lambda pair: -by_drive.get(pair.a.label, -1.0))[:MOST_FOLLOWED]
 
 
-def _clusters(pairing: Pairing, key: str) -> list[object]:
+def _clusters(pairing: Pairing, key: str, damaged: _Damaged) -> list[object]:
     """Return what each pair is of; a drive that does not say is its own."""
-    found = [_cluster(pair.a, key) for pair in pairing.pairs]
+    found: list[str | None] = [None] * len(pairing.pairs)
+    known: set[str] = set()
+    for number, pair in enumerate(pairing.pairs):
+        with damaged.noted(pair.a):
+            found[number] = _cluster(pair.a, key)
+            known.update((pair.a.report() or {}).get("metadata") or {})
     if all(value is None for value in found):
-        known = {k for pair in pairing.pairs for k in ((pair.a.report() or {}).get("metadata") or {})}
         raise UsageError(
             expected=f"a key of the drives: {', '.join(['car', 'day', *sorted(known)])}", got=key, where="--cluster"
         )
@@ -484,17 +523,3 @@ def _cluster(log: OpenedLog, key: str) -> str | None:
 def _named(names: Sequence[str], most: int = 5) -> str:
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
-
-
-@contextmanager
-def _reading(name: str) -> Iterator[None]:
-    """Turn what is said of a damaged file into an OutputError."""
-    import polars as pl
-    import pyarrow as pa
-
-    try:
-        yield
-    except (pl.exceptions.PolarsError, pa.ArrowException, OSError) as error:
-        raise OutputError(
-            expected=f"the {name} of a run", got=str(error).split("\n")[0], where=name, remedy="run the logs again"
-        ) from error

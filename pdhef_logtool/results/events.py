@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pdhef_logtool.evaluation.segments import RUN_GAP_S
-from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
+from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.results.expression import ERRORS, FLAGS, OPERATIONS, SPEED, Column, Condition, Node, Number
@@ -47,7 +46,8 @@ class FoundEvents:
     Attributes
     ----------
     where : the condition. searched : drives that were looked at. events : in the order of the run's drives.
-    left_out : drives that could not be looked at, with the reason; ``failed``: whether one of them is damaged.
+    left_out : drives that could not be looked at, with the reason; ``unreadable``: how many of them are damaged or
+        failed; ``damaged``: a line a damaged one. failed : whether something of the run could not be read.
     clips : files that were written.
     """
 
@@ -56,11 +56,15 @@ class FoundEvents:
     events: tuple[FoundEvent, ...]
     left_out: Mapping[str, str]
     failed: bool = False
+    unreadable: int = 0
+    damaged: tuple[str, ...] = ()
     clips: tuple[str, ...] = ()
 
     @property
     def exit_code(self) -> int:
-        """3 where a drive could not be read, else 0."""
+        """3 where something could not be read, 1 where no drive could, else 0."""
+        if self.unreadable and not self.searched and self.unreadable == len(self.left_out):
+            return EXIT_FAILURE
         return EXIT_PARTIAL if self.failed else EXIT_OK
 
     def to_dict(self) -> dict[str, Any]:
@@ -92,21 +96,25 @@ def find_events(
     """
     events: list[FoundEvent] = []
     left_out: dict[str, str] = {}
-    failed, searched = False, 0
+    damaged: dict[str, str] = {}
+    unreadable = searched = 0
     for log in run.logs:
         try:
-            reason = _unfit(log, condition, estimator)
-            if reason is None:
-                searched += 1
-                events += _events_of(log, condition, estimator or log.main(), pad_s)
+            with log.reading():
+                reason = _unfit(log, condition, estimator)
+                if reason is None:
+                    events += _events_of(log, condition, estimator or log.main(), pad_s)
+                    searched += 1
         except OutputError as error:
-            reason, failed = error.got, True
+            reason = error.got
+            damaged[log.label] = str(error)
         if reason is not None:
             left_out[log.label] = reason
-            failed |= log.outcome.startswith("failed")
+            unreadable += log.label in damaged or log.outcome.startswith("failed")
     if not searched and left_out:
-        _check_tracks(run, condition, estimator)
-    return FoundEvents(condition.text, searched, tuple(events), left_out, failed)
+        _check_tracks([log for log in run.logs if log.label not in damaged], condition, estimator)
+    lines = tuple(damaged.values())
+    return FoundEvents(condition.text, searched, tuple(events), left_out, unreadable > 0, unreadable, lines)
 
 
 def write_events(path: Path, found: FoundEvents) -> None:
@@ -138,10 +146,12 @@ def _unfit(log: OpenedLog, condition: Condition, estimator: str | None) -> str |
     return None
 
 
-def _check_tracks(run: OpenedRun, condition: Condition, estimator: str | None) -> None:
-    """Raise UsageError for an estimator that no drive has."""
-    known = {name for log in run.logs if log.file(ESTIMATES_FILE) is not None for name in _tracks(log)}
-    if known and estimator is None and not any(log.main() for log in run.logs):
+def _check_tracks(logs: Sequence[OpenedLog], condition: Condition, estimator: str | None) -> None:
+    """Raise UsageError for an estimator that none of the drives that can be read has."""
+    known = {name for log in logs if log.file(ESTIMATES_FILE) is not None for name in _tracks(log)}
+    if not known:
+        return
+    if estimator is None and not any(log.main() for log in logs):
         raise UsageError(
             expected=f"an estimator of this run: {', '.join(sorted(known))}",
             got="none named, and none that is the answer",
@@ -162,25 +172,7 @@ def _tracks(log: OpenedLog) -> frozenset[str]:
 
     frame = log.estimates()
     assert frame is not None
-    with _reading(log):
-        names = frame.select(pl.col("estimator").cast(pl.String).unique()).collect()["estimator"]
-    return frozenset(names)
-
-
-@contextmanager
-def _reading(log: OpenedLog) -> Iterator[None]:
-    """Turn what polars says of a damaged file into an OutputError."""
-    import polars as pl
-
-    try:
-        yield
-    except (pl.exceptions.PolarsError, OSError) as error:
-        raise OutputError(
-            expected=f"the {ESTIMATES_FILE} of a run",
-            got=f"one that cannot be read: {str(error).splitlines()[0]}",
-            where=log.label,
-            remedy="run the log again",
-        ) from error
+    return frozenset(frame.select(pl.col("estimator").cast(pl.String).unique()).collect()["estimator"])
 
 
 def _needed(condition: Condition, main: str) -> set[str]:
@@ -200,10 +192,7 @@ def _events_of(log: OpenedLog, condition: Condition, main: str, pad_s: float) ->
     builder = _Builder(main, 0.0 if low_speed is None else float(low_speed))
     holds = builder.expression(condition.node).fill_null(value=False)
     peak = pl.lit(None, pl.Float64) if condition.peak is None else builder.expression(condition.peak)
-    with _reading(log):
-        rows = (
-            _joined(frame, builder.columns, main).select("stamp_ns", holds=holds, peak=peak.cast(pl.Float64)).collect()
-        )
+    rows = _joined(frame, builder.columns, main).select("stamp_ns", holds=holds, peak=peak.cast(pl.Float64)).collect()
     stamps, mask = rows["stamp_ns"].to_numpy(), rows["holds"].to_numpy()
     values = rows["peak"].fill_null(math.nan).to_numpy()
     log_start_ns = int((report.get("log") or {}).get("start_ns", stamps[0] if len(stamps) else 0))

@@ -24,7 +24,7 @@ from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun
 from pdhef_logtool.results.paired_change import holm, log_ratios, sign_p
 
 if TYPE_CHECKING:
-    import polars as pl
+    pass
 
 #: Name of the estimate that each drive's report calls its answer.
 ANSWER = "answer"
@@ -275,13 +275,15 @@ class _Gathered:
             self.failed.append((log.label, reason or "its report is not there any more"))
             return
         try:
-            drive = _drive(log, report, figures)
-            self._add_space(report.get("operating_space"))
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-            self.failed.append((log.label, f"its report is none of this tool: {type(error).__name__}"))
+            with log.reading():
+                drive = _drive(log, report, figures)
+                lost = [(log.label, str(x["what"])) for x in report.get("losses", ()) if x.get("severity") == "lost"]
+                self._add_space(report.get("operating_space"))
+        except PdhefError as error:
+            self.failed.append((log.label, f"its report cannot be read: {error.expected}, got {error.got}"))
             return
         self.drives.append(drive)
-        self.lost += [(log.label, str(x["what"])) for x in report.get("losses", ()) if x.get("severity") == "lost"]
+        self.lost += lost
 
     def _add_space(self, space: Mapping[str, Any] | None) -> None:
         if not space:
@@ -322,27 +324,9 @@ def _figures(run: OpenedRun) -> dict[str, dict[tuple[str, str, str], float]]:
         .select("log", "estimator", "signal", "metric", "value")
     )
     found: dict[str, dict[tuple[str, str, str], float]] = {}
-    for log, estimator, signal, metric, value in collected(rows, run).iter_rows():
+    for log, estimator, signal, metric, value in rows.collect().iter_rows():
         found.setdefault(log, {})[estimator, signal, metric] = math.nan if value is None else value
     return found
-
-
-def collected(rows: pl.LazyFrame, run: OpenedRun) -> pl.DataFrame:
-    """Return rows of a run's figures, read; raises OutputError where the file is damaged."""
-    import polars as pl
-
-    from pdhef_logtool.records.errors import OutputError
-    from pdhef_logtool.results.opened_run import METRICS_FILE
-
-    try:
-        return rows.collect()
-    except (pl.exceptions.PolarsError, OSError) as error:
-        raise OutputError(
-            expected="the metrics of a run",
-            got=" ".join(str(error).split())[:200],
-            where=f"{run.place}/{METRICS_FILE}",
-            remedy="run the logs again",
-        ) from None
 
 
 def _drive(log: OpenedLog, report: Mapping[str, Any], figures: Mapping[tuple[str, str, str], float]) -> FleetDrive:

@@ -1,14 +1,23 @@
-"""A finished run, read back from the files that it left; every command that reads a run reads it here."""
+"""A finished run, read back from the files that it left; every command that reads a run reads it here.
+
+run.json contains its own digest and the sha256 of the files that are read back. What earlier versions wrote has
+neither: its entries and columns are checked instead.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
 
+from pydantic import BaseModel, ConfigDict
+
 from pdhef_logtool.logs.discovery import RUN_FILE
-from pdhef_logtool.records.documents import read_json
-from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.documents import file_sha256, read_json, read_sealed, validated
+from pdhef_logtool.records.errors import OutputError, PdhefError
 from pdhef_logtool.records.object_store import Mirror, is_url
 
 if TYPE_CHECKING:
@@ -30,6 +39,39 @@ PAGE_FILE = "report.html"
 MAX_DOCUMENT_BYTES = 1 << 28
 
 _REMEDY = "pdhef run LOG -o OUT writes one"
+_AGAIN = "run the log again"
+
+
+class _Checked(BaseModel):
+    """The entries that commands rely on, none of which need be there; others are not looked at."""
+
+    model_config = ConfigDict(extra="ignore", strict=True)
+
+
+class _CarEntry(_Checked):
+    name: str = ""
+    sha256: str | None = None
+    network_sha256: str | None = None
+
+
+class _LogEntry(_Checked):
+    outcome: str = ""
+    main: str | None = None
+    sha256: str | None = None
+    signals_sha256: str | None = None
+    truth_sha256: str | None = None
+    mapping_sha256: str | None = None
+    folder: str = ""
+    car: _CarEntry | None = None
+    files: dict[str, str] = {}
+
+
+class _Run(_Checked):
+    logs: list[_LogEntry]
+    versions: dict[str, Any] = {}
+    config: dict[str, Any] = {}
+    remaining: int = 0
+    files: dict[str, str] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,27 +86,59 @@ class OpenedLog:
     folder: Path
     entry: dict[str, Any]
     mirror: Mirror | None = None
+    _sound: set[str] = field(default_factory=set, repr=False, compare=False)
 
     def file(self, name: str) -> Path | None:
-        """Return a file of the log's folder, None where the run wrote none; raises OutputError if a store fails."""
-        if self.mirror is not None:
-            return self.mirror.fetch(f"{LOGS}/{self.label}/{name}")
-        path = self.folder / name
-        return path if path.is_file() else None
+        """Return a file of the log's folder, None where the run wrote none.
+
+        Raises
+        ------
+        OutputError
+            The file is not as the run wrote it, or a store fails.
+        """
+        path = self.folder / name if self.mirror is None else self.mirror.fetch(f"{LOGS}/{self.label}/{name}")
+        if path is None or not os.path.isfile(path):  # noqa: PTH113 (False for a name that no file can have)
+            return None
+        if name not in self._sound:
+            _check(path, self.entry.get("files", {}).get(name), _AGAIN)
+            self._sound.add(name)
+        return path
 
     def report(self) -> dict[str, Any] | None:
         """Return report.json, None where the log failed; raises OutputError for a damaged one."""
         path = self.file(REPORT_FILE)
         if path is None:
             return None
-        return read_json(path, "a report.json", OutputError, "run the log again", MAX_DOCUMENT_BYTES)
+        report = read_json(path, "a report.json", OutputError, _AGAIN, MAX_DOCUMENT_BYTES)
+        if report.get("format") != "pdhef.report":
+            got = f"format {report.get('format')!r}"
+            raise OutputError(expected="a report.json", got=got, where=str(path), remedy=_AGAIN)
+        return report
+
+    @contextmanager
+    def reading(self) -> Iterator[None]:
+        """Turn what a report without a checksum makes its readers raise into an OutputError: it is damaged."""
+        try:
+            yield
+        except PdhefError:
+            raise
+        except Exception as error:
+            if REPORT_FILE in self.entry.get("files", {}):
+                raise
+            raise OutputError(
+                expected="a report.json as this version writes it",
+                got=f"one that raises {type(error).__name__}: {error}",
+                where=str(self.folder / REPORT_FILE),
+                remedy=_AGAIN,
+            ) from error
 
     def main(self) -> str:
         """Return the estimator that is the drive's answer; empty where there is none."""
         if "main" in self.entry:
             return str(self.entry["main"] or "")
-        answer = (self.report() or {}).get("answer") or {}  # run.json of an older version does not say it
-        return str(answer.get("main") or "")
+        with self.reading():
+            answer = (self.report() or {}).get("answer") or {}  # run.json of an older version does not say it
+            return str(answer.get("main") or "")
 
     def estimates(self) -> pl.LazyFrame | None:
         """Return estimates.parquet, of which only what is asked for is read; None where there is none."""
@@ -85,6 +159,7 @@ class OpenedRun:
     document: dict[str, Any]
     logs: tuple[OpenedLog, ...]
     mirror: Mirror | None = None
+    _sound: set[str] = field(default_factory=set, repr=False, compare=False)
 
     @property
     def place(self) -> str:
@@ -92,10 +167,36 @@ class OpenedRun:
         return str(self.folder) if self.mirror is None else self.mirror.objects.shown
 
     def metrics(self) -> pl.LazyFrame:
-        """Return the figures of all logs, a row a figure (metrics.parquet), read when collected."""
+        """Return the figures of all logs, a row a figure (metrics.parquet), read when collected.
+
+        Raises
+        ------
+        OutputError
+            The file is not as the run wrote it.
+        """
         import polars as pl
 
-        return pl.scan_parquet(self.folder / METRICS_FILE)
+        path = self.folder / METRICS_FILE
+        if METRICS_FILE not in self._sound:
+            _check(path, self.document.get("files", {}).get(METRICS_FILE), "run the logs again")
+            self._sound.add(METRICS_FILE)
+        return pl.scan_parquet(path)
+
+
+def _check(path: Path, sha256: str | None, remedy: str) -> None:
+    """Raise OutputError for a file that is not as it was written: by its sha256, or by what Parquet says of itself."""
+    try:
+        if sha256 is None:
+            if path.suffix == ".parquet":
+                from pdhef_logtool.sinks.parquet import check_parquet
+
+                check_parquet(path, path.name)
+        elif file_sha256(path) != sha256:
+            got = "another content: it is damaged, or of another run"
+            raise OutputError(expected=f"the {path.name} that run.json names", got=got, where=str(path), remedy=remedy)
+    except OSError as error:
+        got = error.strerror or str(error)
+        raise OutputError(expected=f"a readable {path.name}", got=got, where=str(path), remedy=remedy) from error
 
 
 def open_run(output: Path | str) -> OpenedRun:
@@ -119,17 +220,18 @@ def open_run(output: Path | str) -> OpenedRun:
             got = f"a folder without {name}" if folder.is_dir() else "no such folder"
             where = str(folder) if mirror is None else mirror.objects.shown
             raise OutputError(expected="the outputs of a run", got=got, where=where, remedy=_REMEDY)
-    document = read_json(folder / RUN_FILE, "the run.json of a run", OutputError, _REMEDY, MAX_DOCUMENT_BYTES)
-    if document.get("format") != "pdhef.run" or not isinstance(document.get("logs"), list):
+    what, path = "the run.json of a run", folder / RUN_FILE
+    document = read_sealed(path, what, OutputError, _REMEDY, MAX_DOCUMENT_BYTES, former=True)
+    if document.get("format") != "pdhef.run":
         got = f"format {document.get('format')!r}"
-        raise OutputError(expected="the run.json of a run", got=got, where=str(folder / RUN_FILE), remedy=_REMEDY)
+        raise OutputError(expected=what, got=got, where=str(path), remedy=_REMEDY)
+    validated(_Run, document, str(path), OutputError, expected=what, remedy=_REMEDY)
     return OpenedRun(folder, document, tuple(_opened(entry, folder, mirror) for entry in document["logs"]), mirror)
 
 
-def _opened(entry: object, folder: Path, mirror: Mirror | None) -> OpenedLog:
-    label = entry.get("log") if isinstance(entry, dict) else None
-    plain = isinstance(label, str) and PurePath(label).name == label and label not in {"", ".."}
-    if not isinstance(entry, dict) or not isinstance(label, str) or not plain:
+def _opened(entry: dict[str, Any], folder: Path, mirror: Mirror | None) -> OpenedLog:
+    label = entry.get("log")
+    if not isinstance(label, str) or PurePath(label).name != label or label in {"", ".."}:
         # A label names a folder that reports are written to: it may not lead out of the run's.
         raise OutputError(
             expected="the name of a log's folder", got=repr(label)[:80], where=str(folder / RUN_FILE), remedy=_REMEDY

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.results.opened_run import OpenedRun
 from pdhef_logtool.results.pairing import Pair
 
@@ -70,11 +71,17 @@ def _sources(pairs: Sequence[Pair]) -> Iterator[str]:
 
 def _example(pair: Pair, what: str) -> str:
     """Return how the first changed source of a pair changed, empty where the reports do not say."""
-    reports = pair.a.report(), pair.b.report()
-    if what not in ("mapping", "truth") or None in reports:
+    if what not in ("mapping", "truth"):
         return ""
     key = "signals" if what == "mapping" else "quantities"
-    one, other = ({s["name"]: s["source"] for s in (r or {}).get(what, {}).get(key, ())} for r in reports)
+    try:
+        with pair.a.reading(), pair.b.reading():
+            reports = pair.a.report(), pair.b.report()
+            one, other = ({s["name"]: s["source"] for s in (r or {}).get(what, {}).get(key, ())} for r in reports)
+    except OutputError as error:
+        return f"; {error}"
+    if None in reports:
+        return ""
     for name in sorted({*one, *other}):
         if one.get(name) != other.get(name):
             return f"; {pair.a.label}: {name} of {one.get(name, 'nothing')} → {other.get(name, 'nothing')}"

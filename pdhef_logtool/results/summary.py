@@ -101,8 +101,6 @@ def _sideslip_errors(run: OpenedRun) -> pl.DataFrame:
     """Return log, estimator, value (RMSE of sideslip in rad) and main (the answer), where the truth is independent."""
     import polars as pl
 
-    from pdhef_logtool.results.fleet import collected
-
     mains = pl.DataFrame(
         {"log": [log.label for log in run.logs], "main": [str(log.entry.get("main") or "") for log in run.logs]},
         schema={"log": pl.String, "main": pl.String},
@@ -111,7 +109,7 @@ def _sideslip_errors(run: OpenedRun) -> pl.DataFrame:
     dependent = rows.filter(pl.col("metric") == "not_independent").select("log", "estimator")
     found = rows.filter((pl.col("metric") == "rmse") & pl.col("value").is_finite())
     found = found.select("log", "estimator", "value").join(dependent, on=["log", "estimator"], how="anti")
-    return collected(found, run).join(mains, on="log").sort("log", "estimator")
+    return found.collect().join(mains, on="log").sort("log", "estimator")
 
 
 def _spread(errors: pl.DataFrame) -> tuple[int, float, float, float]:

@@ -35,7 +35,8 @@ from pdhef_logtool.logs.discovery import (
     with_free_stem,
 )
 from pdhef_logtool.mapping import Mapping, mapping_of
-from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError
+from pdhef_logtool.records.documents import file_sha256
+from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, WorkerError
 from pdhef_logtool.records.files import writing
 from pdhef_logtool.records.object_store import is_url
 from pdhef_logtool.records.outputs import OutputFolder
@@ -43,6 +44,7 @@ from pdhef_logtool.records.processes import own_name
 from pdhef_logtool.records.ray_supervisor import supervise_on_ray
 from pdhef_logtool.records.supervisor import Ended, Limits, Tell, supervise
 from pdhef_logtool.results.opened_run import (
+    JOURNAL_FILE,
     LOGS,
     METRICS_FILE,
     PAGE_FILE,
@@ -53,7 +55,7 @@ from pdhef_logtool.results.opened_run import (
 )
 from pdhef_logtool.runs.cars import RunCars, car_record
 from pdhef_logtool.runs.config import Keep, RunConfig
-from pdhef_logtool.runs.journal import Entry, Journal, Place, changes, digest_of
+from pdhef_logtool.runs.journal import Entry, Journal, Place, changes, digest_of, outputs_digest
 from pdhef_logtool.runs.pipeline import (
     FEW_LOGS,
     LogResult,
@@ -102,6 +104,8 @@ _NO_SETTING = frozenset(
 _FILES = ("mapping", "msgs", "thresholds", "cars")
 _READERS = 16
 _AGAIN = "they are tried again"
+_DAMAGED = "their outputs are damaged"
+_GOES_ON = "; --resume goes on"
 #: Begins the name of a file by which nodes know the output's folder.
 _MARK = ".nodes-"
 
@@ -135,7 +139,7 @@ class DriveEnd:
     Attributes
     ----------
     identity : what its log is known by. car : :func:`~.cars.car_record`. part, error_rad : as in the journal.
-    warned : lines for people. again : whether a failure may be none the next time.
+    warned : lines for people. again : whether a failure may be none the next time. outputs : as in the journal.
     """
 
     outcome: LogOutcome
@@ -146,6 +150,7 @@ class DriveEnd:
     error_rad: float | None = None
     warned: tuple[str, ...] = ()
     again: bool = False
+    outputs: str | None = None
 
 
 Work = Callable[[DriveTask, Tell], DriveEnd]
@@ -230,6 +235,9 @@ def run_logs(
             if resume:
                 stored.fetch_journal()
         journal = Journal.read(output) if resume else Journal.of(output)
+        if journal.damaged:
+            lines = "1 line is" if journal.damaged == 1 else f"{journal.damaged} lines are"
+            say(f"{JOURNAL_FILE}: {lines} damaged or of another version: the drives of these are run again")
         planned = _plan(inputs, journal, twice=config.cars is not None, warn=warn)
         check_places([p.log for p in planned], output, config, mapping, junit, cars.paths)
         pools = _pools(planned, cars, mapping, config)
@@ -257,6 +265,7 @@ def run_logs(
                 if fleet.done:
                     stop.add_note("--resume goes on")
                 stop.add_note(f"{fleet.done} of {len(planned)} logs are done")
+                _sweep_parts(output, {e.part for e in journal.entries.values()})
                 with suppress(PdhefError):
                     fleet.collect()
                     if stored is not None:
@@ -337,6 +346,7 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
         result.failed_checks,
         _error_of(result),
         tuple(warned),
+        outputs=outputs_digest(task.output / log_place(task.log.stem) / REPORT_FILE, task.output / part),
     )
 
 
@@ -351,7 +361,8 @@ def _page_of(output: Path, outcome: LogOutcome) -> list[str]:
     """Write the page of a drive; return what is wrong with it."""
     from pdhef_logtool.reports.pages import write_drive_page
 
-    log = OpenedLog(outcome.log, outcome.outcome, output / log_place(outcome.log), {"main": outcome.main})
+    entry = {"main": outcome.main, "files": outcome.files}
+    log = OpenedLog(outcome.log, outcome.outcome, output / log_place(outcome.log), entry)
     wrong = write_drive_page(log).wrong
     return [f"no page of {outcome.log}: {wrong}"] if wrong else []
 
@@ -547,6 +558,7 @@ class _Fleet:
     _said: set[str] = field(default_factory=set)
     _run: str = field(default_factory=lambda: f"{own_name()}-{next(_RUNS)}")
     _quiet: bool = False
+    _sound: dict[int, bool] = field(default_factory=dict)
 
     @property
     def done(self) -> int:
@@ -578,6 +590,10 @@ class _Fleet:
         todo = [p for p in chosen if reasons[p.log.stem] is not None]
         if names is None and self.journal.entries:
             self._tell_of(chosen, [r for r in reasons.values() if r], retry)
+        elif damaged := sum(
+            self._reason(p, "metrics", retry=False) == _DAMAGED for p in self.planned if p not in chosen
+        ):
+            self.say(f"{damaged} other drives are left out of the run until --resume: {_DAMAGED}")
         if not todo:
             return
         self._quiet = len(self.planned) > FEW_LOGS
@@ -600,21 +616,25 @@ class _Fleet:
         """Yield how the tasks end, here or on a cluster."""
         work = self.work if self.stored is None else partial(stored_drive, self.stored.objects, self.work)
         ends = (
-            supervise(work, tasks, jobs=self.jobs, limits=self.limits, preload=_PRELOAD, progress=hear)
+            supervise(work, tasks, jobs=self.jobs, limits=self.limits, preload=_PRELOAD, progress=hear, warn=self.warn)
             if self.ray is None
             else self._on_cluster(work, tasks, self.ray)
         )
         with closing(ends):
-            for ended in ends:
-                result = ended.result
-                if isinstance(result, OutputError):
-                    if self.stored is not None:
-                        result.remedy += "; --resume goes on"
-                    raise result
-                if isinstance(result, StoredEnd):
-                    assert self.stored is not None
-                    result = self.stored.take(result)
-                yield Ended(ended.number, ended.item, result, ended.failure)
+            try:
+                for ended in ends:
+                    result = ended.result
+                    if isinstance(result, OutputError):
+                        if self.stored is not None:
+                            result.remedy += _GOES_ON
+                        raise result
+                    if isinstance(result, StoredEnd):
+                        assert self.stored is not None
+                        result = self.stored.take(result)
+                    yield Ended(ended.number, ended.item, result, ended.failure)
+            except WorkerError as error:
+                error.remedy += _GOES_ON
+                raise
 
     def _on_cluster(
         self, work: Callable[[DriveTask, Tell], Any], tasks: Iterator[DriveTask], address: str
@@ -664,7 +684,7 @@ class _Fleet:
         before = self.journal.entries.get(one.log.stem)
         failed = end.outcome.failed is not None and end.part is None
         entry = Entry(
-            one.log.stem, one.place, end.identity or one.identity, self.setting, car, keep, end.part,
+            one.log.stem, one.place, end.identity or one.identity, self.setting, car, keep, end.part, end.outputs,
             end.failed_checks, end.error_rad, failed, end.again, quarantined,
         )  # fmt: skip
         self.journal.add(entry, end.outcome)
@@ -695,7 +715,19 @@ class _Fleet:
         folder = self.output / log_place(entry.label)
         if not (folder / REPORT_FILE).is_file() or entry.part is None or not (self.output / entry.part).is_file():
             return "their outputs are gone"
-        return None
+        return None if self._is_sound(entry) else _DAMAGED
+
+    def _is_sound(self, entry: Entry) -> bool:
+        """Whether report and figures of a drive are as they were written; read once for each line of the journal."""
+        if entry.outputs is None:
+            return True
+        if entry.at not in self._sound:
+            paths = self.output / log_place(entry.label) / REPORT_FILE, self.output / str(entry.part)
+            try:
+                self._sound[entry.at] = outputs_digest(*paths) == entry.outputs
+            except OSError:
+                self._sound[entry.at] = False
+        return self._sound[entry.at]
 
     def _changes(self, entry: Entry) -> Iterator[str]:
         """Yield in words what a drive was run with that is not so now."""
@@ -747,15 +779,18 @@ class _Fleet:
         if not entries and remaining:
             return []
         results = [self._result(entry, folder) for entry, folder in entries]
-        join_metrics(self.output / METRICS_FILE, [r.figures_file for r in results if r.figures_file is not None])
+        metrics = self.output / METRICS_FILE
+        join_metrics(metrics, [r.figures_file for r in results if r.figures_file is not None])
+        cars = self.journal.cars | self._cars_now()  # a line that says what a car is may be damaged
         networks = {
-            None if (network := self.journal.cars[e.car]["network"]) is None else (network[0], network[1])
+            None if (network := cars[e.car]["network"]) is None else (network[0], network[1])
             for e, _ in entries
             if e.car is not None
         }
         only = networks.pop() if len(networks) == 1 else None
         network = None if only is None else {"name": only[0], "sha256": only[1]}
-        run = build_run(run_versions(), self.config.to_dict(), network, [r.outcome for r in results], remaining)
+        files, outcomes = {METRICS_FILE: file_sha256(metrics)}, [r.outcome for r in results]
+        run = build_run(run_versions(), self.config.to_dict(), network, outcomes, remaining, files)
         write_json(self.output / RUN_FILE, run)
         if remaining:
             (self.output / PAGE_FILE).unlink(missing_ok=True)  # it is of other drives

@@ -1,7 +1,8 @@
 """journal.jsonl: what a run of several logs has done, a line a drive, from which a run that was ended goes on.
 
-A line is on the disk before the next drive counts as done. A log is known by what it holds; its label was given when
-it was first seen. Where it lies stands as a digest, so that nobody's folders get out, with size and time of change:
+A line is on the disk before the next drive counts as done, and ends with a checksum: one that is not as it was written
+is left out, so that its drive is run again. A log is known by what it holds; its label was given when it was first
+seen. Where it lies stands as a digest, so that nobody's folders get out, with size and time of change:
 a log with the same ones is not read to be known again.
 """
 
@@ -19,12 +20,19 @@ from typing import Any
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.documents import digest, jsonable
-from pdhef_logtool.records.files import open_new, write_bytes, writing
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.results.opened_run import JOURNAL_FILE
 from pdhef_logtool.sinks.report import CarFacts, LogOutcome
 
-_FORMAT = {"format": "pdhef.journal", "version": 1}
+_FORMAT = {"format": "pdhef.journal", "version": 2}
+#: Part of what a checksum is of, so that lines of another version of the format are left out as damaged ones are.
+_VERSION = b"pdhef.journal 2"
+#: Takes the place of a damaged line.
+_LEFT_OUT = {"left_out": "a damaged line"}
 _DIGITS = 16
+#: Bytes of the last entry of a line: the checksum of what is before it.
+_SUM_BYTES = len(b',"sum":""}\n') + _DIGITS
 #: Bytes of a log on a server, which nobody has asked for.
 _ELSEWHERE = -1
 
@@ -75,6 +83,7 @@ class Entry:
     identity : what the log is known by, None where nobody could read it. setting, car : digests of what it was run
         with; car None where it has none. keep : what was written.
     part : the file of its figures below the run's folder, None without. failed_checks : those that count.
+    outputs : :func:`outputs_digest` of what it left, None where that is not known.
     error_rad : RMSE of the answer's sideslip, None where it is not scored against an independent truth.
     failed : whether nothing came out. again : whether that may be otherwise next time, as on a full disk.
     quarantined : whether it took its worker along.
@@ -88,6 +97,7 @@ class Entry:
     car: str | None
     keep: str
     part: str | None = None
+    outputs: str | None = None
     failed_checks: int = 0
     error_rad: float | None = None
     failed: bool = False
@@ -103,12 +113,14 @@ class Journal:
     Attributes
     ----------
     entries : the last of each label. settings, cars : by digest, in words what a drive was run with.
+    damaged : lines that were left out when it was read.
     """
 
     path: Path
     entries: dict[str, Entry] = field(default_factory=dict)
     settings: dict[str, dict[str, str]] = field(default_factory=dict)
     cars: dict[str, dict[str, Any]] = field(default_factory=dict)
+    damaged: int = 0
     _places: dict[str, tuple[Place, str | None, str]] = field(default_factory=dict)
     _labels: dict[str, list[str]] = field(default_factory=dict)
     _sizes: set[int] = field(default_factory=set)
@@ -121,31 +133,43 @@ class Journal:
 
     @classmethod
     def read(cls, folder: Path) -> Journal:
-        """Return the journal of a folder, empty where it has none; a line that was cut off is left out."""
+        """Return the journal of a folder, empty where it has none; damaged lines are left out and counted.
+
+        Raises
+        ------
+        OutputError
+            It cannot be read.
+        """
         journal = cls.of(folder)
-        if not journal.path.is_file():
-            return journal
-        with journal.path.open("rb") as file:
-            for line in file:
-                try:
-                    document = json.loads(line) if line.endswith(b"\n") else None
-                except ValueError:
-                    document = None
-                if not isinstance(document, dict):
-                    break  # what follows a line that is none was not written by this command
-                journal._take(document, journal._end)
-                journal._end += len(line)
+        for line in journal._lines():
+            document = _document(line)
+            journal.damaged += document is None
+            journal._take(_LEFT_OUT if document is None else document, journal._end)
+            journal._end += len(line)
         return journal
 
+    def _lines(self) -> Iterator[bytes]:
+        try:
+            with self.path.open("rb") as file:
+                yield from file
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            got = error.strerror or str(error)
+            raise OutputError(expected="a readable journal", got=got, where=str(self.path)) from error
+
     def begin(self) -> None:
-        """Make it a whole file: the new one in place of an old one, or without a line that was cut off."""
-        if not self._end:
-            data = _line(_FORMAT)
-            write_bytes(self.path, data)
-            self._end = len(data)
-        elif self.path.stat().st_size > self._end:
-            with writing(self.path):
-                os.truncate(self.path, self._end)
+        """Make it a whole file: a new one in place of an old one, or the old one with a mark for each damaged line."""
+        if self._end and not self.damaged:
+            return
+        with writing(self.path), PendingFile(self.path) as pending, open_new(pending.path) as new:
+            had, self._end = self._end, new.write(_line(_FORMAT))
+            for line in self._lines() if had else ():
+                if (document := _document(line)) is None:
+                    document, line = _LEFT_OUT, _line(_LEFT_OUT)
+                if "format" not in document:
+                    self._take(document, self._end)
+                    self._end += new.write(line)
 
     def known(self, place: Place) -> tuple[str, str | None] | None:
         """Return label and identity of the log that lies there, if it lay there before and has not been changed."""
@@ -166,10 +190,18 @@ class Journal:
         return self._labels.get(identity, [])
 
     def outcome(self, entry: Entry) -> LogOutcome:
-        """Return how a drive ended."""
+        """Return how a drive ended; raises OutputError where its line was damaged since it was read."""
         with self.path.open("rb") as file:
             file.seek(entry.at)
-            told = json.loads(file.readline())["outcome"]
+            document = _document(file.readline())
+        if document is None:
+            raise OutputError(
+                expected=f"the line of {entry.label}",
+                got="another content",
+                where=str(self.path),
+                remedy="--resume runs it again",
+            )
+        told = document["outcome"]
         car = None if told["car"] is None else CarFacts(**told["car"])
         return LogOutcome(**{**told, "car": car, "lost": tuple(told["lost"])})
 
@@ -213,6 +245,11 @@ class Journal:
         elif "moved" in document:
             place = Place(**document["place"])
             self._places[place.key] = place, document["identity"], document["label"]
+        elif document == _LEFT_OUT:
+            # The line may have said that a drive that failed before has not failed since.
+            for label, entry in self.entries.items():
+                if entry.failed:
+                    self.entries[label] = replace(entry, again=True, quarantined=False)
         elif "label" in document:
             told = {k: v for k, v in document.items() if k != "outcome"}
             self._keep(Entry(**{**told, "place": Place(**told["place"])}, at=at))
@@ -227,7 +264,31 @@ class Journal:
 
 def _line(document: Mapping[str, Any]) -> bytes:
     text = json.dumps(document, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
-    return text.encode("utf-8", "backslashreplace") + b"\n"
+    data = text.encode("utf-8", "backslashreplace")[:-1]
+    return data + _sum(data)
+
+
+def _document(line: bytes) -> dict[str, Any] | None:
+    """Return what a line says, None if it is not as it was written."""
+    if line[-_SUM_BYTES:] != _sum(line[:-_SUM_BYTES]):
+        return None
+    document: dict[str, Any] = json.loads(line)
+    del document["sum"]
+    return document
+
+
+def _sum(data: bytes) -> bytes:
+    """Return the end of a line: the checksum of what is before it."""
+    text = hashlib.sha256(_VERSION + data).hexdigest()[:_DIGITS]
+    return b',"sum":"%s"}\n' % text.encode()
+
+
+def outputs_digest(*paths: Path) -> str:
+    """Return a digest of the files by which a drive counts as done; raises OSError."""
+    total = hashlib.sha256()
+    for path in paths:
+        total.update(hashlib.sha256(path.read_bytes()).digest())
+    return total.hexdigest()[:_DIGITS]
 
 
 def digest_of(told: Any) -> str:

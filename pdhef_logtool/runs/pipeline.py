@@ -22,6 +22,7 @@ from pdhef_logtool.estimators.stand_in import StandIn
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, Skipped, all_specs, runnable
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
 from pdhef_logtool.mapping import Mapping, merge_losses
+from pdhef_logtool.records.documents import file_sha256
 from pdhef_logtool.records.errors import (
     EXIT_FAILURE,
     EXIT_GATE,
@@ -128,7 +129,7 @@ class LogResult:
         """The document of report.json, None if the log failed; raises OutputError for a damaged one."""
         if self.document is not None or self.output is None:
             return self.document
-        return OpenedLog(self.outcome.log, self.outcome.outcome, self.output, {}).report()
+        return OpenedLog(self.outcome.log, self.outcome.outcome, self.output, {"files": self.outcome.files}).report()
 
     @property
     def rows(self) -> tuple[MetricRow, ...]:
@@ -378,11 +379,18 @@ def _run_estimators(
         car=_car_facts(drive.car),
         main=None if main is None else main.name,
         algorithms={name: a.identity for name, a in algorithms.items()},
+        files=files_of(change.target),
     )
     if len(found.silent) == len(ready):
         outcome = replace(outcome, failed=_ALL_SILENT)
     failed_checks = sum(c.verdict == "failed" and not c.waived for c in drive.checks)
     return LogResult(outcome, change.target, report, tuple(rows), failed_checks=failed_checks)
+
+
+def files_of(folder: Path) -> dict[str, str]:
+    """Return the sha256 of the files in a log's folder that commands read back, by name."""
+    paths = (folder / name for name in (REPORT_FILE, ESTIMATES_FILE))
+    return {path.name: file_sha256(path) for path in paths if path.is_file()}
 
 
 def _car_facts(car: Car) -> CarFacts:
@@ -660,4 +668,5 @@ def write_run(output: Path, config: dict[str, Any], result: LogResult, car: Car 
     known = None if car is None else car.network
     network = None if known is None or car is None else {"name": Path(car.network_name).name, "sha256": known.sha256}
     write_metrics(output / METRICS_FILE, result.rows)
-    write_json(output / RUN_FILE, build_run(run_versions(), config, network, [result.outcome]))
+    files = {METRICS_FILE: file_sha256(output / METRICS_FILE)}
+    write_json(output / RUN_FILE, build_run(run_versions(), config, network, [result.outcome], files=files))

@@ -58,6 +58,7 @@ from pdhef_logtool.runs.pipeline import (
     Progress,
     RunResult,
     check_places,
+    files_of,
     judge,
     log_place,
     outcome_of,
@@ -219,7 +220,8 @@ class _Scoring:
                 _write(change, report, rows, [written, *(r.track for r in recorded)], plan)
             folder = change.target
         progress(drive.name, 1.0)
-        return LogResult(outcome_of(drive, all_losses), folder, report, tuple(rows))
+        files = {} if folder is None else files_of(folder)
+        return LogResult(replace(outcome_of(drive, all_losses), files=files), folder, report, tuple(rows))
 
     def _read_estimates(self, drive: Drive) -> tuple[list[RecordedEstimate], list[Loss]]:
         losses: list[Loss] = []

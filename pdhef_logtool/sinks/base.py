@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,9 @@ TRUTH = "truth"
 
 #: A drive that takes longer is long: of it less is written than every stamp where a person only looks.
 LONGEST_WHOLE_NS = 600_000_000_000
+
+#: Near the end of a Rerun recording that was finished, within so many bytes.
+_RECORDING_END, _RECORDING_TAIL = b"RRF2FOOT", 64
 
 #: What numbers are rounded to in files, far below what sensors can tell: powers of two, so that last bytes are zero.
 _STEPS = {
@@ -75,6 +80,13 @@ def rounded(name: str, values: FloatArray) -> FloatArray:
 def resolution(name: str) -> tuple[float, float]:
     """Return by how much a column as files hold it may be off at most: absolute, and as a share of itself."""
     return (_STEPS[name] / 2.0, 0.0) if name in _STEPS else (0.0, 2.0 ** (_BITS_OUT - 24))
+
+
+def is_finished_recording(path: Path) -> bool:
+    """Return whether a Rerun recording has its end; what is before it is not read."""
+    with path.open("rb") as file:
+        file.seek(-min(_RECORDING_TAIL, path.stat().st_size), os.SEEK_END)
+        return _RECORDING_END in file.read()
 
 
 def first_of_slots(stamps_ns: IntArray, step_ns: int, before_ns: int | None) -> IntArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,8 @@ _PARTS_AT_ONCE = 256
 #: Columns that files of earlier versions have not.
 _LATER_COLUMNS = ("diverged", *OPTIONAL_COLUMNS)
 _LATER_METRIC_COLUMNS = ("algorithm",)
+_ESTIMATES, _METRICS = "estimates.parquet", "metrics.parquet"
+_AGAIN = "run the log again"
 _FLAGS = ("valid", "diverged")
 _STD_COLUMNS = ("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s")
 
@@ -76,6 +78,7 @@ class RowGroups:
                     compression_level=level,
                     use_dictionary=dictionaries,
                     column_encoding=encodings,
+                    write_page_checksum=True,
                 )
         except BaseException:
             self._drop()
@@ -177,7 +180,7 @@ def track_table(track: StateTrack, *, as_written: bool = False) -> pa.Table:
 def list_estimators(path: Path) -> tuple[str, ...]:
     """Return the names of the tracks in an estimates.parquet, in order of their first row group."""
     names: dict[str, None] = {}
-    with _open(path) as file:
+    with _open(path, _ESTIMATES) as file:
         for group in range(file.num_row_groups):
             names.update(dict.fromkeys(_estimators_of(file, group)))
     return tuple(names)
@@ -219,7 +222,7 @@ def read_blocks(path: Path, estimator: str, columns: Iterable[str]) -> Iterator[
     ------
     OutputError : When the file is no estimates.parquet or damaged.
     """
-    with _open(path) as file:
+    with _open(path, _ESTIMATES) as file:
         later = set(_LATER_COLUMNS) - set(file.schema_arrow.names)
     for table in _tables(path, estimator, set(columns) - later):
         yield _track_from_table(estimator, table)
@@ -233,20 +236,14 @@ def _tables(path: Path, estimator: str, columns: set[str] | None) -> Iterator[pa
         raise OutputError(
             expected=f"columns of {', '.join(TRACK_COLUMNS)}", got=", ".join(sorted(unknown)), where=str(path)
         )
-    with _open(path) as file:
+    with _open(path, _ESTIMATES) as file:
         absent = set(wanted) - set(file.schema_arrow.names)
         if columns is None:  # a file from before these columns is whole without them
-            wanted = [c for c in wanted if c not in absent or c not in _LATER_COLUMNS]
-            absent -= set(_LATER_COLUMNS)
-        if absent:
-            raise OutputError(
-                expected="an estimates.parquet",
-                got=f"a Parquet file without {', '.join(sorted(absent))}",
-                where=str(path),
-                remedy="run the log again",
-            )
+            wanted = [c for c in wanted if c not in absent]
+        elif absent:
+            raise _without(path, _ESTIMATES, absent)
         for group in range(file.num_row_groups):
-            try:
+            with _reading(path):
                 names = _estimators_of(file, group)
                 if estimator not in names:
                     continue
@@ -255,8 +252,6 @@ def _tables(path: Path, estimator: str, columns: set[str] | None) -> Iterator[pa
                 else:
                     table = file.read_row_group(group, columns=[*wanted, "estimator"])
                     table = table.filter(pc.field("estimator") == estimator).select(wanted)
-            except (OSError, pa.ArrowException) as error:
-                raise _damaged(path, error) from error
             yield table
 
 
@@ -286,10 +281,6 @@ def _track_from_table(name: str, table: pa.Table) -> StateTrack:
 def _estimators_of(file: pq.ParquetFile, group: int) -> tuple[str, ...]:
     """Return the names in one row group, from its statistics when they leave no doubt."""
     index = file.schema_arrow.get_field_index("estimator")
-    if index < 0:
-        raise OutputError(
-            expected="an estimates.parquet", got="a Parquet file without a column estimator", where="column estimator"
-        )
     statistics = file.metadata.row_group(group).column(index).statistics
     if statistics is not None and statistics.has_min_max and statistics.min == statistics.max:
         return (str(statistics.min),)
@@ -297,15 +288,60 @@ def _estimators_of(file: pq.ParquetFile, group: int) -> tuple[str, ...]:
     return tuple(str(v) for v in pc.unique(column).to_pylist())
 
 
-def _open(path: Path) -> pq.ParquetFile:
+def _open(path: Path, kind: str) -> pq.ParquetFile:
+    """Open a file that has the columns of its kind, but for those that earlier versions did not write."""
+    with _reading(path):
+        file = pq.ParquetFile(path)
+        types = {f.name: _class_of(f.type) for f in file.schema_arrow}
+    wanted = {f.name: _class_of(f.type) for f in arrow_schema(f"{kind}.json")}
+    if absent := wanted.keys() - types.keys() - {*_LATER_COLUMNS, *_LATER_METRIC_COLUMNS}:
+        file.close()
+        raise _without(path, kind, absent)
+    if other := sorted(name for name in wanted.keys() & types.keys() if types[name] != wanted[name]):
+        file.close()
+        raise OutputError(
+            expected=f"the columns of {kind}",
+            got=", ".join(f"{name} of {types[name]}" for name in other),
+            where=str(path),
+            remedy=_AGAIN,
+        )
+    return file
+
+
+def _class_of(kind: pa.DataType) -> str:
+    """Return what the values of a column are, however many bits they have; texts may stand in a dictionary."""
+    if pa.types.is_dictionary(kind):
+        kind = kind.value_type
+    if pa.types.is_string(kind) or pa.types.is_large_string(kind):
+        return "texts"
+    if pa.types.is_integer(kind):
+        return "whole numbers"
+    return "numbers" if pa.types.is_floating(kind) else str(kind)
+
+
+def _without(path: Path, kind: str, absent: Iterable[str]) -> OutputError:
+    got = f"a Parquet file without {', '.join(sorted(absent))}"
+    return OutputError(expected=f"the columns of {kind}", got=got, where=str(path), remedy=_AGAIN)
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn what Arrow says of a damaged file into an OutputError."""
     try:
-        return pq.ParquetFile(path)
-    except (OSError, pa.ArrowException) as error:
-        raise _damaged(path, error) from error
+        yield
+    except (OSError, ValueError, LookupError, pa.ArrowException) as error:
+        got = f"one that cannot be read: {' '.join(str(error).split())[:200]}"
+        raise OutputError(expected="a readable Parquet file", got=got, where=str(path), remedy=_AGAIN) from error
 
 
-def _damaged(path: Path, error: Exception) -> OutputError:
-    return OutputError(expected="a readable Parquet file", got=str(error), where=str(path), remedy="run the log again")
+def check_parquet(path: Path, kind: str) -> None:
+    """Read all of a file and raise OutputError where it is damaged or has not the columns of ``kind``.
+
+    ``kind`` : ``estimates.parquet`` or ``metrics.parquet``.
+    """
+    with _open(path, kind) as file, _reading(path):
+        for group in range(file.num_row_groups):
+            file.read_row_group(group).validate(full=True)
 
 
 def write_metrics(path: Path, rows: Sequence[MetricRow]) -> None:
@@ -331,26 +367,15 @@ def join_metrics(path: Path, parts: Sequence[Path]) -> None:
 
 
 def _metrics_table(path: Path, schema: pa.Schema) -> pa.Table:
-    with _open(path) as file:
-        try:
-            return file.read().select(schema.names).cast(schema)
-        except (OSError, KeyError, pa.ArrowException) as error:
-            raise _damaged(path, error) from error
+    with _open(path, _METRICS) as file, _reading(path):
+        return file.read().select(schema.names).cast(schema)
 
 
 def read_metrics(path: Path) -> list[MetricRow]:
     """Read a metrics.parquet; null becomes NaN, rows marked ``not_independent`` are so again; raises OutputError."""
     schema = arrow_schema("metrics.parquet.json")
-    with _open(path) as file:
+    with _open(path, _METRICS) as file, _reading(path):
         names = [n for n in schema.names if n in file.schema_arrow.names]
-        absent = set(schema.names) - {*names, *_LATER_METRIC_COLUMNS}
-        if absent:
-            raise OutputError(
-                expected="a metrics.parquet",
-                got=f"a Parquet file without {', '.join(sorted(absent))}",
-                where=str(path),
-                remedy="run the logs again",
-            )
         records = file.read(columns=names).to_pylist()
     dependent = {(r["log"], r["estimator"], r["signal"]) for r in records if r["metric"] == "not_independent"}
     return [

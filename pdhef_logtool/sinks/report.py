@@ -23,7 +23,7 @@ from pdhef_logtool.evaluation.units import typed_unit
 from pdhef_logtool.logs.byte_account import ByteLedger, checksummed_share
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.compiled_sources import compiled_digest
-from pdhef_logtool.records.documents import jsonable
+from pdhef_logtool.records.documents import jsonable, seal
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.signals import Loss
@@ -204,7 +204,8 @@ class LogOutcome:
 
     ``failed`` is the one-line reason if nothing came out; ``lost`` says what of the log could not be used.
     ``main``: the estimator that is the answer. ``folder`` of the log, below the one that holds all logs of the run.
-    ``algorithms``: the identity of each estimator that ran.
+    ``algorithms``: the identity of each estimator that ran. ``files``: sha256 by name of the files in the log's folder
+    that commands read back.
     """
 
     log: str
@@ -219,6 +220,7 @@ class LogOutcome:
     main: str | None = None
     folder: str = ""
     algorithms: Mapping[str, str] = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def outcome(self) -> str:
@@ -378,8 +380,9 @@ def build_run(
     model: Mapping[str, str] | None,
     outcomes: Iterable[LogOutcome],
     remaining: int = 0,
+    files: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Return the document of run.json (schemas/run.schema.json).
+    """Return the document of run.json (schemas/run.schema.json), sealed.
 
     Parameters
     ----------
@@ -387,6 +390,7 @@ def build_run(
     config : the configuration in effect, as JSON-able values.
     model : ``name`` and ``sha256`` of the network; None when none ran, or not the same for all.
     outcomes : one a log. remaining : logs that are not done, for the run was ended.
+    files : sha256 by name of the files beside run.json that commands read back.
     """
     document = {
         "format": "pdhef.run",
@@ -395,6 +399,7 @@ def build_run(
         "config": dict(config),
         "model": None if model is None else dict(model),
         **({"remaining": remaining} if remaining else {}),
+        "files": dict(files or {}),
         "logs": [
             {
                 "log": o.log,
@@ -408,11 +413,12 @@ def build_run(
                 "main": o.main,
                 "algorithms": o.algorithms,
                 "car": o.car,
+                "files": o.files,
             }
             for o in outcomes
         ],
     }
-    return {key: jsonable(value) for key, value in document.items()}
+    return seal(document)
 
 
 def json_bytes(document: Mapping[str, Any], *, brief: bool = False) -> bytes:

@@ -24,7 +24,7 @@ from pdhef_logtool.records.geometry import DEGREES, wrap_angle
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.sinks.base import LONGEST_WHOLE_NS, TRUTH, Event, Shown, Sink, first_of_slots
+from pdhef_logtool.sinks.base import LONGEST_WHOLE_NS, TRUTH, Event, Shown, Sink, first_of_slots, is_finished_recording
 from pdhef_logtool.sinks.palette import colour_rgb
 from pdhef_logtool.sinks.report import report_markdown
 
@@ -48,9 +48,6 @@ LONG_STEP_NS, OTHERS_STEP_NS = 100_000_000, 200_000_000
 
 #: How long Rerun may keep one call waiting before the recording is given up.
 LONGEST_WAIT_S = 60.0
-
-#: Stands near the end of a recording that was finished.
-_FOOTER = b"RRF2FOOT"
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,7 +257,7 @@ class RerunSink(Sink):
                 self._draw_whole(report, events)
                 self._recording.disconnect()
                 self._outlet.close()
-            if _FOOTER not in _tail(self._pending.path):
+            if not is_finished_recording(self._pending.path):
                 raise OutputError(
                     expected="a recording that Rerun has finished",
                     got="one without its end",
@@ -522,12 +519,6 @@ class _Trajectory:
         known = np.isfinite(points).all(axis=1)
         pieces = np.split(points, np.flatnonzero(np.diff(known)) + 1)
         return [p for p in pieces if len(p) > 1 and np.isfinite(p[0]).all()]
-
-
-def _tail(path: Path) -> bytes:
-    with path.open("rb") as file:
-        file.seek(-min(64, path.stat().st_size), os.SEEK_END)
-        return file.read()
 
 
 def _event_text(event: Event) -> str:

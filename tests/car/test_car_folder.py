@@ -522,6 +522,10 @@ def test_the_same_folder_is_updated_and_every_command_leaves_a_line(folder: Path
     assert lines[0]["drives"] == [DRIVES[0].model_dump(mode="json")]
     assert lines[1]["sha256"] == digest((folder / NOISE_FILE).read_text()) != lines[0]["sha256"]
     assert [p.name for p in folder.parent.iterdir()] == [folder.name]
+    for damaged in (b"{", b"\xff", b"[]", b'{"command": 1}'):
+        (folder / HISTORY_FILE).write_bytes(damaged)
+        with pytest.raises(VehicleError, match=HISTORY_FILE):
+            read_history(folder)
 
 
 def test_a_network_is_copied_whole_and_replaces_the_one_before(folder: Path) -> None:

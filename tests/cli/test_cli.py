@@ -317,10 +317,10 @@ def test_list_of_manoeuvres_names_the_demo_ones() -> None:
 
 
 def _run_of(folder: Path, *names: str) -> Path:
-    """Make a run whose logs have empty recordings; the last one failed and has none."""
+    """Make a run whose logs have recordings of an end alone; the last one failed and has none."""
     for name in names[:-1]:
         (folder / "logs" / name).mkdir(parents=True)
-        (folder / "logs" / name / "recording.rrd").touch()
+        (folder / "logs" / name / "recording.rrd").write_bytes(b"RRF2FOOT")
     logs = [{"log": name, "outcome": "ok"} for name in names]
     (folder / "run.json").write_text(json.dumps({"format": "pdhef.run", "version": 1, "logs": logs}))
     (folder / "metrics.parquet").touch()

@@ -26,6 +26,7 @@ from pdhef_logtool.drive import reading
 from pdhef_logtool.learning.network.dataset import MANIFEST, SPLITS, read_dataset
 from pdhef_logtool.learning.network.extract_command import ExtractResult, ExtractSettings, choose_split, extract
 from pdhef_logtool.logs.discovery import hash_log
+from pdhef_logtool.records.documents import is_sealed
 from pdhef_logtool.records.errors import LogError, OutputError, UsageError
 from pdhef_logtool.records.outputs import OutputFolder
 from pdhef_logtool.residual_model.features import FEATURES
@@ -211,8 +212,8 @@ def dataset(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 def test_manifest_follows_its_schema(dataset: ExtractResult, sample_logs_dir: Path) -> None:
     document = json.loads((dataset.output / MANIFEST).read_text(encoding="utf-8"))
-    assert document == dataset.manifest
     jsonschema.validate(document, SCHEMA)
+    assert is_sealed(document) and {k: v for k, v in document.items() if k != "digest"} == dataset.manifest
     assert document["features"] == list(FEATURES)
     by_log = {d["log"]: d for d in document["drives"]}
     assert by_log["dlc"]["source"] == {"file": "dlc.mcap", "sha256": hash_log(sample_logs_dir / "dlc.mcap")}
@@ -278,6 +279,10 @@ def test_damaged_dataset_is_told(dataset: ExtractResult, tmp_path: Path) -> None
     with pytest.raises(OutputError, match="another content"):
         broken.load()
     document = json.loads((copy / MANIFEST).read_text())
+    (copy / MANIFEST).write_text(json.dumps({**document, "version": 99}))
+    with pytest.raises(OutputError, match="not as it was written"):
+        read_dataset(copy)
+    del document["digest"]
     (copy / MANIFEST).write_text(json.dumps({**document, "version": 99}))
     with pytest.raises(OutputError, match="makes it anew"):
         read_dataset(copy)

@@ -147,6 +147,12 @@ def test_checkpoint_of_other_data_and_empty_splits_are_refused(tmp_path: Path) -
         train(training[:2], validation, replace(SMALL, epochs=1), tmp_path)
     with pytest.raises(ModelError, match="0 sequences"):
         train(training, [], SMALL, tmp_path / "none")
+    sound = (tmp_path / CHECKPOINT).read_bytes()
+    for at in (4, 20, 300, len(sound) // 2, len(sound) - 5):
+        for damaged in (sound[:at], sound[:at] + bytes([sound[at] ^ 4]) + sound[at + 1 :]):
+            (tmp_path / CHECKPOINT).write_bytes(damaged)
+            with pytest.raises(ModelError, match=r"checkpoint.*remove it to train anew"):
+                train(training, validation, replace(SMALL, epochs=1), tmp_path)
 
 
 def test_paper_recipe_is_table_1() -> None:

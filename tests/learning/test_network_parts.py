@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import polars as pl
+import pyarrow.parquet as pq
 import pytest
 import torch
 from matplotlib.figure import Figure
@@ -43,6 +44,7 @@ from pdhef_logtool.learning.network.residuals import (
 from pdhef_logtool.learning.network.train_command import gap_free_runs, make_recipe, mean_square, train_on
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
+from pdhef_logtool.records.documents import seal
 from pdhef_logtool.records.errors import EstimatorError, ModelError, OutputError, UsageError
 from pdhef_logtool.records.supervisor import Ended, Failure
 from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, ModelBundle, Normalisation
@@ -154,6 +156,7 @@ def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
     other = residual_rows(40)
     write_dataset(tmp_path, z=("train", rows), b=("train", other), c=("extra", other))
     document = json.loads((tmp_path / "manifest.json").read_text())
+    assert len(document.pop("digest")) == 64
     assert [d["log"] for d in document["drives"]] == ["b", "c", "z"]
     assert document["splits"] == {
         "train": {"drives": 2, "rows": 160, "usable_rows": 156},
@@ -187,7 +190,18 @@ def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
     frame = pl.read_parquet(tmp_path / file, hive_partitioning=False)
     assert frame["target_dvy_m_s"].null_count() == 1 and frame[FEATURES[0]].null_count() == 1
     groups = pl.read_parquet_metadata(tmp_path / file)
-    assert groups["pdhef.drive"] == json.dumps(entry_of("z", "train", rows, 0.02), sort_keys=True)
+    assert groups["pdhef.drive"] == json.dumps(seal(entry_of("z", "train", rows, 0.02)), sort_keys=True)
+    sound = (tmp_path / file).read_bytes()
+    table = pq.read_table(tmp_path / file, partitioning=None)
+    for at in range(200, len(sound), len(sound) // 40):
+        (tmp_path / file).write_bytes(sound[:at] + bytes([sound[at] ^ 4]) + sound[at + 1 :])
+        if (entry := read_entry(tmp_path / file)) is not None:
+            assert entry == entry_of("z", "train", rows, 0.02)
+            assert pq.read_table(tmp_path / file, partitioning=None).equals(table)
+        with pytest.raises(OutputError, match="another content"):
+            data.drives[2].load()
+    with pytest.raises(OutputError, match="another content"):  # adding drives does not make a damaged one sound
+        write_manifest(tmp_path, document["drives"], [], settings=SETTINGS, seed=3, vehicles={})
 
 
 def test_parts_of_rows_change_no_byte_and_a_dropped_file_is_gone(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ from pdhef_logtool.learning.retrain.retrain_command import (
 )
 from pdhef_logtool.learning.retrain.roles import GATE, LEAST, SHARES, STOP, TRAIN, TRUST, Candidate, deal
 from pdhef_logtool.learning.stages import Stages
-from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EstimatorError
+from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EstimatorError, OutputError
 from pdhef_logtool.reports import comparison
 from pdhef_logtool.runs.config import RunConfig
 
@@ -234,10 +234,15 @@ def test_a_car_that_took_part_elsewhere_is_not_lost_when_the_stages_are(fleet: F
     found = fleet.retrain()
     shutil.rmtree(found.folder)
     assert fleet.retrain().folder.is_dir() and fleet.done == []
-    for damaged in ("[]", "no json", '{"basis": 1}'):
-        for name in ("seen.json", "roles.json"):
-            (fleet.folder / "out/work" / name).write_text(damaged)
+    roles = fleet.folder / "out/work/roles.json"
+    sound = roles.read_text()
+    for damaged in ("[]", "no json", '{"basis": 1, "digest": "a"}'):
+        (fleet.folder / "out/work/seen.json").write_text(damaged)
         assert fleet.retrain().document == found.document
+        roles.write_text(damaged)
+        with pytest.raises(OutputError, match=r"roles\.json"):
+            fleet.retrain()
+        roles.write_text(sound)
     shutil.rmtree(fleet.folder / "out/work")
     assert fleet.retrain().document == found.document, "parts are drawn by content and seed"
 

@@ -17,7 +17,7 @@ from pdhef_logtool.car.car import SHIPPED_CARS, Car, load_intervals
 from pdhef_logtool.car.flat import load_vehicle
 from pdhef_logtool.evaluation.thresholds import load_thresholds
 from pdhef_logtool.mapping import Mapping, SignalSource, load_mapping
-from pdhef_logtool.records.documents import MAX_DEPTH, digest, read_json, read_toml, unknown
+from pdhef_logtool.records.documents import MAX_DEPTH, digest, read_json, read_sealed, read_toml, seal, unknown
 from pdhef_logtool.records.errors import PdhefError, UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import DOCUMENT_FILE, SHIPPED_FOLDERS, WEIGHTS_FILE, load_network
 from pdhef_logtool.residual_model.linear_model import LinearModel, load_linear_model
@@ -230,6 +230,22 @@ def test_nesting_up_to_the_limit_is_read(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(f'{{"a": {nested}, "n": {2**64 - 1}}}')
     assert list(read_toml(tmp_path / "a.toml", "a file", UsageError)) == ["a"]
     assert read_json(tmp_path / "a.json", "a file", UsageError)["n"] == 2**64 - 1
+
+
+def test_a_sealed_document_is_read_as_it_was_written_or_not_at_all(tmp_path: Path) -> None:
+    path, document = tmp_path / "own.json", {"a": [1, 0.1, None, "é"], "b": {"c": True}}
+    data = json.dumps(seal(document)).encode()
+    path.write_bytes(data)
+    assert read_sealed(path, "ours", UsageError) == document
+    for at in range(len(data)):
+        for damaged in (data[:at], data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]):
+            path.write_bytes(damaged)
+            with pytest.raises(UsageError, match=r"own\.json: expected ours"):
+                read_sealed(path, "ours", UsageError)
+    path.write_text(json.dumps(document))
+    assert read_sealed(path, "ours", UsageError, former=True) == document
+    with pytest.raises(UsageError, match="not as it was written"):
+        read_sealed(path, "ours", UsageError)
 
 
 def test_errors_say_what_was_wanted_where_and_what_to_do(tmp_path: Path) -> None:

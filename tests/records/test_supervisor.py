@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 import tracemalloc
 from collections.abc import Iterator
@@ -18,9 +19,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.errors import EXIT_FAILURE, UsageError, WorkerError
 from pdhef_logtool.records.supervisor import Crew, Ended, Failure, Limits, supervise
-from tests.records.planted_work import Item, Unreadable, called, planted
+from tests.records.planted_work import DEATHS, MOST_DEATHS, Item, Unreadable, called, planted
 
 LIMITS = Limits(silence_s=0.5, memory_bytes=400_000_000)
 PRELOAD = ["tests.records.planted_work:note_call"]
@@ -130,6 +131,86 @@ def test_the_fork_server_may_die_too() -> None:
     ended = outcomes([("kill server", ""), *[("well", "x")] * 3], 2, Limits())
     assert ended[0].failure == Failure("the worker died", "at kill server", 2)
     assert [e.result for e in ended[1:]] == ["x"] * 3
+
+
+@pytest.fixture
+def deaths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file with a letter for each time that the fork server was killed while it loaded: at most twice."""
+    file = tmp_path / "deaths"
+    file.touch()
+    monkeypatch.setenv(DEATHS, str(file))
+    monkeypatch.setenv(MOST_DEATHS, "2")
+    return file
+
+
+DYING = ["tests.records.planted_work:die_at_start"]
+
+
+def test_a_fork_server_that_dies_while_it_loads_is_restarted_and_that_is_said(deaths: Path) -> None:
+    warned: list[str] = []
+    items = [("well", str(i)) for i in range(4)]
+    ended = list(supervise(planted, items, jobs=2, preload=DYING, warn=warned.append))
+    assert sorted((e.result, e.failure) for e in ended) == [(str(i), None) for i in range(4)]
+    assert warned == [f"the fork server died (signal 9): restart {n} of 3, no item is lost" for n in (1, 2)]
+    assert deaths.read_text() == "xx"
+
+
+def test_a_fork_server_that_dies_again_and_again_is_one_error(deaths: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(MOST_DEATHS, "99")
+    with pytest.raises(WorkerError, match="4 that died, the last one by signal 9") as caught:
+        list(supervise(planted, [("well", "")] * 4, jobs=2, preload=DYING))
+    assert caught.value.exit_code == EXIT_FAILURE
+    assert deaths.read_text() == "xxxx"
+
+
+def test_workers_outlive_the_fork_server_until_they_are_dismissed(tmp_path: Path) -> None:
+    files = [tmp_path / name for name in "ab"]
+    warned: list[str] = []
+    begun = [f.with_suffix(".begun") for f in files]
+    pids: list[int] = []
+
+    def heard(*_: object) -> None:
+        if not pids and all(f.is_file() and f.read_text().endswith("\n") for f in begun):
+            os.kill(crew._server._process.pid, signal.SIGKILL)  # type: ignore[union-attr]
+            crew._server._process.wait()  # type: ignore[union-attr]
+            pids.extend(int(f.read_text()) for f in begun)
+            (tmp_path / "go").touch()
+
+    with Crew(planted, jobs=2, preload=PRELOAD, warn=warned.append) as crew:
+        ended = list(crew.each([("wait", str(f)) for f in files] + [("where", "")], heard))
+        assert [e.failure for e in ended] == [None] * 3
+        assert {e.result[0] for e in ended if e.number == 2} <= set(pids)  # type: ignore[index]
+        assert warned == []
+        # One of them dies: now a new one is needed, and a new server.
+        again = list(crew.each([("kill once", str(tmp_path / "once")), ("well", "x")]))
+        assert [(e.result, e.failure) for e in sorted(again, key=lambda e: e.number)] == [
+            (str(tmp_path / "once"), None),
+            ("x", None),
+        ]
+        assert warned == ["the fork server died (signal 9): restart 1 of 3, no item is lost"]
+        os.kill(crew._server._process.pid, signal.SIGKILL)  # type: ignore[union-attr]
+        pids += [w.pid for w in crew._workers if w.pid is not None]
+    for pid in pids:
+        assert not Path(f"/proc/{pid}/exe").exists()
+
+
+def test_an_item_whose_worker_was_never_started_has_not_been_tried() -> None:
+    with Crew(planted, jobs=1, limits=Limits(60.0), preload=PRELOAD) as crew:
+        list(crew.each([("kill", "")]))
+        server = crew._server._process.pid  # type: ignore[union-attr]
+        assert not crew._workers
+        os.kill(server, signal.SIGSTOP)
+
+        def kill_when_asked() -> None:
+            while not crew._workers:
+                time.sleep(0.001)
+            os.kill(server, signal.SIGKILL)
+
+        killer = threading.Thread(target=kill_when_asked)
+        killer.start()
+        (ended,) = crew.each([("kill", "")])
+        killer.join()
+        assert ended.failure == Failure(REASONS["kill"], "at kill", 2)
 
 
 def test_items_of_a_place_go_to_its_worker_as_long_as_it_lives() -> None:

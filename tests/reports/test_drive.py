@@ -23,9 +23,9 @@ from pdhef_logtool.reports.pages import remove_pages, write_pages
 from pdhef_logtool.results.opened_run import open_run
 
 
-def page_of(folder: Path) -> str:
+def page_of(folder: Path, wrong: int = 0) -> str:
     result = write_pages(open_run(folder))
-    assert result.wrong == ()
+    assert (len(result.wrong), result.exit_code) == ((1, 3) if wrong else (0, 0))
     return result.pages[0].file.read_text(encoding="utf-8")
 
 
@@ -122,7 +122,7 @@ def test_without_usable_estimates_the_page_says_so_and_shows_the_rest(tmp_path, 
         file.unlink()
     else:
         file.write_bytes(b"" if damage == "empty" else file.read_bytes()[:1000])
-    text = words(page_of(folder))
+    text = words(page_of(folder, wrong=damage != "absent"))
     assert "estimates.parquet is not in the folder" in text if damage == "absent" else "cannot be drawn" in text
     assert "Errors over the whole drive" in text
 

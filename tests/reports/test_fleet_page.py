@@ -9,15 +9,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import polars as pl
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 from browser import CHROMIUM, WHY_NOT, Browser
 
+from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.reports.fleet import fleet_page
 from pdhef_logtool.reports.pages import remove_pages, write_pages
 from pdhef_logtool.results.opened_run import open_run
+from pdhef_logtool.sinks.parquet import write_metrics
 
 HOSTILE = "</script><script>alert(1)</script>\"'><img src=x onerror=alert(1)>\u202egnp"
 
@@ -46,9 +47,7 @@ def run_of(folder: Path, drives: Mapping[str, Mapping[str, Any]], failed: Mappin
         (place / "report.html").write_text("x")
         logs.append({"log": label, "outcome": "ok", "car": None})
     logs += [{"log": label, "outcome": f"failed: {reason}", "car": None} for label, reason in (failed or {}).items()]
-    columns = ["log", "estimator", "signal", "segment", "metric", "value"]
-    schema = {c: pl.Float64 if c == "value" else pl.String for c in columns}
-    pl.DataFrame(rows, schema=schema, orient="row").write_parquet(folder / "metrics.parquet")
+    write_metrics(folder / "metrics.parquet", [MetricRow(*row, unit="rad", n=9) for row in rows])
     (folder / "run.json").write_text(json.dumps({"format": "pdhef.run", "logs": logs, "versions": {"a": "1"}}))
     return folder
 

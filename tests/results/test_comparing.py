@@ -220,7 +220,7 @@ def test_no_pair_and_unknown_names_are_errors(tmp_path: Path) -> None:
         _compare(scored, a)
     assert _compare(scored, a, Gate((Figure(estimator="pd-hef"),))).figures[0].change.drives == 10
     (tmp_path / "c" / "metrics.parquet").write_bytes(b"PAR1 no")
-    with pytest.raises(OutputError, match=r"the metrics\.parquet of a run"):
+    with pytest.raises(OutputError, match=r"metrics\.parquet: expected a readable Parquet file"):
         _compare(a, c)
 
 

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import polars as pl
 import pytest
 
+from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.results.fleet import ANSWER, Fleet, exact_median, read_fleet
 from pdhef_logtool.results.opened_run import open_run
+from pdhef_logtool.sinks.parquet import write_metrics
 
 LOST = {"what": "ends at byte 3; what follows is gone (a.mcap)", "severity": "lost"}
 NO_TRUTH = {"available": False, "not_independent": []}
@@ -62,9 +63,7 @@ class Run:
         self.rows.append((label, estimator, signal, "all", metric, value))
 
     def read(self, **options: Any) -> Fleet:
-        columns = ["log", "estimator", "signal", "segment", "metric", "value"]
-        schema = {c: pl.Float64 if c == "value" else pl.String for c in columns}
-        pl.DataFrame(self.rows, schema=schema, orient="row").write_parquet(self.folder / "metrics.parquet")
+        write_metrics(self.folder / "metrics.parquet", [MetricRow(*row, unit="rad", n=9) for row in self.rows])
         (self.folder / "run.json").write_text(json.dumps({"format": "pdhef.run", "logs": self.logs}))
         return read_fleet(open_run(self.folder), **options)
 

@@ -12,7 +12,8 @@ from pdhef_logtool.logs.discovery import identity_of
 from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.records.supervisor import Tell
 from pdhef_logtool.runs.cars import RunCars, car_record
-from pdhef_logtool.runs.fleet import DriveEnd, DriveTask, digest_of
+from pdhef_logtool.runs.fleet import DriveEnd, DriveTask, digest_of, outputs_digest
+from pdhef_logtool.runs.pipeline import files_of
 from pdhef_logtool.sinks.parquet import write_metrics
 from pdhef_logtool.sinks.report import CarFacts, LogOutcome, write_json
 
@@ -27,11 +28,16 @@ def stub_drive(task: DriveTask, tell: Tell) -> DriveEnd:
     value = zlib.crc32(log.stem.encode()) / 2**32
     row = MetricRow(log.stem, "physics", "sideslip_rad", "all", "rmse", value, "rad", 100)
     write_metrics(task.output / part, [row])
-    write_json(task.output / "logs" / log.stem / "report.json", {"log": log.stem})
+    report = task.output / "logs" / log.stem / "report.json"
+    write_json(report, {"format": "pdhef.report", "log": {"name": log.stem}})
     identity = identity_of(log)
     facts = CarFacts(car.file_name, car.vehicle.name, car.physics_sha256, None)
-    outcome = LogOutcome(log.stem, Path(str(log.path)).name, identity, car=facts, main="physics")
-    return DriveEnd(outcome, identity, {"digest": digest_of(record["parts"]), **record}, part, error_rad=value)
+    outcome = LogOutcome(
+        log.stem, Path(str(log.path)).name, identity, car=facts, main="physics", files=files_of(report.parent)
+    )
+    outputs = outputs_digest(report, task.output / part)
+    record = {"digest": digest_of(record["parts"]), **record}
+    return DriveEnd(outcome, identity, record, part, error_rad=value, outputs=outputs)
 
 
 def waiting_drive(folder: Path, task: DriveTask, tell: Tell) -> DriveEnd:

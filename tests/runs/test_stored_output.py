@@ -64,7 +64,7 @@ def test_a_store_has_what_a_folder_has_and_is_gone_on_with(tmp_path: Path, memor
     assert stored(memory) == local(tmp_path / "out")
     assert result.to_dict()["output"] == URL
     assert result.to_dict()["logs"][0]["output"] == f"{URL}/logs/a"
-    assert result.results[0].report == {"log": "a"}
+    assert result.results[0].report == {"format": "pdhef.report", "log": {"name": "a"}}
     named_logs(logs, "c")
     said: list[str] = []
     run(logs, URL, work=work, resume=True, say=said.append)
@@ -73,7 +73,7 @@ def test_a_store_has_what_a_folder_has_and_is_gone_on_with(tmp_path: Path, memor
     assert (said, stored(memory)) == ([], local(tmp_path / "out"))
     opened = open_run(URL)
     assert (opened.place, [log.label for log in opened.logs]) == (URL, ["a", "b", "c"])
-    assert opened.logs[2].report() == {"log": "c"}
+    assert opened.logs[2].report() == {"format": "pdhef.report", "log": {"name": "c"}}
     assert opened.logs[2].estimates() is None
     assert opened.metrics().collect().equals(pl.read_parquet(tmp_path / "out" / METRICS_FILE))
 
@@ -84,7 +84,9 @@ def test_a_name_that_is_a_pattern_means_itself(tmp_path: Path, s3: Any) -> None:
         for start in ("1", "2"):
             run(logs, url, config=RunConfig(keep="metrics", start=start))
         run(logs, url, config=RunConfig(keep="metrics", start="2"), only=["d[1]"])
-        assert [log.report() for log in open_run(url).logs] == [{"log": name} for name in ("d1", "d[1]")]
+        assert [log.report() for log in open_run(url).logs] == [
+            {"format": "pdhef.report", "log": {"name": name}} for name in ("d1", "d[1]")
+        ]
 
 
 def test_what_was_fetched_in_part_is_fetched_again(
@@ -100,7 +102,7 @@ def test_what_was_fetched_in_part_is_fetched_again(
     with monkeypatch.context() as patch, pytest.raises(OutputError, match="no answer"):
         patch.setattr(type(memory), "get_file", cut)
         opened.logs[0].report()
-    assert opened.logs[0].report() == {"log": "a"}
+    assert opened.logs[0].report() == {"format": "pdhef.report", "log": {"name": "a"}}
 
 
 def test_a_place_whose_files_do_not_appear_whole_is_written_by_temporary_names(tmp_path: Path) -> None:

@@ -351,6 +351,6 @@ def test_metrics_come_back(tmp_path):
     assert [r.value for r in rows if r.n] == [0.0123, 0.1, 1.0]
     write_metrics(path, [])
     assert read_metrics(path) == []
-    with pytest.raises(OutputError, match=r"expected a metrics\.parquet"):
+    with pytest.raises(OutputError, match=r"expected the columns of metrics\.parquet"):
         write(tmp_path / "estimates.parquet", lambda *a: make_track("zero", np.arange(2)))
         read_metrics(tmp_path / "estimates.parquet")

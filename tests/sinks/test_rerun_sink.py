@@ -406,7 +406,7 @@ def test_a_disk_that_is_full_is_told_and_leaves_nothing(tmp_path, circle, circle
 
 
 def test_a_recording_without_its_end_is_none(tmp_path, circle, circle_signals, monkeypatch):
-    monkeypatch.setattr(rerun, "_FOOTER", b"something that Rerun does not write")
+    monkeypatch.setattr("pdhef_logtool.sinks.base._RECORDING_END", b"something that Rerun does not write")
     with pytest.raises(OutputError, match="got one without its end"):
         write(tmp_path / "recording.rrd", circle, circle_signals)
     assert list(tmp_path.iterdir()) == []

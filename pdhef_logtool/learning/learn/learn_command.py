@@ -7,11 +7,9 @@ came of it, and the car that it made where that stays. A rerun takes every step 
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -54,11 +52,11 @@ from pdhef_logtool.learning.learn.steps import (
     what_more_would_pay,
 )
 from pdhef_logtool.learning.noise.tune_command import REFUSED
-from pdhef_logtool.learning.stages import Stages
+from pdhef_logtool.learning.stages import Stages, read_own
 from pdhef_logtool.logs.discovery import LogInput, Logs
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.records.documents import digest
+from pdhef_logtool.records.documents import digest, seal
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.outputs import OutputFolder, check_no_input, local_path
@@ -423,7 +421,8 @@ def _end(course: _Course, start: Path, car: Path, figures: dict[str, dict[str, A
     lesson = course.lesson
     course.progress("scoring the last part, once", _share(len(STEPS) + 1))
     curve = learning_curve(lesson, car, course.progress)
-    looks = _look(course.work / LOOKS_FILE, [[course.logs[s.path], *(s.span_s or ())] for s in lesson.parts[LAST]])
+    spans = [[course.logs[s.path], *(s.span_s or ())] for s in lesson.parts[LAST]]
+    looks = _look(course.work / LOOKS_FILE, spans, course.say)
     tables = {part: table_of(lesson, start, car, part) for part in (CHECK, LAST)}
     return {
         "car_name": Car.load(car).vehicle.name,
@@ -434,15 +433,13 @@ def _end(course: _Course, start: Path, car: Path, figures: dict[str, dict[str, A
     }
 
 
-def _look(file: Path, spans: list[list[Any]]) -> int:
+def _look(file: Path, spans: list[list[Any]], say: Tell = lambda _text: None) -> int:
     """Remember that spans [hash of the log, start, end] are scored now; return how often any was, this time included.
 
     The file outlives ``--fresh`` and other settings: who tries until the last part looks well has fitted to it.
     """
-    earlier: list[list[list[Any]]] = []
-    with suppress(OSError, ValueError, RecursionError):
-        earlier = json.loads(file.read_text(encoding="utf-8"))["looks"]
-    write_bytes(file, json_bytes({"looks": [*earlier, spans]}))
+    earlier: list[list[list[Any]]] = (read_own(file, say, former=True) or {}).get("looks", [])
+    write_bytes(file, json_bytes(seal({"looks": [*earlier, spans]})))
 
     def meets(one: list[Any], other: list[Any]) -> bool:
         return bool(one[0] == other[0] and min(one[2], other[2]) > max(one[1], other[1]))

@@ -27,10 +27,11 @@ from pdhef_logtool.car.parts import car_folder
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.learning.network.cells import COUNT, EVERYTHING, Picked, Picking, draw_limits, is_chosen, table_of
 from pdhef_logtool.learning.network.residuals import ResidualRows
-from pdhef_logtool.records.documents import digest
+from pdhef_logtool.records.documents import DIGEST, digest, is_sealed, read_sealed, seal, validated
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES
 from pdhef_logtool.sinks.parquet import RowGroups
 from pdhef_logtool.sinks.report import tool_versions, write_json
 from pdhef_logtool.sinks.schema import arrow_schema
@@ -53,6 +54,8 @@ CHOSEN_SPLIT = "train"
 ROWS_A_GROUP = 32768
 
 _ENTRY = b"pdhef.drive"
+_EXPECTED = f"a residual dataset with its {MANIFEST}"
+_REMEDY = "write one with pdhef extract LOG... -o DATASET (--resume finishes an interrupted one)"
 _SCHEMA = "residuals.parquet.json"
 
 FloatArray32: TypeAlias = NDArray[np.float32]
@@ -81,7 +84,7 @@ class DriveWriter:
 
     def finish(self, entry: Mapping[str, Any]) -> None:
         """Write what waits and the drive's entry, and give the file its name."""
-        self._file.finish({_ENTRY.decode(): json.dumps(entry, sort_keys=True)})
+        self._file.finish({_ENTRY.decode(): json.dumps(seal(entry), sort_keys=True)})
 
     def abort(self) -> None:
         """Remove what was written."""
@@ -103,13 +106,20 @@ def _table(rows: ResidualRows, picked: Picked, schema: pa.Schema) -> pa.Table:
 
 
 def read_entry(path: Path) -> dict[str, Any] | None:
-    """Return the manifest's entry that a drive's file carries; None if there is no such file or it is not whole."""
+    """Return the manifest's entry that a drive's file carries.
+
+    Returns None if there is no such file, or if it is not as it was written: all of it is read, by its checksums.
+    """
     try:
-        metadata = pq.read_metadata(path).metadata or {}
-        entry = json.loads(metadata[_ENTRY])
-    except (OSError, KeyError, ValueError, RecursionError, pa.ArrowException):
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            entry = json.loads(file.metadata.metadata[_ENTRY])
+            for _ in file.iter_batches():
+                pass
+    except (OSError, KeyError, TypeError, ValueError, RecursionError, pa.ArrowException):
         return None
-    return entry if isinstance(entry, dict) else None
+    if not isinstance(entry, dict) or not is_sealed(entry):
+        return None
+    return {key: value for key, value in entry.items() if key != DIGEST}
 
 
 def drive_file(folder: Path, entry: Mapping[str, Any]) -> Path:
@@ -133,19 +143,27 @@ def write_manifest(
     vehicles: Mapping[str, Mapping[str, Any]],
     duplicates: Sequence[Mapping[str, str]] = (),
 ) -> dict[str, Any]:
-    """Write manifest.json over the drives' files that are there, and return it; raises OutputError.
+    """Write manifest.json over the drives' files that are there, and return it.
 
     Parameters
     ----------
-    entries : one a drive, as in its file. failed : log, file and reason of the logs that gave none.
+    entries : one a drive, as in its file or an earlier manifest.
+    failed : log, file and reason of the logs that gave none.
     duplicates : log, file and the name of the drive that holds the same, of the logs that were left out for it.
     settings, seed : of the call that wrote last; with ``per_cell_s`` so much of each cell is chosen of split train.
     vehicles : by the digest of their physics; those that no drive names are left out.
+
+    Raises
+    ------
+    OutputError
+        It cannot be written, or a drive's file is missing or not the one that the earlier manifest named.
     """
     drives = []
     for entry in sorted(entries, key=lambda e: str(e["name"])):
         path = drive_file(folder, entry)
-        drives.append({**entry, "file": path.relative_to(folder).as_posix(), "file_sha256": _sha256(path)})
+        sha256 = _sha256(path)
+        _check_content(path, entry.get("file_sha256", sha256), sha256)
+        drives.append({**entry, "file": path.relative_to(folder).as_posix(), "file_sha256": sha256})
     splits: dict[str, dict[str, int]] = {name: {"drives": 0, "rows": 0, "usable_rows": 0} for name in SPLITS}
     for d in drives:
         total = splits.setdefault(d["split"], {"drives": 0, "rows": 0, "usable_rows": 0})
@@ -174,7 +192,7 @@ def write_manifest(
         "duplicates": list(duplicates),
         "versions": tool_versions(),
     }
-    write_json(folder / MANIFEST, document)
+    write_json(folder / MANIFEST, seal(document))
     return document
 
 
@@ -228,6 +246,16 @@ def _sha256(path: Path) -> str:
         ) from None
 
 
+def _check_content(path: Path, named: str, found: str) -> None:
+    if found != named:
+        raise OutputError(
+            expected="the file that the manifest names",
+            got="another content",
+            where=str(path),
+            remedy="extract it again",
+        )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveArrays:
     """One drive for training, in time order; rows on which the parallel filter has no state are left out.
@@ -276,13 +304,7 @@ class DatasetDrive:
         OutputError
             The file is missing, or not the one that the manifest names.
         """
-        if _sha256(self.path) != self.entry["file_sha256"]:
-            raise OutputError(
-                expected="the file that the manifest names",
-                got="another content",
-                where=str(self.path),
-                remedy="extract it again",
-            )
+        _check_content(self.path, self.entry["file_sha256"], _sha256(self.path))
         table = pq.read_table(self.path, partitioning=None)
         column = {name: table[name].to_numpy() for name in table.column_names if name != "split"}
         stamps = column["stamp_ns"].astype(np.int64)
@@ -345,8 +367,9 @@ class Dataset:
     def vehicle(self, drive: DatasetDrive) -> VehicleParameters:
         """Return the vehicle whose model a drive's residuals were taken against."""
         wanted = drive.entry["vehicle_sha256"]
-        parameters = next(v["parameters"] for v in self.manifest["vehicles"] if v["sha256"] == wanted)
-        return VehicleParameters.model_validate(parameters)
+        parameters = next((v["parameters"] for v in self.manifest["vehicles"] if v["sha256"] == wanted), None)
+        where, expected = str(self.folder / MANIFEST), "the parameters of a vehicle"
+        return validated(VehicleParameters, parameters, where, OutputError, expected=expected)
 
 
 def read_dataset(folder: Path) -> Dataset:
@@ -359,7 +382,7 @@ def read_dataset(folder: Path) -> Dataset:
     """
     path = folder / MANIFEST
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = read_manifest(folder)
         kind = (document["format"], document["version"])
         if kind[0] != FORMAT or kind[1] not in READABLE or document["features"] != list(FEATURES):
             raise OutputError(
@@ -390,10 +413,12 @@ def read_dataset(folder: Path) -> Dataset:
             ),
             manifest=document,
         )
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:  # without a digest
         raise OutputError(
-            expected=f"a residual dataset with its {MANIFEST}",
-            got=str(error) or type(error).__name__,
-            where=str(folder),
-            remedy="write one with pdhef extract LOG... -o DATASET (--resume finishes an interrupted one)",
+            expected=_EXPECTED, got=str(error) or type(error).__name__, where=str(folder), remedy=_REMEDY
         ) from None
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Return a dataset's manifest; raises OutputError where there is none or it is not as it was written."""
+    return read_sealed(folder / MANIFEST, _EXPECTED, OutputError, _REMEDY, MAX_DOCUMENT_BYTES, former=True)

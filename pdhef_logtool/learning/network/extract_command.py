@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -43,6 +42,7 @@ from pdhef_logtool.learning.network.dataset import (
     DriveWriter,
     drive_file,
     read_entry,
+    read_manifest,
     remove_unnamed,
     split_folder,
     vehicle_entry,
@@ -61,7 +61,7 @@ from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.documents import digest
-from pdhef_logtool.records.errors import EstimatorError, PdhefError, UsageError
+from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
 from pdhef_logtool.records.files import writing
 from pdhef_logtool.records.outputs import OutputFolder, check_no_input, local_path
 from pdhef_logtool.records.signals import Loss
@@ -257,7 +257,7 @@ def extract(
     names = {settings.name_of(i.stem) for i in inputs}
     read = [*(i.local for i in inputs), *settings.config.files, *(j.car.source for j in work)]
     check_no_input(read, [output / MANIFEST])
-    kept = [_as_in_file(d) for d in before.get("drives", []) if d["name"] not in names]
+    kept = [d for d in before.get("drives", []) if d["name"] not in names]
     vehicles = {v["sha256"]: v for v in before.get("vehicles", [])}
 
     def write(results: Sequence[DriveResult]) -> dict[str, Any]:
@@ -302,10 +302,6 @@ def extract(
         empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
         warn(f"no drive fell to {' and '.join(empty)}: with few drives choose with --split, or another --seed")
     return ExtractResult(output, manifest, results)
-
-
-def _as_in_file(entry: Mapping[str, Any]) -> dict[str, Any]:
-    return {k: v for k, v in entry.items() if k not in ("file", "file_sha256")}
 
 
 def _without_copies(results: Sequence[DriveResult], warn: Tell) -> tuple[DriveResult, ...]:
@@ -363,20 +359,16 @@ def _earlier(output: Path, settings: ExtractSettings) -> dict[str, Any]:
     """
     path = output / MANIFEST
     remedy = "choose another folder with -o"
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        ours = isinstance(document, dict) and document.get("format") == FORMAT
-    except FileNotFoundError:
+    if not path.exists():
         return {}
-    except (OSError, ValueError, RecursionError):
-        ours = False
-    if not ours:
-        raise UsageError(
-            expected="a new folder, or that of a residual dataset",
-            got=f"a folder with another {MANIFEST}",
-            where=str(output),
-            remedy=remedy,
-        )
+    try:
+        document = read_manifest(output)
+        got = "" if document.get("format") == FORMAT else f"a folder with another {MANIFEST}"
+    except OutputError as error:
+        got = f"a folder with another {MANIFEST}: {error.got}"
+    if got:
+        expected = "a new folder, or that of a residual dataset"
+        raise UsageError(expected=expected, got=got, where=str(output), remedy=remedy)
     wanted = (FORMAT_VERSION, settings.model)
     if (found := (document.get("version"), document.get("model"))) != wanted:
         raise UsageError(

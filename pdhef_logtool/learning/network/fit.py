@@ -16,7 +16,7 @@ import json
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -24,6 +24,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 
+from pdhef_logtool.records.documents import is_sealed, seal
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.files import write_bytes, writing
 from pdhef_logtool.records.signals import FloatArray
@@ -486,10 +487,17 @@ def _write_checkpoint(
     for i, state in optimiser.state_dict()["state"].items():
         for key, value in state.items():
             tensors[f"optimiser.{i}.{key}"] = np.asarray(value.cpu().numpy()).copy()
-    document = {"identity": identity, "history": [asdict(e) for e in history]}
+    document = seal({"identity": identity, "history": [asdict(e) for e in history], "sha256": _sha256(tensors)})
     # One file holds tensors and document, so that a kill between two writes cannot leave a pair that disagrees.
     data = save(tensors, metadata={"document": json.dumps(document)})
     write_bytes(work / CHECKPOINT, data)
+
+
+def _sha256(tensors: Mapping[str, Any]) -> str:
+    total = hashlib.sha256()
+    for name in sorted(tensors):
+        total.update(name.encode() + np.ascontiguousarray(tensors[name]).tobytes())
+    return total.hexdigest()
 
 
 def _resume(
@@ -499,14 +507,21 @@ def _resume(
     optimiser: torch.optim.Optimizer,
     device: str,
 ) -> tuple[list[Epoch], dict[str, Any], float]:
-    from safetensors import safe_open
+    from safetensors import SafetensorError, safe_open
 
     file = work / CHECKPOINT
     if not file.is_file():
         return [], _weights(network), math.inf
-    with safe_open(file, framework="numpy") as stored:
-        document = json.loads(stored.metadata()["document"])
-        tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118 (not a mapping)
+    try:
+        with safe_open(file, framework="numpy") as stored:
+            document = json.loads(stored.metadata()["document"])
+            tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118 (not a mapping)
+        if not is_sealed(document) or document["sha256"] != _sha256(tensors):
+            raise ValueError("content that is not as it was written")
+    except (OSError, ValueError, LookupError, TypeError, SafetensorError) as error:
+        raise ModelError(
+            expected="a checkpoint of a training", got=str(error), where=str(file), remedy="remove it to train anew"
+        ) from None
     if document["identity"] != identity:
         raise ModelError(
             expected="a checkpoint of this recipe and data",

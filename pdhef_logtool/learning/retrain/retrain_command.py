@@ -6,7 +6,6 @@ with drives of its own (``roles.py``). The candidate ends under ``accepted/`` or
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -40,18 +39,18 @@ from pdhef_logtool.learning.network.dataset import MANIFEST
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
 from pdhef_logtool.learning.network.fine_tune import GENTLY
 from pdhef_logtool.learning.retrain.roles import GATE, INTERVALS, LEAST, SHARES, STOP, TRAIN, TRUST, Candidate, deal
-from pdhef_logtool.learning.stages import Stages
+from pdhef_logtool.learning.stages import Stages, read_own
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.records.documents import digest
-from pdhef_logtool.records.errors import EXIT_GATE, EstimatorError, PdhefError
+from pdhef_logtool.records.documents import digest, read_sealed, seal
+from pdhef_logtool.records.errors import EXIT_GATE, EstimatorError, OutputError, PdhefError
 from pdhef_logtool.records.files import write_bytes, writing
 from pdhef_logtool.records.outputs import FolderTransaction, OutputFolder, check_no_input
 from pdhef_logtool.records.supervisor import supervise
 from pdhef_logtool.residual_model.bundle import MANY_CARS, NO_MODEL, open_model
 from pdhef_logtool.results.comparing import compare_runs
 from pdhef_logtool.results.gate import Figure, Gate
-from pdhef_logtool.results.opened_run import open_run
+from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES, open_run
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.sinks.report import json_bytes
@@ -70,7 +69,6 @@ CALIBRATED = (HYBRID, "pd-hef-smoothed", "physics")
 DEFAULT_LIMIT = 0.02
 DEFAULT_GATE = Gate((Figure(estimator=HYBRID, limit=DEFAULT_LIMIT),))
 #: What is remembered of each log.
-_SEEN_KEYS = {"sha256", "signals_sha256", "left_out", "span_s"}
 #: Digits of a network's hash that name its folder.
 _NAME = 12
 
@@ -197,7 +195,7 @@ def retrain(
         hashes = {i.stem: identity_of(i) for i in inputs}
         car_sha256 = None if car.source is None else hash_log(car.source)
         basis = digest([record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=config), car), car_sha256])
-        records, signals = _look(inputs, hashes, car, config, work / SEEN_FILE, basis, jobs, progress)
+        records, signals = _look(inputs, hashes, car, config, work / SEEN_FILE, basis, jobs, progress, say)
         records, drives = _roles(inputs, records, signals, car, settings, work)
         told = set[str]()
 
@@ -270,15 +268,13 @@ def _look(  # positional: what reading takes, where it is remembered, and how it
     basis: str,
     jobs: int,
     progress: Progress,
+    say: Tell,
 ) -> tuple[list[DriveRecord], list[str | None]]:
     """Return a record of every log and the hash of its signals; what earlier calls have read is not read again."""
     mapping = open_mapping(config)
     basis = digest([basis, repr(mapping)])
-    known: dict[str, Any] = {}
-    with suppress(OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError):
-        document = json.loads(file.read_text(encoding="utf-8"))
-        logs = document["logs"] if document["basis"] == basis else {}
-        known = {key: found for key, found in logs.items() if set(found) == _SEEN_KEYS}
+    document = read_own(file, say)
+    known: dict[str, Any] = document["logs"] if document is not None and document["basis"] == basis else {}
     new = [_Log(i, car, mapping, config) for i in inputs if hashes[i.stem] not in known]
 
     def tell(number: int, text: str, share: float) -> None:
@@ -298,7 +294,7 @@ def _look(  # positional: what reading takes, where it is remembered, and how it
             "left_out": seen.record.left_out,
             "span_s": seen.record.span_s,
         }
-    write_bytes(file, json_bytes({"basis": basis, "logs": known}))
+    write_bytes(file, json_bytes(seal({"basis": basis, "logs": known})))
 
     def record(log_input: LogInput) -> DriveRecord:
         found = known[hashes[log_input.stem]]
@@ -337,11 +333,12 @@ def _roles(
             split = str(manifests(log_input.folder).get(log_input.path.name, {}).get("split") or "")
             candidates.append(Candidate(key, split, record.sha256 in taught))
     before: dict[str, str] = {}
-    with suppress(OSError, ValueError, RecursionError, AttributeError, TypeError):
-        kept = json.loads((work / ROLES_FILE).read_text(encoding="utf-8"))
-        before = {key: role for key, role in kept.items() if role in SHARES}
+    if (file := work / ROLES_FILE).exists():
+        remedy = "restore it; without it, parts are drawn again by content and seed"
+        kept = read_sealed(file, "the parts of the drives", OutputError, remedy, MAX_DOCUMENT_BYTES, former=True)
+        before = {key: role for key, role in kept.get("roles", kept).items() if role in SHARES}
     roles = deal(candidates, before, settings.seed)
-    write_bytes(work / ROLES_FILE, json_bytes(dict(sorted(roles.items()))))
+    write_bytes(work / ROLES_FILE, json_bytes(seal({"roles": roles})))
     told = list[DriveRecord]()
     drives: dict[str, list[LogInput]] = {role: [] for role in SHARES}
     for log_input, record, key in zip(inputs, records, signals, strict=True):

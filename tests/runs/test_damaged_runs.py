@@ -1,0 +1,205 @@
+"""A run whose files were damaged: what ``--resume`` runs again, and what commands that read it say."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import polars as pl
+import pyarrow.parquet as pq
+import pytest
+
+from pdhef_logtool.cli import running
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.results.opened_run import open_run
+from pdhef_logtool.runs.fleet import DriveEnd
+from pdhef_logtool.runs.journal import Journal
+from pdhef_logtool.sinks.report import LogOutcome
+from studies.torture.workers import Ended, command
+from tests.runs.stub_drives import stub_drive
+from tests.runs.test_fleet_runs import Counted, contents, named_logs, run
+
+OPTIONS = ("--car", "saloon", "-e", "zero,kinematic", "--end", "1.5", "--keep", "estimates", "--no-report")
+
+
+@pytest.fixture(scope="module")
+def sound(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("sound") / "out"
+    logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")]
+    assert command("run", *logs, "-o", str(out), *OPTIONS).code == 0
+    return out
+
+
+@pytest.fixture
+def out(sound: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(sound, tmp_path / "out"))
+
+
+def flip(path: Path, at: float = 0.5) -> None:
+    data = bytearray(path.read_bytes())
+    data[int(at * len(data))] ^= 1
+    path.write_bytes(data)
+
+
+def warnings(ended: Ended) -> list[str]:
+    return [line for line in ended.err.splitlines() if line.startswith("warning: ")]
+
+
+def of_drive(out: Path, kind: str, label: str) -> Path:
+    if kind == "part":
+        (part,) = (p for p in (out / "metrics").rglob("*.parquet") if pl.read_parquet(p)["log"][0] == label)
+        return part
+    return out / "logs" / label / kind
+
+
+@pytest.mark.parametrize("kind", ["report.json", "part"])
+def test_a_drive_whose_outputs_are_damaged_is_run_again_and_that_is_said(tmp_path: Path, kind: str) -> None:
+    logs, out, said, work = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out", list[str](), Counted()
+    run(logs, out)
+    before = contents(out)
+    flip(of_drive(out, kind, "b"))
+    run(logs, out, resume=True, say=said.append, work=work)
+    assert (work.asked, said) == (["b"], ["1 of 2 drives are run anew: their outputs are damaged"])
+    assert contents(out) == before
+
+
+def test_a_column_that_was_changed_without_a_trace_is_noticed(tmp_path: Path) -> None:
+    logs, out, work = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out", Counted()
+    run(logs, out)
+    before, part = contents(out), of_drive(out, "part", "a")
+    table = pq.read_table(part, partitioning=None)
+    pq.write_table(table.set_column(5, "value", pl.Series([0.5]).to_arrow()).cast(table.schema), part)
+    run(logs, out, resume=True, work=work)
+    assert work.asked == ["a"]
+    assert contents(out) == before
+
+
+def test_a_damaged_line_of_the_journal_costs_its_drive_alone_and_is_said_once(tmp_path: Path) -> None:
+    logs, out, said, work = named_logs(tmp_path / "logs", *"abc"), tmp_path / "out", list[str](), Counted()
+    run(logs, out)
+    before, journal = contents(out), out / "journal.jsonl"
+    lines = journal.read_bytes().splitlines(keepends=True)
+    (number,) = (n for n, line in enumerate(lines) if json.loads(line).get("label") == "b")
+    value = json.loads(lines[number])["error_rad"]
+    lines[number] = lines[number].replace(str(value).encode(), str(value + 1.0).encode())
+    journal.write_bytes(b"".join(lines))
+    run(logs, out, resume=True, say=said.append, work=work)
+    assert work.asked == ["b"]
+    assert said == ["journal.jsonl: 1 line is damaged or of another version: the drives of these are run again"]
+    assert contents(out) == before
+    assert Journal.read(out).damaged == 0
+    run(logs, out, resume=True, say=said.append, work=work)
+    assert (work.asked, len(said)) == (["b"], 1)
+
+
+@pytest.mark.parametrize("what", ["car", "setting"])
+def test_a_damaged_line_that_says_what_drives_were_run_with_costs_none(tmp_path: Path, what: str) -> None:
+    logs, out, work = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out", Counted()
+    run(logs, out)
+    before, journal = contents(out), out / "journal.jsonl"
+    lines = journal.read_bytes().splitlines(keepends=True)
+    journal.write_bytes(b"".join(x for x in lines if what not in json.loads(x) or "is" not in json.loads(x)))
+    run(logs, out, resume=True, work=work)
+    assert work.asked == []
+    assert contents(out) == before
+
+
+def test_a_damaged_line_may_have_said_that_a_failure_passed(tmp_path: Path) -> None:
+    logs, out, work = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out", Counted()
+    run(logs, out, work=lambda task, tell: failed(task.log.stem) if task.log.stem == "b" else stub_drive(task, tell))
+    assert run(logs, out, retry=True).exit_code == 0
+    before, journal = contents(out), out / "journal.jsonl"
+    journal.write_bytes(journal.read_bytes()[:-5])
+    assert run(logs, out, resume=True, work=work).exit_code == 0
+    assert work.asked == ["b"]
+    assert contents(out) == before
+
+
+def failed(label: str) -> DriveEnd:
+    return DriveEnd(LogOutcome(label, f"{label}.mcap", None, failed="for a test"), None)
+
+
+def test_a_damaged_drive_is_named_and_the_others_are_used(out: Path, sound: Path) -> None:
+    flip(of_drive(out, "estimates.parquet", "dlc"))
+    told = f"{of_drive(out, 'estimates.parquet', 'dlc')}: expected the estimates.parquet that run.json names, got "
+    report = command("report", str(out))
+    assert report.code == 3
+    assert warnings(report)[0].startswith(f"warning: page of dlc: the figures cannot be drawn: {told}")
+    events = command("events", str(out), "--where", "speed_m_s > 1")
+    assert events.code == 3
+    assert [line.startswith(f"warning: {told}") for line in warnings(events)] == [True]
+    assert "1 event in 1 of 1 drives" in events.out
+    flip(of_drive(out, "report.json", "step"))
+    compared = command("compare", str(out), str(sound), "--cluster", "day", "--max-regression", "5%", "--json")
+    assert (compared.code, json.loads(compared.out)["verdict"]) == (3, "equal")
+    assert len(warnings(compared)) == len(json.loads(compared.out)["damaged"]) == 1
+    assert "step/report.json" in warnings(compared)[0]
+
+
+def test_where_nothing_is_usable_the_exit_code_is_1(out: Path) -> None:
+    for label in ("dlc", "step"):
+        flip(of_drive(out, "report.json", label))
+        flip(of_drive(out, "estimates.parquet", label))
+    report, events = command("report", str(out)), command("events", str(out), "--where", "speed_m_s > 1")
+    assert (report.code, events.code) == (1, 1)
+    assert (len(warnings(report)), len(warnings(events))) == (2, 2)
+    flip(out / "metrics.parquet")
+    for name, call in {
+        "metrics.parquet": ("compare", str(out), str(out)),
+        "run.json": ("report", str(out)),
+    }.items():
+        if name == "run.json":
+            flip(out / name)
+        ended = command(*call)
+        assert ended.code == 1
+        assert ended.err.startswith(f"pdhef: {out / name}: expected ")
+        assert len(ended.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda d: d["logs"].append("text"),
+        lambda d: d["logs"][0].update(outcome=3),
+        lambda d: d["logs"][0].update(car=["golf"]),
+        lambda d: d["logs"][0].update(files=None),
+        lambda d: d.update(config=[1]),
+        lambda d: d.update(remaining="many"),
+    ],
+)
+def test_an_older_run_without_checksums_is_checked_by_its_entries(out: Path, change: Callable[[dict], object]) -> None:
+    document = json.loads((out / "run.json").read_text())
+    for one in (document, *document["logs"]):
+        one.pop("files")
+    with pytest.raises(OutputError, match=r"run\.json.*as it was written"):
+        (out / "run.json").write_text(json.dumps(document))
+        open_run(out)
+    del document["digest"]
+    (out / "run.json").write_text(json.dumps(document))
+    assert open_run(out).logs[0].report() is not None
+    change(document)
+    (out / "run.json").write_text(json.dumps(document))
+    with pytest.raises(OutputError, match=r"run\.json"):
+        open_run(out)
+
+
+def test_a_recording_without_its_end_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = {name: tmp_path / "logs" / name / "recording.rrd" for name in "ab"}
+    for file in files.values():
+        file.parent.mkdir(parents=True)
+        file.write_bytes(b"RRF2 and so on RRF2FOOT")
+    logs = [{"log": name, "outcome": "ok"} for name in files]
+    (tmp_path / "run.json").write_text(json.dumps({"format": "pdhef.run", "version": 1, "logs": logs}))
+    (tmp_path / "metrics.parquet").touch()
+    opened: list[object] = []
+    monkeypatch.setattr(running, "open_viewer", lambda recordings, web: opened.append(recordings) or 0)
+    files["a"].write_bytes(files["a"].read_bytes()[:10])
+    ended = command("view", str(tmp_path), "--web")
+    assert (ended.code, opened) == (3, [[files["b"]]])
+    assert len(warnings(ended)) == 1
+    files["b"].write_bytes(b"")
+    ended = command("view", str(tmp_path), "--web")
+    assert (ended.code, len(opened)) == (1, 1)
+    assert ended.err.startswith(f"pdhef: {files['a']}: expected a finished recording")

@@ -1,0 +1,18 @@
+"""Damaged files of our own, with a fixed seed: ``studies/torture/own_files.py``."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+from studies.torture.own_files import numbers, own_file_judge
+
+CASES = 36
+
+
+def test_damaged_files_of_our_own_are_told_and_made_good(tmp_path: Path) -> None:
+    judge_number = own_file_judge(tmp_path, 1)
+    found = {number: judge_number(number) for number in numbers(CASES)}
+    assert {number: verdict.problem for number, verdict in found.items() if verdict.problem} == {}
+    ends = Counter(verdict.end for verdict in found.values())
+    assert {"exit 0", "exit 1", "exit 3"} <= ends.keys()  # neither harmless nor all refused
