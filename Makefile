@@ -10,20 +10,22 @@ CAR := saloon
 JOBS ?= 2
 # What Python has compiled stays: each process would compile all tests and sources again.
 unexport PYTHONDONTWRITEBYTECODE
-# A thread a process: threads that wait for each other are no faster than the processors, and they wait by counting.
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+# A thread a process: threads that wait for each other are no faster than the processors, and they wait by counting.
+# Tests run in random order. The head of their output has the seed: make test ORDER_SEED=17 repeats an order.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(if $(ORDER_SEED),--randomly-seed=$(ORDER_SEED))
 
-.PHONY: help demo test quick fleet pages mutants check lint format bench train-default samples conditions real switches torture \
+.PHONY: help demo test quick fleet pages mutants mutants-fixed check lint format bench train-default samples conditions real switches torture \
   retrain docs docs-truthsim paper strangers wheel release lock clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
-	@echo "make test     run all tests"
+	@echo "make test     run all tests, in random order (ORDER_SEED=17 repeats one)"
 	@echo "make quick    run the quick tests, which touch every package: under a minute on two cores once compiled"
 	@echo "make fleet    the tests of fleets, which take long, and need pip install '.[ray]' for those on a cluster"
 	@echo "make pages    look at the pages in a browser: their tests, and the pictures of docs/report.md anew (needs Chromium)"
 	@echo "make mutants  put small faults into the code and see which of them the tests notice (SEED=1 COUNT=30)"
+	@echo "make mutants-fixed  faults that the tests are known to notice: all must still be noticed (ten minutes or less)"
 	@echo "make check    formatting, lint, types, import contracts, tests"
 	@echo "make torture  damaged, hostile and odd input, counted: docs/reliability.md (two hours or less on two cores; resumable)"
 	@echo "make strangers  docs/strangers.md: logs that the tool has not met, and what it gets right (under two minutes)"
@@ -84,10 +86,10 @@ $(VENV)/compiled: $(VENV)/installed $(wildcard pdhef_logtool/*.py pdhef_logtool/
 	@touch $@
 
 test: $(VENV)/installed-dev $(VENV)/compiled
-	$(PYTEST) -n $(JOBS) --dist loadfile
+	$(PYTEST) -n $(JOBS) --dist worksteal
 
 quick: $(VENV)/installed-dev $(VENV)/compiled
-	$(PYTEST) -n $(JOBS) --dist loadfile -m "not slow"
+	$(PYTEST) -n $(JOBS) --dist worksteal -m "not slow"
 
 pages: $(VENV)/installed-dev $(VENV)/compiled
 	$(PYTEST) tests/reports tests/results
@@ -103,6 +105,10 @@ SEED ?= 1
 COUNT ?= 30
 mutants: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python tests/mutants.py --seed $(SEED) --count $(COUNT) --jobs $(JOBS)
+
+# Faults that the tests are known to notice (tests/fixed_mutants.json): each runs its own test alone.
+mutants-fixed: $(VENV)/installed-dev $(VENV)/compiled
+	OMP_NUM_THREADS=1 $(BIN)/python tests/fixed_mutants.py --jobs $(JOBS)
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
