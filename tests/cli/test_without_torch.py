@@ -61,6 +61,7 @@ def test_what_trains_no_network_works_without_it(tmp_path: Path) -> None:
     assert (out / "logs/dlc/report.html").is_file()
 
 
+@pytest.mark.slow
 def test_what_trains_one_ends_with_one_line(tmp_path: Path) -> None:
     car = ("--car", "saloon", "-o", tmp_path / "car")
     trained = ("train", tmp_path, "-o", tmp_path / "network")

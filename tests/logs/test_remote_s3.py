@@ -15,6 +15,8 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import UsageError
 from tests.s3_store import S3Store, s3_store
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def store(monkeypatch: pytest.MonkeyPatch) -> Iterator[S3Store]:

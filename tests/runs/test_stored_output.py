@@ -78,6 +78,7 @@ def test_a_store_has_what_a_folder_has_and_is_gone_on_with(tmp_path: Path, memor
     assert opened.metrics().collect().equals(pl.read_parquet(tmp_path / "out" / METRICS_FILE))
 
 
+@pytest.mark.slow
 def test_a_name_that_is_a_pattern_means_itself(tmp_path: Path, s3: S3Store) -> None:
     logs = named_logs(tmp_path / "logs", "d1", "d[1]")
     for url in (URL, f"{s3.url}/odd"):
@@ -216,6 +217,7 @@ def test_what_has_lost_its_hold_ends(tmp_path: Path, memory: Any, monkeypatch: p
     memory.rm(lock)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_an_output_is_told_in_one_line(tmp_path: Path, s3: S3Store) -> None:
     logs = named_logs(tmp_path / "logs", "a")
     for url, error, match in (
@@ -248,6 +250,7 @@ def test_what_writes_to_folders_alone_takes_no_url(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_without_credentials_there_is_one_line(tmp_path: Path, s3: S3Store, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.delenv(name)
