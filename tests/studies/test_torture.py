@@ -20,7 +20,7 @@ from studies.torture.mutating import mutant
 from studies.torture.seeds import SEEDS, write_seeds
 from studies.torture.workers import Ended, Verdict, judge, read_journal, run_cases
 
-LOGS, CONFIGS = 110, 30
+LOGS, CONFIGS = 70, 20
 
 
 def _quiet(_text: str) -> None:
