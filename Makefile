@@ -21,7 +21,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(if $(ORDER_SEED),--randoml
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
 	@echo "make test     run all tests, in random order (ORDER_SEED=17 repeats one)"
-	@echo "make quick    run the quick tests, which touch every package: under a minute on two cores once compiled"
+	@echo "make quick    run the quick tests, which touch every package: 45 s on two cores once compiled"
 	@echo "make fleet    the tests of fleets, which take long, and need pip install '.[ray]' for those on a cluster"
 	@echo "make pages    look at the pages in a browser: their tests, and the pictures of docs/report.md anew (needs Chromium)"
 	@echo "make mutants  put small faults into the code and see which of them the tests notice (SEED=1 COUNT=30)"
