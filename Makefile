@@ -145,7 +145,7 @@ docs-truthsim: $(VENV)/installed
 	$(BIN)/python -m studies.truthsim_docs
 
 # One core: step times are measured in the same run.
-paper: $(VENV)/installed $(VENV)/compiled
+paper: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.paper
 
 # Every estimator on the condition table, with the car's own network or another.
