@@ -25,7 +25,7 @@ help:
 	@echo "make fleet    the tests of fleets, which take long, and need pip install '.[ray]' for those on a cluster"
 	@echo "make pages    look at the pages in a browser: their tests, and the pictures of docs/report.md anew (needs Chromium)"
 	@echo "make mutants  put small faults into the code and see which of them the tests notice (SEED=1 COUNT=30)"
-	@echo "make mutants-fixed  faults that the tests are known to notice: all must still be noticed (ten minutes or less)"
+	@echo "make mutants-fixed  faults that the tests are known to notice: all must still be noticed (three minutes)"
 	@echo "make check    formatting, lint, types, import contracts, tests"
 	@echo "make torture  damaged, hostile and odd input, counted: docs/reliability.md (two hours or less on two cores; resumable)"
 	@echo "make strangers  docs/strangers.md: logs that the tool has not met, and what it gets right (under two minutes)"

@@ -88,7 +88,7 @@ def _case(folder: Path, number: int) -> Verdict:
     if number == 3:
         time.sleep(60.0)
     if number == 4:
-        kept = bytearray(b"x") * (300 << 20)
+        kept = bytearray(b"x") * (700 << 20)
         time.sleep(1.0)
         del kept
     return Verdict("exit 0")
