@@ -1,17 +1,13 @@
 # pdhef as a container. The wheel comes from `make wheel`; then, from this folder:
 #
-#   docker build -t pdhef --build-arg TORCH_INDEX=ADDRESS .
+#   docker build -t pdhef .
 #   docker run --rm -v "$PWD:/work" --user "$(id -u):$(id -g)" pdhef run drive.mcap -o out
-#
-# TORCH_INDEX is the address of PyTorch's index of CPU wheels (pytorch.org names it). Without it pip takes the default
-# build of torch, which brings 2 GB and more of CUDA that nothing here uses.
 FROM python:3.11-slim
 
-ARG TORCH_INDEX=""
 ENV PIP_NO_CACHE_DIR=1 PIP_ROOT_USER_ACTION=ignore PIP_DISABLE_PIP_VERSION_CHECK=1 PYTHONUNBUFFERED=1
 
-COPY dist/*.whl /tmp/dist/
-RUN pip install ${TORCH_INDEX:+--extra-index-url "$TORCH_INDEX"} /tmp/dist/*.whl && rm -r /tmp/dist
+COPY constraints.txt dist/*.whl /tmp/dist/
+RUN pip install --constraint /tmp/dist/constraints.txt /tmp/dist/*.whl && rm -r /tmp/dist
 
 # Compiles the filters, once, into the installation. On a processor of another kind they are compiled again at first use,
 # into the cache of the user who runs them.

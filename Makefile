@@ -10,19 +10,22 @@ CAR := saloon
 JOBS ?= 2
 # What Python has compiled stays: each process would compile all tests and sources again.
 unexport PYTHONDONTWRITEBYTECODE
+INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 # A thread a process: threads that wait for each other are no faster than the processors, and they wait by counting.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+# Tests run in random order. The head of their output has the seed: make test ORDER_SEED=17 repeats an order.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(if $(ORDER_SEED),--randomly-seed=$(ORDER_SEED))
 
-.PHONY: help demo test quick fleet pages mutants check lint format bench train-default samples conditions real switches torture \
-  retrain docs docs-truthsim paper strangers wheel release clean
+.PHONY: help demo test quick fleet pages mutants mutants-fixed check lint format bench train-default samples conditions real switches torture \
+  retrain docs docs-truthsim paper strangers wheel release lock clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
-	@echo "make test     run all tests"
-	@echo "make quick    run the quick tests, which touch every package: under a minute on two cores once compiled"
+	@echo "make test     run all tests, in random order (ORDER_SEED=17 repeats one)"
+	@echo "make quick    run the quick tests, which touch every package: 45 s on two cores once compiled"
 	@echo "make fleet    the tests of fleets, which take long, and need pip install '.[ray]' for those on a cluster"
 	@echo "make pages    look at the pages in a browser: their tests, and the pictures of docs/report.md anew (needs Chromium)"
 	@echo "make mutants  put small faults into the code and see which of them the tests notice (SEED=1 COUNT=30)"
+	@echo "make mutants-fixed  faults that the tests are known to notice: all must still be noticed (three minutes)"
 	@echo "make check    formatting, lint, types, import contracts, tests"
 	@echo "make torture  damaged, hostile and odd input, counted: docs/reliability.md (two hours or less on two cores; resumable)"
 	@echo "make strangers  docs/strangers.md: logs that the tool has not met, and what it gets right (under two minutes)"
@@ -39,6 +42,7 @@ help:
 	@echo "make paper    the paper's experiment: docs/paper.md, its figures and results"
 	@echo "make wheel    dist/: the wheel and the source archive of what is committed, looked at"
 	@echo "make release  the same, installed into a new environment, where the sample job runs"
+	@echo "make lock     constraints.txt: the versions that make, CI and the container install, from pyproject.toml"
 	@echo "make clean    remove the virtual environment and everything that was built"
 
 $(BIN)/python:
@@ -47,13 +51,22 @@ $(BIN)/python:
 	@$(PYTHON) -m venv $(VENV) || \
 	  { rm -rf $(VENV); echo "$(PYTHON) cannot make virtual environments; on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
 
-$(VENV)/installed: $(BIN)/python pyproject.toml
-	$(BIN)/python -m pip install --quiet --editable .
+$(VENV)/installed: $(BIN)/python pyproject.toml constraints.txt
+	$(INSTALL) --editable .
 	@touch $@
 
-$(VENV)/installed-dev: $(VENV)/installed pyproject.toml
-	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+# dev, docs, release: what the extra of that name needs.
+$(VENV)/installed-%: $(VENV)/installed
+	$(INSTALL) --editable '.[$*]'
 	@touch $@
+
+# The versions that CI and the container install; pyproject.toml has the ranges. CUDA packages belong to one build of
+# torch that nothing here needs.
+lock: $(VENV)/installed-release
+	echo '# Written by `make lock` from pyproject.toml: pip install -c constraints.txt' >constraints.new
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --all-extras --no-header --no-annotate pyproject.toml \
+	  | grep -vE '^(cuda-|nvidia-|triton=)' >>constraints.new
+	mv constraints.new constraints.txt
 
 demo: $(VENV)/installed $(VENV)/compiled
 	$(BIN)/pdhef run sample_logs/dlc.mcap sample_logs/road.mcap -o $(OUT) --car $(CAR)
@@ -71,10 +84,10 @@ $(VENV)/compiled: $(VENV)/installed $(wildcard pdhef_logtool/*.py pdhef_logtool/
 	@touch $@
 
 test: $(VENV)/installed-dev $(VENV)/compiled
-	$(PYTEST) -n $(JOBS) --dist loadfile
+	$(PYTEST) -n $(JOBS) --dist worksteal
 
 quick: $(VENV)/installed-dev $(VENV)/compiled
-	$(PYTEST) -n $(JOBS) --dist loadfile -m "not slow"
+	$(PYTEST) -n $(JOBS) --dist worksteal -m "not slow"
 
 pages: $(VENV)/installed-dev $(VENV)/compiled
 	$(PYTEST) tests/reports tests/results
@@ -90,6 +103,10 @@ SEED ?= 1
 COUNT ?= 30
 mutants: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python tests/mutants.py --seed $(SEED) --count $(COUNT) --jobs $(JOBS)
+
+# Faults that the tests are known to notice (tests/fixed_mutants.json): each runs its own test alone.
+mutants-fixed: $(VENV)/installed-dev $(VENV)/compiled
+	OMP_NUM_THREADS=1 $(BIN)/python tests/fixed_mutants.py --jobs $(JOBS)
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
@@ -115,10 +132,6 @@ retrain: $(VENV)/installed-dev $(VENV)/compiled
 	$(if $(LOGS),$(BIN)/pdhef retrain $(LOGS) -o $(if $(filter out/demo,$(OUT)),out/retrain,$(OUT)) --car $(CAR) --jobs $(JOBS),\
 	  OMP_NUM_THREADS=1 $(BIN)/python -m studies.retrain --jobs $(JOBS))
 
-$(VENV)/installed-docs: $(VENV)/installed pyproject.toml
-	$(BIN)/python -m pip install --quiet --editable '.[docs]'
-	@touch $@
-
 docs: $(VENV)/installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo "Site: out/site/index.html"
@@ -130,7 +143,7 @@ docs-truthsim: $(VENV)/installed
 	$(BIN)/python -m studies.truthsim_docs
 
 # One core: step times are measured in the same run.
-paper: $(VENV)/installed $(VENV)/compiled
+paper: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.paper
 
 # Every estimator on the condition table, with the car's own network or another.
@@ -153,19 +166,22 @@ switches: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.switches
 
 # Of what is committed, in a clone: nothing else that lies about here gets in.
-wheel: $(VENV)/installed-dev
+wheel: $(VENV)/installed-release
 	rm -rf build/clone dist
 	git clone --quiet . build/clone
 	$(BIN)/python -m build --outdir dist build/clone >build/build.log 2>&1 || { tail -n 20 build/build.log >&2; exit 1; }
 	$(BIN)/python tests/release/check_dist.py dist
 
-# As a stranger installs and runs it, away from the source tree; the same steps as in the Dockerfile.
+# As a stranger installs and runs it, away from the source tree; the same steps as in the Dockerfile. The bill of
+# materials (CycloneDX) is of that environment.
 release: wheel
 	rm -rf build/fresh
 	$(PYTHON) -m venv build/fresh
-	build/fresh/bin/python -m pip install --quiet dist/*.whl
+	build/fresh/bin/python -m pip install --quiet --constraint constraints.txt dist/*.whl
 	cd build/fresh && bin/pdhef --version && bin/pdhef --help >/dev/null && bin/pdhef compile
 	cd build/fresh && bin/pdhef run ../../sample_logs/dlc.mcap --car saloon --estimators all --annotate none -o out
+	$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible -o dist/sbom.cdx.json build/fresh/bin/python
+	$(BIN)/python tests/release/check_sbom.py dist/sbom.cdx.json
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

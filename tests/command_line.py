@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
+import signal
+import subprocess
+from contextlib import chdir, redirect_stderr, redirect_stdout
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pdhef_logtool.cli.app import app
+from pdhef_logtool.cli.app import app, main
 
 
 def pdhef(*arguments: object) -> None:
@@ -21,3 +27,26 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, An
     pdhef(*arguments, "--json")
     found: dict[str, Any] = json.loads(capsys.readouterr().out)
     return found
+
+
+def called(
+    *arguments: object, cwd: Path | None = None, env: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run a command as its own process would, and return its exit code and streams.
+
+    A process takes two seconds to start. Start one where signals, the streams themselves or what is loaded matter.
+    """
+    words = [str(a) for a in arguments]
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    out, errors = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, chdir(cwd or Path.cwd()):
+        patch.setattr("sys.argv", ["pdhef", *words])
+        for name, value in {"COLUMNS": "100", **(env or {})}.items():
+            patch.setitem(os.environ, name, value)
+        try:
+            with redirect_stdout(out), redirect_stderr(errors), pytest.raises(SystemExit) as ended:
+                main()
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+    return subprocess.CompletedProcess(words, int(ended.value.code or 0), out.getvalue(), errors.getvalue())

@@ -1,4 +1,11 @@
-"""Fixtures shared by all tests."""
+"""Fixtures shared by all tests.
+
+Tests run in random order in several processes, and a process can get any part of a file. A test therefore changes
+what others see (environment, working directory, module attributes, signal handlers) by fixtures only, writes to
+``tmp_path``, lets the system choose ports and takes an S3 bucket of its own (``tests/s3_store.py``). It calls the
+command line in its own process (``called`` in ``tests/command_line.py``) unless it is about processes: a start takes
+two seconds.
+"""
 
 from __future__ import annotations
 

@@ -317,7 +317,19 @@ def run_tests(tree: Path, arguments: Sequence[str]) -> str | None:
     """Run pytest in a copy; return what failed, or None where all passed or nothing was chosen."""
     environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
     environment |= {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--tb=no", *arguments]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-x",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "no:randomly",
+        "--tb=no",
+        *arguments,
+    ]
     try:
         done = subprocess.run(
             command, cwd=tree, env=environment, capture_output=True, text=True, timeout=LONGEST_STAGE_S, check=False
@@ -369,7 +381,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder, ThreadPoolExecutor(options.jobs) as pool:
         clean = copy_tree(ROOT, Path(folder))
         chosen = sorted({f"tests/{f}" for p in packages for f in FOLDERS[p]}) if options.focused else ["tests"]
-        failed = run_tests(clean, [*chosen, "-n", str(options.jobs), "--dist", "loadfile"])
+        failed = run_tests(clean, [*chosen, "-n", str(options.jobs), "--dist", "worksteal"])
         if failed:
             print(f"the tests do not pass without a mutant: {failed}", file=sys.stderr)
             return 2

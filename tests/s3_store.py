@@ -2,22 +2,60 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
 
+#: moto keeps its buckets for the life of the process, whichever server they were made through.
+_numbers = itertools.count(1)
 
-@contextmanager
-def s3_store(bucket: str) -> Iterator[Any]:
-    """Yield a client of a store with an empty bucket; skips where what it takes is not installed."""
-    s3fs = pytest.importorskip("s3fs", reason="writes s3://: pip install 'pdhef-logtool[s3]'")
-    pytest.importorskip("moto.server", reason="stands for S3: pip install 'moto[server]'")
-    import botocore.session
-    from moto.server import ThreadedMotoServer
+
+@dataclass(frozen=True)
+class S3Store:
+    """A bucket of one test, and a client of the store that contains it."""
+
+    client: Any
+    bucket: str
+
+    @property
+    def url(self) -> str:
+        return f"s3://{self.bucket}"
+
+    def put(self, key: str, body: bytes) -> None:
+        self.client.put_object(Bucket=self.bucket, Key=key, Body=body)
+
+    def get(self, key: str) -> bytes:
+        body: bytes = self.client.get_object(Bucket=self.bucket, Key=key)["Body"].read()
+        return body
+
+    def objects(self, prefix: str) -> dict[str, bytes]:
+        """Return the objects below a prefix, by their names there."""
+        pages = self.client.get_paginator("list_objects_v2").paginate(Bucket=self.bucket, Prefix=f"{prefix}/")
+        keys = sorted(entry["Key"] for page in pages for entry in page.get("Contents", ()))
+        return {key.removeprefix(f"{prefix}/"): self.get(key) for key in keys}
+
+
+def forget_file_systems() -> None:
+    """Drop the file systems that this process has opened, with their connections and listings."""
+    import s3fs
 
     from pdhef_logtool.records import object_store
+
+    s3fs.S3FileSystem.clear_instance_cache()
+    object_store._opened.cache_clear()
+
+
+@contextmanager
+def s3_store() -> Iterator[S3Store]:
+    """Yield a store with a new, empty bucket; skip the test if the needed packages are not installed."""
+    pytest.importorskip("s3fs", reason="writes s3://: pip install 'pdhef-logtool[s3]'")
+    pytest.importorskip("moto.server", reason="replaces S3: pip install 'moto[server]'")
+    import botocore.session
+    from moto.server import ThreadedMotoServer
 
     server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
     server.start()
@@ -28,21 +66,11 @@ def s3_store(bucket: str) -> Iterator[Any]:
             for name, value in (("ACCESS_KEY_ID", "key"), ("SECRET_ACCESS_KEY", "hidden")):
                 patch.setenv(f"AWS_{name}", value)
             patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-            s3fs.S3FileSystem.clear_instance_cache()
-            object_store._opened.cache_clear()
+            forget_file_systems()
             client = botocore.session.get_session().create_client("s3")
-            client.create_bucket(Bucket=bucket)
-            yield client
+            store = S3Store(client, f"cars-{next(_numbers)}")
+            client.create_bucket(Bucket=store.bucket)
+            yield store
     finally:
-        s3fs.S3FileSystem.clear_instance_cache()
-        object_store._opened.cache_clear()
+        forget_file_systems()
         server.stop()
-
-
-def objects_of(client: Any, bucket: str, prefix: str) -> dict[str, bytes]:
-    """Return what lies below a prefix, by the name there."""
-    found = client.get_paginator("list_objects_v2").paginate(Bucket=bucket, Prefix=f"{prefix}/")
-    keys = [entry["Key"] for page in found for entry in page.get("Contents", ())]
-    return {
-        key.removeprefix(f"{prefix}/"): client.get_object(Bucket=bucket, Key=key)["Body"].read() for key in sorted(keys)
-    }

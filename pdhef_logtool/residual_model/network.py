@@ -5,8 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
-import torch
-from torch import nn
+from pdhef_logtool.residual_model.torch_extra import check_torch
+
+check_torch()
+
+import torch  # noqa: E402
+from torch import nn  # noqa: E402
 
 #: (h, c) of all layers, each [layers, batch, hidden].
 State = tuple[torch.Tensor, torch.Tensor]

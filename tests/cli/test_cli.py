@@ -11,20 +11,14 @@ from typing import Any
 
 import pytest
 
+from tests.command_line import called
+
 ROOT = Path(__file__).parents[2]
-PDHEF = [sys.executable, "-m", "pdhef_logtool"]
 COMMANDS = (
     *("inspect", "map", "estimators", "run", "metrics", "slim", "report", "compare", "events", "view"),
     *("simulate", "simulate suite", "simulate conditions"),
     *("identify", "extract", "train", "tune", "trust", "calibrate", "learn", "retrain"),
 )
-
-
-def _pdhef(
-    *arguments: str, cwd: Path | None = None, env: dict[str, str] | None = None
-) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "COLUMNS": "100", "PYTHONPATH": str(ROOT), **(env or {})}
-    return subprocess.run([*PDHEF, *arguments], capture_output=True, text=True, cwd=cwd, env=environment, check=False)
 
 
 def _one_line_error(result: subprocess.CompletedProcess[str]) -> str:
@@ -35,7 +29,7 @@ def _one_line_error(result: subprocess.CompletedProcess[str]) -> str:
 
 
 def test_help_names_every_command_with_a_whole_sentence() -> None:
-    text = _pdhef("--help", env={"COLUMNS": "80"}).stdout
+    text = called("--help", env={"COLUMNS": "80"}).stdout
     listed = text[text.index("Commands:") :].splitlines()[1 : len(COMMANDS) + 1]
     assert sorted(line[:21].strip() for line in listed) == sorted(COMMANDS)
     assert all(line.endswith(".") and not line.endswith("...") for line in listed)
@@ -91,12 +85,12 @@ def test_help_imports_nothing_heavy(command: str, helps: dict[str, dict[str, Any
 def test_version() -> None:
     from pdhef_logtool import __version__
 
-    assert _pdhef("--version").stdout == f"pdhef {__version__}\n"
+    assert called("--version").stdout == f"pdhef {__version__}\n"
 
 
 @pytest.mark.slow
 def test_run_prints_a_table_on_stdout_and_warnings_on_stderr(sample_logs_dir: Path, tmp_path: Path) -> None:
-    result = _pdhef(
+    result = called(
         "run", str(sample_logs_dir / "dlc.mcap"), "-o", str(tmp_path), "--annotate", "none", "-e", "zero,phy-ukf"
     )  # fmt: skip
     assert result.returncode == 0
@@ -109,7 +103,7 @@ def test_run_prints_a_table_on_stdout_and_warnings_on_stderr(sample_logs_dir: Pa
 
 @pytest.mark.slow
 def test_json_is_one_document_with_what_was_written(sample_logs_dir: Path, tmp_path: Path) -> None:
-    result = _pdhef(
+    result = called(
         "run", str(sample_logs_dir / "dlc.mcap"), "-o", str(tmp_path), "--annotate", "none", "-e", "zero", "--json"
     )  # fmt: skip
     document = json.loads(result.stdout)
@@ -125,7 +119,7 @@ def test_what_is_no_log_is_one_line_and_exit_code_1(tmp_path: Path, content: byt
         ("run", str(tmp_path / "no.mcap"), "-o", str(tmp_path / "out")),
         ("inspect", str(tmp_path / "no.mcap")),
     ):
-        result = _pdhef(*arguments)
+        result = called(*arguments)
         assert result.returncode == 1
         assert "no.mcap" in _one_line_error(result)
         assert result.stdout == ""
@@ -133,7 +127,7 @@ def test_what_is_no_log_is_one_line_and_exit_code_1(tmp_path: Path, content: byt
 
 @pytest.mark.slow
 def test_missing_log_is_one_line_and_exit_code_1(tmp_path: Path) -> None:
-    result = _pdhef("run", str(tmp_path / "none.mcap"), "-o", str(tmp_path / "out"))
+    result = called("run", str(tmp_path / "none.mcap"), "-o", str(tmp_path / "out"))
     assert result.returncode == 1
     assert "none.mcap" in _one_line_error(result)
 
@@ -154,7 +148,7 @@ def test_usage_errors_are_one_line_and_exit_code_2(
     sample_logs_dir: Path, tmp_path: Path, arguments: tuple[str, ...]
 ) -> None:
     names = {"LOG": str(sample_logs_dir / "dlc.mcap"), "OUT": str(tmp_path / "out")}
-    result = _pdhef(*(names.get(a, a) for a in arguments), cwd=tmp_path)
+    result = called(*(names.get(a, a) for a in arguments), cwd=tmp_path)
     assert result.returncode == 2
     _one_line_error(result)
 
@@ -173,14 +167,14 @@ def test_usage_errors_are_one_line_and_exit_code_2(
     ],
 )
 def test_misspelt_words_are_one_line_and_exit_code_2(arguments: tuple[str, ...], said: str) -> None:
-    result = _pdhef(*arguments)
+    result = called(*arguments)
     assert result.returncode == 2
     assert said in _one_line_error(result)
     assert result.stdout == ""
 
 
 def test_bare_command_shows_its_help() -> None:
-    result = _pdhef()
+    result = called()
     assert result.returncode == 2
     assert "Commands:" in result.stderr
 
@@ -223,7 +217,7 @@ def test_interrupt_is_one_line_and_exit_code_130() -> None:
 )
 @pytest.mark.slow
 def test_options_of_old_are_told_of_once(arguments: tuple[str, ...], notices: list[str], tmp_path: Path) -> None:
-    result = _pdhef(*arguments, "-o", str(tmp_path / "car.toml"), cwd=tmp_path)
+    result = called(*arguments, "-o", str(tmp_path / "car.toml"), cwd=tmp_path)
     assert result.returncode in (1, 2)
     told = [line for line in result.stderr.splitlines() if line.startswith("notice: ")]
     assert told == [f"notice: {notice}" for notice in notices]
@@ -253,7 +247,7 @@ def test_a_run_with_options_of_old_is_the_same_run(sample_logs_dir: Path, tmp_pa
         "old": ("--vehicle", car, "--model", "many-cars", "--calibration", str(shipped / "intervals.json")),
     }
     for name, options in given.items():
-        result = _pdhef(
+        result = called(
             *("run", str(sample_logs_dir / "dlc.mcap"), "-o", str(tmp_path / name), "--annotate", "none"),
             *("-e", "phy-ukf,pd-hef", "--end", "4", *options),
         )
@@ -265,7 +259,7 @@ def test_a_run_with_options_of_old_is_the_same_run(sample_logs_dir: Path, tmp_pa
 
 @pytest.mark.slow
 def test_unknown_manoeuvre_names_those_that_there_are(tmp_path: Path) -> None:
-    result = _pdhef("simulate", "moose", "-o", str(tmp_path / "x.mcap"))
+    result = called("simulate", "moose", "-o", str(tmp_path / "x.mcap"))
     assert result.returncode == 2
     assert "dlc" in _one_line_error(result)
     assert list(tmp_path.iterdir()) == []
@@ -275,14 +269,14 @@ def test_unknown_manoeuvre_names_those_that_there_are(tmp_path: Path) -> None:
 def test_inspect_writes_a_mapping_that_run_takes(sample_logs_dir: Path, tmp_path: Path) -> None:
     log = str(sample_logs_dir / "dlc.mcap")
     mapping = tmp_path / "mapping.toml"
-    result = _pdhef("inspect", log, "--write-mapping", str(mapping), "--json")
+    result = called("inspect", log, "--write-mapping", str(mapping), "--json")
     assert result.returncode == 0
     document = json.loads(result.stdout)
     assert {"topics", "signals", "lost"} <= document.keys()
     assert document["lost"] == []
     assert {"name", "type", "encoding", "messages"} <= document["topics"][0].keys()
-    auto = _pdhef("run", log, "-o", str(tmp_path / "a"), "--annotate", "none", "-e", "phy-ukf")
-    mapped = _pdhef("run", log, "-o", str(tmp_path / "b"), "--annotate", "none", "-e", "phy-ukf", "-m", str(mapping))
+    auto = called("run", log, "-o", str(tmp_path / "a"), "--annotate", "none", "-e", "phy-ukf")
+    mapped = called("run", log, "-o", str(tmp_path / "b"), "--annotate", "none", "-e", "phy-ukf", "-m", str(mapping))
     assert auto.returncode == mapped.returncode == 0
     name = "logs/dlc/estimates.parquet"
     assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
@@ -292,7 +286,7 @@ def test_inspect_writes_a_mapping_that_run_takes(sample_logs_dir: Path, tmp_path
 def test_inspect_never_overwrites_a_mapping(sample_logs_dir: Path, tmp_path: Path) -> None:
     mapping = tmp_path / "mapping.toml"
     mapping.write_text("# mine\n")
-    result = _pdhef("inspect", str(sample_logs_dir / "dlc.mcap"), "--write-mapping", str(mapping))
+    result = called("inspect", str(sample_logs_dir / "dlc.mcap"), "--write-mapping", str(mapping))
     assert result.returncode == 1
     assert "mapping.toml" in _one_line_error(result)
     assert mapping.read_text() == "# mine\n"
@@ -301,19 +295,19 @@ def test_inspect_never_overwrites_a_mapping(sample_logs_dir: Path, tmp_path: Pat
 @pytest.mark.slow
 def test_simulate_writes_a_log_that_inspect_reads(tmp_path: Path) -> None:
     log = tmp_path / "dlc.mcap"
-    made = _pdhef("simulate", "dlc", "--speed", "80", "--seed", "3", "-o", str(log), "--json")
+    made = called("simulate", "dlc", "--speed", "80", "--seed", "3", "-o", str(log), "--json")
     assert made.returncode == 0, made.stderr
     assert json.loads(made.stdout)["output"] == str(log)
-    seen = _pdhef("inspect", str(log), "--json")
+    seen = called("inspect", str(log), "--json")
     assert seen.returncode == 0
     assert {"steer_rad", "ay_m_s2", "yaw_rate_rad_s"} <= json.loads(seen.stdout)["signals"].keys()
 
 
 @pytest.mark.slow
 def test_list_of_manoeuvres_names_the_demo_ones() -> None:
-    result = _pdhef("simulate", "--list", "--json")
+    result = called("simulate", "--list", "--json")
     assert {"dlc", "sine-sweep", "road"} <= {m["name"] for m in json.loads(result.stdout)["manoeuvres"]}
-    assert "dlc" in _pdhef("simulate", "--list").stdout
+    assert "dlc" in called("simulate", "--list").stdout
 
 
 def _run_of(folder: Path, *names: str) -> Path:
@@ -329,10 +323,10 @@ def _run_of(folder: Path, *names: str) -> Path:
 
 @pytest.mark.slow
 def test_view_says_what_is_missing(tmp_path: Path) -> None:
-    result = _pdhef("view", str(tmp_path))
+    result = called("view", str(tmp_path))
     assert result.returncode == 1
     assert "run.json" in _one_line_error(result)
-    result = _pdhef("view", str(_run_of(tmp_path / "out", "b", "a", "failed")), "--log", "failed")
+    result = called("view", str(_run_of(tmp_path / "out", "b", "a", "failed")), "--log", "failed")
     assert "expected a log named failed, got b, a" in _one_line_error(result)
 
 
@@ -353,7 +347,7 @@ def test_view_takes_all_recordings_of_a_run_or_the_named_ones(tmp_path: Path, mo
 def test_view_without_a_display_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    result = _pdhef("view", str(_run_of(tmp_path, "a", "failed")))
+    result = called("view", str(_run_of(tmp_path, "a", "failed")))
     assert result.returncode == 2
     assert "add --web" in _one_line_error(result)
 
@@ -380,7 +374,7 @@ def test_a_bug_of_ours_is_one_line_too(sample_logs_dir: Path, tmp_path: Path) ->
 @pytest.mark.slow
 def test_log_without_truth_shows_what_there_is_instead(sample_logs_dir: Path, tmp_path: Path) -> None:
     log = str(sample_logs_dir / "no_truth.mcap")
-    result = _pdhef("run", log, "-o", str(tmp_path), "--annotate", "none", "-e", "zero,open-loop,phy-ukf")
+    result = called("run", log, "-o", str(tmp_path), "--annotate", "none", "-e", "zero,open-loop,phy-ukf")
     assert result.returncode == 0
     assert "the log has no truth" in result.stdout
     assert "Consistency" in result.stdout
@@ -390,15 +384,15 @@ def test_log_without_truth_shows_what_there_is_instead(sample_logs_dir: Path, tm
 
 @pytest.mark.slow
 def test_map_without_a_terminal_writes_what_was_found(sample_logs_dir: Path, tmp_path: Path) -> None:
-    result = _pdhef("map", str(sample_logs_dir / "dlc.mcap"), "-o", "m.toml", cwd=tmp_path)
+    result = called("map", str(sample_logs_dir / "dlc.mcap"), "-o", "m.toml", cwd=tmp_path)
     assert result.returncode == 0
     assert "[signals.steer" in (tmp_path / "m.toml").read_text()
-    again = _pdhef("map", str(sample_logs_dir / "dlc.mcap"), "-o", "m.toml", cwd=tmp_path)
+    again = called("map", str(sample_logs_dir / "dlc.mcap"), "-o", "m.toml", cwd=tmp_path)
     assert "one that exists" in _one_line_error(again)
 
 
 @pytest.mark.slow
 def test_a_topic_goes_with_fields(sample_logs_dir: Path) -> None:
     log = str(sample_logs_dir / "dlc.mcap")
-    assert "angular_velocity.z" in _pdhef("inspect", log, "--fields", "/imu/data").stdout
-    assert "--fields" in _one_line_error(_pdhef("inspect", log, "/imu/data"))
+    assert "angular_velocity.z" in called("inspect", log, "--fields", "/imu/data").stdout
+    assert "--fields" in _one_line_error(called("inspect", log, "/imu/data"))

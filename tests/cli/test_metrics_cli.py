@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
 
+from tests.command_line import called
+
 pytestmark = pytest.mark.slow
 
-PDHEF = [sys.executable, "-m", "pdhef_logtool"]
 ESTIMATE = ("--estimate", "/pdhef/phy_ukf/state")
 LIMITS = """
 [[threshold]]
@@ -30,16 +28,11 @@ optional = true
 """
 
 
-def _pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "COLUMNS": "100"}
-    return subprocess.run([*PDHEF, *arguments], capture_output=True, text=True, env=environment, check=False)
-
-
 @pytest.fixture(scope="module")
 def annotated(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     out = tmp_path_factory.mktemp("annotated")
     vehicle = str(sample_logs_dir / "vehicle.toml")
-    made = _pdhef(
+    made = called(
         "run",
         str(sample_logs_dir / "dlc.mcap"),
         "-o",
@@ -62,7 +55,7 @@ def _limits(tmp_path: Path, limit: float) -> str:
 
 
 def test_table_goes_to_stdout_and_assumptions_to_stderr(annotated: str) -> None:
-    result = _pdhef("metrics", annotated, *ESTIMATE)
+    result = called("metrics", annotated, *ESTIMATE)
     assert result.returncode == 0
     assert "phy-ukf" in result.stdout
     assert "no --car" in result.stderr
@@ -71,7 +64,7 @@ def test_table_goes_to_stdout_and_assumptions_to_stderr(annotated: str) -> None:
 
 
 def test_json_is_one_document(annotated: str, tmp_path: Path) -> None:
-    result = _pdhef("metrics", annotated, *ESTIMATE, "--thresholds", _limits(tmp_path, 10.0), "--json")
+    result = called("metrics", annotated, *ESTIMATE, "--thresholds", _limits(tmp_path, 10.0), "--json")
     document = json.loads(result.stdout)
     assert document["exit_code"] == result.returncode == 0
     assert document["output"] is None
@@ -81,11 +74,11 @@ def test_json_is_one_document(annotated: str, tmp_path: Path) -> None:
 
 def test_passed_gate_is_0_and_failed_gate_is_4(annotated: str, tmp_path: Path) -> None:
     junit = tmp_path / "gate.xml"
-    passed = _pdhef("metrics", annotated, *ESTIMATE, "--thresholds", _limits(tmp_path, 10.0), "--junit", str(junit))
+    passed = called("metrics", annotated, *ESTIMATE, "--thresholds", _limits(tmp_path, 10.0), "--junit", str(junit))
     assert passed.returncode == 0, passed.stderr
     assert "pass" in passed.stdout
     assert ET.parse(junit).getroot().attrib["failures"] == "0"
-    failed = _pdhef("metrics", annotated, *ESTIMATE, "--thresholds", _limits(tmp_path, 0.01), "--junit", str(junit))
+    failed = called("metrics", annotated, *ESTIMATE, "--thresholds", _limits(tmp_path, 0.01), "--junit", str(junit))
     assert failed.returncode == 4
     assert "beyond the limit" in failed.stderr
     (suite,) = ET.parse(junit).getroot()
@@ -95,7 +88,7 @@ def test_passed_gate_is_0_and_failed_gate_is_4(annotated: str, tmp_path: Path) -
 def test_run_has_the_same_gate(sample_logs_dir: Path, tmp_path: Path) -> None:
     logs = [str(sample_logs_dir / "dlc.mcap"), str(sample_logs_dir / "sweep.mcap")]
     junit = tmp_path / "gate.xml"
-    result = _pdhef(
+    result = called(
         "run", *logs, "-o", str(tmp_path / "out"), "-e", "zero", "--annotate", "none",
         "--thresholds", _limits(tmp_path, 0.01), "--junit", str(junit),
     )  # fmt: skip
@@ -110,14 +103,14 @@ def test_failed_gate_wins_over_lost_input_and_both_are_said(sample_logs_dir: Pat
     (tmp_path / "logs/cut.mcap").write_bytes(whole[: len(whole) * 3 // 4])
     log = str(tmp_path / "logs/cut.mcap")
     arguments = ("run", log, "-e", "zero", "--annotate", "none", "-o", str(tmp_path / "out"))
-    assert _pdhef(*arguments, "--thresholds", _limits(tmp_path, 10.0)).returncode == 3
-    both = _pdhef(*arguments, "--thresholds", _limits(tmp_path, 0.01))
+    assert called(*arguments, "--thresholds", _limits(tmp_path, 10.0)).returncode == 3
+    both = called(*arguments, "--thresholds", _limits(tmp_path, 0.01))
     assert both.returncode == 4
     assert "threshold failed" in both.stderr
     assert "lost" in both.stderr
     (tmp_path / "logs/bad.mcap").write_bytes(b"no log")
     junit = tmp_path / "gate.xml"
-    several = _pdhef(
+    several = called(
         "run", str(tmp_path / "logs"), "-e", "zero", "--annotate", "none", "-o", str(tmp_path / "out2"),
         "--thresholds", _limits(tmp_path, 10.0), "--junit", str(junit),
     )  # fmt: skip
@@ -139,7 +132,7 @@ def test_failed_gate_wins_over_lost_input_and_both_are_said(sample_logs_dir: Pat
     ],
 )
 def test_errors_are_one_line(annotated: str, arguments: tuple[str, ...], code: int, said: str) -> None:
-    result = _pdhef("metrics", annotated, *arguments)
+    result = called("metrics", annotated, *arguments)
     assert result.returncode == code
     lines = [line for line in result.stderr.splitlines() if not line.startswith("warning: ")]
     assert len(lines) == 1, result.stderr

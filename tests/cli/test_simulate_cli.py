@@ -6,25 +6,18 @@ import hashlib
 import json
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests.command_line import called
 from truthsim.manoeuvres import MANOEUVRES
 
 pytestmark = pytest.mark.slow
 
 
-def pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "pdhef_logtool", *arguments], capture_output=True, text=True, check=False
-    )
-
-
 def test_a_drive_s_command_makes_the_same_file_again(tmp_path: Path) -> None:
-    made = pdhef(
+    made = called(
         *("simulate", "step-steer", "--speed", "90", "--mu", "0.7", "--seed", "4", "--duration", "5"),
         *("--amplitude", "0.8", "--vehicle", "suv~3,mass=1.1", "--fault", "burst20:yaw_rate:2:3"),
         *("--sensor", "jitter_s=0.004", "--rtk-rate", "50", "-o", str(tmp_path / "a.mcap"), "--json"),
@@ -32,13 +25,13 @@ def test_a_drive_s_command_makes_the_same_file_again(tmp_path: Path) -> None:
     assert made.returncode == 0, made.stderr
     facts = json.loads(made.stdout)
     assert facts["peak_ay_m_s2"] < 0.7 * 9.81 and not facts["spun"]
-    again = pdhef(*shlex.split(facts["command"])[1:], "-o", str(tmp_path / "b.mcap"))
+    again = called(*shlex.split(facts["command"])[1:], "-o", str(tmp_path / "b.mcap"))
     assert again.returncode == 0, again.stderr
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
 
 
 def test_a_suite_and_each_of_its_commands(tmp_path: Path) -> None:
-    made = pdhef(
+    made = called(
         *("simulate", "suite", "-o", str(tmp_path / "logs"), "--count", "3", "--seed", "5", "--duration", "5"),
         *("--vehicles", "randomised", "--jobs", "2", "--json"),
     )
@@ -47,13 +40,13 @@ def test_a_suite_and_each_of_its_commands(tmp_path: Path) -> None:
     manifest = json.loads((tmp_path / "logs" / "manifest.json").read_text())
     assert len({entry["vehicle"] for entry in manifest["drives"]}) == 3
     entry = manifest["drives"][1]
-    again = pdhef(*shlex.split(entry["command"])[1:], "-o", str(tmp_path / "x.mcap"))
+    again = called(*shlex.split(entry["command"])[1:], "-o", str(tmp_path / "x.mcap"))
     assert again.returncode == 0, again.stderr
     assert hashlib.sha256((tmp_path / "x.mcap").read_bytes()).hexdigest() == entry["sha256"]
 
 
 def test_rows_of_the_condition_table(tmp_path: Path) -> None:
-    made = pdhef(
+    made = called(
         *("simulate", "conditions", "-o", str(tmp_path), "--drives", "1", "--rows", "gyro-dead,friction-unknown")
     )
     assert made.returncode == 0, made.stderr
@@ -63,13 +56,13 @@ def test_rows_of_the_condition_table(tmp_path: Path) -> None:
 
 def test_the_fix_quality_gates_the_rtk_truth(tmp_path: Path) -> None:
     log, mapping, out = tmp_path / "gap.mcap", tmp_path / "mapping.toml", tmp_path / "out"
-    made = pdhef("simulate", "step-steer", "--fault", "lost:rtk:2:4", "-o", str(log))
+    made = called("simulate", "step-steer", "--fault", "lost:rtk:2:4", "-o", str(log))
     assert made.returncode == 0, made.stderr
-    found = pdhef("inspect", str(log), "--prefer-truth", "rtk", "--write-mapping", str(mapping))
+    found = called("inspect", str(log), "--prefer-truth", "rtk", "--write-mapping", str(mapping))
     assert found.returncode == 0, found.stderr
     gate = '[truth_quality]\ntopic = "/rtk/quality"\nfield = "quality"\nvalues = [4]\n'
     mapping.write_text(mapping.read_text() + "\n" + gate)
-    ran = pdhef("run", str(log), "-o", str(out), "-m", str(mapping), "-e", "zero", "--annotate", "none")
+    ran = called("run", str(log), "-o", str(out), "-m", str(mapping), "-e", "zero", "--annotate", "none")
     assert ran.returncode == 0, ran.stderr
     # Two seconds of a hundred samples a second, give or take the fix's own rate of 10 Hz.
     assert "quality gate" in ran.stdout
@@ -78,9 +71,9 @@ def test_the_fix_quality_gates_the_rtk_truth(tmp_path: Path) -> None:
 
 
 def test_all_manoeuvres_are_listed_and_the_help_tells_of_faults() -> None:
-    listed = json.loads(pdhef("simulate", "--list", "--json").stdout)["manoeuvres"]
+    listed = json.loads(called("simulate", "--list", "--json").stdout)["manoeuvres"]
     assert [row["name"] for row in listed] == list(MANOEUVRES)
-    text = pdhef("simulate", "--help").stdout
+    text = called("simulate", "--help").stdout
     assert "KIND:WHAT:START:END" in text and "--keep-spins" in text and "suite" in text and "conditions" in text
 
 
@@ -92,10 +85,10 @@ def test_all_manoeuvres_are_listed_and_the_help_tells_of_faults() -> None:
     ],
 )
 def test_sets_have_a_help_of_their_own(command: str, own: set[str]) -> None:
-    text = pdhef("simulate", command, "--help").stdout
+    text = called("simulate", command, "--help").stdout
     options = text[text.index("Options:") : text.index("Examples:")]
     assert set(re.findall(r"^  (?:-\w, )?(--[\w-]+)", options, re.MULTILINE)) == own
-    assert f"pdhef simulate {command}" in pdhef("simulate", "--help").stdout
+    assert f"pdhef simulate {command}" in called("simulate", "--help", env={"COLUMNS": "80"}).stdout
 
 
 @pytest.mark.parametrize(
@@ -107,16 +100,13 @@ def test_sets_have_a_help_of_their_own(command: str, own: set[str]) -> None:
     ],
 )
 def test_the_name_of_a_set_may_stand_behind_options(arguments: tuple[str, ...], tmp_path: Path) -> None:
-    result = subprocess.run(
-        [sys.executable, "-m", "pdhef_logtool", *arguments], capture_output=True, text=True, check=False, cwd=tmp_path
-    )
+    result = called(*arguments, cwd=tmp_path)
     assert result.returncode == 2
     assert "count 0" in result.stderr
 
 
 def test_a_file_may_be_called_as_a_set(tmp_path: Path) -> None:
-    asked = [sys.executable, "-m", "pdhef_logtool", "simulate", "-o", "suite", "moose"]
-    result = subprocess.run(asked, capture_output=True, text=True, check=False, cwd=tmp_path)
+    result = called("simulate", "-o", "suite", "moose", cwd=tmp_path)
     assert result.returncode == 2
     assert "got 'moose'" in result.stderr
 
@@ -143,7 +133,7 @@ def test_a_file_may_be_called_as_a_set(tmp_path: Path) -> None:
 def test_mistakes_are_one_clear_line(
     arguments: tuple[str, ...], code: int, words: tuple[str, ...], tmp_path: Path
 ) -> None:
-    result = pdhef("simulate", *arguments, "-o", str(tmp_path / "x.mcap"))
+    result = called("simulate", *arguments, "-o", str(tmp_path / "x.mcap"))
     assert result.returncode == code, result.stderr
     assert len(result.stderr.strip().splitlines()) == 1 and all(word in result.stderr for word in words)
     assert not list(tmp_path.iterdir())

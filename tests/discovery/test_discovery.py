@@ -100,6 +100,7 @@ def test_any_name_gives_a_folder_name_that_any_system_takes(tmp_path: Path, name
 _SIGNS = st.characters(exclude_categories=["Cs"], exclude_characters="/\0*?[") | st.sampled_from("\udcff\udc80 ._aA")
 
 
+@pytest.mark.slow
 @given(st.lists(st.text(_SIGNS, min_size=1, max_size=40)))
 def test_stems_are_unique_and_portable_whatever_the_names(names: list[str]) -> None:
     logs = sorted({f"{name}.mcap" for name in names if name != "."})

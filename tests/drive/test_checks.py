@@ -246,6 +246,7 @@ def test_what_is_wrong_with_truth_and_sensors_together(
     assert {c.subject for c in checked(road, **factors) if c.verdict == "failed"} == subjects
 
 
+@pytest.mark.slow
 def test_a_truth_that_is_turned_by_half_a_degree(road: MappedChannels) -> None:
     truth = dict(road.truth)
     turn = np.radians(0.4)

@@ -49,6 +49,7 @@ def pair(kind: str, rng: np.random.Generator, n: int) -> tuple[FloatArray, Float
     return made[kind]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["walk", "holes", "equal", "constant", "ties", "far from zero", "tiny and huge"])
 @pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
 def test_the_shift_is_that_of_every_shift(kind: str) -> None:

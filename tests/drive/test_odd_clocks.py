@@ -75,6 +75,7 @@ def test_one_message_at_the_end_of_time(at_ns: int, sample_logs_dir: Path, tmp_p
     assert inspect_log(log).duration_s == pytest.approx(9.51, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("until_s", "kept"), [(2.0, 0.75), (7.5, 0.75)])
 def test_a_clock_that_is_set(until_s: float, kept: float, sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
     log = tmp_path / "boot.mcap"

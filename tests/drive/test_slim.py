@@ -152,6 +152,7 @@ def _two_publishers(path: Path) -> Path:
     return target
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "make",
     [
@@ -167,6 +168,7 @@ def test_a_slim_log_reads_like_its_source(make: Callable[[Path], Path], tmp_path
     assert _same(source, tmp_path).record.metadata == log_metadata(source)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["faults.mcap", "no_truth.mcap", "step_rosbag2"])
 def test_a_slim_sample_log_reads_like_its_source(name: str, tmp_path: Path) -> None:
     log = _same(SAMPLES / name, tmp_path)
@@ -268,6 +270,7 @@ def test_a_slim_log_of_can_frames_holds_its_dbc(tmp_path: Path) -> None:
     assert _facts(tmp_path / "elsewhere.mcap", None, AS_IT_IS)["losses"]
 
 
+@pytest.mark.slow
 def test_definitions_of_the_user_go_into_the_slim_log(tmp_path: Path) -> None:
     bare, msgs = tmp_path / "bare", tmp_path / "msgs" / "own_msgs" / "msg"
     shutil.copytree(SAMPLES / "step_rosbag2", bare)

@@ -79,6 +79,7 @@ def test_what_decides_an_entry_tells_it_apart(tmp_path: Path) -> None:
     assert len(_entries(place)) == len(caches)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spoilt", ["a byte", "the end", "all", "another file"])
 def test_a_damaged_entry_is_made_anew_with_a_note(tmp_path: Path, spoilt: str) -> None:
     cache = _cache(tmp_path / "cache")

@@ -48,6 +48,7 @@ def by_hand(stamps_ns: np.ndarray, reason: np.ndarray, bit: int) -> list[Interva
     return [Interval(a, b + 1) for a, b in spans]
 
 
+@pytest.mark.slow
 @settings(max_examples=200, derandomize=True, deadline=None)
 @given(
     st.lists(st.tuples(st.integers(1, 40), st.integers(0, 15)), min_size=1, max_size=60),

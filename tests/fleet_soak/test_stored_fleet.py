@@ -10,14 +10,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from pdhef_logtool.records.outputs import LOCK_FILE
 from pdhef_logtool.results.opened_run import JOURNAL_FILE, open_run
 from tests.conftest import ROOT
-from tests.s3_store import objects_of, s3_store
+from tests.s3_store import S3Store, s3_store
 
 pytestmark = [pytest.mark.fleet, pytest.mark.slow]
 
@@ -46,9 +45,9 @@ def contents(files: dict[str, bytes]) -> dict[str, bytes]:
     return {name: data for name, data in files.items() if name != JOURNAL_FILE and not name.endswith(".rrd")}
 
 
-def put_so_far(client: Any) -> int:
+def put_so_far(store: S3Store) -> int:
     """Return how many drives the journal in the store has."""
-    return drives_in(objects_of(client, "cars", "day/out").get(JOURNAL_FILE, b""))
+    return drives_in(store.objects("day/out").get(JOURNAL_FILE, b""))
 
 
 def test_a_killed_run_goes_on_on_another_machine(tmp_path: Path, sample_logs_dir: Path) -> None:
@@ -57,33 +56,33 @@ def test_a_killed_run_goes_on_on_another_machine(tmp_path: Path, sample_logs_dir
     for name in ("dlc", "fishhook", "step", "sweep"):
         shutil.copy(sample_logs_dir / f"{name}.mcap", logs)
     undisturbed = start(str(logs), "-o", str(tmp_path / "out"))
-    with s3_store("cars") as client:
-        process = start(str(logs), "-o", "s3://cars/day/out")
+    with s3_store() as store:
+        process = start(str(logs), "-o", f"{store.url}/day/out")
         ends = time.monotonic() + 300.0
-        while put_so_far(client) < 1 and time.monotonic() < ends:
+        while put_so_far(store) < 1 and time.monotonic() < ends:
             time.sleep(0.05)
         process.send_signal(signal.SIGKILL)
         process.communicate()
-        done = put_so_far(client)
+        done = put_so_far(store)
         assert 1 <= done < 4, "it was killed under way"
-        holder = client.get_object(Bucket="cars", Key=f"day/out/{LOCK_FILE}")["Body"].read().decode()
+        holder = store.get(f"day/out/{LOCK_FILE}").decode()
         assert holder.split("-")[1] == str(process.pid), "it still holds the place"
-        client.put_object(Bucket="cars", Key=f"day/out/{LOCK_FILE}", Body=b"00000000-17-1")
-        told = start(str(logs), "-o", "s3://cars/day/out", "--resume")
+        store.put(f"day/out/{LOCK_FILE}", b"00000000-17-1")
+        told = start(str(logs), "-o", f"{store.url}/day/out", "--resume")
         assert f"or remove {LOCK_FILE} there if that command has ended" in told.communicate()[1]
         assert told.returncode == 1
-        client.put_object(Bucket="cars", Key=f"day/out/{LOCK_FILE}", Body=holder.encode())
-        again = start(str(logs), "-o", "s3://cars/day/out", "--resume")
+        store.put(f"day/out/{LOCK_FILE}", holder.encode())
+        again = start(str(logs), "-o", f"{store.url}/day/out", "--resume")
         said = again.communicate()
         assert again.returncode in (0, 3), said
-        found = objects_of(client, "cars", "day/out")
+        found = store.objects("day/out")
         assert drives_in(found[JOURNAL_FILE]) == 4, "what was put is not done again"
         undisturbed.communicate()
         folder = tmp_path / "out"
         here = {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
         assert set(found) == set(here)
         assert contents(found) == contents(here)
-        run = open_run("s3://cars/day/out")
+        run = open_run(f"{store.url}/day/out")
         assert [log.outcome for log in run.logs] == ["ok"] * 4
         assert {log["log"] for log in json.loads(found["run.json"])["logs"]} == {"dlc", "fishhook", "step", "sweep"}
         frame = run.logs[0].estimates()

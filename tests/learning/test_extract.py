@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -31,6 +30,7 @@ from pdhef_logtool.records.errors import LogError, OutputError, UsageError
 from pdhef_logtool.records.outputs import OutputFolder
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.runs.config import RunConfig
+from tests.command_line import called
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "schemas/dataset.schema.json").read_text(encoding="utf-8"))
 MAPPING = """
@@ -422,23 +422,17 @@ def test_another_manifest_is_not_overwritten(sample_logs_dir: Path, tmp_path: Pa
 # ---- command line ----
 
 
-def _pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "COLUMNS": "120"}
-    command = [sys.executable, "-m", "pdhef_logtool", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
-
-
 @pytest.mark.slow
 def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
     out = tmp_path / "residuals"
     log = str(sample_logs_dir / "dlc.mcap")
-    result = _pdhef("extract", log, "-o", str(out), "--car", str(sample_logs_dir / "vehicle.toml"), "--split", "train")
+    result = called("extract", log, "-o", str(out), "--car", str(sample_logs_dir / "vehicle.toml"), "--split", "train")
     assert result.returncode == 0, result.stderr
     assert "dlc" in result.stdout and "train: 1 drives" in result.stdout
     assert result.stderr.splitlines() == ["warning: dlc: perfect truth taken; /rtk/fix, /rtk/odometry not used"]
     (drive,) = read_dataset(out).drives
     assert drive.usable_rows > 0.99 * drive.rows
-    rtk = _pdhef("extract", log, "-o", str(tmp_path / "rtk"), "--prefer-truth", "rtk", "--split", "train", "--json")
+    rtk = called("extract", log, "-o", str(tmp_path / "rtk"), "--prefer-truth", "rtk", "--split", "train", "--json")
     assert rtk.returncode == 0, rtk.stderr
     document = json.loads(rtk.stdout)
     jsonschema.validate(document["manifest"], SCHEMA)
@@ -454,7 +448,7 @@ def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_errors_are_one_line(tmp_path: Path) -> None:
-    result = _pdhef("extract", str(tmp_path / "none.mcap"), "-o", str(tmp_path / "out"))
+    result = called("extract", str(tmp_path / "none.mcap"), "-o", str(tmp_path / "out"))
     assert result.returncode != 0
     assert result.stderr.splitlines()[-1].startswith("pdhef: ")
     assert "Traceback" not in result.stderr

@@ -81,6 +81,7 @@ def test_a_training_holds_one_drive_and_its_pieces_of_two_batches(
     assert pieces.all == len(data.drives) and pieces.most <= 2 * recipe.batch
 
 
+@pytest.mark.slow
 def test_pieces_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
     sequences = make_sequences(0, 3, steps=3200)
     normalisation = normalisation_of(sequences, SMALL.feature_names)

@@ -233,6 +233,7 @@ def test_parts_are_named_in_words() -> None:
         physics_parts("")
 
 
+@pytest.mark.slow
 def test_few_drives_are_cut_and_many_are_dealt_out(static: FitDrive, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(physics_fit, "LEAST_FOLD_S", 20.0)
     long = static_drive(3, 50.0)

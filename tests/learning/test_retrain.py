@@ -205,6 +205,7 @@ def test_a_candidate_goes_where_its_verdict_belongs_and_what_is_new_is_done_alon
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("better", "cap", "accepted", "why"),
     [

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import polars as pl
@@ -20,14 +17,9 @@ from pdhef_logtool.residual_model.bundle import load_bundle
 from pdhef_logtool.residual_model.features import NOMINAL_FEATURES
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from tests.command_line import pdhef, said
+from tests.command_line import called, pdhef, said
 
 pytestmark = pytest.mark.slow
-
-
-def _pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "pdhef_logtool", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "COLUMNS": "120"})
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +42,7 @@ def test_train_writes_a_model_that_runs(
     sample_logs_dir: Path, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     joined = dataset
-    done = _pdhef("train", str(joined), "-o", str(tmp_path / "model"), "--epochs", "2", "--json")
+    done = called("train", str(joined), "-o", str(tmp_path / "model"), "--epochs", "2", "--json")
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
     bundle = load_bundle(tmp_path / "model")
@@ -115,7 +107,7 @@ def test_wrong_calls_are_one_line(dataset: Path, tmp_path: Path) -> None:
     del document["digest"]
     document["drives"] = [d for d in document["drives"] if d["split"] == "train"]
     (alone / "manifest.json").write_text(json.dumps(document))
-    done = _pdhef("train", str(alone), "-o", str(tmp_path / "m"), "--epochs", "1")
+    done = called("train", str(alone), "-o", str(tmp_path / "m"), "--epochs", "1")
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "validation" in done.stderr

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,6 +47,7 @@ from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.runs.config import RunConfig
+from tests.command_line import called
 
 pytestmark = pytest.mark.slow
 
@@ -390,16 +388,13 @@ def test_wrong_options_are_usage_errors(sample_logs_dir: Path, tmp_path: Path) -
 
 def test_the_command_prints_a_table_or_json(sample_logs_dir: Path, tmp_path: Path) -> None:
     _bundle().save(tmp_path / "model")
-    words = [sys.executable, "-m", "pdhef_logtool", "trust", str(sample_logs_dir / "dlc.mcap"),
-             "--car", str(sample_logs_dir / "vehicle.toml"), "--network", str(tmp_path / "model"),
-             "-o", str(tmp_path / "car.toml")]  # fmt: skip
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    shown = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
+    words = ["trust", sample_logs_dir / "dlc.mcap", "--car", sample_logs_dir / "vehicle.toml",
+             "--network", tmp_path / "model", "-o", tmp_path / "car.toml"]  # fmt: skip
+    shown = called(*words)
     assert shown.returncode == 0, shown.stderr
     # A double lane change is over too soon to decide on.
     assert "trust cap 0: too little to decide on" in shown.stdout
-    done = subprocess.run([*words, "--json"], capture_output=True, text=True, check=False, env=environment)
-    document = json.loads(done.stdout)
+    document = json.loads(called(*words, "--json").stdout)
     assert document["trust_cap"] == 0.0
     assert document["trusts"] == list(TRUSTS)
     assert document["against_trust_0"][4]["low_deg2"] is None

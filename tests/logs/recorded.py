@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +19,17 @@ def numeric_paths(log: DriveLog, topic: str) -> list[str]:
     ]
 
 
-def decoded_by_rosbags(paths: Sequence[Path]) -> dict[str, list[tuple[int, Any]]]:
+def decoded_by_rosbags(
+    paths: Sequence[Path], topics: Collection[str] | None = None
+) -> dict[str, list[tuple[int, Any]]]:
     """Log time and decoded message of every message by topic, through rosbags' own containers and deserialisers."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
     found: dict[str, list[tuple[int, Any]]] = defaultdict(list)
     with AnyReader(list(paths), default_typestore=get_typestore(Stores.LATEST)) as reader:
-        for connection, stamp, data in reader.messages():
+        wanted = [c for c in reader.connections if topics is None or c.topic in topics]
+        for connection, stamp, data in reader.messages(wanted):
             found[connection.topic].append((stamp, reader.deserialize(data, connection.msgtype)))
     return found
 

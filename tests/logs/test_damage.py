@@ -117,6 +117,7 @@ def _read_everything(path: Path) -> tuple[int, bool]:
         log.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", sorted(_SOURCES))
 @settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())

@@ -57,6 +57,7 @@ def test_a_handful_of_messages_is_a_log() -> None:
     assert epochs(np.empty(0, dtype=np.int64))[0] == []
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(
     pieces=st.lists(

@@ -132,6 +132,7 @@ _MESSAGES = st.fixed_dictionaries(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=60, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(values=st.lists(_MESSAGES, min_size=1, max_size=8), choices=st.lists(st.sampled_from(["", "torque", "brake"])))
 def test_columns_equal_protobufs_own_objects(

@@ -35,7 +35,7 @@ _COMPARED = {
 @pytest.mark.parametrize("name", sorted(_COMPARED))
 def test_values_equal_those_of_an_independent_reader(shared_dir: Path, name: str) -> None:
     path = shared_dir / name
-    expected = decoded_by_rosbags([path])
+    expected = decoded_by_rosbags([path], _COMPARED[name])
     log = open_log(path)
     read = log.read(_COMPARED[name])
     for topic, paths in _COMPARED[name].items():

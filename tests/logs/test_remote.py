@@ -126,6 +126,7 @@ def test_any_split_of_ranges_gives_the_same_bytes(reads: list[tuple[int, int]], 
 # -------------------------------------------------------------------------------------------------- the same log
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["dlc.mcap", "faults.mcap", "no_truth.mcap"])
 def test_same_as_the_file_and_each_byte_once(sample_logs_dir: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remote_source, "MOST_RANGE_BYTES", 30_000)
@@ -136,6 +137,7 @@ def test_same_as_the_file_and_each_byte_once(sample_logs_dir: Path, name: str, m
         assert server.bytes_sent == file.stat().st_size
 
 
+@pytest.mark.slow
 def test_a_drive_costs_no_more_than_its_file(sample_logs_dir: Path, saloon: Car) -> None:
     file = sample_logs_dir / "faults.mcap"
     with serving(**{file.name: file.read_bytes()}) as server:
@@ -281,7 +283,7 @@ def test_other_formats_are_fetched_once_as_a_whole(tmp_path: Path, sample_logs_d
 def test_several_ranges_at_once_but_not_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remote_source, "MOST_RANGE_BYTES", 10_000)
     with serving(x=bytes(200_000)) as server:
-        server.fault = slow(0.02)
+        server.fault = slow(0.1)
         source = RemoteSource(_place(server, "x"))
         source.fetch_whole()
         source.close()

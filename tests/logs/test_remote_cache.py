@@ -24,6 +24,7 @@ def _read(url: str, cache: SlimCache) -> tuple[object, ...]:
         return windows, drive.signals_sha256, drive.truth_sha256, drive.sha256, drive.losses, drive.file
 
 
+@pytest.mark.slow
 def test_a_second_reading_asks_only_for_identity(tmp_path: Path, sample_logs_dir: Path) -> None:
     file = sample_logs_dir / "faults.mcap"
     cache = SlimCache(str(tmp_path / "cache"), None, ReadOptions())

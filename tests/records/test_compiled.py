@@ -99,6 +99,7 @@ def test_what_an_installation_brings_along_serves_where_nobody_can_write_it(
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [0, 1, 40])
 def test_a_file_that_was_cut_short_is_compiled_anew(module_file: Path, length: int) -> None:
     _load(module_file).more(1)

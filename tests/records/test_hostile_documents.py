@@ -79,6 +79,7 @@ _VALUE = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_document_with_another_value_somewhere_is_read_or_refused(tmp_path: Path, data: st.DataObject) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tarfile
 import tomllib
@@ -9,6 +10,7 @@ import zipfile
 from pathlib import Path
 
 import check_dist
+import check_sbom
 import pytest
 
 from pdhef_logtool.records.version import __version__
@@ -19,8 +21,8 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 def test_one_version_everywhere() -> None:
     assert PROJECT["version"] == __version__
-    newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
-    assert newest is not None and newest[1] in (__version__, "Unreleased")
+    newest = re.search(r"^## (\S+) \((.+)\)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert newest is not None and (newest[1] == __version__ or newest[2] == "unreleased")
 
 
 def test_the_container_file_is_for_this_package() -> None:
@@ -31,8 +33,46 @@ def test_the_container_file_is_for_this_package() -> None:
     (python,) = re.findall(r"FROM python:3\.(\d+)-slim", "\n".join(lines))
     assert int(python) >= int(PROJECT["requires-python"].removeprefix(">=3."))
     ignored = (ROOT / ".dockerignore").read_text().splitlines()
-    assert "!dist/*.whl" in ignored and "COPY dist/*.whl /tmp/dist/" in lines
+    assert {"!dist/*.whl", "!constraints.txt"} <= set(ignored) and "COPY constraints.txt dist/*.whl /tmp/dist/" in lines
+    (install,) = (line for line in lines if "pip install" in line)
+    assert "--constraint /tmp/dist/constraints.txt" in install and "index" not in install
     assert "RUN pdhef compile" in lines
+
+
+def test_every_dependency_is_locked_and_a_run_needs_no_torch() -> None:
+    extras = PROJECT["optional-dependencies"]
+    names = {
+        check_sbom.normalized(re.split(r"[<>=~\[]", requirement)[0])
+        for requirement in (*PROJECT["dependencies"], *(r for extra in extras.values() for r in extra))
+    }
+    pinned = check_sbom.locked()
+    assert names - {"pdhef-logtool"} <= set(pinned)
+    assert all(re.fullmatch(r"[0-9.]+[0-9a-z.]*", version) for versions in pinned.values() for version in versions)
+    assert not [name for name in pinned if name.startswith(("nvidia-", "cuda-")) or name == "triton"]
+    assert not any("torch" in requirement for requirement in PROJECT["dependencies"])
+    assert any("train" in requirement for requirement in extras["dev"])
+
+
+def _bill(file: Path, **versions: str | None) -> list[str]:
+    """Return the problems of a bill of materials of what a release installs, but for some versions."""
+    needed = {re.split(r"[<>=~\[]", r)[0]: "" for r in PROJECT["dependencies"]} | versions
+    pinned = check_sbom.locked()
+    parts = [
+        {"name": name, "version": version or min(pinned[check_sbom.normalized(name)])}
+        for name, version in needed.items()
+        if version is not None
+    ]
+    root = {"name": PROJECT["name"], "version": __version__}
+    file.write_text(json.dumps({"bomFormat": "CycloneDX", "metadata": {"component": root}, "components": parts}))
+    return check_sbom.problems(file)
+
+
+def test_a_bill_of_materials_is_checked(tmp_path: Path) -> None:
+    file = tmp_path / "sbom.cdx.json"
+    assert _bill(file, pip="1.0") == []
+    assert _bill(file, mcap=None) == ["mcap is missing"]
+    assert _bill(file, scipy="0.1") == ["scipy 0.1 is not in constraints.txt"]
+    assert _bill(file, torch="") == ["torch is no dependency of a run"]
 
 
 def _archives(folder: Path, without: str = "", besides: str = "") -> Path:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import html
 import json
-import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -21,6 +19,7 @@ from pdhef_logtool.reports.colours import colour, contrast
 from pdhef_logtool.reports.drive import drive_page, roles_of
 from pdhef_logtool.reports.pages import remove_pages, write_pages
 from pdhef_logtool.results.opened_run import open_run
+from tests.command_line import called
 
 
 def page_of(folder: Path, wrong: int = 0) -> str:
@@ -262,16 +261,12 @@ def _lab(rgb: np.ndarray) -> np.ndarray:
     return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
 
 
-def _report(*arguments: str) -> subprocess.CompletedProcess[str]:
-    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    command = [sys.executable, "-m", "pdhef_logtool", "report", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
-
-
 @pytest.mark.slow
-def test_the_command_says_what_it_wrote_and_where_no_browser_is(tmp_path):
+def test_the_command_says_what_it_wrote_and_where_no_browser_is(tmp_path, monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
     folder = write_run(tmp_path, drive_tracks())
-    result = _report(str(folder), "--open", "--json")
+    result = called("report", str(folder), "--open", "--json")
     assert result.returncode == 0
     document = json.loads(result.stdout)
     assert document["logs"] == [
@@ -282,7 +277,7 @@ def test_the_command_says_what_it_wrote_and_where_no_browser_is(tmp_path):
 
 @pytest.mark.slow
 def test_a_folder_that_is_no_run_is_one_line_and_is_not_made(tmp_path):
-    result = _report(str(tmp_path / "nothing"))
+    result = called("report", str(tmp_path / "nothing"))
     assert result.returncode == 1
     assert "pdhef run LOG -o OUT writes one" in result.stderr
     assert not (tmp_path / "nothing").exists()

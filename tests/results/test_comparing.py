@@ -79,6 +79,7 @@ def test_a_figure_that_vanished_closes_the_gate_too(tmp_path: Path) -> None:
     assert _compare(a, b).exit_code == 3
 
 
+@pytest.mark.slow
 def test_the_gate_closes_on_a_regression_and_not_on_an_improvement(tmp_path: Path) -> None:
     a = write_run(tmp_path / "a", TEN)
     worse = _compare(a, write_run(tmp_path / "b", _scaled(1.2)), GATE)

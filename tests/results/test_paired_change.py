@@ -17,6 +17,7 @@ def _share_worse(drives: int, planted: float, times: int, seed: int = 3) -> floa
     return float(np.mean([paired_change(one).verdict(0.05) == "worse" for one in ratios]))
 
 
+@pytest.mark.slow
 def test_false_alarms_are_few_and_a_planted_regression_is_found() -> None:
     assert _share_worse(10, 0.0, 300) <= 0.09  # 7 % in 5,000: studies/comparing.py
     assert _share_worse(100, 0.0, 100) <= 0.05

@@ -20,7 +20,7 @@ from pdhef_logtool.runs.fleet import _on_node, run_logs
 from tests.records.ray_nodes import START_S, cluster_of_one, grow, processes_of
 from tests.runs.stub_drives import stub_drive, waiting_drive
 from tests.runs.test_fleet_runs import named_logs
-from tests.s3_store import objects_of, s3_store
+from tests.s3_store import s3_store
 
 
 def files_of(output: Path) -> dict[str, bytes]:
@@ -81,11 +81,11 @@ def test_a_fleet_on_a_cluster_whose_output_is_in_a_store_equals_one_here(
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'pdhef-logtool[ray]'")
     logs = named_logs(tmp_path / "logs", *(f"drive_{i}" for i in range(6)))
     run = partial(run_logs, [str(logs)], config=RunConfig(keep="metrics"), report=False, work=stub_drive)
-    with s3_store("cars") as client, cluster_of_one() as cluster:
-        assert run(output="s3://cars/out", ray=cluster.address).exit_code == 0
+    with s3_store() as store, cluster_of_one() as cluster:
+        assert run(output=f"{store.url}/out", ray=cluster.address).exit_code == 0
         named_logs(logs, "later")
-        assert run(output="s3://cars/out", ray=cluster.address, resume=True).exit_code == 0
-        found = objects_of(client, "cars", "out")
+        assert run(output=f"{store.url}/out", ray=cluster.address, resume=True).exit_code == 0
+        found = store.objects("out")
     run(output=tmp_path / "out")
     timed = ("run.json", "journal.jsonl")
     assert {name: data for name, data in found.items() if name not in timed} == files_of(tmp_path / "out")

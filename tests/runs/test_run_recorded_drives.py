@@ -42,7 +42,8 @@ def _sideslip_rmse_deg(metrics: pl.DataFrame) -> dict[str, float]:
 @pytest.fixture(scope="module")
 def intact(shared_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[pl.DataFrame, pl.DataFrame, int]:
     log = shared_dir / "data/drives/revs_250lm_a.mcap"
-    return _run(log, "revs_250lm.toml", "revs_250lm.toml", tmp_path_factory.mktemp("intact"))
+    out = tmp_path_factory.mktemp("intact")
+    return _run(log, "revs_250lm.toml", "revs_250lm.toml", out, ("phy-ukf", "zero", "kinematic"))
 
 
 def test_250_lm_physics_filter_beats_zero_and_kinematic(intact: tuple[pl.DataFrame, pl.DataFrame, int]) -> None:

@@ -104,6 +104,7 @@ def test_odometry_gives_the_same_but_for_the_rows_that_it_lacks(annotated: Path,
     assert state["state", "all", "nees"][0] == pytest.approx(odometry["state", "all", "nees"][0], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_named_fields_and_a_table_with_scale_give_the_same(
     annotated: Path, sample_logs_dir: Path, tmp_path: Path, config: RunConfig
 ) -> None:

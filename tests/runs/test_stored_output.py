@@ -22,7 +22,7 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import DriveEnd, DriveTask
 from tests.runs.stub_drives import stub_drive
 from tests.runs.test_fleet_runs import Counted, named_logs, run
-from tests.s3_store import s3_store
+from tests.s3_store import S3Store, forget_file_systems, s3_store
 
 #: What holds times, or where logs lie.
 TIMED = ("run.json", JOURNAL_FILE)
@@ -41,10 +41,10 @@ def memory() -> Iterator[Any]:
     store.store.clear()
 
 
-@pytest.fixture(scope="module")
-def s3() -> Iterator[Any]:
-    with s3_store("cars") as client:
-        yield client
+@pytest.fixture
+def s3() -> Iterator[S3Store]:
+    with s3_store() as store:
+        yield store
 
 
 def stored(store: Any, url: str = URL) -> dict[str, bytes]:
@@ -78,9 +78,10 @@ def test_a_store_has_what_a_folder_has_and_is_gone_on_with(tmp_path: Path, memor
     assert opened.metrics().collect().equals(pl.read_parquet(tmp_path / "out" / METRICS_FILE))
 
 
-def test_a_name_that_is_a_pattern_means_itself(tmp_path: Path, s3: Any) -> None:
+@pytest.mark.slow
+def test_a_name_that_is_a_pattern_means_itself(tmp_path: Path, s3: S3Store) -> None:
     logs = named_logs(tmp_path / "logs", "d1", "d[1]")
-    for url in (URL, "s3://cars/odd"):
+    for url in (URL, f"{s3.url}/odd"):
         for start in ("1", "2"):
             run(logs, url, config=RunConfig(keep="metrics", start=start))
         run(logs, url, config=RunConfig(keep="metrics", start="2"), only=["d[1]"])
@@ -218,7 +219,8 @@ def test_what_has_lost_its_hold_ends(tmp_path: Path, memory: Any, monkeypatch: p
     memory.rm(lock)
 
 
-def test_what_cannot_be_an_output_is_told_in_one_line(tmp_path: Path, s3: Any) -> None:
+@pytest.mark.slow
+def test_what_cannot_be_an_output_is_told_in_one_line(tmp_path: Path, s3: S3Store) -> None:
     logs = named_logs(tmp_path / "logs", "a")
     for url, error, match in (
         ("https://user:secret@host/out", UsageError, "https://host/out: expected a folder, or a URL"),
@@ -228,14 +230,14 @@ def test_what_cannot_be_an_output_is_told_in_one_line(tmp_path: Path, s3: Any) -
         with pytest.raises(error, match=match) as raised:
             run(logs, url)
         assert "secret" not in str(raised.value) and "\n" not in str(raised.value)
-    with pytest.raises(OutputError, match=r"s3://cars/none: .* without run\.json"):
-        open_run("s3://cars/none")
-    s3.put_object(Bucket="cars", Key="out/logs/a/annotated.mcap", Body=b"x")
+    with pytest.raises(OutputError, match=rf"{s3.url}/none: .* without run\.json"):
+        open_run(f"{s3.url}/none")
+    s3.put("out/logs/a/annotated.mcap", b"x")
     with pytest.raises(UsageError, match="which lies in it"):
-        run(["s3://cars/out/logs/a/annotated.mcap"], "s3://cars/out")
-    s3.put_object(Bucket="cars", Key=f"held/{LOCK_FILE}", Body=b"00000000-17-1")
+        run([f"{s3.url}/out/logs/a/annotated.mcap"], f"{s3.url}/out")
+    s3.put(f"held/{LOCK_FILE}", b"00000000-17-1")
     with pytest.raises(HeldError):
-        run(logs, "s3://cars/held")
+        run(logs, f"{s3.url}/held")
 
 
 @pytest.mark.parametrize("command", [("slim", "x"), ("metrics", "x")])
@@ -250,16 +252,13 @@ def test_what_writes_to_folders_alone_takes_no_url(
     assert not list(tmp_path.iterdir())
 
 
-def test_without_credentials_there_is_one_line(tmp_path: Path, s3: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    import s3fs
-
+@pytest.mark.slow
+def test_without_credentials_there_is_one_line(tmp_path: Path, s3: S3Store, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.delenv(name)
     monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
     monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "none"))
-    s3fs.S3FileSystem.clear_instance_cache()
-    object_store._opened.cache_clear()
+    forget_file_systems()
     with pytest.raises(OutputError, match="no credentials; give credentials that may write"):
-        run(named_logs(tmp_path / "logs", "a"), "s3://cars/out")
-    s3fs.S3FileSystem.clear_instance_cache()
-    object_store._opened.cache_clear()
+        run(named_logs(tmp_path / "logs", "a"), f"{s3.url}/out")
+    forget_file_systems()

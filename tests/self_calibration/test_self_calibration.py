@@ -91,6 +91,7 @@ def test_the_calibrated_vehicle_reads_its_signals_with_what_was_found() -> None:
     assert calibration.own is RIGHT
 
 
+@pytest.mark.slow
 def test_a_file_that_contradicts_the_drive_is_told() -> None:
     slow = drive(sweep(0.01), 40.0).signals
     agrees, contradicts = (self_calibrate([driving(slow, v)], v).understeer for v in (RIGHT, wrong(2.0, 0.6)))
@@ -107,6 +108,7 @@ def test_too_little_or_too_slow_driving_is_refused() -> None:
     assert "0 s above" in slow.refused
 
 
+@pytest.mark.slow
 def test_straight_driving_leaves_the_file_as_it_stands() -> None:
     straight = found(with_noise(drive(lambda _t: 0.0, 60.0).signals, 5), RIGHT)
     assert "cornering stiffness" in straight.refused
@@ -181,6 +183,7 @@ def test_the_vehicles_of_the_band_spread_as_the_posterior_does() -> None:
         assert 0.7 * sd < math.sqrt(sum(x**2 for x in away)) < 1.05 * sd
 
 
+@pytest.mark.slow
 def test_less_driving_spreads_them_wider() -> None:
     def spread(signals: Signals) -> float:
         of = found(signals, RIGHT)

@@ -386,6 +386,7 @@ def test_sidecar_holds_our_topics_alone(tmp_path, circle):
     assert set(OUR_TOPICS) <= rows
 
 
+@pytest.mark.slow
 def test_bags_become_ros2(tmp_path, shared_dir, circle):
     log = open_log(shared_dir / "data" / "drives" / "f1tenth_hoons_run2.bag")
     path = tmp_path / "annotated.mcap"

@@ -173,6 +173,7 @@ def test_schema_misses_every_part(part):
         validate(report, "report.schema.json")
 
 
+@pytest.mark.slow
 def test_schema_refuses_a_skip_without_reason_and_a_path():
     report = build_report(facts())
     report["estimators"][1]["reason"] = None

@@ -75,6 +75,7 @@ def test_white_noise_of_each_channel_has_the_stated_sigma(straight: Motion) -> N
     assert np.abs(np.corrcoef(errors) - np.eye(3)).max() < 0.03
 
 
+@pytest.mark.slow
 def test_biases_are_drawn_per_drive() -> None:
     motion = record(Plan(20.0, 1.0, steer_rad=np.zeros(1001)))
     noise = NO_NOISE._replace(
@@ -241,6 +242,7 @@ def test_sensors_end_at_their_full_scale(lane_change: Motion) -> None:
     assert np.abs(a_y / step - np.round(a_y / step)).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_the_bus_loses_its_share_of_messages(straight: Motion) -> None:
     usual = sense(straight, Vehicle(), SensorNoise(), 3, 100)
     lossy = sense(straight, Vehicle(), SensorNoise(message_loss=0.1), 3, 100)

@@ -138,6 +138,7 @@ def test_an_hour_of_healthy_driving_reports_one_fault_at_most():
     assert raised > 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [5.0, 15.0])
 def test_a_car_rougher_than_its_file_is_healthy_from_the_start(factor):
     assert not found(road(8, factor=factor)).reason.any()
@@ -169,6 +170,7 @@ def test_a_biased_channel_is_not_noisy(clean):
     assert np.mean(result.reason & (reasons.BURST_AY | reasons.BURST_YAW_RATE) > 0) < 0.005
 
 
+@pytest.mark.slow
 def test_a_rough_car_becomes_usual():
     """Five times the file's noise from 10 s on: a burst at first, what this car is like in the end."""
     s = with_noise(drive(slalom(0.02, 0.3), 100.0, speed=20.0).signals, seed=1)
@@ -225,6 +227,7 @@ def test_five_identical_samples_are_stuck_and_reported_a_little_later(channel, v
     np.testing.assert_array_equal(told, bad & (t - t[first] > sf.STUCK_REPORTED_AFTER_S - 0.005))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quantum", [0.002, 0.01, 0.02])
 def test_a_quantised_gyro_is_not_stuck(quantum):
     """Quiet and coarse: on straights it repeats for seconds."""

@@ -62,6 +62,7 @@ from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.outputs import OutputFolder, check_no_input, local_path
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import NO_MODEL
+from pdhef_logtool.residual_model.torch_extra import check_torch
 from pdhef_logtool.sinks.report import json_bytes
 
 FORMAT, FORMAT_VERSION = "pdhef-learn", 1
@@ -231,6 +232,8 @@ def _check(settings: CourseSettings, output: Path) -> None:
         raise UsageError(
             expected="a car's folder", got=output.name, where="--output", remedy="learn writes more than a file holds"
         )
+    if str(settings.config.network) != NO_MODEL:
+        check_torch(f"; --network {NO_MODEL} trains none")
 
 
 def _read(

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import torch
 
 from pdhef_logtool.records.documents import is_sealed, seal
 from pdhef_logtool.records.errors import ModelError
@@ -31,6 +30,10 @@ from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import OUTPUT_COUNT, RESIDUAL, ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES, ONE_CAR_FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork, State
+
+# isort: split
+# Behind the network, which checks that PyTorch is installed.
+import torch
 
 CHECKPOINT = "checkpoint.safetensors"
 

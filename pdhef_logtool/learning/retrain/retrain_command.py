@@ -48,6 +48,7 @@ from pdhef_logtool.records.files import write_bytes, writing
 from pdhef_logtool.records.outputs import FolderTransaction, OutputFolder, check_no_input
 from pdhef_logtool.records.supervisor import supervise
 from pdhef_logtool.residual_model.bundle import MANY_CARS, NO_MODEL, open_model
+from pdhef_logtool.residual_model.torch_extra import check_torch
 from pdhef_logtool.results.comparing import compare_runs
 from pdhef_logtool.results.gate import Figure, Gate
 from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES, open_run
@@ -182,6 +183,7 @@ def retrain(
     PdhefError
         A stage fails.
     """
+    check_torch()
     config = settings.config
     car = open_car(config, None, warn)
     inputs = find_logs(arguments, private_redirects=config.allow_private_redirects)

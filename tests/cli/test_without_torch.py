@@ -1,0 +1,82 @@
+"""PyTorch is an extra: only what trains a network needs it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+#: Read by every Python process that starts, workers too: as if PyTorch were not installed.
+_BLOCKED = "import sys\nsys.modules['torch'] = None\n"
+_CODE = """
+import contextlib, io, sys
+from pdhef_logtool.cli.app import main
+for line in sys.stdin.read().splitlines():
+    sys.argv, said = ["pdhef", *line.split("|")], io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            main()
+        code = 0
+    except SystemExit as ended:
+        code = ended.code or 0
+    print("ended:", line.split("|")[0], code, " ".join(said.getvalue().split()), flush=True)
+"""
+RUN = ("run", "sample_logs/dlc.mcap", "--car", "saloon", "--end", "2", "-e", "pd-hef,physics", "--annotate", "none")
+
+
+def ended_without_torch(folder: Path, *commands: tuple[object, ...]) -> list[str]:
+    """Run commands in a process of their own; return their names, exit codes and lines on stderr."""
+    (folder / "sitecustomize.py").write_text(_BLOCKED)
+    done = subprocess.run(
+        [sys.executable, "-c", _CODE],
+        input="\n".join("|".join(map(str, words)) for words in commands),
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return [line.removeprefix("ended: ") for line in done.stdout.splitlines() if line.startswith("ended: ")]
+
+
+@pytest.mark.slow
+def test_what_trains_no_network_works_without_it(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    ended = ended_without_torch(
+        tmp_path,
+        (*RUN, "-o", out),
+        (*RUN, "-o", tmp_path / "other", "--no-report"),
+        ("compare", out, tmp_path / "other"),
+        ("inspect", "sample_logs/dlc.mcap"),
+        ("simulate", "step-steer", "-o", tmp_path / "step.mcap"),
+        ("extract", "sample_logs/dlc.mcap", "--car", "saloon", "--end", "3", "-o", tmp_path / "residuals"),
+    )
+    assert [line.split()[:2] for line in ended] == [
+        [name, "0"] for name in ("run", "run", "compare", "inspect", "simulate", "extract")
+    ], ended
+    assert (out / "logs/dlc/report.html").is_file()
+
+
+@pytest.mark.slow
+def test_what_trains_one_ends_with_one_line(tmp_path: Path) -> None:
+    car = ("--car", "saloon", "-o", tmp_path / "car")
+    trained = ("train", tmp_path, "-o", tmp_path / "network")
+    ended = ended_without_torch(
+        tmp_path,
+        trained,
+        (*trained, "--baselines"),
+        ("retrain", "sample_logs/dlc.mcap", *car),
+        ("learn", "sample_logs/dlc.mcap", *car),
+        ("learn", "sample_logs/dlc.mcap", *car, "--network", "none", "--holdout", "2"),
+    )
+    *without, other = ended
+    remedy = "got an installation without it; pip install 'pdhef-logtool[train]'"
+    for line, name in zip(without, ("train", "train", "retrain", "learn"), strict=True):
+        assert line.startswith(f"{name} 2 ") and remedy in line, line
+    assert without[-1].endswith("; --network none trains none")
+    assert other.startswith("learn 2 ") and "--holdout" in other, "what trains no network asks for nothing"
+    assert not (tmp_path / "car").exists() and not (tmp_path / "network").exists()
