@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, fields
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
+from unittest.mock import patch
 
 #: What no case may take.
 LIMIT_S = 10.0
@@ -60,17 +61,22 @@ def command(*arguments: str) -> Ended:
 
     out, err = io.StringIO(), io.StringIO()
     code: int | str | None = 0
-    argv, sys.argv = sys.argv, ["pdhef", *arguments]
-    os.environ["PDHEF_TRACEBACK"] = "1"
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        with (
+            patch.dict(os.environ, PDHEF_TRACEBACK="1"),
+            patch.object(sys, "argv", ["pdhef", *arguments]),
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+        ):
             main()
     except SystemExit as exit_:
         code = exit_.code
     except Exception:  # noqa: BLE001 (this is what is looked for)
         return Ended(1, out.getvalue(), f"internal error\n{traceback.format_exc()}")
     finally:
-        sys.argv = argv
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
     return Ended(code if isinstance(code, int) else 1, out.getvalue(), err.getvalue())
 
 

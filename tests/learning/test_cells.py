@@ -63,7 +63,9 @@ def test_a_choice_holds_at_most_so_much_depends_on_no_order_and_shrinks_as_the_s
     for number in (3, 7):
         held = sum(float((c == number).sum()) * 0.1 for c, _, _ in drives)
         chosen = sum(float((is_chosen(c, d, limits) & (c == number)).sum()) * 0.1 for c, d, _ in drives)
-        assert chosen <= most_s + 1e-6 and (held <= most_s) == (limits[number] == 1.0)
+        assert chosen <= most_s + 1e-6
+        if abs(held - most_s) > 1e-6:  # else rounding decides
+            assert (held <= most_s) == (limits[number] == 1.0)
         assert chosen > min(held, most_s) - 1.0 - 1e-6, "a second more would fit"
         assert limits[number] <= fewer[number]
     assert [x for i, x in enumerate(limits) if i not in (3, 7)] == [1.0] * (COUNT - 2)
