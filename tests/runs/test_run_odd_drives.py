@@ -27,6 +27,9 @@ from studies.torture.numerics import NUMERICS, Drive, read_samples, write_sample
 class _Silent:
     """An estimator that is never sure of anything."""
 
+    algorithm = "silent"
+    version = 1
+
     name: str = "silent"
     causal: bool = True
 
