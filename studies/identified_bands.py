@@ -87,7 +87,7 @@ def identified(one: Simulated) -> Car:
 def judged(car: Car, fit: Simulated, one: Simulated) -> Judged:
     """Judge the band of a car on a drive."""
     estimator, signals = make_estimator(PHYSICS, car), one.drive.signals
-    plain, _ = run_window(estimator, signals, None, None)
+    plain, _ = run_window(estimator, signals)
     wide = calibrator(car, [estimator]).add(plain, signals)
     error = one.error(plain)
     known = np.isfinite(error) & np.isfinite(plain.sideslip_std_rad)
@@ -105,7 +105,7 @@ def judged(car: Car, fit: Simulated, one: Simulated) -> Judged:
 
 
 def _smoothed_rmse(car: Car, one: Simulated, known: BoolArray) -> float:
-    track, _ = run_window(make_estimator(SMOOTHED, car), one.drive.signals, None, None)
+    track, _ = run_window(make_estimator(SMOOTHED, car), one.drive.signals)
     return root_mean_square(one.error(track)[known])
 
 

@@ -31,6 +31,7 @@ from pdhef_logtool.records.errors import PdhefError, SimulationError
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.estimating import calibrator
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.guard import FACTOR, SIMPLE
 from pdhef_logtool.runs.self_calibrating import log_sensors
@@ -150,7 +151,8 @@ def taken(signals: Signals, file: VehicleParameters, found: SelfCalibration) -> 
 def band_of(drive: WholeDrive, car: Car) -> tuple[float, float]:
     """Return how much of the sideslip errors the 95 % band of ``physics`` holds, and its mean whole width over RMSE."""
     assert drive.truth is not None
-    track, _ = run_window(make_estimator("physics", car), drive.signals, None, None)
+    estimator = make_estimator("physics", car)
+    track = calibrator(car, [estimator]).add(run_window(estimator, drive.signals)[0], drive.signals)
     error = signal_error(track, drive.truth, SIDESLIP, car.vehicle.low_speed_blend_m_s)
     known = np.isfinite(error) & np.isfinite(track.sideslip_std_rad)
     error, half = error[known], NORMAL_95 * track.sideslip_std_rad[known]
@@ -171,7 +173,7 @@ def errors_of(
         if name == "physics" and car.self_calibrated is None and "physics" not in car.noise:
             car = car.with_noise("physics", found.noise.model_copy(update={"r_std": {}}))
         used = "open-loop" if name == OPEN_LOOP and car.self_calibrated is None else name
-        track, _ = run_window(make_estimator(used, car), drive.signals, None, None)
+        track, _ = run_window(make_estimator(used, car), drive.signals)
         rows = d2_rows([track], drive.signals, whole, log="", low_speed_m_s=low, sensors=sensors)
         rmse = float(np.degrees(np.sqrt(np.nanmean(signal_error(track, truth, SIDESLIP, low) ** 2))))
         errors[name] = rmse, rows[0].value if rows else float("nan")

@@ -70,7 +70,7 @@ def roads() -> tuple[dict[str, list[float]], dict[str, list[float]]]:
         assert drive.truth is not None
         for name in ON_ROADS:
             estimator = make_estimator(name, car)
-            plain, _ = run_window(estimator, drive.signals, None, None)
+            plain, _ = run_window(estimator, drive.signals)
             track = calibrator(car, [estimator]).add(plain, drive.signals)
             error = signal_error(track, drive.truth, SIDESLIP, car.vehicle.low_speed_blend_m_s)
             known = np.isfinite(error)

@@ -51,10 +51,16 @@ def run_window(
     before : state that the previous window returned, None at the start of a log.
     ahead : signals that follow the window, for an estimator that looks ahead.
     causality : checks the steps of an estimator that declares itself causal.
+
+    Raises
+    ------
+    EstimatorError
+        The estimator did not return one step per sample.
     """
     state = None if before is None else before.estimator
     copied = None if causality is None else causality.state_before(estimator, state)
     steps, state = run_steps(estimator, signals, state, ahead)
+    _check_steps(estimator, signals, steps)
     if causality is not None:
         causality.check(estimator, signals, copied, steps)
     track, pending = compensate(estimator, signals, steps, None if before is None else before.pending)
@@ -64,17 +70,7 @@ def run_window(
 def compensate(
     estimator: Estimator, signals: Signals, steps: Any, before: PendingSteps | None = None
 ) -> tuple[StateTrack, PendingSteps]:
-    """Return the track of an estimator's steps of a window at its stamps, and the steps that stay pending.
-
-    Raises
-    ------
-    EstimatorError
-        The estimator did not return one step per sample.
-    """
-    if len(steps.valid) != len(signals):
-        raise EstimatorError(
-            expected=f"one step per sample, {len(signals)}", got=str(len(steps.valid)), where=estimator.name
-        )
+    """Return the track of an estimator's steps of a window at its stamps, and the steps that stay pending."""
     ready_ns = signals.stamps_ns if look_ahead_of(estimator) else signals.ready_ns
     pending = PendingSteps(signals.stamps_ns, ready_ns, steps)
     if before is not None:
@@ -82,3 +78,14 @@ def compensate(
     chosen = extrapolation(pending.stamps_ns, pending.ready_ns, pending.steps.valid, signals.stamps_ns)
     track = predict_track(estimator, pending.steps, chosen, signals.stamps_ns)
     return track, pending.since(release(pending.ready_ns, signals.stamps_ns).needed)
+
+
+def _check_steps(estimator: Estimator, signals: Signals, steps: Any) -> None:
+    is_record = isinstance(steps, StepColumns)
+    if not is_record or len(steps.valid) != len(signals):
+        raise EstimatorError(
+            expected=f"steps, one per sample ({len(signals)})",
+            got=f"{len(steps.valid)} steps" if is_record else type(steps).__name__,
+            where=estimator.name,
+            remedy="return Steps, or a StepColumns record with a column named valid",
+        )

@@ -75,13 +75,10 @@ arrayobj.raise_with_shape_context = _sizes_differ
 
 
 def njit(function: Any = None, *, cache: bool = False, **options: Any) -> Any:
-    """Compile a function as ``numba.njit`` does; ``cache`` keeps its machine code as said above.
-
-    A function with ``forceinline`` can be called by compiled functions alone: it is compiled without what Python needs.
-    """
+    """Compile a function as ``numba.njit`` does; ``cache`` keeps its machine code as said above."""
     if function is None:
         return functools.partial(njit, cache=cache, **options)
-    options |= {"no_cfunc_wrapper": True, "no_cpython_wrapper": bool(options.get("forceinline"))}
+    options |= {"no_cfunc_wrapper": True}
     compiled = numba.njit(function, **options)
     if cache and not config.DISABLE_JIT:
         compiled._cache = _Cache(function)

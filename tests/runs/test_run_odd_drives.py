@@ -14,8 +14,8 @@ import typer
 
 from pdhef_logtool.cli.running import _finish
 from pdhef_logtool.estimators import table
+from pdhef_logtool.estimators.base import Steps
 from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.runs import pipeline
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
@@ -33,10 +33,9 @@ class _Silent:
     name: str = "silent"
     causal: bool = True
 
-    def run(self, signals: Signals, carry: object) -> tuple[StateTrack, None]:
-        known = np.zeros(len(signals), np.bool_)
-        zeros = np.zeros(len(signals))
-        return make_track(self.name, signals.stamps_ns, vx_m_s=zeros, vy_m_s=zeros, valid=known), None
+    def run(self, signals: Signals, state: object) -> tuple[Steps, None]:
+        nothing = np.zeros((len(signals), 4))
+        return Steps(nothing, nothing, np.zeros(len(signals), np.bool_)), None
 
 
 @pytest.fixture

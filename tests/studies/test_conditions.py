@@ -81,7 +81,7 @@ def test_the_page_has_every_row_and_its_pooled_figure_is_that_of_the_samples(mad
     for entry in manifest["drives"]:
         if entry["row"] == "in-domain":
             drive = read_drive(folder / entry["file"], car)
-            track, _ = make_estimator("zero", car).run(drive.signals, None)
+            track, _ = run_window(make_estimator("zero", car), drive.signals)
             truth = drive.truth
             scored = track.valid & (np.hypot(truth.vx_m_s, truth.vy_m_s) > vehicle.low_speed_blend_m_s)
             squares += float(np.sum(truth.sideslip_rad[scored] ** 2))  # the error of sideslip 0

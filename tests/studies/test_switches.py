@@ -8,6 +8,7 @@ import pytest
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.base import Steps, make_steps
 from pdhef_logtool.estimators.physics import PhysicsUkf
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.estimators.table import make_estimator
@@ -63,9 +64,11 @@ def test_steering_that_counts_when_it_arrives_is_old_and_nothing_waits_for_it(dr
     seen: list[Signals] = []
 
     class Watching:
-        def run(self, signals: Signals, _carry: None) -> tuple[None, None]:
+        name, causal = "watching", True
+
+        def run(self, signals: Signals, _state: None) -> tuple[Steps, None]:
             seen.append(signals)
-            return None, None
+            return make_steps(*np.zeros((3, len(signals)))), None
 
     switches.run_late_steering(Watching(), drive)  # type: ignore[arg-type]
     late = round(switches.LATE_S / 0.01)
