@@ -199,6 +199,7 @@ def _pdhef(package: Path, *arguments: object) -> tuple[int, str, str]:
     return done.returncode, done.stdout, done.stderr
 
 
+@pytest.mark.slow
 def test_a_fleet_of_tables_runs_in_several_processes(package: Path, npz: Path, tmp_path: Path) -> None:
     logs = tmp_path / "logs"
     for name in ("one", "two"):
