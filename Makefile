@@ -132,8 +132,9 @@ retrain: $(VENV)/installed-dev $(VENV)/compiled
 	$(if $(LOGS),$(BIN)/pdhef retrain $(LOGS) -o $(if $(filter out/demo,$(OUT)),out/retrain,$(OUT)) --car $(CAR) --jobs $(JOBS),\
 	  OMP_NUM_THREADS=1 $(BIN)/python -m studies.retrain --jobs $(JOBS))
 
+# Without --quiet, which would hide the warnings that make it fail.
 docs: $(VENV)/installed-docs
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 	@echo "Site: out/site/index.html"
 
 samples: $(VENV)/installed $(VENV)/compiled

@@ -49,7 +49,11 @@ def mathml(latex: str, *, block: bool = False) -> str:
         markup = convert(latex, display="block" if block else "inline")
     except Exception as error:  # of many types, none of which is documented
         raise PluginError(f"equation not understood: {latex} ({error!r})") from error
-    if "\\" in markup or "&<" in markup:  # an unknown command, or an alignment that MathML has no sign for
+    bare = re.sub(r"\\[{}]", "", latex)
+    sides = [len(re.findall(rf"\\{side}(?![a-z])", latex)) for side in ("left", "right")]
+    is_balanced = bare.count("{") == bare.count("}") and sides[0] == sides[1]
+    # What the converter leaves: an unknown command, or an alignment, which it has no markup for.
+    if "\\" in markup or "&<" in markup or not is_balanced:
         raise PluginError(f"equation not understood: {latex}")
     markup = _FUNCTION.sub(r"\1<mspace width='0.167em'/>", markup)
     return markup.replace("<mo>&#x0007C;</mo>", "<mo lspace='0' rspace='0'>&#x0007C;</mo>")

@@ -1,8 +1,8 @@
 """Divergence that no innovation shows: the estimate's own changes of v_y against accelerometer and gyro.
 
 Behind the peak of a tyre's force two sideslips give the same a_y and nearly the same yaw rate. A filter can be carried
-to the wrong one of them and then agrees with all its sensors: its normalised innovation stays small (METHOD §12). The
-way there betrays it. At the IMU, whatever the tyres do,
+to the wrong one of them and then agrees with all its sensors: its normalised innovation stays small
+(docs/method.md#divergence). The way there betrays it. At the IMU, whatever the tyres do,
 
     v̇_y,i = a_y / (1 + g K_φ) − v_x,i r,    v_x,i = v_x − y_i r,  v_y,i = v_y + x_i r,
 

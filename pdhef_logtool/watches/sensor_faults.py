@@ -1,4 +1,4 @@
-"""Faults of accelerometer and gyro found without the filter (METHOD §15, bottom layer): noise, spikes, stuck, dead.
+"""Faults of accelerometer and gyro found without the filter (docs/method.md#faults): noise, spikes, stuck, dead.
 
 Nothing here looks at an innovation of a filter with the network in it, so that a model error cannot be read as noise.
 For each of a_y and yaw rate:
