@@ -113,6 +113,7 @@ lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python tests/language_check.py
 
 format: $(VENV)/installed-dev
 	$(BIN)/ruff format .
