@@ -1,4 +1,4 @@
-"""The nominal 3-DOF single-track model f_nom and its measurement function, compiled (METHOD §2, Eq 1-4).
+"""The nominal 3-DOF single-track model f_nom and its measurement function, compiled (docs/method.md#model, Eq 1-4).
 
 State [v_x, v_y, r] at the centre of gravity, ISO 8855, SI. Below the vehicle's low-speed limit the slip angles are
 singular, so that the model blends to the kinematic single-track model, whose lateral velocity and yaw rate follow
@@ -49,7 +49,7 @@ class ModelParameters(NamedTuple):
 def model_parameters(vehicle: VehicleParameters, *, roll_correction: bool = False) -> ModelParameters:
     """Flatten vehicle parameters for the compiled model.
 
-    With ``roll_correction`` the measured a_y is taken as (1 + g·K_φ) times the planar one (METHOD §3).
+    With ``roll_correction`` the measured a_y is taken as (1 + g·K_φ) times the planar one (docs/method.md#model).
     """
     bf, cf, df, ef = vehicle.magic_formula(True, 1.0)
     br, cr, dr, er = vehicle.magic_formula(False, 1.0)
@@ -78,7 +78,7 @@ def model_parameters(vehicle: VehicleParameters, *, roll_correction: bool = Fals
 
 @njit(cache=True)
 def magic_formula_force(alpha, B, C, D_n, E, fixed_stiffness, friction):  # type: ignore[no-untyped-def]
-    """Return the lateral axle force in N at slip angle ``alpha`` in rad (Eq 3)."""
+    """Return the lateral axle force in N at slip angle ``alpha`` in rad (Eq 2)."""
     b = B / friction if fixed_stiffness else B
     ba = b * alpha
     return friction * D_n * math.sin(C * math.atan(ba - E * (ba - math.atan(ba))))
@@ -93,7 +93,7 @@ def dynamic_share(vx, p):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def lateral_acceleration_and_yaw_acceleration(vx, vy, r, steer, friction, p, force_scale=1.0):  # type: ignore[no-untyped-def]
-    """Return (F_yf cos δ + F_yr)/m in m/s² and (l_f F_yf cos δ − l_r F_yr)/I_z in rad/s² (Eq 1, 2).
+    """Return (F_yf cos δ + F_yr)/m in m/s² and (l_f F_yf cos δ − l_r F_yr)/I_z in rad/s² (Eq 1-4).
 
     ``force_scale`` multiplies both axles' forces.
     """

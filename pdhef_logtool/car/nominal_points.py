@@ -114,7 +114,7 @@ def _constants(friction, p):  # type: ignore[no-untyped-def]
 
 @_inline
 def _axle_accelerations(vx, vy, r, steer, cos_steer, force, c, p):  # type: ignore[no-untyped-def]
-    """Return a_y in m/s² and the yaw acceleration in rad/s² (Eq 1-3), as the function of the nominal model does."""
+    """Return a_y in m/s² and the yaw acceleration in rad/s² (Eq 1-4), as the function of the nominal model does."""
     v = max(vx, p.blend_low_m_s)
     front = c.b_front * (steer - arctangent(vy + p.front_m * r, v))
     rear = -c.b_rear * arctangent(vy - p.rear_m * r, v)

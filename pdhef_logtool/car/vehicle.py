@@ -46,9 +46,9 @@ class Record(BaseModel):
 
 
 class AxleTyre(Record):
-    """Axle magic formula at friction 1 (METHOD Eq 3), or a cornering stiffness alone.
+    """Axle magic formula at friction 1 (Eq 2, docs/method.md#model), or a cornering stiffness alone.
 
-    ``D_n`` is the axle's peak force in N at friction 1. Eq 3 scales the whole curve with friction, its stiffness too;
+    ``D_n`` is the axle's peak force in N at friction 1. Eq 2 scales the whole curve with friction, its stiffness too;
     real tyres keep theirs. With ``reference_friction``, the friction that the curve was measured at, B becomes
     B · reference / friction: the peak follows friction, the stiffness stays (similarity, Pacejka 2012, section 4.2).
     A tyre that is given by ``cornering_stiffness_n_per_rad`` keeps that stiffness at any friction and saturates at
@@ -91,7 +91,7 @@ class Sensors(Record):
     A bias is what the sensor reads too much, ``yaw_rate_gain`` what the gyro reads of 1; both are taken off before any
     estimator sees the signal. ``yaw_rate_delay_s`` is what the gyro's stamps are late by; unless it is 0 it stands in
     place of the mapping's ``latency_s``. ``*_bias_std`` is the 1-sigma of what is left of a bias from drive to drive,
-    for the filters that estimate it. The defaults are METHOD §9's for a production car's sensors.
+    for the filters that estimate it. The defaults are those of a production car (docs/method.md#sensors).
     """
 
     ax_std_m_s2: AccelerationStd = 0.12
@@ -115,7 +115,10 @@ class Sensors(Record):
 
 
 class PhysicsParts(Record):
-    """Which parts of the model ``physics`` has beside the static single track (METHOD §16); each needs evidence."""
+    """Which parts of the model ``physics`` has beside the static single track; each needs evidence.
+
+    See docs/method.md#physics.
+    """
 
     lag: bool = False
     load_transfer: bool = False
@@ -132,7 +135,9 @@ class PhysicsParts(Record):
 
 
 class VehicleParameters(Record):
-    """Everything that the nominal single-track model needs to know of a vehicle (DESIGN §8). SI units, ISO 8855.
+    """Everything that the nominal single-track model needs to know of a vehicle. SI units, ISO 8855.
+
+    See docs/formats.md#vehicletoml.
 
     Ranges reach from a 1:10 car to a truck of 40 t; what only contradicts another entry is found by the relations.
     """
@@ -153,15 +158,17 @@ class VehicleParameters(Record):
     imu_position_m: Position = (0.0, 0.0, 0.0)
     truth_position_m: Position = (0.0, 0.0, 0.0)
     low_speed_blend_m_s: Annotated[float, Field(ge=0.01, le=30)] = 3.0
-    #: Way over which a lateral axle force builds up; 0.3-0.7 m for car tyres (METHOD §13; Pacejka 2012, chapter 7).
+    #: Way over which a lateral axle force builds up; 0.3-0.7 m for car tyres (docs/method.md#physics; Pacejka 2012,
+    #: chapter 7).
     relaxation_length_m: Annotated[float, Field(ge=0, le=10)] = 0.5
     #: Share of lateral force per load that a tyre loses for each relative excess of load: −p_Dy2/p_Dy1, 0.145/0.990 for
     #: the 205/60 R15 of Pacejka 2012, appendix 3.
     load_sensitivity: Annotated[float, Field(ge=0, lt=1)] = 0.15
-    #: Undamped natural frequency and damping ratio of body roll; 1.5-2 Hz and 0.3-0.4 for cars (METHOD §16).
+    #: Undamped natural frequency and damping ratio of body roll; 1.5-2 Hz and 0.3-0.4 for cars
+    #: (docs/method.md#physics).
     roll_frequency_rad_s: Annotated[float, Field(ge=2, le=60)] = 11.0
     roll_damping: Annotated[float, Field(ge=0.02, le=3)] = 0.35
-    #: 0.7 of the height of the CG for the default sedan (METHOD §16).
+    #: 0.7 of the height of the CG for the default sedan (docs/method.md#physics).
     cg_over_roll_axis_m: Annotated[float, Field(ge=0, le=3)] = 0.4
     physics: PhysicsParts = PhysicsParts()
     sensors: Sensors = Sensors()
@@ -197,7 +204,7 @@ class VehicleParameters(Record):
                 # From ice that the file calls friction 1 to a racing tyre's 2, twice that for a crude curve.
                 peak = self.magic_formula(front, 1.0)[2] / load
                 yield f"peak force {over}", f"tyres.{axle}.D_n mass_kg", (peak,), 0.1, 5.0
-            # Per rad: trucks and 1:10 cars 5, cars 8 to 25, racing cars 40. Eq 3 scales it with friction, so that a
+            # Per rad: trucks and 1:10 cars 5, cars 8 to 25, racing cars 40. Eq 2 scales it with friction, so that a
             # curve may be a plausible one at friction 1 or at the file's.
             slopes = tuple(self.cornering_stiffness_n_per_rad(front, mu) / load for mu in (1.0, self.assumed_friction))
             yield f"cornering stiffness {over} in 1/rad", f"tyres.{axle} mass_kg", slopes, 2.0, 100.0
@@ -224,7 +231,7 @@ class VehicleParameters(Record):
 
     @property
     def assumed_friction(self) -> float:
-        """Friction of the file, or 1 where the file says nothing (DESIGN §8)."""
+        """Friction of the file, or 1 where the file says nothing (docs/formats.md#vehicletoml)."""
         return 1.0 if self.friction is None else self.friction
 
     def axle_load_n(self, front: bool) -> float:
@@ -283,12 +290,12 @@ def corrected_anew(signals: Signals, was: VehicleParameters, vehicle: VehiclePar
     return correct_signals(raw, vehicle)
 
 
-#: Table 3 of the paper, with METHOD §2's nominal axle tyres. Used when no vehicle file is given.
+#: Table 3 of the paper, with axle tyres fitted at friction 0.85. Used when no vehicle file is given.
 DEFAULT_VEHICLE_NAME = "sedan"
 
 
 def default_vehicle() -> VehicleParameters:
-    """Return the paper's sedan (Table 3) with METHOD §2's tyres at friction 0.85."""
+    """Return the paper's sedan (Table 3) with nominal tyres at friction 0.85."""
     return VehicleParameters(
         name=DEFAULT_VEHICLE_NAME,
         mass_kg=1440.0,

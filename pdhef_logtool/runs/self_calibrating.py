@@ -1,4 +1,7 @@
-"""The first pass over a log, in which it calibrates its car without truth (METHOD §17), and what comes of it."""
+"""The first pass over a log, in which it calibrates its car without truth, and what comes of it.
+
+See docs/method.md#self-calibration.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""``pdhef identify --without-truth``: a pool of logs calibrates its car on the sensors alone (METHOD §17).
+"""``pdhef identify --without-truth``: a pool of logs calibrates its car on the sensors alone.
+
+See docs/method.md#self-calibration.
 
 One log's calibration serves that log, and on another it can be absurd: only pools are written to a car.
 """
