@@ -161,13 +161,13 @@ def work_size(count):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def place_count(points):  # type: ignore[no-untyped-def]
-    """Return for how many points a work array has room; all of them must hold finite numbers."""
+    """Return for how many points a work array has room; all of them must be finite."""
     return points.shape[0] // BLOCK * WIDTH
 
 
 @njit(forceinline=True)
 def place(i):  # type: ignore[no-untyped-def]
-    """Return where in the work array the first quantity of point ``i`` stands; the others are AT_... behind it."""
+    """Return the index of the first quantity of point ``i`` in the work array; the others follow at AT_...."""
     return i // WIDTH * BLOCK + i % WIDTH
 
 
