@@ -13,18 +13,11 @@ if TYPE_CHECKING:
     from pdhef_logtool.drive.reading import Drive as Drive
     from pdhef_logtool.drive.reading import read_drive as read_drive
     from pdhef_logtool.inspection import inspect_log as inspect_log
-    from pdhef_logtool.learning.car.identify_command import identify as identify
     from pdhef_logtool.learning.drives import LearnSettings as LearnSettings
-    from pdhef_logtool.learning.evidence.calibrate_command import CalibrateSettings as CalibrateSettings
-    from pdhef_logtool.learning.evidence.calibrate_command import calibrate as calibrate
-    from pdhef_logtool.learning.evidence.trust_command import trust as trust
-    from pdhef_logtool.learning.learn.learn_command import CourseSettings as CourseSettings
-    from pdhef_logtool.learning.learn.learn_command import learn as learn
+    from pdhef_logtool.learning.engine import learn as learn
     from pdhef_logtool.learning.network.extract_command import ExtractSettings as ExtractSettings
     from pdhef_logtool.learning.network.extract_command import extract as extract
     from pdhef_logtool.learning.network.train_command import run_training as train  # noqa: F401
-    from pdhef_logtool.learning.noise.tune_command import TuneSettings as TuneSettings
-    from pdhef_logtool.learning.noise.tune_command import tune as tune
     from pdhef_logtool.mapping import load_mapping as load_mapping
     from pdhef_logtool.records.errors import PdhefError as PdhefError
     from pdhef_logtool.runs.config import RunConfig as RunConfig
@@ -41,18 +34,11 @@ _HOMES = {
     "Drive": "drive.reading",
     "read_drive": "drive.reading",
     "inspect_log": "inspection",
-    "identify": "learning.car.identify_command",
     "LearnSettings": "learning.drives",
-    "CalibrateSettings": "learning.evidence.calibrate_command",
-    "calibrate": "learning.evidence.calibrate_command",
-    "trust": "learning.evidence.trust_command",
-    "CourseSettings": "learning.learn.learn_command",
-    "learn": "learning.learn.learn_command",
+    "learn": "learning.engine",
     "ExtractSettings": "learning.network.extract_command",
     "extract": "learning.network.extract_command",
     "train": "learning.network.train_command:run_training",
-    "TuneSettings": "learning.noise.tune_command",
-    "tune": "learning.noise.tune_command",
     "load_mapping": "mapping",
     "PdhefError": "records.errors",
     "RunConfig": "runs.config",

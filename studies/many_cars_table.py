@@ -22,10 +22,11 @@ from pdhef_logtool.car.flat import load_vehicle, vehicle_toml
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.learning.car.identify_command import identify
-from pdhef_logtool.learning.network.fine_tune import train_on_parts
+from pdhef_logtool.learning.drives import IDENTIFY, LearnSettings
+from pdhef_logtool.learning.engine import learn
 from pdhef_logtool.learning.network.fit import Recipe
 from pdhef_logtool.learning.network.train_command import dataset_for, train_on
+from pdhef_logtool.learning.stages.network import train_on_parts
 from pdhef_logtool.residual_model.bundle import PHYSICS_MODEL, SHIPPED_FOLDERS, ModelBundle, load_bundle
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.runs.config import RunConfig
@@ -99,7 +100,7 @@ def independent_cases(work: Path) -> Iterator[Case]:
     fit = [log for log, _ in runs if log.stem.endswith(IDENTIFY_ON)]
     guess, found = work / "guess.toml", work / "identified"
     guess.write_text(vehicle_toml(start), encoding="utf-8")
-    identify([str(log) for log in fit], found, RunConfig(car=guess), holdout=0.0)
+    learn([str(log) for log in fit], found, LearnSettings(config=RunConfig(car=guess), stages=(IDENTIFY,), holdout=0.0))
     identified = Car.load(found, network="none")
     noise = with_shipped_noise(identified.vehicle).noise
     car = replace(identified, noise={**noise, PHYSICS: identified.noise[PHYSICS]})

@@ -117,7 +117,7 @@ Sensors have [their errors](method.md#sensors); friction is told.
 - One family of simulated cars. It knows nothing of trucks, of worn dampers, of tyres near their temperature limit.
 - Fishhooks are in no training drive; the condition table (`docs/conditions.md`) has them, faults, wrong friction, bank.
 - Below the vehicle's low-speed limit the residual is switched off.
-- What a real car brings is in `make real`; for yours: `pdhef identify`, `pdhef extract`, `pdhef train --init`.
+- What a real car brings is in `make real`; for yours: `pdhef learn`.
 """
 
 

@@ -40,12 +40,11 @@ from pdhef_logtool.evaluation.bootstrap import block_sums
 from pdhef_logtool.evaluation.comparison import Errors, compare, shown_interval
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive
-from pdhef_logtool.learning.car.identify_command import identify
+from pdhef_logtool.learning.drives import IDENTIFY, NOISE, LearnSettings
+from pdhef_logtool.learning.engine import learn
 from pdhef_logtool.learning.evidence.trust import decide_cap
-from pdhef_logtool.learning.evidence.trust_command import errors_by_trust
-from pdhef_logtool.learning.learn.learn_command import CourseSettings, learn
-from pdhef_logtool.learning.network.fine_tune import train_on_parts
-from pdhef_logtool.learning.noise.tune_command import TuneSettings, tune
+from pdhef_logtool.learning.stages.gain import errors_by_trust
+from pdhef_logtool.learning.stages.network import train_on_parts
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.documents import digest
@@ -311,7 +310,7 @@ def learnt_car(case: Case, network: Path, trials: int) -> tuple[list[Row], str]:
     given = None if str(network) == NO_MODEL else network
     config = replace(case.fit.config, mapping=mapping_file, car=catalogue_file, network=given)
     # The scored part is the last part here: nothing of the fit part is held back for one.
-    settings = CourseSettings(config=config, trials=trials, holdout=0.0)
+    settings = LearnSettings(config=config, trials=trials, holdout=0.0)
     with tempfile.TemporaryDirectory() as name:
         car = Path(name) / "learnt"
         say(f"{case.name}: learn")
@@ -320,7 +319,7 @@ def learnt_car(case: Case, network: Path, trials: int) -> tuple[list[Row], str]:
         except PdhefError as error:
             return [], f"Nothing could be learnt: expected {error.expected}, got {error.got}."
         rows = scored(case, "learnt", Car.load(car), ("physics", "pd-hef", "pd-hef-smoothed"))
-    return rows, f"learn: {', '.join(f'{s.name} {s.status}' for s in found.steps)}."
+    return rows, f"learn: {', '.join(f'{s.name} {s.status}' for s in found.stages)}."
 
 
 def identified_car(case: Case, network: Path, trials: int) -> tuple[list[Row], str]:
@@ -338,7 +337,8 @@ def identified_car(case: Case, network: Path, trials: int) -> tuple[list[Row], s
         log, config = [str(DRIVES / case.fit.log)], replace(case.fit.config, mapping=mapping_file)
         say(f"{case.name}: identification")
         try:
-            identify(log, folder / "identified", replace(config, car=catalogue_file), holdout=0.0)
+            settings = LearnSettings(config=replace(config, car=catalogue_file), stages=(IDENTIFY,), holdout=0.0)
+            learn(log, folder / "identified", settings)
         except PdhefError as error:
             say(str(error))
             return results, f"The car could not be identified: expected {error.expected}, got {error.got}."
@@ -358,7 +358,7 @@ def identified_car(case: Case, network: Path, trials: int) -> tuple[list[Row], s
         bundle.save(folder / "last")
         say(f"{case.name}: tuning, {trials} trials")
         config = replace(config, network=folder / "last")
-        tune(log, folder / "tuned", TuneSettings(config=config, trials=trials), warn=say)
+        learn(log, folder / "tuned", LearnSettings(config=config, stages=(NOISE,), trials=trials), warn=say)
         tuned = Car.load(folder / "tuned", network=NO_MODEL)
         add("tuned", tuned, ("phy-ukf-tuned", "physics"))
         add(f"tuned, {last}", with_evidence(case, tuned, bundle), hybrids)
@@ -503,7 +503,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         f"Written by `{command} --trials {given.trials}`; every figure comes from that command. Given network: {used}.",
         "Sideslip RMSE with the 95 % interval of a bootstrap of 10 s blocks. The drives may not be redistributed.",
         "*catalogue*: the published file. *self-calibrated*: by the scored part itself, without truth; not causal.",
-        "*identified*: by `pdhef identify` on the fit part. *learnt*: by `pdhef learn --holdout 0` there.",
+        "*identified*: by stage identify of `pdhef learn` on the fit part. *learnt*: by all stages there.",
         "The last columns are of the 95 % bands of `pdhef run`; one that fits is about 4 times the RMSE wide.",
         "The blocks one by one, for comparisons in pairs: [real/blocks.parquet](real/blocks.parquet).",
         "",

@@ -59,8 +59,8 @@ def cases(shipped: str) -> tuple[Case, ...]:
         Case("250lm", ("run", lm, *known)),
         Case("250lm-truncated", ("run", "{drives}/faulty/revs_250lm_a_truncated60.mcap", *known), 3),
         Case("250lm-flipped", ("run", "{drives}/faulty/revs_250lm_a_flipped_byte.mcap", *known), 3),
-        Case("250lm-car", ("identify", lm, *known, "--end", "150", "--holdout", "0")),
-        Case("250lm-identified", ("run", lm, "--vehicle", "{out}/250lm-car.toml", *_MAPPING, "--start", "155")),
+        Case("250lm-car", ("learn", lm, *known, "--stages", "identify", "--end", "150", "--holdout", "0")),
+        Case("250lm-identified", ("run", lm, "--vehicle", "{out}/250lm-car", *_MAPPING, "--start", "155")),
         Case(
             "recorded",
             ("metrics", "{out}/samples/logs/dlc/annotated.mcap", "--estimate", "/pdhef/phy_ukf/state", *samples_car),
@@ -127,9 +127,8 @@ def _run(tree: Path, out: Path) -> None:
         if case.needs_drives and not DRIVES.is_dir():
             print(f"{case.name}: no ../shared, left out")
             continue
-        target = out / (f"{case.name}.toml" if case.words[0] == "identify" else case.name)
         words = [w.format(drives=DRIVES, out=out) for w in case.words] + (every if case.words[0] == "run" else [])
-        command = [sys.executable, "-m", "pdhef_logtool", *words, "-o", str(target)]
+        command = [sys.executable, "-m", "pdhef_logtool", *words, "-o", str(out / case.name)]
         done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, check=False)
         print(f"{tree.name}: {case.name} ended with {done.returncode}", flush=True)
         if done.returncode != case.exit_code:

@@ -349,7 +349,7 @@ Written by `{command}`; every figure comes from it. Sideslip RMSE in degrees.
 What is fitted, with which priors, stands at the head of `pdhef_logtool/self_calibration/calibration.py`: an open-loop
 single track with relaxing axle forces, to yaw rate and a_y below 4 Hz, on all driving of a log above 10 m/s. It is not
 causal: the whole log speaks before the first estimate. `pdhef run --calibrate off` is the file as it stands, `pool`
-makes one calibration of all logs of a run, `pdhef identify --without-truth` writes that of a pool to a car.
+makes one calibration of all logs of a run, `pdhef learn --without-truth` writes that of a pool to a car.
 
 A log that leaves a cornering stiffness at more than ± {least} is refused, and the file stays as it stands; a pool that
 is to be written to a car is at ± {exported}. So is driving with an implausible understeer gradient, a drift, too little

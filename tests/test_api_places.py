@@ -81,12 +81,7 @@ def test_run(dlc: Path, mapping: Path, sample_logs_dir: Path, tmp_path: Path, ki
 
 
 def _settings(name: str, config: pdhef.RunConfig) -> Any:
-    kinds = {
-        "identify": config, "tune": pdhef.TuneSettings(config=config), "trust": pdhef.LearnSettings(config=config),
-        "calibrate": pdhef.CalibrateSettings(config=config), "learn": pdhef.CourseSettings(config=config),
-        "extract": pdhef.ExtractSettings(config=config),
-    }  # fmt: skip
-    return kinds[name]
+    return (pdhef.LearnSettings if name == "learn" else pdhef.ExtractSettings)(config=config)
 
 
 def _ends(call: Callable[[], Any]) -> str:
@@ -96,7 +91,7 @@ def _ends(call: Callable[[], Any]) -> str:
     return str(ended.value)
 
 
-@pytest.mark.parametrize("name", ["identify", "tune", "trust", "calibrate", "learn", "extract"])
+@pytest.mark.parametrize("name", ["learn", "extract"])
 def test_what_learns(name: str, sample_logs_dir: Path, tmp_path: Path) -> None:
     log = tmp_path / "none.mcap"
     command = getattr(pdhef, name)
@@ -110,8 +105,8 @@ def test_what_learns(name: str, sample_logs_dir: Path, tmp_path: Path) -> None:
     assert "no such file" in ends.pop().lower()
 
 
-@pytest.mark.parametrize("name", ["identify", "tune", "trust", "calibrate", "learn", "extract"])
-def test_a_url_is_no_place_for_what_is_learnt(name: str, dlc: Path) -> None:
+@pytest.mark.parametrize("name", ["learn", "extract"])
+def test_a_url_is_no_place_for_a_car_or_a_dataset(name: str, dlc: Path) -> None:
     config = pdhef.RunConfig(car=Path("saloon"))
     ends = _ends(lambda: getattr(pdhef, name)([dlc], "s3://bucket/car", _settings(name, config)))
     assert "expected a place on this machine, got s3://bucket/car" in ends
@@ -130,7 +125,7 @@ def test_train(tmp_path: Path) -> None:
 
 def test_every_name_of_the_api_is_tested_or_takes_no_file() -> None:
     tested = {"read_drive", "inspect_log", "load_mapping", "Car", "RunConfig", "ReadOptions", "run", "train"}
-    tested |= {"identify", "tune", "trust", "calibrate", "learn", "extract"}
+    tested |= {"learn", "extract"}
     of_drives = {"choose", "estimate", "estimate_windows", "score", "Drive"}
     settings = {name for name in pdhef.__all__ if name.endswith("Settings")}
     assert set(pdhef.__all__) == tested | of_drives | settings | {"PdhefError", "__version__"}

@@ -135,7 +135,7 @@ class Car:
         ----------
         path : a car's folder, a vehicle.toml, ``saloon`` (the shipped car); None: the default sedan.
         network : instead of the car's own: a shipped network's name, a folder, ``none``.
-        intervals : instead of the car's own: a file of ``pdhef calibrate``, ``unsure``, ``none``.
+        intervals : instead of the car's own: a file of ``pdhef learn --stages intervals``, ``unsure``, ``none``.
 
         Raises
         ------
@@ -168,12 +168,14 @@ class Car:
             car = replace(car, fitted_physics=car.fitted_physics.model_copy(update={"varied": ()}))
         stale = list(car.notes)
         if other := car._other_than_tried:
-            stale.append(f"{NETWORK_FILE} allows no trust: it was found with {other}; pdhef trust makes it anew")
+            stale.append(
+                f"{NETWORK_FILE} allows no trust: it was found with {other}; pdhef learn --stages gain makes it anew"
+            )
         own = intervals is None and folder is not None and (folder / INTERVALS_FILE).is_file()
         if intervals is None and not own and car.varied_physics:
             car = replace(car, intervals=None)  # what its own drives left open says more than another car's intervals
         if own and found is not None and found.physics_sha256 != car.physics_sha256:
-            stale.append(f"{INTERVALS_FILE} was made with other physics; pdhef calibrate makes it anew")
+            stale.append(f"{INTERVALS_FILE} was made with other physics; pdhef learn --stages intervals makes it anew")
         return replace(car, notes=tuple(stale))
 
     @property
@@ -232,16 +234,18 @@ class Car:
         found = self.trust
         if found is None or not found.has_evidence:
             why = f"no evidence that this network helps on {self.vehicle.name}"
-            return AllowedTrust(0.0, f"{why}; a drive with truth and pdhef trust give it")
+            return AllowedTrust(0.0, f"{why}; a drive with truth and pdhef learn --stages gain give it")
         here = "" if self.network is None else self.network.sha256
         if found.network_sha256 is not None and found.network_sha256 != here:
             return AllowedTrust(
                 0.0,
                 f"the car's evidence is about network {found.network_sha256[:SHOWN_DIGITS]}, this one is "
-                f"{here[:SHOWN_DIGITS]}; pdhef trust tries it",
+                f"{here[:SHOWN_DIGITS]}; pdhef learn --stages gain tries it",
             )
         if other := self._other_than_tried:
-            return AllowedTrust(0.0, f"the car's evidence was found with {other}; pdhef trust gives it anew")
+            return AllowedTrust(
+                0.0, f"the car's evidence was found with {other}; pdhef learn --stages gain gives it anew"
+            )
         return AllowedTrust(found.trust_cap, found.evidence)
 
     @property
@@ -314,22 +318,22 @@ def _with_parts(car: Car, flat: FlatCar, folder: Path | None) -> Car:
         if fit is not None and fit.physics_sha256 == physics_sha256(car.own):
             car = car.with_fit(fit)
         elif fit is not None:
-            notes.append(_stale(FIT_FILE, f"{VEHICLE_FILE} has changed since", "pdhef identify"))
+            notes.append(_stale(FIT_FILE, f"{VEHICLE_FILE} has changed since", "identify"))
         found = _part(folder / NOISE_FILE, Noise)
         tuned = {} if found is None else found.filter
         car = replace(car, trust=_part(folder / NETWORK_FILE, Trust) or car.trust)
     noise = {**car.noise, **{n: one for n, one in tuned.items() if car.owns_noise(n, one)}}
     if stale := [n for n, one in tuned.items() if n not in FORMER_FILTERS and not car.owns_noise(n, one)]:
-        notes.append(_stale(f"noise of {', '.join(stale)}", "it belongs to other physics", "pdhef tune"))
+        notes.append(_stale(f"noise of {', '.join(stale)}", "it belongs to other physics", "noise"))
     for name in sorted(FORMER_FILTERS.keys() & (noise.keys() | tuned.keys())):
         now = FORMER_FILTERS[name]
-        notes.append(_stale(f"noise of {name}", f"{name} is {now} now", "pdhef tune"))
+        notes.append(_stale(f"noise of {name}", f"{name} is {now} now", "noise"))
         noise.pop(name, None)
     return replace(car, noise=noise, notes=tuple(notes))
 
 
-def _stale(what: str, why: str, command: str) -> str:
-    return f"{what} is not used: {why}; {command} makes it anew"
+def _stale(what: str, why: str, stage: str) -> str:
+    return f"{what} is not used: {why}; pdhef learn --stages {stage} makes it anew"
 
 
 def _part(path: Path, kind: type[PartT]) -> PartT | None:
@@ -380,15 +384,17 @@ def load_intervals(path: Path) -> Intervals:
         The file is missing or wrong, or of an older format that filed intervals under names.
     """
     file = path / INTERVALS_FILE if path.is_dir() else path
-    raw = read_json(file, "a file of pdhef calibrate", VehicleError)
+    raw = read_json(file, "a file of pdhef learn --stages intervals", VehicleError)
     if isinstance(raw, dict) and raw.get("format") == "pdhef-calibration":
         raise VehicleError(
             expected="intervals filed by algorithm (pdhef-intervals 1)",
             got="a calibration filed by name, which does not say what ran",
             where=str(file),
-            remedy="pdhef calibrate makes it anew",
+            remedy="pdhef learn --stages intervals makes it anew",
         )
-    return validated(Intervals, raw, str(file), VehicleError, expected="the entries of a file of pdhef calibrate")
+    return validated(
+        Intervals, raw, str(file), VehicleError, expected="the entries of a file of pdhef learn --stages intervals"
+    )
 
 
 def read_history(folder: Path) -> list[dict[str, Any]]:

@@ -140,7 +140,7 @@ class FilterNoise(Record):
         ``physics`` also of the two axle forces. Empty: the filter's own.
     r_std : by measurement; what is left out is the filter's own.
     physics_sha256 : of the physics that it belongs to. network_sha256 : of the network, in files of older versions.
-    score_deg : what it scored in ``pdhef tune``, lower is better; None where nothing was compared. trial : its number.
+    score_deg : in ``pdhef learn --stages noise``, lower is better; None where nothing was compared. trial : its number.
     """
 
     q_std: Annotated[tuple[NonNegative, ...], Field(strict=False)] = ()
@@ -205,7 +205,7 @@ class FittedPhysics(Record):
 
 
 class Fit(Record):
-    """``fit.toml``, written by ``pdhef identify``: the car's physics as the drives show it.
+    """``fit.toml``, written by ``pdhef learn --stages identify``: the car's physics as the drives show it.
 
     The noise in ``filter`` was found together with the values and belongs to them (docs/method.md#identification).
     ``physics`` are those of the filter of that name, whose model has other parts: each filter's are found through
@@ -226,7 +226,7 @@ class Fit(Record):
 
 
 class Noise(Record):
-    """``noise.toml``, written by ``pdhef tune``: filter noise by filter, and how it was searched for."""
+    """``noise.toml``, written by ``pdhef learn --stages noise``: filter noise by filter, and the search for it."""
 
     format: Literal["pdhef-noise"] = "pdhef-noise"
     version: Literal[1] = 1
@@ -236,7 +236,7 @@ class Noise(Record):
 
 
 class Trust(Record):
-    """``network.toml``, written by ``pdhef trust``: which network this car has, how far it is trusted, and why.
+    """``network.toml``, written by ``pdhef learn --stages gain``: network of this car, its gain limit, and why.
 
     Attributes
     ----------
@@ -353,7 +353,7 @@ class IntervalEntry(Record):
 
 
 class Intervals(Record):
-    """``intervals.json``, written by ``pdhef calibrate``: 95 % intervals by resolved algorithm.
+    """``intervals.json``, written by ``pdhef learn --stages intervals``: 95 % intervals by resolved algorithm.
 
     ``spread`` is by how much friction and vehicle were made wrong too; 0: not at all.
     """

@@ -13,6 +13,7 @@ import typer
 
 from pdhef_logtool.cli import comparing, compiling, inspecting, learning, reporting, running, simulating, stopping
 from pdhef_logtool.cli.console import say
+from pdhef_logtool.cli.removed_commands import replacement
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, PdhefError
 from pdhef_logtool.records.files import OF_WRITING, cannot_write
 
@@ -86,6 +87,8 @@ def _run() -> int:
     except _WrongWord as error:
         if len(sys.argv) == 1:
             error.show()  # pdhef alone is asked for its help
+        elif message := replacement(sys.argv[1:]):
+            say(f"pdhef: {message}")
         else:
             command = error.ctx.command_path if error.ctx else "pdhef"
             say(f"{command}: {' '.join(error.format_message().split()).rstrip('.')}; see {command} --help")

@@ -1,7 +1,8 @@
-"""``pdhef identify``, ``extract``, ``train``, ``tune``, ``trust``, ``calibrate``, ``learn``, ``retrain``."""
+"""``pdhef learn``, ``extract``, ``train``, ``retrain``."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,38 +20,72 @@ commands = typer.Typer()
 
 @options.command(
     commands,
-    "pdhef identify drives/ --car guess.toml -o mycar",
-    "pdhef identify drive.mcap --car guess.toml -o mycar --end 150 --holdout 0",
-    "pdhef identify logs/ --car guess.toml -o mycar --without-truth",
-    shared="cache",
-    car="Where the fit starts (mass, geometry, sensor noise, priors)",
+    "pdhef learn drives/ --car guess.toml -o mycar",
+    "pdhef learn logs/ --car guess.toml -o mycar --without-truth",
+    "pdhef learn lap.mcap --car guess.toml -o mycar --end 150 --stages identify",
+    "pdhef learn logs/ --car mycar -o mycar --stages noise --jobs 2",
+    "pdhef learn lap.mcap --car mycar -o mycar --start 155 --stages gain",
+    "pdhef learn logs/ --car mycar -o mycar --stages intervals",
+    notes="""Stages, in the order in which they run: identify (tyres, steering, biases, roll gradient, model structure),
+noise (filter noise by search), gain (residual gain of the network), network (fine-tuning of the network and its
+residual gain), intervals (95 % confidence intervals).
+
+Several stages share the drives: they are split into training, validation and test; a stage that raises the validation
+error is undone; the test part is scored once (learn.md in the car's folder). An interrupted call continues when it is
+repeated. One stage alone uses all drives and is not undone. Drives that a simulated set marks test or extrapolation are
+refused; for gain alone, those marked train or validation (docs/learn.md).""",
+    shared="cache sensors friction network",
+    car="Car to start from (mass, geometry, sensor noise, priors)",
 )
-def identify(
+def learn(
+    *,
     logs: options.TruthLogs,
-    output: options.CarOutput,
+    output: Annotated[
+        Path, Option("--output", "-o", metavar="CAR", help="Folder of the car to write; may be that of --car.")
+    ],
     config: RunConfig,
-    holdout: Annotated[float, Option(help="Share at the end of each slice that is only scored, once.")] = 0.25,
-    parts: Annotated[
-        str, Option(help="Of the model of physics: auto (by held-out driving), static, or names with commas.")
-    ] = "auto",
+    stages: Annotated[str | None, Option(help="Comma-separated stages. Default: all.")] = None,
     without_truth: Annotated[
-        bool, Option("--without-truth", help="From the sensors of several logs alone: no truth is looked at.")
+        bool, Option("--without-truth", help="Identify from the sensors of several logs; ground truth is not read.")
     ] = False,
+    estimators: Annotated[
+        str | None, Option("--estimators", "-e", help="Estimators of the stages noise and intervals. Default: theirs.")
+    ] = None,
+    holdout: Annotated[float, Option(help="Share of the driving that is only scored, once.")] = 0.15,
+    trials: Annotated[int, Option(help="Trials of the noise search, per estimator.")] = 64,
+    vary: Annotated[
+        float, Option(help="Spread of wrong friction and vehicle in two further runs of each interval drive.")
+    ] = 0.1,
+    seed: Annotated[int, Option(help="Seed of searches, bootstraps and --vary.")] = 0,
+    split: options.Split = None,
+    any_split: options.AnySplit = False,
+    fresh: Annotated[bool, Option("--fresh", help="Forget the results of an earlier call with this output.")] = False,
+    jobs: options.Jobs = 1,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Fit a car's tyres, steering and biases to its drives. Roll gradient and filter noise are fitted too."""
-    if without_truth:
-        from pdhef_logtool.learning.car.without_truth_command import identify_without_truth
+    """Identify, tune, train and calibrate a car. Each stage can run alone."""
+    from pdhef_logtool.learning.drives import IDENTIFY, STAGES, LearnSettings
+    from pdhef_logtool.learning.engine import learn as run_stages
 
-        with console.progress() as bar:
-            found = identify_without_truth(logs, output, config, progress=bar, warn=console.warn)
-        console.finish(found, learning_tables.render_without_truth, as_json)
-    from pdhef_logtool.learning.car.identify_command import identify as fit
-    from pdhef_logtool.learning.car.physics_fit import physics_parts
-
+    if estimators is not None:
+        config = replace(config, estimators=options.split_names(estimators))
+    names = STAGES if stages is None else options.split_names(stages)
+    settings = LearnSettings(
+        config=config,
+        stages=(IDENTIFY,) if without_truth and stages is None else names,
+        holdout=holdout,
+        trials=trials,
+        spread=vary,
+        seed=seed,
+        split=split,
+        any_split=any_split,
+        without_truth=without_truth,
+    )
     with console.progress() as bar:
-        result = fit(logs, output, config, holdout=holdout, parts=physics_parts(parts), progress=bar, warn=console.warn)
-    console.finish(result, learning_tables.render_identification, as_json)
+        result = run_stages(
+            logs, output, settings, jobs=jobs, fresh=fresh, progress=bar, warn=console.warn, say=console.say
+        )
+    console.finish(result, learning_tables.render_learning, as_json)
 
 
 @options.command(
@@ -142,141 +177,6 @@ def train(
             dataset, output, init=init, paper=paper, seed=seed, epochs=epochs, device=device, progress=bar
         )
     console.finish(result, learning_tables.render_training, as_json)
-
-
-@options.command(
-    commands,
-    "pdhef tune logs/ --split validation --car mycar -o mycar --jobs 2",
-    "pdhef tune logs/ --split validation --car mycar -o mycar --trials 256",
-    notes="Every estimator gets the same search space, drives and number of trials. All trials and a plot of them "
-    "are kept with the car. Drives that a set's manifest marks test or extrapolation are refused (docs/tune.md).",
-    shared="cache sensors friction network model signal_map",
-    car="The car whose filter noise is tuned",
-)
-def tune(
-    *,
-    logs: options.TruthLogs,
-    output: options.CarOutput,
-    config: RunConfig,
-    estimators: Annotated[
-        str | None,
-        Option(
-            "--estimators",
-            "-e",
-            help="Out of phy-ukf-tuned, physics, pd-hef, pd-hef-smoothed. Default: the first two, and pd-hef "
-            "where the car has a network of its own or --network names one.",
-        ),
-    ] = None,
-    trials: Annotated[int, Option(help="Of each estimator.")] = 128,
-    seed: Annotated[int, Option(help="Seed of the search.")] = 0,
-    split: options.Split = None,
-    any_split: options.AnySplit = False,
-    jobs: options.Jobs = 1,
-    as_json: options.JsonFlag = False,
-) -> None:
-    """Tune the noise of a car's filters for sideslip. All filters are searched alike."""
-    from pdhef_logtool.learning.noise.tune_command import TuneSettings
-    from pdhef_logtool.learning.noise.tune_command import tune as search_noise
-
-    names = None if estimators is None else options.split_names(estimators)
-    settings = TuneSettings(config=config, names=names, trials=trials, seed=seed, split=split, any_split=any_split)
-    with console.progress() as bar:
-        result = search_noise(logs, output, settings, jobs=jobs, progress=bar, warn=console.warn)
-    console.finish(result, learning_tables.render_tuning, as_json)
-
-
-@options.command(
-    commands,
-    "pdhef trust drive.mcap --car mycar --start 155 -o mycar",
-    "pdhef trust logs/ --split test --car mycar -o mycar",
-    notes="Give driving that neither the network nor the car was fitted to; drives that a manifest marks train or "
-    "validation are refused. The filter runs at trust 0, 0.25, 0.5, 0.75 and 1. The cap is 1 only if a bootstrap of "
-    "blocks confirms the gain, at most 0.5 on a mean gain, else 0 (docs/trust.md). All figures are kept with the car.",
-    shared="cache sensors friction network model",
-    car="The car of the drives",
-)
-def trust(
-    logs: options.TruthLogs,
-    output: options.CarOutput,
-    config: RunConfig,
-    split: options.Split = None,
-    any_split: options.AnySplit = False,
-    seed: Annotated[int, Option(help="Seed of the bootstrap.")] = 0,
-    as_json: options.JsonFlag = False,
-) -> None:
-    """Find how far the network may be trusted on a car. Without truth in the drives it cannot be told."""
-    from pdhef_logtool.learning.drives import LearnSettings
-    from pdhef_logtool.learning.evidence.trust_command import trust as try_network
-
-    settings = LearnSettings(config=config, seed=seed, split=split, any_split=any_split)
-    with console.progress() as bar:
-        result = try_network(logs, output, settings, progress=bar, warn=console.warn)
-    console.finish(result, learning_tables.render_trust, as_json)
-
-
-@options.command(
-    commands,
-    "pdhef calibrate logs/ --split validation --car mycar -o mycar",
-    "pdhef calibrate logs/ --car mycar --vary 0 -o mycar",
-    notes="Give drives of many kinds that neither network nor filter noise was fitted to; drives that a set's "
-    "manifest marks test or extrapolation are refused (docs/calibrate.md).",
-    shared="estimators cache sensors friction network model",
-    car="The car that the estimators run with",
-)
-def calibrate(
-    logs: options.TruthLogs,
-    output: options.CarOutput,
-    config: RunConfig,
-    vary: Annotated[float, Option(help="Run each drive twice more with friction and car wrong by this spread.")] = 0.1,
-    seed: Annotated[int, Option(help="Seed of --vary.")] = 0,
-    split: options.Split = None,
-    any_split: options.AnySplit = False,
-    as_json: options.JsonFlag = False,
-) -> None:
-    """Fit the 95 % intervals of a car's estimators. Each regime of driving has its own."""
-    from pdhef_logtool.learning.evidence.calibrate_command import CalibrateSettings
-    from pdhef_logtool.learning.evidence.calibrate_command import calibrate as fit_intervals
-
-    settings = CalibrateSettings(config=config, spread=vary, seed=seed, split=split, any_split=any_split)
-    with console.progress() as bar:
-        result = fit_intervals(logs, output, settings, progress=bar, warn=console.warn)
-    console.finish(result, learning_tables.render_calibration, as_json)
-
-
-@options.command(
-    commands,
-    "pdhef learn drives/ --car guess.toml -o mycar",
-    "pdhef learn drive.mcap --car guess.toml -o mycar --end 150 --holdout 0",
-    notes="The drives are cut in parts that do not mix. Physics, noise, network with its trust, and intervals are "
-    "learnt one after the other; a step that makes the error on held-out driving worse is undone. The end of a drive "
-    "(or some drives of many) is scored once, against all baselines: learn.md in the car's folder (docs/learn.md). The "
-    "same command again goes on where it was interrupted.",
-    shared="cache sensors friction network",
-    car="Where it starts (mass, geometry, sensor noise, priors)",
-)
-def learn(
-    *,
-    logs: options.TruthLogs,
-    output: Annotated[Path, Option("--output", "-o", metavar="CAR", help="Folder of the car to write.")],
-    config: RunConfig,
-    holdout: Annotated[float, Option(help="Share of the driving that is only scored, once, at the end.")] = 0.15,
-    trials: Annotated[int, Option(help="Of the search for the noise of physics.")] = 64,
-    seed: Annotated[int, Option(help="Of the search, of bootstraps and of vehicles that are made wrong.")] = 0,
-    split: options.Split = None,
-    any_split: options.AnySplit = False,
-    fresh: Annotated[bool, Option("--fresh", help="Forget what an earlier call with this output has found.")] = False,
-    as_json: options.JsonFlag = False,
-) -> None:
-    """Teach a car all that drives with truth can. One command from a vehicle file to a proven car."""
-    from pdhef_logtool.learning.learn.learn_command import CourseSettings
-    from pdhef_logtool.learning.learn.learn_command import learn as teach
-
-    settings = CourseSettings(
-        config=config, holdout=holdout, trials=trials, seed=seed, split=split, any_split=any_split
-    )
-    with console.progress() as bar:
-        result = teach(logs, output, settings, fresh=fresh, progress=bar, warn=console.warn, say=console.say)
-    console.finish(result, learning_tables.render_course, as_json)
 
 
 @options.command(

@@ -11,15 +11,10 @@ from pdhef_logtool.cli.console import cell, table
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pdhef_logtool.learning.car.identify_command import IdentifyResult
-    from pdhef_logtool.learning.car.without_truth_command import WithoutTruthResult
-    from pdhef_logtool.learning.evidence.calibrate_command import CalibrateResult
-    from pdhef_logtool.learning.evidence.trust_command import TrustResult
-    from pdhef_logtool.learning.learn.learn_command import CourseResult
+    from pdhef_logtool.learning.engine import LearnResult
     from pdhef_logtool.learning.network.baselines import BaselinesResult
     from pdhef_logtool.learning.network.extract_command import ExtractResult
     from pdhef_logtool.learning.network.train_command import TrainResult
-    from pdhef_logtool.learning.noise.tune_command import TuneResult
     from pdhef_logtool.learning.retrain.retrain_command import RetrainResult
 
 
@@ -27,36 +22,106 @@ if TYPE_CHECKING:
 MOST_DRIVES = 40
 
 
-def render_identification(result: IdentifyResult, console: Console) -> None:
-    """Print what was identified, how well it is known, and how well the filter then does."""
-    found = result.identification
+def render_learning(result: LearnResult, console: Console) -> None:
+    """Print the tables of a stage that ran alone; of several their outcomes, the test part and what more is worth."""
+    if not result.document:
+        (stage,) = result.stages
+        _RENDER[stage.name](stage.figures, console)
+        console.print(f"{len(result.drives)} drives; car in {result.car}", soft_wrap=True)
+        return
+    stages = table("stage", "outcome", ">validation RMSE °\nbefore", ">\nafter", "of")
+    for s in result.stages:
+        before, after = ("-" if x is None else f"{x[1]:.3f}" for x in (s.before, s.after))
+        stages.add_row(s.name, s.status, before, after, "" if s.after is None else s.after[0])
+    console.print(stages)
+    console.print()
+    scores = table("estimator", ">RMSE °", ">95 % CI", ">coverage %")
+    for line in result.document["test"]:
+        if "skipped" in line:
+            scores.add_row(line["name"], "-", "-", "-")
+            continue
+        value, low, high = line["rmse_deg"]
+        interval = "-" if low is None else f"{low:.3f} to {high:.3f}"
+        scores.add_row(line["name"], cell(value, digits=3), interval, cell(line["covered"], 100.0, 0))
+    if result.document["test"]:
+        console.print("sideslip RMSE on the test part, scored once")
+        console.print(scores)
+    for text in result.document["more"]:
+        console.print(f"  {text}")
+    console.print(f"car in {result.car}; evidence of each decision in learn.md there", soft_wrap=True)
+
+
+def _identification(figures: Mapping[str, Any], console: Console) -> None:
+    """Print the identified parameters with their uncertainty, and the error of the filter with them."""
+    if found := figures.get("self_calibration"):
+        parameters = table("parameter", ">value", ">± 1 sd", ">prior", ">± 1 sd", "unit")
+        for p in found["parameters"]:
+            spread = [f"{100.0 * s:.0f} %" if p["log"] else f"{s:.2g}" for s in (p["sd"], p["prior_sd"])]
+            parameters.add_row(p["name"], f"{p['value']:.5g}", spread[0], f"{p['prior']:.4g}", spread[1], p["unit"])
+        console.print(parameters)
+        console.print(f"  {found['text']}")
+        return
     parameters = table("parameter", ">value", ">95 % interval", ">prior", "unit", "")
-    for p in found.parameters:
-        interval = f"{p.low:.4g} to {p.high:.4g}" if p.excited else "-"
-        remark = "filter noise" if p.tuning else "" if p.excited else "kept: not excited further"
-        parameters.add_row(p.name, f"{p.value:.5g}", interval, f"{p.prior:.4g}", p.unit, remark)
-    scores = table("part", ">seconds", ">β = 0", ">phy-ukf, starting car", ">phy-ukf-tuned, identified", ">physics")
-    for s in found.scores:
-        errors = (f"{value:.3f}°" for value in (s.zero_deg, s.start_file_deg, s.identified_deg, s.physics_deg))
-        scores.add_row(s.part, f"{s.seconds:.1f}", *errors)
+    for p in figures["parameters"]:
+        interval = f"{p['low95']:.4g} to {p['high95']:.4g}" if p["excited"] else "-"
+        remark = "filter noise" if p["noise"] else "" if p["excited"] else "not observable, kept"
+        parameters.add_row(p["name"], f"{p['value']:.5g}", interval, f"{p['prior']:.4g}", p["unit"], remark)
     console.print(parameters)
     console.print()
     console.print("sideslip RMSE")
+    names = [name for name in figures["sideslip_rmse_deg"][0] if name not in ("part", "seconds")]
+    scores = table("part", ">seconds", *(f">{name}" for name in names))
+    for score in figures["sideslip_rmse_deg"]:
+        scores.add_row(score["part"], f"{score['seconds']:.1f}", *(f"{score[name]:.3f}°" for name in names))
     console.print(scores)
-    for note in found.notes:
+    for note in figures["notes"]:
         console.print(f"  {note}")
-    console.print(f"car in {result.car}", soft_wrap=True)
 
 
-def render_without_truth(result: WithoutTruthResult, console: Console) -> None:
-    """Print what a pool of logs says of its car without truth, and how well it is known."""
-    parameters = table("parameter", ">value", ">± 1 sd", ">prior", ">± 1 sd", "unit")
-    for p in result.calibration.parameters:
-        spread = [f"{100.0 * s:.0f} %" if p.log else f"{s:.2g}" for s in (p.sd, p.prior_sd)]
-        parameters.add_row(p.name, f"{p.value:.5g}", spread[0], f"{p.prior:.4g}", spread[1], p.unit)
-    console.print(parameters)
-    console.print(f"  {result.calibration.text}")
-    console.print(f"car in {result.car}", soft_wrap=True)
+def _noise(figures: Mapping[str, Any], console: Console) -> None:
+    """Print the best noise of each estimator and its sideslip error; all had the same drives and trials."""
+    from pdhef_logtool.learning.noise.search import FACTORS
+
+    errors = (">\nobjective °", ">\nmedian °", ">\npooled °", ">car's own\nobjective °")
+    tuned = table("\nestimator", *(f">{f.name}\n{f.unit}" for f in FACTORS), *errors, ">\ntrials")
+    for name, t in figures["estimators"].items():
+        before = None if t["before"] is None else t["before"]["objective_deg"]
+        scores = (*(t["score"][key] for key in ("objective_deg", "median_deg", "pooled_deg")), before)
+        values = (f"{v:g}" for v in t["values"].values())
+        tuned.add_row(name, *values, *(cell(v, digits=4) for v in scores), str(t["trials"]))
+    console.print("sideslip RMSE over drives")
+    console.print(tuned)
+
+
+def _gain(figures: Mapping[str, Any], console: Console) -> None:
+    """Print the sideslip error at each residual gain, its difference to gain 0 with bounds, and the limit."""
+    errors = table(">residual\ngain", ">sideslip\nRMSE °", ">squared error minus\nthat at 0, deg²", ">\n95 % bounds")
+    columns = (figures[key] for key in ("trusts", "rmse_deg", "against_trust_0"))
+    for gain, rmse, b in zip(*columns, strict=True):
+        bounds = f"{b['low_deg2']:.4f} to {b['high_deg2']:.4f}" if gain and b["low_deg2"] is not None else "-"
+        errors.add_row(f"{gain:g}", f"{rmse:.4f}", f"{b['value_deg2']:.4f}" if gain else "-", bounds)
+    console.print(errors)
+    seconds = f"{figures['scored_s']:.0f} s scored, {figures['excited_s']:.0f} s of them excited"
+    console.print(f"{figures['blocks']} blocks, {seconds}")
+    console.print(f"residual gain limit {figures['trust_cap']:g}: {figures['reason']}")
+
+
+def _intervals(figures: Mapping[str, Any], console: Console) -> None:
+    """Print coverage and width of the 95 % intervals of sideslip, on drives that were not fitted to."""
+    widths = (">coverage %\nbefore", ">\nafter", ">width / normal\nbefore", ">\nafter")
+    intervals = table("\nestimator", "\ncar", "grip\nuse", ">\ndrives", ">RMSE\n°", *widths)
+    for name, rows in figures["coverage"].items():
+        for c in rows:
+            covered = (f"{100.0 * c[key]:.1f}" for key in ("covered_before", "covered_after"))
+            width = (f"{c[key]:.2f}" for key in ("width_before", "width_after"))
+            given = "made wrong" if c["wrong_vehicle"] else "as given"
+            rmse = cell(c["rmse_rad"], math.degrees(1.0), 4)
+            intervals.add_row(name, given, c["bin"], str(c["drives"]), rmse, *covered, *width)
+    console.print("95 % intervals of sideslip, each drive judged by a fit without it; width over 3.92 x RMSE")
+    console.print(intervals)
+
+
+_RENDER = {"identify": _identification, "noise": _noise, "gain": _gain, "intervals": _intervals}
 
 
 def render_extraction(result: ExtractResult, console: Console) -> None:
@@ -138,80 +203,6 @@ def render_baselines(result: BaselinesResult, console: Console) -> None:
     shown = ", ".join(f"{split} {value:.3f}" for split, value in errors.items() if value is not None)
     console.print(f"linear regression, sideslip RMSE in degrees: {shown}")
     console.print(f"coefficients in {result.regression_file}", soft_wrap=True)
-
-
-def render_tuning(result: TuneResult, console: Console) -> None:
-    """Print the best noise of each estimator and its sideslip error; all had the same drives and trials."""
-    from pdhef_logtool.learning.noise.search import FACTORS
-
-    errors = (">\nobjective °", ">\nmedian °", ">\npooled °", ">car's own\nobjective °")
-    tuned = table("\nestimator", *(f">{f.name}\n{f.unit}" for f in FACTORS), *errors)
-    for t in result.tuned:
-        best, before = t.best.score, None if t.before is None else t.before.objective_deg
-        scores = (best.objective_deg, best.median_deg, best.pooled_deg, before)
-        tuned.add_row(t.name, *(f"{v:g}" for v in t.best.values), *(cell(v, digits=4) for v in scores))
-    console.print("sideslip RMSE over drives")
-    console.print(tuned)
-    trials = len(result.tuned[0].trials)
-    console.print(f"{len(result.drives)} drives, {trials} trials of each estimator")
-    console.print(f"car in {result.car}", soft_wrap=True)
-
-
-def render_trust(result: TrustResult, console: Console) -> None:
-    """Print the sideslip error at each trust, its difference to trust 0 with bounds, and the cap with its reason."""
-    from pdhef_logtool.learning.evidence.trust import TRUSTS
-
-    d = result.decision
-    errors = table(">\ntrust", ">sideslip\nRMSE °", ">squared error less\nthat at 0, deg²", ">\n95 % bounds")
-    for trust, rmse, b in zip(TRUSTS, d.rmse_deg, d.against_zero, strict=True):
-        known = trust > 0.0 and not math.isnan(b.low_deg2)
-        bounds = f"{b.low_deg2:.4f} to {b.high_deg2:.4f}" if known else "-"
-        errors.add_row(f"{trust:g}", f"{rmse:.4f}", f"{b.value_deg2:.4f}" if trust else "-", bounds)
-    console.print(errors)
-    seconds = f"{d.scored_s:.0f} s scored, {d.excited_s:.0f} s of them excited"
-    console.print(f"{len(result.drives)} drives, {d.blocks} blocks, {seconds}")
-    console.print(f"trust cap {d.cap:g}: {d.reason}")
-    console.print(f"car in {result.car}", soft_wrap=True)
-
-
-def render_calibration(result: CalibrateResult, console: Console) -> None:
-    """Print how the 95 % intervals of sideslip stand before and after, on drives that were not fitted to."""
-    widths = (">covered %\nbefore", ">\nafter", ">width / normal\nbefore", ">\nafter")
-    intervals = table("\nestimator", "\ncar", "grip\nuse", ">\ndrives", ">RMSE\n°", *widths)
-    for entry in result.intervals.entries:
-        for c in entry.coverage:
-            covered = (f"{100.0 * c[key]:.1f}" for key in ("covered_before", "covered_after"))
-            width = (f"{c[key]:.2f}" for key in ("width_before", "width_after"))
-            given = "made wrong" if c["wrong_vehicle"] else "as given"
-            rmse = cell(c["rmse_rad"], math.degrees(1.0), 4)
-            intervals.add_row(entry.estimator, given, c["bin"], str(c["drives"]), rmse, *covered, *width)
-    console.print("95 % intervals of sideslip, each drive judged by a fit without it; width over 3.92 x RMSE")
-    console.print(intervals)
-    console.print(f"{len(result.intervals.drives)} drives; intervals in {result.file}", soft_wrap=True)
-
-
-def render_course(result: CourseResult, console: Console) -> None:
-    """Print what each step came to, the part that was scored once, and what more driving would pay."""
-    steps = table("step", "came to", ">held out °\nbefore", ">\nafter", "by")
-    for s in result.steps:
-        before, after = ("-" if x is None else f"{x[1]:.3f}" for x in (s.before, s.after))
-        steps.add_row(s.name, s.status, before, after, "" if s.after is None else s.after[0])
-    console.print(steps)
-    console.print()
-    scores = table("estimator", ">RMSE °", ">95 % interval", ">inside 95 %")
-    for line in result.last:
-        if "skipped" in line:
-            scores.add_row(line["name"], "-", "-", "-")
-            continue
-        value, low, high = line["rmse_deg"]
-        interval = "-" if low is None else f"{low:.3f} to {high:.3f}"
-        scores.add_row(line["name"], cell(value, digits=3), interval, cell(line["covered"], 100.0, 0))
-    if result.last:
-        console.print("sideslip RMSE on the last part, scored once")
-        console.print(scores)
-    for text in result.more:
-        console.print(f"  {text}")
-    console.print(f"car in {result.car}, what each decision rests on in learn.md there", soft_wrap=True)
 
 
 def render_retraining(result: RetrainResult, console: Console) -> None:

@@ -65,7 +65,7 @@ class Spec:
     in_all : whether it is one of :data:`ALL_ESTIMATORS`.
     network : which part of a network bundle it needs; empty: none; ``optional``: it runs without as well.
     needs_noise : whether it cannot run without noise of its own in the car.
-    tunable : whether ``pdhef tune`` searches its noise.
+    tunable : whether ``pdhef learn --stages noise`` searches its noise.
     """
 
     name: str
@@ -86,7 +86,7 @@ class Spec:
         if self.name in SELF_CALIBRATED:
             car = car.calibrated_car
         if self.needs_noise and self.name not in car.noise:
-            return f"the car has no noise for {self.name}; pdhef identify finds it"
+            return f"the car has no noise for {self.name}; pdhef learn --stages identify finds it"
         if self.network in ("", "optional"):
             return ""
         if car.network is None:

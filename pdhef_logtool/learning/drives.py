@@ -1,4 +1,4 @@
-"""Drives of the learning commands: which are taken, how they are read, and what is told and recorded of each."""
+"""Settings and drives of the learning commands: selection, reading, and the record of each drive."""
 
 from __future__ import annotations
 
@@ -15,101 +15,112 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import LearntOn
-from pdhef_logtool.car.store import check_output
 from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import MAX_BYTES, Drive, Tell, WholeDrive, lost_texts
 from pdhef_logtool.drive.windows import DrivePlan
-from pdhef_logtool.learning.noise.search import scorable_stamps
+from pdhef_logtool.learning.noise.search import MIN_TRIALS, scorable_stamps
+from pdhef_logtool.learning.variation import MAX_VARIATION
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
-from pdhef_logtool.records.outputs import check_no_input
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.sinks.report import tool_versions
 
-#: What of the configuration decides what is learnt.
+#: Stages of ``pdhef learn`` in the order in which they run.
+IDENTIFY, NOISE, GAIN, NETWORK, INTERVALS = STAGES = ("identify", "noise", "gain", "network", "intervals")
+#: Splits of a simulated set that results are reported on, and those that a network is trained on and chosen by.
+HELD_OUT, SEEN = ("test", "extrapolation"), ("train", "validation")
+#: Entries of the configuration that decide what is learned.
 _SETTINGS = ("car", "mapping", "network", "start", "end", "sensors", "friction", "prefer_truth", "estimators")
 #: Drives that are named in an error.
 _NAMED = 3
-
-
-@dataclass(frozen=True, slots=True)
-class Refusal:
-    """Splits that a command refuses, what it expects instead, who says so, and what to do."""
-
-    splits: tuple[str, ...]
-    expected: str
-    where: str
-    remedy: str
+MAX_HOLDOUT = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LearnSettings:
-    """What decides what a command learns, beside the logs.
+    """What decides what ``learn`` learns, beside the logs.
 
     Attributes
     ----------
-    config : car, network, mapping, slice, sensors, which truth, estimators where they matter.
-    seed : of whatever is drawn. split : only drives that their set's manifest puts into this split.
-    any_split : do not refuse drives of the splits that the command refuses.
+    config : car, network, mapping, slice, sensors, truth channel; estimators of the stages noise and intervals.
+    stages : names out of :data:`STAGES`, in any order.
+    holdout : share of the driving that is only scored, once.
+    trials : of the noise search, per estimator.
+    spread : of the random errors of friction and vehicle in further runs of each interval drive; 0 = no such runs.
+    seed : of every random draw.
+    split : only drives that their set's manifest assigns to this split.
+    any_split : accept drives of the splits that the stages otherwise refuse.
+    without_truth : identify from the sensors of several logs alone.
     """
 
     config: RunConfig
+    stages: tuple[str, ...] = STAGES
+    holdout: float = 0.15
+    trials: int = 64
+    spread: float = 0.1
     seed: int = 0
     split: str | None = None
     any_split: bool = False
+    without_truth: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what no seed is; raises UsageError."""
-        if self.seed < 0:
-            raise UsageError(expected="a seed of at least 0", got=str(self.seed), where="--seed")
+        """Check the values; raises UsageError."""
+        checks = (
+            (self.seed >= 0, "a seed of at least 0", self.seed, "--seed"),
+            (0.0 <= self.holdout <= MAX_HOLDOUT, f"a share from 0 to {MAX_HOLDOUT:g}", self.holdout, "--holdout"),
+            (self.trials >= MIN_TRIALS, f"at least {MIN_TRIALS} trials", self.trials, "--trials"),
+            (0.0 <= self.spread <= MAX_VARIATION, f"a spread of 0 to {MAX_VARIATION:g}", self.spread, "--vary"),
+            (
+                self.stages and set(self.stages) <= set(STAGES),
+                f"stages out of {', '.join(STAGES)}",
+                ", ".join(self.stages) or "none",
+                "--stages",
+            ),
+            (
+                not self.without_truth or self.stages == (IDENTIFY,),
+                f"stage {IDENTIFY} alone",
+                ", ".join(self.stages),
+                "--without-truth",
+            ),
+        )
+        for holds, expected, got, where in checks:
+            if not holds:
+                raise UsageError(expected=expected, got=str(got), where=where)
+
+    @property
+    def order(self) -> tuple[str, ...]:
+        """The stages in the order in which they run."""
+        return tuple(name for name in STAGES if name in self.stages)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON-able values; files by name only."""
-        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "config"}
-        return {**config_document(self.config), **own}
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "config"}
+        return {**config_document(self.config), **values, "stages": list(self.order)}
 
 
 def config_document(config: RunConfig) -> dict[str, Any]:
-    """Return what of a configuration decides what is learnt, as JSON-able values; files by name only."""
+    """Return the entries of a configuration that decide what is learned, as JSON-able values; files by name only."""
     document = config.to_dict()
     return {k: document[k] for k in _SETTINGS if k != "estimators" or document[k] is not None}
 
 
-def open_car(config: RunConfig, output: Path | None, warn: Tell) -> Car:
-    """Return the car of a command that learns of it, after a look at where it is to be written (None: nowhere).
-
-    Raises
-    ------
-    UsageError
-        No car is named, or ``output`` is no place for it.
-    """
+def open_car(config: RunConfig, warn: Tell) -> Car:
+    """Return the car that a command requires; raises UsageError where none is named."""
     if config.car is None:
         raise UsageError(
-            expected="a car", got="none", where="--car", remedy="pdhef identify makes one from a vehicle.toml"
+            expected="a car",
+            got="none",
+            where="--car",
+            remedy=f"pdhef learn LOG... --car vehicle.toml -o CAR --stages {IDENTIFY} makes one",
         )
     car = Car.load(config.car, network=config.network, intervals=config.intervals)
-    if output is not None:
-        check_output(car, output)
     for note in car.notes:
         warn(note)
     return car
-
-
-def check_file_output(inputs: Sequence[LogInput], config: RunConfig, output: Path) -> None:
-    """Refuse a single file (.toml, .json) as output that the command reads; that of the car itself may be one.
-
-    Raises
-    ------
-    UsageError
-        ``output`` is a log or another file of the command.
-    """
-    if output.suffix:
-        read = [*(i.local for i in inputs), *config.files]
-        check_no_input([path for path in read if path != config.car], [output])
 
 
 def open_mapping(config: RunConfig) -> SignalMapping | None:
@@ -129,34 +140,37 @@ def record_head(kind: str, version: int, settings: LearnSettings, car: Car) -> d
     }
 
 
-def choose_drives(arguments: Logs, choice: LearnSettings, refusal: Refusal) -> tuple[list[LogInput], dict[str, str]]:
-    """Return the logs to take, and by name the split that the manifest of a set beside a log gives it.
+def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInput], dict[str, str]]:
+    """Return the logs to take, and by name the split that the manifest of a set beside a log assigns to it.
 
     Raises
     ------
     UsageError
-        A drive is of a refused split, or none is left.
+        A drive belongs to a refused split, or none is left.
     """
-    inputs = find_logs(arguments, private_redirects=choice.config.allow_private_redirects)
+    inputs = find_logs(arguments, private_redirects=settings.config.allow_private_redirects)
     manifests = cache(set_manifest)
     splits = {i.stem: str(manifests(i.folder).get(i.path.name, {}).get("split") or "") for i in inputs}
-    if choice.split is not None:
-        inputs = [i for i in inputs if splits[i.stem] == choice.split]
+    if settings.split is not None:
+        inputs = [i for i in inputs if splits[i.stem] == settings.split]
         if not inputs:
             there = ", ".join(sorted({s for s in splits.values() if s}))
             raise UsageError(
-                expected=f"drives of split {choice.split}",
+                expected=f"drives of split {settings.split}",
                 got=f"drives of {there}" if there else "drives without a set's manifest beside them",
                 where="--split",
             )
-    refused = [f"{i.stem} ({splits[i.stem]})" for i in inputs if splits[i.stem] in refusal.splits]
-    if refused and not choice.any_split:
+    gain_only = settings.order == (GAIN,)
+    refused = [f"{i.stem} ({splits[i.stem]})" for i in inputs if splits[i.stem] in (SEEN if gain_only else HELD_OUT)]
+    if refused and not settings.any_split and not settings.without_truth:
         more = f" and {len(refused) - _NAMED} more" if len(refused) > _NAMED else ""
         raise UsageError(
-            expected=refusal.expected,
+            expected="drives that no network was trained on" if gain_only else "drives that no result is reported on",
             got=", ".join(refused[:_NAMED]) + more,
-            where=refusal.where,
-            remedy=refusal.remedy,
+            where="learn",
+            remedy="take --split test, or --any-split if this network was not trained on them"
+            if gain_only
+            else "a test on drives that a stage has used is no test: take --split validation, or --any-split",
         )
     return list(inputs), {i.stem: splits[i.stem] for i in inputs if splits[i.stem]}
 
@@ -263,35 +277,8 @@ def exit_code(records: Sequence[DriveRecord]) -> int:
     return EXIT_PARTIAL if any(r.left_out or r.lost for r in records) else EXIT_OK
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class LearnResult:
-    """What every command returns: the car that it wrote (a folder, or a flat file), and a record of every drive."""
-
-    car: Path
-    records: tuple[DriveRecord, ...]
-
-    @property
-    def exit_code(self) -> int:
-        """0 if all drives took part whole, 3 if not."""
-        return exit_code(self.records)
-
-    @property
-    def drives(self) -> tuple[DriveRecord, ...]:
-        """Those that took part."""
-        return tuple(r for r in self.records if not r.left_out)
-
-    @property
-    def left_out(self) -> tuple[DriveRecord, ...]:
-        """The others."""
-        return tuple(r for r in self.records if r.left_out)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the result as one JSON-able document."""
-        return {"car": str(self.car), "exit_code": self.exit_code, **drives_document(self.records)}
-
-
 def no_drive(expected: str, where: str) -> EstimatorError:
-    """Return the error for drives of which none can be learnt from."""
+    """Return the error for drives of which no stage can use any."""
     return EstimatorError(
         expected=f"at least one drive with {expected}",
         got="none",

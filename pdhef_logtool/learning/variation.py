@@ -29,6 +29,8 @@ SPREADS = {
 }
 #: 1-sigma of the shift of the CG as a share of the wheelbase, times the spread.
 CG_SHIFT = 0.2
+#: Largest spread.
+MAX_VARIATION = 0.3
 #: No draw goes further than this many 1-sigma.
 LIMIT = 2.5
 

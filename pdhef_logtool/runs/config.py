@@ -71,8 +71,8 @@ class RunConfig:
     budget : factor on what reading a log may cost before its claims count as damage.
     msgs : folder with definitions of message types that a log does not define.
     network : instead of the car's: a folder, ``default``, ``many-cars`` (the shipped one for any car), ``none``.
-    intervals : instead of the car's: a file of ``pdhef calibrate``, ``none`` (intervals as they are), ``unsure`` (wide
-        ones, for a car that may have changed since its file was made).
+    intervals : instead of the car's: a file of the stage intervals, ``none`` (as they are), ``unsure`` (wide ones, for
+        a car that may have changed since its file was made).
     thresholds : limits that the figures are held against; None = no gate.
     waived : names of checks whose failure does not count.
     calibrate : a car without evidence, without truth: on each ``log`` for itself, on the ``pool`` of all, or ``off``.

@@ -267,10 +267,10 @@ def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]
         steps.append(
             f"let this truth teach and prove the car: pdhef learn LOG {given}"
             if _error(figures, main.name) is not None
-            else f"let several logs of the car teach it: pdhef identify LOGS {given} --without-truth"
+            else f"let several logs of the car teach it: pdhef learn LOGS {given} --without-truth"
         )
     if vehicle["proven"] and share is not None and share < NEARLY_HOLDS:
-        steps.append("make the band anew from drives like this one: pdhef calibrate")
+        steps.append("make the band anew from drives like this one: pdhef learn --stages intervals")
     friction = report["friction"]
     if friction is not None and friction["estimated"] and (friction["observable_share"] or 0.0) < _FRICTION_SHOWN:
         steps.append("tell the friction if you know the road: --friction 0.8")

@@ -129,7 +129,7 @@ class TrackCalibrator:
             return ""
         return (
             f"the calibrated intervals of {name} are not applied: expected {made[0]}, got {ran[0].identity}; "
-            "run pdhef calibrate"
+            "run pdhef learn --stages intervals"
         )
 
     def _found(self, name: str) -> tuple[IntervalEntry, Algorithm] | None:

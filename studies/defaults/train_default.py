@@ -5,7 +5,7 @@
 Short drives of one simulated car whose vehicle file is right, with the friction told. ``physics`` is fitted on five
 minutes of other drives (:mod:`studies.defaults.fit_physics`), its noise with it; the residual network learns what it
 lacks. The direct network, the regression and the paper's network see the same drives, with the nominal model. Filter
-noise of all tuned estimators is chosen on validation drives in one search (``pdhef tune``). Seeds other than 0 train
+noise of all tuned estimators is chosen on validation drives in one search (stage noise). Seeds other than 0 train
 networks for spreads and take fit and noise of the shipped car. A second set, of other cars of the same kind, is for the
 model card. Logs that are there already as they should be are kept.
 """
@@ -22,7 +22,15 @@ from pathlib import Path
 
 import torch
 
-from pdhef_logtool.car.car import FIT_FILE, NETWORK_FOLDER, NOISE_FILE, SHIPPED_CARS, UNSURE_FILE, VEHICLE_FILE
+from pdhef_logtool.car.car import (
+    FIT_FILE,
+    INTERVALS_FILE,
+    NETWORK_FOLDER,
+    NOISE_FILE,
+    SHIPPED_CARS,
+    UNSURE_FILE,
+    VEHICLE_FILE,
+)
 from pdhef_logtool.learning.network.fit import Recipe
 from pdhef_logtool.learning.network.train_command import dataset_for, train_on
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
@@ -114,13 +122,14 @@ def main(arguments: list[str] | None = None) -> int:
     validation = [work / "one_car", "--split", "validation", *told]
     if given.seed == 0:
         say("tune the noise of all tuned estimators alike, on validation drives")
-        pdhef("tune", *validation, "--trials", given.trials, "--jobs", given.jobs, "-o", car)
+        pdhef("learn", *validation, "--stages", "noise", "--trials", given.trials, "--jobs", given.jobs, "-o", car)
     say("evidence that the network helps on this car")
-    pdhef("trust", work / "evidence", *told, "--any-split", "-o", car)
+    pdhef("learn", work / "evidence", *told, "--stages", "gain", "--any-split", "-o", car)
     if given.seed == 0:
         say("calibrate the intervals: for a car that is nearly as its file says, and for one that may have changed")
-        for spread, place in ((USUAL_SPREAD, car), (UNSURE_SPREAD, car / UNSURE_FILE)):
-            pdhef("calibrate", *validation, "--vary", spread, "-o", place)
+        for spread, place in ((USUAL_SPREAD, car), (UNSURE_SPREAD, work / "unsure")):
+            pdhef("learn", *validation, "--stages", "intervals", "--vary", spread, "-o", place)
+        shutil.copyfile(work / "unsure" / INTERVALS_FILE, car / UNSURE_FILE)
     say(f"done: {car}")
     return 0
 

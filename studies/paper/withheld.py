@@ -51,7 +51,7 @@ def train_withheld(work: Path, output: Path) -> None:
     network = output / NETWORK_FOLDER
     train_on(replace(data, drives=kept), network, Recipe(seed=0, epochs=EPOCHS))
     told = ["--car", output, "--mapping", work / "mapping.toml", "--network", network]
-    pdhef("trust", work / "evidence", *told, "--any-split", "-o", output)
+    pdhef("learn", work / "evidence", *told, "--stages", "gain", "--any-split", "-o", output)
 
 
 def withheld_car(work: Path, output: Path) -> Car:

@@ -44,7 +44,7 @@ def test_a_car_without_evidence_gets_none() -> None:
         allowed = car.allowed_trust
         assert allowed.cap == 0.0
         assert "no evidence" in allowed.reason
-        assert "pdhef trust" in allowed.note
+        assert "pdhef learn --stages gain" in allowed.note
 
 
 @pytest.mark.parametrize("cap", [0.0, 0.25, 0.5, 1.0])
@@ -75,7 +75,7 @@ def test_other_physics_or_noise_need_evidence_of_their_own() -> None:
     for what in ("physics", "noise"):
         other = _car(trust_cap=1.0, evidence=EVIDENCE, **{**found, f"{what}_sha256": "0" * 64})
         assert other.allowed_trust.cap == 0.0
-        assert f"other {what}; pdhef trust" in other.allowed_trust.reason
+        assert f"other {what}; pdhef learn --stages gain" in other.allowed_trust.reason
     assert tried.with_noise("physics", FilterNoise(q_std=(1.0, 1.0, 1.0))).allowed_trust.cap == 0.0
     assert tried.with_noise("phy-ukf-tuned", FilterNoise(q_std=(1.0, 1.0, 1.0))).allowed_trust.cap == 1.0
     heavier = tried.vehicle.model_copy(update={"mass_kg": 1500.0})

@@ -280,12 +280,12 @@ def test_other_physics_leave_fit_noise_and_trust_out_and_say_so(folder: Path, ol
     assert dict(car.noise) == {}
     assert car.learnt_on == ()
     assert car.notes == (
-        "fit.toml is not used: vehicle.toml has changed since; pdhef identify makes it anew",
-        "noise of physics is not used: it belongs to other physics; pdhef tune makes it anew",
-        "network.toml allows no trust: it was found with other physics; pdhef trust makes it anew",
+        "fit.toml is not used: vehicle.toml has changed since; pdhef learn --stages identify makes it anew",
+        "noise of physics is not used: it belongs to other physics; pdhef learn --stages noise makes it anew",
+        "network.toml allows no trust: it was found with other physics; pdhef learn --stages gain makes it anew",
     )
     assert car.allowed_trust.cap == 0.0
-    assert "other physics; pdhef trust gives it anew" in car.allowed_trust.note
+    assert "other physics; pdhef learn --stages gain gives it anew" in car.allowed_trust.note
 
 
 @pytest.mark.parametrize(
@@ -339,7 +339,9 @@ def test_other_noise_takes_the_trust_but_nothing_else(folder: Path) -> None:
     add_trust(folder)
     add_noise(folder)
     car = load(folder, "default")
-    assert car.notes == ("network.toml allows no trust: it was found with other noise; pdhef trust makes it anew",)
+    assert car.notes == (
+        "network.toml allows no trust: it was found with other noise; pdhef learn --stages gain makes it anew",
+    )
     assert car.allowed_trust.cap == 0.0
     assert "other noise" in car.allowed_trust.reason
 
@@ -363,7 +365,10 @@ def test_trust_changes_no_physics_so_that_intervals_stay_those_of_the_car(folder
     assert after.intervals is not None and after.intervals.physics_sha256 == after.physics_sha256
     assert after.notes == ()
     edit(folder, "mass_kg = 1440.0 ", "mass_kg = 1450.0 ")
-    assert "intervals.json was made with other physics; pdhef calibrate makes it anew" in Car.load(folder).notes
+    assert (
+        "intervals.json was made with other physics; pdhef learn --stages intervals makes it anew"
+        in Car.load(folder).notes
+    )
     assert not any("intervals" in note for note in load(folder).notes)  # they are not in force
 
 
@@ -404,7 +409,11 @@ TRUST = 'format = "pdhef-network"\nversion = 1\n'
         (NETWORK_FILE, TRUST + "trust_cap = 1.5\n", "trust_cap: "),
         (NETWORK_FILE, TRUST + 'network_sha256 = "ab"\n', "network_sha256: "),
         (INTERVALS_FILE, '{"entris": []}', "entris: unknown, did you mean entries?"),
-        (INTERVALS_FILE, '{"format": "pdhef-calibration", "estimators": {}}', "pdhef calibrate makes it anew"),
+        (
+            INTERVALS_FILE,
+            '{"format": "pdhef-calibration", "estimators": {}}',
+            "pdhef learn --stages intervals makes it anew",
+        ),
     ],
 )
 def test_wrong_entries_of_every_part_are_told_in_one_line(folder: Path, name: str, text: str, said: str) -> None:
@@ -465,7 +474,7 @@ def test_a_sentence_that_is_not_understood_is_an_error_and_chooses_no_filter(
 
 
 def noise_change(noise: dict[str, FilterNoise], **more: Any) -> Change:
-    data = part_toml(Noise(filter=noise), "Written by pdhef tune.").encode()
+    data = part_toml(Noise(filter=noise), "Written by pdhef learn --stages noise.").encode()
     return Change("tune", NOISE_FILE, {NOISE_FILE: data}, settings={"trials": 8}, drives=DRIVES, **more)
 
 
@@ -732,7 +741,9 @@ def test_noise_of_a_filter_that_is_no_more_is_left_out_with_one_notice(folder: P
         )
     car = load(folder)
     assert dict(car.noise) == {TUNED: kept}
-    assert car.notes == ("noise of physics-plus is not used: physics-plus is physics now; pdhef tune makes it anew",)
+    assert car.notes == (
+        "noise of physics-plus is not used: physics-plus is physics now; pdhef learn --stages noise makes it anew",
+    )
 
 
 def test_noise_of_physics_belongs_to_the_values_that_were_found_through_it(folder: Path) -> None:
@@ -750,7 +761,9 @@ def test_noise_of_physics_belongs_to_the_values_that_were_found_through_it(folde
     write_part(folder / NOISE_FILE, Noise(filter={OURS: tuned.model_copy(update={"physics_sha256": "ab" * 32})}))
     car = load(folder)
     assert car.noise[OURS] == found.noise
-    assert car.notes == ("noise of physics is not used: it belongs to other physics; pdhef tune makes it anew",)
+    assert car.notes == (
+        "noise of physics is not used: it belongs to other physics; pdhef learn --stages noise makes it anew",
+    )
 
 
 def test_the_folder_of_a_cars_drives_is_short_and_portable() -> None:

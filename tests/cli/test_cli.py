@@ -11,13 +11,14 @@ from typing import Any
 
 import pytest
 
+from pdhef_logtool.cli.removed_commands import REMOVED
 from tests.command_line import called
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = (
     *("inspect", "map", "estimators", "run", "metrics", "slim", "report", "compare", "events", "view"),
     *("simulate", "simulate suite", "simulate conditions"),
-    *("identify", "extract", "train", "tune", "trust", "calibrate", "learn", "retrain"),
+    *("learn", "extract", "train", "retrain"),
 )
 
 
@@ -159,11 +160,11 @@ def test_usage_errors_are_one_line_and_exit_code_2(
     [
         (("run",), "pdhef run: Missing argument"),
         (("run", "x", "--no-such-flag"), "pdhef run: No such option: --no-such-flag"),
-        (("tune", "x", "--ouptut", "y"), "--output"),
+        (("learn", "x", "--ouptut", "y"), "--output"),
         (("simulate", "suite", "--cuont", "3"), "pdhef simulate suite: No such option: --cuont"),
         (("insepct", "x"), "inspect"),
         (("fly",), "pdhef --help"),
-        (("tune", "x", "-o", "y", "--trials", "many"), "--trials"),
+        (("learn", "x", "-o", "y", "--trials", "many"), "--trials"),
     ],
 )
 def test_misspelt_words_are_one_line_and_exit_code_2(arguments: tuple[str, ...], said: str) -> None:
@@ -171,6 +172,15 @@ def test_misspelt_words_are_one_line_and_exit_code_2(arguments: tuple[str, ...],
     assert result.returncode == 2
     assert said in _one_line_error(result)
     assert result.stdout == ""
+
+
+@pytest.mark.parametrize("command", sorted(REMOVED.keys() - set(COMMANDS)))
+def test_removed_commands_name_the_one_that_does_their_work(command: str) -> None:
+    for words in ((command,), (command, "x", "-o", "y"), (command, "--help")):
+        result = called(*words)
+        assert result.returncode == 2
+        assert result.stdout == ""
+        assert _one_line_error(result) == f"pdhef: '{command}' was removed; use: {REMOVED[command]}"
 
 
 def test_bare_command_shows_its_help() -> None:
@@ -207,11 +217,6 @@ def test_interrupt_is_one_line_and_exit_code_130() -> None:
         ),
         (("metrics", "no", "-v", "a.toml"), ["--vehicle is now --car"]),
         (("extract", "no", "-v", "a.toml"), ["--vehicle is now --car"]),
-        (("identify", "no", "-v", "a.toml"), ["--vehicle is now --car"]),
-        (("tune", "no", "--model", "m"), ["--model is now --network"]),
-        (("tune", "no", "--signal-map", "m.toml"), ["--signal-map is now --mapping"]),
-        (("trust", "no", "--model", "m"), ["--model is now --network"]),
-        (("calibrate", "no", "--model", "m"), ["--model is now --network"]),
         (("run", "no", "--car", "a.toml"), []),
     ],
 )

@@ -1,4 +1,4 @@
-"""``pdhef calibrate``: known scales are recovered, unseen drives are covered, and a run uses what it wrote."""
+"""Stage intervals: known scales are recovered, unseen drives are covered, and a run uses what it wrote."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import pytest
 
 from pdhef_logtool.car.car import Car, load_intervals
 from pdhef_logtool.car.parts import Inflation
-from pdhef_logtool.learning.drives import choose_drives
+from pdhef_logtool.learning.drives import LearnSettings, choose_drives
+from pdhef_logtool.learning.engine import learn
 from pdhef_logtool.learning.evidence.calibrate import (
     FOLDS,
     Samples,
@@ -27,7 +28,6 @@ from pdhef_logtool.learning.evidence.calibrate import (
     grip_factors,
     share_for,
 )
-from pdhef_logtool.learning.evidence.calibrate_command import REFUSED, CalibrateSettings, calibrate
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.signals import FloatArray
@@ -296,10 +296,10 @@ def test_few_drives_are_refused() -> None:
 # ---- the command ----
 
 
-def _settings(sample_logs_dir: Path, estimators: tuple[str, ...] = ("phy-ukf", "zero")) -> CalibrateSettings:
+def _settings(sample_logs_dir: Path, estimators: tuple[str, ...] = ("phy-ukf", "zero")) -> LearnSettings:
     car = sample_logs_dir / "vehicle.toml"
     config = RunConfig(estimators=estimators, car=car, network=Path("none"), end="+6s")
-    return CalibrateSettings(config=config, spread=0.1)
+    return LearnSettings(config=config, stages=("intervals",), spread=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -307,17 +307,17 @@ def calibration(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory)
     folder = tmp_path_factory.mktemp("calibration")
     logs = [str(sample_logs_dir / f"{n}.mcap") for n in ("dlc", "step", "fishhook", "sweep", "road", "no_truth")]
     told: list[str] = []
-    result = calibrate(logs, folder / "mycar", _settings(sample_logs_dir), warn=told.append)
+    result = learn(logs, folder / "mycar", _settings(sample_logs_dir), warn=told.append)
     assert result.exit_code == 3
     assert [d.name for d in result.left_out] == ["no_truth"]
     assert [r.counts for r in result.drives] == [
         {"scored_stamps": r.counts["scored_stamps"], "runs": 3} for r in result.drives
     ]
     assert any("no_truth" in t for t in told)
-    again = calibrate(logs[:5], folder / "again.json", _settings(sample_logs_dir))
+    again = learn(logs[:5], folder / "again", _settings(sample_logs_dir))
     assert again.exit_code == 0
-    assert again.file.read_bytes() == result.file.read_bytes()
-    return result.file
+    assert (again.car / "intervals.json").read_bytes() == (result.car / "intervals.json").read_bytes()
+    return result.car / "intervals.json"
 
 
 def test_the_file_says_where_it_is_from(calibration: Path, sample_logs_dir: Path) -> None:
@@ -382,8 +382,8 @@ def test_a_run_uses_it_says_so_and_windows_change_nothing(
 
 def test_too_few_drives_with_truth(sample_logs_dir: Path, tmp_path: Path) -> None:
     with pytest.raises(EstimatorError, match="5 drives"):
-        calibrate([str(sample_logs_dir / "step.mcap")], tmp_path / "c.json", _settings(sample_logs_dir))
-    assert not (tmp_path / "c.json").exists()
+        learn([str(sample_logs_dir / "step.mcap")], tmp_path / "c", _settings(sample_logs_dir))
+    assert not (tmp_path / "c").exists()
 
 
 def test_held_out_drives_are_refused(sample_logs_dir: Path, tmp_path: Path) -> None:
@@ -395,24 +395,24 @@ def test_held_out_drives_are_refused(sample_logs_dir: Path, tmp_path: Path) -> N
     settings = _settings(sample_logs_dir)
     inputs = find_logs([str(tmp_path)])
     with pytest.raises(UsageError, match=r"step \(test\)"):
-        choose_drives(inputs, settings, REFUSED)
-    chosen, splits = choose_drives(inputs, replace(settings, split="validation"), REFUSED)
+        choose_drives(inputs, settings)
+    chosen, splits = choose_drives(inputs, replace(settings, split="validation"))
     assert [i.stem for i in chosen] == ["dlc"]
     assert splits == {"dlc": "validation"}
-    assert len(choose_drives(inputs, replace(settings, any_split=True), REFUSED)[0]) == 2
+    assert len(choose_drives(inputs, replace(settings, any_split=True))[0]) == 2
     with pytest.raises(UsageError, match="train"):
-        choose_drives(inputs, replace(settings, split="train"), REFUSED)
+        choose_drives(inputs, replace(settings, split="train"))
 
 
 def test_wrong_options(sample_logs_dir: Path, tmp_path: Path) -> None:
     settings = _settings(sample_logs_dir)
     log = [str(sample_logs_dir / "step.mcap")]
     with pytest.raises(UsageError, match="--output"):
-        calibrate(log, tmp_path / "nowhere.toml", settings)
+        learn(log, tmp_path / "nowhere.toml", settings)
     with pytest.raises(UsageError, match="--vary"):
-        calibrate(log, tmp_path, replace(settings, spread=0.5))
+        replace(settings, spread=0.5)
     (tmp_path / "notes.txt").write_text("no car")
     with pytest.raises(UsageError, match="--output"):
-        calibrate(log, tmp_path, settings)
+        learn(log, tmp_path, settings)
     with pytest.raises(UsageError, match="--car"):
-        calibrate(log, tmp_path, replace(settings, config=replace(settings.config, car=None)))
+        learn(log, tmp_path, replace(settings, config=replace(settings.config, car=None)))

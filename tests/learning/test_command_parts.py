@@ -31,15 +31,18 @@ from pdhef_logtool.learning.drives import (
     set_manifest,
     tell_drive,
 )
-from pdhef_logtool.learning.evidence import calibrate_command, trust_command
+from pdhef_logtool.learning.engine import learn
 from pdhef_logtool.learning.evidence.calibrate import Coverage, Fitted, Samples
-from pdhef_logtool.learning.evidence.calibrate_command import CalibrateSettings, drive_samples, made_wrong
 from pdhef_logtool.learning.evidence.trust import BlockErrors, Bound, TrustDecision
 from pdhef_logtool.learning.network import extract_command
-from pdhef_logtool.learning.noise import tune_command, tune_drives
+from pdhef_logtool.learning.noise import benches
+from pdhef_logtool.learning.noise.benches import Benches, BenchSetup, DriveBench, choose_names
 from pdhef_logtool.learning.noise.search import DriveError, Score, Trial
-from pdhef_logtool.learning.noise.tune_command import REFUSED, Tuned, TuneSettings
-from pdhef_logtool.learning.noise.tune_drives import Benches, DriveBench, TuneSetup, choose_names
+from pdhef_logtool.learning.split import Split
+from pdhef_logtool.learning.stages import gain, intervals, noise
+from pdhef_logtool.learning.stages.intervals import drive_samples, made_wrong
+from pdhef_logtool.learning.stages.noise import Tuned
+from pdhef_logtool.learning.stages.task import Task
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.signals import Loss
@@ -185,15 +188,15 @@ def test_three_refused_drives_are_named_and_the_rest_counted(tmp_path: Path) -> 
     def refused(count: int) -> str:
         (tmp_path / "manifest.json").write_text(json.dumps({"drives": entries[:count]}))
         with pytest.raises(UsageError) as caught:
-            choose_drives(inputs, LearnSettings(config=SALOON), REFUSED)
+            choose_drives(inputs, LearnSettings(config=SALOON))
         return str(caught.value)
 
     assert "a (test), b (test), c (test) and 2 more" in refused(5)
     assert "a (test), b (test), c (test)" in refused(3) and "more" not in refused(3)
     (tmp_path / "manifest.json").unlink()
     with pytest.raises(UsageError, match="drives without a set's manifest"):
-        choose_drives(inputs, LearnSettings(config=SALOON, split="validation"), REFUSED)
-    assert choose_drives(inputs, LearnSettings(config=SALOON), REFUSED) == (inputs, {})
+        choose_drives(inputs, LearnSettings(config=SALOON, split="validation"))
+    assert choose_drives(inputs, LearnSettings(config=SALOON)) == (inputs, {})
 
 
 def test_settings_are_told_by_name_and_estimators_where_they_matter() -> None:
@@ -268,7 +271,7 @@ def test_samples_stand_every_twentieth_of_a_second_where_all_is_known() -> None:
 
 def test_a_drive_is_run_as_told_and_twice_with_a_wrong_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:
     kept = record("a", counts={"scored_stamps": 601})
-    monkeypatch.setattr(calibrate_command, "load_drive", lambda *_, **__: (kept, WHOLE))
+    monkeypatch.setattr(intervals, "load_drive", lambda *_, **__: (kept, WHOLE))
     seen: list[Any] = []
 
     def samples(track: Any, told: Any, signals: Any, truth: Any, vehicle: Any, number: int, *, wrong: bool) -> Any:
@@ -276,10 +279,12 @@ def test_a_drive_is_run_as_told_and_twice_with_a_wrong_vehicle(monkeypatch: pyte
         seen.append((track.name, told.friction, signals.friction, vehicle, number, wrong))
         return range(20)
 
-    monkeypatch.setattr(calibrate_command, "drive_samples", samples)
-    settings = CalibrateSettings(config=replace(SALOON, estimators=("phy-ukf",), friction=0.5), spread=0.1, seed=2)
+    monkeypatch.setattr(intervals, "drive_samples", samples)
+    settings = LearnSettings(config=replace(SALOON, friction=0.5), spread=0.1, seed=2)
     car, log = Car.of(VEHICLE), LogInput(Path("a.mcap"), "a")
-    told, found = calibrate_command._run_drive(log, 5, settings, car, None)
+    task = Task(car=car, settings=settings, split=Split.undivided([log]), estimators=("phy-ukf",))
+    told, found = intervals._run_drive(log, 5, task)
+    assert found is not None
     assert told.counts == {"scored_stamps": 601, "runs": 3}
     assert [(name, len(part)) for name, _, part in found] == [("phy-ukf", 20)] * 3
     assert [one[5] for one in seen] == [False, True, True]
@@ -288,12 +293,12 @@ def test_a_drive_is_run_as_told_and_twice_with_a_wrong_vehicle(monkeypatch: pyte
     # The bins know the best that is known of the drive, whatever a run was told.
     assert all((one[2] == 0.5).all() for one in seen)
     assert (seen[0][1] == 0.5).all() and all((one[1] != 0.5).all() for one in seen[1:])
-    monkeypatch.setattr(calibrate_command, "drive_samples", lambda *_, **__: range(19))
-    told, found = calibrate_command._run_drive(log, 5, replace(settings, spread=0.0), car, None)
-    assert found == [] and told.left_out.startswith("no estimate with an interval")
+    monkeypatch.setattr(intervals, "drive_samples", lambda *_, **__: range(19))
+    told, found = intervals._run_drive(log, 5, replace(task, settings=replace(settings, spread=0.0)))
+    assert found is None and told.left_out.startswith("no estimate with an interval")
     left_out = record("b", left_out="no true sideslip")
-    monkeypatch.setattr(calibrate_command, "load_drive", lambda *_, **__: (left_out, None))
-    assert calibrate_command._run_drive(log, 5, settings, car, None) == (left_out, [])
+    monkeypatch.setattr(intervals, "load_drive", lambda *_, **__: (left_out, None))
+    assert intervals._run_drive(log, 5, task) == (left_out, None)
 
 
 def _samples(drive_number: int, wrong: bool = False) -> Samples:
@@ -320,10 +325,10 @@ def test_calibrate_tells_its_progress_and_whom_it_leaves_out(tmp_path: Path, mon
     one, other = (resolve(make_estimator(n, car)) for n in ("phy-ukf", "kinematic"))
     fitted: list[Samples] = []
 
-    def run(log: LogInput, number: int, used: CalibrateSettings, saloon: Car, _mapping: Any) -> Any:
-        assert used.spread == 0.1 and saloon.vehicle.name
+    def run(log: LogInput, number: int, task: Task) -> Any:
+        assert task.settings.spread == 0.1 and task.car.vehicle.name
         if log.stem == "f":
-            return record("f", left_out="no true sideslip"), []
+            return record("f", left_out="no true sideslip"), None
         parts = [("phy-ukf", one, _samples(number)), ("phy-ukf", one, _samples(number, wrong=True))]
         return record(log.stem), [*parts, *([("kinematic", other, _samples(number))] if number < 4 else [])]
 
@@ -331,27 +336,25 @@ def test_calibrate_tells_its_progress_and_whom_it_leaves_out(tmp_path: Path, mon
         fitted.append(samples)
         return Fitted(INFLATION, 1.5, (Coverage("low", False, 5, 150, 0.1, 0.8, 0.95, 0.9, 1.1),))
 
-    monkeypatch.setattr(calibrate_command, "_run_drive", run)
-    monkeypatch.setattr(calibrate_command, "fit_inflation", fit)
+    monkeypatch.setattr(intervals, "_run_drive", run)
+    monkeypatch.setattr(intervals, "fit_inflation", fit)
     folder = tmp_path / "set"
     arguments = logs(folder, "abcdef")
     (folder / "manifest.json").write_text(json.dumps({"drives": [{"file": "a.mcap", "split": "train"}]}))
     told: list[tuple[str, float]] = []
     warned: list[str] = []
-    settings = CalibrateSettings(config=SALOON, spread=0.1, seed=4)
-    result = calibrate_command.calibrate(
-        arguments, tmp_path / "i.json", settings, progress=lambda *x: told.append(x), warn=warned.append
-    )
-    shares = {n: 0.9 * i / 6 for i, n in enumerate("abcdef")} | {"fitting phy-ukf": 0.9, "fitting kinematic": 0.95}
-    assert dict(told) == pytest.approx(shares)
+    settings = LearnSettings(config=SALOON, stages=("intervals",), spread=0.1, seed=4)
+    result = learn(arguments, tmp_path / "car", settings, progress=lambda *x: told.append(x), warn=warned.append)
+    shares = {f"reading {n}": 0.9 * i / 6 for i, n in enumerate("abcdef")}
+    assert dict(told) == pytest.approx(shares | {"fitting phy-ukf": 0.9, "fitting kinematic": 0.95, "done": 1.0})
     assert [s for _, s in told] == sorted(s for _, s in told)
     assert warned == [
-        "drives of split train: a network is better there than in service, and its intervals will be too narrow",
+        "drives of split train: a network is better there than in service, and its intervals too narrow",
         "f is left out: no true sideslip",
         "kinematic is not calibrated: it has 4 drives, at least 5 are needed",
     ]
     assert [len(s) for s in fitted] == [300]
-    document = json.loads((tmp_path / "i.json").read_text())
+    document = json.loads((tmp_path / "car/intervals.json").read_text())
     (entry,) = document["entries"]
     assert (entry["estimator"], entry["unseen_factor"], entry["wrong_vehicle_factor"]) == ("phy-ukf", 1.5, None)
     assert entry["coverage"][0]["covered_after"] == 0.95
@@ -361,15 +364,14 @@ def test_calibrate_tells_its_progress_and_whom_it_leaves_out(tmp_path: Path, mon
     assert [d["name"] for d in document["drives"]] == list("abcde")
     assert document["roll_gradient_rad_per_m_s2"] == Car.load("saloon").vehicle.roll_gradient_rad_per_m_s2
     assert [r.split for r in result.records] == ["train", None, None, None, None, None]
-    assert result.to_dict()["file"] == str(tmp_path / "i.json") and result.exit_code == 3
-    folder_result = calibrate_command.calibrate(arguments, tmp_path / "car", settings)
+    assert result.figures == {"coverage": {"phy-ukf": entry["coverage"]}} and result.exit_code == 3
     (line,) = read_history(tmp_path / "car")[-1:]
-    assert (line["command"], line["part"]) == ("calibrate", "intervals.json")
-    assert folder_result.file == tmp_path / "car/intervals.json"
-    with pytest.raises(EstimatorError, match=r"at least 5 drives .*, got 4"):
-        calibrate_command.calibrate(arguments[:4], tmp_path / "j.json", settings)
+    assert (line["command"], line["part"]) == ("learn --stages intervals", "intervals.json")
+    for few in (arguments[:4], [*arguments[:4], arguments[5]]):
+        with pytest.raises(EstimatorError, match=r"at least 5 drives.*, got 4"):
+            learn(few, tmp_path / "other", settings)
     with pytest.raises(UsageError, match="--vary"):
-        calibrate_command.calibrate(arguments, tmp_path / "j.json", replace(settings, spread=0.31))
+        replace(settings, spread=0.31)
 
 
 # ---- trust ----
@@ -378,11 +380,12 @@ def test_calibrate_tells_its_progress_and_whom_it_leaves_out(tmp_path: Path, mon
 def test_trust_tells_its_progress_warns_and_keeps_its_evidence(
     sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shipped = LearnSettings(config=RunConfig(car=sample_logs_dir / "vehicle.toml", network=Path("default")))
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", network=Path("default"))
+    shipped = LearnSettings(config=config, stages=("gain",))
     asked: list[Any] = []
 
-    def load(log: LogInput, *_: Any, split: str | None, refuse: Any, least_scored: int) -> Any:
-        asked.append((split, least_scored, refuse(SimpleNamespace(available=frozenset({"speed_m_s"})))))
+    def load(log: LogInput, *_: Any, refuse: Any, least_scored: int) -> Any:
+        asked.append((least_scored, refuse(SimpleNamespace(available=frozenset({"speed_m_s"})))))
         assert refuse(ReadDrive()) == ""
         if log.stem == "c":
             return record("c", left_out="no true sideslip"), None
@@ -390,46 +393,42 @@ def test_trust_tells_its_progress_warns_and_keeps_its_evidence(
 
     squares = np.radians(np.array([0.5, 0.4, 0.3, 0.2, 0.1]))[:, None] ** 2 * np.full(20, 100.0)
     blocks = BlockErrors(squares, np.full(20, 100.0), 200.1234, 50.1234, lost=3)
-    monkeypatch.setattr(trust_command, "load_drive", load)
-    monkeypatch.setattr(trust_command, "errors_by_trust", lambda *_, **__: blocks)
+    monkeypatch.setattr(gain, "load_drive", load)
+    monkeypatch.setattr(gain, "errors_by_trust", lambda *_, **__: blocks)
     folder = tmp_path / "set"
     arguments = logs(folder, "abc")
     (folder / "manifest.json").write_text(json.dumps({"drives": [{"file": "b.mcap", "split": "test"}]}))
     told: list[tuple[str, float]] = []
     warned: list[str] = []
-    result = trust_command.trust(
-        arguments,
-        tmp_path / "car",
-        shipped,
-        progress=lambda *x: told.append(x),
-        warn=warned.append,
-    )
-    assert told == [("a", 0.0), ("b", pytest.approx(1 / 3)), ("c", pytest.approx(2 / 3)), ("done", 1.0)]
+    result = learn(arguments, tmp_path / "car", shipped, progress=lambda *x: told.append(x), warn=warned.append)
+    shares = (0.0, pytest.approx(1 / 3), pytest.approx(2 / 3), 1.0)
+    assert told == list(zip(("reading a", "reading b", "reading c", "done"), shares, strict=True))
     missing = "pd-hef needs ay_m_s2, steer_rad, yaw_rate_rad_s"
-    assert asked == [(None, 100, missing), ("test", 100, missing), (None, 100, missing)]
+    assert asked == [(100, missing)] * 3
+    assert [r.split for r in result.records] == [None, "test", None]
     assert warned == [
         "c is left out: no true sideslip",
-        "6 stamps without an estimate at some trust above 0 are charged to it",
+        "6 stamps without an estimate at some gain above 0 are counted against it",
     ]
-    assert result.decision.cap == 1.0
+    assert result.figures["trust_cap"] == 1.0
     car = Car.load(tmp_path / "car")
     assert car.trust is not None and car.trust.network == "default"
     assert not (tmp_path / "car/network").exists()  # a shipped network is named, not copied
     assert (car.trust.physics_sha256, car.trust.noise_sha256) == (car.physics_sha256, car.noise_sha256)
     assert [d.name for d in car.trust.drives] == ["a", "b"]
-    document = result.to_dict()
-    assert document["drives"][0]["rmse_deg"] == pytest.approx([0.5, 0.4, 0.3, 0.2, 0.1])
+    document = result.figures
     assert (document["scored_s"], document["excited_s"], document["blocks"]) == (400.247, 100.247, 40)
     assert document["trust_1_against_best_lower"]["value_deg2"] == pytest.approx(0.01 - 0.04)
     record_json = json.loads((tmp_path / "car/network.record.json").read_text())
+    assert record_json["drives"][0]["rmse_deg"] == pytest.approx([0.5, 0.4, 0.3, 0.2, 0.1])
     assert (record_json["format"], record_json["version"]) == ("pdhef-trust", 2)
     assert record_json["network_sha256"] == car.trust.network_sha256
     assert record_json["rule"] == {
         "block_s": 10.0, "min_blocks": 8, "excited_m_s2": 2.0, "min_excited_s": 20.0, "tolerance": 0.05,
         "unconfirmed_cap": 0.5, "level": 0.95, "resamples": 4000,
     }  # fmt: skip
-    monkeypatch.setattr(trust_command, "errors_by_trust", lambda *_, **__: replace(blocks, lost=0))
-    trust_command.trust(arguments[:1], tmp_path / "other", shipped, warn=warned.append)
+    monkeypatch.setattr(gain, "errors_by_trust", lambda *_, **__: replace(blocks, lost=0))
+    learn(arguments[:1], tmp_path / "other", shipped, warn=warned.append)
     assert len(warned) == 2
 
 
@@ -445,16 +444,16 @@ def test_the_evidence_is_one_sentence_with_its_figures() -> None:
         scored_s=61.6,
         excited_s=20.4,
     )
-    said = trust_command.evidence(decision, 2, "0123456789abcdef" * 4)
+    said = gain.evidence(decision, 2, "0123456789abcdef" * 4)
     assert said == (
         "a gain on the mean; 3 blocks are too few: 2 drives with truth, 62 s scored, 20 s of them above 2 m/s²; "
         "sideslip RMSE 0.500° at trust 0, 0.410° at trust 0.25, 0.300° at trust 0.5, 0.700° at trust 1; squared error "
         "at 1 less that at 0 0.24 (95 %: -0.1 to 0.5) deg² over 3 blocks; network 0123456789ab"
     )
     few = replace(decision, against_zero=(Bound(0.24, math.nan, math.nan),) * 5)
-    assert "at 0 0.24 deg² over" in trust_command.evidence(few, 1, "0" * 64)
-    assert "1 drive with truth" in trust_command.evidence(few, 1, "0" * 64)
-    assert trust_command._bound(Bound(0.24, math.nan, 1.0)) == {"value_deg2": 0.24, "low_deg2": None, "high_deg2": 1.0}
+    assert "at 0 0.24 deg² over" in gain.evidence(few, 1, "0" * 64)
+    assert "1 drive with truth" in gain.evidence(few, 1, "0" * 64)
+    assert gain._bound(Bound(0.24, math.nan, 1.0)) == {"value_deg2": 0.24, "low_deg2": None, "high_deg2": 1.0}
 
 
 # ---- tune ----
@@ -469,7 +468,7 @@ class FakeBenches:
 
     made: list[tuple[Any, int]]
 
-    def __init__(self, setup: TuneSetup, jobs: int) -> None:
+    def __init__(self, setup: BenchSetup, jobs: int) -> None:
         self.made.append((setup, jobs))
 
     def __enter__(self) -> FakeBenches:
@@ -493,7 +492,7 @@ class FakeBenches:
 
 def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FakeBenches, "made", [], raising=False)
-    monkeypatch.setattr(tune_command, "Benches", FakeBenches)
+    monkeypatch.setattr(noise, "Benches", FakeBenches)
     figures: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: (figures.append(self), file.write(b"png")))
     folder = tmp_path / "set"
@@ -501,69 +500,70 @@ def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkey
     (folder / "manifest.json").write_text(json.dumps({"drives": [{"file": "b.mcap", "split": "train"}]}))
     told: list[tuple[str, float]] = []
     warned: list[str] = []
-    settings = TuneSettings(config=SALOON, trials=6, seed=1, names=("phy-ukf-tuned", "physics"))
-    result = tune_command.tune(
+    config = replace(SALOON, estimators=("phy-ukf-tuned", "physics"))
+    settings = LearnSettings(config=config, stages=("noise",), trials=6, seed=1)
+    result = learn(
         arguments, tmp_path / "car", settings, jobs=5, progress=lambda *x: told.append(x), warn=warned.append
     )
     assert dict(told) == pytest.approx(
         {f"reading {n}": 0.2 * (i + 1) / 3 for i, n in enumerate("abc")}
         | {f"trial {i} of 6": 0.2 + 0.8 * i / 6 for i in range(1, 7)}
+        | {"done": 1.0}
     )
-    assert told[-1] == ("trial 6 of 6", pytest.approx(1.0))
+    assert told[-2] == ("trial 6 of 6", pytest.approx(1.0))
     ((setup, jobs),) = FakeBenches.made
     assert jobs == 3 and setup.names == ("physics", "phy-ukf-tuned")
     assert warned[0] == "c is left out: no true sideslip"
-    assert list(result.notes) == warned[1:]
+    assert result.figures["notes"] == warned[1:]
     car = Car.load(tmp_path / "car")
     document = json.loads((tmp_path / "car/noise.record.json").read_text())
-    for one in result.tuned:
-        best = min(one.trials, key=lambda t: t.score.objective_deg)
-        noise = car.noise[one.name]
-        assert (noise.trial, noise.score_deg) == (best.number, round(best.score.objective_deg, 4))
-        assert noise.q_std[1:] + tuple(noise.r_std.values()) == best.values
-        entry = document["estimators"][one.name]
-        assert entry["best_trial"] == best.number and len(entry["trials"]) == 6
-        rmse = 0.1 + abs(math.log(best.values[0] / 0.3))
+    for name in ("physics", "phy-ukf-tuned"):
+        entry, best_noise = document["estimators"][name], car.noise[name]
+        best = min(entry["trials"], key=lambda t: t["objective_deg"])
+        values = tuple(best["values"].values())
+        assert (best_noise.trial, best_noise.score_deg) == (best["trial"], round(best["objective_deg"], 4))
+        assert best_noise.q_std[1:] + tuple(best_noise.r_std.values()) == values
+        assert entry["best_trial"] == best["trial"] and len(entry["trials"]) == 6
+        rmse = 0.1 + abs(math.log(values[0] / 0.3))
         assert entry["rmse_deg"] == {"a": pytest.approx(rmse), "b": None}
-        assert entry["trials"][2]["values"] == dict(
-            zip(("q_vy", "q_yaw_rate", "r_ay", "r_yaw_rate"), one.trials[2].values, strict=True)
-        )
-        assert one.before is not None  # the saloon has noise for both
-        assert entry["before"]["objective_deg"] == one.before.objective_deg
+        assert list(entry["trials"][2]["values"]) == ["q_vy", "q_yaw_rate", "r_ay", "r_yaw_rate"]
+        figures_of = result.figures["estimators"][name]
+        assert entry["before"] is not None  # the saloon has noise for both
+        assert figures_of["before"] == entry["before"]
+        assert (figures_of["trials"], figures_of["best_trial"]) == (6, best["trial"])
     told_search = document["search"]
     assert (told_search["trials"], told_search["seed"], told_search["floor_deg"]) == (6, 1, 0.05)
     assert (told_search["exploring_share"], told_search["step_shares"]) == (0.5, [0.15, 0.02])
     assert (told_search["min_availability"], told_search["low_speed_m_s"]) == (0.9, 3.0)
     assert [f["name"] for f in told_search["space"]] == ["q_vy", "q_yaw_rate", "r_ay", "r_yaw_rate"]
     lines = figures[0].axes[0].get_lines()
-    values = [t.score.objective_deg for t in result.tuned[0].trials]
+    first = document["estimators"]["physics"]
+    values = [t["objective_deg"] for t in first["trials"]]
     np.testing.assert_allclose(lines[0].get_xydata(), np.stack([np.arange(1, 7), values], axis=1))
     np.testing.assert_allclose(lines[1].get_ydata(), np.minimum.accumulate(values))
-    assert lines[2].get_ydata()[0] == pytest.approx(result.tuned[0].before.objective_deg)
+    assert lines[2].get_ydata()[0] == pytest.approx(first["before"]["objective_deg"])
     assert lines[-1].get_xdata()[0] == 3.5  # between the third trial, the last that explores, and the fourth
-    shown = result.to_dict()["estimators"]["phy-ukf-tuned"]
-    assert (shown["trials"], shown["best_trial"]) == (6, result.tuned[1].best.number)
-    with pytest.raises(EstimatorError, match="tune"):
-        tune_command.tune(arguments[2:], tmp_path / "other", settings)
-    for wrong in ({"trials": 3}, {"jobs": 0}):
-        with pytest.raises(UsageError, match=next(iter(wrong))):
-            jobs = wrong.pop("jobs", 1)
-            tune_command.tune(arguments, tmp_path / "other", replace(settings, **wrong), jobs=jobs)
+    with pytest.raises(EstimatorError, match="noise"):
+        learn(arguments[2:], tmp_path / "other", settings)
+    with pytest.raises(UsageError, match="trials"):
+        replace(settings, trials=3)
+    with pytest.raises(UsageError, match="jobs"):
+        learn(arguments, tmp_path / "other", settings, jobs=0)
 
 
 def test_only_a_search_that_ends_badly_is_noted() -> None:
     good = Trial(0, "sobol", (0.1, 0.1, 0.5, 0.005), Score(1.0, 1.0, 1.0))
     edge = Trial(0, "sobol", (2.0, 0.1, 0.5, 0.0002), Score(1.0, 1.0, 1.0))
-    assert tune_command._notes([Tuned("a", None, (good,), ()), Tuned("b", Score(1.0, 0, 0), (good,), ())]) == ()
-    notes = tune_command._notes([Tuned("a", Score(0.87654321, 0, 0), (edge,), ())])
-    assert notes[0] == "a: the best q_vy, r_yaw_rate stands at an end of the search space"
+    assert noise._notes([Tuned("a", None, (good,), ()), Tuned("b", Score(1.0, 0, 0), (good,), ())]) == []
+    notes = noise._notes([Tuned("a", Score(0.87654321, 0, 0), (edge,), ())])
+    assert notes[0] == "a: the best q_vy, r_yaw_rate is at an end of the search space"
     assert "(0.8765 deg)" in notes[1] and len(notes) == 2
 
 
 def test_what_a_person_wrote_is_no_search_s() -> None:
     searched = FilterNoise(q_std=(0.1, 0.1, 0.1), trial=3, score_deg=0.5)
     car = Car.of(VEHICLE, noise={"phy-ukf-tuned": searched, "physics": FilterNoise(q_std=(0.2, 0.2, 0.2))})
-    assert tune_command._kept(car) == {"phy-ukf-tuned": searched.model_copy(update={"score_deg": None})}
+    assert noise._kept(car) == {"phy-ukf-tuned": searched.model_copy(update={"score_deg": None})}
 
 
 def test_names_are_those_of_the_tables_in_their_order() -> None:
@@ -579,7 +579,7 @@ def test_names_are_those_of_the_tables_in_their_order() -> None:
 
 def test_a_bench_keeps_drives_by_number_and_scores_filters(monkeypatch: pytest.MonkeyPatch) -> None:
     car = Car.of(VEHICLE)
-    setup = TuneSetup(replace(SALOON, sensors="esp"), car, None, ("phy-ukf-tuned", "physics"))
+    setup = BenchSetup(replace(SALOON, sensors="esp"), car, None, ("phy-ukf-tuned", "physics"))
     asked: list[Any] = []
 
     def load(_log: Any, used: Car, _mapping: Any, _options: Any, *, refuse: Any, **named: Any) -> Any:
@@ -587,7 +587,7 @@ def test_a_bench_keeps_drives_by_number_and_scores_filters(monkeypatch: pytest.M
         assert refuse(ReadDrive()) == ""
         return record("a"), loaded
 
-    monkeypatch.setattr(tune_drives, "load_drive", load)
+    monkeypatch.setattr(benches, "load_drive", load)
     bench, loaded = DriveBench(setup), WHOLE
     assert bench.load(3, LogInput(Path("a"), "a"), "test", 17).name == "a"
     loaded = None
@@ -604,7 +604,7 @@ def test_a_bench_keeps_drives_by_number_and_scores_filters(monkeypatch: pytest.M
     own = spec_of("phy-ukf-tuned").make(car.with_noise("phy-ukf-tuned", noise), Options(use_speed=False))
     assert WHOLE.truth is not None
     assert found == {"phy-ukf-tuned": {3: drive_error(run_window(own, WHOLE.signals)[0], WHOLE.truth, 3.0)}}
-    assert DriveBench(TuneSetup(SALOON, car, None, ("physics",)))._options.use_speed
+    assert DriveBench(BenchSetup(SALOON, car, None, ("physics",)))._options.use_speed
 
 
 class FakeBench:
@@ -647,7 +647,7 @@ class FakeCrew:
     def end(self, what: tuple[int, Any]) -> Ended[Any, Any]:
         number, part = what
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(tune_drives, "_here", self.benches[part.place])
+            patch.setattr(benches, "_here", self.benches[part.place])
             return Ended(number, part, self.work(part, None))
 
     def __exit__(self, *_: Any) -> None:
@@ -656,44 +656,44 @@ class FakeCrew:
 
 def test_drives_are_dealt_out_in_turn_within_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FakeCrew, "made", [], raising=False)
-    monkeypatch.setattr(tune_drives, "Crew", FakeCrew)
-    monkeypatch.setattr(tune_drives, "DriveBench", FakeBench)
-    monkeypatch.setattr(tune_drives, "MAX_BYTES", 200)
+    monkeypatch.setattr(benches, "Crew", FakeCrew)
+    monkeypatch.setattr(benches, "DriveBench", FakeBench)
+    monkeypatch.setattr(benches, "MAX_BYTES", 200)
     inputs = [LogInput(Path(n), n) for n in "abcde"]
     setup: Any = None
     for jobs in (1, 2):
         told: list[DriveRecord] = []
-        with Benches(setup, jobs) as benches:
-            loaded = benches.load(inputs, {"b": "test"}, told.append)
+        with Benches(setup, jobs) as pool:
+            loaded = pool.load(inputs, {"b": "test"}, told.append)
             assert loaded == told and [r.name for r in told] == list("abcde")
-            assert benches.score({"x": FilterNoise()}) == {"x": [0, 1, 2, 3, 4]}
+            assert pool.score({"x": FilterNoise()}) == {"x": [0, 1, 2, 3, 4]}
             if jobs == 1:
-                seen = benches._local.loaded
+                seen = pool._local.loaded
                 assert seen == [(i, n, "test" if n == "b" else None, 200 - 40 * i) for i, n in enumerate("abcde")]
     crew = FakeCrew.made[0]
     assert [[one[1] for one in place["bench"].loaded] for place in crew.benches] == [["a", "c", "e"], ["b", "d"]]
     assert [one[3] for one in crew.benches[0]["bench"].loaded] == [200, 120, 40]
     assert crew.ended
-    monkeypatch.setattr(tune_drives, "MAX_BYTES", 199)
-    with pytest.raises(EstimatorError, match="e: expected"), Benches(setup, 2) as benches:
-        benches.load(inputs, {}, lambda _: None)
+    monkeypatch.setattr(benches, "MAX_BYTES", 199)
+    with pytest.raises(EstimatorError, match="e: expected"), Benches(setup, 2) as pool:
+        pool.load(inputs, {}, lambda _: None)
     assert FakeCrew.made[-1].ended
 
 
 def test_drives_that_went_with_their_process_end_the_tuning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FakeCrew, "made", [], raising=False)
-    monkeypatch.setattr(tune_drives, "Crew", FakeCrew)
-    monkeypatch.setattr(tune_drives, "DriveBench", FakeBench)
+    monkeypatch.setattr(benches, "Crew", FakeCrew)
+    monkeypatch.setattr(benches, "DriveBench", FakeBench)
     setup: Any = None
-    with Benches(setup, 2) as benches:
-        benches.load([LogInput(Path(n), n) for n in "abc"], {}, lambda _: None)
+    with Benches(setup, 2) as pool:
+        pool.load([LogInput(Path(n), n) for n in "abc"], {}, lambda _: None)
         FakeCrew.made[0].benches[1].clear()
         with pytest.raises(EstimatorError, match="one that died with its drives"):
-            benches.score({"x": FilterNoise()})
+            pool.score({"x": FilterNoise()})
         lost = Ended(0, None, failure=Failure("the worker was killed (signal 9)"))
         monkeypatch.setattr(FakeCrew, "each", lambda *_, **__: iter([lost]))
         with pytest.raises(EstimatorError, match="killed"):
-            benches.score({"x": FilterNoise()})
+            pool.score({"x": FilterNoise()})
 
 
 # ---- extract ----

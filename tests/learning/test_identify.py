@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,12 +20,13 @@ from pdhef_logtool.learning.car import physics_fit
 from pdhef_logtool.learning.car.axle_forces import AxleCurve, axle_samples, fit_axle
 from pdhef_logtool.learning.car.fit_data import GUARD_S, FitDrive, split_drive
 from pdhef_logtool.learning.car.identify import _projected_levenberg_marquardt, fit_car
-from pdhef_logtool.learning.car.identify_command import identify
+from pdhef_logtool.learning.stages import identify as stage
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
+from tests.learning.stage_run import run_stage
 
 pytestmark = pytest.mark.slow
 
@@ -194,69 +196,69 @@ def test_held_out_part_changes_nothing_in_the_fit(drives: tuple[FitDrive, FitDri
 
 
 @quick_physics
-def test_command_writes_a_file_that_runs_and_says_where_its_numbers_come_from(
-    sample_logs_dir: Path, tmp_path: Path
+def test_the_stage_writes_a_part_that_runs_and_says_where_its_numbers_come_from(
+    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    guess = tmp_path / "guess.toml"
+    identifications = []
+
+    def fit(*args: Any, **named: Any) -> Any:
+        identifications.append(fit_car(*args, parts=STATIC, **named))
+        return identifications[-1]
+
+    monkeypatch.setattr(stage, "fit_car", fit)
+    guess, out = tmp_path / "guess.toml", tmp_path / "mycar"
     text = (sample_logs_dir / "vehicle.toml").read_text()
     assert "trust_cap = 1.0" in text  # found with other tyres
     guess.write_text(text)
-    config = RunConfig(car=guess, end="80")
     log = [str(sample_logs_dir / "road.mcap")]
-    out, folder = tmp_path / "car.toml", tmp_path / "mycar"
-    result = identify(log, out, config, holdout=0.25, parts=STATIC)
-    car, found = Car.load(out), result.identification
+    result = run_stage("identify", log, out, RunConfig(car=guess, end="80"), holdout=0.25)
+    car, (found,) = Car.load(out), identifications
     assert car.vehicle == found.vehicle.model_copy(update={"name": car.vehicle.name})
-    assert car.noise == {NAME: found.noise, "physics": found.physics.noise}
+    assert car.noise[NAME].model_copy(update={"physics_sha256": None}) == found.noise
+    assert car.noise["physics"].q_std == found.physics.noise.q_std
     assert car.fitted_physics == found.physics
     physics = car.physics_vehicle
     assert (physics.tyres, physics.physics) == (found.physics.values.tyres, STATIC)
     assert car.allowed_trust.cap == 0.0 and "no evidence" in car.allowed_trust.reason
     (drive,) = car.learnt_on
     assert (drive.name, drive.start_s) == ("road", 0.0)
-    assert "95 %" in out.read_text()
-    assert text.splitlines()[0] in out.read_text()  # a person's comments stay
-    assert (tmp_path / "car.fit.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "vehicle.toml").read_text() == text
+    assert "95 %" in (out / "fit.toml").read_text()
+    assert (out / "fit.png").read_bytes().startswith(b"\x89PNG")
+    assert [s["part"] for s in result.figures["sideslip_rmse_deg"]] == ["fit", "held out"]
     json.dumps(result.to_dict(), allow_nan=False)
     make_estimator(NAME, car)
     make_estimator("physics", car)
-
-    identify(log, folder, config, holdout=0.25, parts=STATIC)
-    same = Car.load(folder)
-    assert (same.vehicle, same.learnt_on) == (car.vehicle, car.learnt_on)
-    assert same.noise[NAME].model_copy(update={"physics_sha256": None}) == car.noise[NAME]
-    assert same.fitted_physics == car.fitted_physics
-    assert same.noise["physics"] == car.noise["physics"]
-    assert same.physics_vehicle.model_copy(update={"name": physics.name}) == physics
-    assert same.allowed_trust.cap == 0.0
-    assert (folder / "vehicle.toml").read_text() == text
-    assert "95 %" in (folder / "fit.toml").read_text()
-    assert (folder / "fit.png").read_bytes() == (tmp_path / "car.fit.png").read_bytes()
 
 
 def test_command_refuses_what_it_cannot_use(sample_logs_dir: Path, tmp_path: Path) -> None:
     log = [str(sample_logs_dir / "dlc.mcap")]
     with pytest.raises(UsageError, match="holdout"):
-        identify(log, tmp_path / "car.toml", RunConfig(), holdout=1.0)
-    (tmp_path / "car.json").write_text("{}")
-    with pytest.raises(UsageError, match=r"\.toml"):
-        identify(log, tmp_path / "car.json", RunConfig())
-    for name in ("car.toml", "mycar"):
-        with pytest.raises(EstimatorError, match="20 s"):
-            identify(log, tmp_path / name, RunConfig())
-    assert [p.name for p in tmp_path.iterdir()] == ["car.json"]
+        run_stage("identify", log, tmp_path / "mycar", RunConfig(), holdout=1.0)
+    (tmp_path / "notes").write_text("{}")
+    with pytest.raises(UsageError, match="a car's folder"):
+        run_stage("identify", log, tmp_path / "notes", RunConfig())
+    for suffix in (".json", ".toml"):
+        with pytest.raises(UsageError, match="a car's folder"):
+            run_stage("identify", log, tmp_path / f"car{suffix}", RunConfig())
+    with pytest.raises(EstimatorError, match="20 s"):
+        run_stage("identify", log, tmp_path / "mycar", RunConfig())
+    assert [p.name for p in tmp_path.iterdir()] == ["notes"]
 
 
 @quick_physics
-def test_250_lm_identified_on_its_first_half_is_good_on_its_second(shared_dir: Path, tmp_path: Path) -> None:
+def test_250_lm_identified_on_its_first_half_is_good_on_its_second(
+    shared_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """An identified filter has 0.30 to 0.34° on 155 to 300 s."""
     reference = Path(__file__).resolve().parents[1] / "reference"
     mapping = reference / "mappings" / "revs_250lm.toml"
     log = [str(shared_dir / "data/drives/revs_250lm_a.mcap")]
     first = RunConfig(car=reference / "vehicles" / "revs_250lm.toml", mapping=mapping, end="150")
-    identify(log, tmp_path / "car.toml", first, holdout=0.0, parts=STATIC)
+    monkeypatch.setattr(stage, "fit_car", partial(fit_car, parts=STATIC))
+    run_stage("identify", log, tmp_path / "car", first, holdout=0.0)
     second = RunConfig(
-        car=tmp_path / "car.toml", mapping=mapping, start="155", estimators=("zero", "phy-ukf-tuned"), annotate="none"
+        car=tmp_path / "car", mapping=mapping, start="155", estimators=("zero", "phy-ukf-tuned"), annotate="none"
     )
     result = run_logs(log, tmp_path / "out", second)
     rmse = {
@@ -284,5 +286,5 @@ def test_projected_steps_find_the_bounded_minimum_also_from_a_start_at_the_bound
 def test_command_says_which_truth_it_took(sample_logs_dir: Path, tmp_path: Path) -> None:
     said: list[str] = []
     with pytest.raises(EstimatorError):
-        identify([str(sample_logs_dir / "dlc.mcap")], tmp_path / "car.toml", RunConfig(), warn=said.append)
+        run_stage("identify", [str(sample_logs_dir / "dlc.mcap")], tmp_path / "car", RunConfig(), warn=said.append)
     assert any(text.startswith("dlc: ") and "/rtk/odometry" in text for text in said)

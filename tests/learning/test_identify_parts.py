@@ -22,7 +22,7 @@ from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, PhysicsUkf
 from pdhef_logtool.estimators.physics_tuned import physics_ukf_tuned
 from pdhef_logtool.estimators.physics_ukf import physics_filter
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.learning.car import fit_data, identify, identify_command, identify_plot
+from pdhef_logtool.learning.car import fit_data, identify, identify_plot
 from pdhef_logtool.learning.car.axle_forces import AxleCurve, AxleSamples, axle_samples, fit_axle, usable_stamps
 from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive, split_drive
 from pdhef_logtool.learning.car.identify import (
@@ -36,7 +36,9 @@ from pdhef_logtool.learning.car.identify import (
     understeer_deg_per_g,
 )
 from pdhef_logtool.learning.car.physics_fit import PhysicsFit
-from pdhef_logtool.learning.drives import DriveRecord
+from pdhef_logtool.learning.drives import DriveRecord, LearnSettings
+from pdhef_logtool.learning.engine import learn
+from pdhef_logtool.learning.stages import identify as stage
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.tracks import make_track
@@ -581,7 +583,7 @@ FOUND = Identification(
 
 
 def test_intervals_are_said_in_words_beside_their_entries() -> None:
-    said = identify_command._comments(FOUND)
+    said = stage._comments(FOUND)
     interval = "95 %: 4000 to 6000, prior 5500"
     assert said == {
         "yaw_inertia_kg_m2": "kept at its prior: the sideslip says no more about it",
@@ -597,8 +599,8 @@ def test_intervals_are_said_in_words_beside_their_entries() -> None:
             )
         },
     }
-    assert identify_command.describe(PARAMETERS[-1]) == "95 %: 0.123 to 1"
-    assert "the fit to the axle forces" in identify_command.describe(_parameter("rear shape", excited=False))
+    assert stage.describe(PARAMETERS[-1]) == "95 %: 0.123 to 1"
+    assert "the fit to the axle forces" in stage.describe(_parameter("rear shape", excited=False))
 
 
 def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
@@ -616,34 +618,25 @@ def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
         one, why = made[log.stem]
         return DriveRecord(log.stem, log.path.name, sha256=f"{'abc'.index(log.stem)}" * 64, left_out=why), one
 
-    def fit(
-        drives: Any, held_out: Any, start: Any, *, steering_wheel: bool, parts: Any, progress: Any
-    ) -> Identification:
-        asked.append((len(drives), len(held_out), start, steering_wheel, parts))
+    def fit(drives: Any, held_out: Any, start: Any, *, steering_wheel: bool, progress: Any) -> Identification:
+        asked.append((len(drives), len(held_out), start, steering_wheel))
         progress("fitting", 0.5)
         return FOUND
 
-    monkeypatch.setattr(identify_command, "load_fit_drive", load)
-    monkeypatch.setattr(identify_command, "fit_car", fit)
+    monkeypatch.setattr(stage, "load_fit_drive", load)
+    monkeypatch.setattr(stage, "fit_car", fit)
     monkeypatch.setattr(Figure, "savefig", lambda _, file, **__: file.write(b"png"))
     told: list[tuple[str, float]] = []
     warned: list[str] = []
-    result = identify_command.identify(
-        [str(folder)],
-        tmp_path / "car",
-        RunConfig(),
-        holdout=0.1,
-        parts=STATIC,
-        progress=lambda *x: told.append(x),
-        warn=warned.append,
-    )
-    shares = {"reading a": 0.0, "reading b": 0.2 / 3, "reading c": 0.4 / 3, "fitting": 0.6}
+    settings = LearnSettings(config=RunConfig(), stages=("identify",), holdout=0.1)
+    result = learn([str(folder)], tmp_path / "car", settings, progress=lambda *x: told.append(x), warn=warned.append)
+    shares = {"reading a": 0.0, "reading b": 0.2 / 3, "reading c": 0.4 / 3, "fitting": 0.6, "done": 1.0}
     assert dict(told) == pytest.approx(shares)
     assert warned == [
         "no --car: mass, geometry and priors are those of the default sedan",
         "b is left out: no true sideslip",
     ]
-    assert asked == [(2, 0, default_vehicle(), True, STATIC)]
+    assert asked == [(2, 0, default_vehicle(), True)]
     car = Car.load(tmp_path / "car")
     assert (tmp_path / "car/fit.png").read_bytes() == b"png"
     # To the hundredth of a second, which is what two slices are compared by.
@@ -652,11 +645,11 @@ def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
         ("c", "2", 1.23, 6.62),
     ]
     assert car.vehicle.yaw_inertia_kg_m2 == 1600.0
-    document = result.to_dict()
-    assert document["exit_code"] == 3
+    assert result.to_dict()["exit_code"] == 3
+    document = result.figures
     assert document["parameters"][0] == {
         "name": "front cornering stiffness", "unit": "1", "value": 5000.4, "low95": 4000.0, "high95": 6000.0,
-        "prior": 5500.0, "excited": True,
+        "prior": 5500.0, "excited": True, "noise": False,
     }  # fmt: skip
     assert document["sideslip_rmse_deg"][1] == {
         "part": "held out", "seconds": 20.0, "zero": 3.5, "phy-ukf, starting file": 2.5,
@@ -669,9 +662,9 @@ def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
     assert document["notes"] == ["a note"]
     made.update(a=(None, "x"), c=(None, "x"))
     with pytest.raises(EstimatorError, match="identify"):
-        identify_command.identify([str(folder)], tmp_path / "other", RunConfig())
+        learn([str(folder)], tmp_path / "other", settings)
     with pytest.raises(UsageError, match="holdout"):
-        identify_command.identify([str(folder)], tmp_path / "other", RunConfig(), holdout=0.9)
+        replace(settings, holdout=0.9)
 
 
 def test_the_plot_shows_samples_curves_intervals_and_errors(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""``pdhef learn``: parts that do not mix, steps that are undone, a rerun that goes on, and a car from one minute."""
+"""``pdhef learn``: parts that do not mix, stages that are undone, a rerun that continues, and a car from one minute."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,21 +18,22 @@ from hypothesis import strategies as st
 from pdhef_logtool.car.car import FIT_FILE, Car
 from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import Fit, FittedValues, physics_sha256
-from pdhef_logtool.car.store import Change, update_car
+from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres
 from pdhef_logtool.evaluation.comparison import Errors
+from pdhef_logtool.learning import engine, more_driving
 from pdhef_logtool.learning.car import identify, physics_fit
-from pdhef_logtool.learning.learn import learn_command, steps
-from pdhef_logtool.learning.learn.learn_command import CourseSettings, _compare, learn
-from pdhef_logtool.learning.learn.page import draw_page, page_markdown
-from pdhef_logtool.learning.learn.parts import (
-    CHECK,
-    FIT,
+from pdhef_logtool.learning.drives import STAGES, LearnSettings
+from pdhef_logtool.learning.engine import _compare, count_evaluations, learn
+from pdhef_logtool.learning.page import draw_page, page_markdown
+from pdhef_logtool.learning.split import (
     GAP_S,
-    LAST,
-    NETWORK,
+    NETWORK_TRAINING,
     OWN_NETWORK_PART_S,
     PARTS,
+    TEST,
+    TRAINING,
+    VALIDATION,
     WHOLE_DRIVES,
     DriveTimes,
     divided,
@@ -42,7 +42,7 @@ from pdhef_logtool.learning.learn.parts import (
     split_drives,
     usable_in,
 )
-from pdhef_logtool.learning.learn.steps import Taught
+from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.runs.config import RunConfig
@@ -71,7 +71,7 @@ stretches = st.lists(st.tuples(st.floats(0.0, 40.0), st.floats(1.0, 300.0)), min
 def test_parts_of_a_drive_never_meet(drives: list[list[tuple[float, float]]], holdout: float) -> None:
     times = [_times(f"d{i}", s) for i, s in enumerate(drives)]
     parts = split_drives(times, holdout)
-    assert set(parts) == set(PARTS) and bool(parts[LAST]) <= (holdout > 0.0)
+    assert set(parts) == set(PARTS) and bool(parts[TEST]) <= (holdout > 0.0)
     for drive in times:
         mine = [(s.span_s, part) for part in PARTS for s in parts[part] if s.path == drive.log.path and s.span_s]
         assert [s.stem for p in PARTS for s in parts[p] if s.path == drive.log.path] == [
@@ -81,7 +81,7 @@ def test_parts_of_a_drive_never_meet(drives: list[list[tuple[float, float]]], ho
         for ((_, end), part), ((start, _), other) in pairwise(mine):
             assert start - end > GAP_S - ROUNDING_S and part != other
         assert all(b > a for (a, b), _ in mine)
-        assert not any(part == LAST for _, part in mine[:-1])
+        assert not any(part == TEST for _, part in mine[:-1])
         assert not mine or (mine[0][0][0] >= drive.usable_s[0] - ROUNDING_S)
         assert not mine or mine[-1][0][1] <= drive.usable_s[-1] + ROUNDING_S
 
@@ -104,7 +104,7 @@ def test_a_minute_leaves_something_to_check_and_to_score_however_it_comes() -> N
         times = [_times(f"d{i}", [one]) for i, one in enumerate(drives)]
         parts = split_drives(times, 0.15)
         usable = {p: sum(t.seconds for t in usable_in(times, parts[p])) for p in PARTS}
-        assert usable[FIT] > 22.0 and usable[CHECK] > 9.5 and usable[LAST] > 9.5, drives
+        assert usable[TRAINING] > 22.0 and usable[VALIDATION] > 9.5 and usable[TEST] > 9.5, drives
 
 
 def test_shares_are_of_usable_driving_and_the_network_has_its_own_where_there_is_much() -> None:
@@ -112,12 +112,14 @@ def test_shares_are_of_usable_driving_and_the_network_has_its_own_where_there_is
     little = _times("a", [(0.0, 50.0), (300.0, 250.0)])
     parts = split_drives([little], 0.15)
     usable = {p: sum(t.seconds for t in usable_in([little], parts[p])) for p in PARTS}
-    assert parts[NETWORK] == () and len(parts[FIT]) == 1
-    assert usable[FIT] == pytest.approx(0.85 * 0.82 * 300.0 - GAP_S / 2, abs=0.5)
-    assert usable[CHECK] == pytest.approx(0.85 * 0.18 * 300.0 - GAP_S, abs=0.5)
-    assert usable[LAST] == pytest.approx(0.15 * 300.0 - GAP_S / 2, abs=0.5)
+    assert parts[NETWORK_TRAINING] == () and len(parts[TRAINING]) == 1
+    assert usable[TRAINING] == pytest.approx(0.85 * 0.82 * 300.0 - GAP_S / 2, abs=0.5)
+    assert usable[VALIDATION] == pytest.approx(0.85 * 0.18 * 300.0 - GAP_S, abs=0.5)
+    assert usable[TEST] == pytest.approx(0.15 * 300.0 - GAP_S / 2, abs=0.5)
     much = split_drives([_times("a", [(0.0, OWN_NETWORK_PART_S + 1.0)])], 0.15)
-    assert len(much[FIT]) == len(much[NETWORK]) == len(much[CHECK]) == 2 and len(much[LAST]) == 1
+    assert len(much[TRAINING]) == len(much[NETWORK_TRAINING]) == len(much[VALIDATION]) == 2 and len(much[TEST]) == 1
+    # Without a fit the network is trained on the training part, however much there is.
+    assert split_drives([_times("a", [(0.0, 900.0)])], 0.15, ("gain", "network"))[NETWORK_TRAINING] == ()
     for share in (0.0, 0.15, 0.5):
         assert sum(shares_of(100.0, share).values()) == pytest.approx(1.0)
         assert sum(shares_of(1000.0, share).values()) == pytest.approx(1.0)
@@ -161,17 +163,17 @@ def test_noise_must_be_better_beyond_doubt() -> None:
 
     rng = np.random.default_rng(0)
     old = rng.normal(0.0, 1.0, 900)
-    assert learn_command._confirmed(errors(old), errors(0.9 * old))
-    assert not learn_command._confirmed(errors(old[:700]), errors(0.9 * old[:700]))  # of seven blocks
-    assert not learn_command._confirmed(errors(old), errors(rng.normal(0.0, 0.99, 900)))
-    assert not learn_command._confirmed(errors(0.9 * old), errors(old))
+    assert engine._confirmed(errors(old), errors(0.9 * old))
+    assert not engine._confirmed(errors(old[:700]), errors(0.9 * old[:700]))  # of seven blocks
+    assert not engine._confirmed(errors(old), errors(rng.normal(0.0, 0.99, 900)))
+    assert not engine._confirmed(errors(0.9 * old), errors(old))
 
 
-def test_every_look_at_the_same_driving_is_counted(tmp_path: Path) -> None:
-    file = tmp_path / "looks.json"
-    looks = ([["a", 90.0, 100.0], ["b", 0.0, 10.0]], [["a", 100.0, 110.0]], [["b", 9.0, 20.0]], [["a", 95.0, 105.0]])
-    assert [learn_command._look(file, list(spans)) for spans in looks] == [1, 1, 2, 3]
-    assert learn_command._look(file, []) == 1
+def test_evaluations_of_the_same_driving_are_counted(tmp_path: Path) -> None:
+    file = tmp_path / "evaluations.json"
+    calls = ([["a", 90.0, 100.0], ["b", 0.0, 10.0]], [["a", 100.0, 110.0]], [["b", 9.0, 20.0]], [["a", 95.0, 105.0]])
+    assert [count_evaluations(file, list(spans)) for spans in calls] == [1, 1, 2, 3]
+    assert count_evaluations(file, []) == 1
 
 
 @pytest.mark.parametrize(
@@ -179,12 +181,12 @@ def test_every_look_at_the_same_driving_is_counted(tmp_path: Path) -> None:
 )
 def test_a_gain_is_not_worth_intervals_that_mean_nothing(was: int, now: int, sure: bool) -> None:
     old, new = (replace(_errors(*[1.0] * 10), inside=np.arange(10) < n) for n in (was, now))
-    assert learn_command._still_sure(old, new) is sure
+    assert engine._still_sure(old, new) is sure
 
 
 @pytest.mark.slow
 def test_the_page_holds_any_name_and_what_was_not_known() -> None:
-    line = {"name": "pd-hef-smoothed, learnt", "causal": False, "share": 1.0, "covered": None}
+    line = {"name": "pd-hef-smoothed, trained", "causal": False, "share": 1.0, "covered": None}
     parameter = {
         "name": "shape",
         "unit": "1",
@@ -201,10 +203,10 @@ def test_the_page_holds_any_name_and_what_was_not_known() -> None:
     found = {"physics_parameters": [parameter], "physics": {"tried": tried}}
     document = {
         "car_name": "a|b\x1b",
-        "looks": 2,
+        "evaluations": 2,
         "versions": {"tool": "1"},
-        "parts": {"fit": {"usable_s": 30.4, "slices": ["x|y_0-30s"]}, "last": {"usable_s": 0.0, "slices": []}},
-        "steps": [
+        "split": {"training": {"usable_s": 30.4, "slices": ["x|y_0-30s"]}, "test": {"usable_s": 0.0, "slices": []}},
+        "stages": [
             {
                 "name": "one",
                 "status": "undone",
@@ -215,25 +217,25 @@ def test_the_page_holds_any_name_and_what_was_not_known() -> None:
             },
             {"name": "two", "status": "not done", "text": "why not", "before": None, "after": None, "figures": {}},
         ],
-        "check": [
+        "validation": [
             {**line, "rmse_deg": [0.1, None, None], "against_hybrid_deg": [-0.02, -0.03, 0.01]},
             {"name": "physics, as given", "skipped": "no noise"},
         ],
-        "last": [],
+        "test": [],
         "more": ["more | driving"],
     }
     page = page_markdown(document)
     for text in (
-        "# What was learnt of a\\|b\\x1b",
+        "# Training of a\\|b\\x1b",
         "x\\|y_0-30s |",
         "| one | undone | a: 0.500 | b: 0.750 | why |",
         "| two | not done | – | – | why not |",
-        "| shape | 1.2 | 1 to 1.4 | 1.3 | 1 | hardly more than the prior |",
+        "| shape | 1.2 | 1 to 1.4 | 1.3 | 1 | not observable |",
         "| none | 0.200 | 0.300 | taken |",
         "| lag, roll | 0.100 | 0.200 |  |",
         "Nothing was held out.",
-        "Some of it was scored 2 times",
-        "| pd-hef-smoothed, learnt (not causal) | 0.100 | 100 % | – | -0.020 [-0.030, 0.010] |",
+        "Number of evaluations on the test part, in calls with this output: 2.",
+        "| pd-hef-smoothed, trained (not causal) | 0.100 | 100 % | – | -0.020 [-0.030, 0.010] |",
         "| physics, as given | – (no noise) |",
         "- more \\| driving",
     ):
@@ -241,30 +243,35 @@ def test_the_page_holds_any_name_and_what_was_not_known() -> None:
     assert draw_page(document).startswith(b"\x89PNG") and draw_page(document) == draw_page(document)
 
 
-# ---- the command, with steps that are quick ----
+# ---- the command, with stages that are quick ----
 
 SLICE = RunConfig(start="210", end="275")
 GOOD, BAD = 1.0, 0.5
+#: Everything but the intervals.
+FOUR = STAGES[:4]
 
 
-def _tyres(factor: float) -> Callable[..., Taught]:
-    """Return a step that gives the car the tyres that it should have, times a factor on its rear stiffness."""
+def _tyres(factor: float) -> Callable[[Task], StageOutput]:
+    """Return a stage that gives the car the tyres that it should have, times a factor on its rear stiffness."""
 
-    def teach(_lesson: steps.Lesson, before: Path, output: Path, _progress: object) -> Taught:
-        car = Car.load(before)
+    def run(task: Task) -> StageOutput:
         tyres = Tyres(
             front=AxleTyre(cornering_stiffness_n_per_rad=90_000.0),
             rear=AxleTyre(cornering_stiffness_n_per_rad=factor * 125_000.0),
         )
-        fit = Fit(physics_sha256=physics_sha256(car.own), values=FittedValues(tyres=tyres))
-        update_car(car, output, Change("step", FIT_FILE, {FIT_FILE: part_toml(fit, "made").encode()}))
-        return Taught(f"factor {factor}", {"factor": factor})
+        fit = Fit(physics_sha256=physics_sha256(task.car.own), values=FittedValues(tyres=tyres))
+        change = Change("stage", FIT_FILE, {FIT_FILE: part_toml(fit, "made").encode()})
+        return StageOutput(change, (), f"factor {factor}", {"physics_parameters": [], "physics": {}})
 
-    return teach
+    return run
 
 
-def _too_little(*_: object) -> Taught:
+def _too_little(_task: Task) -> StageOutput:
     raise EstimatorError(expected="more", got="less", where="little")
+
+
+def _interrupted(_task: Task) -> StageOutput:
+    raise KeyboardInterrupt
 
 
 @pytest.fixture
@@ -284,63 +291,63 @@ def _content(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-def test_steps_that_make_it_worse_are_undone_and_a_rerun_goes_on_to_the_same_bytes(
+def test_stages_that_raise_the_error_are_undone_and_a_rerun_continues_to_the_same_bytes(
     guess: Path, tmp_path: Path, sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done: list[str] = []
 
-    def counted(name: str, teach: Callable[..., Taught]) -> Callable[..., Taught]:
-        def count(*args: Any) -> Taught:
+    def counted(name: str, run: Callable[[Task], StageOutput]) -> Callable[[Task], StageOutput]:
+        def count(task: Task) -> StageOutput:
             done.append(name)
-            return teach(*args)
+            return run(task)
 
         return count
 
-    course = {"good": _tyres(GOOD), "little": _too_little, "bad": _tyres(BAD), "again": _tyres(GOOD)}
-    taught = {name: counted(name, teach) for name, teach in course.items()}
-    monkeypatch.setattr(learn_command, "STEPS", taught)
-    monkeypatch.setattr(learn_command, "MUST_GAIN", ("again",))
-    settings = CourseSettings(config=RunConfig(car=guess, start=SLICE.start, end=SLICE.end))
+    stages = {"identify": _tyres(GOOD), "noise": _too_little, "gain": _tyres(BAD), "network": _tyres(GOOD)}
+    for name, run in stages.items():
+        monkeypatch.setitem(engine.RUN, name, counted(name, run))
+    settings = LearnSettings(config=RunConfig(car=guess, start=SLICE.start, end=SLICE.end), stages=FOUR)
     logs = [str(sample_logs_dir / "road.mcap")]
     whole = tmp_path / "whole"
     result = learn(logs, whole, settings)
-    assert [(s.name, s.status) for s in result.steps] == [
-        ("good", "kept"),
-        ("little", "not done"),
-        ("bad", "undone"),
-        ("again", "undone"),
+    assert [(s.name, s.status) for s in result.stages] == [
+        ("identify", "kept"),
+        ("noise", "not done"),
+        ("gain", "undone"),
+        ("network", "undone"),
     ]
-    good, little, bad, again = result.steps
+    good, little, bad, again = result.stages
+    assert good.before is not None and bad.before is not None
     assert good.after is not None and bad.after is not None and again.after is not None
     assert good.after[1] < good.before[1] and bad.after[1] > bad.before[1] == good.after[1] == again.after[1]
     assert "expected more, got less" in little.text and result.exit_code == 0
     assert Car.load(whole).vehicle.tyres.rear.cornering_stiffness_n_per_rad == 125_000.0
-    assert sorted(p.name for p in (whole / "learn" / "3-bad").iterdir()) == ["step.json"]
-    names = [line["name"] for line in result.last]
+    assert sorted(p.name for p in (whole / "learn" / "3-gain").iterdir()) == ["step.json"]
+    names = [line["name"] for line in result.document["test"]]
     assert names[:4] == ["zero", "kinematic", "open-loop, as given", "phy-ukf, as given"]
     page = (whole / "learn.md").read_text(encoding="utf-8")
-    assert "| bad | undone |" in page and "scored once" in page
+    assert "| gain | undone |" in page and "scored once" in page
     json.dumps(result.to_dict())
 
-    # The second is stopped after its first step, goes on, and then has nothing left to do.
+    # The second is stopped after its first stage, continues, and then has nothing left to do.
     halted = tmp_path / "halted"
-    monkeypatch.setitem(taught, "little", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setitem(engine.RUN, "noise", _interrupted)
     with pytest.raises(KeyboardInterrupt):
         learn(logs, halted, settings)
     assert Car.load(halted).vehicle == Car.load(guess).vehicle  # a car all the time
-    monkeypatch.setitem(taught, "little", counted("little", _too_little))
+    monkeypatch.setitem(engine.RUN, "noise", counted("noise", _too_little))
     done.clear()
     learn(logs, halted, settings)
-    assert done == ["little", "bad", "again"]
+    assert done == ["noise", "gain", "network"]
     assert _content(halted) == _content(whole)
-    for folder in (halted, whole):  # what else is there stays; a part that was not learnt here does not
+    for folder in (halted, whole):  # what else is there stays; a part that was not made here does not
         (folder / "notes.txt").write_text("mine", encoding="utf-8")
     (halted / "noise.toml").write_text("stale", encoding="utf-8")
     done.clear()
-    monkeypatch.setattr(learn_command, "score_slices", lambda *_: pytest.fail("scored more than once"))
+    monkeypatch.setattr(engine, "score_slices", lambda *_: pytest.fail("scored more than once"))
     said: list[str] = []
     learn(logs, halted, settings, say=said.append)
-    assert not done and all("as found before" in line for line in said) and _content(halted) == _content(whole)
+    assert not done and all("from an earlier call" in line for line in said) and _content(halted) == _content(whole)
 
 
 @pytest.mark.slow
@@ -350,22 +357,46 @@ def test_other_settings_begin_anew_and_so_does_fresh(
     done: list[int] = []
     good = _tyres(GOOD)
 
-    def step(*args: Any) -> Taught:
+    def run(task: Task) -> StageOutput:
         done.append(1)
-        return good(*args)
+        return good(task)
 
-    monkeypatch.setattr(learn_command, "STEPS", {"good": step})
-    monkeypatch.setattr(
-        learn_command, "_end", lambda *_: {"car_name": "x", "looks": 1, "check": [], "last": [], "more": []}
-    )
+    monkeypatch.setitem(engine.RUN, "identify", run)
+    monkeypatch.setitem(engine.RUN, "noise", _too_little)
+    end = {"car_name": "x", "evaluations": 1, "validation": [], "test": [], "more": []}
+    monkeypatch.setattr(engine, "_end", lambda *_: end)
     logs = [str(sample_logs_dir / "road.mcap")]
     config = RunConfig(car=guess, start=SLICE.start, end=SLICE.end)
+    settings = LearnSettings(config=config, stages=("noise", "identify"))
     for count, (holdout, fresh) in enumerate(((0.2, False), (0.3, False), (0.3, True)), start=1):
-        learn(logs, tmp_path / "car", CourseSettings(config=config, holdout=holdout), fresh=fresh)
+        learn(logs, tmp_path / "car", replace(settings, holdout=holdout), fresh=fresh)
         assert len(done) == count
     shutil.rmtree(tmp_path / "car" / "learn")
-    learn(logs, tmp_path / "car", CourseSettings(config=config, holdout=0.3))
+    learn(logs, tmp_path / "car", replace(settings, holdout=0.3))
     assert len(done) == 4
+
+
+@pytest.mark.slow
+def test_some_stages_start_from_the_parts_that_the_car_has(
+    guess: Path, tmp_path: Path, sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logs = [str(sample_logs_dir / "road.mcap")]
+    config = RunConfig(car=guess, start=SLICE.start, end=SLICE.end)
+    monkeypatch.setitem(engine.RUN, "identify", _tyres(GOOD))
+    learn(logs, tmp_path / "car", LearnSettings(config=config, stages=("identify",)))
+    seen: list[Car] = []
+
+    def run(task: Task) -> StageOutput:
+        seen.append(task.car)
+        raise EstimatorError(expected="more", got="less", where="gain")
+
+    monkeypatch.setitem(engine.RUN, "gain", run)
+    monkeypatch.setitem(engine.RUN, "intervals", run)
+    settings = LearnSettings(config=replace(config, car=tmp_path / "car"), stages=("intervals", "gain"))
+    result = learn(logs, tmp_path / "car", settings)
+    assert [(s.name, s.status) for s in result.stages] == [("gain", "not done"), ("intervals", "not done")]
+    assert all(car.vehicle.tyres.rear.cornering_stiffness_n_per_rad == 125_000.0 for car in seen)
+    assert Car.load(tmp_path / "car").vehicle.tyres.rear.cornering_stiffness_n_per_rad == 125_000.0
 
 
 @pytest.mark.slow
@@ -374,39 +405,39 @@ def test_a_minute_of_driving_gives_a_car_that_says_what_it_could_not_learn(
 ) -> None:
     # What is found does not matter here: two steps from one start.
     quick = partial(physics_fit.fit_physics, starts=physics_fit.STARTS[:1], iterations=2)
-    for module in (physics_fit, steps):
+    for module in (physics_fit, more_driving):
         monkeypatch.setattr(module, "fit_physics", quick)
     monkeypatch.setattr(identify, "MAX_ITERATIONS", 2)
     config = RunConfig(car=guess, start="210", end="270")
     said: list[str] = []
     result = learn(
-        [str(sample_logs_dir / "road.mcap")], tmp_path / "car", CourseSettings(config=config), say=said.append
+        [str(sample_logs_dir / "road.mcap")], tmp_path / "car", LearnSettings(config=config), say=said.append
     )
-    by_name = {s.name: s for s in result.steps}
-    assert list(by_name) == list(steps.STEPS) and by_name["physics"].status == "kept"
-    assert {by_name[n].status for n in ("training", "intervals")} == {"not done"}
-    figures = {line["name"]: line["rmse_deg"][0] for line in result.last if "rmse_deg" in line}
-    assert figures["physics, learnt"] < figures["phy-ukf, as given"]
-    told = "\n".join(result.more)
+    by_name = {s.name: s for s in result.stages}
+    assert tuple(by_name) == STAGES and by_name["identify"].status == "kept"
+    assert {by_name[n].status for n in ("network", "intervals")} == {"not done"}
+    figures = {line["name"]: line["rmse_deg"][0] for line in result.document["test"] if "rmse_deg" in line}
+    assert figures["physics, trained"] < figures["phy-ukf, as given"]
+    told = "\n".join(result.document["more"])
     for words in (
         "none was tried on",
-        "it takes 100 s",
-        "the 95 % intervals are the filters' own",
-        "half of the fit part",
+        "needs 100 s",
+        "the 95 % intervals are not calibrated",
+        "half of the training part",
     ):
         assert words in told
-    assert len(said) == len(steps.STEPS) + 1 and (tmp_path / "car" / "learn.png").is_file()
+    assert len(said) == len(STAGES) + 1 and (tmp_path / "car" / "learn.png").is_file()
     assert Car.load(tmp_path / "car").fitted_physics is not None
 
 
 def test_too_little_driving_and_wrong_options_are_said(guess: Path, tmp_path: Path, sample_logs_dir: Path) -> None:
     logs = [str(sample_logs_dir / "dlc.mcap")]
-    settings = CourseSettings(config=RunConfig(car=guess))
+    settings = LearnSettings(config=RunConfig(car=guess))
     with pytest.raises(EstimatorError, match="at least 50 s"):
         learn(logs, tmp_path / "car", settings)
     assert not (tmp_path / "car").exists()
     with pytest.raises(UsageError, match="--holdout"):
-        learn(logs, tmp_path / "car", CourseSettings(config=RunConfig(car=guess), holdout=0.6))
+        learn(logs, tmp_path / "car", LearnSettings(config=RunConfig(car=guess), holdout=0.6))
     with pytest.raises(UsageError, match="a car's folder"):
         learn(logs, tmp_path / "car.toml", settings)
     with pytest.raises(UsageError, match="would replace the input"):

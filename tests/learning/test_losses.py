@@ -10,15 +10,11 @@ from typing import Any
 
 import pytest
 
-from pdhef_logtool.learning.car.identify_command import identify
-from pdhef_logtool.learning.drives import LearnSettings
-from pdhef_logtool.learning.evidence.calibrate_command import CalibrateSettings, calibrate
-from pdhef_logtool.learning.evidence.trust_command import trust
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
-from pdhef_logtool.learning.noise.tune_command import TuneSettings, tune
 from pdhef_logtool.records.errors import EXIT_PARTIAL
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
+from tests.learning.stage_run import run_stage
 
 pytestmark = pytest.mark.slow
 
@@ -28,25 +24,21 @@ REFERENCE = Path(__file__).resolve().parents[1] / "reference"
 def _losses_by_command(
     log: Path, others: list[Path], out: Path, config: RunConfig
 ) -> dict[str, tuple[list[dict[str, Any]], list[str]]]:
-    """Run every command on a damaged log, calibrate with others beside it; return by command its losses and warnings.
+    """Run every command on a damaged log, intervals with others beside it; return by command its losses and warnings.
 
     Every one must end with exit code 3.
     """
     logs, found = [str(log)], {}
     physics = replace(config, network=Path("none"), estimators=("phy-ukf",))
 
-    def learn(**settings: Any) -> dict[str, Any]:
-        return {"config": replace(physics, estimators=None), **settings}
-
+    tuned = replace(physics, estimators=("phy-ukf-tuned",))
     commands = {
-        "identify": lambda tell: identify(logs, out / "1", config, holdout=0.0, warn=tell),
+        "identify": lambda tell: run_stage("identify", logs, out / "1", config, holdout=0.0, warn=tell),
         "extract": lambda tell: extract(logs, out / "2", ExtractSettings(physics), warn=tell),
-        "tune": lambda tell: tune(
-            logs, out / "3", TuneSettings(**learn(names=("phy-ukf-tuned",), trials=4)), warn=tell
-        ),
-        "trust": lambda tell: trust(logs, out / "4", LearnSettings(config=config), warn=tell),
-        "calibrate": lambda tell: calibrate(
-            [*logs, *map(str, others)], out / "5", CalibrateSettings(config=physics, spread=0.0), warn=tell
+        "noise": lambda tell: run_stage("noise", logs, out / "3", tuned, trials=4, warn=tell),
+        "gain": lambda tell: run_stage("gain", logs, out / "4", config, warn=tell),
+        "intervals": lambda tell: run_stage(
+            "intervals", [*logs, *map(str, others)], out / "5", physics, spread=0.0, warn=tell
         ),
         "run": lambda tell: run_logs(logs, out / "6", replace(physics, annotate="none"), warn=tell),
     }

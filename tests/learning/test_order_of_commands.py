@@ -1,4 +1,4 @@
-"""The parts of a car, whatever the order of the commands: each is valid, or said to be stale with its command."""
+"""The parts of a car, whatever the order of the stages: each is valid, or named as stale with its stage."""
 
 from __future__ import annotations
 
@@ -11,31 +11,28 @@ import pytest
 import torch
 
 from pdhef_logtool.car.car import Car, read_history
-from pdhef_logtool.learning.car import identify_command
-from pdhef_logtool.learning.drives import LearnSettings
-from pdhef_logtool.learning.evidence.calibrate_command import CalibrateSettings, calibrate
-from pdhef_logtool.learning.evidence.trust_command import trust
-from pdhef_logtool.learning.noise.tune_command import TuneSettings, tune
+from pdhef_logtool.learning.stages import identify
 from pdhef_logtool.records.documents import digest
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
+from tests.learning.stage_run import run_stage
 
 pytestmark = pytest.mark.slow
 
 #: Files by the command that writes them; the first is the part.
 FILES = {
     "identify": ("fit.toml", "fit.png"),
-    "tune": ("noise.toml", "noise.record.json", "noise.png"),
-    "trust": ("network.toml", "network.record.json"),
-    "calibrate": ("intervals.json",),
+    "noise": ("noise.toml", "noise.record.json", "noise.png"),
+    "gain": ("network.toml", "network.record.json"),
+    "intervals": ("intervals.json",),
 }
 #: Every command follows every other one once.
 ORDER = (
-    *("tune", "trust", "calibrate", "identify", "trust", "tune", "identify"),
-    *("calibrate", "tune", "calibrate", "trust", "identify", "tune"),
+    *("noise", "gain", "intervals", "identify", "gain", "noise", "identify"),
+    *("intervals", "noise", "intervals", "gain", "identify", "noise"),
 )
 
 
@@ -62,9 +59,9 @@ class Commands:
             name: [str(sample_logs_dir / f"{log}.mcap") for log in logs.split()]
             for name, logs in {
                 "identify": "road",
-                "tune": "dlc",
-                "trust": "dlc",
-                "calibrate": "dlc step fishhook sweep road",
+                "noise": "dlc",
+                "gain": "dlc",
+                "intervals": "dlc step fishhook sweep road",
             }.items()
         }
 
@@ -72,15 +69,13 @@ class Commands:
         config = RunConfig(car=self.car if self.car.exists() else self.guess)
         logs = self._logs[name]
         if name == "identify":
-            identify_command.identify(logs, self.car, replace(config, end="34"), holdout=0.0)
-        elif name == "tune":
-            tune(logs, self.car, TuneSettings(config=config, names=("phy-ukf-tuned", "physics"), trials=4))
-        elif name == "trust":
-            network = self.car.parent / "model"
-            trust(logs, self.car, LearnSettings(config=replace(config, network=network, end="+5s")))
+            run_stage(name, logs, self.car, replace(config, end="34"), holdout=0.0)
+        elif name == "noise":
+            run_stage(name, logs, self.car, replace(config, estimators=("phy-ukf-tuned", "physics")), trials=4)
+        elif name == "gain":
+            run_stage(name, logs, self.car, replace(config, network=self.car.parent / "model", end="+5s"))
         else:
-            config = replace(config, estimators=("physics",), end="+5s")
-            calibrate(logs, self.car, CalibrateSettings(config=config, spread=0.0))
+            run_stage(name, logs, self.car, replace(config, estimators=("physics",), end="+5s"), spread=0.0)
 
     def drives(self, name: str) -> list[str]:
         return [Path(log).stem for log in self._logs[name]]
@@ -103,7 +98,7 @@ class Commands:
 
 @pytest.fixture
 def commands(sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Commands:
-    fit: Callable[..., object] = identify_command.fit_car
+    fit: Callable[..., object] = identify.fit_car
     # Every identification here has the same drives and start: one is enough.
     found: list[object] = []
 
@@ -112,13 +107,13 @@ def commands(sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
             found.append(fit(*arguments, **named))
         return found[0]
 
-    monkeypatch.setattr(identify_command, "fit_car", once)
+    monkeypatch.setattr(identify, "fit_car", once)
     return Commands(sample_logs_dir, tmp_path)
 
 
 def _stale(notes: list[str] | tuple[str, ...]) -> set[str]:
     """Return the commands that notes name, each once."""
-    named = [command for note in notes for command in FILES if f"pdhef {command} makes it anew" in note]
+    named = [command for note in notes for command in FILES if f"pdhef learn --stages {command} makes it anew" in note]
     assert len(named) == len(notes) == len(set(named)), notes
     return set(named)
 
@@ -132,19 +127,19 @@ def test_every_order_gives_parts_that_are_valid_or_said_to_be_stale(commands: Co
     for number, command in enumerate(ORDER, start=1):
         # What counts is whether the car is identified, and whether it has tuned noise that belongs to it.
         identified |= command == "identify"
-        tuned = made.get("tune") == (identified,)
-        basis = (identified, tuned) if command == "trust" else (identified,)
+        tuned = made.get("noise") == (identified,)
+        basis = (identified, tuned) if command == "gain" else (identified,)
         commands(command)
         after = commands.contents()
 
         assert after["vehicle.toml"] == person
-        own = {f for f in after if f in FILES[command] or (command == "trust" and f.startswith("network/"))}
+        own = {f for f in after if f in FILES[command] or (command == "gain" and f.startswith("network/"))}
         assert set(FILES[command]) <= own
         assert {f: b for f, b in after.items() if f not in own} == {f: b for f, b in before.items() if f not in own} | {
             "vehicle.toml": person
         }
         history = read_history(commands.car)
-        assert [line["command"] for line in history] == list(ORDER[:number])
+        assert [line["command"] for line in history] == [f"learn --stages {name}" for name in ORDER[:number]]
         part = FILES[command][0]
         assert (history[-1]["part"], history[-1]["sha256"]) == (part, digest(after[part].decode()))
         assert [drive["name"] for drive in history[-1]["drives"]] == commands.drives(command)
@@ -153,25 +148,25 @@ def test_every_order_gives_parts_that_are_valid_or_said_to_be_stale(commands: Co
         if command == "identify" and command in made:  # its input is the person's file and drives alone
             assert {f: after[f] for f in own} == {f: before[f] for f in own}
         made[command] = basis
-        tuned = made.get("tune") == (identified,)
-        expected = {c for c in ("tune", "calibrate") if made.get(c, (identified,)) != (identified,)}
-        expected |= {"trust"} if made.get("trust", (identified, tuned)) != (identified, tuned) else set()
+        tuned = made.get("noise") == (identified,)
+        expected = {c for c in ("noise", "intervals") if made.get(c, (identified,)) != (identified,)}
+        expected |= {"gain"} if made.get("gain", (identified, tuned)) != (identified, tuned) else set()
         car = Car.load(commands.car)
         assert _stale(car.notes) == expected, (number, command)
         assert car.vehicle.name.endswith("(identified)") == identified
         assert ("physics" in car.noise) == (tuned or identified)
         assert (car.fitted_physics is not None) == identified
-        assert ("trust" in made) == car.allowed_trust.reason.startswith(("too little", "the car's evidence was found"))
-        assert ("trust" in expected) == ("pdhef trust gives it anew" in car.allowed_trust.reason)
+        assert ("gain" in made) == car.allowed_trust.reason.startswith(("too little", "the car's evidence was found"))
+        assert ("gain" in expected) == ("pdhef learn --stages gain gives it anew" in car.allowed_trust.reason)
         before = after
 
         if number == ORDER.index("identify") + 1:
-            assert expected == {"tune", "trust", "calibrate"}
+            assert expected == {"noise", "gain", "intervals"}
             said, notes = commands.run(commands.car.parent / "out", dlc)
             assert _stale(said) == expected
             assert "but with other physics" in notes["physics"][0]
-        if (ORDER[number - 2], command) == ("calibrate", "trust"):
-            assert "calibrate" not in expected
+        if (ORDER[number - 2], command) == ("intervals", "gain"):
+            assert "intervals" not in expected
             said, notes = commands.run(commands.car.parent / "out", dlc)
             assert said == []
             assert notes["physics"] == [
@@ -180,7 +175,7 @@ def test_every_order_gives_parts_that_are_valid_or_said_to_be_stale(commands: Co
 
 
 # What calibrate writes twice is compared where it is tested; what identify writes, above.
-@pytest.mark.parametrize("command", ["tune", "trust"])
+@pytest.mark.parametrize("command", ["noise", "gain"])
 def test_the_same_command_on_the_same_input_gives_the_same_bytes(commands: Commands, command: str) -> None:
     commands(command)
     once = commands.contents(), (commands.car / "history.jsonl").read_bytes()

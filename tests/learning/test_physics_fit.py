@@ -27,11 +27,9 @@ from pdhef_logtool.learning.car.physics_fit import (
     fit_physics,
     make_folds,
     make_priors,
-    physics_parts,
     usable_seconds,
     varied_vehicles,
 )
-from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.self_calibration.calibration import VARIED
 
@@ -220,17 +218,6 @@ def test_the_car_at_theta_has_its_values_and_keeps_the_rest() -> None:
 
 
 # ---- parts ----
-
-
-def test_parts_are_named_in_words() -> None:
-    assert physics_parts("auto") is None
-    assert physics_parts("static") == STATIC
-    assert physics_parts("lag,roll") == PhysicsParts(lag=True, roll=True)
-    assert physics_parts("lag,roll").names == ("lag", "roll")  # type: ignore[union-attr]
-    with pytest.raises(UsageError, match=r"--parts.*expected auto, static, or names out of lag, load_transfer.*swing"):
-        physics_parts("lag,swing")
-    with pytest.raises(UsageError, match="--parts"):
-        physics_parts("")
 
 
 @pytest.mark.slow

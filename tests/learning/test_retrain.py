@@ -19,6 +19,7 @@ from test_network_parts import residual_rows, write_dataset
 
 from pdhef_logtool.learning.drives import DriveRecord
 from pdhef_logtool.learning.network.dataset import read_dataset
+from pdhef_logtool.learning.resume import Stages
 from pdhef_logtool.learning.retrain import retrain_command
 from pdhef_logtool.learning.retrain.retrain_command import (
     ACCEPTED,
@@ -30,7 +31,6 @@ from pdhef_logtool.learning.retrain.retrain_command import (
     retrain,
 )
 from pdhef_logtool.learning.retrain.roles import GATE, LEAST, SHARES, STOP, TRAIN, TRUST, Candidate, deal
-from pdhef_logtool.learning.stages import Stages
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EstimatorError, OutputError
 from pdhef_logtool.reports import comparison
 from pdhef_logtool.runs.config import RunConfig
@@ -83,7 +83,7 @@ def test_a_stage_is_done_once_for_a_basis_and_stands_whole_or_not_at_all(tmp_pat
         return {"n": len(done)}
 
     assert [stages.do(1, "one", ["a"], 0.0, work)["n"] for _ in range(3)] == [1, 1, 1]
-    assert said == ["one: came to 1 (0 s)", *["one: came to 1 (as found before)"] * 2]
+    assert said == ["one: came to 1 (0 s)", *["one: came to 1 (from an earlier call)"] * 2]
     assert stages.do(1, "one", ["b"], 0.0, work) == {"n": 2}
     with pytest.raises(KeyboardInterrupt):
         stages.do(2, "two", [], 0.0, work)
@@ -179,7 +179,7 @@ def test_a_candidate_goes_where_its_verdict_belongs_and_what_is_new_is_done_alon
     assert {n for n, role in roles.items() if role == GATE} == fleet.gate
     before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
     again = fleet.retrain()
-    assert fleet.done == [] and all(s.endswith("(as found before)") for s in fleet.said) and len(fleet.said) == 7
+    assert fleet.done == [] and all(s.endswith("(from an earlier call)") for s in fleet.said) and len(fleet.said) == 7
     assert again.document == found.document
     assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
     # Another gate on the same runs: only the verdict is new, and the candidate moves.

@@ -1,4 +1,4 @@
-"""``pdhef trust``: the rule on errors whose answer is known, and what it writes."""
+"""Stage gain: the rule on errors whose answer is known, and what it writes."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from pdhef_logtool.estimators.physics_ukf import of_car
 from pdhef_logtool.evaluation.bootstrap import block_bootstrap_difference
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.drives import LearnSettings, choose_drives, load_drive
+from pdhef_logtool.learning.engine import learn
 from pdhef_logtool.learning.evidence.trust import (
     MIN_BLOCKS,
     MIN_EXCITED_S,
@@ -34,12 +35,7 @@ from pdhef_logtool.learning.evidence.trust import (
     decide_cap,
     join_blocks,
 )
-from pdhef_logtool.learning.evidence.trust_command import (
-    REFUSED,
-    errors_by_trust,
-    seen_by_identification,
-    trust,
-)
+from pdhef_logtool.learning.stages.gain import errors_by_trust, seen_by_identification
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
@@ -256,7 +252,7 @@ def _bundle(seed: int = 0) -> ModelBundle:
 def _settings(sample_logs_dir: Path, folder: Path, **changes: object) -> LearnSettings:
     _bundle().save(folder / "model")
     config = RunConfig(car=sample_logs_dir / "vehicle.toml", network=folder / "model")
-    return replace(LearnSettings(config=config), **changes)  # type: ignore[arg-type]
+    return replace(LearnSettings(config=config, stages=("gain",)), **changes)  # type: ignore[arg-type]
 
 
 def test_the_errors_are_those_of_pd_hef_at_each_trust(sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -288,45 +284,43 @@ def test_the_file_is_the_one_that_was_given_but_for_the_network(sample_logs_dir:
     options = replace(options, config=replace(options.config, car=source))
     logs = [str(sample_logs_dir / f"{n}.mcap") for n in ("dlc", "step", "no_truth")]
     told: list[str] = []
-    result = trust(logs, tmp_path / "trusted.toml", options, warn=told.append)
+    result = learn(logs, tmp_path / "trusted", options, warn=told.append)
     assert result.exit_code == 3
     assert any(line.startswith("no_truth is left out") for line in told)
-    before, after = Car.load(source), Car.load(tmp_path / "trusted.toml", network=tmp_path / "model")
+    before, after = Car.load(source), Car.load(tmp_path / "trusted", network=tmp_path / "model")
     assert (after.vehicle, after.noise, after.learnt_on) == (before.vehicle, before.noise, before.learnt_on)
-    found = result.trust
-    assert after.trust is not None
-    assert (after.trust.trust_cap, after.trust.evidence) == (found.trust_cap, found.evidence)
-    assert after.trust.network_sha256 == found.network_sha256 == _bundle().sha256
-    assert after.allowed_trust.cap == result.decision.cap
-    assert after.trust.has_evidence
-    for figure in (f"{result.decision.rmse_deg[0]:.3f}°", f"{result.decision.rmse_deg[4]:.3f}°", "2 drives"):
-        assert figure in after.trust.evidence
-    written = (tmp_path / "trusted.toml").read_text()
-    assert written.startswith("# A head.")
-    assert "# measured" in written
-    record = json.loads((tmp_path / "trusted.network.record.json").read_text())
-    assert record["trust_cap"] == result.decision.cap
+    found, part = result.figures, after.trust
+    assert part is not None
+    assert (part.trust_cap, part.evidence) == (found["trust_cap"], found["evidence"])
+    assert part.network_sha256 == found["network_sha256"] == _bundle().sha256
+    assert after.allowed_trust.cap == found["trust_cap"]
+    assert part.has_evidence
+    for figure in (f"{found['rmse_deg'][0]:.3f}°", f"{found['rmse_deg'][4]:.3f}°", "2 drives"):
+        assert figure in part.evidence
+    assert (tmp_path / "trusted/vehicle.toml").read_bytes() == source.read_bytes()
+    record = json.loads((tmp_path / "trusted/network.record.json").read_text())
+    assert record["trust_cap"] == found["trust_cap"]
     assert [d["name"] for d in record["drives"]] == ["dlc", "step"]
     assert record["drives"][0]["sha256"]
     assert record["network_sha256"] == _bundle().sha256
     # Once more, onto itself: the old evidence is replaced.
-    again = replace(options, config=replace(options.config, car=tmp_path / "trusted.toml"))
-    trust(logs[:2], tmp_path / "trusted.toml", again)
-    assert (tmp_path / "trusted.toml").read_text() == written
+    again = replace(options, config=replace(options.config, car=tmp_path / "trusted"))
+    learn(logs[:2], tmp_path / "trusted", again)
+    assert Car.load(tmp_path / "trusted").trust == part
 
 
 def test_a_folder_gets_a_copy_of_the_network_that_was_tried(sample_logs_dir: Path, tmp_path: Path) -> None:
     options = _settings(sample_logs_dir, tmp_path)
-    result = trust([str(sample_logs_dir / "dlc.mcap")], tmp_path / "mycar", options)
+    result = learn([str(sample_logs_dir / "dlc.mcap")], tmp_path / "mycar", options)
     shutil.rmtree(tmp_path / "model")
     car = Car.load(tmp_path / "mycar")
     assert car.network is not None and car.network.sha256 == _bundle().sha256
-    assert car.trust == result.trust
+    assert car.trust is not None and car.trust.evidence == result.figures["evidence"]
     assert car.trust.physics_sha256 == car.physics_sha256
-    assert car.allowed_trust.reason == result.trust.evidence
+    assert car.allowed_trust.reason == car.trust.evidence
     # Another network may be taken, but not on this evidence.
     other = Car.load(tmp_path / "mycar", network="default")
-    assert other.allowed_trust.cap == 0.0 and "pdhef trust tries it" in other.allowed_trust.reason
+    assert other.allowed_trust.cap == 0.0 and "pdhef learn --stages gain tries it" in other.allowed_trust.reason
 
 
 def test_drives_that_a_network_was_trained_on_are_refused(sample_logs_dir: Path, tmp_path: Path) -> None:
@@ -337,13 +331,13 @@ def test_drives_that_a_network_was_trained_on_are_refused(sample_logs_dir: Path,
         entries.append({"file": f"{name}.mcap", "split": split})
     (tmp_path / "set" / "manifest.json").write_text(json.dumps({"drives": entries}))
     logs = find_logs([str(tmp_path / "set")])
-    options = LearnSettings(config=RunConfig())
+    options = LearnSettings(config=RunConfig(), stages=("gain",))
     with pytest.raises(UsageError, match=r"dlc \(train\).*--split test"):
-        choose_drives(logs, options, REFUSED)
+        choose_drives(logs, options)
     with pytest.raises(UsageError, match="drives of split extrapolation, got drives of test, train"):
-        choose_drives(logs, replace(options, split="extrapolation"), REFUSED)
-    assert [i.stem for i in choose_drives(logs, replace(options, split="test"), REFUSED)[0]] == ["step"]
-    assert [i.stem for i in choose_drives(logs, replace(options, any_split=True), REFUSED)[0]] == ["dlc", "step"]
+        choose_drives(logs, replace(options, split="extrapolation"))
+    assert [i.stem for i in choose_drives(logs, replace(options, split="test"))[0]] == ["step"]
+    assert [i.stem for i in choose_drives(logs, replace(options, any_split=True))[0]] == ["dlc", "step"]
 
 
 def test_a_drive_of_the_identification_is_told(sample_logs_dir: Path) -> None:
@@ -377,26 +371,27 @@ def test_wrong_options_are_usage_errors(sample_logs_dir: Path, tmp_path: Path) -
         replace(options, seed=-1)
     for one, message in wrong:
         with pytest.raises(UsageError, match=message):
-            trust(log, tmp_path / "out.toml", one)
-    (tmp_path / "out.txt").write_text("no folder")
-    with pytest.raises(UsageError, match=r"\.toml"):
-        trust(log, tmp_path / "out.txt", options)
+            learn(log, tmp_path / "out", one)
+    (tmp_path / "notes").write_text("no folder")
+    with pytest.raises(UsageError, match="a car's folder"):
+        learn(log, tmp_path / "notes", options)
     with pytest.raises(EstimatorError, match="at least one drive with a true sideslip"):
-        trust([str(sample_logs_dir / "no_truth.mcap")], tmp_path / "out.toml", options)
-    assert not (tmp_path / "out.toml").exists()
+        learn([str(sample_logs_dir / "no_truth.mcap")], tmp_path / "out", options)
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_command_prints_a_table_or_json(sample_logs_dir: Path, tmp_path: Path) -> None:
     _bundle().save(tmp_path / "model")
-    words = ["trust", sample_logs_dir / "dlc.mcap", "--car", sample_logs_dir / "vehicle.toml",
-             "--network", tmp_path / "model", "-o", tmp_path / "car.toml"]  # fmt: skip
+    words = ["learn", sample_logs_dir / "dlc.mcap", "--stages", "gain", "--car", sample_logs_dir / "vehicle.toml",
+             "--network", tmp_path / "model", "-o", tmp_path / "car"]  # fmt: skip
     shown = called(*words)
     assert shown.returncode == 0, shown.stderr
     # A double lane change is over too soon to decide on.
-    assert "trust cap 0: too little to decide on" in shown.stdout
-    document = json.loads(called(*words, "--json").stdout)
-    assert document["trust_cap"] == 0.0
-    assert document["trusts"] == list(TRUSTS)
-    assert document["against_trust_0"][4]["low_deg2"] is None
-    found = Car.load(tmp_path / "car.toml").trust
-    assert found is not None and found.evidence == document["evidence"]
+    assert "residual gain limit 0: too little to decide on" in shown.stdout
+    (stage,) = json.loads(called(*words, "--json").stdout)["stages"]
+    figures = stage["figures"]
+    assert (stage["name"], stage["status"], figures["trust_cap"]) == ("gain", "kept", 0.0)
+    assert figures["trusts"] == list(TRUSTS)
+    assert figures["against_trust_0"][4]["low_deg2"] is None
+    found = Car.load(tmp_path / "car").trust
+    assert found is not None and found.evidence == figures["evidence"]

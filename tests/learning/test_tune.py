@@ -1,4 +1,4 @@
-"""``pdhef tune``: the search finds an optimum, is the same for all, and its scores are those of a run."""
+"""Stage noise: the search finds an optimum, is the same for all, and its scores are those of a run."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ import torch
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.evaluation.metrics import score_track
-from pdhef_logtool.learning.drives import choose_drives
-from pdhef_logtool.learning.noise import tune_drives
+from pdhef_logtool.learning.drives import LearnSettings, choose_drives
+from pdhef_logtool.learning.engine import learn
+from pdhef_logtool.learning.noise import benches
+from pdhef_logtool.learning.noise.benches import choose_names
 from pdhef_logtool.learning.noise.search import (
     FACTORS,
     DriveError,
@@ -33,8 +35,6 @@ from pdhef_logtool.learning.noise.search import (
     search,
     sobol_points,
 )
-from pdhef_logtool.learning.noise.tune_command import REFUSED, TuneSettings, tune
-from pdhef_logtool.learning.noise.tune_drives import choose_names
 from pdhef_logtool.records.errors import EstimatorError, LogError, UsageError
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
@@ -206,9 +206,16 @@ def drives(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     return folder
 
 
-def _settings(sample_logs_dir: Path, **changes: object) -> TuneSettings:
-    config = RunConfig(car=sample_logs_dir / "vehicle.toml", network=Path("none"))
-    return replace(TuneSettings(config=config, trials=4, split="validation"), **changes)  # type: ignore[arg-type]
+def _settings(sample_logs_dir: Path, *, names: tuple[str, ...] | None = None, **changes: object) -> LearnSettings:
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", network=Path("none"), estimators=names)
+    settings = LearnSettings(config=config, stages=("noise",), trials=4, split="validation")
+    return replace(settings, **changes)  # type: ignore[arg-type]
+
+
+def _for(settings: LearnSettings, *names: str, **changes: object) -> LearnSettings:
+    """Return the settings for estimators, with another configuration."""
+    config = replace(settings.config, estimators=names or None, **changes)  # type: ignore[arg-type]
+    return replace(settings, config=config)
 
 
 def test_what_is_written_runs_with_the_scores_that_are_recorded(
@@ -217,7 +224,7 @@ def test_what_is_written_runs_with_the_scores_that_are_recorded(
     _bundle().save(tmp_path / "model")
     settings = _settings(sample_logs_dir)
     settings = replace(settings, config=replace(settings.config, network=tmp_path / "model"))
-    result = tune([str(drives)], tmp_path / "mycar", settings)
+    result = learn([str(drives)], tmp_path / "mycar", settings)
     assert result.exit_code == 0
     assert [d.name for d in result.drives] == ["dlc", "step"]
 
@@ -257,13 +264,14 @@ def test_processes_change_nothing_and_the_command_prints_json(
 ) -> None:
     texts = []
     for jobs in (1, 2):
-        output = tmp_path / str(jobs) / "car.toml"
+        output = tmp_path / str(jobs) / "car"
         document = said(
-            capsys, "tune", drives, "--split", "validation", "--car", sample_logs_dir / "vehicle.toml",
+            capsys, "learn", drives, "--stages", "noise", "--split", "validation",
+            "--car", sample_logs_dir / "vehicle.toml",
             "--network", "none", "-o", output, "-e", "phy-ukf-tuned", "--trials", 4, "--jobs", jobs,
         )  # fmt: skip
-        assert document["estimators"]["phy-ukf-tuned"]["trials"] == 4
-        texts.append((output.read_text(), output.with_name("car.noise.record.json").read_text()))
+        assert document["stages"][0]["figures"]["estimators"]["phy-ukf-tuned"]["trials"] == 4
+        texts.append(((output / "noise.toml").read_text(), (output / "noise.record.json").read_text()))
     assert texts[0] == texts[1]
 
 
@@ -271,14 +279,14 @@ def test_held_out_drives_are_refused(sample_logs_dir: Path, drives: Path, tmp_pa
     from pdhef_logtool.logs.discovery import find_logs
 
     with pytest.raises(UsageError, match=r"fishhook \(test\), sweep \(extrapolation\).*--any-split"):
-        tune([str(drives)], tmp_path / "car.toml", _settings(sample_logs_dir, split=None))
+        learn([str(drives)], tmp_path / "car", _settings(sample_logs_dir, split=None))
     assert not list(tmp_path.iterdir())
     logs = find_logs([str(drives)])
     with pytest.raises(UsageError, match=r"fishhook \(test\)"):
-        choose_drives(logs, _settings(sample_logs_dir, split="test"), REFUSED)
+        choose_drives(logs, _settings(sample_logs_dir, split="test"))
     with pytest.raises(UsageError, match="expected drives of split train, got drives of extrapolation, test"):
-        choose_drives(logs, _settings(sample_logs_dir, split="train"), REFUSED)
-    chosen, splits = choose_drives(logs, _settings(sample_logs_dir, split=None, any_split=True), REFUSED)
+        choose_drives(logs, _settings(sample_logs_dir, split="train"))
+    chosen, splits = choose_drives(logs, _settings(sample_logs_dir, split=None, any_split=True))
     assert [c.stem for c in chosen] == ["dlc", "fishhook", "step", "sweep"]
     assert splits["fishhook"] == "test"
 
@@ -286,8 +294,8 @@ def test_held_out_drives_are_refused(sample_logs_dir: Path, drives: Path, tmp_pa
 def test_a_drive_without_truth_is_left_out_and_told(sample_logs_dir: Path, tmp_path: Path) -> None:
     logs = [str(sample_logs_dir / "dlc.mcap"), str(sample_logs_dir / "no_truth.mcap")]
     told: list[str] = []
-    result = tune(
-        logs, tmp_path / "car.toml", _settings(sample_logs_dir, split=None, names=("phy-ukf-tuned",)), warn=told.append
+    result = learn(
+        logs, tmp_path / "car", _settings(sample_logs_dir, split=None, names=("phy-ukf-tuned",)), warn=told.append
     )
     assert result.exit_code == 3
     assert [d.name for d in result.left_out] == ["no_truth"]
@@ -295,7 +303,7 @@ def test_a_drive_without_truth_is_left_out_and_told(sample_logs_dir: Path, tmp_p
     assert not any("reason" in d for d in result.to_dict()["drives"])
     assert any("no_truth is left out" in line for line in told)
     with pytest.raises(EstimatorError, match="at least one drive with a true sideslip"):
-        tune(logs[1:], tmp_path / "none.toml", _settings(sample_logs_dir, split=None))
+        learn(logs[1:], tmp_path / "none", _settings(sample_logs_dir, split=None))
 
 
 def test_an_unreadable_log_stops_the_command_from_any_process(sample_logs_dir: Path, tmp_path: Path) -> None:
@@ -304,71 +312,62 @@ def test_an_unreadable_log_stops_the_command_from_any_process(sample_logs_dir: P
     settings = _settings(sample_logs_dir, split=None, names=("phy-ukf-tuned",))
     for jobs in (1, 2):
         with pytest.raises(LogError, match=r"bad\.mcap"):
-            tune(logs, tmp_path / "car.toml", settings, jobs=jobs)
-    assert not (tmp_path / "car.toml").exists()
+            learn(logs, tmp_path / "car", settings, jobs=jobs)
+    assert not (tmp_path / "car").exists()
 
 
 def test_drives_that_do_not_fit_are_refused(
     sample_logs_dir: Path, drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = _settings(sample_logs_dir, names=("phy-ukf-tuned",))
-    facts = tune([str(drives)], tmp_path / "car.toml", settings).drives
+    facts = learn([str(drives)], tmp_path / "car", settings).drives
     assert all(f.bytes_held > 100 * f.counts["scored_stamps"] for f in facts)
-    monkeypatch.setattr(tune_drives, "MAX_BYTES", sum(f.bytes_held for f in facts) - 1)
+    monkeypatch.setattr(benches, "MAX_BYTES", sum(f.bytes_held for f in facts) - 1)
     with pytest.raises(EstimatorError, match="--start and --end"):
-        tune([str(drives)], tmp_path / "again.toml", settings)
+        learn([str(drives)], tmp_path / "again", settings)
 
 
 def test_wrong_options_are_usage_errors(sample_logs_dir: Path, drives: Path, tmp_path: Path) -> None:
     settings = _settings(sample_logs_dir)
     wrong = [
-        (replace(settings, trials=3), "at least 4 trials"),
         (replace(settings, config=RunConfig()), "a car"),
-        (replace(settings, names=("zero",)), "estimators out of"),
-        (replace(settings, names=("pd-hef",)), "a network"),
+        (_for(settings, "zero"), "estimators out of"),
+        (_for(settings, "pd-hef"), "a network"),
     ]
+    with pytest.raises(UsageError, match="at least 4 trials"):
+        replace(settings, trials=3)
     with pytest.raises(UsageError, match="seed"):
         replace(settings, seed=-1)
     for one, message in wrong:
         with pytest.raises(UsageError, match=message):
-            tune([str(drives)], tmp_path / "car.toml", one)
+            learn([str(drives)], tmp_path / "car", one)
     (tmp_path / "other").mkdir()
     (tmp_path / "other/notes.txt").write_text("no car")
-    with pytest.raises(UsageError, match=r"ends in \.toml"):
-        tune([str(drives)], tmp_path / "other", settings)
+    with pytest.raises(UsageError, match="a car's folder"):
+        learn([str(drives)], tmp_path / "other", settings)
     with pytest.raises(UsageError, match="at least one process"):
-        tune([str(drives)], tmp_path / "car.toml", settings, jobs=0)
+        learn([str(drives)], tmp_path / "car", settings, jobs=0)
 
 
 def test_noise_of_an_earlier_search_stays_without_its_score(sample_logs_dir: Path, tmp_path: Path) -> None:
     log = [str(sample_logs_dir / "dlc.mcap")]
     settings = _settings(sample_logs_dir, split=None)
-    tune(log, tmp_path / "mycar", replace(settings, names=("physics",)))
+    learn(log, tmp_path / "mycar", _for(settings, "physics"))
     first = Car.load(tmp_path / "mycar").noise["physics"]
     assert first.score_deg is not None
-    again = replace(settings, config=replace(settings.config, car=tmp_path / "mycar"), names=("phy-ukf-tuned",))
-    tune(log, tmp_path / "mycar", again)
+    again = _for(settings, "phy-ukf-tuned", car=tmp_path / "mycar")
+    learn(log, tmp_path / "mycar", again)
     noise = Car.load(tmp_path / "mycar").noise
     # It is as good as it was, but was not compared with the other on the same drives.
     assert noise["physics"] == first.model_copy(update={"score_deg": None})
     assert noise["phy-ukf-tuned"].score_deg is not None
-    tune(log, tmp_path / "mycar", again)
+    learn(log, tmp_path / "mycar", again)
     assert Car.load(tmp_path / "mycar").noise == noise
 
 
-def test_comments_of_the_vehicle_file_are_kept(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_the_vehicle_file_is_kept_byte_by_byte(sample_logs_dir: Path, tmp_path: Path) -> None:
     text = (sample_logs_dir / "vehicle.toml").read_text()
-    text = text.replace("mass_kg = 1440.0", "mass_kg = 1440.0  # weighed # twice")
-    text = text.replace('name = "truthsim saloon"', 'name = "a # b"').replace(
-        "\n[sensors]", "\n# data sheet\n[sensors]"
-    )
-    (tmp_path / "guess.toml").write_text("# Written by hand.\n# Understood by few.\n" + text)
-    settings = _settings(sample_logs_dir, split=None, names=("phy-ukf-tuned",))
-    config = replace(settings.config, car=tmp_path / "guess.toml")
-    for output in ("car.toml", "mycar"):
-        tune([str(sample_logs_dir / "dlc.mcap")], tmp_path / output, replace(settings, config=config))
-    given = (tmp_path / "guess.toml").read_text()
-    assert (tmp_path / "mycar/vehicle.toml").read_text() == given
-    written = (tmp_path / "car.toml").read_text().splitlines()
-    assert [line for line in given.splitlines() if line not in written] == []
-    assert written[:2] == ["# Written by hand.", "# Understood by few."]
+    (tmp_path / "guess.toml").write_text("# Written by hand.\n" + text.replace("1440.0", "1440.0  # weighed # twice"))
+    settings = _for(_settings(sample_logs_dir, split=None), "phy-ukf-tuned", car=tmp_path / "guess.toml")
+    learn([str(sample_logs_dir / "dlc.mcap")], tmp_path / "mycar", settings)
+    assert (tmp_path / "mycar/vehicle.toml").read_bytes() == (tmp_path / "guess.toml").read_bytes()

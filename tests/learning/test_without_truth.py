@@ -1,4 +1,4 @@
-"""``pdhef identify --without-truth``: a pool of logs makes a car, and what cannot carry one is refused."""
+"""``pdhef learn --without-truth``: a pool of logs makes a car, and what cannot carry one is refused."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import pytest
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.learning.car.without_truth_command import WithoutTruthResult, identify_without_truth
+from pdhef_logtool.learning.engine import LearnResult
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.runs.config import RunConfig
+from tests.learning.stage_run import run_stage
 
 pytestmark = pytest.mark.slow
 
@@ -26,12 +27,12 @@ def config(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> R
 
 
 @pytest.fixture(scope="module")
-def pool(sample_logs_dir: Path, config: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> WithoutTruthResult:
+def pool(sample_logs_dir: Path, config: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> LearnResult:
     logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "sweep")]
-    return identify_without_truth(logs, tmp_path_factory.mktemp("out") / "car", config)
+    return run_stage("identify", logs, tmp_path_factory.mktemp("out") / "car", config, without_truth=True)
 
 
-def test_a_pool_of_logs_mends_the_file(pool: WithoutTruthResult, sample_logs_dir: Path) -> None:
+def test_a_pool_of_logs_mends_the_file(pool: LearnResult, sample_logs_dir: Path) -> None:
     right = Car.load(sample_logs_dir / "vehicle.toml").vehicle
     car = Car.load(pool.car)
     for front in (True, False):
@@ -40,7 +41,7 @@ def test_a_pool_of_logs_mends_the_file(pool: WithoutTruthResult, sample_logs_dir
     assert car.own.cornering_stiffness_n_per_rad(True, 0.85) < 0.6 * right.cornering_stiffness_n_per_rad(True, 0.85)
 
 
-def test_the_car_says_what_it_rests_on_and_that_no_truth_was_looked_at(pool: WithoutTruthResult) -> None:
+def test_the_car_says_what_it_rests_on_and_that_no_truth_was_looked_at(pool: LearnResult) -> None:
     text = (pool.car / "fit.toml").read_text()
     assert "without_truth = true" in text
     assert "no truth was looked at" in text
@@ -50,20 +51,12 @@ def test_the_car_says_what_it_rests_on_and_that_no_truth_was_looked_at(pool: Wit
     assert car.vehicle.name.endswith("(calibrated without truth)")
     assert car.has_evidence  # it is not calibrated once more in a run
     assert make_estimator("physics", car).causal
-    assert pool.to_dict()["self_calibration"]["logs"] == 2
-
-
-def test_a_flat_file_holds_the_same(
-    pool: WithoutTruthResult, sample_logs_dir: Path, config: RunConfig, tmp_path: Path
-) -> None:
-    logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "sweep")]
-    flat = identify_without_truth(logs, tmp_path / "car.toml", config).car
-    assert Car.load(flat).physics_sha256 == Car.load(pool.car).physics_sha256
+    assert pool.figures["self_calibration"]["logs"] == 2
 
 
 def test_one_log_is_no_pool(sample_logs_dir: Path, config: RunConfig, tmp_path: Path) -> None:
     with pytest.raises(EstimatorError, match="need not hold on another"):
-        identify_without_truth([str(sample_logs_dir / "dlc.mcap")], tmp_path / "car", config)
+        run_stage("identify", [str(sample_logs_dir / "dlc.mcap")], tmp_path / "car", config, without_truth=True)
     assert not (tmp_path / "car").exists()
 
 
@@ -72,5 +65,5 @@ def test_logs_that_do_not_know_the_stiffness_are_refused(
 ) -> None:
     logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("no_truth", "faults")]
     with pytest.raises(EstimatorError, match=r"cornering stiffness|are needed"):
-        identify_without_truth(logs, tmp_path / "car", config)
+        run_stage("identify", logs, tmp_path / "car", config, without_truth=True)
     assert not (tmp_path / "car").exists()

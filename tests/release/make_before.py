@@ -28,15 +28,16 @@ def main(folder: Path) -> None:
     from pdhef_logtool.learning.network.train_command import train_on
 
     car, bundle, dataset = (str(folder / name) for name in ("car", "bundle", "dataset"))
-    road = ("sample_logs/road.mcap", "--end", "60", "--parts", "static")
-    _pdhef("identify", *road, "--car", "sample_logs/vehicle.toml", "-o", car)
-    _pdhef("tune", SAMPLES[0], "--car", car, "-o", car, "--trials", "4", *SLICE)
+    road = ("sample_logs/road.mcap", "--end", "60", "--stages", "identify")
+    _pdhef("learn", *road, "--car", "sample_logs/vehicle.toml", "-o", car)
+    _pdhef("learn", SAMPLES[0], "--stages", "noise", "--car", car, "-o", car, "--trials", "4", *SLICE)
     for split, log in zip(("train", "validation"), SAMPLES, strict=True):
         _pdhef("extract", log, "--car", car, "-o", dataset, "--split", split, *SLICE)
     tiny = Recipe(hidden=4, layers=1, head=(4,), epochs=1)
     train_on(read_dataset(Path(dataset)), Path(bundle), tiny)
     five = [*SAMPLES, *(f"sample_logs/{name}" for name in ("fishhook.mcap", "sweep.mcap", "faults.mcap"))]
-    _pdhef("calibrate", *five, "--car", car, "-o", car, "--vary", "0", "-e", "physics,zero", "--end", "6")
+    intervals = ("--stages", "intervals", "--vary", "0", "-e", "physics,zero", "--end", "6")
+    _pdhef("learn", *five, "--car", car, "-o", car, *intervals)
     estimators = ("-e", "pd-hef,physics,zero", "--annotate", "none", "--start", "2", "--end", "4.5")
     _pdhef("run", SAMPLES[0], "-o", str(folder / "run"), "--car", car, "--network", bundle, *estimators)
     _pdhef("run", SAMPLES[0], "-o", str(folder / "again"), "--car", "saloon", *estimators)

@@ -33,7 +33,7 @@ PLACE = CheckKind(
     "ay_m_s2.place",
     compares="the accelerometer's place, by a_y against the truth, with the place in the vehicle file",
     fails="they are 0.5 m apart",
-    remedy="imu_position_m = [{lever:.2f}, 0.0, 0.0] in the vehicle file, or pdhef identify",
+    remedy="imu_position_m = [{lever:.2f}, 0.0, 0.0] in the vehicle file, or pdhef learn --stages identify",
     lacks="no car has it there: the truth's lateral velocity or yaw rate may stand at another point or time",
     function=_check,
 )

@@ -24,7 +24,7 @@ DELAY = CheckKind(
     "yaw_rate_rad_s.delay",
     compares="the stamps of the gyro with those of the truth",
     fails="the gyro is 30 ms late",
-    remedy="latency_s = {delay:.4f} more in the mapping, or pdhef identify",
+    remedy="latency_s = {delay:.4f} more in the mapping, or pdhef learn --stages identify",
     function=_check,
 )
 CHECKS = (DELAY,)

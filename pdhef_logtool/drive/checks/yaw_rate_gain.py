@@ -29,7 +29,7 @@ GAIN = CheckKind(
     "yaw_rate_rad_s.gain",
     compares="the gyro with the truth's yaw rate",
     fails="its gain is off by 5 %",
-    remedy="sensors.yaw_rate_gain = {gain:.3f} in the vehicle file, or pdhef identify",
+    remedy="sensors.yaw_rate_gain = {gain:.3f} in the vehicle file, or pdhef learn --stages identify",
     function=_check,
 )
 CHECKS = (GAIN,)

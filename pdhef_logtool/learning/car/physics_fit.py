@@ -42,7 +42,6 @@ from pdhef_logtool.learning.car.axle_forces import (
     usable_stamps,
 )
 from pdhef_logtool.learning.car.fit_data import FitDrive, part_of, period_s, signals_of
-from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.self_calibration.calibration import varied_parameters
 
@@ -335,23 +334,6 @@ TRIAL_ITERATIONS = 8
 #: Drives from which on folds are whole drives; usable driving that a fold needs, for 75 s chose worse than none would
 #: have (150 s cannot choose a structure); nothing within this of a cut.
 WHOLE_DRIVES, LEAST_FOLD_S, GUARD_S = 4, 100.0, 2.5
-
-
-def physics_parts(text: str) -> PhysicsParts | None:
-    """Return the parts that a text names: ``auto`` is None, ``static`` none, else names with commas.
-
-    Raises
-    ------
-    UsageError
-        A name is unknown.
-    """
-    if text == "auto":
-        return None
-    names = [] if text == "static" else text.split(",")
-    if unknown := [name for name in names if name not in PhysicsParts.model_fields]:
-        known = ", ".join(PhysicsParts.model_fields)
-        raise UsageError(expected=f"auto, static, or names out of {known}", got=", ".join(unknown), where="--parts")
-    return PhysicsParts(**dict.fromkeys(names, True))
 
 
 Fold = tuple[Sequence[FitDrive], Sequence[FitDrive]]

@@ -56,7 +56,7 @@ from pdhef_logtool.learning.network.residuals import (
     difference_noise,
     residual_windows,
 )
-from pdhef_logtool.learning.variation import vary
+from pdhef_logtool.learning.variation import MAX_VARIATION, vary
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
@@ -73,7 +73,6 @@ from pdhef_logtool.sinks.report import tool_versions
 #: Upper ends of the shares of train and validation in [0, 1); the rest is test.
 SPLIT_ENDS = (0.70, 0.85)
 MAX_SMOOTHING_HALF_S = 1.0
-MAX_VARIATION = 0.3
 
 Progress = Callable[[str, float], None]
 

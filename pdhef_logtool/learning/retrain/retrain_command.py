@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.store import update_car
 from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.estimators.table import FILTERS
@@ -33,13 +34,15 @@ from pdhef_logtool.learning.drives import (
     tell_drive,
 )
 from pdhef_logtool.learning.evidence.calibrate import MIN_DRIVES
-from pdhef_logtool.learning.evidence.calibrate_command import CalibrateSettings, calibrate
-from pdhef_logtool.learning.evidence.trust_command import trust
 from pdhef_logtool.learning.network.dataset import MANIFEST
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
-from pdhef_logtool.learning.network.fine_tune import GENTLY
+from pdhef_logtool.learning.resume import Stages, read_own
 from pdhef_logtool.learning.retrain.roles import GATE, INTERVALS, LEAST, SHARES, STOP, TRAIN, TRUST, Candidate, deal
-from pdhef_logtool.learning.stages import Stages, read_own
+from pdhef_logtool.learning.split import Split
+from pdhef_logtool.learning.stages.gain import find_gain
+from pdhef_logtool.learning.stages.intervals import fit_intervals
+from pdhef_logtool.learning.stages.network import GENTLY
+from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.documents import digest, read_sealed, seal
@@ -77,17 +80,26 @@ Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RetrainSettings(LearnSettings):
-    """With the network to begin with, the epochs of training (None: the recipe's), and the gate.
+class RetrainSettings:
+    """Settings of a retraining, beside the logs.
 
-    ``init``: a bundle or ``none``; None = the car's network, else that of many cars. ``strict``: that nobody can tell
-    closes the gate.
+    Attributes
+    ----------
+    config : car, mapping, slice, sensors, truth channel. seed : of the split assignment, training and bootstraps.
+    init : network to start from, a bundle or ``none``; None = the car's, else that of many cars.
+    epochs : of training; None = the recipe's. gate : limits of the candidate. strict : undecided closes the gate.
     """
 
+    config: RunConfig
+    seed: int = 0
     init: Path | None = None
     epochs: int | None = None
     gate: Gate = DEFAULT_GATE
     strict: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the seed; raises UsageError."""
+        LearnSettings(config=self.config, seed=self.seed)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,7 +197,7 @@ def retrain(
     """
     check_torch()
     config = settings.config
-    car = open_car(config, None, warn)
+    car = open_car(config, warn)
     inputs = find_logs(arguments, private_redirects=config.allow_private_redirects)
     read = [*(i.local for i in inputs), *config.files]
     check_no_input(read, [], [output / name for name in (WORK, ACCEPTED, REJECTED)])
@@ -463,14 +475,30 @@ def _train(this: _Retraining, folder: Path, basis: str) -> dict[str, Any]:
     }
 
 
+def _stage(
+    this: _Retraining, number: int, role: str, folder: Path, config: RunConfig, run: Callable[[Task], StageOutput]
+) -> StageOutput:
+    """Run a stage of ``learn`` on the drives of a role and write its car to a folder."""
+    car = Car.load(config.car, network=config.network)
+    task = Task(
+        car=car,
+        settings=LearnSettings(config=config, seed=this.settings.seed, any_split=True),
+        split=Split.undivided(this.drives[role]),
+        mapping=open_mapping(config),
+        estimators=config.estimators,
+        progress=lambda text, share: this.step(number, text, share),
+    )
+    output = run(task)
+    update_car(car, folder / CAR_FOLDER, output.change)
+    return output
+
+
 def _trust(this: _Retraining, folder: Path, network: Path) -> dict[str, Any]:
     config = this.config_for(this.settings.config.car, network)
-    settings = LearnSettings(config=config, seed=this.settings.seed, any_split=True)
-    result = trust(
-        this.drives[TRUST], folder / CAR_FOLDER, settings, progress=lambda text, share: this.step(3, text, share)
-    )
-    cap = result.decision.cap
-    return {"shown": f"trust {cap:g}: {result.decision.reason}", "cap": cap, "evidence": result.trust.evidence}
+    figures = _stage(this, 3, TRUST, folder, config, find_gain).figures
+    cap = figures["trust_cap"]
+    shown = f"residual gain {cap:g}: {figures['reason']}"
+    return {"shown": shown, "cap": cap, "evidence": figures["evidence"]}
 
 
 def _intervals(this: _Retraining, folder: Path) -> dict[str, Any]:
@@ -480,15 +508,8 @@ def _intervals(this: _Retraining, folder: Path) -> dict[str, Any]:
         shutil.copytree(before, folder / CAR_FOLDER)
         return {"shown": f"not fitted: {len(drives)} drives, {MIN_DRIVES} are needed", "coverage": {}}
     config = replace(this.config_for(before), estimators=CALIBRATED)
-    settings = CalibrateSettings(config=config, seed=this.settings.seed, any_split=True)
-    result = calibrate(
-        drives, folder / CAR_FOLDER, settings, progress=lambda text, share: this.step(4, text, share)
-    )  # fmt: skip
-    names = ", ".join(e.estimator for e in result.intervals.entries)
-    return {
-        "shown": f"{names}, on {len(drives)} drives",
-        "coverage": {e.estimator: list(e.coverage) for e in result.intervals.entries},
-    }
+    output = _stage(this, 4, INTERVALS, folder, config, fit_intervals)
+    return {"shown": output.text, **output.figures}
 
 
 def _run(this: _Retraining, number: int, folder: Path, car: Path | None, network: Path | None) -> dict[str, Any]:

@@ -1,6 +1,6 @@
-"""Drives that noise is tuned on, kept in memory by the processes that score them.
+"""Drives of the noise search, kept in memory by the processes that score them.
 
-What does not depend on a filter's noise (reading, alignment, truth) is done once a drive.
+Reading, alignment and ground truth do not depend on a filter's noise and are computed once per drive.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MIN_SCORED_STAMPS = 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TuneSetup:
+class BenchSetup:
     """What all drives are read and all filters are built with."""
 
     config: RunConfig
@@ -78,7 +78,7 @@ class _Drive:
 class DriveBench:
     """Drives of one process and the scoring on them."""
 
-    def __init__(self, setup: TuneSetup) -> None:
+    def __init__(self, setup: BenchSetup) -> None:
         self._setup = setup
         self._drives: dict[int, _Drive] = {}
         self._options = Options(setup.config.sensors == "full")
@@ -139,7 +139,7 @@ class _Part:
 class Benches:
     """Drives dealt out to processes that live as long as the tuning does; one process is this one itself."""
 
-    def __init__(self, setup: TuneSetup, jobs: int) -> None:
+    def __init__(self, setup: BenchSetup, jobs: int) -> None:
         self._jobs = jobs
         self._local = DriveBench(setup) if jobs == 1 else None
         preload = (__name__, *FILTERS)
@@ -216,7 +216,7 @@ def _lost(reason: str) -> EstimatorError:
 _here: dict[str, DriveBench] = {}
 
 
-def _do(setup: TuneSetup, part: _Part, _tell: Tell) -> Any:
+def _do(setup: BenchSetup, part: _Part, _tell: Tell) -> Any:
     """Do a part in a process of its own, where errors are results."""
     if "bench" not in _here:
         if part.load is None or part.load[0] != part.place:  # not its first one: it was held by a process that died

@@ -1,4 +1,4 @@
-"""Which driving teaches what: parts of drives that do not mix, with a gap wherever two of them meet."""
+"""Split of drives into training, network training, validation and test, with a gap wherever two of them meet."""
 
 from __future__ import annotations
 
@@ -9,24 +9,25 @@ from itertools import pairwise
 import numpy as np
 
 from pdhef_logtool.learning.car.fit_data import GUARD_S
+from pdhef_logtool.learning.drives import IDENTIFY, NETWORK, NOISE, STAGES
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.signals import FloatArray
 
-#: What fits parameters and noise (and chooses the model's parts, by folds of its own), what trains the network, what
-#: says after each step whether it stays, and what is scored once.
-FIT, NETWORK, CHECK, LAST = "fit", "network", "check", "last"
-PARTS = (FIT, NETWORK, CHECK, LAST)
-#: Shares of what is not held out, without and with a part for the network.
-SHARES = {FIT: 0.82, CHECK: 0.18}
-SHARES_WITH_NETWORK = {FIT: 0.50, NETWORK: 0.32, CHECK: 0.18}
+#: Fit of parameters and noise (and choice of the model's parts, by folds); training of the network; decision after each
+#: stage whether it is kept, residual gain and intervals; scored once at the end.
+TRAINING, NETWORK_TRAINING, VALIDATION, TEST = "training", "network training", "validation", "test"
+PARTS = (TRAINING, NETWORK_TRAINING, VALIDATION, TEST)
+#: Shares of the driving that is not held out, without and with a part for the network.
+SHARES = {TRAINING: 0.82, VALIDATION: 0.18}
+SHARES_WITH_NETWORK = {TRAINING: 0.50, NETWORK_TRAINING: 0.32, VALIDATION: 0.18}
 #: Usable driving from which on the network has a part of its own, that physics was not fitted to, and still leaves
 #: the fit enough to choose the model's parts; with less it learns from the fit part.
 OWN_NETWORK_PART_S = 600.0
-#: One drive is cut into rounds of about this much usable driving, each with all parts but the last.
+#: One drive is cut into rounds of about this much usable driving, each with all parts but the test.
 ROUND_S = 240.0
-#: What check and last have at least of usable driving, where there is little; a gap comes off it.
+#: Least usable driving of validation and test, where there is little; a gap comes off it.
 LEAST_PART_S = 10.0 + GUARD_S
-#: Drives shorter than this are not cut each for itself.
+#: Drives shorter than this are cut together, as if they were one.
 LEAST_CUT_S = 100.0
 #: From so many drives on each belongs to one part whole; fewer are cut by time.
 WHOLE_DRIVES = 8
@@ -36,7 +37,7 @@ GAP_S = GUARD_S
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveTimes:
-    """When a drive can be learnt from: [n] seconds from the log's start, ascending, one a step of ``period_s``."""
+    """When a drive can be used: [n] seconds from the log's start, ascending, one a step of ``period_s``."""
 
     log: LogInput
     usable_s: FloatArray
@@ -44,28 +45,64 @@ class DriveTimes:
 
     @property
     def seconds(self) -> float:
-        """How much of it can be learnt from."""
+        """Usable driving of it."""
         return float(self.usable_s.size) * self.period_s
 
 
-def shares_of(usable_s: float, holdout: float) -> dict[str, float]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Split:
+    """Slices of drives by part, and when they can be used.
+
+    ``times`` is empty where whole logs are given to one stage; that stage then holds out the share ``holdout`` itself.
+    """
+
+    parts: Mapping[str, tuple[LogInput, ...]]
+    times: tuple[DriveTimes, ...] = ()
+    holdout: float = 0.0
+
+    @classmethod
+    def undivided(cls, logs: Sequence[LogInput], holdout: float = 0.0) -> Split:
+        """Return all logs as every part, for a stage that runs alone."""
+        return cls(dict.fromkeys(PARTS, tuple(logs)), holdout=holdout)
+
+    def usable(self, part: str) -> list[DriveTimes]:
+        """Return when the slices of a part can be used."""
+        return usable_in(self.times, self.parts[part])
+
+    def seconds(self, part: str) -> float:
+        """Return the usable driving of a part."""
+        return sum(d.seconds for d in self.usable(part))
+
+    def pieces(self, part: str, piece_s: float) -> tuple[LogInput, ...]:
+        """Return a part in pieces of at least ``piece_s`` of usable driving, or its whole logs."""
+        return pieces_of(self.usable(part), piece_s) if self.times else self.parts[part]
+
+    def network_part(self) -> str:
+        """Return the part that the network is trained on."""
+        return NETWORK_TRAINING if self.parts[NETWORK_TRAINING] else TRAINING
+
+
+def shares_of(usable_s: float, holdout: float, stages: Iterable[str] = STAGES) -> dict[str, float]:
     """Return the share of each part in so much usable driving; their sum is 1."""
     least = LEAST_PART_S / max(usable_s, 1e-9)
     last = min(max(holdout, least), 0.5) if holdout > 0.0 else 0.0
-    shares = SHARES if usable_s < OWN_NETWORK_PART_S else SHARES_WITH_NETWORK
+    both = NETWORK in stages and {IDENTIFY, NOISE} & set(stages)
+    shares = SHARES_WITH_NETWORK if both and usable_s >= OWN_NETWORK_PART_S else SHARES
     shares = {part: (1.0 - last) * share for part, share in shares.items()}
-    lacks = min(max(0.0, least - shares[CHECK]), shares[FIT])
-    return {**shares, FIT: shares[FIT] - lacks, CHECK: shares[CHECK] + lacks, LAST: last}
+    lacks = min(max(0.0, least - shares[VALIDATION]), shares[TRAINING])
+    return {**shares, TRAINING: shares[TRAINING] - lacks, VALIDATION: shares[VALIDATION] + lacks, TEST: last}
 
 
-def split_drives(drives: Sequence[DriveTimes], holdout: float) -> dict[str, tuple[LogInput, ...]]:
+def split_drives(
+    drives: Sequence[DriveTimes], holdout: float, stages: Iterable[str] = STAGES
+) -> dict[str, tuple[LogInput, ...]]:
     """Return the slices of each part: whole drives where there are many, else all drives are cut by time.
 
     Parameters
     ----------
-    holdout : share of the last part: the end of each drive that is cut, or whole drives.
+    holdout : share of the test part: the end of each drive that is cut, or whole drives.
     """
-    shares = shares_of(sum(d.seconds for d in drives), holdout)
+    shares = shares_of(sum(d.seconds for d in drives), holdout, stages)
     found: dict[str, tuple[LogInput, ...]] = dict.fromkeys(PARTS, ())
     if len(drives) >= WHOLE_DRIVES:
         return found | deal_drives(drives, shares)
@@ -91,13 +128,13 @@ def deal_drives(drives: Sequence[DriveTimes], shares: Mapping[str, float]) -> di
 def cut_times(drives: Sequence[DriveTimes], shares: Mapping[str, float]) -> list[tuple[str, LogInput]]:
     """Return the slices of drives, one behind the other, by part in order of time; shares are of usable driving.
 
-    All parts but the last come in rounds, so that each has something of all of it; the last is the end.
+    All parts but the test come in rounds, so that each has something of all of it; the test is the end.
     """
     total = sum(d.seconds for d in drives)
-    learnt = {part: share for part, share in shares.items() if part != LAST and share > 0.0}
-    rounds = max(1, round(sum(learnt.values()) * total / ROUND_S))
-    pieces = [(part, share / rounds) for _ in range(rounds) for part, share in learnt.items()]
-    pieces += [(LAST, shares[LAST])] if shares.get(LAST, 0.0) > 0.0 else []
+    used = {part: share for part, share in shares.items() if part != TEST and share > 0.0}
+    rounds = max(1, round(sum(used.values()) * total / ROUND_S))
+    pieces = [(part, share / rounds) for _ in range(rounds) for part, share in used.items()]
+    pieces += [(TEST, shares[TEST])] if shares.get(TEST, 0.0) > 0.0 else []
     ends = np.concatenate([[0.0], np.cumsum([share for _, share in pieces])])
     slices = []
     for (part, _), (a, b) in zip(pieces, pairwise(total * ends / ends[-1]), strict=True):
@@ -126,7 +163,7 @@ def part_of_log(log: LogInput, span_s: tuple[float, float]) -> LogInput:
 
 
 def usable_in(times: Iterable[DriveTimes], slices: Iterable[LogInput]) -> list[DriveTimes]:
-    """Return when each slice can be learnt from."""
+    """Return when each slice can be used."""
     by_path = {t.log.path: t for t in times}
     found = []
     for one in slices:

@@ -42,7 +42,7 @@ class Stages:
         key, folder = digest([name, basis]), self.place(number, name)
         document = read_own(folder / STAGE_FILE, self.say)
         if document is not None and document["basis"] == key:
-            self.say(f"{name}: {document['shown']} (as found before)")
+            self.say(f"{name}: {document['shown']} (from an earlier call)")
             return dict(document["found"])
         began = time.monotonic()
         self.progress(name, share)

@@ -1,0 +1,21 @@
+"""Commands of former versions, and the one that does their work now."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+_LEARN = "pdhef learn LOG... --car CAR -o CAR --stages"
+REMOVED = {
+    "identify": f"{_LEARN} identify",
+    "tune": f"{_LEARN} noise",
+    "trust": f"{_LEARN} gain",
+    "calibrate": f"{_LEARN} intervals",
+    "estimators": "pdhef run --list-estimators",
+    "slim": "pdhef run LOG... -o OUT --cache DIR",
+}
+
+
+def replacement(words: Sequence[str]) -> str:
+    """Return the message on a removed command, empty if the words of the command line name none."""
+    command = next((word for word in words if not word.startswith("-")), "")
+    return f"'{command}' was removed; use: {REMOVED[command]}" if command in REMOVED else ""

@@ -1,0 +1,575 @@
+"""``pdhef learn``: load and split drives, run the stages, undo a stage that raises the error, score once, write.
+
+A stage that runs alone uses all logs. Several stages, or the training of a network, share the logs: each has its part,
+and a stage is kept only if it does not raise the error on the validation part. The folder ``learn/NUMBER-NAME/`` of the
+car contains the result of each such stage: ``step.json`` with the hash of its inputs and its result, and its car if it
+is kept. A rerun takes every stage whose inputs are as they were.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.car.car import NO_INTERVALS, VEHICLE_FILE, Car
+from pdhef_logtool.car.parts import PHYSICS
+from pdhef_logtool.car.store import Change, check_output, update_car, vehicle_file
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import Tell
+from pdhef_logtool.estimators.table import spec_of
+from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference
+from pdhef_logtool.evaluation.comparison import BLOCK_S, Compared, Errors, compare
+from pdhef_logtool.learning.car.axle_forces import usable_stamps
+from pdhef_logtool.learning.car.fit_data import load_fit_drive, period_s
+from pdhef_logtool.learning.drives import (
+    GAIN,
+    IDENTIFY,
+    INTERVALS,
+    NETWORK,
+    NOISE,
+    DriveRecord,
+    LearnSettings,
+    choose_drives,
+    drives_document,
+    exit_code,
+    no_drive,
+    open_car,
+    open_mapping,
+    record_head,
+)
+from pdhef_logtool.learning.evidence.trust import MIN_BLOCKS
+from pdhef_logtool.learning.more_driving import learning_curve, what_more_would_pay
+from pdhef_logtool.learning.page import draw_page, page_markdown
+from pdhef_logtool.learning.resume import Stages, read_own
+from pdhef_logtool.learning.score import score_slices
+from pdhef_logtool.learning.split import PARTS, TEST, TRAINING, VALIDATION, DriveTimes, Split, split_drives
+from pdhef_logtool.learning.stages.gain import find_gain
+from pdhef_logtool.learning.stages.identify import identify
+from pdhef_logtool.learning.stages.intervals import fit_intervals
+from pdhef_logtool.learning.stages.network import train_network
+from pdhef_logtool.learning.stages.noise import tune
+from pdhef_logtool.learning.stages.task import Progress, StageOutput, Task
+from pdhef_logtool.logs.discovery import LogInput, Logs, hash_log
+from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.records.documents import digest, seal
+from pdhef_logtool.records.errors import EstimatorError, ModelError, UsageError
+from pdhef_logtool.records.files import write_bytes
+from pdhef_logtool.records.outputs import LOCK_FILE, OutputFolder, check_no_input, local_path
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.residual_model.bundle import MANY_CARS, NO_MODEL
+from pdhef_logtool.residual_model.torch_extra import check_torch
+from pdhef_logtool.sinks.report import json_bytes
+
+FORMAT, FORMAT_VERSION = "pdhef-learn", 2
+#: In the car's folder: the stages' results, and the record, page and plot of the whole.
+WORK, RECORD_FILE, PAGE_FILE, PLOT_FILE = "learn", "learn.record.json", "learn.md", "learn.png"
+CAR, EVALUATIONS_FILE = "car", "evaluations.json"
+#: Outcome of a stage.
+KEPT, UNDONE, NOT_DONE = "kept", "undone", "not done"
+RUN: dict[str, Callable[[Task], StageOutput]] = {
+    IDENTIFY: identify,
+    NOISE: tune,
+    GAIN: find_gain,
+    NETWORK: train_network,
+    INTERVALS: fit_intervals,
+}
+#: Stages that are undone where they change nothing, or where the 95 % intervals then contain less than a share of the
+#: errors and less than before: simpler is better, and a lower error is not worth a meaningless interval.
+MUST_GAIN, LEAST_COVERED = (NOISE, NETWORK), 0.8
+#: Identification has chosen noise through the filter already: another one must be better with significance.
+MUST_CONFIRM = (NOISE,)
+#: Usable driving below which nothing is left to fit, to validate and to test.
+LEAST_S = 50.0
+#: A candidate that gives an estimate at fewer of the stamps counts as worse.
+LEAST_AVAILABILITY = 0.9
+#: The filter that follows the network, the same smoothed, and the baseline that runs on every vehicle file.
+HYBRID, SMOOTHED, BASELINE = "pd-hef", "pd-hef-smoothed", "phy-ukf"
+#: Estimators of the stages noise and intervals where several stages share the drives.
+ESTIMATORS = {NOISE: (PHYSICS,), INTERVALS: (PHYSICS, HYBRID, SMOOTHED)}
+#: Lines of the tables: estimators with the vehicle file as it was given, and with the trained car.
+BEFORE = ("zero", "kinematic", "open-loop", BASELINE, PHYSICS)
+AFTER = (PHYSICS, HYBRID, SMOOTHED)
+#: Estimators that do not depend on the car.
+_OF_NO_CAR = ("zero", "kinematic")
+YARDSTICK = f"{HYBRID}, trained"
+
+
+@dataclass(frozen=True, slots=True)
+class StageResult:
+    """Outcome of one stage.
+
+    Attributes
+    ----------
+    status : ``kept``; ``undone``, with the validation error higher, or no lower where it must be; or ``not done``.
+    text : summary, or why not.
+    before, after : [estimator that represents the car, its validation RMSE in degrees], None without a validation.
+    figures : of the stage itself.
+    """
+
+    name: str
+    status: str
+    text: str
+    before: list[Any] | None
+    after: list[Any] | None
+    figures: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LearnResult:
+    """The car that was written, a record of every drive, the stages, and the document of a call with several stages."""
+
+    car: Path
+    records: tuple[DriveRecord, ...]
+    stages: tuple[StageResult, ...]
+    document: Mapping[str, Any]
+
+    @property
+    def exit_code(self) -> int:
+        """0 if all drives took part whole, 3 if not."""
+        return exit_code(self.records)
+
+    @property
+    def drives(self) -> tuple[DriveRecord, ...]:
+        """Drives that took part."""
+        return tuple(r for r in self.records if not r.left_out)
+
+    @property
+    def left_out(self) -> tuple[DriveRecord, ...]:
+        """Drives that did not."""
+        return tuple(r for r in self.records if r.left_out)
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """The figures of the last stage."""
+        return self.stages[-1].figures
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as one JSON-able document."""
+        shared = {"car": str(self.car), "exit_code": self.exit_code, **drives_document(self.records)}
+        return {**shared, "stages": [asdict(s) for s in self.stages], **self.document}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Call:
+    """One call with several stages: what they share, the logs' hashes, the work folder, and the hash of all inputs."""
+
+    task: Task
+    logs: Mapping[LogPlace, str]
+    work: Path
+    basis: str
+    say: Tell
+
+
+def learn(
+    arguments: Logs,
+    output: Path | str,
+    settings: LearnSettings,
+    *,
+    jobs: int = 1,
+    fresh: bool = False,
+    progress: Progress = lambda _text, _share: None,
+    warn: Tell = lambda _text: None,
+    say: Tell = lambda _text: None,
+) -> LearnResult:
+    """Run stages on drives and write the car to the folder ``output``.
+
+    Parameters
+    ----------
+    arguments : logs, folders, glob patterns. jobs : worker processes of the noise search; results do not depend on it.
+    fresh : forget the results of an earlier call with this output. say : receives each stage with the time it took.
+
+    Raises
+    ------
+    UsageError
+        An option is wrong, or drives are held out by their set.
+    PdhefError
+        A file or log cannot be read: an absent drive would change the result unnoticed.
+    EstimatorError
+        There is too little driving with ground truth.
+    """
+    output, config, order = local_path(output), settings.config, settings.order
+    if output.suffix in (".toml", ".json"):
+        raise UsageError(
+            expected="a car's folder", got=output.name, where="--output", remedy="a car has more than a file contains"
+        )
+    if NETWORK in order and str(config.network) != NO_MODEL:
+        check_torch(f"; --network {NO_MODEL} trains none")
+    car = _open(settings, warn)
+    check_output(car, output)
+    inputs, set_splits = choose_drives(arguments, settings)
+    read = [*(i.local for i in inputs), *(path for path in config.files if path != config.car)]
+    check_no_input(read, [], [output])
+    task = Task(
+        car=car,
+        settings=settings,
+        split=Split.undivided(inputs, settings.holdout),
+        mapping=open_mapping(config),
+        set_splits=set_splits,
+        estimators=config.estimators,
+        jobs=jobs,
+        progress=progress,
+        warn=warn,
+    )
+    if len(order) == 1 and order != (NETWORK,):
+        result = _learn_alone(task, output)
+    else:
+        result = _learn_in_turn(task, inputs, output, fresh=fresh, say=say)
+    progress("done", 1.0)
+    return result
+
+
+def _open(settings: LearnSettings, warn: Tell) -> Car:
+    """Return the car to start from: identification starts from the vehicle file and nothing else."""
+    config = settings.config
+    if IDENTIFY in settings.order:
+        car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
+        if config.car is None:
+            warn(f"no --car: mass, geometry and priors are those of the default {car.own.name}")
+        return car
+    car = open_car(config, warn)
+    if {GAIN, NETWORK} & set(settings.order) and car.network is None and config.network is None:
+        car = Car.load(config.car, network=Path(MANY_CARS), intervals=config.intervals)
+    return car
+
+
+def _learn_alone(task: Task, output: Path) -> LearnResult:
+    """Run one stage on all logs and write its part of the car."""
+    (name,) = task.settings.order
+    found = RUN[name](task)
+    update_car(task.car, output, found.change)
+    result = StageResult(name, KEPT, found.text, None, None, found.figures)
+    return LearnResult(output, found.records, (result,), {})
+
+
+def _learn_in_turn(task: Task, inputs: Sequence[LogInput], output: Path, *, fresh: bool, say: Tell) -> LearnResult:
+    """Split the driving, run the stages one after the other and score the test part."""
+    settings, given = task.settings, task.car
+    records, times = _read(inputs, task)
+    split = Split(split_drives(times, settings.holdout, settings.order), tuple(times))
+    if not split.parts[TRAINING] or not split.parts[VALIDATION]:
+        raise EstimatorError(
+            expected="driving to fit and to validate",
+            got="too little of one",
+            where="learn",
+            remedy="give longer drives",
+        )
+    task = replace(task, split=split)
+    if not (output / VEHICLE_FILE).is_file():
+        write_bytes(output / VEHICLE_FILE, vehicle_file(given))
+    work = output / WORK
+    with OutputFolder(work, (".",)):
+        start = _begin(work, given, settings, fresh=fresh)
+        basis = digest(_basis(task, start, records))
+        logs = {i.path: r.sha256 for i, r in zip(inputs, records, strict=True)}
+        call = _Call(task, logs, work, basis, say)
+        stages, car = _run_stages(call, start)
+        kept = [s.name for s in stages if s.status == KEPT]
+        ends = _cached(call, len(stages) + 1, "end", kept, lambda _: _end(call, start, car, stages))
+    document = {
+        **record_head(FORMAT, FORMAT_VERSION, settings, Car.load(start, network=NO_MODEL)),
+        "split": {
+            p: {"usable_s": round(split.seconds(p), 2), "slices": [s.stem for s in split.parts[p]]} for p in PARTS
+        },
+        "stages": [asdict(s) for s in stages],
+        **ends,
+        **drives_document(records),
+    }
+    used = tuple(r.learnt_on for r in records if not r.left_out)
+    files = {
+        RECORD_FILE: json_bytes(document),
+        PAGE_FILE: page_markdown(document).encode(),
+        PLOT_FILE: draw_page(document),
+    }
+    change = Change("learn", RECORD_FILE, files, {WORK: work}, settings.to_dict(), used)
+    update_car(given, output, change, parts_from=car)
+    return LearnResult(output, records, tuple(stages), document)
+
+
+def _read(inputs: Sequence[LogInput], task: Task) -> tuple[tuple[DriveRecord, ...], list[DriveTimes]]:
+    """Return a record of every drive, and when each can be used."""
+    own = task.car.own
+
+    def read(log: LogInput) -> tuple[DriveRecord, DriveTimes | None]:
+        record, drive = load_fit_drive(log, Car.of(own), task.mapping, task.options)
+        if drive is None:
+            return record, None
+        use = usable_stamps(drive, own)
+        seconds: FloatArray = (drive.signals.stamps_ns[use] - drive.log_start_ns).astype(np.float64) * 1e-9
+        if seconds.size < 2:
+            return replace(record, left_out="no driving with truth above twice the low-speed limit"), None
+        return record, DriveTimes(log, seconds, period_s(drive))
+
+    records, times = task.read(inputs, read, 0.05)
+    if not times:
+        raise no_drive("truth velocities", "learn")
+    usable_s = sum(t.seconds for t in times)
+    if usable_s < LEAST_S:
+        raise EstimatorError(
+            expected=f"at least {LEAST_S:g} s of driving with truth, above twice the low-speed limit",
+            got=f"{usable_s:.1f} s",
+            where="learn",
+            remedy="give more drives",
+        )
+    return records, times
+
+
+def _begin(work: Path, given: Car, settings: LearnSettings, *, fresh: bool) -> Path:
+    """Return the folder of the car that everything starts from."""
+    start = work / "0-start"
+    for folder in [p for p in work.iterdir() if p.is_dir() and (fresh or p == start)]:
+        shutil.rmtree(folder)
+    if given.source is not None and given.source.is_dir() and IDENTIFY not in settings.order:
+        shutil.copytree(given.source, start, ignore=shutil.ignore_patterns(WORK, "learn.*", f"{LOCK_FILE}*"))
+    write_bytes(start / VEHICLE_FILE, vehicle_file(given))
+    return start
+
+
+def _basis(task: Task, start: Path, records: Sequence[DriveRecord]) -> dict[str, Any]:
+    """Return everything that decides the results, as JSON-able values."""
+    config = task.settings.config
+    network = _network_of(task.settings, Car.load(start)).network
+    return {
+        **record_head(FORMAT, FORMAT_VERSION, task.settings, task.car),
+        "start": hash_log(start),
+        "mapping": None if config.mapping is None else hashlib.sha256(config.mapping.read_bytes()).hexdigest(),
+        "network": str(config.network) if network is None else network.sha256,
+        "drives": [[r.name, r.sha256, r.left_out] for r in records],
+        "split": {p: [[s.stem, *(s.span_s or ())] for s in task.split.parts[p]] for p in PARTS},
+    }
+
+
+# ---- the stages ----
+
+
+def _run_stages(call: _Call, start: Path) -> tuple[list[StageResult], Path]:
+    """Run all stages, each with the car that those before have left; return their outcomes and the last car."""
+    car, results = start, list[StageResult]()
+    for number, name in enumerate(call.task.settings.order, start=1):
+        kept = [r.name for r in results if r.status == KEPT]
+        outcome = _cached(call, number, name, kept, partial(_run_stage, call, number, name, car))
+        results.append(StageResult(name, **outcome))
+        if results[-1].status == KEPT:
+            car = call.work / f"{number}-{name}" / CAR
+    return results, car
+
+
+def _cached(
+    call: _Call, number: int, name: str, kept: Sequence[str], work: Callable[[Path], dict[str, Any]]
+) -> dict[str, Any]:
+    """Return the result of a stage; it depends on the inputs of the call and on the stages that are ``kept``."""
+    stages = Stages(call.work, _shown, call.say, call.task.progress)
+    return stages.do(number, name, [call.basis, list(kept)], _share(call, number), work)
+
+
+def _share(call: _Call, number: int) -> float:
+    return 0.05 + 0.95 * (number - 1) / (len(call.task.settings.order) + 1)
+
+
+def _shown(outcome: dict[str, Any]) -> str:
+    """Return the outcome of a stage in a line."""
+    if "status" not in outcome:
+        return "the test part is scored" + (
+            "" if outcome["evaluations"] == 1 else f", evaluation {outcome['evaluations']} of it"
+        )
+    if outcome["after"] is None:
+        return f"{outcome['status']}: {outcome['text']}"
+    (old, was), (new, now) = outcome["before"], outcome["after"]
+    return f"{outcome['status']}; validation RMSE of {old} before {was:.3f}°, of {new} after {now:.3f}°"
+
+
+def config_of(settings: LearnSettings, car: Path) -> LearnSettings:
+    """Return the settings of a stage that runs with ``car``; slices bring their own start and end."""
+    config = replace(settings.config, car=car, network=None, intervals=None, estimators=None, start=None, end=None)
+    return replace(settings, config=config)
+
+
+def _network_of(settings: LearnSettings, car: Car) -> Car:
+    """Return the car with the network to start from: the requested one, else its own, else that of many cars."""
+    assert car.source is not None
+    if settings.config.network is None and IDENTIFY not in settings.order and car.residual_network is not None:
+        return car
+    try:
+        return Car.load(car.source, network=settings.config.network or Path(MANY_CARS))
+    except ModelError:
+        if settings.config.network is None:
+            return car  # a source tree without shipped networks still runs the stages that need none
+        raise
+
+
+def _stage_task(call: _Call, number: int, name: str, before: Path, folder: Path) -> Task:
+    settings = config_of(call.task.settings, before)
+    car = Car.load(before)
+    if name in (GAIN, NETWORK):
+        car = _network_of(call.task.settings, car)
+        if car.network is None:
+            raise EstimatorError(expected="a network", got="none", where=name)
+        network = call.task.settings.config.network or (None if car.network_folder is None else car.network_folder)
+        settings = replace(settings, config=replace(settings.config, network=network))
+    first, span = _share(call, number), _share(call, 2) - _share(call, 1)
+    return replace(
+        call.task,
+        car=car,
+        settings=settings,
+        estimators=call.task.estimators or ESTIMATORS.get(name),
+        work=folder,
+        progress=lambda text, share: call.task.progress(f"{name}: {text}", first + share * span),
+        warn=lambda _text: None,
+    )
+
+
+def _run_stage(call: _Call, number: int, name: str, before: Path, folder: Path) -> dict[str, Any]:
+    """Run one stage in a folder; return the values of its :class:`StageResult`. Its car is left only if it is kept."""
+    try:
+        task = _stage_task(call, number, name, before, folder)
+        output = RUN[name](task)
+    except EstimatorError as error:
+        _tidy(folder, keep_car=False)
+        if name == IDENTIFY:
+            raise  # without it there is nothing to give
+        return {"status": NOT_DONE, "text": str(error), "before": None, "after": None, "figures": {}}
+    update_car(task.car, folder / CAR, output.change)
+    task.progress("scoring the validation part", 1.0)
+    old, new = (_validation_errors(call, car) for car in (before, folder / CAR))
+    (was, now), gains = _compare(old, new)
+    unsure = name in MUST_GAIN and not _still_sure(old, new)
+    doubtful = name in MUST_CONFIRM and not _confirmed(old, new)
+    kept = not unsure and not doubtful and (gains is True if name in MUST_GAIN else gains is not False)
+    _tidy(folder, keep_car=kept)
+    text = output.text + ("; its 95 % intervals contain too few of the errors" if unsure else "")
+    return {
+        "status": KEPT if kept else UNDONE,
+        "text": text + ("; the lower error is not significant" if doubtful else ""),
+        "before": [old.name, was],
+        "after": [new.name, now],
+        "figures": output.figures,
+    }
+
+
+def _tidy(folder: Path, *, keep_car: bool) -> None:
+    """Leave nothing of a stage's folder but its car, if that."""
+    for path in folder.iterdir():
+        if path.is_dir() and not (keep_car and path.name == CAR):
+            shutil.rmtree(path)
+
+
+def judged_by(car: Car) -> str:
+    """Return the estimator that represents a car: the best that it has evidence for."""
+    if car.network is not None and car.trust is not None and car.trust.has_evidence:
+        return HYBRID
+    return BASELINE if spec_of(PHYSICS).missing(car) else PHYSICS
+
+
+def _validation_errors(call: _Call, car_folder: Path) -> Errors:
+    """Return the errors on the validation part of the estimator that represents a car."""
+    car, task = Car.load(car_folder), call.task
+    name = judged_by(car)
+    scored = score_slices(car, (name,), task.split.parts[VALIDATION], task.mapping, _slice_options(task))
+    if name not in scored.errors or not scored.errors[name].scored:
+        raise EstimatorError(
+            expected=f"an estimate of {name} on the validation part",
+            got=scored.skipped.get(name, "none"),
+            where="learn",
+            remedy="give more driving with truth",
+        )
+    return scored.errors[name]
+
+
+def _compare(old: Errors, new: Errors) -> tuple[tuple[float, float], bool | None]:
+    """Return the RMSE of both in degrees where both are known, and whether the new one is better; None: it is alike."""
+    both = np.isfinite(old.error) & np.isfinite(new.error)
+    was, now = (float(np.degrees(np.sqrt(np.mean(e.error[both] ** 2)))) if both.any() else np.nan for e in (old, new))
+    lacks = new.scored < LEAST_AVAILABILITY * old.scored
+    return (round(was, 6), round(now, 6)), None if was == now and not lacks else now < was and not lacks
+
+
+def _still_sure(old: Errors, new: Errors) -> bool:
+    """Return whether the 95 % intervals of the new one hold most of its errors, or as many as those of the old one."""
+    was, now = (float(np.mean(e.inside[np.isfinite(e.error)])) if e.inside is not None else 0.0 for e in (old, new))
+    return now >= min(was, LEAST_COVERED)
+
+
+def _confirmed(old: Errors, new: Errors) -> bool:
+    """Return whether the 95 % bounds of a paired block bootstrap say that the new one is better."""
+    found = block_bootstrap_difference(new.error, old.error, new.stamps_ns, block_s=BLOCK_S)
+    return found.blocks >= MIN_BLOCKS and found.high < 0.0
+
+
+# ---- the end ----
+
+
+def _end(call: _Call, start: Path, car: Path, stages: Sequence[StageResult]) -> dict[str, Any]:
+    """Score the test part once, and return what more driving would be worth."""
+    task = call.task
+    task.progress("scoring the test part, once", _share(call, len(stages) + 1))
+    curve = learning_curve(task.split, car, task.mapping, _slice_options(task), task.progress)
+    spans = [[call.logs[s.path], *(s.span_s or ())] for s in task.split.parts[TEST]]
+    count = count_evaluations(call.work / EVALUATIONS_FILE, spans, call.say)
+    tables = {part: table_of(task, start, car, part) for part in (VALIDATION, TEST)}
+    figures = {s.name: s.figures for s in stages if s.status == KEPT}
+    return {
+        "car_name": Car.load(car).vehicle.name,
+        "evaluations": count,
+        **tables,
+        "curve": curve,
+        "more": what_more_would_pay(task.split, task.settings.order, figures, curve),
+    }
+
+
+def _slice_options(task: Task) -> ReadOptions:
+    return config_of(task.settings, Path()).config.read_options
+
+
+def count_evaluations(file: Path, spans: list[list[Any]], say: Tell = lambda _text: None) -> int:
+    """Record that spans [hash of the log, start, end] are scored now; return how often any was, this time included.
+
+    The file remains through ``--fresh`` and other settings: repeated trials until the test looks well are fits to it.
+    """
+    earlier: list[list[list[Any]]] = (read_own(file, say) or {}).get("evaluations", [])
+    write_bytes(file, json_bytes(seal({"evaluations": [*earlier, spans]})))
+
+    def overlap(one: list[Any], other: list[Any]) -> bool:
+        return bool(one[0] == other[0] and min(one[2], other[2]) > max(one[1], other[1]))
+
+    return 1 + sum(any(overlap(a, b) for a in before for b in spans) for before in earlier)
+
+
+def table_of(task: Task, start: Path, trained: Path, part: str) -> list[dict[str, Any]]:
+    """Return one line per estimator on a part of the drives, with the car as it was given and as it was trained."""
+    names_in_order, lines = list[str](), list[Errors]()
+    skipped: dict[str, dict[str, Any]] = {}
+    for label, folder, names in (("as given", start, BEFORE), ("trained", trained, AFTER)):
+        scored = score_slices(Car.load(folder), names, task.split.parts[part], task.mapping, _slice_options(task))
+        for name in names:
+            shown = name if name in _OF_NO_CAR else f"{name}, {label}"
+            names_in_order.append(shown)
+            if name in scored.errors:
+                lines.append(replace(scored.errors[name], name=shown))
+            elif name in scored.skipped:
+                skipped[shown] = {"name": shown, "skipped": scored.skipped[name]}
+    table = skipped | {line.name: _line(line) for line in compare(lines, YARDSTICK)}
+    return [table[name] for name in names_in_order if name in table]
+
+
+def _line(compared: Compared) -> dict[str, Any]:
+    return {
+        "name": compared.name,
+        "causal": spec_of(compared.name.partition(",")[0]).causal,
+        "rmse_deg": _degrees(compared.rmse),
+        "share": round(compared.share, 4),
+        "covered": None if compared.covered is None else round(compared.covered, 4),
+        "against_hybrid_deg": None if compared.difference is None else _degrees(compared.difference),
+    }
+
+
+def _degrees(interval: Interval) -> list[float | None]:
+    """Return value, lower and upper bound in degrees; None where there are too few blocks for one."""
+    values = (math.degrees(x) for x in (interval.value, interval.low, interval.high))
+    return [round(x, 6) if math.isfinite(x) else None for x in values]

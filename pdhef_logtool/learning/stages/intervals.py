@@ -1,0 +1,207 @@
+"""Stage ``intervals``: 95 % intervals of estimators, filed under the algorithm that ran (``intervals.json``)."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+
+import numpy as np
+
+from pdhef_logtool.car.car import INTERVALS_FILE
+from pdhef_logtool.car.parts import Algorithm, IntervalEntry, Intervals
+from pdhef_logtool.car.store import Change
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.drive.reading import friction_of
+from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, runnable
+from pdhef_logtool.evaluation.metrics import signal_error
+from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, smooth
+from pdhef_logtool.learning.drives import INTERVALS, DriveRecord, load_drive
+from pdhef_logtool.learning.evidence.calibrate import (
+    COVERED,
+    FOLDS,
+    MIN_DRIVES,
+    Fitted,
+    Samples,
+    bin_numbers,
+    fit_inflation,
+    join_samples,
+)
+from pdhef_logtool.learning.split import VALIDATION
+from pdhef_logtool.learning.stages.task import StageOutput, Task
+from pdhef_logtool.learning.variation import Variation, vary
+from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.records.errors import EstimatorError
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.runs.estimating import estimate_windows
+from pdhef_logtool.sinks.report import json_bytes, tool_versions
+from pdhef_logtool.watches.error_features import error_terms
+from pdhef_logtool.watches.intervals import yaw_rate_terms
+
+#: Neighbouring errors are correlated: one sample in this time is kept.
+SAMPLE_EVERY_S = 0.05
+#: Runs of each drive with wrong friction and vehicle.
+WRONG_RUNS = 2
+#: A drive with fewer kept samples does not count.
+MIN_SAMPLES = 20
+#: Share of the progress that running the estimators takes.
+RUNNING = 0.9
+#: A piece of a divided drive that counts as a drive of its own.
+PIECE_S = 20.0
+
+_Ran = list[tuple[str, Algorithm, Samples]]
+
+
+def fit_intervals(task: Task) -> StageOutput:
+    """Fit the intervals of every algorithm that gives one on the validation drives, each judged by a fit without it.
+
+    Raises
+    ------
+    EstimatorError
+        There are too few drives with ground truth.
+    """
+    logs = task.split.pieces(VALIDATION, PIECE_S)
+    if len(logs) < MIN_DRIVES:
+        raise _too_few(len(logs))
+    if task.car.network is not None and "train" in task.set_splits.values():
+        task.warn("drives of split train: a network is better there than in service, and its intervals too narrow")
+    numbers = itertools.count()
+    records, ran = task.read(logs, lambda log: _run_drive(log, next(numbers), task), RUNNING)
+    names: dict[str, tuple[str, Algorithm]] = {}
+    samples: dict[str, list[Samples]] = {}
+    for name, algorithm, part in itertools.chain.from_iterable(ran):
+        names.setdefault(algorithm.identity, (name, algorithm))
+        samples.setdefault(algorithm.identity, []).append(part)
+    entries: list[IntervalEntry] = []
+    for number, (identity, parts) in enumerate(samples.items()):
+        name, algorithm = names[identity]
+        task.progress(f"fitting {name}", RUNNING + (1.0 - RUNNING) * number / len(samples))
+        joined = join_samples(parts)
+        count = int(np.unique(joined.drive[~joined.wrong]).size)
+        if count < MIN_DRIVES:
+            task.warn(f"{name} is not calibrated: it has {count} drives, at least {MIN_DRIVES} are needed")
+            continue
+        entries.append(_entry(name, algorithm, fit_inflation(joined)))
+    if not entries:
+        raise _too_few(len(ran))
+    vehicle = task.car.vehicle
+    fitted = Intervals(
+        car=vehicle.name,
+        physics_sha256=task.car.physics_sha256,
+        roll_gradient_rad_per_m_s2=vehicle.roll_gradient_rad_per_m_s2,
+        spread=task.settings.spread,
+        entries=tuple(entries),
+        settings=task.settings.to_dict(),
+        fit={"covered": COVERED, "folds": FOLDS, "wrong_runs": WRONG_RUNS, "sample_every_s": SAMPLE_EVERY_S},
+        drives=tuple(r.learnt_on for r in records if not r.left_out),
+        versions=tool_versions(),
+    )
+    files = {INTERVALS_FILE: json_bytes(fitted.model_dump(mode="json"))}
+    change = Change(
+        f"learn --stages {INTERVALS}", INTERVALS_FILE, files, settings=task.settings.to_dict(), drives=fitted.drives
+    )
+    coverage = {e.estimator: list(e.coverage) for e in entries}
+    return StageOutput(change, records, f"{', '.join(coverage)}, on {len(ran)} drives", {"coverage": coverage})
+
+
+def _too_few(count: int) -> EstimatorError:
+    return EstimatorError(
+        expected=f"at least {MIN_DRIVES} drives, or pieces of {PIECE_S:g} s of one, with a true sideslip",
+        got=str(count),
+        where=INTERVALS,
+        remedy="give more drives; the same number of short drives of many kinds is worth more than a long one",
+    )
+
+
+def made_wrong(vehicle: VehicleParameters, spread: float, key: str) -> Iterator[Variation]:
+    """Yield the draws of a key that do not leave everything as it is; ``spread`` > 0."""
+    draws = (vary(vehicle, spread, f"{key}:{number}") for number in itertools.count())
+    return (draw for draw in draws if draw.vehicle is not vehicle)
+
+
+def _run_drive(log: LogInput, number: int, task: Task) -> tuple[DriveRecord, _Ran | None]:
+    """Run the estimators on a drive, once as given and some times with a wrong vehicle; return errors and terms."""
+    settings, car, vehicle, options = task.settings, task.car, task.car.vehicle, task.options
+    record, drive = load_drive(log, car, task.mapping, options, fill_friction=False)
+    if drive is None or drive.truth is None:
+        return record, None
+    signals = drive.signals
+    runs = [(vehicle, 1.0, False)]
+    if settings.spread > 0.0:
+        draws = itertools.islice(made_wrong(vehicle, settings.spread, f"{settings.seed}:{record.sha256}"), WRONG_RUNS)
+        runs += [(draw.vehicle, draw.friction_factor, True) for draw in draws]
+    ran: _Ran = []
+    for assumed, factor, wrong in runs:
+        seen = friction_of(drive.plan, assumed, options, factor).fill(drive.signals)
+        if not ran and "friction" not in drive.plan.alignment.available:
+            signals = replace(signals, friction=seen.friction)  # the best that is known of the drive, for the bins
+        presumed = car if assumed is vehicle else car.with_vehicle(assumed)
+        available = drive.plan.alignment.available
+        estimators, _ = runnable(task.estimators or (ALL_ESTIMATORS,), presumed, available, Options(options.use_speed))
+        for window in estimate_windows(replace(drive, signals=seen), estimators, watched=False, drawn=False):
+            for estimator, track in zip(estimators, window.tracks, strict=True):
+                part = drive_samples(track, seen, signals, drive.truth, vehicle, number, wrong=wrong)
+                if len(part) >= MIN_SAMPLES:
+                    ran.append((track.name, resolve(estimator), part))
+    if not ran:
+        return replace(record, left_out="no estimate with an interval where the truth is known"), None
+    return replace(record, counts={**record.counts, "runs": len(runs)}), ran
+
+
+def drive_samples(
+    track: StateTrack,
+    given: Signals,
+    signals: Signals,
+    truth: StateTrack,
+    vehicle: VehicleParameters,
+    drive: int,
+    *,
+    wrong: bool,
+) -> Samples:
+    """Return the samples of one run of a drive, a stamp every :data:`SAMPLE_EVERY_S`; none without an interval.
+
+    Parameters
+    ----------
+    given : signals that the estimator had; the terms come from them.
+    signals : with the friction of the drive, for the bins.
+    vehicle : the right one; its roll gradient and lowest speed count.
+    """
+    slow = vehicle.low_speed_blend_m_s
+    terms, _ = error_terms(track, given, vehicle.roll_gradient_rad_per_m_s2, None)
+    error = {s: signal_error(track, truth, s, slow) for s in ("sideslip_rad", "vy_m_s", "yaw_rate_rad_s")}
+    own, rate_std = track.sideslip_std_rad, track.yaw_rate_std_rad_s
+    use = np.isfinite(own) & (own > 0.0) & np.isfinite(track.vy_std_m_s) & np.isfinite(rate_std)
+    for values in error.values():
+        use &= np.isfinite(values)
+    ay = truth.ay_m_s2 if np.isfinite(truth.ay_m_s2).any() else signals.ay_m_s2
+    friction = np.where(np.isfinite(signals.friction), signals.friction, vehicle.assumed_friction)
+    bins = bin_numbers(np.abs(smooth(truth.stamps_ns, ay, GRIP_SMOOTHING_HZ)) / (friction * GRAVITY_M_S2))
+    use &= bins >= 0
+    slot = (truth.stamps_ns - truth.stamps_ns[0]) // round(SAMPLE_EVERY_S * 1e9) if len(truth) else truth.stamps_ns
+    kept = np.flatnonzero(use)
+    kept = kept[np.unique(slot[kept], return_index=True)[1]]
+    count = kept.size
+    return Samples(
+        terms=terms[kept],
+        yaw_rate_terms=yaw_rate_terms(terms, rate_std)[kept],
+        vy_per_sideslip=track.vy_std_m_s[kept] / own[kept],
+        sideslip_error=error["sideslip_rad"][kept],
+        vy_error=error["vy_m_s"][kept],
+        yaw_rate_error=error["yaw_rate_rad_s"][kept],
+        own_std=own[kept],
+        bin=bins[kept],
+        drive=np.full(count, drive, dtype=np.int64),
+        wrong=np.full(count, wrong, dtype=np.bool_),
+    )
+
+
+def _entry(name: str, algorithm: Algorithm, fitted: Fitted) -> IntervalEntry:
+    return IntervalEntry(
+        estimator=name,
+        algorithm=algorithm,
+        inflation=fitted.inflation,
+        unseen_factor=fitted.unseen_factor,
+        coverage=tuple(asdict(c) for c in fitted.coverage),
+    )

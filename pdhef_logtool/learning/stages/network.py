@@ -1,0 +1,67 @@
+"""Stage ``network``: the network trained on by drives with truth, stopped by others, and its residual gain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.learning.split import divided
+from pdhef_logtool.learning.stages.gain import find_gain
+from pdhef_logtool.learning.stages.task import StageOutput, Task
+from pdhef_logtool.logs.discovery import Logs
+from pdhef_logtool.records.errors import EstimatorError
+from pdhef_logtool.residual_model.bundle import ModelBundle
+from pdhef_logtool.runs.config import RunConfig
+
+#: Fine-tuning of a trained network; a network from random weights is a small one, for a minute or two of driving.
+GENTLY: dict[str, Any] = {"learning_rate": 5e-4, "epochs": 15}
+SMALL: dict[str, Any] = {"hidden": 32, "layers": 1}
+#: Least driving for training, and the share of it that the network learns from; the rest stops the training.
+LEAST_TRAINING_S, TRAIN_SHARE = 100.0, 0.8
+
+
+def train_network(task: Task) -> StageOutput:
+    """Fine-tune the network of the car and find its residual gain; raises EstimatorError on too little driving."""
+    part, init = task.split.network_part(), task.car.network
+    if init is None:
+        raise EstimatorError(expected="a network", got="none", where="network")
+    seconds = task.split.seconds(part)
+    learns, stops = divided(task.split.usable(part), TRAIN_SHARE)
+    if seconds < LEAST_TRAINING_S or not stops:
+        raise EstimatorError(
+            expected=f"at least {LEAST_TRAINING_S:g} s of usable driving to train on",
+            got=f"{seconds:.0f} s",
+            where="network",
+        )
+    config = replace(task.settings.config, network=None)
+    work = task.work / "training"
+    train_on_parts({"train": (learns, config), "validation": (stops, config)}, work, init, progress=task.progress)
+    network = work / "model"
+    settings = replace(task.settings, config=replace(config, network=network))
+    return find_gain(replace(task, car=Car.load(config.car, network=network), settings=settings))
+
+
+def train_on_parts(
+    parts: Mapping[str, tuple[Logs, RunConfig]],
+    folder: Path,
+    init: ModelBundle | None,
+    *,
+    progress: Callable[[str, float], None] = lambda _text, _share: None,
+) -> ModelBundle:
+    """Extract the logs of the parts ``train`` and ``validation`` into a folder and train; ``init`` is the start.
+
+    The network is left in ``folder/model``.
+    """
+    from pdhef_logtool.learning.network.dataset import read_dataset
+    from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
+    from pdhef_logtool.learning.network.train_command import make_recipe, train_on
+
+    for split, (logs, config) in parts.items():
+        extract(logs, folder / split, ExtractSettings(config, split=split))
+    sets = [read_dataset(folder / split) for split in parts]
+    both = replace(sets[0], drives=tuple(d for s in sets for d in s.drives))
+    recipe = replace(make_recipe(paper=False, seed=0, epochs=None, device="cpu"), **(SMALL if init is None else GENTLY))
+    return train_on(both, folder / "model", recipe, init=init, progress=progress).bundle

@@ -1,0 +1,77 @@
+"""Input and output of a stage: every stage is one function ``Task -> StageOutput``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.store import Change
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import Tell
+from pdhef_logtool.learning.drives import DriveRecord, LearnSettings, tell_drive
+from pdhef_logtool.learning.split import Split
+from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.mapping import Mapping as SignalMapping
+
+_Read = TypeVar("_Read")
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Task:
+    """Input of a stage.
+
+    Attributes
+    ----------
+    car : with the parts of the stages before.
+    settings : their configuration names this car and the network to start from.
+    split : the slices of drives by their use. set_splits : by log, the split of its simulated set.
+    estimators : whose noise is searched or whose intervals are fitted; None = the stage's default.
+    work : folder for files that nobody needs afterwards. jobs : worker processes; results do not depend on it.
+    """
+
+    car: Car
+    settings: LearnSettings
+    split: Split
+    mapping: SignalMapping | None = None
+    set_splits: Mapping[str, str] = field(default_factory=dict)
+    estimators: tuple[str, ...] | None = None
+    work: Path = Path()
+    jobs: int = 1
+    progress: Progress = lambda _text, _share: None
+    warn: Tell = lambda _text: None
+
+    @property
+    def options(self) -> ReadOptions:
+        """How logs are read."""
+        return self.settings.config.read_options
+
+    def read(
+        self, logs: Sequence[LogInput], read: Callable[[LogInput], tuple[DriveRecord, _Read | None]], share: float = 1.0
+    ) -> tuple[tuple[DriveRecord, ...], list[_Read]]:
+        """Read logs in order; return a record of each and the content of those that can be used.
+
+        ``share`` : of the stage's progress that reading takes.
+        """
+        records, drives = [], list[_Read]()
+        for number, log in enumerate(logs):
+            self.progress(f"reading {log.stem}", share * number / len(logs))
+            record, drive = read(log)
+            records.append(replace(record, split=self.set_splits.get(log.stem)))
+            tell_drive(records[-1], self.warn)
+            if drive is not None:
+                drives.append(drive)
+        return tuple(records), drives
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StageOutput:
+    """Output of a stage: the change of the car, a record per drive, a summary line and figures as JSON-able values."""
+
+    change: Change
+    records: tuple[DriveRecord, ...]
+    text: str
+    figures: dict[str, Any]
