@@ -163,7 +163,7 @@ def tune(
         Option(
             "--estimators",
             "-e",
-            help="Out of phy-ukf-tuned, physics, pd-hef, pd-hef-smoothed. Default: the first two, and pd-hef "
+            help="Out of phy-ukf:tuned, physics, pd-hef, pd-hef-smoothed. Default: the first two, and pd-hef "
             "where the car has a network of its own or --network names one.",
         ),
     ] = None,

@@ -35,7 +35,7 @@ def render_identification(result: IdentifyResult, console: Console) -> None:
         interval = f"{p.low:.4g} to {p.high:.4g}" if p.excited else "-"
         remark = "filter noise" if p.tuning else "" if p.excited else "kept: not excited further"
         parameters.add_row(p.name, f"{p.value:.5g}", interval, f"{p.prior:.4g}", p.unit, remark)
-    scores = table("part", ">seconds", ">β = 0", ">phy-ukf, starting car", ">phy-ukf-tuned, identified", ">physics")
+    scores = table("part", ">seconds", ">β = 0", ">phy-ukf, starting car", ">phy-ukf:tuned, identified", ">physics")
     for s in found.scores:
         errors = (f"{value:.3f}°" for value in (s.zero_deg, s.start_file_deg, s.identified_deg, s.physics_deg))
         scores.add_row(s.part, f"{s.seconds:.1f}", *errors)

@@ -42,7 +42,7 @@ def _losses_by_command(
         "identify": lambda tell: identify(logs, out / "1", config, holdout=0.0, warn=tell),
         "extract": lambda tell: extract(logs, out / "2", ExtractSettings(physics), warn=tell),
         "tune": lambda tell: tune(
-            logs, out / "3", TuneSettings(**learn(names=("phy-ukf-tuned",), trials=4)), warn=tell
+            logs, out / "3", TuneSettings(**learn(names=("phy-ukf:tuned",), trials=4)), warn=tell
         ),
         "trust": lambda tell: trust(logs, out / "4", LearnSettings(config=config), warn=tell),
         "calibrate": lambda tell: calibrate(

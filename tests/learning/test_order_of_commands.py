@@ -74,7 +74,7 @@ class Commands:
         if name == "identify":
             identify_command.identify(logs, self.car, replace(config, end="34"), holdout=0.0)
         elif name == "tune":
-            tune(logs, self.car, TuneSettings(config=config, names=("phy-ukf-tuned", "physics"), trials=4))
+            tune(logs, self.car, TuneSettings(config=config, names=("phy-ukf:tuned", "physics"), trials=4))
         elif name == "trust":
             network = self.car.parent / "model"
             trust(logs, self.car, LearnSettings(config=replace(config, network=network, end="+5s")))

@@ -230,7 +230,7 @@ def test_what_is_written_runs_with_the_scores_that_are_recorded(
     assert (tmp_path / "mycar/noise.png").read_bytes().startswith(b"\x89PNG")
 
     names = choose_names(None, before)
-    assert set(names) == {"phy-ukf-tuned", "physics"}
+    assert set(names) == {"phy-ukf:tuned", "physics"}
     assert set(record["estimators"]) == set(names)
     explored = {n: [t["values"] for t in e["trials"] if t["stage"] == "sobol"] for n, e in record["estimators"].items()}
     assert all(len(record["estimators"][n]["trials"]) == 4 and explored[n] == explored["physics"] for n in names)
@@ -260,9 +260,9 @@ def test_processes_change_nothing_and_the_command_prints_json(
         output = tmp_path / str(jobs) / "car.toml"
         document = said(
             capsys, "tune", drives, "--split", "validation", "--car", sample_logs_dir / "vehicle.toml",
-            "--network", "none", "-o", output, "-e", "phy-ukf-tuned", "--trials", 4, "--jobs", jobs,
+            "--network", "none", "-o", output, "-e", "phy-ukf:tuned", "--trials", 4, "--jobs", jobs,
         )  # fmt: skip
-        assert document["estimators"]["phy-ukf-tuned"]["trials"] == 4
+        assert document["estimators"]["phy-ukf:tuned"]["trials"] == 4
         texts.append((output.read_text(), output.with_name("car.noise.record.json").read_text()))
     assert texts[0] == texts[1]
 
@@ -287,7 +287,7 @@ def test_a_drive_without_truth_is_left_out_and_told(sample_logs_dir: Path, tmp_p
     logs = [str(sample_logs_dir / "dlc.mcap"), str(sample_logs_dir / "no_truth.mcap")]
     told: list[str] = []
     result = tune(
-        logs, tmp_path / "car.toml", _settings(sample_logs_dir, split=None, names=("phy-ukf-tuned",)), warn=told.append
+        logs, tmp_path / "car.toml", _settings(sample_logs_dir, split=None, names=("phy-ukf:tuned",)), warn=told.append
     )
     assert result.exit_code == 3
     assert [d.name for d in result.left_out] == ["no_truth"]
@@ -301,7 +301,7 @@ def test_a_drive_without_truth_is_left_out_and_told(sample_logs_dir: Path, tmp_p
 def test_an_unreadable_log_stops_the_command_from_any_process(sample_logs_dir: Path, tmp_path: Path) -> None:
     (tmp_path / "bad.mcap").write_bytes(b"no log at all")
     logs = [str(sample_logs_dir / "dlc.mcap"), str(tmp_path / "bad.mcap")]
-    settings = _settings(sample_logs_dir, split=None, names=("phy-ukf-tuned",))
+    settings = _settings(sample_logs_dir, split=None, names=("phy-ukf:tuned",))
     for jobs in (1, 2):
         with pytest.raises(LogError, match=r"bad\.mcap"):
             tune(logs, tmp_path / "car.toml", settings, jobs=jobs)
@@ -311,7 +311,7 @@ def test_an_unreadable_log_stops_the_command_from_any_process(sample_logs_dir: P
 def test_drives_that_do_not_fit_are_refused(
     sample_logs_dir: Path, drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = _settings(sample_logs_dir, names=("phy-ukf-tuned",))
+    settings = _settings(sample_logs_dir, names=("phy-ukf:tuned",))
     facts = tune([str(drives)], tmp_path / "car.toml", settings).drives
     assert all(f.bytes_held > 100 * f.counts["scored_stamps"] for f in facts)
     monkeypatch.setattr(tune_drives, "MAX_BYTES", sum(f.bytes_held for f in facts) - 1)
@@ -346,12 +346,12 @@ def test_noise_of_an_earlier_search_stays_without_its_score(sample_logs_dir: Pat
     tune(log, tmp_path / "mycar", replace(settings, names=("physics",)))
     first = Car.load(tmp_path / "mycar").noise["physics"]
     assert first.score_deg is not None
-    again = replace(settings, config=replace(settings.config, car=tmp_path / "mycar"), names=("phy-ukf-tuned",))
+    again = replace(settings, config=replace(settings.config, car=tmp_path / "mycar"), names=("phy-ukf:tuned",))
     tune(log, tmp_path / "mycar", again)
     noise = Car.load(tmp_path / "mycar").noise
     # It is as good as it was, but was not compared with the other on the same drives.
     assert noise["physics"] == first.model_copy(update={"score_deg": None})
-    assert noise["phy-ukf-tuned"].score_deg is not None
+    assert noise["phy-ukf:tuned"].score_deg is not None
     tune(log, tmp_path / "mycar", again)
     assert Car.load(tmp_path / "mycar").noise == noise
 
@@ -363,7 +363,7 @@ def test_comments_of_the_vehicle_file_are_kept(sample_logs_dir: Path, tmp_path: 
         "\n[sensors]", "\n# data sheet\n[sensors]"
     )
     (tmp_path / "guess.toml").write_text("# Written by hand.\n# Understood by few.\n" + text)
-    settings = _settings(sample_logs_dir, split=None, names=("phy-ukf-tuned",))
+    settings = _settings(sample_logs_dir, split=None, names=("phy-ukf:tuned",))
     config = replace(settings.config, car=tmp_path / "guess.toml")
     for output in ("car.toml", "mycar"):
         tune([str(sample_logs_dir / "dlc.mcap")], tmp_path / output, replace(settings, config=config))
