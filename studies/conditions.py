@@ -31,8 +31,8 @@ INDEPENDENT_ROW = "independent-simulator"
 CALIBRATION_SEED_OFFSET = 1000
 #: What the table's claims are about, the first of these that ran, and what it is held against.
 SUBJECTS = ("pd-hef", fixed_grid.BASE)
-REFERENCES = ("physics", "pd-hef-fixed-r", "phy-ukf-tuned", "pd-hef-paper", fixed_grid.BEST)
-BUDGET = ("phy-ukf-tuned", "phy-ukf")
+REFERENCES = ("physics", "pd-hef:fixed-r", "phy-ukf:tuned", "pd-hef-paper", fixed_grid.BEST)
+BUDGET = ("phy-ukf:tuned", "phy-ukf")
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -22,7 +22,7 @@ AY_FACTORS = (0.5, 1.0, 2.0)
 Q_FACTORS = (0.5, 1.0, 2.0)
 PREFIX = "fixed"
 #: The estimator whose trust and noise the grid varies.
-BASE = "pd-hef-fixed-r"
+BASE = "pd-hef:fixed-r"
 #: What the best setting on the calibration drives is called in the tables.
 BEST = "fixed-best"
 

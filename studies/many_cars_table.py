@@ -44,10 +44,10 @@ UNSEEN_SEED, UNSEEN_CARS, UNSEEN_DRIVES = 4100, 24, 4
 EPOCHS = 48
 #: Estimator by the name in the table: registered name, and which network it has.
 COLUMNS = {
-    "phy-ukf-tuned": ("phy-ukf-tuned", "one"),
+    "phy-ukf:tuned": ("phy-ukf:tuned", "one"),
     "physics": ("physics", "one"),
-    "one car": ("pd-hef-trust1", "one"),
-    "many cars": ("pd-hef-trust1", "many"),
+    "one car": ("pd-hef:gain=1", "one"),
+    "many cars": ("pd-hef:gain=1", "many"),
 }
 LEAST_SAMPLES = 100
 #: Fine-tuning: hatchbacks of their own, how many drives of each are fitted to, and the last of these to stop by.
@@ -126,10 +126,10 @@ def fine_tuned(network: ModelBundle, work: Path) -> dict[str, Errors]:
         )
         drawn = with_shipped_noise(load_vehicle(vehicle_file))
         columns = {
-            "phy-ukf-tuned": ("phy-ukf-tuned", network),
+            "phy-ukf:tuned": ("phy-ukf:tuned", network),
             "physics": ("physics", network),
-            "many cars": ("pd-hef-trust1", network),
-            "many cars, fine-tuned": ("pd-hef-trust1", own),
+            "many cars": ("pd-hef:gain=1", network),
+            "many cars, fine-tuned": ("pd-hef:gain=1", own),
         }
         for column, errors in score([Case(log, drawn) for log in logs[FIT_DRIVES:]], columns).items():
             found.setdefault(column, []).extend(errors)

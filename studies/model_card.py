@@ -21,8 +21,8 @@ from studies.condition_drives import drives_of, read_drive, root_mean_square, si
 from studies.defaults.train_default import DRIVES, SETS
 from studies.pages import options, table, write
 
-ESTIMATORS = ("zero", "linear-regression", "phy-ukf", "phy-ukf-tuned", "physics", "pure-lstm", "pd-hef-paper",
-              "pd-hef-fixed-r", "pd-hef")  # fmt: skip
+ESTIMATORS = ("zero", "linear-regression", "phy-ukf", "phy-ukf:tuned", "physics", "pure-lstm", "pd-hef-paper",
+              "pd-hef:fixed-r", "pd-hef")  # fmt: skip
 #: Set, split, how the card calls them.
 PARTS = (
     ("one_car", "test", "the car of the vehicle file, test drives"),

@@ -63,12 +63,12 @@ REFERENCE = ROOT / "tests" / "reference"
 #: Share of the fit part that the network learns from; the rest, behind a guard, stops its training.
 TRAIN_SHARE, GUARD_S = 0.8, 5.0
 #: Against which all others are judged, the first that ran.
-YARDSTICKS = ("phy-ukf-tuned, identified", "phy-ukf, catalogue")
+YARDSTICKS = ("phy-ukf:tuned, identified", "phy-ukf, catalogue")
 
 
 #: What needs no car; what needs no network; what may have one.
 FREE = ("zero", "kinematic")
-PHYSICAL = tuple(s.name for s in SPECS if not s.network and s.name not in (*FREE, "gyro", OPEN_LOOP))
+PHYSICAL = tuple(s.name for s in SPECS if not s.network and s.name not in (*FREE, "zero:no-lateral", OPEN_LOOP))
 NETWORKS = tuple(s.name for s in SPECS if s.network)
 #: Versions of this page, and of the published files on docs/self_calibration.md, before looks were counted.
 LOOKS_BEFORE = 6
@@ -360,7 +360,7 @@ def identified_car(case: Case, network: Path, trials: int) -> tuple[list[Row], s
         config = replace(config, network=folder / "last")
         learn(log, folder / "tuned", LearnSettings(config=config, stages=(NOISE,), trials=trials), warn=say)
         tuned = Car.load(folder / "tuned", network=NO_MODEL)
-        add("tuned", tuned, ("phy-ukf-tuned", "physics"))
+        add("tuned", tuned, ("phy-ukf:tuned", "physics"))
         add(f"tuned, {last}", with_evidence(case, tuned, bundle), hybrids)
     return results, ""
 
@@ -400,7 +400,7 @@ def with_evidence(case: Case, car: Car, network: ModelBundle) -> Car:
 
 def half_trust(ready: Sequence[Estimator]) -> list[Estimator]:
     """Return the fixed hybrid filter at half trust, where the fixed one runs."""
-    name = "pd-hef-fixed-r"
+    name = "pd-hef:fixed-r"
     fixed = [e for e in ready if e.name == name and isinstance(e, AdaptivePhysics)]
     return [replace(e, trust=0.5, name=f"{name} at trust 0.5") for e in fixed]
 

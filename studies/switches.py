@@ -38,7 +38,7 @@ from truthsim.drive import simulate_drive, write_drive
 from truthsim.faults import parse_fault
 
 FIRST_SEED = 11000
-ESTIMATORS = ("phy-ukf-tuned", "physics", "pd-hef")
+ESTIMATORS = ("phy-ukf:tuned", "physics", "pd-hef")
 #: Ratios nearer to 1 than this are no difference that matters.
 TRIFLE = 0.01
 #: Names of the drives that the table of conditions makes, and how the others are made.
@@ -125,8 +125,8 @@ def option_switch(title: str, drives: str, name: str, default: dict[str, bool]) 
 
 
 _ALL = dict.fromkeys(ESTIMATORS, True)
-_OF_TUNED = {"phy-ukf-tuned": False}
-_ROLLING = {"phy-ukf-tuned": True}
+_OF_TUNED = {"phy-ukf:tuned": False}
+_ROLLING = {"phy-ukf:tuned": True}
 _PART = {"physics": True}
 SWITCHES = (
     option_switch("bias states of a_y, yaw rate, steering", "bias", "bias_states", _OF_TUNED),

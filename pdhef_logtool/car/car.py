@@ -144,7 +144,7 @@ class Car:
 
         >>> car = Car.load("saloon")
         >>> car.vehicle.mass_kg, sorted(car.noise), car.allowed_trust.cap
-        (1440.0, ['phy-ukf-tuned', 'physics'], 0.75)
+        (1440.0, ['phy-ukf:tuned', 'physics'], 0.75)
         """
         source = SHIPPED_CARS.get(str(path), None if path is None else Path(path))
         folder = source if source is not None and source.is_dir() else None

@@ -22,7 +22,7 @@ from pdhef_logtool.records.errors import VehicleError
 _TABLES = ("filter", "network", "identification")
 #: A drive and a score, as older versions wrote them for people.
 _SPAN = re.compile(r"(?P<name>.+): (?P<start_s>-?[\d.]+) to (?P<end_s>-?[\d.]+) s")
-_SCORE = re.compile(r"(?P<name>[a-z-]+): (?P<score_deg>[\d.]+) deg at trial (?P<trial>\d+)")
+_SCORE = re.compile(r"(?P<name>[a-z:-]+): (?P<score_deg>[\d.]+) deg at trial (?P<trial>\d+)")
 
 
 class _Network(Record):

@@ -29,7 +29,7 @@ Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 #: The filter on physics that has parts of its own.
 PHYSICS = "physics"
 #: Filters whose noise a car may hold, by the name of the estimator that it belongs to.
-NOISY_FILTERS = ("phy-ukf-tuned", PHYSICS)
+NOISY_FILTERS = ("phy-ukf:tuned", PHYSICS)
 #: Filters of older versions by name, and what stands for them or for their noise now. A file may hold noise of theirs;
 #: it is not used.
 FORMER_FILTERS = {

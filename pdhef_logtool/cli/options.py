@@ -187,8 +187,6 @@ def run_config(options: dict[str, Any]) -> RunConfig:
         if now in flags:
             raise UsageError(expected=f"--{now} or its alias", got="both", where=f"--{now}")
         flags[now] = flags.pop(alias)
-    if "estimators" in flags:
-        flags["estimators"] = split_names(flags["estimators"])
     return load_config(flags.pop("config_file", None), flags)
 
 

@@ -41,7 +41,7 @@ from pdhef_logtool.watches.sensor_faults import no_faults
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.table import Options
+    from pdhef_logtool.estimators.presets import Options
 
 #: What a model may lack, as parts of ``physics``; each is the state of one filter.
 CURES = ("force_scale", "bank")

@@ -59,7 +59,7 @@ from pdhef_logtool.watches.speed_slip import believable
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.table import Options
+    from pdhef_logtool.estimators.presets import Options
 
 #: θ of Eq 22 and γ of Eq 26: the paper names no values, docs/method.md#paper-adaptation fixes these.
 FORGETTING = 0.95

@@ -14,7 +14,7 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.table import Options
+    from pdhef_logtool.estimators.presets import Options
 
 #: Time constant of the leak, s. A pure integrator drifts by bias · time (0.08 m/s² gives 24 m/s in five minutes).
 #: Chosen against the truth of simulated drives by ``studies.defaults.tune_kinematic_leak``, which is to its advantage.

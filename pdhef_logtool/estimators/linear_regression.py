@@ -20,7 +20,7 @@ from pdhef_logtool.residual_model.low_pass import low_pass
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.table import Options
+    from pdhef_logtool.estimators.presets import Options
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,7 +22,7 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.table import Options
+    from pdhef_logtool.estimators.presets import Options
 
 #: The rate of a_y is taken along the motion over this time.
 AY_RATE_STEP_S = 0.001

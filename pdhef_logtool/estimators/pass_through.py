@@ -1,4 +1,4 @@
-"""``zero`` (β = 0) and ``gyro`` (the sensors as they are): what any estimator must beat."""
+"""``zero`` (β = 0) and ``zero:no-lateral`` (the sensors as they are): what any estimator must beat."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pdhef_logtool.estimators.base import Steps, make_steps
+from pdhef_logtool.estimators.presets import options_of
 from pdhef_logtool.estimators.stepwise import StepState, measured_speed
 from pdhef_logtool.records.signals import Signals
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.table import Options
+    from pdhef_logtool.estimators.presets import Options
 
 
 @dataclass(frozen=True, slots=True)
 class PassThrough:
-    """Speed sensor, gyro and accelerometer passed through; ``zero`` adds v_y = 0, ``gyro`` claims no v_y.
+    """Speed sensor, gyro and accelerometer passed through; ``zero`` adds v_y = 0, ``zero:no-lateral`` claims no v_y.
 
     Both have the sensors' delay: the newest sample that had arrived is held until the scored stamp.
     """
@@ -39,6 +40,6 @@ class PassThrough:
 
 
 def build(name: str, car: Car, options: Options) -> PassThrough:
-    """Return ``zero`` or ``gyro``."""
+    """Return ``zero`` or its variant ``no-lateral``."""
     del car, options
-    return PassThrough(name, claims_zero_sideslip=name == "zero")
+    return PassThrough(name, claims_zero_sideslip="no-lateral" not in options_of(name))

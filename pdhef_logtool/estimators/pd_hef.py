@@ -1,4 +1,4 @@
-"""``pd-hef`` and its presets: ``physics`` of the car plus trust times what the network says that it lacks.
+"""``pd-hef`` and its variants: ``physics`` of the car plus trust times what the network says that it lacks.
 
 The trust is what the car's evidence allows; without a network or evidence it is 0, and ``pd-hef`` is ``physics``.
 """
@@ -11,14 +11,12 @@ from typing import TYPE_CHECKING
 from pdhef_logtool.car.parts import SMOOTHING
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.physics_ukf import of_car
+from pdhef_logtool.estimators.presets import options_of
 from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_smoothing
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.table import Options
-
-#: Presets at trust 1, whatever the car allows; the second is without the adaptive mechanism.
-FULL_TRUST, FIXED = "pd-hef-trust1", "pd-hef-fixed-r"
+    from pdhef_logtool.estimators.presets import Options
 
 
 def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
@@ -28,7 +26,7 @@ def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
         of_car(car, use_speed=options.use_speed),
         options.service(car) if trust > 0.0 else None,
         trust,
-        adaptive=name != FIXED,
+        adaptive="fixed-r" not in options_of(name),
         name=name,
         notes=notes,
     )
@@ -48,7 +46,7 @@ def _trust(name: str, car: Car, options: Options) -> tuple[float, tuple[str, ...
         return 0.0, (f"network trust 0: {why}",)
     if options.trust is not None:
         return options.trust, ()
-    if name in (FULL_TRUST, FIXED):
-        return 1.0, ()
+    if chosen := options_of(name):
+        return float(chosen.get("gain", 1.0)), ()
     allowed = car.allowed_trust
     return allowed.cap, (allowed.note,)

@@ -1,4 +1,4 @@
-"""``phy-ukf-tuned``: the physics filter with noise that belongs to the car, corrected for body roll."""
+"""``phy-ukf:tuned``: the physics filter with noise that belongs to the car, corrected for body roll."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, PhysicsUkf
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.table import Options
+    from pdhef_logtool.estimators.presets import Options
 
-NAME = "phy-ukf-tuned"
+NAME = "phy-ukf:tuned"
 
 
 def physics_ukf_tuned(vehicle: VehicleParameters, noise: FilterNoise, *, use_speed: bool = True) -> PhysicsUkf:
@@ -29,5 +29,5 @@ def physics_ukf_tuned(vehicle: VehicleParameters, noise: FilterNoise, *, use_spe
 
 
 def build(name: str, car: Car, options: Options) -> PhysicsUkf:
-    """Return ``phy-ukf-tuned`` of a car that has noise for it."""
+    """Return ``phy-ukf:tuned`` of a car that has noise for it."""
     return physics_ukf_tuned(car.vehicle, car.noise[name], use_speed=options.use_speed)

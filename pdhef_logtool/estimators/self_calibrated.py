@@ -34,18 +34,10 @@ from pdhef_logtool.watches.intervals import MAX_SIDESLIP_STD_RAD
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 
-#: Names that run on ``physics``: they take the calibrated vehicle where there is one, the others the file as it stands.
-SELF_CALIBRATED = frozenset(
-    {
-        "physics",
-        "pd-hef",
-        "pd-hef-fixed-r",
-        "pd-hef-smoothed",
-        "pd-hef-trust1",
-    }
-)
-#: What runs on the file runs once more on the calibrated vehicle under this name.
-OPEN_LOOP = "open-loop-calibrated"
+#: Presets built on ``physics``. They use the calibrated vehicle if there is one; all others use the vehicle file.
+SELF_CALIBRATED = frozenset({"physics", "pd-hef", "pd-hef-smoothed"})
+#: The open-loop model on the calibrated vehicle.
+OPEN_LOOP = "open-loop:calibrated"
 #: k_o and k_d above, chosen on 16 simulated cars with wrong files, whose parameters' posterior held as it is.
 OWN_SHARE, D2_SHARE = 0.25, 0.5
 

@@ -7,48 +7,22 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import FORMER_FILTERS
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.presets import Options as Options
+from pdhef_logtool.estimators.presets import check_options, options_of, preset_of
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED, SelfCalibrated
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.shown import shown
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 
-if TYPE_CHECKING:
-    from pdhef_logtool.residual_model.service import NetworkService
-
 _ESP = frozenset({"steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """What a run asks of every estimator.
-
-    Attributes
-    ----------
-    use_speed : False is the paper's ``esp`` suite for the filters: the speed sensor only starts them
-    (docs/method.md#frame).
-    trust : of the hybrid filters, in [0, 1]; None: what the car's evidence allows.
-    network : of the car, ready to run, where several estimators share it; None: made anew.
-    """
-
-    use_speed: bool = True
-    trust: float | None = None
-    network: NetworkService | None = field(default=None, compare=False)
-
-    def service(self, car: Car) -> NetworkService:
-        """Return the car's network, ready to run."""
-        assert car.network is not None, "the table lets no estimator run without the network that it needs"
-        from pdhef_logtool.residual_model.service import NetworkService
-
-        return self.network or NetworkService(car.network)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +57,7 @@ class Spec:
         """Return why a car does not let it run, empty if it does."""
         if self.name == OPEN_LOOP and car.self_calibrated is None:
             return "the log has not calibrated its car"
-        if self.name in SELF_CALIBRATED:
+        if preset_of(self.name) in SELF_CALIBRATED:
             car = car.calibrated_car
         if self.needs_noise and self.name not in car.noise:
             return f"the car has no noise for {self.name}; pdhef learn --stages identify finds it"
@@ -116,7 +90,7 @@ class Spec:
         if isinstance(build, str):
             module, _, function = build.partition(":")
             build = getattr(import_module(f"{__package__}.{module}"), function)
-        if car.self_calibrated is None or self.name not in {OPEN_LOOP, *SELF_CALIBRATED}:
+        if car.self_calibrated is None or (self.name != OPEN_LOOP and preset_of(self.name) not in SELF_CALIBRATED):
             estimator: Estimator = build(self.name, car, options)
             return estimator
         estimator = build(self.name, car.calibrated_car, options)
@@ -136,7 +110,7 @@ SPECS: tuple[Spec, ...] = (
         frozenset({"speed_m_s", "yaw_rate_rad_s"}), 0xF0E442,
     ),
     Spec(
-        "gyro", "the sensors passed through; claims no lateral velocity", "pass_through:build",
+        "zero:no-lateral", "the sensors passed through; claims no lateral velocity", "pass_through:build",
         frozenset({"speed_m_s", "yaw_rate_rad_s"}), 0xCC79A7,
     ),
     Spec(
@@ -165,7 +139,7 @@ SPECS: tuple[Spec, ...] = (
         "adaptive_physics:build", _ESP, 0x44AA99, tunable=True,
     ),
     Spec(
-        "phy-ukf-tuned", "the same with the noise of an identified car, corrected for body roll",
+        "phy-ukf:tuned", "the same with the noise of an identified car, corrected for body roll",
         "physics_tuned:build", _ESP, 0x56B4E9, needs_noise=True, tunable=True,
     ),
     Spec(
@@ -177,7 +151,7 @@ SPECS: tuple[Spec, ...] = (
         "pd_hef:build", _ESP, 0xD55E00, network="optional",
     ),
     Spec(
-        "pd-hef-fixed-r", "the same at trust 1 without the adaptive mechanism (needs a network)",
+        "pd-hef:fixed-r", "pd-hef at gain 1 without the adaptive mechanism (needs a network)",
         "pd_hef:build", _ESP, 0x117733, network="residual",
     ),
     Spec(
@@ -185,7 +159,8 @@ SPECS: tuple[Spec, ...] = (
         "pd_hef:build_smoothed", _ESP, 0x332288, causal=False, network="optional",
     ),
     Spec(
-        "pd-hef-trust1", "pd-hef at trust 1, whatever the car allows (needs a network; to be named, not one of all)",
+        "pd-hef:gain=1",
+        "pd-hef at a given residual gain, 0 to 1, with or without evidence (needs a network; not in all)",
         "pd_hef:build", _ESP, 0x882255, in_all=False, network="residual",
     ),
     Spec(
@@ -237,27 +212,27 @@ def all_specs() -> tuple[Spec, ...]:
 def spec_of(name: str) -> Spec:
     """Return the line of a name; raises UsageError if there is none."""
     check_names((name,))
-    return next(s for s in all_specs() if s.name == name)
+    lines = {s.name: s for s in all_specs()}
+    if name in lines:
+        return lines[name]
+    given = options_of(name)
+    alike = [s for s in lines.values() if preset_of(s.name) == preset_of(name) and given.keys() & options_of(s.name)]
+    return replace(alike[0], name=name, in_all=False)
 
 
 def check_names(names: Sequence[str]) -> None:
-    """Raise UsageError if a name is unknown or occurs twice, or there is none; :data:`ALL_ESTIMATORS` stands alone."""
+    """Raise UsageError if a name is unknown or occurs twice, or there is none; :data:`ALL_ESTIMATORS` is used alone."""
     if tuple(names) == (ALL_ESTIMATORS,):
         return
-    known = [s.name for s in all_specs()]
-    wrong = [n for n in names if n not in known] + sorted({n for n in names if names.count(n) > 1})
+    presets = list(dict.fromkeys(preset_of(s.name) for s in all_specs()))
+    wrong = [n for n in names if preset_of(n) not in presets] + sorted({n for n in names if names.count(n) > 1})
     if wrong or not names:
         raise UsageError(
-            expected=f"{ALL_ESTIMATORS}, or estimators out of {', '.join(known)}",
+            expected=f"{ALL_ESTIMATORS}, or estimators out of {', '.join(presets)}",
             got=", ".join(wrong) or "none",
             where="--estimators",
-            remedy=former(wrong),
         )
-
-
-def former(names: Sequence[str]) -> str:
-    """Return what stands now for estimators of older versions, empty if none of the names is one."""
-    return "; ".join(f"{n} is {FORMER_FILTERS[n]} now" for n in names if n in FORMER_FILTERS)
+    check_options(names)
 
 
 def all_names(car: Car) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping as MappingABC
 
+from pdhef_logtool.estimators.presets import preset_of
 from pdhef_logtool.estimators.table import all_specs, spec_of
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.signals import WHEELS
@@ -33,13 +34,13 @@ def usable_signals(mapping: Mapping) -> frozenset[str]:
 def what_it_is_good_for(mapping: Mapping) -> str:
     """Return what can be done with a log that is mapped so."""
     have = usable_signals(mapping)
-    names = [s.name for s in all_specs() if s.needs <= have and not s.network and not s.needs_noise]
+    names = [preset_of(s.name) for s in all_specs() if s.needs <= have and not s.network and not s.needs_noise]
     uses = []
     if spec_of(_MAIN).needs <= have:
         against = _scored(mapping)
         uses.append(f"estimate sideslip ({_MAIN} and others){against}")
     elif names and have:
-        uses.append(f"run {', '.join(names[:3])}{_scored(mapping)}")
+        uses.append(f"run {', '.join(list(dict.fromkeys(names))[:3])}{_scored(mapping)}")
     if mapping.truth and not (names and have):
         uses.append("look at the truth")
     if have:

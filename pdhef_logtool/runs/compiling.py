@@ -14,14 +14,15 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.presets import preset_of
 from pdhef_logtool.estimators.table import Options, all_names, make_estimator
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.supervisor import Tell, supervise
 
 #: Parts that are no estimators: the filter of ``physics``, and what runs beside it over every drive.
 _FILTER, _CHECKS = "filter", "checks"
-#: The estimators that are made of the filter.
-_FILTERED = ("physics", "pd-hef", "pd-hef-smoothed", "pd-hef-fixed-r", "pd-hef-trust1")
+#: The presets that are made of the filter.
+_FILTERED = ("physics", "pd-hef", "pd-hef-smoothed")
 #: By part the function that is compiled last. The longest parts come first.
 _LAST = {
     "phy-ukf": "physics._filter",
@@ -37,7 +38,7 @@ def compile_for(names: Sequence[str]) -> None:
     """Compile what estimators need most time for, in several processes, if it is not kept already."""
     from pdhef_logtool.records import compiled
 
-    wanted = {*names, _CHECKS, *([_FILTER] if set(names) & set(_FILTERED) else [])}
+    wanted = {*names, _CHECKS, *([_FILTER] if set(map(preset_of, names)) & set(_FILTERED) else [])}
     parts = [part for part, last in _LAST.items() if part in wanted and not compiled.is_kept(last)]
     if min(len(parts), _processors()) > 1 and compiled.kept_in() is not None and hasattr(os, "fork"):
         with suppress(OSError, RuntimeError):  # the run compiles in its own process where no others can be started

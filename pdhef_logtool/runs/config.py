@@ -13,6 +13,7 @@ from pydantic.dataclasses import dataclass
 from pdhef_logtool.car.car import NO_INTERVALS, SHIPPED_CARS, UNSURE
 from pdhef_logtool.drive.friction import parse_friction
 from pdhef_logtool.drive.options import WINDOW_S, ReadOptions, parse_time
+from pdhef_logtool.estimators.presets import split_names
 from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.object_store import is_url
@@ -39,7 +40,7 @@ def _as_text(value: object) -> object:
 Time = Annotated[str, Field(max_length=64), BeforeValidator(_as_text)]
 #: As a list or with commas.
 Names = Annotated[
-    tuple[str, ...], Field(strict=False), BeforeValidator(lambda v: v.split(",") if isinstance(v, str) else v)
+    tuple[str, ...], Field(strict=False), BeforeValidator(lambda v: split_names(v) if isinstance(v, str) else v)
 ]
 #: A file or folder, as a path or a text.
 File = Annotated[Path, BeforeValidator(lambda v: Path(v) if isinstance(v, str) else v)]

@@ -15,6 +15,7 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, look_ahead_of
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.latency_compensation import WindowState, run_window
+from pdhef_logtool.estimators.presets import preset_of
 from pdhef_logtool.estimators.self_calibrated import SELF_CALIBRATED, CalibratedBand
 from pdhef_logtool.records.geometry import DeadReckoner
 from pdhef_logtool.records.signals import Signals
@@ -107,7 +108,7 @@ def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
             continue
         other = getattr(estimator, "calibrated_as", None)
         algorithms[estimator.name] = [resolve(e) for e in (estimator, other) if e is not None]
-        if band is not None and estimator.name in SELF_CALIBRATED:
+        if band is not None and preset_of(estimator.name) in SELF_CALIBRATED:
             posterior[estimator.name] = band.add
     of_car = car.intervals is not None and car.intervals.physics_sha256 == car.physics_sha256
     return TrackCalibrator(car.intervals, algorithms, own, posterior, of_car=of_car)

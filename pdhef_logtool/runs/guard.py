@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 #: What is guarded, and by what; ``kinematic`` is none of them, for it integrates what d2 holds against an estimate.
 GUARDED = "pd-hef"
-SIMPLE = ("zero", "open-loop", "open-loop-calibrated", "phy-ukf", "physics")
+SIMPLE = ("zero", "open-loop", "open-loop:calibrated", "phy-ukf", "physics")
 #: On simulated drives with right and wrong files every estimate beyond 1.05 times the least d2 had at least 1.7 times
 #: its sideslip error (docs/self_calibration.md).
 FACTOR = 1.2
@@ -29,8 +29,8 @@ FACTOR = 1.2
 #: other naive one, ``kinematic``, follows the accelerometer's bias and is worse on half of the recorded drives.
 NAIVE = "zero"
 #: The main estimator is the first of these that ran, unless d2 speaks against it; else the first other one.
-_BEST_FIRST = (GUARDED, PHYSICS, "phy-ukf-tuned", "phy-ukf", "open-loop-calibrated", "open-loop", "kinematic")
-_LAST = (NAIVE, "gyro")
+_BEST_FIRST = (GUARDED, PHYSICS, "phy-ukf:tuned", "phy-ukf", "open-loop:calibrated", "open-loop", "kinematic")
+_LAST = (NAIVE, "zero:no-lateral")
 
 
 @dataclass(frozen=True, slots=True)

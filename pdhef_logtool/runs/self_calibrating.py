@@ -18,6 +18,7 @@ from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.presets import preset_of
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, make_estimator
 from pdhef_logtool.logs.discovery import LogInput
@@ -166,7 +167,7 @@ def _asked(config: RunConfig, car: Car) -> bool:
     names = config.estimators
     if car.has_evidence or config.sensors == "esp":
         return False
-    return names is None or bool({ALL_ESTIMATORS, OPEN_LOOP, *SELF_CALIBRATED} & set(names))
+    return names is None or bool({ALL_ESTIMATORS, OPEN_LOOP, *SELF_CALIBRATED} & {*names, *map(preset_of, names)})
 
 
 def _told(drive: Drive) -> bool:

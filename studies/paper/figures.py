@@ -25,7 +25,7 @@ from studies.pictures import STYLE, save, subplots
 
 COLOURS = {"truth": "#8c8c8c", **{s.name: f"#{s.colour:06x}" for s in SPECS}}
 DASHES = {"phy-ukf": (0, (4, 1.5)), "pure-lstm": (0, (1.5, 1)), "pd-hef-paper": (0, (5, 1, 1, 1))}
-BARS = ("phy-ukf", "phy-ukf-tuned", "physics", "pure-lstm", "pd-hef-paper", "pd-hef-fixed-r", "pd-hef")
+BARS = ("phy-ukf", "phy-ukf:tuned", "physics", "pure-lstm", "pd-hef-paper", "pd-hef:fixed-r", "pd-hef")
 
 #: Signal, factor to the unit drawn, label.
 SIGNALS = {
@@ -243,7 +243,7 @@ def draw(r: Results, folder: Path) -> None:
         position(folder, f"figure{first}_position_{letter}", r.experiment, scenario, schemes)
         for i, signal in enumerate(SIGNALS, start=1):
             history(folder, f"figure{first + i}_{signal}_{letter}", r.experiment, scenario, signal, schemes)
-    compared = [n for n in ("phy-ukf", "pd-hef-fixed-r", "pd-hef-paper", "pd-hef") if n in r.ran]
+    compared = [n for n in ("phy-ukf", "pd-hef:fixed-r", "pd-hef-paper", "pd-hef") if n in r.ran]
     noise_adaptation(folder, r.experiment, list(r.inflations), compared)
     if any(r.curves.values()):
         trust(folder, {s: c for s, c in r.curves.items() if c})

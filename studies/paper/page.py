@@ -268,7 +268,7 @@ def _sideslip_notes(r: Results, scenario: str, found: Findings) -> None:
 
 
 def _yaw_rate_notes(r: Results, scenario: str, found: Findings) -> None:
-    gyro = r.spread(scenario, "gyro", "yaw_rate_rad_s")
+    gyro = r.spread(scenario, "zero:no-lateral", "yaw_rate_rad_s")
     if gyro is not None and scenario == A.name:
         phy, paper = published.PHY_RMSE[scenario, "yaw_rate_rad_s"], published.RMSE[scenario, "yaw_rate_rad_s"]
         if gyro.high < min(phy, paper):
@@ -301,7 +301,7 @@ def _ay_notes(r: Results, scenario: str, found: Findings) -> None:
             f"{percent(published.OPEN_LOOP_AY_OFFSET)}"
         )
         found.say(max(abs(over.median), size.median) > published.OPEN_LOOP_AY_OFFSET, text)
-    gyro = r.spread(scenario, "gyro", "ay_g")
+    gyro = r.spread(scenario, "zero:no-lateral", "ay_g")
     if gyro is not None:
         found.say(False, f"the accelerometer passed through, which reads body roll too, has {ranged(gyro)} g")
 
@@ -341,7 +341,7 @@ def _figure_19(r: Results) -> str:
 
 def _figure_20(r: Results) -> str:
     title = "Figure 20: bottom layer, adaptation of R in a noise burst"
-    shown = [n for n in ("phy-ukf", "pd-hef-fixed-r", "pd-hef-paper", "pd-hef") if n in r.ran]
+    shown = [n for n in ("phy-ukf", "pd-hef:fixed-r", "pd-hef-paper", "pd-hef") if n in r.ran]
     pairs = [
         f"`{n}` {ranged(clean)} → {ranged(burst)}"
         for n in shown
@@ -361,7 +361,7 @@ def _figure_20(r: Results) -> str:
         quiet = i.without_burst <= 1.5
         found.say(quiet, rest + (", quiet where there is no noise" if quiet else ": model error is read as noise"))
     for name in (n for n in ("pd-hef-paper", HYBRID) if n in r.inflations):
-        gain = r.improvement(BURST.name, name, "pd-hef-fixed-r")
+        gain = r.improvement(BURST.name, name, "pd-hef:fixed-r")
         found.gain(gain, f"sideslip of `{name}` in the burst against fixed R:")
     if not r.inflations:
         found.say(False, "no scheme of this run adapts R")
@@ -398,7 +398,7 @@ def _figure_21(r: Results) -> str:
 def _figure_22(r: Results) -> str:
     found = Findings()
     for scenario in (A.name, B.name):
-        for baseline in ("phy-ukf", "phy-ukf-tuned", "physics"):
+        for baseline in ("phy-ukf", "phy-ukf:tuned", "physics"):
             gain = r.improvement(scenario, HYBRID, baseline)
             if gain is not None:
                 text = f"sideslip in {scenario} against `{baseline}` {gain_text(gain)}"
@@ -505,10 +505,10 @@ def _conditions(r: Results) -> str:
 
 def _trust_note(r: Results) -> str:
     """Say at which trust the hybrid filters with a fixed one ran: a vehicle file may cap it."""
-    track = r.experiment.tracks.get((A.name, "pd-hef-fixed-r"))
+    track = r.experiment.tracks.get((A.name, "pd-hef:fixed-r"))
     if track is None:
         return "No hybrid filter with fixed trust ran."
-    return f"`pd-hef-fixed-r` ran at a trust of {float(np.nanmax(track.network_trust)):g} in the network."
+    return f"`pd-hef:fixed-r` ran at a trust of {float(np.nanmax(track.network_trust)):g} in the network."
 
 
 def _impossible_course() -> str:

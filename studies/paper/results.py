@@ -44,7 +44,7 @@ SCENARIOS: tuple[Scenario, ...] = (A, B, BURST)
 ADAPTIVE = ("pd-hef-paper", "pd-hef")
 #: What improvements are about where nothing else is said.
 FIGURE = "sideslip_deg"
-BASELINES = ("phy-ukf", "phy-ukf-tuned", "physics", "linear-regression", "pure-lstm", "pd-hef-paper")
+BASELINES = ("phy-ukf", "phy-ukf:tuned", "physics", "linear-regression", "pure-lstm", "pd-hef-paper")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

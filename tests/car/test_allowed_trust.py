@@ -77,7 +77,7 @@ def test_other_physics_or_noise_need_evidence_of_their_own() -> None:
         assert other.allowed_trust.cap == 0.0
         assert f"other {what}; pdhef learn --stages gain" in other.allowed_trust.reason
     assert tried.with_noise("physics", FilterNoise(q_std=(1.0, 1.0, 1.0))).allowed_trust.cap == 0.0
-    assert tried.with_noise("phy-ukf-tuned", FilterNoise(q_std=(1.0, 1.0, 1.0))).allowed_trust.cap == 1.0
+    assert tried.with_noise("phy-ukf:tuned", FilterNoise(q_std=(1.0, 1.0, 1.0))).allowed_trust.cap == 1.0
     heavier = tried.vehicle.model_copy(update={"mass_kg": 1500.0})
     assert tried.with_vehicle(heavier).allowed_trust.cap == 1.0  # a car made wrong on purpose is trusted as before
 
@@ -99,8 +99,8 @@ def test_the_entries_survive_the_part_and_the_flat_file(tmp_path: Path) -> None:
 def test_only_pd_hef_heeds_the_cap() -> None:
     model = _bundle()
     for car in (_car(), _car(trust_cap=0.25, evidence=EVIDENCE, network_sha256=model.sha256)):
-        assert make_estimator("pd-hef-trust1", car).trust == 1.0  # type: ignore[attr-defined]
-        assert make_estimator("pd-hef-fixed-r", car).trust == 1.0  # type: ignore[attr-defined]
+        assert make_estimator("pd-hef:gain=1", car).trust == 1.0  # type: ignore[attr-defined]
+        assert make_estimator("pd-hef:fixed-r", car).trust == 1.0  # type: ignore[attr-defined]
         capped = make_estimator("pd-hef", car)
         assert getattr(capped, "trust", 0.0) == car.allowed_trust.cap
 
@@ -121,12 +121,12 @@ def test_the_report_says_the_cap_and_why(
         file = tmp_path / f"car{cap}.toml"
         file.write_text(text + network)
         config = RunConfig(
-            car=file, network=tmp_path / "model", estimators=("pd-hef", "pd-hef-trust1"), annotate="none"
+            car=file, network=tmp_path / "model", estimators=("pd-hef", "pd-hef:gain=1"), annotate="none"
         )
         result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / f"out{cap}", config)
         report = json.loads((tmp_path / f"out{cap}" / "logs" / "dlc" / "report.json").read_text())
         notes = {e["name"]: [n for n in e["notes"] if n.startswith("network trust")] for e in report["estimators"]}
-        assert notes["pd-hef-trust1"] == []
+        assert notes["pd-hef:gain=1"] == []
         (note,) = notes["pd-hef"]
         assert note.startswith(f"network trust {cap:g}: ")
         assert why in note

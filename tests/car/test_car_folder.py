@@ -70,7 +70,7 @@ cornering_stiffness_n_per_rad = 108000.0
 """
 COMMENTS = ("# My car, weighed on 3 May.", "# with driver", "# tank full", "# guessed", "# end")
 DRIVES = (LearntOn(name="lap", sha256="cd" * 32, start_s=0.0, end_s=80.0),)
-TUNED, OURS = "phy-ukf-tuned", "physics"
+TUNED, OURS = "phy-ukf:tuned", "physics"
 
 
 @pytest.fixture
@@ -382,7 +382,7 @@ def test_a_network_is_no_car(tmp_path: Path) -> None:
         Car.load(tmp_path)
 
 
-NOISE = f'format = "pdhef-noise"\nversion = 1\n[filter.{TUNED}]\n'
+NOISE = f'format = "pdhef-noise"\nversion = 1\n[filter."{TUNED}"]\n'
 FIT = f'format = "pdhef-fit"\nversion = 1\nphysics_sha256 = "{"ab" * 32}"\n'
 TRUST = 'format = "pdhef-network"\nversion = 1\n'
 
@@ -428,7 +428,7 @@ def test_wrong_entries_of_every_part_are_told_in_one_line(folder: Path, name: st
 # --- one file, as older versions wrote it --------------------------------------------------------------------------
 
 FLAT = """
-[filter.phy-ukf-tuned]
+[filter."phy-ukf:tuned"]
 q_std = [0.1, 0.1, 0.1]
 [filter.physics]
 q_std = [0.1, 0.1, 0.1]
@@ -437,7 +437,7 @@ trust_cap = 0.25
 evidence = "a drive of 300 s"
 [identification]
 drives = ["lap: 0 to 80.5 s", {name = "other", sha256 = "cd", start_s = 1.0, end_s = 2.0}]
-tuning_scores = ["physics: 0.1092 deg at trial 63", "phy-ukf-tuned: 0.1378 deg at trial 7"]
+tuning_scores = ["physics: 0.1092 deg at trial 63", "phy-ukf:tuned: 0.1378 deg at trial 7"]
 tool = "pdhef 0.1"
 """
 
@@ -737,7 +737,9 @@ def test_noise_of_a_filter_that_is_no_more_is_left_out_with_one_notice(folder: P
         write_part(folder / FIT_FILE, fit)
     else:
         edit(
-            folder, "# end", "[filter.phy-ukf-tuned]\nq_std = [0.4, 0.5, 0.6]\n[filter.physics-plus]\nq_std = []\n# end"
+            folder,
+            "# end",
+            '[filter."phy-ukf:tuned"]\nq_std = [0.4, 0.5, 0.6]\n[filter.physics-plus]\nq_std = []\n# end',
         )
     car = load(folder)
     assert dict(car.noise) == {TUNED: kept}

@@ -34,7 +34,7 @@ FIT = Fit(
         tyres=default_vehicle().tyres,
         sensors=FittedSensors(ay_bias_m_s2=0.1, yaw_rate_bias_rad_s=0.0),
     ),
-    filter={"phy-ukf-tuned": FilterNoise(q_std=(0.1, 0.1, 0.1), r_std={"ay_m_s2": 1.0})},
+    filter={"phy-ukf:tuned": FilterNoise(q_std=(0.1, 0.1, 0.1), r_std={"ay_m_s2": 1.0})},
     drives=(LearntOn(name="lap", sha256="cd", end_s=9.0),),
     scores={"fit": {"rmse": 0.1}},
     notes=("a note",),

@@ -45,7 +45,7 @@ D_n = 7600.0
 E = 0.30
 [tyres.rear]
 cornering_stiffness_n_per_rad = 108000.0
-[filter.phy-ukf-tuned]
+[filter."phy-ukf:tuned"]
 q_std = [0.02, 0.006, 0.002]
 r_std = { ay_m_s2 = 1.0, yaw_rate_rad_s = 0.003, speed_m_s = 0.1 }
 [network]
@@ -137,14 +137,14 @@ def test_all_problems_are_reported_together(tmp_path):
         ("imu_position_m = [0.1, 0.0, 0.2]", "imu_position_m = [0.1, nan, 0.2]", "imu_position_m.1"),
         ("yaw_rate_std_rad_s = 0.004", "yaw_rate_std_rad_s = 0", "sensors.yaw_rate_std_rad_s"),
         ("yaw_rate_std_rad_s = 0.004", "yaw_rate_std_deg_s = 0.2", "sensors.yaw_rate_std_deg_s"),
-        ("q_std = [0.02, 0.006, 0.002]", "q_std = [0.02, -0.006]", "filter.phy-ukf-tuned.q_std.1"),
+        ("q_std = [0.02, 0.006, 0.002]", "q_std = [0.02, -0.006]", "filter.phy-ukf:tuned.q_std.1"),
         ("trust_cap = 0.3", "trust_cap = 1.3", "network.trust_cap"),
         ("[tyres.rear]", "[tyres.back]", "tyres.back"),
-        ("q_std = [0.02, 0.006, 0.002]", "q_std = [0.02]", "filter.phy-ukf-tuned: q_std needs 3 or 4 entries"),
-        ("q_std = [0.02, 0.006, 0.002]", f"q_std = {[0.02] * 9}", "filter.phy-ukf-tuned: q_std needs 3 or 4 entries"),
-        ("q_std = [0.02, 0.006, 0.002]", f"q_std = {[0.02] * 6}", "filter: q_std of phy-ukf-tuned needs 3 or 4"),
-        ("r_std = { ay_m_s2", "r_std = { ay", "filter.phy-ukf-tuned.r_std.ay: unknown, did you mean"),
-        ("[filter.phy-ukf-tuned]", "[filter.phy_ukf_tuned]", "did you mean filter.phy-ukf-tuned?"),
+        ("q_std = [0.02, 0.006, 0.002]", "q_std = [0.02]", "filter.phy-ukf:tuned: q_std needs 3 or 4 entries"),
+        ("q_std = [0.02, 0.006, 0.002]", f"q_std = {[0.02] * 9}", "filter.phy-ukf:tuned: q_std needs 3 or 4 entries"),
+        ("q_std = [0.02, 0.006, 0.002]", f"q_std = {[0.02] * 6}", "filter: q_std of phy-ukf:tuned needs 3 or 4"),
+        ("r_std = { ay_m_s2", "r_std = { ay", "filter.phy-ukf:tuned.r_std.ay: unknown, did you mean"),
+        ('[filter."phy-ukf:tuned"]', "[filter.phy_ukf_tuned]", "did you mean filter.phy-ukf:tuned?"),
         ("mass_kg = 1440.0", 'mass_kg = "1440"', "mass_kg: should be a valid number, got '1440'"),
         ("mass_kg = 1440.0", "mass_kg = true", "mass_kg: should be a valid number, got True"),
         ("imu_position_m = [0.1, 0.0, 0.2]", 'imu_position_m = "100"', "imu_position_m: should be a list, got '100'"),
@@ -163,11 +163,11 @@ def test_a_wrong_entry_is_named(tmp_path, old, new, named):
 @pytest.mark.parametrize("entries", [[], [0.02, 0.006, 0.002], [0.02, 0.006, 0.002, 0.001]])
 def test_noise_of_three_or_four_states_is_read(tmp_path, entries):
     text = EXAMPLE.replace("q_std = [0.02, 0.006, 0.002]", f"q_std = {entries}")
-    assert read_flat(write(tmp_path, text)).noise["phy-ukf-tuned"].q_std == tuple(entries)
+    assert read_flat(write(tmp_path, text)).noise["phy-ukf:tuned"].q_std == tuple(entries)
 
 
 def test_physics_has_two_states_more(tmp_path):
-    text = EXAMPLE.replace("filter.phy-ukf-tuned", "filter.physics")
+    text = EXAMPLE.replace('filter."phy-ukf:tuned"', "filter.physics")
     text = text.replace("q_std = [0.02, 0.006, 0.002]", f"q_std = {[0.02] * 6}")
     assert len(read_flat(write(tmp_path, text)).noise["physics"].q_std) == 6
 

@@ -98,11 +98,11 @@ def test_by_stamp_there_is_no_latency_and_nothing_is_causal(
     sample_logs_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = sample_logs_dir / "dlc.mcap"
-    code, report, err = run(capsys, tmp_path / "stamp", log, "--estimators", "gyro", "--clock", "stamp")
+    code, report, err = run(capsys, tmp_path / "stamp", log, "--estimators", "zero:no-lateral", "--clock", "stamp")
     assert (code, [e["causal"] for e in report["estimators"]]) == (0, [False])
     assert "arrives" not in err, "the user asked for it: no warning"
     assert "not causal: all signals read by stamp, not by arrival" in report["estimators"][0]["notes"]
-    _, plain, _ = run(capsys, tmp_path / "arrival", log, "--estimators", "gyro")
+    _, plain, _ = run(capsys, tmp_path / "arrival", log, "--estimators", "zero:no-lateral")
     assert plain["estimators"][0]["causal"]
     of = ("yaw_rate_rad_s", "all", "rmse")
     rmse = [

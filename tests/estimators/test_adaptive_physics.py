@@ -68,7 +68,7 @@ def adaptive(network: NetworkService = SILENT, **options) -> AdaptivePhysics:
 
 def fixed(network: NetworkService = SILENT, **options) -> AdaptivePhysics:
     given = {"physics": PLAIN, "network": network, "trust": 1.0, **options}
-    return AdaptivePhysics(adaptive=False, name="pd-hef-fixed-r", **given)
+    return AdaptivePhysics(adaptive=False, name="pd-hef:fixed-r", **given)
 
 
 def times(signals: Signals) -> np.ndarray:
@@ -147,7 +147,7 @@ def test_a_burst_raises_r_for_its_time_and_costs_less(made):
     assert np.median(track.r_scale[(t > 4.1) & burst]) > 50
     assert (track.r_scale[t > 6.7] == 1.0).all()
     error = {e.name: np.abs(run_window(e, bad)[0].sideslip_rad - made.sideslip) for e in (adaptive(), fixed())}
-    assert error["pd-hef"][burst].mean() < 0.5 * error["pd-hef-fixed-r"][burst].mean()
+    assert error["pd-hef"][burst].mean() < 0.5 * error["pd-hef:fixed-r"][burst].mean()
 
 
 def test_a_slow_model_error_leaves_r_alone(weak):
@@ -168,7 +168,7 @@ def test_a_gyro_that_fails_does_not_take_the_filter_with_it(made, how):
         for e in (adaptive(), fixed())
     }
     assert error["pd-hef"] < np.radians(0.1)
-    assert error["pd-hef"] < 0.2 * error["pd-hef-fixed-r"]
+    assert error["pd-hef"] < 0.2 * error["pd-hef:fixed-r"]
 
 
 # --- top layer -------------------------------------------------------------------------------------------------------
@@ -185,7 +185,7 @@ def test_forces_that_are_wrong_in_proportion_are_scaled(weak):
         e.name: np.sqrt(np.nanmean((run_window(e, signals)[0].sideslip_rad - weak.sideslip)[150:] ** 2))
         for e in (adaptive(), fixed())
     }
-    assert error["pd-hef"] < 0.7 * error["pd-hef-fixed-r"]
+    assert error["pd-hef"] < 0.7 * error["pd-hef:fixed-r"]
 
 
 def rmse(estimator: AdaptivePhysics, signals: Signals, made) -> float:

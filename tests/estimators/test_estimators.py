@@ -26,13 +26,13 @@ from pdhef_logtool.records.tracks import StateTrack, concatenate
 
 pytestmark = pytest.mark.slow
 
-#: With the noise that ``phy-ukf-tuned`` and ``physics`` look for in the car.
+#: With the noise that ``phy-ukf:tuned`` and ``physics`` look for in the car.
 NOISE = FilterNoise(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
 VEHICLE = default_vehicle()
 #: What a log calibrated is another estimator in a wrapper (test_self_calibrated.py).
-NAMES = tuple(s.name for s in all_specs() if not s.network and s.name != "open-loop-calibrated")
+NAMES = tuple(s.name for s in all_specs() if not s.network and s.name != "open-loop:calibrated")
 #: Those that claim a lateral velocity by a model or by integration.
-FILTERS = ("phy-ukf", "physics", "phy-ukf-tuned")
+FILTERS = ("phy-ukf", "physics", "phy-ukf:tuned")
 CLAIMING = ("kinematic", "open-loop", *FILTERS)
 STIFFNESS_VEHICLE = VEHICLE.model_copy(
     update={
@@ -47,7 +47,7 @@ MIRRORED = ("vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2")
 
 
 def car_of(vehicle: VehicleParameters = VEHICLE) -> Car:
-    return Car.of(vehicle, noise={"phy-ukf-tuned": NOISE, "physics": NOISE})
+    return Car.of(vehicle, noise={"phy-ukf:tuned": NOISE, "physics": NOISE})
 
 
 def run(name: str, signals: Signals, **options) -> StateTrack:
@@ -202,7 +202,7 @@ def test_speed_is_predicted_by_the_delay():
     assert worst(track.vx_m_s - made.vx, settled) < 0.005  # 0.15 m/s without prediction
 
 
-@pytest.mark.parametrize("name", ["zero", "gyro"])
+@pytest.mark.parametrize("name", ["zero", "zero:no-lateral"])
 def test_pass_through_shows_the_newest_arrived_sample(name):
     made = drive(slalom(), 3.0)
     track = run(name, replace(made.signals, ready_ns=made.signals.stamps_ns + 25_000_000))
@@ -280,7 +280,7 @@ FAULTS = {
 def check_sane(track: StateTrack, name: str, signals: Signals) -> None:
     ok = track.valid
     columns = ["vx_m_s", "yaw_rate_rad_s"]
-    if name != "gyro":
+    if name != "zero:no-lateral":
         columns += ["vy_m_s", "sideslip_rad"]
     if name in CLAIMING:
         columns += ["ay_m_s2"]
@@ -421,17 +421,17 @@ def test_an_estimator_runs_on_what_it_needs_alone(name, plain):
 
 def test_what_cannot_run_is_skipped_with_the_reason():
     estimators, skipped = runnable(NAMES, car_of(), frozenset({"speed_m_s", "yaw_rate_rad_s", "ay_m_s2"}))
-    assert [e.name for e in estimators] == ["zero", "gyro", "kinematic"]
+    assert [e.name for e in estimators] == ["zero", "zero:no-lateral", "kinematic"]
     assert [s.name for s in skipped] == ["open-loop", *FILTERS]
     assert all("steer_rad" in s.reason and "speed_m_s" not in s.reason for s in skipped)
     assert runnable(NAMES, car_of(), frozenset(ALIGNED_SIGNALS))[1] == []
     skipped = runnable(NAMES, Car.of(VEHICLE), frozenset(ALIGNED_SIGNALS))[1]
-    assert [s.name for s in skipped] == ["phy-ukf-tuned"]
+    assert [s.name for s in skipped] == ["phy-ukf:tuned"]
     assert all(f"no noise for {s.name}; pdhef learn --stages identify" in s.reason for s in skipped)
 
 
 def test_the_tuned_filter_takes_its_noise_from_the_car():
-    tuned, plain_filter = make_estimator("phy-ukf-tuned", car_of()), make_estimator("phy-ukf", car_of())
+    tuned, plain_filter = make_estimator("phy-ukf:tuned", car_of()), make_estimator("phy-ukf", car_of())
     assert tuned.q_std == (0.05, 0.02, 0.02, plain_filter.q_std[3])  # what the car leaves out stays
     assert tuned.measurement_std.tolist() == [0.8, *plain_filter.measurement_std[1:]]
     assert tuned.roll_correction
@@ -455,7 +455,7 @@ def test_signals_hold_no_truth():
 def test_baselines_claim_what_they_say(plain):
     made = drive(slalom(0.03, 0.6), 6.0, tyre=tanh_tyre)
     assert (run("zero", plain).vy_m_s[run("zero", plain).valid] == 0).all()
-    assert np.isnan(run("gyro", plain).vy_m_s).all()
+    assert np.isnan(run("zero:no-lateral", plain).vy_m_s).all()
     error = {n: worst(run(n, made.signals).sideslip_rad - made.sideslip, made.time_s > 1) for n in (*CLAIMING, "zero")}
     assert error["phy-ukf"] < error["zero"] / 4
     assert error["open-loop"] < error["zero"]

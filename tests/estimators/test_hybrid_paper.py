@@ -268,14 +268,14 @@ def test_a_missing_accelerometer_leaves_trust_where_it_was(weaving):
 
 
 def test_the_table_makes_it_with_a_network_and_skips_it_without():
-    names = ("pd-hef-paper", "pd-hef-trust1", "pd-hef")
+    names = ("pd-hef-paper", "pd-hef:gain=1", "pd-hef")
     available = frozenset(ALIGNED_SIGNALS)
     papers = replace(make_bundle(), model=NOMINAL_MODEL)
     both = replace(make_bundle(), paper_network=papers)
     for network, ran in (
         (both, names),
         (papers, ("pd-hef-paper", "pd-hef")),
-        (make_bundle(), ("pd-hef-trust1", "pd-hef")),
+        (make_bundle(), ("pd-hef:gain=1", "pd-hef")),
         (None, ("pd-hef",)),
     ):
         estimators, skipped = runnable(names, Car.of(VEHICLE, network=network), available)

@@ -23,16 +23,16 @@ _HYBRID = "adaptive-physics 1 (physics=physics-filter, trust=0.75)"
 #: Identity and digest of the presets on the shipped car. The digest covers noise, physics and network as well.
 SHIPPED = {
     "zero": ("pass-through 1 (claims_zero_sideslip=True)", "138e43c5f7aa"),
-    "gyro": ("pass-through 1 (claims_zero_sideslip=False)", "5ba63001dd67"),
+    "zero:no-lateral": ("pass-through 1 (claims_zero_sideslip=False)", "5ba63001dd67"),
     "kinematic": ("kinematic 1", "6a7d76af0e93"),
     "open-loop": ("open-loop 1", "5afc5962fabb"),
     "linear-regression": ("linear-regression 1", "9de17837d3ad"),
     "phy-ukf": ("physics-ukf 1", "50fddfe0bbfa"),
     "physics": ("adaptive-physics 1 (physics=physics-filter)", "12c85100356c"),
-    "phy-ukf-tuned": ("physics-ukf 1 (roll_correction=True)", "28232f13c924"),
+    "phy-ukf:tuned": ("physics-ukf 1 (roll_correction=True)", "28232f13c924"),
     "pure-lstm": ("direct-network 1", "4441758f4188"),
     "pd-hef": (_HYBRID, "a29a14dbfbf0"),
-    "pd-hef-fixed-r": ("adaptive-physics 1 (adaptive=False, physics=physics-filter, trust=1.0)", "9045ef1e00d9"),
+    "pd-hef:fixed-r": ("adaptive-physics 1 (adaptive=False, physics=physics-filter, trust=1.0)", "9045ef1e00d9"),
     "pd-hef-smoothed": (
         "smoothed-physics 1 (filtered=adaptive-physics, filtered.physics=physics-filter, filtered.trust=0.75)",
         "88c546b80f30",
@@ -80,7 +80,7 @@ def test_a_new_option_at_its_default_changes_no_identity(saloon: Car) -> None:
 @pytest.mark.parametrize("spec", SPECS, ids=lambda s: s.name)
 def test_every_field_of_an_estimator_is_an_option_or_has_a_role(spec: Any, saloon: Car) -> None:
     if spec.missing(saloon):
-        assert spec.name == "open-loop-calibrated"  # the class of open-loop
+        assert spec.name == "open-loop:calibrated"  # the class of open-loop
         return
     parts: list[Any] = [make_estimator(spec.name, saloon)]
     while parts:

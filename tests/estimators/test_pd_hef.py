@@ -170,21 +170,21 @@ def test_a_dead_accelerometer_and_gaps_stay_finite() -> None:
 
 def test_it_needs_a_model_and_says_so() -> None:
     with pytest.raises(UsageError, match="--network"):
-        make_estimator("pd-hef-fixed-r", Car.of(VEHICLE))
-    _, skipped = runnable(("zero", "pd-hef-fixed-r"), Car.of(VEHICLE), frozenset(ALIGNED_SIGNALS))
-    assert [s.name for s in skipped] == ["pd-hef-fixed-r"]
+        make_estimator("pd-hef:fixed-r", Car.of(VEHICLE))
+    _, skipped = runnable(("zero", "pd-hef:fixed-r"), Car.of(VEHICLE), frozenset(ALIGNED_SIGNALS))
+    assert [s.name for s in skipped] == ["pd-hef:fixed-r"]
 
 
 def test_run_with_a_model_writes_its_hash_and_its_estimates(sample_logs_dir: Path, tmp_path: Path) -> None:
     bundle = _bundle((0.0, 0.0))
     bundle.save(tmp_path / "model")
-    names, car = ("pd-hef", "pd-hef-fixed-r"), sample_logs_dir / "vehicle.toml"
+    names, car = ("pd-hef", "pd-hef:fixed-r"), sample_logs_dir / "vehicle.toml"
     config = RunConfig(car=car, network=tmp_path / "model", estimators=names, annotate="none")
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
     assert result.exit_code == 0
     assert bundle.sha256 in (tmp_path / "out" / "run.json").read_text()
     estimates = pl.read_parquet(tmp_path / "out/logs/dlc/estimates.parquet")
-    trust = estimates.filter((pl.col("estimator") == "pd-hef-fixed-r") & pl.col("valid"))["network_trust"]
+    trust = estimates.filter((pl.col("estimator") == "pd-hef:fixed-r") & pl.col("valid"))["network_trust"]
     assert trust.unique().to_list() == [1.0]
 
 

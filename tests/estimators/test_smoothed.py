@@ -512,7 +512,7 @@ def test_what_it_says_of_itself(rough):
     assert "a drive of 300 s" in estimator.notes[1]
     assert isinstance(estimator, LookingAhead)
     assert (estimator.name, estimator.causal) == ("pd-hef-smoothed", False)
-    assert [s.name for s in SPECS if not s.causal] == ["open-loop-calibrated", "pd-hef-smoothed"]
+    assert [s.name for s in SPECS if not s.causal] == ["open-loop:calibrated", "pd-hef-smoothed"]
     for spec in SPECS:
         if spec.network in ("residual", "optional"):
             assert make_estimator(spec.name, trusted).causal == spec.causal

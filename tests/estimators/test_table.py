@@ -27,6 +27,7 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import LookingAhead
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD
+from pdhef_logtool.estimators.presets import OPTIONS, options_of, preset_of, split_names
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
 from pdhef_logtool.estimators.table import (
     SPECS,
@@ -87,7 +88,7 @@ def make_model(seed: int = 1) -> ModelBundle:
 
 MODEL = make_model()
 #: It has all that any estimator needs.
-CAR = Car.of(VEHICLE, network=MODEL, noise={"phy-ukf-tuned": NOISE, "physics": NOISE}, trust=EVIDENCE)
+CAR = Car.of(VEHICLE, network=MODEL, noise={"phy-ukf:tuned": NOISE, "physics": NOISE}, trust=EVIDENCE)
 
 
 @pytest.fixture(scope="module")
@@ -189,17 +190,46 @@ def test_tuned_noise_keeps_the_axle_forces_noise_of_the_fit() -> None:
     assert estimator.vehicle.roll_damping == 0.5
 
 
-def test_a_name_of_an_older_version_is_said_to_be_what_it_is_now() -> None:
-    with pytest.raises(UsageError, match=r"physics-plus; physics-plus is physics now$"):
-        check_names(("zero", "physics-plus"))
-    with pytest.raises(UsageError, match=r"got physics-pluss$"):
-        check_names(("physics-pluss",))
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("physics-plus", r"expected all, or estimators out of zero, kinematic, open-loop, .*, got physics-plus$"),
+        ("pd-hef:trust=1", r"expected options of pd-hef: gain=0\.\.1, fixed-r, got pd-hef:trust=1$"),
+        ("pd-hef:gain", "got pd-hef:gain$"),
+        ("pd-hef:gain=2", "got pd-hef:gain=2$"),
+        ("pd-hef:gain=nan", "got pd-hef:gain=nan$"),
+        ("pd-hef:fixed-r=1", "got pd-hef:fixed-r=1$"),
+        ("pd-hef:", "got pd-hef:$"),
+        ("physics:tuned", "expected options of physics: none, got physics:tuned$"),
+    ],
+)
+def test_an_unknown_name_or_option_is_answered_with_those_that_exist(name: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        check_names(("zero", name))
+
+
+def test_ten_presets() -> None:
+    assert len({preset_of(s.name) for s in SPECS}) == 10
+    variants = {
+        preset: {o for s in SPECS if preset_of(s.name) == preset for o in options_of(s.name)} for preset in OPTIONS
+    }
+    assert variants == {preset: set(options) for preset, options in OPTIONS.items()}
+
+
+def test_options_of_a_name_are_combined() -> None:
+    assert split_names("zero, pd-hef:gain=0.5,fixed-r,phy-ukf") == ("zero", "pd-hef:gain=0.5,fixed-r", "phy-ukf")
+    assert ran("pd-hef:gain=0.5").options["trust"] == 0.5
+    both = ran("pd-hef:gain=0.5,fixed-r").options
+    assert (both["trust"], both["adaptive"]) == (0.5, False)
+    assert make_estimator("pd-hef:gain=0.5,fixed-r", CAR).name == "pd-hef:gain=0.5,fixed-r"
+    _, skipped = runnable(("pd-hef:gain=0.5",), Car.of(VEHICLE), frozenset(ALIGNED_SIGNALS))
+    assert [s.name for s in skipped] == ["pd-hef:gain=0.5"]
 
 
 # --- what runs under a name ------------------------------------------------------------------------------------------
 
 #: Nothing of the car but its signals.
-SENSORS_ALONE = ("zero", "gyro", "kinematic")
+SENSORS_ALONE = ("zero", "zero:no-lateral", "kinematic")
 
 
 def ran(name: str, car: Car = CAR, **options: Any) -> Algorithm:
@@ -215,7 +245,7 @@ def test_names_stand_for_different_algorithms() -> None:
     for spec in LINES:
         identities.setdefault(ran(spec.name).identity, []).append(spec.name)
     # CAR allows all of the trust.
-    assert [n for n in identities.values() if len(n) > 1] == [["pd-hef", "pd-hef-trust1"]]
+    assert [n for n in identities.values() if len(n) > 1] == [["pd-hef", "pd-hef:gain=1"]]
 
 
 @every_spec
@@ -238,9 +268,9 @@ def test_another_network_is_another_basis_of_what_has_one(spec: Any) -> None:
     assert was.identity == is_now.identity
 
 
-@pytest.mark.parametrize("name", ["phy-ukf-tuned", "physics", "pd-hef", "pd-hef-smoothed"])
+@pytest.mark.parametrize("name", ["phy-ukf:tuned", "physics", "pd-hef", "pd-hef-smoothed"])
 def test_other_noise_is_another_basis_of_the_same_identity(name: str) -> None:
-    of = name if name == "phy-ukf-tuned" else "physics"
+    of = name if name == "phy-ukf:tuned" else "physics"
     was = ran(name, CAR.with_noise(of, NOISE))
     for change in ({"q_std": (0.1, 0.2, 0.2)}, {"r_std": {"ay_m_s2": 1.0}}):
         is_now = ran(name, CAR.with_noise(of, NOISE.model_copy(update=change)))

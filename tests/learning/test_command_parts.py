@@ -500,7 +500,7 @@ def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkey
     (folder / "manifest.json").write_text(json.dumps({"drives": [{"file": "b.mcap", "split": "train"}]}))
     told: list[tuple[str, float]] = []
     warned: list[str] = []
-    config = replace(SALOON, estimators=("phy-ukf-tuned", "physics"))
+    config = replace(SALOON, estimators=("phy-ukf:tuned", "physics"))
     settings = LearnSettings(config=config, stages=("noise",), trials=6, seed=1)
     result = learn(
         arguments, tmp_path / "car", settings, jobs=5, progress=lambda *x: told.append(x), warn=warned.append
@@ -512,12 +512,12 @@ def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkey
     )
     assert told[-2] == ("trial 6 of 6", pytest.approx(1.0))
     ((setup, jobs),) = FakeBenches.made
-    assert jobs == 3 and setup.names == ("physics", "phy-ukf-tuned")
+    assert jobs == 3 and setup.names == ("physics", "phy-ukf:tuned")
     assert warned[0] == "c is left out: no true sideslip"
     assert result.figures["notes"] == warned[1:]
     car = Car.load(tmp_path / "car")
     document = json.loads((tmp_path / "car/noise.record.json").read_text())
-    for name in ("physics", "phy-ukf-tuned"):
+    for name in ("physics", "phy-ukf:tuned"):
         entry, best_noise = document["estimators"][name], car.noise[name]
         best = min(entry["trials"], key=lambda t: t["objective_deg"])
         values = tuple(best["values"].values())
@@ -562,16 +562,16 @@ def test_only_a_search_that_ends_badly_is_noted() -> None:
 
 def test_what_a_person_wrote_is_no_search_s() -> None:
     searched = FilterNoise(q_std=(0.1, 0.1, 0.1), trial=3, score_deg=0.5)
-    car = Car.of(VEHICLE, noise={"phy-ukf-tuned": searched, "physics": FilterNoise(q_std=(0.2, 0.2, 0.2))})
-    assert noise._kept(car) == {"phy-ukf-tuned": searched.model_copy(update={"score_deg": None})}
+    car = Car.of(VEHICLE, noise={"phy-ukf:tuned": searched, "physics": FilterNoise(q_std=(0.2, 0.2, 0.2))})
+    assert noise._kept(car) == {"phy-ukf:tuned": searched.model_copy(update={"score_deg": None})}
 
 
 def test_names_are_those_of_the_tables_in_their_order() -> None:
     car = Car.load("saloon")
-    assert choose_names(None, car) == ("phy-ukf-tuned",)
+    assert choose_names(None, car) == ("phy-ukf:tuned",)
     # Where no fit of it holds the noise of physics, it is tuned as all are.
-    assert choose_names(None, replace(car, fitted_physics=None)) == ("physics", "phy-ukf-tuned")
-    assert choose_names(("phy-ukf-tuned", "physics"), car) == ("physics", "phy-ukf-tuned")
+    assert choose_names(None, replace(car, fitted_physics=None)) == ("physics", "phy-ukf:tuned")
+    assert choose_names(("phy-ukf:tuned", "physics"), car) == ("physics", "phy-ukf:tuned")
     for wrong in ((), ("zero",), ("pd-hef",), ("physics", "physics")):
         with pytest.raises(UsageError, match="--estimators"):
             choose_names(wrong, car)
@@ -579,7 +579,7 @@ def test_names_are_those_of_the_tables_in_their_order() -> None:
 
 def test_a_bench_keeps_drives_by_number_and_scores_filters(monkeypatch: pytest.MonkeyPatch) -> None:
     car = Car.of(VEHICLE)
-    setup = BenchSetup(replace(SALOON, sensors="esp"), car, None, ("phy-ukf-tuned", "physics"))
+    setup = BenchSetup(replace(SALOON, sensors="esp"), car, None, ("phy-ukf:tuned", "physics"))
     asked: list[Any] = []
 
     def load(_log: Any, used: Car, _mapping: Any, _options: Any, *, refuse: Any, **named: Any) -> Any:
@@ -594,16 +594,16 @@ def test_a_bench_keeps_drives_by_number_and_scores_filters(monkeypatch: pytest.M
     bench.load(4, LogInput(Path("b"), "b"), None, 17)
     used, why, named = asked[0]
     lacks = "ay_m_s2, yaw_rate_rad_s"
-    assert used is car and why == f"phy-ukf-tuned needs {lacks}; physics needs {lacks}"
+    assert used is car and why == f"phy-ukf:tuned needs {lacks}; physics needs {lacks}"
     assert named == {"split": "test", "least_scored": 100, "max_bytes": 17}
     noise = FilterNoise(q_std=(0.1, 0.2, 0.3), r_std={"ay_m_s2": 0.5, "yaw_rate_rad_s": 0.004})
-    found = bench.score({"phy-ukf-tuned": noise})
+    found = bench.score({"phy-ukf:tuned": noise})
     from pdhef_logtool.estimators.table import Options, spec_of
     from pdhef_logtool.learning.noise.search import drive_error
 
-    own = spec_of("phy-ukf-tuned").make(car.with_noise("phy-ukf-tuned", noise), Options(use_speed=False))
+    own = spec_of("phy-ukf:tuned").make(car.with_noise("phy-ukf:tuned", noise), Options(use_speed=False))
     assert WHOLE.truth is not None
-    assert found == {"phy-ukf-tuned": {3: drive_error(run_window(own, WHOLE.signals)[0], WHOLE.truth, 3.0)}}
+    assert found == {"phy-ukf:tuned": {3: drive_error(run_window(own, WHOLE.signals)[0], WHOLE.truth, 3.0)}}
     assert DriveBench(BenchSetup(SALOON, car, None, ("physics",)))._options.use_speed
 
 

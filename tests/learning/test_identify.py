@@ -258,7 +258,7 @@ def test_250_lm_identified_on_its_first_half_is_good_on_its_second(
     monkeypatch.setattr(stage, "fit_car", partial(fit_car, parts=STATIC))
     run_stage("identify", log, tmp_path / "car", first, holdout=0.0)
     second = RunConfig(
-        car=tmp_path / "car", mapping=mapping, start="155", estimators=("zero", "phy-ukf-tuned"), annotate="none"
+        car=tmp_path / "car", mapping=mapping, start="155", estimators=("zero", "phy-ukf:tuned"), annotate="none"
     )
     result = run_logs(log, tmp_path / "out", second)
     rmse = {
@@ -266,7 +266,7 @@ def test_250_lm_identified_on_its_first_half_is_good_on_its_second(
         for row in result.results[0].rows
         if (row.signal, row.metric, row.segment) == ("sideslip_rad", "rmse", "all")
     }
-    assert rmse["phy-ukf-tuned"] < 0.34 < rmse["zero"]
+    assert rmse["phy-ukf:tuned"] < 0.34 < rmse["zero"]
 
 
 def test_projected_steps_find_the_bounded_minimum_also_from_a_start_at_the_bound() -> None:

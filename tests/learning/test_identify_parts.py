@@ -653,7 +653,7 @@ def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
     }  # fmt: skip
     assert document["sideslip_rmse_deg"][1] == {
         "part": "held out", "seconds": 20.0, "zero": 3.5, "phy-ukf, starting file": 2.5,
-        "phy-ukf-tuned, identified file": 1.5, "physics": 0.75,
+        "phy-ukf:tuned, identified file": 1.5, "physics": 0.75,
     }  # fmt: skip
     assert document["physics"] == PHYSICS.model_dump(mode="json", exclude_none=True)
     assert car.fitted_physics == PHYSICS

@@ -31,7 +31,7 @@ def _losses_by_command(
     logs, found = [str(log)], {}
     physics = replace(config, network=Path("none"), estimators=("phy-ukf",))
 
-    tuned = replace(physics, estimators=("phy-ukf-tuned",))
+    tuned = replace(physics, estimators=("phy-ukf:tuned",))
     commands = {
         "identify": lambda tell: run_stage("identify", logs, out / "1", config, holdout=0.0, warn=tell),
         "extract": lambda tell: extract(logs, out / "2", ExtractSettings(physics), warn=tell),

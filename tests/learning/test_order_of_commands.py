@@ -71,7 +71,7 @@ class Commands:
         if name == "identify":
             run_stage(name, logs, self.car, replace(config, end="34"), holdout=0.0)
         elif name == "noise":
-            run_stage(name, logs, self.car, replace(config, estimators=("phy-ukf-tuned", "physics")), trials=4)
+            run_stage(name, logs, self.car, replace(config, estimators=("phy-ukf:tuned", "physics")), trials=4)
         elif name == "gain":
             run_stage(name, logs, self.car, replace(config, network=self.car.parent / "model", end="+5s"))
         else:

@@ -56,7 +56,7 @@ def test_train_writes_a_model_that_runs(
     car, network = sample_logs_dir / "vehicle.toml", tmp_path / "model"
     config = RunConfig(car=car, network=network, estimators=("all",), annotate="none", end="5")
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
-    assert {r.estimator for r in result.results[0].rows} >= {"pd-hef-fixed-r", "pd-hef"}
+    assert {r.estimator for r in result.results[0].rows} >= {"pd-hef:fixed-r", "pd-hef"}
     again = run_training(joined, tmp_path / "again", epochs=2)
     assert again.bundle.sha256 == bundle.sha256
     assert again.bundle.provenance["fine_tuned_on"] is None

@@ -237,7 +237,7 @@ def test_what_is_written_runs_with_the_scores_that_are_recorded(
     assert (tmp_path / "mycar/noise.png").read_bytes().startswith(b"\x89PNG")
 
     names = choose_names(None, before)
-    assert set(names) == {"phy-ukf-tuned", "physics"}
+    assert set(names) == {"phy-ukf:tuned", "physics"}
     assert set(record["estimators"]) == set(names)
     explored = {n: [t["values"] for t in e["trials"] if t["stage"] == "sobol"] for n, e in record["estimators"].items()}
     assert all(len(record["estimators"][n]["trials"]) == 4 and explored[n] == explored["physics"] for n in names)
@@ -268,9 +268,9 @@ def test_processes_change_nothing_and_the_command_prints_json(
         document = said(
             capsys, "learn", drives, "--stages", "noise", "--split", "validation",
             "--car", sample_logs_dir / "vehicle.toml",
-            "--network", "none", "-o", output, "-e", "phy-ukf-tuned", "--trials", 4, "--jobs", jobs,
+            "--network", "none", "-o", output, "-e", "phy-ukf:tuned", "--trials", 4, "--jobs", jobs,
         )  # fmt: skip
-        assert document["stages"][0]["figures"]["estimators"]["phy-ukf-tuned"]["trials"] == 4
+        assert document["stages"][0]["figures"]["estimators"]["phy-ukf:tuned"]["trials"] == 4
         texts.append(((output / "noise.toml").read_text(), (output / "noise.record.json").read_text()))
     assert texts[0] == texts[1]
 
@@ -295,7 +295,7 @@ def test_a_drive_without_truth_is_left_out_and_told(sample_logs_dir: Path, tmp_p
     logs = [str(sample_logs_dir / "dlc.mcap"), str(sample_logs_dir / "no_truth.mcap")]
     told: list[str] = []
     result = learn(
-        logs, tmp_path / "car", _settings(sample_logs_dir, split=None, names=("phy-ukf-tuned",)), warn=told.append
+        logs, tmp_path / "car", _settings(sample_logs_dir, split=None, names=("phy-ukf:tuned",)), warn=told.append
     )
     assert result.exit_code == 3
     assert [d.name for d in result.left_out] == ["no_truth"]
@@ -309,7 +309,7 @@ def test_a_drive_without_truth_is_left_out_and_told(sample_logs_dir: Path, tmp_p
 def test_an_unreadable_log_stops_the_command_from_any_process(sample_logs_dir: Path, tmp_path: Path) -> None:
     (tmp_path / "bad.mcap").write_bytes(b"no log at all")
     logs = [str(sample_logs_dir / "dlc.mcap"), str(tmp_path / "bad.mcap")]
-    settings = _settings(sample_logs_dir, split=None, names=("phy-ukf-tuned",))
+    settings = _settings(sample_logs_dir, split=None, names=("phy-ukf:tuned",))
     for jobs in (1, 2):
         with pytest.raises(LogError, match=r"bad\.mcap"):
             learn(logs, tmp_path / "car", settings, jobs=jobs)
@@ -319,7 +319,7 @@ def test_an_unreadable_log_stops_the_command_from_any_process(sample_logs_dir: P
 def test_drives_that_do_not_fit_are_refused(
     sample_logs_dir: Path, drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = _settings(sample_logs_dir, names=("phy-ukf-tuned",))
+    settings = _settings(sample_logs_dir, names=("phy-ukf:tuned",))
     facts = learn([str(drives)], tmp_path / "car", settings).drives
     assert all(f.bytes_held > 100 * f.counts["scored_stamps"] for f in facts)
     monkeypatch.setattr(benches, "MAX_BYTES", sum(f.bytes_held for f in facts) - 1)
@@ -355,12 +355,12 @@ def test_noise_of_an_earlier_search_stays_without_its_score(sample_logs_dir: Pat
     learn(log, tmp_path / "mycar", _for(settings, "physics"))
     first = Car.load(tmp_path / "mycar").noise["physics"]
     assert first.score_deg is not None
-    again = _for(settings, "phy-ukf-tuned", car=tmp_path / "mycar")
+    again = _for(settings, "phy-ukf:tuned", car=tmp_path / "mycar")
     learn(log, tmp_path / "mycar", again)
     noise = Car.load(tmp_path / "mycar").noise
     # It is as good as it was, but was not compared with the other on the same drives.
     assert noise["physics"] == first.model_copy(update={"score_deg": None})
-    assert noise["phy-ukf-tuned"].score_deg is not None
+    assert noise["phy-ukf:tuned"].score_deg is not None
     learn(log, tmp_path / "mycar", again)
     assert Car.load(tmp_path / "mycar").noise == noise
 
@@ -368,6 +368,6 @@ def test_noise_of_an_earlier_search_stays_without_its_score(sample_logs_dir: Pat
 def test_the_vehicle_file_is_kept_byte_by_byte(sample_logs_dir: Path, tmp_path: Path) -> None:
     text = (sample_logs_dir / "vehicle.toml").read_text()
     (tmp_path / "guess.toml").write_text("# Written by hand.\n" + text.replace("1440.0", "1440.0  # weighed # twice"))
-    settings = _for(_settings(sample_logs_dir, split=None), "phy-ukf-tuned", car=tmp_path / "guess.toml")
+    settings = _for(_settings(sample_logs_dir, split=None), "phy-ukf:tuned", car=tmp_path / "guess.toml")
     learn([str(sample_logs_dir / "dlc.mcap")], tmp_path / "mycar", settings)
     assert (tmp_path / "mycar/vehicle.toml").read_bytes() == (tmp_path / "guess.toml").read_bytes()

@@ -48,7 +48,7 @@ VALID_FIT = {
     "version": 1,
     "physics_sha256": "ab" * 32,
     "values": {"friction": 0.9, "sensors": {"ay_bias_m_s2": 0.01, "yaw_rate_bias_rad_s": 0.0}},
-    "filter": {"phy-ukf-tuned": {"q_std": [0.1, 0.1, 0.1], "r_std": {"ay_m_s2": 1.0}}},
+    "filter": {"phy-ukf:tuned": {"q_std": [0.1, 0.1, 0.1], "r_std": {"ay_m_s2": 1.0}}},
     "drives": [{"name": "lap", "sha256": "cd", "start_s": 0.0, "end_s": 9.5}],
     "scores": {"lap": {"rmse": 0.2}},
 }
@@ -287,7 +287,7 @@ def test_the_nearest_name_is_told() -> None:
         (
             LOADERS[3],
             "[filter.phy_ukf_tuned]\nq_std = []",
-            "filter.phy_ukf_tuned: unknown, did you mean filter.phy-ukf-tuned?",
+            "filter.phy_ukf_tuned: unknown, did you mean filter.phy-ukf:tuned?",
         ),
         (
             LOADERS[3],

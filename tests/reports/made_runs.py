@@ -14,8 +14,8 @@ from pdhef_logtool.sinks.report import write_json
 START_NS = 1_700_000_000_000_000_000
 #: Those of `pdhef run --estimators all` with a network that has its baselines.
 NAMES = (
-    "pd-hef", "physics", "zero", "gyro", "kinematic", "open-loop", "phy-ukf", "phy-ukf-tuned", "linear-regression",
-    "pure-lstm", "pd-hef-fixed-r", "pd-hef-smoothed", "pd-hef-paper", "pd-hef-trust1",
+    "pd-hef", "physics", "zero", "zero:no-lateral", "kinematic", "open-loop", "phy-ukf", "phy-ukf:tuned",
+    "linear-regression", "pure-lstm", "pd-hef:fixed-r", "pd-hef-smoothed", "pd-hef-paper", "pd-hef:gain=1",
 )  # fmt: skip
 
 
@@ -47,7 +47,7 @@ def drive_tracks(
     for i, name in enumerate(names):
         drift = np.radians(0.1 * (i + 1)) * np.sin(0.05 * t + i)
         own = beta + drift + np.radians(0.01) * rng.normal(size=n)
-        filtered = {} if name in ("zero", "gyro") else {
+        filtered = {} if name in ("zero", "zero:no-lateral") else {
             "network_trust": 0.6 + 0.2 * np.sin(0.1 * t + i) + 0.01 * rng.normal(size=n),
             "r_scale": 1.0 + np.where(rng.random(n) < 0.01, 50.0 * rng.random(n), 0.0),
             "nis": rng.chisquare(3, size=n),

@@ -39,7 +39,7 @@ def test_noise_evidence_and_calibration_are_of_the_shipped_network() -> None:
     assert car.trust is not None and car.trust.network_sha256 == model.sha256
     assert car.allowed_trust.cap == 0.75
     assert car.notes == ()
-    assert {"phy-ukf-tuned", "physics"} == set(car.noise)
+    assert {"phy-ukf:tuned", "physics"} == set(car.noise)
     for chosen in (None, UNSURE):
         intervals = Car.load("saloon", intervals=chosen).intervals
         assert intervals is not None

@@ -65,9 +65,9 @@ def test_empty_slice_is_a_usage_error(start: str | None, end: str | None) -> Non
 
 def test_flags_win_over_file_and_paths_are_relative_to_it(tmp_path: Path) -> None:
     file = tmp_path / "pdhef.toml"
-    file.write_text('estimators = ["zero", "gyro"]\ncar = "car.toml"\nannotate = "sidecar"\nstart = 10\n')
+    file.write_text('estimators = ["zero", "zero:no-lateral"]\ncar = "car.toml"\nannotate = "sidecar"\nstart = 10\n')
     config = load_config(file, {"annotate": "none", "mapping": None})
-    assert config.estimators == ("zero", "gyro")
+    assert config.estimators == ("zero", "zero:no-lateral")
     assert config.car == tmp_path / "car.toml"
     assert config.annotate == "none"
     assert config.start == "10"
@@ -142,8 +142,8 @@ def test_a_time_is_a_number_a_text_or_a_date(tmp_path: Path, text: str, said: st
 
 
 def test_estimators_may_be_a_text_with_commas(tmp_path: Path) -> None:
-    (tmp_path / "c.toml").write_text('estimators = "zero,gyro"\n')
-    assert load_config(tmp_path / "c.toml", {}).estimators == ("zero", "gyro")
+    (tmp_path / "c.toml").write_text('estimators = "zero, pd-hef:gain=0.5,fixed-r"\n')
+    assert load_config(tmp_path / "c.toml", {}).estimators == ("zero", "pd-hef:gain=0.5,fixed-r")
 
 
 def test_a_configuration_is_checked_wherever_it_is_made() -> None:

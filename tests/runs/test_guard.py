@@ -69,8 +69,8 @@ def test_the_main_one_is_the_best_of_its_kind_whatever_the_order() -> None:
     assert main(ran("zero", "kinematic", "physics", "pd-hef"), [], proven=True).name == "pd-hef"
     assert main(ran("zero", "phy-ukf", "open-loop"), []).name == "phy-ukf"
     assert main(ran("zero", "kinematic"), []).name == "kinematic"
-    assert main(ran("zero", "pure-lstm", "gyro"), []).name == "pure-lstm"
-    assert main(ran("gyro", "zero"), []).name == "zero"
+    assert main(ran("zero", "pure-lstm", "zero:no-lateral"), []).name == "pure-lstm"
+    assert main(ran("zero:no-lateral", "zero"), []).name == "zero"
 
 
 def test_evidence_goes_before_d2_and_d2_before_the_order() -> None:

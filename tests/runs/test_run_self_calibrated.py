@@ -29,7 +29,7 @@ pytestmark = pytest.mark.slow
 
 #: Of the road: so much carries a calibration.
 END = "110"
-NAMES = ("zero", "open-loop", "open-loop-calibrated", "phy-ukf", "physics")
+NAMES = ("zero", "open-loop", "open-loop:calibrated", "phy-ukf", "physics")
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_calibrated_estimators_are_not_causal_and_say_so_and_the_others_keep_the
     report = json.loads((calibrated / "logs/road/report.json").read_text())
     jsonschema.validate(report, load_schema("report.schema.json"))
     told = {e["name"]: e for e in report["estimators"]}
-    for name in ("physics", "open-loop-calibrated"):
+    for name in ("physics", "open-loop:calibrated"):
         assert not told[name]["causal"]
         assert any("whole log" in note for note in told[name]["notes"])
     assert all(told[name]["causal"] for name in ("zero", "open-loop", "phy-ukf"))
@@ -74,7 +74,7 @@ def test_calibrated_estimators_are_not_causal_and_say_so_and_the_others_keep_the
     assert "calibrated on this log without truth" in report["answer"]["texts"]["assumed"]
     assert "the drive understeers otherwise" in report["answer"]["texts"]["assumed"]
     assert told["physics"]["intervals"] == ["intervals: own, parameters and d2"]
-    assert told["open-loop-calibrated"]["intervals"] == []
+    assert told["open-loop:calibrated"]["intervals"] == []
 
 
 def test_a_wrong_file_is_mended(calibrated: Path) -> None:
@@ -115,7 +115,7 @@ def test_a_short_log_is_refused_and_the_file_stays(sample_logs_dir: Path, wrong_
     report = run(sample_logs_dir / "sweep.mcap", wrong_car, tmp_path)
     assert "are needed" in report["self_calibration"]["refused"]
     told = {e["name"]: e for e in report["estimators"]}
-    assert told["open-loop-calibrated"]["outcome"] == "skipped"
+    assert told["open-loop:calibrated"]["outcome"] == "skipped"
     assert "not calibrated on this log" in report["answer"]["texts"]["assumed"]
 
 

@@ -347,10 +347,14 @@ def test_topics_of_an_earlier_run_go(tmp_path, annotated, circle):
     path = tmp_path / "other.mcap"
     log = open_log(annotated)
     sink = AnnotatedMcapSink(path, log)
-    sink.append(circle("gyro", 0, 600))
+    sink.append(circle("zero:no-lateral", 0, 600))
     sink.finish({**REPORT, "metrics": []})
     log.close()
-    assert {topic for topic, *_ in messages(path)} == {*SOURCE_TOPICS, "/pdhef/gyro/state", "/pdhef/gyro/odometry"}
+    assert {topic for topic, *_ in messages(path)} == {
+        *SOURCE_TOPICS,
+        "/pdhef/zero_no_lateral/state",
+        "/pdhef/zero_no_lateral/odometry",
+    }
 
 
 def test_in_place(source, circle):

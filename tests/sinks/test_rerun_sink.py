@@ -528,7 +528,7 @@ def test_of_a_long_drive_ten_rows_a_second_are_drawn_with_the_largest_nis_and_fi
     )
     for part in (slice(0, 30_003), slice(30_003, n)):  # a window may end inside of a step
         speed = np.full(part.stop - part.start, 20.0)
-        for name in ("zero", "gyro"):
+        for name in ("zero", "zero:no-lateral"):
             track = make_track(name, stamps[part], vx_m_s=speed, vy_m_s=0 * speed, nis=nis[part])
             sink.append(track.with_pose(speed, speed, 0 * speed))
     sink.finish(REPORT)

@@ -29,7 +29,7 @@ from truthsim.vehicle_choice import choose_vehicle
 
 pytestmark = pytest.mark.slow
 
-NAMES = "zero,phy-ukf,pd-hef-fixed-r"
+NAMES = "zero,phy-ukf,pd-hef:fixed-r"
 ROWS = ("in-domain", "friction-plus-20", "gyro-dropped")
 
 

@@ -20,9 +20,9 @@ pytestmark = pytest.mark.slow
 
 #: Largest sideslip RMSE in degrees by scenario and scheme.
 SIDESLIP_BOUNDS_DEG: dict[tuple[str, str], float] = {
-    ("A", "pd-hef-fixed-r"): 0.05,
+    ("A", "pd-hef:fixed-r"): 0.05,
     ("A", "pd-hef"): 0.05,
-    ("B", "pd-hef-fixed-r"): 0.06,
+    ("B", "pd-hef:fixed-r"): 0.06,
     ("B", "pd-hef"): 0.06,
     ("A", "phy-ukf"): 0.40,
     ("B", "phy-ukf"): 0.60,
@@ -31,10 +31,10 @@ SIDESLIP_BOUNDS_DEG: dict[tuple[str, str], float] = {
 LEAST_GAIN: dict[tuple[str, str, str], float] = {
     ("A", "pd-hef", "phy-ukf"): 0.6,
     ("B", "pd-hef", "phy-ukf"): 0.6,
-    ("A", "pd-hef", "phy-ukf-tuned"): 0.4,
-    ("B", "pd-hef", "phy-ukf-tuned"): 0.4,
+    ("A", "pd-hef", "phy-ukf:tuned"): 0.4,
+    ("B", "pd-hef", "phy-ukf:tuned"): 0.4,
 }
-SCHEMES = ("zero", "gyro", "phy-ukf", "phy-ukf-tuned", "pd-hef-fixed-r", "pd-hef")
+SCHEMES = ("zero", "zero:no-lateral", "phy-ukf", "phy-ukf:tuned", "pd-hef:fixed-r", "pd-hef")
 
 
 @pytest.fixture(scope="module")

@@ -104,7 +104,7 @@ class PartScore:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identification:
-    """Everything that identification found: values with the noise of ``phy-ukf-tuned``, and those of ``physics``.
+    """Everything that identification found: values with the noise of ``phy-ukf:tuned``, and those of ``physics``.
 
     ``parameters`` are those of the former, ``physics_parameters`` those of the latter.
     """

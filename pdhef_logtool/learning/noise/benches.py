@@ -17,7 +17,7 @@ from pdhef_logtool.car.parts import PHYSICS, FilterNoise
 from pdhef_logtool.drive.reading import MAX_BYTES, too_big
 from pdhef_logtool.drive.reading import Drive as ReadDrive
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.table import FILTERS, SPECS, Options, former, spec_of
+from pdhef_logtool.estimators.table import FILTERS, SPECS, Options, spec_of
 from pdhef_logtool.learning.drives import DriveRecord, load_drive
 from pdhef_logtool.learning.noise.search import DriveError, drive_error
 from pdhef_logtool.logs.discovery import LogInput
@@ -64,7 +64,6 @@ def choose_names(names: Sequence[str] | None, car: Car) -> tuple[str, ...]:
             expected=f"estimators out of {', '.join(tunable)}",
             got=", ".join(wrong) or "none",
             where="--estimators",
-            remedy=former(wrong),
         )
     return tuple(n for n in tunable if n in names)
 
