@@ -173,7 +173,6 @@ def learn(
     output: Path | str,
     settings: LearnSettings,
     *,
-    jobs: int = 1,
     fresh: bool = False,
     progress: Progress = lambda _text, _share: None,
     warn: Tell = lambda _text: None,
@@ -183,7 +182,7 @@ def learn(
 
     Parameters
     ----------
-    arguments : logs, folders, glob patterns. jobs : worker processes of the noise search; results do not depend on it.
+    arguments : logs, folders, glob patterns.
     fresh : forget the results of an earlier call with this output. say : receives each stage with the time it took.
 
     Raises
@@ -214,7 +213,6 @@ def learn(
         mapping=open_mapping(config),
         set_splits=set_splits,
         estimators=config.estimators,
-        jobs=jobs,
         progress=progress,
         warn=warn,
     )

@@ -33,7 +33,7 @@ from pdhef_logtool.learning.evidence.trust import (
     decide_cap,
     join_blocks,
 )
-from pdhef_logtool.learning.noise.benches import MIN_SCORED_STAMPS
+from pdhef_logtool.learning.noise.bench import MIN_SCORED_STAMPS
 from pdhef_logtool.learning.split import VALIDATION
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.logs.discovery import LogInput
