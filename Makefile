@@ -113,6 +113,8 @@ lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python tests/size_budget.py
+	$(BIN)/python tests/language_check.py
 
 format: $(VENV)/installed-dev
 	$(BIN)/ruff format .
@@ -132,8 +134,9 @@ retrain: $(VENV)/installed-dev $(VENV)/compiled
 	$(if $(LOGS),$(BIN)/pdhef retrain $(LOGS) -o $(if $(filter out/demo,$(OUT)),out/retrain,$(OUT)) --car $(CAR) --jobs $(JOBS),\
 	  OMP_NUM_THREADS=1 $(BIN)/python -m studies.retrain --jobs $(JOBS))
 
+# Without --quiet, which would hide the warnings that make it fail.
 docs: $(VENV)/installed-docs
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 	@echo "Site: out/site/index.html"
 
 samples: $(VENV)/installed $(VENV)/compiled

@@ -35,7 +35,7 @@ from studies.table_maths import interval_score
 from truthsim.drive import Drive, write_drive
 
 SIDESLIP = "sideslip_rad"
-#: Bins of true |a_y| over μ g (METHOD §10), by name: lower and upper limit.
+#: Bins of true |a_y| over μ g (docs/method.md#evaluation), by name: lower and upper limit.
 BINS: dict[str, tuple[float, float]] = {"low": (0.0, 0.3), "middle": (0.3, 0.6), "high": (0.6, np.inf)}
 NONLINEAR = "nonlinear"
 #: A drive counts in a bin from this many seconds on.

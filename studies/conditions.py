@@ -1,4 +1,4 @@
-"""The condition table (METHOD §10): every estimator on the same drives with one thing wrong in each row.
+"""The condition table (docs/method.md#evaluation): every estimator on the same drives with one thing wrong in each row.
 
     python -m studies.conditions [--car CAR] [--network FOLDER] [--drives 30] [--jobs 2] [--rows NAME,...]
 

@@ -99,7 +99,7 @@ Written by `python -m studies.model_card`; the model by `make train-default`.
   its trust is capped by that car's own evidence; on this one it is {car.allowed_trust.cap:g}. The baselines beside it
   are of the nominal model and older: they did not change with it.
 - Data: simulated, {DRIVES} drives of 12.5 s of that car (seed {SETS["one_car"][0]}), friction 0.3 to 1.0, 40 to
-  120 km/h, sensors with METHOD's noise, biases and delays; friction is told by the simulator. {splits}; split by drive.
+  120 km/h, sensors with [their errors](method.md#sensors); friction is told by the simulator. {splits}; split by drive.
 - Training: seed {recipe["seed"]}, one cycle up to a learning rate of {recipe["learning_rate"]:g}, on
   {model.provenance["training_hours"]:.2f} h of driving.
 
@@ -109,7 +109,7 @@ Losses are mean squares of normalised targets. `pure-lstm` has another target: i
 
 ## Sideslip RMSE on drives that took no part
 
-Sensors have METHOD's noise, biases and delays; friction is told.
+Sensors have [their errors](method.md#sensors); friction is told.
 
 {chr(10).join(parts)}
 ## Limits

@@ -1,4 +1,4 @@
-"""Recorded drives: fit on one part, score once on another that took no part in anything (METHOD §10, §14).
+"""Recorded drives: fit on one part, score once on another that took no part in anything (docs/method.md#evaluation).
 
     python -m studies.real [--network model/] [--out docs] [--trials 64] [--cases 250lm,...] [--work out/real]
 

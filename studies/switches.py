@@ -245,7 +245,7 @@ NOTES = """How each is switched:
 - *Body-roll correction*: the filter's a_y holds g times the roll gradient, or is taken for planar.
 - *Standstill*: motion is held at zero while the car stands, and the bias of a_x is learnt there, or it just filters on.
 - *Slip gate*: speed samples of wheels that spin or lock are left out, or used
-  ([estimators.md](estimators.md#wheel-slip-which-speed-is-believed)).
+  ([method.md](method.md#wheel-slip)).
 - *Prediction over the latency*: the newest step that had arrived is predicted to the stamp, or stands there as it is.
 - *The steering's own measurement time*: each channel is put where it was measured, however late it came, and the step
   waits for it; or the steering counts as measured when it arrived, and nothing waits. A filter on physics alone may be

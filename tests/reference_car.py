@@ -1,4 +1,4 @@
-"""A single-track car in plain Python, written from METHOD's equations, and drives of it for the estimator tests.
+"""A single-track car in plain Python, written from docs/method.md, and drives of it for the estimator tests.
 
 It shares nothing with ``pdhef_logtool.car.nominal_model``: it is what the compiled model is compared with.
 """
@@ -25,7 +25,7 @@ Force = Callable[[float, float, bool], float]
 
 
 def magic_tyre(alpha: float, mu: float, front: bool) -> float:
-    """Eq 3, axle force in N."""
+    """Eq 2, axle force in N."""
     b, c, d, e = FRONT_TYRE if front else REAR_TYRE
     inner = b * alpha - e * (b * alpha - math.atan(b * alpha))
     return mu * d * math.sin(c * math.atan(inner))
@@ -39,7 +39,7 @@ def tanh_tyre(alpha: float, mu: float, front: bool) -> float:
 
 
 def forces(vx: float, vy: float, r: float, steer: float, mu: float, tyre: Force = magic_tyre) -> tuple[float, float]:
-    """Lateral acceleration and yaw acceleration of Eq 1, 2."""
+    """Lateral acceleration and yaw acceleration of Eq 1-4."""
     alpha_f = steer - math.atan((vy + FRONT_M * r) / vx)
     alpha_r = -math.atan((vy - REAR_M * r) / vx)
     front = tyre(alpha_f, mu, True) * math.cos(steer)
@@ -170,7 +170,7 @@ def slalom(amplitude: float = 0.03, frequency_hz: float = 0.4) -> Callable[[floa
 
 
 def with_noise(signals: Signals, seed: int, scale: float = 1.0) -> Signals:
-    """Add the sensor noise of METHOD §9 (Gaussian)."""
+    """Add the sensor noise of docs/method.md#sensors (Gaussian)."""
     rng = np.random.default_rng(seed)
     n = len(signals)
 

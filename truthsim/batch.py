@@ -27,7 +27,7 @@ from truthsim.sensors import SIGNED, SensorNoise
 from truthsim.vehicle_choice import choose_vehicle
 
 MANIFEST = "manifest.json"
-#: Bins of |a_y| over μ g in which METHOD §10 scores, by name; each from its lower limit on.
+#: Bins of |a_y| over μ g (docs/method.md#evaluation), by name; each from its lower limit on.
 BINS: dict[str, float] = {"low": 0.0, "middle": 0.3, "high": 0.6}
 #: Drives between two writings of the manifest, which is what an interrupted batch goes on from.
 _SAVE_EVERY = 25

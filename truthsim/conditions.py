@@ -1,4 +1,6 @@
-"""The drives of the condition table (METHOD §10): the same drives again and again, with one thing wrong in each row.
+"""The drives of the condition table: the same drives again and again, with one thing wrong in each row.
+
+See docs/method.md#evaluation.
 
 A row that changes the car, the sensors or the road changes the truth; the nominal vehicle file stays. A row that
 changes only what an estimator is told (friction, which sensors) has no drives of its own: it names those of the row

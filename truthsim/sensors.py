@@ -1,7 +1,7 @@
 """Sensors of the simulated car: what a recorder would have got, with noise, bias, drift, delay, tilt and outages.
 
-Numbers are the paper experiment's (METHOD §9). Every error source draws from a stream of its own, so that changing one
-leaves the others as they were.
+Numbers are the paper experiment's (docs/method.md#sensors). Every error source draws from a stream of its own, so that
+changing one leaves the others as they were.
 """
 
 from __future__ import annotations

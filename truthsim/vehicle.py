@@ -29,7 +29,9 @@ AIR_DENSITY_KG_M3 = 1.204
 
 
 class Vehicle(NamedTuple):
-    """A mid-size saloon with the paper's Table 3 mass and geometry; the rest are typical values (METHOD §13).
+    """A mid-size saloon with the paper's Table 3 mass and geometry; the rest are typical values.
+
+    See docs/method.md#simulator.
 
     ``truthsim/vehicles/`` holds this one and others as files.
     """

@@ -226,7 +226,7 @@ class Car:
 
     @property
     def allowed_trust(self) -> AllowedTrust:
-        """How far ``pd-hef`` may follow the network on this car, and why (METHOD §14).
+        """How far ``pd-hef`` may follow the network on this car, and why (docs/method.md#gain).
 
         Innovations do not tell whether a network helps on a car that it has never seen: drives with truth do. Evidence
         counts for the network, physics and noise that it was found with; a part written by hand names none of them.

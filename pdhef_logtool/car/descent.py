@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt for fits to driving: robust errors of all drives, whose scales follow them, and normal priors."""
+"""Levenberg-Marquardt descent for fits to drives, with robust errors, scales that follow them, and normal priors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _Errors = TypeVar("_Errors")
 
 
 class Descent(NamedTuple):
-    """Where a descent ended: θ, the normal matrix of the last step with the priors in it, and the cost."""
+    """Result of a descent: θ, the normal matrix of the last step including the priors, and the cost."""
 
     theta: FloatArray
     normal: FloatArray
@@ -34,15 +34,16 @@ def descend(
     derivative_step: float,
     max_step: float,
 ) -> tuple[Descent, _Errors]:
-    """Return where a descent of the cost ends, and the errors there.
+    """Minimize the cost; return the result and the errors there.
 
     Parameters
     ----------
-    errors : of parameters θ [K], which are distances from the prior in its standard deviations.
-    cost : of errors and θ, with |θ|² for the priors in it.
-    scaled : residuals [R] of errors with the scales that others have, whose squares the cost stands for.
-    least_gain : of the cost, below which the search ends, by the errors then.
-    derivative_step, max_step : of θ: for derivatives, and the largest that the search makes.
+    errors : function of the parameters θ [K], which are distances from the prior in standard deviations.
+    cost : function of errors and θ, including |θ|² for the priors.
+    scaled : function of errors, and of the errors that give the scales, that returns residuals [R]; the cost
+        approximates their sum of squares.
+    least_gain : function of errors: decrease of the cost below which the search ends.
+    derivative_step, max_step : step of θ for derivatives, and the largest step of the search.
     """
     found = errors(theta)
     value = cost(found, theta)

@@ -1,4 +1,4 @@
-"""The nominal 3-DOF single-track model f_nom and its measurement function, compiled (METHOD §2, Eq 1-4).
+"""The nominal 3-DOF single-track model f_nom and its measurement function, compiled (docs/method.md#model, Eq 1-4).
 
 State [v_x, v_y, r] at the centre of gravity, ISO 8855, SI. Below the vehicle's low-speed limit the slip angles are
 singular, so that the model blends to the kinematic single-track model, whose lateral velocity and yaw rate follow
@@ -13,17 +13,17 @@ from typing import NamedTuple
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.records.compiled import njit
 
-#: Time constant with which the kinematic model is followed, s. Short against driving, long against a 10 ms step.
+#: Time constant of the approach to the kinematic model, s: short for driving, long for a 10 ms step.
 KINEMATIC_TIME_CONSTANT_S = 0.1
 #: The blend starts at this share of the vehicle's low-speed limit and ends at the limit.
 BLEND_START_SHARE = 0.5
-#: Largest product of step and fastest pole for one RK4 step; longer steps are divided.
+#: Largest product of step and fastest pole of an RK4 step; longer steps are divided.
 MAX_STEP_TIMES_POLE = 1.0
 MAX_SUBSTEPS = 32
 
 
 class ModelParameters(NamedTuple):
-    """What the compiled model needs, flat. Tyres: F = friction · D sin(C atan(B α − E (B α − atan B α)))."""
+    """Parameters of the compiled model. Tyres: F = friction · D sin(C atan(B α − E (B α − atan B α)))."""
 
     mass_kg: float
     yaw_inertia_kg_m2: float
@@ -43,13 +43,13 @@ class ModelParameters(NamedTuple):
     blend_high_m_s: float
     imu_x_m: float
     imu_y_m: float
-    ay_roll_gain: float  # share by which a tilted accelerometer reads more than the planar a_y; 0 = not corrected
+    ay_roll_gain: float  # relative excess of a tilted accelerometer over the planar a_y; 0 = not corrected
 
 
 def model_parameters(vehicle: VehicleParameters, *, roll_correction: bool = False) -> ModelParameters:
     """Flatten vehicle parameters for the compiled model.
 
-    With ``roll_correction`` the measured a_y is taken as (1 + g·K_φ) times the planar one (METHOD §3).
+    With ``roll_correction`` the measured a_y is taken as (1 + g·K_φ) times the planar one (docs/method.md#model).
     """
     bf, cf, df, ef = vehicle.magic_formula(True, 1.0)
     br, cr, dr, er = vehicle.magic_formula(False, 1.0)
@@ -78,7 +78,7 @@ def model_parameters(vehicle: VehicleParameters, *, roll_correction: bool = Fals
 
 @njit(cache=True)
 def magic_formula_force(alpha, B, C, D_n, E, fixed_stiffness, friction):  # type: ignore[no-untyped-def]
-    """Return the lateral axle force in N at slip angle ``alpha`` in rad (Eq 3)."""
+    """Return the lateral axle force in N at slip angle ``alpha`` in rad (Eq 2)."""
     b = B / friction if fixed_stiffness else B
     ba = b * alpha
     return friction * D_n * math.sin(C * math.atan(ba - E * (ba - math.atan(ba))))
@@ -93,7 +93,7 @@ def dynamic_share(vx, p):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def lateral_acceleration_and_yaw_acceleration(vx, vy, r, steer, friction, p, force_scale=1.0):  # type: ignore[no-untyped-def]
-    """Return (F_yf cos δ + F_yr)/m in m/s² and (l_f F_yf cos δ − l_r F_yr)/I_z in rad/s² (Eq 1, 2).
+    """Return (F_yf cos δ + F_yr)/m in m/s² and (l_f F_yf cos δ − l_r F_yr)/I_z in rad/s² (Eq 1-4).
 
     ``force_scale`` multiplies both axles' forces.
     """
@@ -141,7 +141,7 @@ def planar_lateral_acceleration(vx, vy, r, steer, friction, p, force_scale=1.0):
 
 @njit(cache=True)
 def measured_lateral_acceleration(vx, vy, r, steer, friction, p, force_scale=1.0):  # type: ignore[no-untyped-def]
-    """Return what the accelerometer reads: planar a_y, moved to the IMU, with the gravity that body roll adds."""
+    """Return the accelerometer's reading: planar a_y at the IMU plus the gravity component of body roll."""
     w = dynamic_share(vx, p)
     ay = vx * r
     r_dot = 0.0
@@ -154,7 +154,7 @@ def measured_lateral_acceleration(vx, vy, r, steer, friction, p, force_scale=1.0
 
 @njit(cache=True)
 def substeps(vx, dt, friction, p):  # type: ignore[no-untyped-def]
-    """Return into how many RK4 steps ``dt`` must be divided for the model's fastest pole."""
+    """Return the number of RK4 steps in ``dt`` that the model's fastest pole requires."""
     v = max(vx, p.blend_low_m_s)
     cf = p.front_B * p.front_C * p.front_D_n * (1.0 if p.front_fixed_stiffness else friction)
     cr = p.rear_B * p.rear_C * p.rear_D_n * (1.0 if p.rear_fixed_stiffness else friction)
@@ -164,7 +164,7 @@ def substeps(vx, dt, friction, p):  # type: ignore[no-untyped-def]
     return min(max(n, 1), MAX_SUBSTEPS)
 
 
-# positional: scalars throughout, as the model's other functions; every caller has them apart.
+# positional: scalars, as in the model's other functions.
 @njit(cache=True)
 def rk4_step(vx, vy, r, steer, ax, friction, dt, n, p, force_scale=1.0):  # type: ignore[no-untyped-def]
     """Advance [v_x, v_y, r] by ``dt`` s in ``n`` RK4 steps with constant inputs."""

@@ -114,7 +114,7 @@ def _constants(friction, p):  # type: ignore[no-untyped-def]
 
 @_inline
 def _axle_accelerations(vx, vy, r, steer, cos_steer, force, c, p):  # type: ignore[no-untyped-def]
-    """Return a_y in m/s² and the yaw acceleration in rad/s² (Eq 1-3), as the function of the nominal model does."""
+    """Return a_y in m/s² and the yaw acceleration in rad/s² (Eq 1-4), as the function of the nominal model does."""
     v = max(vx, p.blend_low_m_s)
     front = c.b_front * (steer - arctangent(vy + p.front_m * r, v))
     rear = -c.b_rear * arctangent(vy - p.rear_m * r, v)
@@ -161,13 +161,13 @@ def work_size(count):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def place_count(points):  # type: ignore[no-untyped-def]
-    """Return for how many points a work array has room; all of them must hold finite numbers."""
+    """Return for how many points a work array has room; all of them must be finite."""
     return points.shape[0] // BLOCK * WIDTH
 
 
 @njit(forceinline=True)
 def place(i):  # type: ignore[no-untyped-def]
-    """Return where in the work array the first quantity of point ``i`` stands; the others are AT_... behind it."""
+    """Return the index of the first quantity of point ``i`` in the work array; the others follow at AT_...."""
     return i // WIDTH * BLOCK + i % WIDTH
 
 

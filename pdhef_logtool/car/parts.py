@@ -207,9 +207,10 @@ class FittedPhysics(Record):
 class Fit(Record):
     """``fit.toml``, written by ``pdhef learn --stages identify``: the car's physics as the drives show it.
 
-    The noise in ``filter`` was found together with the values and belongs to them (METHOD §14). ``physics`` are those
-    of the filter of that name, whose model has other parts: each filter's are found through itself. ``without_truth``:
-    the drives had none; they calibrated the car on their sensors alone (METHOD §17).
+    The noise in ``filter`` was found together with the values and belongs to them (docs/method.md#identification).
+    ``physics`` are those of the filter of that name, whose model has other parts: each filter's are found through
+    itself. ``without_truth``: the drives had none; they calibrated the car on their sensors alone
+    (docs/method.md#self-calibration).
     """
 
     format: Literal["pdhef-fit"] = "pdhef-fit"

@@ -1,4 +1,4 @@
-"""The prior of one parameter that is fitted: where it is believed to be before a drive is seen."""
+"""Prior of one fitted parameter: its distribution before any drive is used."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from pdhef_logtool.records.errors import VehicleError
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.records.signals import Signals
 
-#: A car is taken to stand below this share of its low-speed blend.
+#: A car is at a standstill below this share of its low-speed blend.
 STANDSTILL_SHARE = 0.1
 GRAVITY_M_S2 = 9.80665
 
@@ -27,28 +27,28 @@ AxleDistance = Annotated[float, Field(ge=0.01, le=15)]
 Coordinate = Annotated[float, Field(ge=-25, le=25)]
 #: TOML has lists alone.
 Position = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
-#: Noise of accelerometers: hard-mounted ones of a 1:10 car show 5 m/s².
+#: Accelerometer noise; rigidly mounted sensors of a 1:10 car have 5 m/s².
 AccelerationStd = Annotated[float, Field(gt=0, le=30)]
-#: More than that is no bias but a mounting that must be mapped.
+#: A larger value is no bias but a mounting error, which belongs in the mapping.
 AccelerationBias = Annotated[float, Field(ge=-5, le=5)]
 AngleStd = Annotated[float, Field(gt=0, le=0.5)]
 
-#: What to do about a wrong entry.
+#: Remedy for a wrong entry.
 REMEDY = "see docs/formats.md for every entry and its unit"
-#: Shape factor of a tyre that is known by its cornering stiffness alone (typical lateral C, Pacejka 2012).
+#: Shape factor of a tyre that is given by its cornering stiffness (typical lateral C, Pacejka 2012).
 STIFFNESS_TYRE_SHAPE = 1.35
 
 
 class Record(BaseModel):
-    """A frozen record whose entries are all known, of the right type and finite."""
+    """Frozen record that rejects unknown entries, wrong types and values that are not finite."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
 class AxleTyre(Record):
-    """Axle magic formula at friction 1 (METHOD Eq 3), or a cornering stiffness alone.
+    """Axle magic formula at friction 1 (Eq 2, docs/method.md#model), or a cornering stiffness alone.
 
-    ``D_n`` is the axle's peak force in N at friction 1. Eq 3 scales the whole curve with friction, its stiffness too;
+    ``D_n`` is the axle's peak force in N at friction 1. Eq 2 scales the whole curve with friction, its stiffness too;
     real tyres keep theirs. With ``reference_friction``, the friction that the curve was measured at, B becomes
     B · reference / friction: the peak follows friction, the stiffness stays (similarity, Pacejka 2012, section 4.2).
     A tyre that is given by ``cornering_stiffness_n_per_rad`` keeps that stiffness at any friction and saturates at
@@ -86,12 +86,12 @@ class Tyres(Record):
 
 
 class Sensors(Record):
-    """1-sigma white noise of the sensors, which is R of the sensor-level filters, and their constant errors.
+    """White noise (1 sigma) and constant errors of the sensors; R of the filters with sensor-level noise.
 
-    A bias is what the sensor reads too much, ``yaw_rate_gain`` what the gyro reads of 1; both are taken off before any
-    estimator sees the signal. ``yaw_rate_delay_s`` is what the gyro's stamps are late by; unless it is 0 it stands in
-    place of the mapping's ``latency_s``. ``*_bias_std`` is the 1-sigma of what is left of a bias from drive to drive,
-    for the filters that estimate it. The defaults are METHOD §9's for a production car's sensors.
+    A bias is reading minus true value, ``yaw_rate_gain`` reading over true value; both are corrected before any
+    estimator receives the signal. ``yaw_rate_delay_s`` is the delay of the gyro's stamps; unless it is 0 it replaces
+    the mapping's ``latency_s``. ``*_bias_std`` is the standard deviation of the remaining bias between drives, for
+    filters that estimate it. The defaults are those of a production car (docs/method.md#sensors).
     """
 
     ax_std_m_s2: AccelerationStd = 0.12
@@ -110,12 +110,15 @@ class Sensors(Record):
 
     @property
     def measurement_std(self) -> tuple[float, float, float]:
-        """1-sigma of what filters measure: a_y, yaw rate, speed."""
+        """Standard deviations of the measurements a_y, yaw rate, speed."""
         return self.ay_std_m_s2, self.yaw_rate_std_rad_s, self.speed_std_m_s
 
 
 class PhysicsParts(Record):
-    """Which parts of the model ``physics`` has beside the static single track (METHOD §16); each needs evidence."""
+    """Parts of the model of ``physics`` beside the static single track; each needs evidence.
+
+    See docs/method.md#physics.
+    """
 
     lag: bool = False
     load_transfer: bool = False
@@ -127,14 +130,16 @@ class PhysicsParts(Record):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The parts that the car has."""
+        """Names of the enabled parts."""
         return tuple(name for name, has in self if has)
 
 
 class VehicleParameters(Record):
-    """Everything that the nominal single-track model needs to know of a vehicle (DESIGN §8). SI units, ISO 8855.
+    """Parameters of a vehicle for the single-track model. SI units, ISO 8855.
 
-    Ranges reach from a 1:10 car to a truck of 40 t; what only contradicts another entry is found by the relations.
+    See docs/formats.md#vehicletoml.
+
+    Ranges include 1:10 cars and trucks of 40 t. Entries that contradict each other are rejected by relations.
     """
 
     name: str = "unnamed"
@@ -145,23 +150,27 @@ class VehicleParameters(Record):
     track_m: Annotated[float, Field(gt=0, le=4)] = 1.55
     cg_height_m: Annotated[float, Field(ge=0, le=4)] = 0.55
     wheel_radius_m: Annotated[float, Field(ge=0.01, le=1.5)] = 0.30
-    steering_ratio: Annotated[float, Field(ge=0.2, le=60)] = 16.0  # 1: the log holds road-wheel angles; trucks to 30
+    steering_ratio: Annotated[float, Field(ge=0.2, le=60)] = (
+        16.0  # 1: the log contains road-wheel angles; trucks up to 30
+    )
     steer_offset_rad: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
-    #: Cars have 0.005 to 0.015, 3 to 8 degrees per g, trucks up to 0.03; a file in degrees is beyond.
+    #: Cars have 0.005 to 0.015 (3 to 8 degrees per g), trucks up to 0.03; a value in degrees is out of range.
     roll_gradient_rad_per_m_s2: Annotated[float, Field(ge=-0.1, le=0.1)] = 0.0
     friction: Friction | None = None
     imu_position_m: Position = (0.0, 0.0, 0.0)
     truth_position_m: Position = (0.0, 0.0, 0.0)
     low_speed_blend_m_s: Annotated[float, Field(ge=0.01, le=30)] = 3.0
-    #: Way over which a lateral axle force builds up; 0.3-0.7 m for car tyres (METHOD §13; Pacejka 2012, chapter 7).
+    #: Distance over which a lateral axle force builds up; 0.3-0.7 m for cars (docs/method.md#physics; Pacejka 2012,
+    #: chapter 7).
     relaxation_length_m: Annotated[float, Field(ge=0, le=10)] = 0.5
-    #: Share of lateral force per load that a tyre loses for each relative excess of load: −p_Dy2/p_Dy1, 0.145/0.990 for
+    #: Relative loss of lateral force per load for each relative excess of load: −p_Dy2/p_Dy1, 0.145/0.990 for
     #: the 205/60 R15 of Pacejka 2012, appendix 3.
     load_sensitivity: Annotated[float, Field(ge=0, lt=1)] = 0.15
-    #: Undamped natural frequency and damping ratio of body roll; 1.5-2 Hz and 0.3-0.4 for cars (METHOD §16).
+    #: Undamped natural frequency and damping ratio of body roll; 1.5-2 Hz and 0.3-0.4 for cars
+    #: (docs/method.md#physics).
     roll_frequency_rad_s: Annotated[float, Field(ge=2, le=60)] = 11.0
     roll_damping: Annotated[float, Field(ge=0.02, le=3)] = 0.35
-    #: 0.7 of the height of the CG for the default sedan (METHOD §16).
+    #: 0.7 of the height of the CG for the default sedan (docs/method.md#physics).
     cg_over_roll_axis_m: Annotated[float, Field(ge=0, le=3)] = 0.4
     physics: PhysicsParts = PhysicsParts()
     sensors: Sensors = Sensors()
@@ -185,7 +194,7 @@ class VehicleParameters(Record):
         return entry if given else f"{entry} (left out: {getattr(self, entry)})"
 
     def _relations(self) -> Iterator[tuple[str, str, tuple[float, ...], float, float]]:
-        """Yield what it is, its entries beside the axles' distances, its values (one may do), and their range."""
+        """Yield name, entries beside the axle distances, values (one must be in range), and range of each relation."""
         length = self.wheelbase_m
         # Near 1 for cars; 0.5 for the paper's sedan, 3.6 for the 1:10 car of the F1TENTH model, a guess of its authors
         # that a fit may still double.
@@ -194,10 +203,10 @@ class VehicleParameters(Record):
         for axle, front in (("front", True), ("rear", False)):
             load, over = self.axle_load_n(front), f"over static load of the {axle} axle"
             if getattr(self.tyres, axle).D_n is not None:
-                # From ice that the file calls friction 1 to a racing tyre's 2, twice that for a crude curve.
+                # From ice at friction 1 of the file to 2 for a racing tyre, and twice that for a rough curve.
                 peak = self.magic_formula(front, 1.0)[2] / load
                 yield f"peak force {over}", f"tyres.{axle}.D_n mass_kg", (peak,), 0.1, 5.0
-            # Per rad: trucks and 1:10 cars 5, cars 8 to 25, racing cars 40. Eq 3 scales it with friction, so that a
+            # Per rad: trucks and 1:10 cars 5, cars 8 to 25, racing cars 40. Eq 2 scales it with friction, so that a
             # curve may be a plausible one at friction 1 or at the file's.
             slopes = tuple(self.cornering_stiffness_n_per_rad(front, mu) / load for mu in (1.0, self.assumed_friction))
             yield f"cornering stiffness {over} in 1/rad", f"tyres.{axle} mass_kg", slopes, 2.0, 100.0
@@ -219,12 +228,12 @@ class VehicleParameters(Record):
 
     @property
     def standstill_m_s(self) -> float:
-        """Speed below which the car stands: the direction of its velocity is noise."""
+        """Speed below which the car is at a standstill: the direction of its velocity is noise."""
         return STANDSTILL_SHARE * self.low_speed_blend_m_s
 
     @property
     def assumed_friction(self) -> float:
-        """Friction of the file, or 1 where the file says nothing (DESIGN §8)."""
+        """Friction of the file, or 1 if the file has no entry (docs/formats.md#vehicletoml)."""
         return 1.0 if self.friction is None else self.friction
 
     def axle_load_n(self, front: bool) -> float:
@@ -257,7 +266,7 @@ class VehicleParameters(Record):
 
 
 def correct_signals(signals: Signals, vehicle: VehicleParameters) -> Signals:
-    """Take steering offset, sensor biases and gain off the signals; all estimators get the result."""
+    """Correct the signals for steering offset, sensor biases and gyro gain; all estimators receive the result."""
     sensors = vehicle.sensors
     return replace(
         signals,
@@ -269,7 +278,7 @@ def correct_signals(signals: Signals, vehicle: VehicleParameters) -> Signals:
 
 
 def corrected_anew(signals: Signals, was: VehicleParameters, vehicle: VehicleParameters) -> Signals:
-    """Return signals that were read and corrected with one vehicle as another one's ratio, offset and biases do it."""
+    """Return signals that one vehicle's ratio, offset and biases corrected, as those of another correct them."""
     before, after = was.sensors, vehicle.sensors
     if (was.steering_ratio, was.steer_offset_rad, before) == (vehicle.steering_ratio, vehicle.steer_offset_rad, after):
         return signals
@@ -283,12 +292,12 @@ def corrected_anew(signals: Signals, was: VehicleParameters, vehicle: VehiclePar
     return correct_signals(raw, vehicle)
 
 
-#: Table 3 of the paper, with METHOD §2's nominal axle tyres. Used when no vehicle file is given.
+#: Table 3 of the paper, with axle tyres fitted at friction 0.85. Used when no vehicle file is given.
 DEFAULT_VEHICLE_NAME = "sedan"
 
 
 def default_vehicle() -> VehicleParameters:
-    """Return the paper's sedan (Table 3) with METHOD §2's tyres at friction 0.85."""
+    """Return the paper's sedan (Table 3) with nominal tyres at friction 0.85."""
     return VehicleParameters(
         name=DEFAULT_VEHICLE_NAME,
         mass_kg=1440.0,

@@ -53,7 +53,7 @@ class FrictionSource:
     note : what a user must be told before the run; empty: nothing.
     constant : told to all estimators; None leaves the signals' own (and the vehicle file's where they have none).
     bank : estimates it; None where nothing is estimated.
-    factor : by which what topic or option tell is made wrong on purpose, for training (METHOD §3).
+    factor : by which what topic or option tell is made wrong on purpose, for training (docs/method.md#limits).
     stamps, observable_stamps : of the windows so far.
     """
 

@@ -1,7 +1,7 @@
 """``physics`` and ``pd-hef``: the physics filter with trust times a network's residual, and an adaptive mechanism.
 
 There is one set of noise, that of the car's physics: trust scales the residual only, and ``physics`` is trust 0 without
-a network. The mechanism (METHOD §7, §15) does not read model error as noise.
+a network. The mechanism (docs/method.md#adaptation) does not read model error as noise.
 
 Bottom layer: :mod:`~.sensor_faults` looks at a_y and yaw rate alone. What it finds goes into every filter here, the
 parallel one too, and keeps bad samples from the network.

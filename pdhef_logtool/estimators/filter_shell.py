@@ -48,14 +48,15 @@ MOTION = 3  # entries of the state that an output has a covariance of
 U_STEER, U_AX, U_FRICTION, U_AX_KNOWN, U_SPEED = 0, 1, 2, 3, 4
 INPUTS = 5
 
-#: Speed process noise where the log has no longitudinal accelerometer: the speed is then a random walk (METHOD §1).
+#: Speed process noise where the log has no longitudinal accelerometer: the speed is then a random walk
+#: (docs/method.md#frame).
 NO_AX_Q_STD = 3.0
 INITIAL_STD = (0.5, 0.5, 0.1, 0.3)
 #: The last steering angle is kept for this long where the signal is missing.
 STEER_HOLD_S = 0.2
 #: A sample further from its prediction than this many standard deviations is not used ...
 GATE_SIGMA = 6.0
-#: ... unless it has been so for this long: then the filter is wrong, not the sensor (METHOD §6, no lock-out).
+#: ... unless it has been so for this long: then the filter is wrong, not the sensor (docs/method.md#gate).
 GATE_OPENS_AFTER_S = 0.2
 GATE_INFLATION = 10.0
 STANDSTILL_SPEED_M_S = 0.05
@@ -355,7 +356,7 @@ def innovate(k, now, r_std, extra_r, z_hat, S, nu):  # type: ignore[no-untyped-d
 
 @njit(cache=True)
 def gate(now, memory, nu, S, at_gate, given, use):  # type: ignore[no-untyped-def]
-    """Decide which samples are used; those that are out of the gate for too long open it (METHOD §6).
+    """Decide which samples are used; those that are out of the gate for too long open it (docs/method.md#gate).
 
     Writes which samples there are (``given``), which are used, and the innovation with those beyond it at the gate.
     """

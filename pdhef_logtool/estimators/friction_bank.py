@@ -1,4 +1,4 @@
-"""Road friction on line, from a bank of filters that each assume another one (METHOD §8).
+"""Road friction on line, from a bank of filters that each assume another one (docs/method.md#friction).
 
 Every filter j of the bank has the state [v_y, r] at its own friction μ_j, and the speed and held inputs of one
 ``phy-ukf`` beside the bank. It is an extended Kalman filter on the nominal model, a_y corrected for body roll, R at

@@ -1,13 +1,14 @@
 """``pd-hef-paper``: the paper's hybrid filter with its dual-layer adaptive mechanism, to the letter (Eq 19-26).
 
-It is on record for comparison and is not the filter to use: METHOD §7 says what the mechanism costs. Per step k:
+It is on record for comparison and is not the filter to use: docs/method.md#paper-adaptation gives the reason. Per step
+k:
 
 - β_k from the fuzzy rules (Eq 24, 25, Table 2); a_y,nom is the nominal model's at the parallel physics filter's prior,
   without residual. A missing a_y leaves β where it was.
 - χ_k = RK4(f_nom; χ_{k−1}, u) + β_k Δx_net(I_{k−1}), the increment whole at the step's end (Eq 19); mean and
   covariance with Q_k = Q_0 (1 + γ β_k) (Eq 20, 21, 26); sigma points anew. Eq 19 writes u_{k−1}; u is the mean of
   u_{k−1} and u_k, as in ``phy-ukf`` and in the residual targets, so that half a step of delay is not held against it.
-- h_ay = ΣF/m + β_k Δx_net[v_y]/Δt: the residual belongs to the predicted a_y too (METHOD §6).
+- h_ay = ΣF/m + β_k Δx_net[v_y]/Δt: the residual belongs to the predicted a_y too (docs/method.md#hybrid).
 - C_k = θ C_{k−1} + (1 − θ) ν νᵀ and R_k = max(R_0, C_k − P_zz) on the diagonal (Eq 22, 23). C starts at P_zz + R_0.
 
 What the paper does not say is as in ``phy-ukf``: state [v_x, v_y, r, b_ax], Q_0, wheel speed as a measurement, start
@@ -60,7 +61,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
     from pdhef_logtool.estimators.table import Options
 
-#: θ of Eq 22 and γ of Eq 26: the paper names no values, METHOD §7 fixes these.
+#: θ of Eq 22 and γ of Eq 26: the paper names no values, docs/method.md#paper-adaptation fixes these.
 FORGETTING = 0.95
 PROCESS_NOISE_GAIN = 3.0
 #: Undisturbed norm of R in the paper's Figure 20; a_y has nearly all of it, so that it is the variance of a_y, m²/s⁴.

@@ -1,4 +1,4 @@
-"""The pure physics filter that runs beside the network and gives it its features (METHOD §5).
+"""The pure physics filter that runs beside the network and gives it its features (docs/method.md#network).
 
 Which one a network was trained with stands in its bundle: ``physics``, or ``phy-ukf`` for the paper's network and the
 baselines beside it, which are frozen.

@@ -1,11 +1,11 @@
-"""``phy-ukf``: the pure physics unscented Kalman filter on the nominal single-track model (METHOD §1, §2, §6).
+"""``phy-ukf``: the pure physics unscented Kalman filter on the nominal single-track model (docs/method.md#filter).
 
 State [v_x, v_y, r, b_ax]; b_ax is a slow bias of the longitudinal accelerometer (grade, pitch). Optional states
 behind it: the biases of a_y, yaw rate and steering angle, and the force scale s, by which model and residual are taken
-to be wrong: (1 + s) times their forces, an Ornstein-Uhlenbeck process (METHOD §12, §15). Measurements [a_y, r, v_x],
-each of which may be missing at any step. Without options this is the paper's physics baseline and frozen: R at sensor
-level from the vehicle file, Q by innovation likelihood (``studies/defaults/tune_physics_q.py``). What is not the model
-is in :mod:`~.filter_shell`.
+to be wrong: (1 + s) times their forces, an Ornstein-Uhlenbeck process (docs/method.md#physics). Measurements [a_y, r,
+v_x], each of which may be missing at any step. Without options this is the paper's physics baseline and frozen: R at
+sensor level from the vehicle file, Q by innovation likelihood (``studies/defaults/tune_physics_q.py``). What is not the
+model is in :mod:`~.filter_shell`.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ BIAS_STATES = 3
 PHY_UKF_Q_STD = (0.089, 0.31, 0.062, 0.021)
 #: Random walk of the a_y (m/s²), yaw-rate (rad/s) and steering (rad) bias, 1-sigma per square root of second.
 BIAS_WALK_STD = (0.004, 0.00008, 0.00002)
-#: Force scale: its spread, and the time constant with which it returns to 0 (METHOD §15).
+#: Force scale: its spread, and the time constant with which it returns to 0 (docs/method.md#physics).
 FORCE_SCALE_STD = 0.05
 FORCE_SCALE_TIME_S = 2.0
 

@@ -1,4 +1,6 @@
-"""The single-track model of ``physics``: axle forces that lag, load transfer, braking, roll, bank (METHOD §3, §16).
+"""The single-track model of ``physics``: axle forces that lag, load transfer, braking, roll, bank.
+
+See docs/method.md#physics.
 
 State of a point, ISO 8855, SI, at the centre of gravity: [v_x, v_y, r, b_ax, f_f, f_r] and, each where the car has that
 part, [φ, φ̇], [bank], [s], [b_δ], [b_ay, b_r]. f = F_y / m is an axle's lateral force over the vehicle's mass in m/s².
@@ -49,7 +51,7 @@ PLACES = 13
 LANES = 8
 WIDTH = 3 * LANES
 
-#: Time constant with which the bank returns to 0 (METHOD §16).
+#: Time constant with which the bank returns to 0 (docs/method.md#physics).
 BANK_TIME_S = 5.0
 #: Largest product of step and the roll mode's frequency; longer steps are divided.
 _MAX_ROLL_STEP = 0.5

@@ -1,9 +1,9 @@
 """``physics``: the strongest filter on physics alone, with the parts that a car's driving gives evidence for.
 
-An unscented filter on the model of :mod:`~.physics_model` (METHOD §6, §16). As the axles' forces and the roll are
-states, what the sensors read is linear in the state but for a lever arm's r²: the update takes the derivative, which
-for a linear function is what the sigma points give. Points that differ in the sensors' biases alone move with their
-centre.
+An unscented filter on the model of :mod:`~.physics_model` (docs/method.md#filter). As the axles' forces and the roll
+are states, what the sensors read is linear in the state but for a lever arm's r²: the update takes the derivative,
+which for a linear function is what the sigma points give. Points that differ in the sensors' biases alone move with
+their centre.
 
 A residual rate of v̇_y and ṙ enters as in ``phy-ukf``: half before and half after the model's step, and in the
 predicted a_y, times the force scale where that is a state. Zeros change no bit.

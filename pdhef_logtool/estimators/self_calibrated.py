@@ -2,7 +2,8 @@
 
 What a whole log says of its car is known only at its end: none of them is causal.
 
-Their variance of sideslip is their own, what the parameters leave open, and what the sensors contradict (METHOD §17):
+Their variance of sideslip is their own, what the parameters leave open, and what the sensors contradict
+(docs/method.md#intervals):
 
     s² = (k_o s_own)² + (Σ_i (v_y,i − v_y)² + (k_d d2)²) / v_x²,
 

@@ -1,4 +1,4 @@
-"""``pd-hef-smoothed``: Rauch-Tung-Striebel smoothing over ``pd-hef`` (METHOD §12, §14). Not causal.
+"""``pd-hef-smoothed``: Rauch-Tung-Striebel smoothing over ``pd-hef`` (docs/method.md#smoothing). Not causal.
 
 Forward run the filters of ``pd-hef``, each with its residual, on checked signals (:mod:`~.checked_inputs`);
 backward goes each of them, from the last step that is seen,

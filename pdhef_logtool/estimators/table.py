@@ -33,7 +33,8 @@ class Options:
 
     Attributes
     ----------
-    use_speed : False is the paper's ``esp`` suite for the filters: the speed sensor only starts them (METHOD §1).
+    use_speed : False is the paper's ``esp`` suite for the filters: the speed sensor only starts them
+    (docs/method.md#frame).
     trust : of the hybrid filters, in [0, 1]; None: what the car's evidence allows.
     network : of the car, ready to run, where several estimators share it; None: made anew.
     """

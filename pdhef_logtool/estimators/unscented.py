@@ -1,4 +1,6 @@
-"""The scaled unscented transform and the Kalman update on it, compiled (Wan & van der Merwe 2000; METHOD §6).
+"""The scaled unscented transform and the Kalman update on it, compiled (Wan & van der Merwe 2000).
+
+See docs/method.md#filter.
 
 All functions work on small float64 arrays in place of allocation where it matters, and know nothing of vehicles.
 """

@@ -28,7 +28,8 @@ def block_bootstrap_interval(
 
     Parameters
     ----------
-    errors : NaN does not count. stamps_ns : int64 [N]. block_s : METHOD asks for at least 10 s. n : resamples.
+    errors : NaN does not count. stamps_ns : int64 [N]. block_s : at least 10 s (docs/method.md#evaluation). n :
+    resamples.
     """
     sums, counts, _ = block_sums([errors], stamps_ns, block_s)
     return rmse_interval(sums, counts, n=n, seed=seed, level=level)

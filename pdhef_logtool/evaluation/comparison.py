@@ -11,7 +11,7 @@ import numpy as np
 from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference, block_bootstrap_interval
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
-#: Errors are correlated over seconds (METHOD §10).
+#: Errors are correlated over seconds (docs/method.md#evaluation).
 BLOCK_S = 10.0
 
 

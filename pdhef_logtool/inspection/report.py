@@ -21,7 +21,8 @@ from pdhef_logtool.inspection.uses import uses_of
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
 from pdhef_logtool.logs.byte_account import checksummed_share
 from pdhef_logtool.logs.container import Wanted
-from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, LogIndex, TopicInfo, windows
+from pdhef_logtool.logs.drive_log import DriveLog, LogIndex, TopicInfo, windows
+from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping import (

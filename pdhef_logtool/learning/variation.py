@@ -1,4 +1,4 @@
-"""Wrong friction and wrong vehicle files on purpose: what a network must get along with (METHOD §3, §14).
+"""Wrong friction and wrong vehicle files on purpose: what a network must get along with (docs/method.md#limits).
 
 In service the nominal model is told a friction and a vehicle that are not quite those of the drive. A network that was
 trained on right ones takes a model error for something else. So a share of the drives of a training set is extracted

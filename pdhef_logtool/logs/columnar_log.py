@@ -23,8 +23,9 @@ from pdhef_logtool.logs.decoding import (
     missing_column,
 )
 from pdhef_logtool.logs.definitions import SHIPPED
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, FieldInfo, TopicInfo, nearest
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, nearest
 from pdhef_logtool.logs.message_schema import (
+    FieldInfo,
     MessageSchema,
     MissingDefinitionError,
     NoSchemaError,

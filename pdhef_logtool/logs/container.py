@@ -19,7 +19,7 @@ from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import IntArray, Loss
 
 if TYPE_CHECKING:
-    from pdhef_logtool.logs.formats import LogFile
+    from pdhef_logtool.logs.log_file import LogFile
 
 # What the files of each format begin with.
 MCAP_MAGIC = b"\x89MCAP0\r\n"

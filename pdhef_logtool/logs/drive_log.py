@@ -10,13 +10,14 @@ from __future__ import annotations
 import difflib
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_account import ByteLedger
+from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.occupied_time import OccupiedTime
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import MappingError
@@ -35,23 +36,6 @@ class TopicInfo:
     type_name: str
     encoding: str  # of its messages: "cdr" | "ros1" | "json" | "protobuf" | ...; of tables the kind of log
     messages: int
-
-
-@dataclass(frozen=True, slots=True)
-class FieldInfo:
-    """One scalar leaf of a topic's schema.
-
-    ``path`` is dotted (``linear_acceleration.x``); fixed arrays appear as ``name[i]`` per element when they have at
-    most 16 elements, sequences as ``name[]``. ``kind`` is ``number``, ``bool``, ``string`` or ``time`` (a ROS
-    builtin time, whose path names the whole struct, for example ``header.stamp``). ``code`` is NumPy's of a number in a
-    binary message (``f4``), empty where the encoding has no such types. ``unit`` is the text that the file gives
-    (``km/h``), empty where it gives none.
-    """
-
-    path: str
-    kind: str
-    code: str = field(default="", compare=False)
-    unit: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,12 +10,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pdhef_logtool.logs.budget import Meter
 from pdhef_logtool.logs.container import MCAP_MAGIC, ROSBAG1_MAGIC, SQLITE_MAGIC, Container
-from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.logs.log_file import LogFile
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.drive_log import DriveLog
@@ -27,29 +25,6 @@ HEAD_BYTES = 16
 COMPRESSED_SUFFIXES = (".zstd", ".zst")
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 ROSBAG2_METADATA = "metadata.yaml"
-
-
-@dataclass(frozen=True, slots=True)
-class LogFile:
-    """A file to open.
-
-    Attributes
-    ----------
-    path : on this machine. place : as the user named it; ``path`` may be a decompressed or downloaded copy.
-    meter : what reading may cost. release : to be called when the log is closed; removes a copy.
-    cut : why a copy does not have all of the file; empty where it does.
-    """
-
-    path: Path
-    place: LogPlace
-    meter: Meter
-    release: Callable[[], None] = lambda: None
-    cut: str = ""
-
-    @property
-    def is_copy(self) -> bool:
-        """Whether it is not the file itself."""
-        return self.path != self.place
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,14 +8,14 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
 from pdhef_logtool.logs.definitions import SHIPPED, Definitions
-from pdhef_logtool.logs.drive_log import FieldInfo
+from pdhef_logtool.logs.schema_files import referenced
 from pdhef_logtool.records.errors import MappingError, PdhefError
 
 if TYPE_CHECKING:
@@ -33,6 +33,23 @@ VECTOR_ORDERS: dict[frozenset[str], tuple[str, ...]] = {
 TIME_MEMBERS = (("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec"), ("seconds", "nanos"))
 
 Step: TypeAlias = str | int
+
+
+@dataclass(frozen=True, slots=True)
+class FieldInfo:
+    """One scalar leaf of a topic's schema.
+
+    ``path`` is dotted (``linear_acceleration.x``); fixed arrays appear as ``name[i]`` per element when they have at
+    most 16 elements, sequences as ``name[]``. ``kind`` is ``number``, ``bool``, ``string`` or ``time`` (a ROS
+    builtin time, whose path names the whole struct, for example ``header.stamp``). ``code`` is NumPy's of a number in a
+    binary message (``f4``), empty where the encoding has no such types. ``unit`` is the text that the file gives
+    (``km/h``), empty where it gives none.
+    """
+
+    path: str
+    kind: str
+    code: str = field(default="", compare=False)
+    unit: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,19 +264,6 @@ def _store_of(distro: str) -> Any:
     from rosbags.typesys import Stores
 
     return getattr(Stores, f"ROS2_{distro.upper()}", Stores.LATEST) if distro else Stores.LATEST
-
-
-def referenced(types: Mapping[str, Any]) -> set[str]:
-    """Return the names of the types that types contain directly."""
-    from rosbags.interfaces import Nodetype
-
-    names: set[str] = set()
-    for _, members in types.values():
-        for _, (kind, args) in members:
-            inner_kind, inner = (kind, args) if kind in (Nodetype.BASE, Nodetype.NAME) else args[0]
-            if inner_kind == Nodetype.NAME:
-                names.add(inner)
-    return names
 
 
 def _completed(

@@ -32,11 +32,11 @@ from pdhef_logtool.logs.formats import (
     HEAD_BYTES,
     ROSBAG2_METADATA,
     ZSTD_MAGIC,
-    LogFile,
     log_suffixes,
     recognised_format,
     what_is_a_log,
 )
+from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.logs.slim_log import SlimLog, slim_record
 from pdhef_logtool.records.documents import read_text

@@ -31,7 +31,7 @@ from pdhef_logtool.records.files import scratch_folder
 from pdhef_logtool.records.signals import IntArray
 
 if TYPE_CHECKING:
-    from pdhef_logtool.logs.formats import LogFile
+    from pdhef_logtool.logs.log_file import LogFile
 
 _PAGE_ROWS = 8192
 _PAGE_BYTES = 4 << 20

@@ -67,8 +67,6 @@ def _shipped_parts(types: Mapping[str, Any], known: set[str]) -> dict[str, Any]:
     """Return the shipped types that others contain and nobody knows, at any depth."""
     from rosbags.typesys import get_types_from_msg
 
-    from pdhef_logtool.logs.message_schema import referenced
-
     found: dict[str, Any] = {}
     todo = referenced(types) - known - set(types)
     while todo:
@@ -76,3 +74,16 @@ def _shipped_parts(types: Mapping[str, Any], known: set[str]) -> dict[str, Any]:
         found |= get_types_from_msg(shipped_definition(name), name)
         todo |= referenced(found) - known - set(types) - set(found)
     return found
+
+
+def referenced(types: Mapping[str, Any]) -> set[str]:
+    """Return the names of the types that types contain directly."""
+    from rosbags.interfaces import Nodetype
+
+    names: set[str] = set()
+    for _, members in types.values():
+        for _, (kind, args) in members:
+            inner_kind, inner = (kind, args) if kind in (Nodetype.BASE, Nodetype.NAME) else args[0]
+            if inner_kind == Nodetype.NAME:
+                names.add(inner)
+    return names

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.container import told
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, FieldInfo, TopicInfo, nearest
-from pdhef_logtool.logs.formats import LogFile
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, nearest
+from pdhef_logtool.logs.log_file import LogFile
+from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.occupied_time import OccupiedTime, survey_stamps
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import IntArray, Loss

@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_account import ByteLedger
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, FieldInfo, TopicInfo
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo
+from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.occupied_time import OccupiedTime
 from pdhef_logtool.mapping.records import CAN_PREFIX, CanSettings, SignalSource
 from pdhef_logtool.mapping.records import Mapping as SignalMapping

@@ -14,7 +14,8 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, TopicInfo
+from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
 from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings

@@ -7,7 +7,8 @@ from dataclasses import replace
 from difflib import get_close_matches
 from typing import TypeVar
 
-from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.records import AUTO_STAMP, RECORDER_STAMPS, Mapping, QualityGate, SignalSource
 from pdhef_logtool.records.errors import MappingError

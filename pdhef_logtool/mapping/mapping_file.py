@@ -1,4 +1,4 @@
-"""mapping.toml: strict reading, and writing ready to edit (DESIGN §8)."""
+"""mapping.toml: strict reading, and writing ready to edit (docs/formats.md#mappingtoml)."""
 
 from __future__ import annotations
 

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, TopicInfo
+from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.checking import stamp_path_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, Seen
 from pdhef_logtool.mapping.naming import meaning_of, unit_of, words_of

@@ -12,7 +12,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from pdhef_logtool.logs.drive_log import FieldInfo, TopicInfo
+from pdhef_logtool.logs.drive_log import TopicInfo
+from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.naming import Meaning
 from pdhef_logtool.mapping.records import VECTOR_COLUMNS, SignalSource
 from pdhef_logtool.records.documents import checked, read_toml

@@ -63,7 +63,7 @@ class Release:
 def released_steps(ready_ns: IntArray, stamps_ns: IntArray) -> IntArray:
     """Return for each scored stamp the newest step whose data had arrived by then, −1 for none.
 
-    ``ready_ns`` [K] is non-decreasing, ``stamps_ns`` [M]; the result is int64 [M] (METHOD §1, §6 "Delay").
+    ``ready_ns`` [K] is non-decreasing, ``stamps_ns`` [M]; the result is int64 [M] (docs/method.md#delay).
     """
     return np.searchsorted(ready_ns, stamps_ns, side="right").astype(np.int64) - 1
 

@@ -1,4 +1,4 @@
-"""The network's inputs, one piece of code for training and service (METHOD §5, §16).
+"""The network's inputs, one piece of code for training and service (docs/method.md#network).
 
 A filter on physics runs in parallel and gives the reference for ε_phy: Δr = r_m − r̂⁻ and Δβ = β̂⁺ − β̂⁻, prior and
 posterior of that filter. Nothing here depends on what the hybrid filter does, and nothing on truth.

@@ -1,4 +1,4 @@
-"""The network over a whole log in one pass per window, with carried state (METHOD §5)."""
+"""The network over a whole log in one pass per window, with carried state (docs/method.md#network)."""
 
 from __future__ import annotations
 

@@ -111,7 +111,7 @@ def find_events(
         if reason is not None:
             left_out[log.label] = reason
             unreadable += log.label in damaged or log.outcome.startswith("failed")
-    if not searched and left_out:
+    if not searched:
         _check_tracks([log for log in run.logs if log.label not in damaged], condition, estimator)
     lines = tuple(damaged.values())
     return FoundEvents(condition.text, searched, tuple(events), left_out, unreadable > 0, unreadable, lines)

@@ -1,29 +1,26 @@
 """Conditions on the columns of tracks: ``abs(sideslip_error_deg) > 2 and speed_m_s > 10 for 0.5s``.
 
-::
+The syntax is that of Python's expressions (:mod:`ast` parses it, nothing is evaluated): comparisons joined by ``and``,
+``or`` and ``not``; ``+ - * /``, ``abs`` and brackets within them; at the end an optional minimum duration
+``for NUMBER s``. A column is ``[TRACK.]COLUMN``; a track whose name has other characters than letters, digits and
+hyphens is quoted: ``"pd-hef:gain=1".sideslip_rad``.
 
-    condition:  either [for NUMBER s]        holds at least so long
-    either:     both {or both}
-    both:       one {and one}
-    one:        not one | sum [(< | <= | > | >= | == | !=) sum]
-    sum:        product {(+ | -) product}
-    product:    atom {(* | /) atom}
-    atom:       NUMBER | [-] atom | abs(sum) | (either) | [TRACK.]COLUMN
-
-A column is one of estimates.parquet, ``speed_m_s``, or the error of a scored signal against the truth, with ``error``
-before its unit: ``sideslip_error_rad``, ``vx_error_m_s``. Each column in rad may be asked for in deg, each in m/s in
-km_h. What is not known, as an error without truth, is neither true nor false.
+A column is one of estimates.parquet, ``speed_m_s``, or the error of a scored signal against the ground truth, with
+``error`` before its unit: ``sideslip_error_rad``, ``vx_error_m_s``. Columns in rad are also available in deg, columns
+in m/s in km_h. A missing value, such as an error without ground truth, is neither true nor false.
 """
 
 from __future__ import annotations
 
+import ast
 import math
 import operator
 import re
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Any, NoReturn, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -40,13 +37,15 @@ COLUMNS = (*(c for c in TRACK_COLUMNS if c != "stamp_ns"), SPEED, *ERRORS)
 #: Ends of names that people may write instead: the end in our files, and the factor from it.
 _UNITS = {"_deg": ("_rad", math.degrees(1.0)), "_deg_s": ("_rad_s", math.degrees(1.0)), "_km_h": ("_m_s", 3.6)}
 _MOST_SIGNS, _DEEPEST = 2000, 40
-_TOKEN = re.compile(
-    r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)"
-    r"|(?P<name>[A-Za-z_]\w*(?:(?:-\w+)*\.[A-Za-z_]\w*)?)"
-    r"|(?P<sign><=|>=|==|!=|[-+*/<>()]))",
-    re.ASCII,
-)
+#: A track before its column; hyphens are no part of a name for :mod:`ast`.
+_TRACK = re.compile(r"[A-Za-z_]\w*(?:-\w+)+(?=\.)", re.ASCII)
+_DURATION = re.compile(r"\bfor\b\s*(?:(?P<number>[\d.]+(?:[eE][+-]?\d+)?)\s*)?(?P<rest>.*)$", re.ASCII)
 _COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
+_SIGNS: dict[type[ast.AST], str] = {
+    ast.And: "and", ast.Or: "or", ast.Not: "not", ast.USub: "minus",
+    ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/",
+    ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=",
+}  # fmt: skip
 #: What an :class:`Applied` does, on arrays as on expressions of polars.
 OPERATIONS: dict[str, Callable[..., Any]] = {
     "not": operator.invert, "minus": operator.neg, "abs": abs, "and": operator.and_, "or": operator.or_,
@@ -111,13 +110,14 @@ def parse_condition(text: str, columns: tuple[str, ...] = COLUMNS, guide: str = 
     UsageError
         It does not parse, names no column, or mixes numbers with what is true or false; the place is told.
     """
-    parser = _Parser(text, columns, guide)
-    node = parser.condition()
+    plain = "".join(" " if sign.isspace() else sign for sign in text)
+    parser = _Parser(plain, columns, guide)
+    node, least_s = parser.condition()
     compared = next((n for n in _all(node) if isinstance(n, Applied) and n.of in _COMPARISONS), None)
     return Condition(
         text=" ".join(text.split()),
         node=node,
-        least_s=parser.least_s,
+        least_s=least_s,
         peak=None if compared is None else compared.operands[0],
         falls=compared is not None and compared.of in ("<", "<="),
     )
@@ -155,195 +155,123 @@ def is_flag(node: Node) -> bool:
     return isinstance(node, Column) and node.name in FLAGS
 
 
-#: A rule of the grammar.
-_Rule: TypeAlias = Callable[[], Node]
-
-
 class _Parser:
+    """Turns a text into nodes; every failure is a UsageError with its place in the text."""
+
     def __init__(self, text: str, columns: tuple[str, ...], guide: str) -> None:
         self._text, self._columns, self._guide = text, columns, guide
-        self.least_s = 0.0
-        self._depth = 0
-        if len(text) > _MOST_SIGNS:
+        self._start = len(text) - len(text.lstrip())
+
+    def condition(self) -> tuple[Node, float]:
+        """Return the condition and its minimum duration in s."""
+        if len(self._text) > _MOST_SIGNS:
             raise UsageError(
-                expected=f"a condition of at most {_MOST_SIGNS} signs", got=f"{len(text)} signs", where="--where"
+                expected=f"a condition of at most {_MOST_SIGNS} signs", got=f"{len(self._text)} signs", where="--where"
             )
-        self._tokens = list(self._split())
-        self._at = 0
+        if not self._text.isascii():
+            raise self._error(
+                "a column, a number or a sign", next(k for k, c in enumerate(self._text) if not c.isascii())
+            )
+        duration = _DURATION.search(self._text)
+        end = len(self._text) if duration is None else duration.start()
+        root = self._parsed(self._text[self._start : end].rstrip())
+        node = self._node(root, 0)
+        if not is_flag(node):
+            raise self._error("a condition, such as a comparison", self._start)
+        return node, 0.0 if duration is None else self._seconds(duration)
 
-    def condition(self) -> Node:
-        node = self._flag(self._either, "a condition")
-        if self._take("for"):
-            self.least_s = self._number("a time such as 0.5s")
-            if not self._take("s"):
-                self._fail("s, for seconds")
-        if self._kind != "end":
-            self._fail("and, or, for, or the end")
+    def _seconds(self, duration: re.Match[str]) -> float:
+        try:
+            seconds = float(duration["number"] or "")
+        except ValueError:
+            raise self._error(
+                "a time such as 0.5s", duration.start("number" if duration["number"] else "rest")
+            ) from None
+        if duration["rest"].strip() != "s":
+            raise self._error("s, for seconds", duration.start("rest"))
+        return seconds
+
+    def _parsed(self, text: str) -> ast.expr:
+        #: The names of tracks as they were written, by the names that stand for them.
+        self._tracks = {name.replace("-", "_"): name for name in _TRACK.findall(text)}
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                return ast.parse(_TRACK.sub(lambda name: name[0].replace("-", "_"), text), mode="eval").body
+        except (MemoryError, RecursionError):
+            raise self._error(f"at most {_DEEPEST} brackets and signs inside one another", self._start) from None
+        except (SyntaxError, ValueError) as error:
+            offset = getattr(error, "offset", None) or len(text) + 1  # 0: at the end
+            place = self._start + min(offset - 1, len(text))
+            raise self._error("a condition on columns, numbers and abs()", place) from None
+
+    def _node(self, of: ast.expr, depth: int) -> Node:
+        if depth > _DEEPEST:
+            raise self._error(f"at most {_DEEPEST} brackets and signs inside one another", of)
+        match of:
+            case ast.BoolOp(op=op, values=[first, *others]):
+                node = self._flag(first, depth)
+                for other in others:
+                    node = Applied(_SIGNS[type(op)], (node, self._flag(other, depth)))
+                return node
+            case ast.UnaryOp(op=ast.Not(), operand=operand):
+                return Applied("not", (self._flag(operand, depth),))
+            case ast.UnaryOp(op=ast.USub(), operand=operand):
+                return Applied("minus", (self._number(operand, depth),))
+            case ast.BinOp(left=left, op=op, right=right) if type(op) in _SIGNS:
+                return Applied(_SIGNS[type(op)], (self._number(left, depth), self._number(right, depth)))
+            case ast.Compare(left=left, ops=[op], comparators=[right]) if type(op) in _SIGNS:
+                return Applied(_SIGNS[type(op)], (self._number(left, depth), self._number(right, depth)))
+            case ast.Compare(comparators=[_, second, *_]):
+                raise self._error("and between two comparisons", second)
+            case ast.Call(func=ast.Name(id="abs"), args=[operand], keywords=[]):
+                return Applied("abs", (self._number(operand, depth),))
+            case ast.Constant(value=bool()):
+                raise self._error("a column, a number, abs or (", of)
+            case ast.Constant(value=int() | float() as value):
+                return Number(float(value))
+            case ast.Name(id=name):
+                return self._column(None, name, of)
+            case ast.Attribute(value=ast.Name(id=track), attr=name):
+                return self._column(self._tracks.get(track, track), name, of)
+            case ast.Attribute(value=ast.Constant(value=str() as track), attr=name):
+                return self._column(track, name, of)
+        raise self._error("a column, a number, abs or (", of)
+
+    def _flag(self, of: ast.expr, depth: int) -> Node:
+        node = self._node(of, depth + 1)
+        if not is_flag(node):
+            raise self._error("a comparison or a flag", of)
         return node
 
-    def _either(self) -> Node:
-        return self._joined(self._both, "or")
-
-    def _both(self) -> Node:
-        return self._joined(self._one, "and")
-
-    def _joined(self, part: _Rule, word: str) -> Node:
-        start = self._at
-        node = part()
-        while self._word == word:
-            self._must_be_flag(node, start)
-            self._at += 1
-            start = self._at
-            other = part()
-            self._must_be_flag(other, start)
-            node = Applied(word, (node, other))
+    def _number(self, of: ast.expr, depth: int) -> Node:
+        node = self._node(of, depth + 1)
+        if is_flag(node):
+            raise self._error("a number", of)
         return node
 
-    def _one(self) -> Node:
-        if self._take("not"):
-            start = self._at
-            node = self._deeper(self._one)
-            self._must_be_flag(node, start)
-            return Applied("not", (node,))
-        start = self._at
-        node = self._sum()
-        if self._word in _COMPARISONS:
-            self._must_be_number(node, start)
-            sign = self._next()
-            start = self._at
-            other = self._sum()
-            self._must_be_number(other, start)
-            node = Applied(sign, (node, other))
-            if self._word in _COMPARISONS:
-                self._fail("and between two comparisons")
-        return node
-
-    def _sum(self) -> Node:
-        return self._calculated(self._product, ("+", "-"))
-
-    def _product(self) -> Node:
-        return self._calculated(self._atom, ("*", "/"))
-
-    def _calculated(self, part: _Rule, signs: tuple[str, ...]) -> Node:
-        start = self._at
-        node = part()
-        while self._word in signs:
-            self._must_be_number(node, start)
-            sign = self._next()
-            start = self._at
-            other = part()
-            self._must_be_number(other, start)
-            node = Applied(sign, (node, other))
-        return node
-
-    def _atom(self) -> Node:
-        if self._take("-"):
-            start = self._at
-            node = self._deeper(self._atom)
-            self._must_be_number(node, start)
-            return Applied("minus", (node,))
-        if self._take("("):
-            node = self._deeper(self._either)
-            self._close()
-            return node
-        if self._kind == "number":
-            return Number(self._number(""))
-        if self._kind != "name" or self._word in ("and", "or", "not", "for"):
-            self._fail("a column, a number, abs or (")
-        if self._word == "abs" and self._tokens[self._at + 1][1] == "(":
-            self._at += 2
-            start = self._at
-            node = self._deeper(self._sum)
-            self._must_be_number(node, start)
-            self._close()
-            return Applied("abs", (node,))
-        return self._column()
-
-    def _column(self) -> Column:
-        track, _, name = self._word.rpartition(".")
+    def _column(self, track: str | None, name: str, place: ast.expr) -> Column:
         ours, factor = name, 1.0
         for end, (ending, times) in _UNITS.items():
             if name.endswith(end) and name.removesuffix(end) + ending in self._columns:
                 ours, factor = name.removesuffix(end) + ending, times
         if ours not in self._columns:
             near = get_close_matches(name, [*self._columns, *_in_other_units(self._columns)], n=1, cutoff=0.5)
-            self._fail(f"a column such as {near[0]}" if near else f"a column: {', '.join(self._columns)}")
+            raise self._error(f"a column such as {near[0]}" if near else f"a column: {', '.join(self._columns)}", place)
         if track and self._columns is not COLUMNS:
-            self._fail(f"{name} alone")
+            raise self._error(f"{name} alone", place)
         if track == "truth" and ours in ERRORS:
-            self._fail("an estimator before an error")
-        self._at += 1
-        return Column(track or None, ours, factor)
+            raise self._error("an estimator before an error", place)
+        return Column(track, ours, factor)
 
-    def _close(self) -> None:
-        if not self._take(")"):
-            self._fail(")")
-
-    def _number(self, expected: str) -> float:
-        if self._kind != "number":
-            self._fail(expected)
-        return float(self._next())
-
-    def _flag(self, rule: _Rule, expected: str) -> Node:
-        start = self._at
-        node = rule()
-        if not is_flag(node):
-            self._fail(f"{expected}, such as a comparison", start)
-        return node
-
-    def _must_be_flag(self, node: Node, place: int) -> None:
-        if not is_flag(node):
-            self._fail("a comparison or a flag", place)
-
-    def _must_be_number(self, node: Node, place: int) -> None:
-        if is_flag(node):
-            self._fail("a number", place)
-
-    def _deeper(self, rule: _Rule) -> Node:
-        self._depth += 1
-        if self._depth > _DEEPEST:
-            self._fail(f"at most {_DEEPEST} brackets and signs inside one another")
-        node = rule()
-        self._depth -= 1
-        return node
-
-    @property
-    def _kind(self) -> str:
-        return self._tokens[self._at][0]
-
-    @property
-    def _word(self) -> str:
-        return self._tokens[self._at][1]
-
-    def _next(self) -> str:
-        self._at += 1
-        return self._tokens[self._at - 1][1]
-
-    def _take(self, word: str) -> bool:
-        if self._word != word:
-            return False
-        self._at += 1
-        return True
-
-    def _split(self) -> Iterator[tuple[str, str, int]]:
-        at, end = 0, len(self._text.rstrip())
-        while at < end:
-            found = _TOKEN.match(self._text, at)
-            if found is None:
-                at += len(self._text[at:]) - len(self._text[at:].lstrip())
-                self._point("a column, a number or a sign", self._text[at], at)
-            kind = str(found.lastgroup)
-            yield kind, found[kind], found.start(kind)
-            at = found.end()
-        yield "end", "", end
-
-    def _fail(self, expected: str, place: int | None = None) -> NoReturn:
-        _, word, at = self._tokens[self._at if place is None else place]
-        self._point(expected, word or "the end", at)
-
-    def _point(self, expected: str, got: str, at: int) -> NoReturn:
+    def _error(self, expected: str, place: ast.expr | int) -> UsageError:
+        at = place if isinstance(place, int) else self._start + place.col_offset
         before, after = self._text[:at], self._text[at:]
-        raise UsageError(
+        if isinstance(place, ast.expr) and place.end_col_offset is not None:
+            got = self._text[at : self._start + place.end_col_offset][:40]
+        else:
+            got = "".join(re.findall(r"^\s*(\w+|\S)", after)) or "the end"
+        return UsageError(
             expected=expected,
             got=got,
             where=f"--where, sign {at + 1} (here: {before[-30:]}»{after[:30]})",

@@ -18,7 +18,7 @@ from pdhef_logtool.records.tracks import StateTrack, concatenate
 BLOCKS = 6
 SECONDS = 60.0
 MOST_STAMPS = 4000
-#: What a filter needs before its error counts (METHOD §14).
+#: What a filter needs before its error counts (docs/method.md#identification).
 SETTLE_S = 2.0
 
 

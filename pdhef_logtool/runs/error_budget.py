@@ -277,7 +277,7 @@ def _late_truth(case: _Case, delay_s: float) -> _Case:
     return replace(case, truth=replace(truth, sideslip_rad=np.where(known, moved, np.nan)))
 
 
-#: Spreads: friction that is told or estimated, and those of METHOD §14 about a vehicle file and a car's sensors.
+#: Spreads: friction that is told or estimated, and the priors' about a vehicle file and a car's sensors.
 _CAUSES: dict[str, tuple[_Parameter, ...]] = {
     "friction": (_Parameter("friction", "1", 0.2, _friction),),
     "tyres": (

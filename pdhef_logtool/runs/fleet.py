@@ -175,7 +175,7 @@ def run_logs(
     warn: Callable[[str], None] = lambda _text: None,
     say: Callable[[str], None] = lambda _text: None,
 ) -> RunResult:
-    """Run the configured estimators on logs and write everything of DESIGN §6 to ``output``.
+    """Run the configured estimators on logs and write the outputs of docs/formats.md#outputs to ``output``.
 
     A log that fails is reported and never stops the others. One whose content another has is run once.
 

@@ -1,4 +1,7 @@
-"""Which estimators run where none are named, and which one is the answer: chosen without truth (METHOD §17)."""
+"""Which estimators run where none are named, and which one is the answer: chosen without truth.
+
+See docs/method.md#selection.
+"""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from pdhef_logtool.sinks.base import TRUTH, Event
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
-    from pdhef_logtool.evaluation.metrics.d2 import LogSensors
+    from pdhef_logtool.evaluation.metrics.metric import SensorErrors
     from pdhef_logtool.evaluation.reasons import ReasonFacts
 
 
@@ -42,7 +42,7 @@ def evaluate(
     names: Sequence[str],
     read: Callable[[str], StateTrack | None],
     signals: Signals,
-    sensors: LogSensors | None = None,
+    sensors: SensorErrors | None = None,
 ) -> Evaluation:
     """Score the tracks of a drive, block by block where they are on disk.
 

@@ -1,4 +1,7 @@
-"""The first pass over a log, in which it calibrates its car without truth (METHOD §17), and what comes of it."""
+"""The first pass over a log, in which it calibrates its car without truth, and what comes of it.
+
+See docs/method.md#self-calibration.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ from pdhef_logtool.runs import guard
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.metrics.d2 import LogSensors
+    from pdhef_logtool.evaluation.metrics.metric import SensorErrors
     from pdhef_logtool.self_calibration.calibration import SelfCalibration
     from pdhef_logtool.self_calibration.driving import Driving
 
@@ -95,7 +98,7 @@ def checked(drive: Drive, calibration: SelfCalibration | None) -> SelfCalibratio
     return replace(calibration, refused=why)
 
 
-def _d2_of(drive: Drive, estimators: Sequence[Estimator], sensors: LogSensors) -> list[tuple[float, float]]:
+def _d2_of(drive: Drive, estimators: Sequence[Estimator], sensors: SensorErrors) -> list[tuple[float, float]]:
     """Return d2 of estimators over a drive, and its part that goes with the driving, window by window, in m/s.
 
     The windows have a fixed length. NaN where it cannot be told.
@@ -138,18 +141,18 @@ def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
     return replace(drive.car, self_calibrated=found)
 
 
-def log_sensors(vehicle: VehicleParameters, calibration: SelfCalibration | None) -> LogSensors:
+def log_sensors(vehicle: VehicleParameters, calibration: SelfCalibration | None) -> SensorErrors:
     """Return what the sensors of a log have that was read with a vehicle: as calibrated on it, else as its file says.
 
     What is refused for its tyres is no worse for its sensors.
     """
-    from pdhef_logtool.evaluation.metrics.d2 import LogSensors
+    from pdhef_logtool.evaluation.metrics.metric import SensorErrors
 
     if calibration is None or not calibration.parameters:
         gain = 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2
-        return LogSensors(ay_gain=gain, lever_m=vehicle.imu_position_m[0])
+        return SensorErrors(ay_gain=gain, lever_m=vehicle.imu_position_m[0])
     found = {p.name: p.value for p in calibration.parameters}
-    return LogSensors(
+    return SensorErrors(
         ay_bias_m_s2=found["a_y bias"] - vehicle.sensors.ay_bias_m_s2,
         yaw_rate_bias_rad_s=found["yaw rate bias"] - vehicle.sensors.yaw_rate_bias_rad_s,
         ay_gain=found["roll gain"],

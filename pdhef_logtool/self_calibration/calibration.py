@@ -1,4 +1,6 @@
-"""A log calibrates its car, without truth (METHOD §17): tyres, inertia, steering and sensors by output error.
+"""A log calibrates its car, without truth: tyres, inertia, steering and sensors by output error.
+
+See docs/method.md#self-calibration.
 
 The open-loop model of :mod:`~.single_track` is fitted to yaw rate and a_y. In normalised parameters θ (distance from
 the prior in its standard deviations) the cost is
@@ -64,7 +66,7 @@ FORGOTTEN = np.array([0.0, STEP_S / 5.0])
 FIRST_ITERATIONS, ITERATIONS = 8, 20
 DERIVATIVE_STEP, MAX_STEP, MIN_GAIN = 0.02, 2.0, 1e-3
 
-#: Priors of METHOD §17, 1 sd: in the logarithm, or in the parameter's unit.
+#: Priors of docs/method.md#self-calibration, 1 sd: in the logarithm, or in the parameter's unit.
 FILE_STIFFNESS_STD, USUAL_STIFFNESS_STD, USUAL_STIFFNESS = 0.5, 0.4, (14.0, 15.0)
 USUAL_UNDERSTEER, UNDERSTEER_STD = 3e-3, 4e-3
 PEAK_STD, PEAK_OVER_SEEN, INERTIA_STD, RELAXATION_STD = 0.15, 1.05, 0.2, 0.4
@@ -527,7 +529,10 @@ def _track_of(vehicle: VehicleParameters, own: VehicleParameters, nuisance: Mapp
 
 
 def _priors(drives: Sequence[Driving], own: VehicleParameters) -> tuple[Prior, ...]:
-    """Return the priors of METHOD §17; of a stiffness both, that about the file and that about any car's, as one."""
+    """Return the priors; that of a stiffness combines the file's and that of any car.
+
+    See docs/method.md#self-calibration.
+    """
     mu = own.assumed_friction
     hard = [np.abs(d.columns[AY][_inside(d, 0)]) * mu / d.columns[FRICTION][_inside(d, 0)] for d in drives]
     gain = 1.0 + GRAVITY_M_S2 * own.roll_gradient_rad_per_m_s2

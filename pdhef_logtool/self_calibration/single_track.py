@@ -1,4 +1,6 @@
-"""The open-loop single track that a log calibrates: relaxing axle forces from steering and speed alone (METHOD §17).
+"""The open-loop single track that a log calibrates: relaxing axle forces from steering and speed alone.
+
+See docs/method.md#self-calibration.
 
 State [v_y, r, f_f, f_r] with f = F_y / m of an axle; (σ / v_x) ḟ + f = f_ss(α). No sensor corrects it, so that low
 frequencies count. What it says of yaw rate and a_y is compared with the sensors, both through the same low-pass.

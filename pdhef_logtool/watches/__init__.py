@@ -1,1 +1,1 @@
-"""What looks at signals and estimates beside the estimators: faults, slip, divergence, intervals."""
+"""Monitors of signals and estimates beside the estimators: faults, wheel slip, divergence, confidence intervals."""

@@ -1,20 +1,19 @@
-"""Divergence that no innovation shows: the estimate's own changes of v_y against accelerometer and gyro.
+"""Divergence that no innovation shows: the estimate's changes of v_y against accelerometer and gyro.
 
-Behind the peak of a tyre's force two sideslips give the same a_y and nearly the same yaw rate. A filter can be carried
-to the wrong one of them and then agrees with all its sensors: its normalised innovation stays small (METHOD §12). The
-way there betrays it. At the IMU, whatever the tyres do,
+Beyond the peak of the tyre force two sideslip angles give the same a_y and nearly the same yaw rate. A filter that
+converges to the wrong one agrees with all its sensors, so that its normalized innovation stays small
+(docs/method.md#divergence). The way there is visible: at the IMU, for any tyre forces,
 
-    v̇_y,i = a_y / (1 + g K_φ) − v_x,i r,    v_x,i = v_x − y_i r,  v_y,i = v_y + x_i r,
+    v̇_y,i = a_y / (1 + g K_φ) − v_x,i r,    v_x,i = v_x − y_i r,  v_y,i = v_y + x_i r.
 
-so that D, the leaky sum of what v̂_y,i changes beyond that, is the error that the estimate has taken up of late. The
-leak is quick (``LINEAR_S``) where the tyres are in their linear range, which has one branch only, since there D would
-gather bank, bias and noise; and slow (``LIMIT_S``) near the limit of grip, and as long as the flag stands, so that a
-return to the right branch takes the flag back. The flag is set while abs D exceeds v̂_x times ``ON_RAD``, until it is
-below v̂_x times ``OFF_RAD``, both plus ``NOISE_SIGMAS`` of what the sensors' white noise (vehicle file) adds to D:
-sensors that are too noisy to judge do not judge.
+D, the leaky sum of the changes of v̂_y,i beyond that, is the error that the estimate accumulated recently. The leak is
+fast (``LINEAR_S``) in the linear range of the tyres, where only one solution exists and D would accumulate bank, bias
+and noise. It is slow (``LIMIT_S``) near the limit of grip, and while the flag is set, so that a return to the right
+solution clears the flag. The flag is set while abs D exceeds v̂_x times ``ON_RAD``, and cleared below v̂_x times
+``OFF_RAD``. Both limits are increased by ``NOISE_SIGMAS`` of the sensors' white noise (vehicle file) in D.
 
-What it cannot see: an estimate that is off from its start on, or drifts away more slowly than the leak forgets. What
-accelerometer or gyro read wrongly it lays at the estimate's door, save missing and stuck samples, which are not judged.
+Not detected: an estimate that is wrong from its start, or drifts more slowly than the leak forgets. Errors of
+accelerometer or gyro are attributed to the estimate, except for missing and stuck samples, which are not judged.
 """
 
 from __future__ import annotations
@@ -36,13 +35,13 @@ LINEAR_S, LIMIT_S = 0.5, 3.0
 #: Shares of the grip, abs a_y / (μ g), between which the leak goes from quick to slow.
 GRIP_LOW, GRIP_HIGH = 0.5, 0.7
 GRIP_SMOOTHING_S, GRIP_HOLD_S = 0.1, 1.0
-#: 1-sigmas of the noise in D that are allowed on top.
+#: Tolerance for the noise in D, in standard deviations.
 NOISE_SIGMAS = 3.0
-#: Speed that D is divided by at least, in low-speed blends.
+#: Smallest speed in the limit of D, as a multiple of the low-speed blend.
 LEAST_SPEED_BLENDS = 3.0
-#: A sample is held for this long; without a newer one the time is not judged.
+#: Zero-order hold of a sample; without a newer sample the monitor is suspended.
 SAMPLE_HOLD_S = 0.1
-#: So many identical samples in a row are a stuck sensor, or a coarse one that says nothing yet.
+#: Consecutive identical samples that indicate a stuck sensor, or one whose resolution is too coarse to judge.
 STUCK_SAMPLES = 5
 
 # Entries of the memory.
@@ -60,7 +59,7 @@ class FlagSteps(StepColumns):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DivergenceCarry:
-    """Memory between windows: the sum's state, and the flags of steps that coming stamps still need."""
+    """State between windows: the sum, and the flags of steps that later stamps need."""
 
     memory: FloatArray
     last_stamp_ns: int | None
@@ -69,16 +68,16 @@ class DivergenceCarry:
 
 @dataclass(slots=True)
 class DivergenceWatch:
-    """Watches the tracks of a drive window by window, each by its name.
+    """Monitor of the tracks of a drive, window by window and by name.
 
-    Only estimates with a covariance are watched: an estimator that claims no accuracy cannot be wrong about it.
+    Estimates without a covariance are not monitored: they make no claim about their accuracy.
     """
 
     vehicle: VehicleParameters
     _carries: dict[str, DivergenceCarry] = field(default_factory=dict)
 
     def add(self, track: StateTrack, signals: Signals) -> StateTrack:
-        """Return the next window of a track with its ``diverged`` completed."""
+        """Return the next window of a track with ``diverged`` updated."""
         if track.covariance.shape[0] == 0:
             return track
         flags, self._carries[track.name] = wrong_branch(track, signals, self.vehicle, self._carries.get(track.name))
@@ -88,9 +87,9 @@ class DivergenceWatch:
 def wrong_branch(
     track: StateTrack, signals: Signals, vehicle: VehicleParameters, carry: DivergenceCarry | None = None
 ) -> tuple[BoolArray, DivergenceCarry]:
-    """Return where a track is seen to have left the sensors' motion, [N]; joined windows equal the whole bit for bit.
+    """Return where a track departs from the sensors' motion, [N]; joined windows equal the whole bit for bit.
 
-    Computed on measurement time; a scored stamp takes the flag of the newest step that had arrived.
+    Computed on measurement time; a scored stamp has the flag of the newest step that had arrived.
 
     Parameters
     ----------
@@ -123,7 +122,7 @@ def wrong_branch(
 
 @njit(cache=True)
 def _hold(sample, dt, value, age, run, memory):  # type: ignore[no-untyped-def]
-    """Keep a sensor's newest sample in the memory, its age and how often it has come unchanged."""
+    """Store a sensor's newest sample, its age and its number of consecutive repetitions."""
     if math.isfinite(sample):
         memory[run] = memory[run] + 1.0 if sample == memory[value] else 1.0
         memory[value] = sample

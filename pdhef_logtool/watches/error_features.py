@@ -1,4 +1,4 @@
-"""What tells, on line and without truth, how wrong an estimate may be: the terms of a calibrated interval.
+"""Terms of a calibrated confidence interval: indicators of the estimation error that are available online.
 
 ============  ====  ================================================================================================
 term          unit  definition
@@ -6,19 +6,19 @@ term          unit  definition
 ``floor``     rad   a constant, 1e-4
 ``filter``    rad   the estimator's own 1-sigma of sideslip
 ``sideslip``  rad   abs β̂: an error of the cornering stiffness is proportional to the slip angles
-``grip``      rad   0.003 x, x = abs a_y / (μ g), a_y smoothed (0.05 s), its peak held (0.5 s), μ as told
-``grip2``     rad   0.01 x²: beyond the linear range everything that is not known of the tyres counts for more
+``grip``      rad   0.003 x, x = abs a_y / (μ g), a_y smoothed (0.05 s), peak decay 0.5 s, μ as given
+``grip2``     rad   0.01 x²: uncertainty of the tyres beyond the linear range
 ``kinematic`` rad   rms over 1 s of w / v_x, w = leaky integral (0.3 s) of a_y / (1 + g K_φ) − v̂_x r_m less v̂_y seen
-                    through the same high-pass; its slow mean (3 s: bias, bank) taken off. The accelerometer and the
-                    gyro against the estimate's own changes: no vehicle model stands between
-``yaw_rate``  rad/s rms over 1 s of r_m − r̂, smoothed over 0.15 s so that noise goes and model error stays
-``cure``      rad   abs β̂ times the weight of the filters that cure what the car lacks: it lacks something then
-``bank``      rad   abs of the road's bank as the estimator has it
+                    through the same high-pass; its slow mean (3 s: bias, bank) removed. The accelerometer and the
+                    gyro against the estimate's changes, without a vehicle model
+``yaw_rate``  rad/s rms over 1 s of r_m − r̂, smoothed over 0.15 s, which removes noise and keeps model error
+``cure``      rad   abs β̂ times the weight of the filters with a force scale or bank
+``bank``      rad   abs of the estimated road bank
 ============  ====  ================================================================================================
 
-The sensors' samples of a stamp arrive later than the stamp. So the terms are computed on measurement time and each
-scored stamp takes those of the newest step that had arrived (:mod:`~.release`), as the estimates themselves do.
-Samples that the estimator says are faulty leave the terms as they are.
+Samples arrive later than their stamps. The terms are computed on measurement time, and a scored stamp has those of the
+newest step that had arrived (:mod:`~.release`), as estimates do. Samples that the estimator reports as faulty are
+ignored.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ KINEMATIC_S, SLOW_MEAN_S = 0.3, 3.0
 YAW_SMOOTHING_S = 0.15
 MEMORY_S = 1.0
 MIN_SPEED_M_S = 3.0
-#: Without a friction from log or estimator.
+#: Friction if neither log nor estimator provides it.
 ASSUMED_FRICTION = 1.0
-#: Those of the yaw rate are the same, shifted left by one.
+#: The bits of the yaw rate are the same, shifted left by one.
 _AY_BITS = BURST_AY | SPIKE_AY | STUCK_AY | DEAD_AY | MISSING_AY
 
 # Entries of the memory.
@@ -121,9 +121,9 @@ def error_terms(
 
 
 def believed(track: StateTrack, signals: Signals) -> tuple[FloatArray, FloatArray]:
-    """Return a_y and yaw rate [N] without the samples that the estimator itself says it did not use as usual.
+    """Return a_y and yaw rate [N] without the samples that the estimator reports as faulty.
 
-    A stuck gyro disagrees with a right estimate. The estimator tells so once the sample has arrived, a few steps late.
+    A stuck gyro disagrees with a correct estimate. The estimator reports it a few steps late, when the sample arrived.
     """
     if len(track.reason) != len(track):
         return signals.ay_m_s2, signals.yaw_rate_rad_s
@@ -132,12 +132,12 @@ def believed(track: StateTrack, signals: Signals) -> tuple[FloatArray, FloatArra
 
 
 def grip_share(terms: FloatArray) -> FloatArray:
-    """Return the share of the grip that is used [N], from terms [N, 9]."""
+    """Return the grip utilization [N] of terms [N, 9]."""
     return terms[:, TERMS.index("grip")] / GRIP_RAD
 
 
 def _column(track: StateTrack, values: FloatArray) -> FloatArray:
-    """Return an optional column of a track [N], 0 where it is not known."""
+    """Return an optional column of a track [N], 0 where it is missing."""
     return _known(values) if len(values) == len(track) else np.zeros(len(track))
 
 
@@ -149,7 +149,7 @@ def _known(values: FloatArray) -> FloatArray:
 def _advance(motion, tilt, memory, out):  # type: ignore[no-untyped-def]
     """Advance the memory over the steps [N] and write grip share, kinematic and yaw-rate terms [N, 3] in place.
 
-    A step with a sample missing leaves the filters that need it as they are.
+    A missing sample leaves the low-pass filters that need it unchanged.
     """
     dt, ay, rate, friction, vx, vy, yaw_rate = motion
     for k in range(dt.shape[0]):

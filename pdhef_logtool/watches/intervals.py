@@ -1,15 +1,14 @@
-"""Calibrated intervals: how much wider or narrower an estimator's own 1-sigma must be, learnt on drives with truth.
+"""Calibrated confidence intervals: scaling of an estimator's standard deviations, fitted to drives with ground truth.
 
-The calibrated variance of sideslip is a sum of non-negative contributions,
+The calibrated variance of sideslip is a sum of non-negative contributions (docs/method.md#intervals),
 
     s² = g² Σ (k_i t_i)²,
 
-with the terms t_i of :mod:`pdhef_logtool.watches.error_features` (the filter's own 1-sigma, grip use, sideslip,
-disagreement with accelerometer and gyro, ...) and a factor g by grip use: driving near the limit decides what counts
-there, and nothing else. It grows with every term and needs no truth and no future. ``s`` is the
-95 % quantile of the error divided by 1.96, so that ± 1.96 s covers 95 % whatever the errors' distribution. The yaw
-rate's is the same sum over fewer terms; v_y's 1-sigma keeps its ratio to the sideslip's, times a factor. The covariance
-is scaled row and column alike, so that its correlations stay. Estimates themselves never change.
+with the terms t_i of :mod:`pdhef_logtool.watches.error_features` and a factor g by grip utilization, so that driving
+near the limit determines the intervals there only. ``s`` is the 95 % quantile of the error divided by 1.96: ± 1.96 s
+covers 95 % for any distribution of the errors. The yaw rate has the same sum with fewer terms. The standard deviation
+of v_y keeps its ratio to that of the sideslip, times a factor. Rows and columns of the covariance are scaled alike, so
+that correlations do not change. Estimates never change.
 """
 
 from __future__ import annotations
@@ -34,30 +33,32 @@ from pdhef_logtool.records.tracks import StateTrack
 if TYPE_CHECKING:
     from pdhef_logtool.watches.error_features import FeatureCarry
 
-#: Terms of the sideslip's variance; those of the yaw rate's, where ``filter`` is its own 1-sigma.
+#: Terms of the sideslip's variance; terms of the yaw rate's, where ``filter`` is its standard deviation.
 SIDESLIP_TERMS = ("floor", "filter", "sideslip", "grip", "grip2", "kinematic", "yaw_rate", "cure", "bank")
 YAW_RATE_TERMS = ("floor", "filter", "yaw_rate")
-#: Share of the grip that is used at which the factors hold; between them it goes over, beyond them it stays.
+#: Grip utilization at which the factors apply; linear between them, constant beyond.
 GRIP_PLACES = (0.2, 0.45, 0.7)
-#: A sideslip is not known at all beyond this 1-sigma.
+#: Largest standard deviation of sideslip.
 MAX_SIDESLIP_STD_RAD = 1.0
 
 
-#: Takes the next window of a track and its signals and returns it with wider intervals.
+#: Function of the next window of a track and its signals that returns the track with wider intervals.
 Widening = Callable[[StateTrack, Signals], StateTrack]
-#: What is told of intervals that hold what is open of a car's parameters.
+#: Note for intervals that contain the uncertainty of a car's parameters.
 POSTERIOR_NOTE = "intervals: own, identified parameters and sensors"
 
 
 @dataclass(slots=True)
 class TrackCalibrator:
-    """Applies intervals, or none, to the tracks of a drive window by window.
+    """Application of calibrated intervals to the tracks of a drive, window by window.
 
-    ``algorithms`` says by name what ran, then what else its intervals may be taken from. Intervals are found by the
-    identity of what ran, never by its name; what else they rest on (noise, physics, network) is compared and told.
-    ``of_car``: whether the intervals were calibrated for this car, and not for the shipped one.
-    ``own`` says by name what is told of intervals that stay as they are. ``posterior`` widens, by name, what the car
-    has no intervals for.
+    Attributes
+    ----------
+    algorithms : by name, the algorithm that ran, then others whose intervals apply to it. Intervals are looked up by
+        the identity of the algorithm; differences of noise, parameters and network are reported.
+    of_car : whether the intervals were calibrated for this car, not for the shipped one.
+    own : by name, the note for intervals that are not changed.
+    posterior : by name, the function that widens intervals where the car has none.
     """
 
     intervals: Intervals | None
@@ -69,7 +70,7 @@ class TrackCalibrator:
     _has_interval: set[str] = field(default_factory=set)
 
     def add(self, track: StateTrack, signals: Signals) -> StateTrack:
-        """Return the next window of a track with calibrated intervals, or as it is where it has no entry."""
+        """Return the next window of a track with calibrated intervals; unchanged without an entry."""
         if np.isfinite(track.sideslip_std_rad).any():
             self._has_interval.add(track.name)
         found = self._found(track.name)
@@ -85,7 +86,7 @@ class TrackCalibrator:
         return track
 
     def notes(self, name: str) -> tuple[str, ...]:
-        """Return what the report says of an estimator's intervals; nothing for one without."""
+        """Return the report's notes on an estimator's intervals; empty without intervals."""
         if name not in self._has_interval:
             return ()
         if name in self.own:
@@ -115,11 +116,11 @@ class TrackCalibrator:
 
     @property
     def warning(self) -> str:
-        """Which intervals of the car are not applied, and why; empty if there are none."""
+        """Names of the car's intervals that are not applied, with the reason; empty if all are."""
         return "; ".join(filter(None, map(self.mismatch, self.algorithms)))
 
     def mismatch(self, name: str) -> str:
-        """Return why the intervals that the car has for an estimator are not applied to it, empty if that is not so."""
+        """Return why the car's intervals for an estimator are not applied to it; empty if they are."""
         ran = self.algorithms.get(name)
         if self.intervals is None or not self.of_car or not ran or self._found(name) is not None:
             return ""
@@ -132,7 +133,7 @@ class TrackCalibrator:
         )
 
     def _found(self, name: str) -> tuple[IntervalEntry, Algorithm] | None:
-        """Return the entry for a name and the algorithm that it was found by."""
+        """Return the entry for a name and the algorithm that it belongs to."""
         entries = {} if self.intervals is None else {e.algorithm.identity: e for e in self.intervals.entries}
         for algorithm in self.algorithms.get(name, ()):
             if algorithm.identity in entries:
@@ -151,8 +152,8 @@ def calibrated(
 
     Parameters
     ----------
-    track, signals : [N] at the same stamps. roll_gradient_rad_per_m_s2 : of the car that the fit was made on.
-    carry : of the previous window.
+    track, signals : [N] at the same stamps. roll_gradient_rad_per_m_s2 : of the car of the fit.
+    carry : state after the previous window.
     """
     from pdhef_logtool.watches.error_features import error_terms
 
@@ -161,7 +162,7 @@ def calibrated(
 
 
 def inflated(track: StateTrack, terms: FloatArray, inflation: Inflation) -> StateTrack:
-    """Scale a track's 1-sigmas and covariance by an inflation; ``terms`` [N, 9]. NaN stays NaN."""
+    """Scale a track's standard deviations and covariance; ``terms`` [N, 9]. NaN stays NaN."""
     from pdhef_logtool.watches.error_features import grip_share
 
     own = track.sideslip_std_rad
@@ -181,7 +182,7 @@ def inflated(track: StateTrack, terms: FloatArray, inflation: Inflation) -> Stat
 
 def combined(terms: FloatArray, coefficients: tuple[float, ...]) -> FloatArray:
     """Return √ Σ (k_i t_i)² of terms [N, m], [N]."""
-    # Added term by term: a product of matrices need not give the same bits for a window as for the whole.
+    # Added term by term: a matrix product may round differently for a window and for the whole log.
     total = np.zeros(terms.shape[0])
     for i, k in enumerate(coefficients):
         total += (k * terms[:, i]) ** 2
@@ -189,18 +190,18 @@ def combined(terms: FloatArray, coefficients: tuple[float, ...]) -> FloatArray:
 
 
 def grip_factor(share: FloatArray, factors: Sequence[float]) -> FloatArray:
-    """Return the factor [N] at shares of the grip [N] of the ``factors`` at :data:`GRIP_PLACES`."""
+    """Interpolate the ``factors`` at :data:`GRIP_PLACES` at grip utilizations [N]; return [N]."""
     return np.interp(share, GRIP_PLACES, factors)
 
 
 def yaw_rate_terms(terms: FloatArray, rate_std: FloatArray) -> FloatArray:
-    """Return the yaw rate's terms [N, 3] from those of the sideslip and the estimator's own 1-sigma [N]."""
+    """Return the yaw rate's terms [N, 3] from the sideslip's terms and the estimator's standard deviation [N]."""
     known = np.where(np.isfinite(rate_std), rate_std, 0.0)
     return np.stack([terms[:, 0], known, terms[:, SIDESLIP_TERMS.index("yaw_rate")]], axis=1)
 
 
 def _ratio(new: FloatArray, old: FloatArray) -> FloatArray:
-    """Return new / old where both are known and old is not 0, else 1."""
+    """Return new / old where both are finite and old is positive, else 1."""
     good = np.isfinite(new) & np.isfinite(old) & (old > 0.0)
     return np.where(good, new / np.where(good, old, 1.0), 1.0)
 

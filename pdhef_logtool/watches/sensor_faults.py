@@ -1,35 +1,34 @@
-"""Faults of accelerometer and gyro found without the filter (METHOD §15, bottom layer): noise, spikes, stuck, dead.
+"""Faults of accelerometer and gyro detected without the filter: noise, spikes, stuck and dead channels.
 
-Nothing here looks at an innovation of a filter with the network in it, so that a model error cannot be read as noise.
-For each of a_y and yaw rate:
+No innovation of a filter with a network is used, so that a model error cannot be interpreted as noise
+(docs/method.md#faults). For each of a_y and yaw rate:
 
-* noise: what a parabola through the three samples before misses the sample by, squared, over its gain for white noise;
-  on an even clock that is e = (z_k − 3 z_k−1 + 3 z_k−2 − z_k−3)²/20, and it is exact for parabolas on an uneven one.
+* noise: squared difference between a sample and the parabola through the three samples before, divided by its gain for
+  white noise; with an even clock e = (z_k − 3 z_k−1 + 3 z_k−2 − z_k−3)²/20, and exact for parabolas with an uneven one.
   ŝ² = max(mean of the last 4 e, s₀² + keep · (ŝ² − s₀²)): fast attack, slow decay. Beyond ``BURST_RATIO`` s₀² the
-  excess ŝ² − s₀² is added to R in every filter, and the network does not see the sample.
-* spikes: a sample beyond 6 sigma of a constant-velocity tracker, and the next sample back again.
-* stuck: five and more identical samples that are no accident. Quantised signals repeat by themselves, so that the share
-  of repeats is learnt while the car moves, and a coarse signal is stuck only if the car has turned meanwhile; at a
-  standstill nothing is stuck.
-* dead, noisy or not: three witnesses of the turning, r, (a_y − v̇_y)/v_x and the yaw rate of the nominal model in open
-  loop from steering and speed, which gives v̇_y as well. Where two agree and the third stays
-  next to nothing, the third is dead.
+  excess ŝ² − s₀² is added to R in every filter, and the network does not receive the sample.
+* spikes: a sample beyond 6 sigma of a constant-velocity tracker, if the next sample returns.
+* stuck: at least five identical samples that chance does not explain. Quantized signals repeat, so the share of
+  repetitions is learned while the car moves, and a coarse signal is stuck only if the car has turned meanwhile; at a
+  standstill no channel is stuck.
+* dead, with or without noise: three measures of the yaw rate: r, (a_y − v̇_y)/v_x, and that of the open-loop nominal
+  model with steering and speed, which provides v̇_y too. If two agree and the third stays near zero, the third is dead.
 
-Stuck, dead and spiked samples are missing samples. s₀ is the vehicle file's, or what the log has as its usual noise
-where that is more: a rough car is no burst.
+Stuck, dead and spike samples are treated as missing. s₀ is the vehicle file's, or the usual noise of the log if larger:
+a rough road is no burst.
 
-All of that is what the filters do with a sample, and it costs little where nothing is wrong: real noise has long tails,
-and each of its outliers is weighted down. What is *reported* needs evidence that adds up (Page's test, in nats) to what
-chance reaches once in ``HOURS_TO_FALSE_ALARM`` of clean driving:
+Filters apply all of this, which costs little without faults: real noise has long tails, and its outliers get less
+weight. A fault is *reported* only if its accumulated evidence (Page's test, in nats) exceeds the level that chance
+reaches once in ``HOURS_TO_FALSE_ALARM`` of clean driving:
 
-* burst: samples beyond 3 sigma of the log's own usual noise. Healthy noise may be twice the usual one for as long as it
-  likes; the burst that is looked for is five times. The usual noise is here a high quantile of e that falls more slowly
-  than it rises: rough roads are remembered, and held samples (e = 0) do not make it small.
-* spikes: more of them than a long tail has, or one far beyond it.
-* stuck, missing: for ``STUCK_REPORTED_AFTER_S``, ``MISSING_REPORTED_AFTER_S``. Dead: within one band for
+* burst: samples beyond 3 sigma of the log's usual noise. Healthy noise may be twice the usual noise for any time; a
+  burst has five times. The usual noise is here a high quantile of e that decreases more slowly than it increases, so
+  that rough roads are remembered and repeated samples (e = 0) do not reduce it.
+* spikes: more of them than a long tail contains, or one far beyond it.
+* stuck, missing: for ``STUCK_REPORTED_AFTER_S``, ``MISSING_REPORTED_AFTER_S``. Dead: within a narrow range for
   ``DEAD_REPORTED_AFTER_S`` of turning.
 
-``docs/false_alarms.md`` has the rates and delays.
+``docs/false_alarms.md`` contains rates and delays.
 """
 
 from __future__ import annotations
@@ -52,43 +51,43 @@ from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 AY, YAW_RATE = 0, 1
 CHANNELS = 2
 
-#: Noise variance over the usual one from which on it is a burst.
+#: Ratio of noise variance to the usual variance above which it is a burst.
 BURST_RATIO = 16.0
 #: Time constant of the decay: e^(−1/8) a step of 10 ms.
 DECAY_S = 0.08
-#: Samples further apart than this in all say nothing of white noise: the motion is in them too.
+#: Differences over a longer span are not used: they contain the motion.
 DIFFERENCE_SPAN_S = 0.16
-#: An uneven clock can make the parabola's gain large; such a difference is not used.
+#: Differences with a larger gain, which an uneven clock can cause, are not used.
 MAX_DIFFERENCE_GAIN = 200.0
-#: The usual noise is learnt with the median of e, which doubles or halves in this time at most.
+#: Shortest time in which the learned usual noise, from the median of e, doubles or halves.
 LEARNING_S = 10.0
 #: Median of the square of a standard normal variable.
 MEDIAN_SQUARE = 0.4549
-#: Constant-velocity tracker: gains, spike limit, and the second derivatives (m/s⁴, rad/s³) that a car can have.
+#: Constant-velocity tracker: gains, spike limit, and largest second derivatives of a car (m/s⁴, rad/s³).
 TRACK_GAIN, TRACK_RATE_GAIN = 0.7, 0.4
 SPIKE_SIGMA = 6.0
 #: 1-sigma of the tracker's innovation over that of a sample, for the gains above.
 TRACK_INNOVATION_RATIO = 1.5
 CURVATURE = (2000.0, 100.0)
-#: This many samples in a row beyond the limit are no spikes but a jump or a burst.
+#: Largest number of consecutive spikes; more are a jump or a burst.
 MAX_SPIKES = 2
-#: Identical samples from which on a channel may be stuck, and the chance of them that is taken for none.
+#: Smallest number of identical samples of a stuck channel, and the probability below which chance is excluded.
 STUCK_SAMPLES = 5
 STUCK_CHANCE = 1e-6
-#: Times over which the share of repeats is learnt and forgotten, and the share that is assumed before.
+#: Time constants with which the share of repetitions increases and decreases, and its initial value.
 REPEATS_S = 20.0
 REPEATS_FORGOTTEN_S = 60.0
 REPEATS_BEFORE = 0.5
-#: A channel that repeats itself more often than this is quantised coarsely; it then counts as stuck only when the
-#: open-loop model has meanwhile turned by this much.
+#: Share of repetitions above which a channel is coarsely quantized; it is then stuck only if the yaw rate of the
+#: open-loop model has changed by this much meanwhile.
 COARSE_REPEATS = 0.1
 MOVED_RAD_S = 0.05
-#: Below this speed repeated samples are rest.
+#: Below this speed repeated samples are a standstill.
 STUCK_SPEED_M_S = 1.0
-#: A speed sample is held for this long.
+#: Zero-order hold of a speed sample.
 SPEED_HOLD_S = 0.5
-#: Dead: the witnesses are smoothed over this time; both must read this much, in rad/s and in sigmas of the noise, for a
-#: time in which the dead channel stays within a band and below a share of them.
+#: Dead: smoothing time of the three measures; smallest value of the two others, in rad/s and in sigmas of the noise;
+#: largest share of them, range and duration of the dead channel.
 WITNESS_S = 0.04
 WITNESS_RAD_S = 0.06
 WITNESS_NOISE_SIGMAS = 5.0
@@ -96,43 +95,42 @@ DEAD_SHARE = 0.3
 DEAD_BAND_RAD_S = 0.008
 DEAD_BAND_SIGMAS = 2.0
 DEAD_AFTER_S = 0.15
-#: It lives again when it reads this share of both others for a time, or when nothing turns for longer.
+#: A dead channel recovers if it reads this share of both others for a time, or if nothing turns for longer.
 ALIVE_SHARE = 0.6
 ALIVE_AFTER_S = 0.2
 QUIET_RAD_S = 0.03
 QUIET_AFTER_S = 1.0
-#: The open-loop model is a witness above this speed and this long after its start.
+#: The open-loop model is used above this speed and this long after its start.
 WITNESS_SPEED_M_S = 6.0
 WITNESS_SETTLED_S = 1.0
 
-#: What is reported: hours of clean driving to a false alarm, and what an hour has of samples and of questions.
+#: Reports: hours of clean driving per false alarm, sampling rate, and number of tests.
 HOURS_TO_FALSE_ALARM = 1.0
 SAMPLES_PER_S = 100.0
 QUESTIONS = 4.0
-#: Noise that is healthy and noise that is a burst, over the usual sigma; and the sigmas beyond which a sample counts.
+#: Noise of a healthy channel and of a burst as multiples of the usual sigma, and the threshold of a sample in sigmas.
 HEALTHY_FACTOR, BURST_FACTOR, BEYOND_SIGMA = 2.0, 5.0, 3.0
 SHARE_HEALTHY, SHARE_BURST = (math.erfc(BEYOND_SIGMA / f / math.sqrt(2.0)) for f in (HEALTHY_FACTOR, BURST_FACTOR))
 NATS_BEYOND = math.log(SHARE_BURST / SHARE_HEALTHY)
 NATS_WITHIN = math.log((1.0 - SHARE_BURST) / (1.0 - SHARE_HEALTHY))
-#: Differences share samples: this many tell as much as one alone.
+#: Number of differences, which share samples, with the information of one independent sample.
 DIFFERENCES_PER_SAMPLE = 2.3
-#: Evidence from which on a burst is reported, and the shares of it down to which it then is, and from which on spikes
-#: are those of a burst.
+#: Evidence for reporting a burst, the share of it below which the report ends, and the share above which spikes belong
+#: to a burst.
 BURST_NATS = DIFFERENCES_PER_SAMPLE * math.log(3600.0 * SAMPLES_PER_S * HOURS_TO_FALSE_ALARM * QUESTIONS)
 BURST_OVER, BURST_LIKELY = 0.5, 0.25
-#: The level of e that ``SHARE_HEALTHY`` of the samples exceed is guessed in this time, with this gain; nothing is
-#: reported meanwhile. Afterwards it doubles in ``LEARNING_S`` at most. A level that was learnt in this time is worth
-#: half: twice the evidence is asked for.
+#: The level of e that ``SHARE_HEALTHY`` of the samples exceed is initialized in this time, with this gain and without
+#: reports. Afterwards it doubles in ``LEARNING_S`` at most. After the second time twice the evidence is required.
 FIRST_GUESS_S, FIRST_GAIN = 1.0, 5.0
 HALF_KNOWN_S = 3.0
-#: A spike at its limit is evidence of so much, and more as this power of what it is beyond it by; so much is forgotten
-#: in a second. With a tail of the fourth power and a spike in 45 s (Student's t with 4 degrees) it does not add up.
+#: Evidence of a spike at its limit, exponent of its ratio to the limit, and evidence that is forgotten per second. With
+#: a tail of the fourth power and a spike in 45 s (Student's t with 4 degrees) the evidence does not accumulate.
 SPIKE_AT_LIMIT_NATS, SPIKE_POWER, SPIKE_FORGOTTEN_NATS_PER_S = 2.4, 3.0, 1.0
 SPIKE_NATS = math.log(3600.0 * HOURS_TO_FALSE_ALARM * QUESTIONS)
-#: Least time for which a channel is stuck or missing before that is reported.
+#: Shortest reported duration of a stuck or missing channel.
 STUCK_REPORTED_AFTER_S, MISSING_REPORTED_AFTER_S = 0.05, 0.1
-#: Least time for which both others have turned while a dead channel stayed in one band; for a_y half of it to each
-#: side, for a bank can take all of it away on one.
+#: Shortest reported duration in which both others turned and a dead channel did not change; for a_y half of it to each
+#: side, because bank can compensate a_y on one side.
 DEAD_REPORTED_AFTER_S = 0.5
 
 # Memory of a channel.
@@ -145,14 +143,14 @@ C_ANCHOR, C_STUCK = 30, 31
 C_LEVEL, C_LEVEL_S, C_BURST, C_BURST_TOLD, C_SPIKE = 32, 33, 34, 35, 36
 C_RUN_S, C_UNSEEN_S, C_SILENT_LEFT_S, C_SILENT_RIGHT_S = 37, 38, 39, 40
 CHANNEL_MEMORY = 41
-# Memory of the witnesses: speed and its age, the open-loop model's v_y and r, the smoothed r, and what held before.
+# Memory of the open-loop model: speed and its age, v_y and r, smoothed r and a_y, time, last inputs.
 W_SPEED, W_SPEED_AGE, W_VY, W_R, W_SMOOTH_R, W_SMOOTH_AY, W_SETTLED_S, W_STEER, W_FRICTION = range(9)
 WITNESS_MEMORY = 9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaultCarry:
-    """What the detector takes from window to window: memory of the channels [2, m] and of the witnesses [w]."""
+    """State between windows: memory of the channels [2, m] and of the open-loop model [w]."""
 
     channels: FloatArray
     witness: FloatArray
@@ -161,15 +159,15 @@ class FaultCarry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorFaults:
-    """What is wrong with a_y and yaw rate at each step.
+    """Faults of a_y and yaw rate at each step.
 
     Attributes
     ----------
-    extra_r : [N, 2], variance beyond the usual one, m²/s⁴ and rad²/s²; 0 where the channel is as usual.
-    noise_std : [N, 2], 1-sigma ŝ of now.
-    reason : int64 [N], what is reported, bits of :mod:`pdhef_logtool.records.reasons`.
-    filtered : the signals for filters; samples that are stuck, dead or a spike are missing.
-    network : the signals for the network's inputs; samples of a burst are missing as well.
+    extra_r : [N, 2], variance in excess of the usual one, m²/s⁴ and rad²/s²; 0 without a fault.
+    noise_std : [N, 2], present standard deviation ŝ.
+    reason : int64 [N], reported faults, bits of :mod:`pdhef_logtool.records.reasons`.
+    filtered : signals for filters, without stuck, dead and spike samples.
+    network : signals for the network's features, also without samples of a burst.
     """
 
     extra_r: FloatArray
@@ -181,7 +179,7 @@ class SensorFaults:
 
 @njit(cache=True)
 def _difference(c, z):  # type: ignore[no-untyped-def]
-    """Return what the parabola through the last three samples misses ``z`` by, and its gain for white noise.
+    """Return the difference of ``z`` from the parabola through the last three samples, and its gain for white noise.
 
     Ages a₁ < a₂ < a₃ of the samples are in ``c``. The gain is NaN where the ages do not allow it.
     """
@@ -199,7 +197,7 @@ def _difference(c, z):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _forget(c):  # type: ignore[no-untyped-def]
-    """Drop the samples, not what was learnt: the next sample starts anew."""
+    """Drop the samples but not the learned levels; the next sample starts a new sequence."""
     c[C_COUNT] = 0.0
     c[C_SPIKES] = 0.0
     c[C_E : C_E + 4] = 0.0
@@ -213,18 +211,18 @@ def _decayed(c, usual, dt):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _asked(c, nats):  # type: ignore[no-untyped-def]
-    """Return the evidence that is asked for where ``nats`` would do with a level that is known for sure."""
+    """Return the required evidence: ``nats`` for a well-determined level, more for an uncertain one."""
     return nats * (1.0 + HALF_KNOWN_S / max(c[C_LEVEL_S], FIRST_GUESS_S))
 
 
 @njit(cache=True)
 def _weigh_burst(c, e, s0, moving):  # type: ignore[no-untyped-def]
-    """Add what a squared difference says for a burst, and learn the level that such differences usually have."""
+    """Add the evidence of a squared difference for a burst, and update the usual level."""
     age = c[C_AGE]
     known = c[C_LEVEL_S] > FIRST_GUESS_S
     beyond = e > max(BEYOND_SIGMA * BEYOND_SIGMA * s0 * s0, HEALTHY_FACTOR * HEALTHY_FACTOR * c[C_LEVEL])
     nats = NATS_BEYOND if beyond and moving and known else NATS_WITHIN
-    # Samples that follow each other faster are not independent: road and body are slower.
+    # Faster samples are not independent: road and body motion are slower.
     nats *= min(1.0, age * SAMPLES_PER_S)
     asked = _asked(c, BURST_NATS)
     c[C_BURST] = min(max(c[C_BURST] + nats, 0.0), asked)
@@ -244,7 +242,7 @@ def _weigh_burst(c, e, s0, moving):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _weigh_spike(c, beyond, dt):  # type: ignore[no-untyped-def]
-    """Add what a sample ``beyond`` times its limit says for spikes that are no chance; return whether to report it."""
+    """Add the evidence of a sample ``beyond`` times its limit for spikes; return whether to report it."""
     c[C_SPIKE] = max(c[C_SPIKE] - SPIKE_FORGOTTEN_NATS_PER_S * dt, 0.0)
     if beyond <= 1.0 or c[C_LEVEL_S] <= FIRST_GUESS_S or c[C_BURST] > BURST_LIKELY * BURST_NATS:
         return False
@@ -255,9 +253,9 @@ def _weigh_spike(c, beyond, dt):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _noise_and_spike(c, z, dt, s0, curvature, learn):  # type: ignore[no-untyped-def]
-    """Take a sample into the memory of its channel; return whether it is a spike, and how far beyond its limit.
+    """Process a sample of a channel; return whether it is a spike, and its ratio to the limit of reports.
 
-    Updates ŝ² and the usual noise. The limit that counts for reports is that of the level that was learnt.
+    Updates ŝ² and the usual noise. The limit of reports depends on the learned level.
     """
     usual = max(s0 * s0, c[C_USUAL])
     if c[C_AGE] > DIFFERENCE_SPAN_S:
@@ -273,12 +271,12 @@ def _noise_and_spike(c, z, dt, s0, curvature, learn):  # type: ignore[no-untyped
         miss = z - ahead
         sigma = TRACK_INNOVATION_RATIO * math.sqrt(max(usual, c[C_NOISE]))
         bend = curvature * age * age / TRACK_RATE_GAIN
-        # The rate is not known before the third sample.
+        # The rate needs three samples.
         spike = c[C_COUNT] >= 3.0 and age <= DIFFERENCE_SPAN_S and abs(miss) > SPIKE_SIGMA * sigma + bend
         learnt = TRACK_INNOVATION_RATIO * HEALTHY_FACTOR / BEYOND_SIGMA * math.sqrt(c[C_LEVEL])
         beyond = abs(miss) / (SPIKE_SIGMA * max(sigma, learnt) + bend)
         if spike and c[C_SPIKES] >= MAX_SPIKES:
-            # A jump or a burst: the samples are what they are.
+            # A jump or a burst: the samples are valid.
             spike = False
             c[C_SPIKES] = 0.0
             c[C_TRACK], c[C_TRACK_RATE], c[C_TRACK_AGE] = z, 0.0, 0.0
@@ -288,7 +286,7 @@ def _noise_and_spike(c, z, dt, s0, curvature, learn):  # type: ignore[no-untyped
             c[C_SPIKES] += 1.0
         else:
             if c[C_SPIKES] > 0.0:
-                # It was a spike and no burst: take it out of the differences and out of the noise.
+                # A spike and no burst: remove it from the differences and from the noise.
                 for i in range(int(c[C_SPIKES])):
                     c[C_Z + i] = ahead - c[C_TRACK_RATE] * c[C_AGE + i]
                     c[C_E + i] = 0.0
@@ -321,7 +319,7 @@ def _noise_and_spike(c, z, dt, s0, curvature, learn):  # type: ignore[no-untyped
 
 @njit(cache=True)
 def _stuck(c, z, dt, moving, turning):  # type: ignore[no-untyped-def]
-    """Return whether the channel repeats a value for longer than its repeats so far explain.
+    """Return whether the channel repeats a value for longer than its share of repetitions explains.
 
     ``turning`` is the open-loop model's yaw rate, rad/s.
     """
@@ -352,10 +350,10 @@ def _stuck(c, z, dt, moving, turning):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _judge_witness(c, own, one, other, least, band, dt):  # type: ignore[no-untyped-def]
-    """Update whether a channel is dead: its yaw rate ``own`` against those of two other witnesses, rad/s.
+    """Update whether a channel is dead: its yaw rate ``own`` against the two other measures, rad/s.
 
-    A live channel may disagree for a while, in a spin or with a wrong model, but it moves then, or at the grip limit
-    reads much. A dead one stays within ``band`` and reads next to nothing of what both others tell.
+    A healthy channel may disagree for a while, in a spin or with a wrong model, but then it changes, or reads a large
+    value at the limit of grip. A dead one stays within ``band`` and near zero while both others turn.
     """
     if abs(own - c[C_ANCHOR]) > band:
         c[C_ANCHOR] = own
@@ -381,7 +379,7 @@ def _judge_witness(c, own, one, other, least, band, dt):  # type: ignore[no-unty
 
 @njit(cache=True)
 def _open_loop(w, steer, friction, dt, p):  # type: ignore[no-untyped-def]
-    """Move the open-loop model by ``dt`` at the speed of ``w``; its r stays within what friction allows."""
+    """Advance the open-loop model by ``dt`` at the speed of ``w``; friction limits its r."""
     v = w[W_SPEED]
     n = substeps(v, dt, friction, p)
     _, vy, r = rk4_step(v, w[W_VY], w[W_R], 0.5 * (w[W_STEER] + steer), -w[W_VY] * w[W_R], friction, dt, n, p)
@@ -392,7 +390,7 @@ def _open_loop(w, steer, friction, dt, p):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _detect(window, default_friction, s0, p, channels, w, found):  # type: ignore[no-untyped-def]
-    """Run over one window; ``dt[k]`` ends at step k, NaN = start of a log. Memories are updated in place."""
+    """Process one window; ``dt[k]`` ends at step k, NaN = start of a log. Memories are updated in place."""
     dt, steer, ay, yaw_rate, speed, friction = window
     extra, noise, reason, usable = found
     for k in range(dt.shape[0]):
@@ -493,7 +491,7 @@ def _detect(window, default_friction, s0, p, channels, w, found):  # type: ignor
 
 
 def no_faults(signals: Signals) -> SensorFaults:
-    """Return signals of which nobody asks whether something is wrong."""
+    """Return the signals unchanged, without faults."""
     nothing = np.zeros((len(signals), CHANNELS))
     return SensorFaults(nothing, nothing, np.zeros(len(signals), dtype=np.int64), signals, signals)
 
@@ -501,7 +499,7 @@ def no_faults(signals: Signals) -> SensorFaults:
 def find_faults(
     signals: Signals, vehicle: VehicleParameters, carry: FaultCarry | None
 ) -> tuple[SensorFaults, FaultCarry]:
-    """Look for faults of a_y and yaw rate in one window, causally: step k depends on samples up to k.
+    """Detect faults of a_y and yaw rate in one window, causally: step k depends on samples up to k.
 
     Joined windows give the same bits as one call over the whole log.
     """

@@ -1,20 +1,20 @@
-"""Speed samples of wheels that spin or lock, kept from the filters: measured speed against the accelerometer.
+"""Wheel slip: speed samples of spinning or locked wheels, rejected by comparison with the accelerometer.
 
-What the speed changes from sample to sample beyond ∫(a_x + b) dt is excess; b is what it exceeds a_x by slowly (grade,
-pitch, bias), learnt. Two cumulative sums (Page 1954), one for each sign, gather the excess beyond an allowance of
-``CONTRADICTION_M_S2``, and of what v̇_x = a_x + v_y r may hold in a turn. One of them beyond a bound that noise does not
-reach, at two samples in a row, is slip, and the sum's last zero says when it began. From the speed of then a_x counts
-on: v̂. While slip lasts,
+The excess of a sample is the change of the measured speed beyond ∫(a_x + b) dt; b is the learned slow part of the
+excess (grade, pitch, bias). Two cumulative sums (Page 1954), one for each sign, add the excess beyond an allowance of
+``CONTRADICTION_M_S2`` plus the part of v̇_x = a_x + v_y r that a turn may cause. A sum above a bound that noise does not
+reach, at two consecutive samples, is wheel slip; it began at the sum's last zero. From the speed at that time, a_x is
+integrated to v̂ (docs/method.md#wheel-slip). While slip lasts,
 
-- the reading nearest to v̂ and within a tolerance is believed, out of the speed itself and the mean wheel speed of each
-  axle where the log has them: of two driven wheels that spin, the median of four still takes half. v̂ follows it;
-- without one the sample is missing, but for as long as wrong samples were believed before the slip was seen, v̂ stands
-  in their place: else a filter would go on with what they did to it.
+- the reading nearest to v̂ within a tolerance is accepted: the speed itself, or the mean wheel speed of an axle where
+  the log has them (with two spinning driven wheels the median of four is half wrong). v̂ follows it;
+- without such a reading the sample is missing. For as long as wrong samples were accepted before the detection, v̂
+  replaces them: otherwise the filter would keep their effect.
 
-It ends when the speed itself has agreed with v̂ for a while; after a time-out without any reading to believe, when v̂ is
-no better than the speed and the accelerometer is not heeded for a time. Locked wheels on a car that decelerates do not
-time out. A car that stands reads zero, and below some speed there are no pulses: steps into and out of that range are
-no excess. Neither is slip what only ends: wheels that spun are right again after a fall while the car accelerates.
+Slip ends when the speed has agreed with v̂ for a while, or after a timeout without an accepted reading; v̂ is then no
+better than the speed, and the check is suspended. Locked wheels on a decelerating car have no timeout. At a standstill
+the sensor reads zero, and below some speed there are no pulses: steps into and out of that range are not counted. A
+recovery is no slip either: the speed of spinning wheels falls while the car accelerates.
 """
 
 from __future__ import annotations
@@ -29,37 +29,37 @@ from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.release import RESTART_GAP_S, last_stamp_ns, step_durations_s
 from pdhef_logtool.records.signals import FloatArray, Signals
 
-#: A speed that changes by this much more or less than the accelerometer says is contradicted: no hill is so steep.
+#: Allowed difference between the change of speed and the accelerometer; no hill is steeper.
 CONTRADICTION_M_S2 = 3.0
-#: |v_y| / v_x up to which v_y r is allowed in v̇_x, while turning: a drifting car has more of it than the limit above.
+#: Largest |v_y| / v_x for the allowance v_y r in v̇_x: of a drifting car it exceeds the limit above.
 TURN_SHARE = 1.5
-#: Bound of the cumulative sums: this many 1-sigmas of the speed sensor, and at least the second.
+#: Bound of the cumulative sums, in standard deviations of the speed sensor, and its smallest value.
 BOUND_SIGMAS, LEAST_BOUND_M_S = 6.0, 0.4
-#: Of the speed sensor, for an estimator that knows no vehicle.
+#: Standard deviation of the speed sensor for an estimator without a vehicle file.
 ASSUMED_STD_M_S = 0.08
-#: Samples in a row beyond the bound: one alone is an outlier.
+#: Consecutive samples beyond the bound; a single one is an outlier.
 ALARM_SAMPLES = 2
 #: Time constant and limit of b.
 BIAS_S, MAX_BIAS_M_S2 = 3.0, 2.5
-#: A reading within the bound of v̂ is believed; without one the tolerance grows at this rate, and by the second share
-#: of |r| v_x.
+#: A reading within the bound of v̂ is accepted; without one the tolerance grows at this rate, and by this share of
+#: |r| v_x.
 DRIFT_M_S2, TURN_DRIFT_SHARE = 0.3, 1.0
-#: Time constant with which v̂ follows what is believed.
+#: Time constant with which v̂ follows accepted readings.
 FOLLOW_S = 0.3
-#: The speed must have agreed for this long.
+#: Duration of agreement after which slip ends.
 RELEASE_S = 0.2
-#: Longest time without a reading to believe, and for how long nothing is gated behind it.
+#: Timeout without an accepted reading, and the time for which the check is then suspended.
 TIMEOUT_S, HEED_AGAIN_S = 5.0, 30.0
-#: A sensor without pulses reads below the first; readings up to the second may come next to it.
+#: Reading of a sensor without pulses, and the largest reading that may follow or precede it.
 ZERO_M_S, PULSE_FLOOR_M_S = 0.05, 1.0
-#: Wheels lock where the car decelerates by more than this, smoothed, and spin where it does not; else they recover from
-#: slip that grew too slowly to be seen, and are right again.
+#: Wheels lock if the smoothed deceleration exceeds this, and spin otherwise; in the other cases they recover from slip
+#: that grew too slowly to be detected.
 BRAKING_M_S2, BRAKING_SMOOTHING_S = 0.5, 0.1
 #: Locked wheels do not time out above this v̂.
 LOCKED_SPEED_M_S = 1.0
 
-# Entries of the memory. Last samples of speed, a_x, yaw rate; since the last speed sample: time, what a_x says of the
-# speed, what is allowed beyond it; time since a_x.
+# Entries of the memory. Last samples of speed, a_x, yaw rate; since the last speed sample: time, integral of a_x,
+# allowance; time since a_x.
 (_STARTED, _SPEED, _AX, _HAS_AX, _RATE, _SPAN, _EXPECTED, _ALLOWED, _AX_AGE, _BIAS) = range(10)
 # The sums: value, dead-reckoned speed and time since the last zero, b at that time, samples beyond the bound.
 _UP, _DOWN = 10, 15
@@ -81,7 +81,7 @@ class SlipCarry:
 
 @njit(cache=True)
 def _forget(m):  # type: ignore[no-untyped-def]
-    """Begin the sums anew at the last speed sample."""
+    """Reset the sums to the last speed sample."""
     for s in (_UP, _DOWN):
         m[s + _SUM] = 0.0
         m[s + _FROM] = m[_SPEED]
@@ -92,7 +92,7 @@ def _forget(m):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _gather(m, s, excess, z, bound):  # type: ignore[no-untyped-def]
-    """Take an excess into a sum; return whether it says slip."""
+    """Add an excess to a sum; return whether it indicates slip."""
     m[s + _SUM] += excess
     if m[s + _SUM] <= 0.0:
         m[s + _SUM] = 0.0
@@ -105,7 +105,7 @@ def _gather(m, s, excess, z, bound):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _onward(v, change):  # type: ignore[no-untyped-def]
-    """Return a speed after a change; slipping wheels turn no car around."""
+    """Return a speed after a change, without a change of sign: wheel slip does not reverse the car."""
     return max(0.0, v + change) if v >= 0.0 else min(0.0, v + change)
 
 
@@ -121,9 +121,9 @@ def _brakes(m):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _one_axle_agrees(z, wheels, bound):  # type: ignore[no-untyped-def]
-    """Return whether the speed is that of one axle and not of the other: it has just become right again.
+    """Return whether the speed agrees with one axle and not with the other: it has just recovered.
 
-    Wheels that slip together take it along to where no axle is, or to where both are.
+    Wheels that slip together move the speed to a value of no axle or of both.
     """
     front, rear = abs(_axle(wheels, 0) - z) <= 0.5 * bound, abs(_axle(wheels, 2) - z) <= 0.5 * bound
     return math.isfinite(wheels.sum()) and front != rear
@@ -131,9 +131,9 @@ def _one_axle_agrees(z, wheels, bound):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _start(v, wheels, bound, spins):  # type: ignore[no-untyped-def]
-    """Return v̂ at an alarm: the dead-reckoned speed, or that of the axle that slips less and says more slip still.
+    """Return v̂ at an alarm: the dead-reckoned speed, or that of the axle with less slip if it indicates more slip.
 
-    Slip that grew slowly at first has taken the speed along before the sum began to count.
+    Slip that grew slowly at first has changed the speed before the sum began to grow.
     """
     front, rear = _axle(wheels, 0), _axle(wheels, 2)
     if spins and min(front, rear) < v - bound:
@@ -145,7 +145,7 @@ def _start(v, wheels, bound, spins):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _while_slipping(m, z, wheels, bound):  # type: ignore[no-untyped-def]
-    """Take a sample while slip lasts; return the speed to believe, NaN for none."""
+    """Process a sample during slip; return the accepted speed, NaN for none."""
     v, span = m[_V], m[_SPAN]
     tolerance = bound + m[_GROWTH]
     agrees = abs(z - v) <= tolerance
@@ -175,9 +175,9 @@ def _while_slipping(m, z, wheels, bound):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _gate(window, bound, m, believed, reckoned):  # type: ignore[no-untyped-def]
-    """Run over one window; ``dt[k]`` ends at step k, NaN = start. Returns whether any sample is not as it was.
+    """Process one window; ``dt[k]`` ends at step k, NaN = start. Returns whether any sample changed.
 
-    ``believed`` [N] is the speed for filters, ``reckoned`` [N] that with v̂ in place of what is missing.
+    ``believed`` [N] is the speed for filters, ``reckoned`` [N] that with v̂ in place of missing samples.
     """
     dt, ax, yaw_rate, speed, wheels = window
     changed = False
@@ -188,7 +188,7 @@ def _gate(window, bound, m, believed, reckoned):  # type: ignore[no-untyped-def]
         has_ax = math.isfinite(ax[k])
         if math.isfinite(yaw_rate[k]):
             m[_RATE] = yaw_rate[k]
-        # As in the filters: the mean of the step's two ends, or the one that is known.
+        # As in the filters: the mean of both ends of the step, or the finite one.
         a = m[_AX] if not has_ax else ax[k] if m[_HAS_AX] == 0.0 else 0.5 * (m[_AX] + ax[k])
         known = has_ax or m[_HAS_AX] > 0.0
         m[_HAS_AX] = 1.0 if has_ax else 0.0
@@ -223,7 +223,7 @@ def _gate(window, bound, m, believed, reckoned):  # type: ignore[no-untyped-def]
             if known:
                 m[_STARTED] = 1.0
                 m[_SPEED] = z
-                m[_NOT_HEEDED] = RELEASE_S  # the first sample may be a wrong one
+                m[_NOT_HEEDED] = RELEASE_S  # the first sample may be an outlier
                 _forget(m)
         elif m[_SLIPS] > 0.0:
             believed[k] = _while_slipping(m, z, wheels[k], bound)
@@ -253,7 +253,7 @@ def _gate(window, bound, m, believed, reckoned):  # type: ignore[no-untyped-def]
                 if (up or down) and recovers:
                     _forget(m)
                 elif alone and not (up or down):
-                    _forget(m)  # one sample was off: its way back is no slip either
+                    _forget(m)  # a single outlier: its return is no slip
                 elif up or down:
                     s = _UP if up else _DOWN
                     m[_SLIPS] = 1.0
@@ -285,14 +285,14 @@ def _run(
 def without_slip(
     signals: Signals, speed_std_m_s: float, carry: SlipCarry | None, *, reckoned: bool = False
 ) -> tuple[Signals, SlipCarry]:
-    """Return the signals with the speed samples of slipping wheels missing; the same object where there are none.
+    """Return the signals without the speed samples of slipping wheels; the same object if there are none.
 
     Causal: step k depends on samples up to k. Joined windows give the same bits as one call over the whole log.
 
     Parameters
     ----------
-    speed_std_m_s : 1-sigma of the speed sensor. carry : what the previous window's call returned.
-    reckoned : put the dead-reckoned speed where a sample is missing, for estimators that need one to go on.
+    speed_std_m_s : standard deviation of the speed sensor. carry : state after the previous window.
+    reckoned : replace missing samples by the dead-reckoned speed, for estimators that need one.
     """
     changed, believed, with_reckoned, after = _run(signals, speed_std_m_s, carry)
     if not changed:
@@ -303,6 +303,6 @@ def without_slip(
 def believable(
     signals: Signals, speed_std_m_s: float, carry: SlipCarry | None, *, gate: bool, reckoned: bool = False
 ) -> tuple[Signals, SlipCarry | None]:
-    """Return what an estimator starts from: no impossible readings and, with ``gate``, no speed of slipping wheels."""
+    """Return signals without impossible readings and, with ``gate``, without the speed of slipping wheels."""
     signals = without_impossible(signals)
     return without_slip(signals, speed_std_m_s, carry, reckoned=reckoned) if gate else (signals, None)

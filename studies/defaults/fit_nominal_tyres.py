@@ -2,8 +2,8 @@
 
     python -m studies.defaults.fit_nominal_tyres [sample_logs]
 
-The nominal model (METHOD section 2) knows one slip angle an axle, from the mean steering angle and the motion of the
-CG. So load transfer, compliance and both wheels of an axle go into its magic formula. Forces follow from Newton and
+The nominal model (docs/method.md#model) knows one slip angle an axle, from the mean steering angle and the motion of
+the CG. So load transfer, compliance and both wheels of an axle go into its magic formula. Forces follow from Newton and
 Euler as they would from measured accelerations: F_f = (l_r m a_y + I_z dr/dt) / (L cos d), F_r = m a_y - F_f cos d.
 
 One curve serves all roads: by similarity (Pacejka 2012, section 4.2) the force over friction is a function of the slip

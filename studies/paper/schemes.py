@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-#: All schemes that belong in the tables (METHOD §10), with one line each for the page.
+#: All schemes that belong in the tables (docs/method.md#evaluation), with one line each for the page.
 SCHEMES: dict[str, str] = {
     "zero": "sideslip 0",
     "gyro": "sensors passed through, no lateral velocity",

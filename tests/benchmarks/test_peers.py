@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -29,9 +30,11 @@ def test_the_peer_writer_knows_every_field_of_our_messages() -> None:
 @pytest.mark.slow
 def test_the_straightforward_pipeline_writes_what_our_reader_finds(tmp_path: Path) -> None:
     log, output = Path(__file__).parents[2] / "sample_logs" / "road.mcap", tmp_path / "out.mcap"
-    start_ns = open_log(log).start_ns
+    with closing(open_log(log)) as source:
+        start_ns = source.start_ns
     steps = peers.run_pipeline(log, output, start_ns + 500_000_000)
-    written = open_log(output).read({peers.topic_of(name, "state"): ("vx_m_s",) for name in ("pd-hef", "physics")})
+    with closing(open_log(output)) as result:
+        written = result.read({peers.topic_of(name, "state"): ("vx_m_s",) for name in ("pd-hef", "physics")})
     assert steps > 40
     assert [len(columns) for columns in written.values()] == [steps, steps]
     assert all(np.isfinite(columns.fields["vx_m_s"]).all() for columns in written.values())

@@ -327,7 +327,7 @@ def test_left_and_right_are_mirrored(rough):
     np.testing.assert_allclose(b.sideslip_std_rad, a.sideslip_std_rad, rtol=1e-6)
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error", "ignore::ResourceWarning")
 def test_bad_signals_leave_it_finite_and_its_covariance_definite(rough):
     nothing = {c: np.full(len(rough), np.nan) for c in ("ay_m_s2", "yaw_rate_rad_s", "friction", "ax_m_s2")}
     spiked = {"ay_m_s2": np.where(np.arange(len(rough)) % 50 == 0, 1e6, rough.ay_m_s2)}

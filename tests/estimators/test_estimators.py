@@ -312,7 +312,7 @@ def plain() -> Signals:
 
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error", "ignore::ResourceWarning")
 def test_no_fault_breaks_an_estimator(name, fault, plain):
     faulty = FAULTS[fault](plain)
     for vehicle in (VEHICLE, STIFFNESS_VEHICLE):
@@ -347,7 +347,7 @@ def test_spikes_do_no_harm(fault, plain):
 
 @pytest.mark.parametrize("name", ["open-loop", "phy-ukf"])
 @pytest.mark.parametrize("delay_s", [0.0, 0.1])
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error", "ignore::ResourceWarning")
 def test_a_vehicle_that_no_step_can_follow_claims_nothing_infinite(name, delay_s, plain):
     """A yaw inertia in the wrong unit makes the model faster than any step: the state runs away, and is dropped."""
     toy = VEHICLE.model_copy(update={"yaw_inertia_kg_m2": 0.001})

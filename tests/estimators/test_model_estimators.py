@@ -115,7 +115,7 @@ def test_nothing_that_arrives_later_changes_an_output(name, rough, j, seed, miss
 
 @pytest.mark.parametrize("fault", properties.FAULTS)
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error", "ignore::ResourceWarning")
 def test_no_fault_breaks_an_estimator(name, fault):
     s = with_noise(drive(slalom(0.035, 0.5), 8.0, speed=22.0).signals, seed=9)
     s.friction[:] = 0.85

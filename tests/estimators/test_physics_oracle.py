@@ -1,4 +1,4 @@
-"""The whole physics filter against filterpy's UKF with model functions written from METHOD's equations."""
+"""The whole physics filter against filterpy's UKF with model functions written from docs/method.md."""
 
 from __future__ import annotations
 

@@ -173,7 +173,7 @@ Q_STD, R_STD = (0.05, 0.3, 0.15, 0.05), (0.12, 0.004, 0.08)
 
 
 def unscented_smoother(signals: Signals, rate: np.ndarray):
-    """Unscented filter and smoother in plain numpy, the residual as a known input (METHOD §6, Särkkä 2008)."""
+    """Unscented filter and smoother in plain numpy, the residual as a known input (Särkkä 2008)."""
     n, weight = 4, np.array([0.0] + [1 / 8] * 8)
     weight_c = weight + np.array([2.0] + [0.0] * 8)
 

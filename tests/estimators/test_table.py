@@ -251,6 +251,11 @@ def test_other_noise_is_another_basis_of_the_same_identity(name: str) -> None:
     assert told == was
 
 
+def test_options_reach_an_estimator_and_have_defaults() -> None:
+    assert resolve(make_estimator("pd-hef", CAR)) == ran("pd-hef")
+    assert resolve(make_estimator("phy-ukf", CAR)).use_speed is True
+
+
 def test_trust_and_speed_sensor_are_told() -> None:
     assert len({ran("pd-hef", trust=t).identity for t in (0.0, 0.5, 1.0)}) == 3
     assert ran("pd-hef", trust=0.5).options["trust"] == 0.5

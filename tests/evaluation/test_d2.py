@@ -9,7 +9,8 @@ import pytest
 
 from pdhef_logtool.evaluation import blocks
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.evaluation.metrics.d2 import LogSensors, d2_rows, driven_d2, driving_products
+from pdhef_logtool.evaluation.metrics.d2 import d2_rows, driven_d2, driving_products
+from pdhef_logtool.evaluation.metrics.metric import SensorErrors
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.runs.guard import FACTOR, distrust
@@ -19,10 +20,10 @@ STAMPS = 1_700_000_000_000_000_000 + np.round(T * 1e9).astype(np.int64)
 EVERYTHING = {"all": np.ones(T.size, bool)}
 SPEED, RATE, VY = 20.0 + 0.0 * T, 0.1 * np.sin(0.5 * T), 0.4 * np.sin(0.8 * T)
 VY_RATE, YAW_ACCELERATION = 0.32 * np.cos(0.8 * T), 0.05 * np.cos(0.5 * T)
-SENSORS = LogSensors(ay_bias_m_s2=0.2, yaw_rate_bias_rad_s=0.003, ay_gain=1.08, lever_m=0.7, superelevation=0.25)
+SENSORS = SensorErrors(ay_bias_m_s2=0.2, yaw_rate_bias_rad_s=0.003, ay_gain=1.08, lever_m=0.7, superelevation=0.25)
 
 
-def signals(sensors: LogSensors) -> Signals:
+def signals(sensors: SensorErrors) -> Signals:
     """Return what such sensors read of the motion above."""
     felt = VY_RATE + (1.0 - sensors.superelevation) * SPEED * RATE
     ay = sensors.ay_gain * felt + sensors.lever_m * YAW_ACCELERATION + sensors.ay_bias_m_s2
@@ -43,7 +44,7 @@ def track(vy: np.ndarray) -> StateTrack:
     return make_track("e", STAMPS, vx_m_s=SPEED, vy_m_s=vy, valid=np.ones(T.size, bool))
 
 
-def d2(of: Signals, vy: np.ndarray, sensors: LogSensors) -> MetricRow:
+def d2(of: Signals, vy: np.ndarray, sensors: SensorErrors) -> MetricRow:
     (row,) = d2_rows([track(vy)], of, EVERYTHING, log="drive", low_speed_m_s=3.0, sensors=sensors)
     return row
 
@@ -86,7 +87,7 @@ def test_the_true_lateral_velocity_contradicts_nothing_once_the_sensors_are_know
 
 @pytest.mark.parametrize("entry", ["ay_bias_m_s2", "yaw_rate_bias_rad_s", "ay_gain", "lever_m", "superelevation"])
 def test_each_entry_of_the_sensors_counts(entry: str) -> None:
-    plain = getattr(LogSensors(), entry)
+    plain = getattr(SensorErrors(), entry)
     assert d2(signals(SENSORS), VY, replace(SENSORS, **{entry: plain})).value > 0.01
 
 

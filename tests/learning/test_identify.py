@@ -250,7 +250,7 @@ def test_command_refuses_what_it_cannot_use(sample_logs_dir: Path, tmp_path: Pat
 def test_250_lm_identified_on_its_first_half_is_good_on_its_second(
     shared_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """METHOD §14: 0.30 to 0.34° is to be expected of an identified filter on 155 to 300 s."""
+    """An identified filter has 0.30 to 0.34° on 155 to 300 s."""
     reference = Path(__file__).resolve().parents[1] / "reference"
     mapping = reference / "mappings" / "revs_250lm.toml"
     log = [str(shared_dir / "data/drives/revs_250lm_a.mcap")]

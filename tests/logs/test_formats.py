@@ -21,8 +21,8 @@ from pdhef_logtool.drive.slim import slim_log
 from pdhef_logtool.logs import formats
 from pdhef_logtool.logs.budget import Meter
 from pdhef_logtool.logs.discovery import LogInput, find_logs
-from pdhef_logtool.logs.drive_log import FieldInfo
-from pdhef_logtool.logs.formats import LogFile
+from pdhef_logtool.logs.log_file import LogFile
+from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.table_log import Table, TableLog
 from pdhef_logtool.records.errors import LogError, MappingError, PdhefError
@@ -199,6 +199,7 @@ def _pdhef(package: Path, *arguments: object) -> tuple[int, str, str]:
     return done.returncode, done.stdout, done.stderr
 
 
+@pytest.mark.slow
 def test_a_fleet_of_tables_runs_in_several_processes(package: Path, npz: Path, tmp_path: Path) -> None:
     logs = tmp_path / "logs"
     for name in ("one", "two"):

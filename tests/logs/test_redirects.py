@@ -129,6 +129,7 @@ def test_an_option_allows_it(server: CountingServer, tmp_path: Path, monkeypatch
     assert _exit_code("inspect", url) == EXIT_OK
 
 
+@pytest.mark.slow
 def test_the_option_reaches_the_processes_of_a_fleet(server: CountingServer, tmp_path: Path) -> None:
     server.fault = _redirecting(server.place("dlc.mcap").replace("127.0.0.1", "localhost"))
     urls = [server.place("away.mcap"), server.place("dlc.mcap")]

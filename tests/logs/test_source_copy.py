@@ -113,15 +113,16 @@ def test_an_mcap_copy_equals_its_source(tmp_path: Path, whole: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    "name",
+    ("name", "whole"),
     [
-        "data/drives/comma2k19_segment.mcap",
-        "data/drives/faulty/revs_250lm_a_disorder.mcap",
-        "reader_corpus/plotjuggler_pj-mcap-server/test_unsupported_encoding.mcap",
-        "reader_corpus/rerun/foxglove_log.mcap",
+        ("data/drives/comma2k19_segment.mcap", False),
+        ("data/drives/faulty/revs_250lm_a_disorder.mcap", True),
+        ("reader_corpus/plotjuggler_pj-mcap-server/test_unsupported_encoding.mcap", False),
+        ("reader_corpus/plotjuggler_pj-mcap-server/test_unsupported_encoding.mcap", True),
+        ("reader_corpus/rerun/foxglove_log.mcap", False),
+        ("reader_corpus/rerun/foxglove_log.mcap", True),
     ],
 )
-@pytest.mark.parametrize("whole", [False, True])
 def test_copies_of_recordings_equal_their_sources(shared_dir: Path, tmp_path: Path, name: str, whole: bool) -> None:
     _copy(shared_dir / name, tmp_path / "copy.mcap", whole)
     copied, original = _content(tmp_path / "copy.mcap"), _content(shared_dir / name)

@@ -557,7 +557,7 @@ def test_what_is_beside_a_quantity_is_not_it(path: str, quantity: str) -> None:
     assert (meaning.quantity if meaning else "") == quantity
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error", "ignore::ResourceWarning")
 @pytest.mark.parametrize("values", ["nan", "inf", "huge", "zero", "noise", "few"])
 def test_values_that_are_no_drive_break_nothing(values: str) -> None:
     noise = np.random.default_rng(0).normal(size=N)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+import math
 import re
 import sys
 from pathlib import Path
@@ -17,6 +18,7 @@ from made_runs import START_NS, drive_tracks, write_run
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.reports.colours import colour, contrast
 from pdhef_logtool.reports.drive import drive_page, roles_of
+from pdhef_logtool.reports.page import number
 from pdhef_logtool.reports.pages import remove_pages, write_pages
 from pdhef_logtool.results.opened_run import open_run
 from tests.command_line import called
@@ -143,6 +145,7 @@ def test_tracks_of_one_row_and_of_unknown_values_have_a_page(tmp_path):
     at = np.array([START_NS], dtype=np.int64)
     nothing = make_track("pd-hef", at)
     assert words(page_of(write_run(tmp_path, [nothing])))
+    assert (number(None), number(math.nan), number(0.123456, 10.0)) == ("–", "–", "1.235")
 
 
 @pytest.mark.parametrize("outcome", ["better", "worse", "same", "undecided", "none"])

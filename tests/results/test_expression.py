@@ -36,6 +36,8 @@ def test_tracks_units_and_errors_are_columns() -> None:
     assert condition.least_s == 0.5
     assert condition.peak == Applied("abs", (Column("pd-hef", "sideslip_error_rad", 57.29577951308232),))
     assert not condition.falls
+    (quoted,) = parse_condition("'pd-hef:gain=1'.vx_m_s > 2").columns()
+    assert quoted == Column("pd-hef:gain=1", "vx_m_s")
     assert parse_condition("speed_m_s < 3").falls
     assert parse_condition("diverged").peak is None
 
@@ -43,13 +45,13 @@ def test_tracks_units_and_errors_are_columns() -> None:
 @pytest.mark.parametrize(
     ("text", "sign", "expected", "got"),
     [
-        ("", 1, "a column, a number, abs or (", "the end"),
+        ("", 1, "a condition on columns", "the end"),
         ("abs(sidslip_error_deg) > 2", 5, "a column such as sideslip_error_deg", "sidslip_error_deg"),
-        ("speed_m_s > 2 and", 18, "a column, a number, abs or (", "the end"),
-        ("speed_m_s > 2 & valid", 15, "a column, a number or a sign", "&"),
-        ("(speed_m_s > 2", 15, "expected ),", "the end"),
-        ("speed_m_s > 2)", 14, "and, or, for, or the end", ")"),
-        ("1 < speed_m_s < 2", 15, "and between two comparisons", "<"),
+        ("speed_m_s > 2 and", 18, "a condition on columns", "the end"),
+        ("speed_m_s > 2 & valid", 13, "a column, a number, abs or (", "2 & valid"),
+        ("(speed_m_s > 2", 1, "a condition on columns", "("),
+        ("speed_m_s > 2)", 14, "a condition on columns", ")"),
+        ("1 < speed_m_s < 2", 17, "and between two comparisons", "2"),
         ("speed_m_s", 1, "a condition, such as a comparison", "speed_m_s"),
         ("speed_m_s and valid", 1, "a comparison or a flag", "speed_m_s"),
         ("valid + 1 > 2", 1, "a number", "valid"),
@@ -58,9 +60,14 @@ def test_tracks_units_and_errors_are_columns() -> None:
         ("valid for long", 11, "a time such as 0.5s", "long"),
         ("valid for 3 min", 13, "s, for seconds", "min"),
         ("truth.sideslip_error_rad > 1", 1, "an estimator before an error", "truth.sideslip_error_rad"),
-        ("__import__('os').system('x') > 1", 12, "a column, a number or a sign", "'"),
+        ("__import__('os').system('x') > 1", 1, "a column, a number, abs or (", "__import__('os').system('x')"),
         ("stamp_ns > 1", 1, "a column", "stamp_ns"),
-        ("(" * 100, 42, "at most 40", "("),
+        ("-" * 100 + "1 > 2", 41, "at most 40", "-"),
+        ("(" * 1000 + "1", 0, "expected", "("),
+        ("not " * 400 + "valid", 0, "at most 40", "not"),
+        ("speed_m_s > 2 ü", 15, "a column, a number or a sign", "ü"),
+        ("speed_m_s > 1j", 13, "a column, a number", "1j"),
+        ("speed_m_s > True", 13, "a column, a number", "True"),
         ("speed_m_s > 2 " * 300, 0, "at most 2000 signs", "4200 signs"),
     ],
 )

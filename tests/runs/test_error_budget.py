@@ -53,7 +53,7 @@ def taken_off(found: ErrorBudget) -> dict[str, float]:
 
 
 def stiffer_front(factor: float) -> VehicleParameters:
-    """Return the car with one axle stiffened: both at once is what another friction does to tyres by Eq 3."""
+    """Return the car with one axle stiffened: both at once is what another friction does to tyres by Eq 2."""
     tyres = VEHICLE.tyres
     assert tyres.front.B is not None
     front = tyres.front.model_copy(update={"B": factor * tyres.front.B})

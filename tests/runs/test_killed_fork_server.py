@@ -61,6 +61,7 @@ def test_a_fork_server_that_is_killed_costs_no_drive(
     assert not list(out.rglob(".*"))
 
 
+@pytest.mark.slow
 def test_a_fork_server_that_is_always_killed_ends_the_run_with_one_error_and_the_run_goes_on_later(
     tmp_path: Path, dies_at_start: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

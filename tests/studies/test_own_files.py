@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
+import pytest
+
 from studies.torture.own_files import numbers, own_file_judge
 
 CASES = 36
 
 
+@pytest.mark.slow
 def test_damaged_files_of_our_own_are_told_and_made_good(tmp_path: Path) -> None:
     judge_number = own_file_judge(tmp_path, 1)
     found = {number: judge_number(number) for number in numbers(CASES)}

@@ -20,7 +20,7 @@ from studies.torture.mutating import mutant
 from studies.torture.seeds import SEEDS, write_seeds
 from studies.torture.workers import Ended, Verdict, judge, read_journal, run_cases
 
-LOGS, CONFIGS = 70, 20
+LOGS, CONFIGS = 40, 12
 
 
 def _quiet(_text: str) -> None:
@@ -30,7 +30,7 @@ def _quiet(_text: str) -> None:
 @pytest.mark.slow
 def test_mutants_do_no_harm(tmp_path: Path) -> None:
     """In a process of its own: what the tests hold in memory is not the mutants'."""
-    options = ["--seed", "7", "--logs", str(LOGS), "--configs", str(CONFIGS), "--jobs", "1", "--only", "mutations"]
+    options = ["--seed", "2", "--logs", str(LOGS), "--configs", str(CONFIGS), "--jobs", "1", "--only", "mutations"]
     call = [
         sys.executable,
         "-m",

@@ -1,4 +1,4 @@
-"""Credibility gates of the truth vehicle (METHOD section 13), each with proof that it can fail.
+"""Credibility gates of the truth vehicle (docs/method.md#simulator), each with proof that it can fail.
 
 A gate is a function of a simulator and a car that asserts what physics or linear theory demands of Table 3's car.
 Each is run on the simulator as it is; then on simulators with an error put in, a wrong sign or a gain 10 % off, in a

@@ -1,4 +1,4 @@
-"""Sensor errors have the size, shape, delay and independence that METHOD section 9 gives them."""
+"""Sensor errors have the size, shape, delay and independence that docs/method.md#sensors gives them."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def test_braking_takes_from_the_side_force() -> None:
 
 
 def test_load_transfer_costs_force() -> None:
-    # METHOD section 3: F_y(F_z0 + d) + F_y(F_z0 - d) < 2 F_y(F_z0), at small and at large slip.
+    # docs/method.md#physics: F_y(F_z0 + d) + F_y(F_z0 - d) < 2 F_y(F_z0), at small and at large slip.
     for alpha in (0.01, 0.05, 0.15):
         pair = sum(forces_n(TYRE, 0.0, alpha, 3530.0 + d, 0.85)[1] for d in (1500.0, -1500.0))
         assert pair < 0.99 * 2.0 * forces_n(TYRE, 0.0, alpha, 3530.0, 0.85)[1]

@@ -3,34 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from pdhef_logtool.evaluation.blocks import SegmentSums, blocks_with_halo, packed
-from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, OfDrive
+from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, OfDrive, SensorErrors
 from pdhef_logtool.evaluation.metrics.sensor_residuals import MAX_STEP_S, carried_speed
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
 D2_SPAN_S = 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class LogSensors:
-    """What a log's own sensors were found to have, against the vehicle that its signals were read with.
-
-    Attributes
-    ----------
-    ay_bias_m_s2, yaw_rate_bias_rad_s : what they read too much. ay_gain : of body roll. lever_m : of a_y ahead of the
-        centre of gravity. superelevation : share of v_x r that the road's bank carries.
-    """
-
-    ay_bias_m_s2: float = 0.0
-    yaw_rate_bias_rad_s: float = 0.0
-    ay_gain: float = 1.0
-    lever_m: float = 0.0
-    superelevation: float = 0.0
 
 
 def _rows(drive: EvaluatedDrive) -> list[MetricRow]:
@@ -51,7 +33,7 @@ def d2_rows(
     *,
     log: str,
     low_speed_m_s: float,
-    sensors: LogSensors,
+    sensors: SensorErrors,
 ) -> list[MetricRow]:
     """Return ``d2`` of estimators at the same stamps as the signals [N], a row a segment; none where v_y is not."""
     masks = packed(masks, len(signals))
@@ -70,7 +52,7 @@ def d2_rows(
 
 
 def driving_products(
-    track: StateTrack, signals: Signals, *, low_speed_m_s: float, sensors: LogSensors
+    track: StateTrack, signals: Signals, *, low_speed_m_s: float, sensors: SensorErrors
 ) -> tuple[FloatArray, float]:
     """Return what :func:`driven_d2` needs of a window, to be added up: integrals over time [4, 4], and how long, s.
 
@@ -109,7 +91,7 @@ class _Driven:
     turn : v_x r as far as no bank carries it, [N] in m/s².
     """
 
-    def __init__(self, signals: Signals, low_speed_m_s: float, sensors: LogSensors) -> None:
+    def __init__(self, signals: Signals, low_speed_m_s: float, sensors: SensorErrors) -> None:
         t = signals.stamps_ns
         speed = carried_speed(signals)
         rate = signals.yaw_rate_rad_s - sensors.yaw_rate_bias_rad_s

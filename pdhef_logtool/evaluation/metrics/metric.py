@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, TypeVar
+from typing import Literal, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -13,9 +13,6 @@ from pdhef_logtool.evaluation.track_errors import scorable
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS, SIGNALS, read_unit
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-
-if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.metrics.d2 import LogSensors
 
 ALL = "all"
 _T = TypeVar("_T")
@@ -152,6 +149,23 @@ def _scorable_bits(truth: StateTrack, low_speed_m_s: float) -> SegmentMasks:
     return SegmentMasks([*SCORED_SIGNALS], np.concatenate(blocks))
 
 
+@dataclass(frozen=True, slots=True)
+class SensorErrors:
+    """Errors of a log's sensors, relative to the vehicle that its signals were read with.
+
+    Attributes
+    ----------
+    ay_bias_m_s2, yaw_rate_bias_rad_s : reading minus true value. ay_gain : of a_y, by body roll. lever_m : position of
+        the accelerometer ahead of the centre of gravity. superelevation : share of v_x r that the road's bank carries.
+    """
+
+    ay_bias_m_s2: float = 0.0
+    yaw_rate_bias_rad_s: float = 0.0
+    ay_gain: float = 1.0
+    lever_m: float = 0.0
+    superelevation: float = 0.0
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class EvaluatedDrive:
     """All tracks of a drive with what its sensors measured, at the same stamps [N].
@@ -165,7 +179,7 @@ class EvaluatedDrive:
     signals: Signals
     masks: SegmentMasks
     low_speed_m_s: float
-    sensors: LogSensors
+    sensors: SensorErrors
 
 
 @dataclass(frozen=True, slots=True)

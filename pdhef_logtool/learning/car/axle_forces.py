@@ -1,7 +1,7 @@
 """Axle slip angles and lateral forces from truth, and a magic formula through them: where identification starts.
 
 F_yf cos δ + F_yr = m a_y and l_f F_yf cos δ − l_r F_yr = I_z ṙ give both axle forces; the slip angles follow from the
-true velocity (METHOD Eq 2, 3). The fit is least squares with the priors of METHOD §14.
+true velocity (Eq 3, 4). The fit is least squares with the priors of docs/method.md#identification.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ FIT_RATE_HZ = 20.0
 SMOOTHING_HZ = 2.0
 #: Used where the true speed is above this multiple of the low-speed limit.
 SPEED_FACTOR = 2.0
-#: Sideslip beyond this is a spin or a drift, where a static single-track tyre explains nothing (METHOD §14).
+#: Sideslip beyond this is a spin or a drift, where a static single-track tyre explains nothing
+#: (docs/method.md#identification).
 MAX_SIDESLIP_RAD = float(np.deg2rad(8.0))
-#: 1-sigma of the priors on log stiffness, log peak force, shape (METHOD §14).
+#: 1-sigma of the priors on log stiffness, log peak force, shape (docs/method.md#identification).
 STIFFNESS_LOG_STD = 0.25
 PEAK_LOG_STD = 0.10
 SHAPE_STD = 0.10

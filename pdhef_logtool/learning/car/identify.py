@@ -1,7 +1,8 @@
 """Vehicle identification: axle tyres, steering, roll gradient, biases, and the filter noise that belongs to them.
 
-Direct minimisation of the sideslip error of the physics filter itself, with priors (METHOD §14), started from a fit to
-axle forces. In normalised parameters θ (distance from the prior in its standard deviations) the cost is
+Direct minimisation of the sideslip error of the physics filter itself, with priors (docs/method.md#identification),
+started from a fit to axle forces. In normalised parameters θ (distance from the prior in its standard deviations) the
+cost is
 
     Σ_k w (β̂_k(θ) − β_k)² / σ² + |θ|²,
 
@@ -56,7 +57,7 @@ MIN_SIGMA_RAD = math.radians(0.05)
 NOT_EXCITED = 0.8
 #: Step of the numerical derivative, in prior standard deviations.
 DERIVATIVE_STEP = 0.03
-#: Width of the tyres' priors about the axle-force fit, as a share of METHOD §14's widths about a vehicle file.
+#: Width of the tyres' priors about the axle-force fit, as a share of the widths about a vehicle file.
 AXLE_FIT_SHARE = 0.5
 #: Errors beyond this many σ count linearly: a moment in which the filter is lost must not decide the tyres.
 ROBUST_SIGMA = 3.0
@@ -209,10 +210,10 @@ def _identified(
 def make_priors(
     samples: AxleSamples, start: VehicleParameters, usable_s: float, *, steering_wheel: bool
 ) -> tuple[Prior, ...]:
-    """Return the priors of METHOD §14; those of the tyres stand about the fit to the axle forces.
+    """Return the priors of docs/method.md#identification; those of the tyres stand about the fit to the axle forces.
 
     That fit has the starting file as its own prior, and its peaks stay above every force that was seen. As it has seen
-    the drives already, the filter's error may move the tyres by ``AXLE_FIT_SHARE`` of METHOD's widths only: the error
+    the drives already, the filter's error may move the tyres by ``AXLE_FIT_SHARE`` of those widths only: the error
     of the sideslip alone would also accept tyres that contradict the forces.
     """
     friction = start.assumed_friction

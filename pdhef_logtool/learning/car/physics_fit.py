@@ -6,8 +6,9 @@ In normalised parameters θ (distance from the prior in its standard deviations)
 
 where s_i is the RMS of the filter's sideslip error on drive i, N_i its length over the time in which errors stay alike,
 and s_0 what is not believed to be beaten. With a fixed σ in place of the log, "σ is what remains" has two fixed points,
-and a poor start ends at the worse one (METHOD §16). The last term fixes the scale of Q and R, of which the gain knows
-the ratio alone. It is minimised by Gauss-Newton steps on errors over their present s_i, derivatives by differences.
+and a poor start ends at the worse one (docs/method.md#identification). The last term fixes the scale of Q and R, of
+which the gain knows the ratio alone. It is minimised by Gauss-Newton steps on errors over their present s_i,
+derivatives by differences.
 
 Force scale and bank are states of the one filter here, and filters of their own in service
 (:mod:`~pdhef_logtool.estimators.adaptive_physics`): through the bank of them the noise follows few drives too closely.
@@ -54,7 +55,7 @@ NIS_LOG_STD = 1.0
 ROBUST = 3.0
 DERIVATIVE_STEP = 0.05
 MAX_ITERATIONS, MAX_STEP, MIN_GAIN = 40, 1.5, 2e-4
-#: Width of the tyres' priors about the axle-force fit, as a share of METHOD §14's widths about a vehicle file.
+#: Width of the tyres' priors about the axle-force fit, as a share of the widths about a vehicle file.
 AXLE_FIT_SHARE = 0.5
 NOISE_LOG_STD = 1.2
 Theta = dict[str, float]
@@ -65,7 +66,7 @@ STARTS: tuple[Theta, ...] = ({}, {"r a_y": 1.5, "q v_y": 1.4, "q yaw rate": 2.3}
 def make_priors(
     start: VehicleParameters, parts: PhysicsParts, samples: AxleSamples, usable_s: float, *, steering_wheel: bool
 ) -> tuple[Prior, ...]:
-    """Return the priors of METHOD §14 and §16 about a vehicle file."""
+    """Return the priors of docs/method.md#identification about a vehicle file."""
     mu = start.assumed_friction
     priors = []
     for axle, front, slip, force in (
@@ -331,7 +332,7 @@ LEAST_GAIN = 0.01
 #: Steps of a fit that only says whether a part is worth having; it starts where the one with the part ended.
 TRIAL_ITERATIONS = 8
 #: Drives from which on folds are whole drives; usable driving that a fold needs, for 75 s chose worse than none would
-#: have (METHOD §14: 150 s cannot choose a structure); nothing within this of a cut.
+#: have (150 s cannot choose a structure); nothing within this of a cut.
 WHOLE_DRIVES, LEAST_FOLD_S, GUARD_S = 4, 100.0, 2.5
 
 

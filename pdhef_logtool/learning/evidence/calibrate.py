@@ -30,7 +30,7 @@ from pdhef_logtool.watches.intervals import combined, grip_factor, make_inflatio
 COVERED = 0.95
 #: 95 % of a normal distribution lie within this many 1-sigma.
 NORMAL_95 = 1.959963984540054
-#: Bins of true abs a_y over μ g (METHOD §10), by name: lower and upper limit.
+#: Bins of true abs a_y over μ g (docs/method.md#evaluation), by name: lower and upper limit.
 BINS: dict[str, tuple[float, float]] = {"low": (0.0, 0.3), "middle": (0.3, 0.6), "high": (0.6, np.inf)}
 FOLDS = 5
 #: A fit on fewer drives says nothing of a further one.

@@ -1,4 +1,4 @@
-"""The rule that turns errors at several trusts into the cap of a vehicle file (METHOD §14). Pure functions.
+"""The rule that turns errors at several trusts into the cap of a vehicle file (docs/method.md#gain). Pure functions.
 
 On a car that a network has never seen it may help or hurt. So trust above 0 needs driving with truth that neither the
 network nor the vehicle file was fitted to, trust above one half needs more than a mean: a paired bootstrap of blocks.
@@ -15,9 +15,10 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 #: Trusts that are tried, the first is physics alone.
 TRUSTS = (0.0, 0.25, 0.5, 0.75, 1.0)
-#: Largest cap on a mean gain alone (METHOD §14: 0.3 to 0.5).
+#: Largest cap on a mean gain alone (docs/method.md#gain).
 UNCONFIRMED_CAP = 0.5
-#: Errors are correlated over seconds: a block is at least this long, a shorter drive is one block (METHOD §10).
+#: Errors are correlated over seconds: a block is at least this long, a shorter drive is one block
+#: (docs/method.md#evaluation).
 BLOCK_S = 10.0
 #: Below so many blocks a percentile interval is too narrow to confirm anything.
 MIN_BLOCKS = 8

@@ -1,4 +1,6 @@
-"""A residual dataset on disk: one Parquet file a drive, and manifest.json that makes them one dataset (DESIGN §8).
+"""A residual dataset on disk: one Parquet file a drive, and manifest.json that makes them one dataset.
+
+See docs/formats.md#residual-dataset.
 
 Files stand in ``split=SPLIT/car=CAR/part-DRIVE.parquet``: ``polars.scan_parquet`` and others read them as one table.
 Features, targets and weights are stored as float32: a relative error of 6e-8, which no network sees. Each file carries

@@ -1,9 +1,9 @@
 """Training of the residual network: stateful truncated back-propagation through time, resumable at every epoch.
 
 Sequences run in order through chunks of ``chunk_steps``; the LSTM state is carried from chunk to chunk and detached
-(METHOD §5). The loss is the weighted mean square of the normalised residual rates; a piece counts by the inverse of its
-own mean square, so that calm driving is not drowned by the limit. Every epoch is a pure function of
-the state before it, the seed and its number, so that an interrupted training goes on as if nothing had happened.
+(docs/method.md#network). The loss is the weighted mean square of the normalised residual rates; a piece counts by the
+inverse of its own mean square, so that calm driving is not drowned by the limit. Every epoch is a pure function of the
+state before it, the seed and its number, so that an interrupted training goes on as if nothing had happened.
 
 A set may be larger than the memory: sequences come one by one, and the pieces that they are cut into wait in a file on
 the disk of the output, from which a batch reads its own. What is held is one sequence and one batch.
@@ -64,7 +64,7 @@ class FeatureSequence:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How to train. The defaults are METHOD §5's recipe; :data:`PAPER_RECIPE` is the paper's Table 1.
+    """How to train. The defaults are the recipe of docs/method.md#network; :data:`PAPER_RECIPE` is the paper's Table 1.
 
     64 units a layer were as good as 96 after the same number of epochs (``docs/model_card.md``) in two thirds of the
     time, in training and in service.

@@ -1,4 +1,4 @@
-"""What the model of ``physics`` misses, step by step, from a drive with truth (METHOD §4, §16, Eq 8-10, 18).
+"""What the model of ``physics`` misses, step by step, from a drive with truth (docs/method.md#residual, Eq 8-10, 18).
 
 From one stamp of the IMU to the next the residual is the increment
 

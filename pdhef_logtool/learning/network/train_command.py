@@ -77,7 +77,7 @@ def run_training(
 
     Parameters
     ----------
-    init : bundle to fine-tune. paper : Table 1's hyper-parameters instead of METHOD's recipe.
+    init : bundle to fine-tune. paper : Table 1's hyper-parameters instead of the default recipe.
     epochs : None = the recipe's. device : a PyTorch device such as ``cpu`` or ``cuda``.
 
     Raises

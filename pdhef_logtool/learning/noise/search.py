@@ -1,4 +1,6 @@
-"""The search for filter noise that estimators share: one space, one objective, one number of trials (METHOD §10).
+"""The search for filter noise that estimators share: one space, one objective, one number of trials.
+
+See docs/method.md#noise.
 
 A trial is a point of the space for every estimator. The first half of the trials is a scrambled Sobol sequence, the
 same points for all. The rest are Gaussian steps from each estimator's own best point so far, in the logarithms of the

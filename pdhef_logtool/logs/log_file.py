@@ -1,0 +1,33 @@
+"""A file that is opened as a log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from pdhef_logtool.logs.budget import Meter
+from pdhef_logtool.logs.remote_place import LogPlace
+
+
+@dataclass(frozen=True, slots=True)
+class LogFile:
+    """A file to open.
+
+    Attributes
+    ----------
+    path : on this machine. place : as the user named it; ``path`` may be a decompressed or downloaded copy.
+    meter : what reading may cost. release : to be called when the log is closed; removes a copy.
+    cut : why a copy does not have all of the file; empty where it does.
+    """
+
+    path: Path
+    place: LogPlace
+    meter: Meter
+    release: Callable[[], None] = lambda: None
+    cut: str = ""
+
+    @property
+    def is_copy(self) -> bool:
+        """Whether it is not the file itself."""
+        return self.path != self.place

@@ -1,0 +1,69 @@
+"""The size budget: what it counts, and that no figure rises without a reason."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import size_budget
+
+CODE = '''"""A module.
+
+Of three lines.
+"""
+
+LIMIT = 3  # a comment
+NAMES = ("a",)
+
+
+def f(x):
+    """Return it."""
+    # why
+    return [
+        y for y in x if y and x
+    ]
+'''
+
+
+def test_blanks_comments_and_docstrings_are_no_code(tmp_path: Path) -> None:
+    (tmp_path / "a.py").write_text(CODE)
+    sizes = size_budget.python_sizes(tmp_path)
+    assert (sizes["code_lines"], sizes["constants"], sizes["long_functions"]) == (6, 1, 0)
+
+
+def test_long_and_complex_functions_count_unless_they_are_compiled(tmp_path: Path) -> None:
+    body = "def f(x):\n" + "    if x:\n        x += 1\n" * 31
+    (tmp_path / "a.py").write_text(body)
+    assert size_budget.python_sizes(tmp_path)["long_functions"] == 1
+    assert size_budget.complexity(ast.parse(body).body[0]) == 32
+    (tmp_path / "compiled").mkdir()
+    (tmp_path / "compiled" / "a.py").write_text("@njit(cache=True)\n" + body)
+    sizes = size_budget.python_sizes(tmp_path / "compiled")
+    assert (sizes["long_functions"], sizes["complex_functions"]) == (0, 0)
+
+
+def test_a_size_above_its_limit_or_without_one_is_a_problem() -> None:
+    assert list(size_budget.problems({"a.x": 3}, {"a.x": 3})) == []
+    assert "a.x: 4, limit 3" in next(size_budget.problems({"a.x": 4}, {"a.x": 3}))
+    assert "expected in both" in next(size_budget.problems({"a.x": 4}, {}))
+
+
+def test_a_limit_rises_with_a_reason_only() -> None:
+    before, after = {"a": {"x": 3}}, {"a": {"x": 4}}
+    assert "raised from 3 to 4" in next(size_budget.unexplained(after, before))
+    reasons = [{"figure": "a.x", "limit": 4, "reason": "a log format"}]
+    assert list(size_budget.unexplained({**after, "raised": reasons}, before)) == []
+    assert list(size_budget.unexplained(before, after)) == []
+
+
+def test_writing_lowers_and_never_raises() -> None:
+    text = "# head\n[a]\nx = 3\ny = 3\n"
+    assert size_budget.lowered(text, {"a.x": 2, "a.y": 5}) == "# head\n[a]\nx = 2\ny = 3\n"
+
+
+def test_pages_that_commands_write_are_not_counted(tmp_path: Path) -> None:
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "a.md").write_text("one two")
+    (tmp_path / "docs" / "b.md").write_text("three four five")
+    (tmp_path / "mkdocs.yml").write_text("nav:\n  - Home: a.md\n  - Evidence:\n      - B: b.md\n")
+    assert size_budget.words_of_docs(tmp_path) == 2
