@@ -433,7 +433,7 @@ def test_trust_tells_its_progress_warns_and_keeps_its_evidence(
 def test_the_evidence_is_one_sentence_with_its_figures() -> None:
     decision = TrustDecision(
         cap=0.25,
-        reason="a gain on the mean; 3 blocks are too few",
+        reason="an improvement on the mean; 3 blocks are too few",
         rmse_deg=(0.5, 0.41, 0.3, 0.45, 0.7),
         against_zero=(Bound(0.0, 0.0, 0.0),) * 4 + (Bound(0.24, -0.1, 0.5),),
         best_lower=0.5,
@@ -444,13 +444,14 @@ def test_the_evidence_is_one_sentence_with_its_figures() -> None:
     )
     said = gain.evidence(decision, 2, "0123456789abcdef" * 4)
     assert said == (
-        "a gain on the mean; 3 blocks are too few: 2 drives with truth, 62 s scored, 20 s of them above 2 m/s²; "
-        "sideslip RMSE 0.500° at trust 0, 0.410° at trust 0.25, 0.300° at trust 0.5, 0.700° at trust 1; squared error "
+        "an improvement on the mean; 3 blocks are too few: 2 drives with ground truth, 62 s scored, 20 s of them above "
+        "2 m/s²; "
+        "sideslip RMSE 0.500° at gain 0, 0.410° at gain 0.25, 0.300° at gain 0.5, 0.700° at gain 1; squared error "
         "at 1 less that at 0 0.24 (95 %: -0.1 to 0.5) deg² over 3 blocks; network 0123456789ab"
     )
     few = replace(decision, against_zero=(Bound(0.24, math.nan, math.nan),) * 5)
     assert "at 0 0.24 deg² over" in gain.evidence(few, 1, "0" * 64)
-    assert "1 drive with truth" in gain.evidence(few, 1, "0" * 64)
+    assert "1 drive with ground truth" in gain.evidence(few, 1, "0" * 64)
     assert gain._bound(Bound(0.24, math.nan, 1.0)) == {"value_deg2": 0.24, "low_deg2": None, "high_deg2": 1.0}
 
 

@@ -1,4 +1,4 @@
-"""Stage ``network``: the network trained on by drives with truth, stopped by others, and its residual gain."""
+"""Stage ``network``: the network fine-tuned on drives with ground truth, stopped by others, and its residual gain."""
 
 from __future__ import annotations
 
