@@ -283,7 +283,8 @@ def no_drive(expected: str, where: str) -> EstimatorError:
         expected=f"at least one drive with {expected}",
         got="none",
         where=where,
-        remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
+        remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference; "
+        "--without-truth identifies a car from the sensors alone",
     )
 
 

@@ -50,7 +50,7 @@ from pdhef_logtool.learning.more_driving import learning_curve, what_more_would_
 from pdhef_logtool.learning.page import draw_page, page_markdown
 from pdhef_logtool.learning.resume import Stages, read_own
 from pdhef_logtool.learning.score import score_slices
-from pdhef_logtool.learning.split import PARTS, TEST, TRAINING, VALIDATION, DriveTimes, Split, split_drives
+from pdhef_logtool.learning.split import PARTS, TEST, TRAINED, TRAINING, VALIDATION, DriveTimes, Split, split_drives
 from pdhef_logtool.learning.stages.gain import find_gain
 from pdhef_logtool.learning.stages.identify import identify
 from pdhef_logtool.learning.stages.intervals import fit_intervals
@@ -252,7 +252,7 @@ def _learn_in_turn(task: Task, inputs: Sequence[LogInput], output: Path, *, fres
     settings, given = task.settings, task.car
     records, times = _read(inputs, task)
     split = Split(split_drives(times, settings.holdout, settings.order), tuple(times))
-    if not split.parts[TRAINING] or not split.parts[VALIDATION]:
+    if not split.parts[VALIDATION] or not (split.parts[TRAINING] or TRAINED.isdisjoint(settings.order)):
         raise EstimatorError(
             expected="driving to fit and to validate",
             got="too little of one",
@@ -322,7 +322,8 @@ def _read(inputs: Sequence[LogInput], task: Task) -> tuple[tuple[DriveRecord, ..
 def _begin(work: Path, given: Car, settings: LearnSettings, *, fresh: bool) -> Path:
     """Return the folder of the car that everything starts from."""
     start = work / "0-start"
-    for folder in [p for p in work.iterdir() if p.is_dir() and (fresh or p == start)]:
+    kept = set() if fresh else {f"{number}-{name}" for number, name in enumerate((*settings.order, "end"), start=1)}
+    for folder in [p for p in work.iterdir() if p.is_dir() and p.name not in kept]:
         shutil.rmtree(folder)
     if given.source is not None and given.source.is_dir() and IDENTIFY not in settings.order:
         shutil.copytree(given.source, start, ignore=shutil.ignore_patterns(WORK, "learn.*", f"{LOCK_FILE}*"))
@@ -507,7 +508,9 @@ def _end(call: _Call, start: Path, car: Path, stages: Sequence[StageResult]) -> 
     """Score the test part once, and return what more driving would be worth."""
     task = call.task
     task.progress("scoring the test part, once", _share(call, len(stages) + 1))
-    curve = learning_curve(task.split, car, task.mapping, _slice_options(task), task.progress)
+    curve = None
+    if IDENTIFY in task.settings.order:
+        curve = learning_curve(task.split, car, task.mapping, _slice_options(task), task.progress)
     spans = [[call.logs[s.path], *(s.span_s or ())] for s in task.split.parts[TEST]]
     count = count_evaluations(call.work / EVALUATIONS_FILE, spans, call.say)
     tables = {part: table_of(task, start, car, part) for part in (VALIDATION, TEST)}
