@@ -23,7 +23,7 @@ commands = typer.Typer()
     "pdhef learn drives/ --car guess.toml -o mycar",
     "pdhef learn logs/ --car guess.toml -o mycar --without-truth",
     "pdhef learn lap.mcap --car guess.toml -o mycar --end 150 --stages identify",
-    "pdhef learn logs/ --car mycar -o mycar --stages noise --jobs 2",
+    "pdhef learn logs/ --car mycar -o mycar --stages noise",
     "pdhef learn lap.mcap --car mycar -o mycar --start 155 --stages gain",
     "pdhef learn logs/ --car mycar -o mycar --stages intervals",
     notes="""Stages, in the order in which they run: identify (tyres, steering, biases, roll gradient, model structure),
@@ -60,7 +60,6 @@ def learn(
     split: options.Split = None,
     any_split: options.AnySplit = False,
     fresh: Annotated[bool, Option("--fresh", help="Forget the results of an earlier call with this output.")] = False,
-    jobs: options.Jobs = 1,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Identify, tune, train and calibrate a car. Each stage can run alone."""
@@ -82,9 +81,7 @@ def learn(
         without_truth=without_truth,
     )
     with console.progress() as bar:
-        result = run_stages(
-            logs, output, settings, jobs=jobs, fresh=fresh, progress=bar, warn=console.warn, say=console.say
-        )
+        result = run_stages(logs, output, settings, fresh=fresh, progress=bar, warn=console.warn, say=console.say)
     console.finish(result, learning_tables.render_learning, as_json)
 
 

@@ -83,13 +83,13 @@ def _noise(figures: Mapping[str, Any], console: Console) -> None:
     from pdhef_logtool.learning.noise.search import FACTORS
 
     errors = (">\nobjective °", ">\nmedian °", ">\npooled °", ">car's own\nobjective °")
-    tuned = table("\nestimator", *(f">{f.name}\n{f.unit}" for f in FACTORS), *errors, ">\ntrials")
+    tuned = table("\nestimator", *(f">{f.name}\n{f.unit}" for f in FACTORS), *errors)
     for name, t in figures["estimators"].items():
         before = None if t["before"] is None else t["before"]["objective_deg"]
         scores = (*(t["score"][key] for key in ("objective_deg", "median_deg", "pooled_deg")), before)
         values = (f"{v:g}" for v in t["values"].values())
-        tuned.add_row(name, *values, *(cell(v, digits=4) for v in scores), str(t["trials"]))
-    console.print("sideslip RMSE over drives")
+        tuned.add_row(name, *values, *(cell(v, digits=4) for v in scores))
+    console.print(f"sideslip RMSE over drives, {t['trials']} trials of each estimator")
     console.print(tuned)
 
 

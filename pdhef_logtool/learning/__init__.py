@@ -1,1 +1,1 @@
-"""What drives with truth can teach."""
+"""Identification, tuning, training and calibration of cars."""

@@ -193,12 +193,12 @@ def _entries(value: Any) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True, slots=True)
 class DriveRecord:
-    """What every command records of a drive; ``left_out`` says why it is not used, empty if it is.
+    """Record of a drive in every command; ``left_out`` is the reason why it is not used, empty if it is.
 
     Attributes
     ----------
     seconds : from first to last stamp. span_s : these two, in seconds from the log's start.
-    truth : its sources. friction_from : in the words of the report. notes : what the reading told.
+    truth : sources of the ground truth. friction_from : in the words of the report. notes : of the reading.
     counts : what a command counts of it, by name. bytes_held : memory that it takes in the command.
     """
 
@@ -263,7 +263,7 @@ def record_of(
 
 
 def tell_drive(record: DriveRecord, warn: Tell) -> None:
-    """Say what a user must know of a drive: notes, what of the input is gone, and why it is left out."""
+    """Warn of the notes and losses of a drive, and of the reason why it is left out."""
     for text in (*record.notes, *record.lost):
         warn(f"{record.name}: {text}")
     if record.left_out:
@@ -278,17 +278,18 @@ def exit_code(records: Sequence[DriveRecord]) -> int:
 
 
 def no_drive(expected: str, where: str) -> EstimatorError:
-    """Return the error for drives of which no stage can use any."""
+    """Return the error where no drive can be used."""
     return EstimatorError(
         expected=f"at least one drive with {expected}",
         got="none",
         where=where,
-        remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
+        remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference; "
+        "--without-truth identifies a car from the sensors alone",
     )
 
 
 def drives_document(records: Sequence[DriveRecord]) -> dict[str, list[dict[str, Any]]]:
-    """Return the drives and those left out, as they stand in every command's JSON."""
+    """Return the drives and those left out for the JSON of a command."""
     return {
         "drives": [r.to_dict() for r in records if not r.left_out],
         "left_out": [r.to_dict() for r in records if r.left_out],
@@ -296,7 +297,7 @@ def drives_document(records: Sequence[DriveRecord]) -> dict[str, list[dict[str, 
 
 
 def no_true_sideslip(plan: DrivePlan) -> str:
-    """Return why a drive has no truth to learn a sideslip from, empty if it has."""
+    """Return why a drive has no ground truth of the sideslip, empty if it has."""
     if plan.truth is None or "sideslip_rad" not in plan.derivation:
         return "no true sideslip"
     if "sideslip_rad" in plan.dependent:

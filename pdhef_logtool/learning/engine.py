@@ -50,7 +50,7 @@ from pdhef_logtool.learning.more_driving import learning_curve, what_more_would_
 from pdhef_logtool.learning.page import draw_page, page_markdown
 from pdhef_logtool.learning.resume import Stages, read_own
 from pdhef_logtool.learning.score import score_slices
-from pdhef_logtool.learning.split import PARTS, TEST, TRAINING, VALIDATION, DriveTimes, Split, split_drives
+from pdhef_logtool.learning.split import PARTS, TEST, TRAINED, TRAINING, VALIDATION, DriveTimes, Split, split_drives
 from pdhef_logtool.learning.stages.gain import find_gain
 from pdhef_logtool.learning.stages.identify import identify
 from pdhef_logtool.learning.stages.intervals import fit_intervals
@@ -173,7 +173,6 @@ def learn(
     output: Path | str,
     settings: LearnSettings,
     *,
-    jobs: int = 1,
     fresh: bool = False,
     progress: Progress = lambda _text, _share: None,
     warn: Tell = lambda _text: None,
@@ -183,7 +182,7 @@ def learn(
 
     Parameters
     ----------
-    arguments : logs, folders, glob patterns. jobs : worker processes of the noise search; results do not depend on it.
+    arguments : logs, folders, glob patterns.
     fresh : forget the results of an earlier call with this output. say : receives each stage with the time it took.
 
     Raises
@@ -214,7 +213,6 @@ def learn(
         mapping=open_mapping(config),
         set_splits=set_splits,
         estimators=config.estimators,
-        jobs=jobs,
         progress=progress,
         warn=warn,
     )
@@ -243,10 +241,10 @@ def _open(settings: LearnSettings, warn: Tell) -> Car:
 def _learn_alone(task: Task, output: Path) -> LearnResult:
     """Run one stage on all logs and write its part of the car."""
     (name,) = task.settings.order
-    found = RUN[name](task)
-    update_car(task.car, output, found.change)
-    result = StageResult(name, KEPT, found.text, None, None, found.figures)
-    return LearnResult(output, found.records, (result,), {})
+    stage = RUN[name](task)
+    update_car(task.car, output, stage.change)
+    result = StageResult(name, KEPT, stage.text, None, None, stage.figures)
+    return LearnResult(output, stage.records, (result,), {})
 
 
 def _learn_in_turn(task: Task, inputs: Sequence[LogInput], output: Path, *, fresh: bool, say: Tell) -> LearnResult:
@@ -254,7 +252,7 @@ def _learn_in_turn(task: Task, inputs: Sequence[LogInput], output: Path, *, fres
     settings, given = task.settings, task.car
     records, times = _read(inputs, task)
     split = Split(split_drives(times, settings.holdout, settings.order), tuple(times))
-    if not split.parts[TRAINING] or not split.parts[VALIDATION]:
+    if not split.parts[VALIDATION] or not (split.parts[TRAINING] or TRAINED.isdisjoint(settings.order)):
         raise EstimatorError(
             expected="driving to fit and to validate",
             got="too little of one",
@@ -295,13 +293,13 @@ def _learn_in_turn(task: Task, inputs: Sequence[LogInput], output: Path, *, fres
 
 def _read(inputs: Sequence[LogInput], task: Task) -> tuple[tuple[DriveRecord, ...], list[DriveTimes]]:
     """Return a record of every drive, and when each can be used."""
-    own = task.car.own
+    vehicle = task.car.own
 
     def read(log: LogInput) -> tuple[DriveRecord, DriveTimes | None]:
-        record, drive = load_fit_drive(log, Car.of(own), task.mapping, task.options)
+        record, drive = load_fit_drive(log, Car.of(vehicle), task.mapping, task.options)
         if drive is None:
             return record, None
-        use = usable_stamps(drive, own)
+        use = usable_stamps(drive, vehicle)
         seconds: FloatArray = (drive.signals.stamps_ns[use] - drive.log_start_ns).astype(np.float64) * 1e-9
         if seconds.size < 2:
             return replace(record, left_out="no driving with truth above twice the low-speed limit"), None
@@ -324,7 +322,8 @@ def _read(inputs: Sequence[LogInput], task: Task) -> tuple[tuple[DriveRecord, ..
 def _begin(work: Path, given: Car, settings: LearnSettings, *, fresh: bool) -> Path:
     """Return the folder of the car that everything starts from."""
     start = work / "0-start"
-    for folder in [p for p in work.iterdir() if p.is_dir() and (fresh or p == start)]:
+    kept = set() if fresh else {f"{number}-{name}" for number, name in enumerate((*settings.order, "end"), start=1)}
+    for folder in [p for p in work.iterdir() if p.is_dir() and p.name not in kept]:
         shutil.rmtree(folder)
     if given.source is not None and given.source.is_dir() and IDENTIFY not in settings.order:
         shutil.copytree(given.source, start, ignore=shutil.ignore_patterns(WORK, "learn.*", f"{LOCK_FILE}*"))
@@ -491,15 +490,15 @@ def _compare(old: Errors, new: Errors) -> tuple[tuple[float, float], bool | None
 
 
 def _still_sure(old: Errors, new: Errors) -> bool:
-    """Return whether the 95 % intervals of the new one hold most of its errors, or as many as those of the old one."""
+    """Return whether the new 95 % intervals contain most of the errors, or as many as the old ones."""
     was, now = (float(np.mean(e.inside[np.isfinite(e.error)])) if e.inside is not None else 0.0 for e in (old, new))
     return now >= min(was, LEAST_COVERED)
 
 
 def _confirmed(old: Errors, new: Errors) -> bool:
-    """Return whether the 95 % bounds of a paired block bootstrap say that the new one is better."""
-    found = block_bootstrap_difference(new.error, old.error, new.stamps_ns, block_s=BLOCK_S)
-    return found.blocks >= MIN_BLOCKS and found.high < 0.0
+    """Return whether the new error is lower by the 95 % bounds of a paired block bootstrap."""
+    difference = block_bootstrap_difference(new.error, old.error, new.stamps_ns, block_s=BLOCK_S)
+    return difference.blocks >= MIN_BLOCKS and difference.high < 0.0
 
 
 # ---- the end ----
@@ -509,7 +508,9 @@ def _end(call: _Call, start: Path, car: Path, stages: Sequence[StageResult]) -> 
     """Score the test part once, and return what more driving would be worth."""
     task = call.task
     task.progress("scoring the test part, once", _share(call, len(stages) + 1))
-    curve = learning_curve(task.split, car, task.mapping, _slice_options(task), task.progress)
+    curve = None
+    if IDENTIFY in task.settings.order:
+        curve = learning_curve(task.split, car, task.mapping, _slice_options(task), task.progress)
     spans = [[call.logs[s.path], *(s.span_s or ())] for s in task.split.parts[TEST]]
     count = count_evaluations(call.work / EVALUATIONS_FILE, spans, call.say)
     tables = {part: table_of(task, start, car, part) for part in (VALIDATION, TEST)}
@@ -530,13 +531,13 @@ def _slice_options(task: Task) -> ReadOptions:
 def count_evaluations(file: Path, spans: list[list[Any]], say: Tell = lambda _text: None) -> int:
     """Record that spans [hash of the log, start, end] are scored now; return how often any was, this time included.
 
-    The file remains through ``--fresh`` and other settings: repeated trials until the test looks well are fits to it.
+    The file remains through ``--fresh`` and other settings: repeated trials until the test error is low are fits to it.
     """
     earlier: list[list[list[Any]]] = (read_own(file, say) or {}).get("evaluations", [])
     write_bytes(file, json_bytes(seal({"evaluations": [*earlier, spans]})))
 
-    def overlap(one: list[Any], other: list[Any]) -> bool:
-        return bool(one[0] == other[0] and min(one[2], other[2]) > max(one[1], other[1]))
+    def overlap(a: list[Any], b: list[Any]) -> bool:
+        return bool(a[0] == b[0] and min(a[2], b[2]) > max(a[1], b[1]))
 
     return 1 + sum(any(overlap(a, b) for a in before for b in spans) for before in earlier)
 

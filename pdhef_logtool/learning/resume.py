@@ -1,4 +1,4 @@
-"""Stages of a long command: what one came to stands in a folder, and is taken from there on the same basis."""
+"""Stages of a long command: the result of each is in a folder and is used again for the same inputs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STAGE_FILE = "step.json"
 
 @dataclass(frozen=True, slots=True)
 class Stages:
-    """Where the stages of a command stand, and whom it tells; ``shown`` says what a stage came to in a line."""
+    """Folder of the stages of a command and its reporting; ``shown`` returns the result of a stage in a line."""
 
     folder: Path
     shown: Callable[[dict[str, Any]], str]
@@ -32,40 +32,41 @@ class Stages:
     def do(
         self, number: int, name: str, basis: Any, share: float, work: Callable[[Path], dict[str, Any]]
     ) -> dict[str, Any]:
-        """Return what a stage comes to: from an earlier call if its basis was the same, else by doing it.
+        """Return the result of a stage: from an earlier call if its inputs were the same, else by running it.
 
         Parameters
         ----------
-        basis : all that decides what comes out, as JSON-able values. share : how far the command is when it begins.
-        work : does the stage in a folder, which then stands whole or not at all as ``NUMBER-NAME``.
+        basis : all inputs that decide the result, as JSON-able values. share : progress of the command at its start.
+        work : runs the stage in a folder, which then appears whole or not at all as ``NUMBER-NAME``.
         """
         key, folder = digest([name, basis]), self.place(number, name)
         document = read_own(folder / STAGE_FILE, self.say)
         if document is not None and document["basis"] == key:
             self.say(f"{name}: {document['shown']} (from an earlier call)")
-            return dict(document["found"])
+            return dict(document["result"])
         began = time.monotonic()
         self.progress(name, share)
         with writing(folder), FolderTransaction(folder, keep=False) as transaction:
-            found = work(transaction.file("."))
-            shown = self.shown(found)
-            write_bytes(transaction.file(STAGE_FILE), json_bytes(seal({"basis": key, "shown": shown, "found": found})))
+            result = work(transaction.file("."))
+            shown = self.shown(result)
+            write_bytes(
+                transaction.file(STAGE_FILE), json_bytes(seal({"basis": key, "shown": shown, "result": result}))
+            )
         self.say(f"{name}: {shown} ({time.monotonic() - began:.0f} s)")
-        found_again: dict[str, Any] = json.loads(json_bytes(found))
-        return found_again
+        as_read: dict[str, Any] = json.loads(json_bytes(result))
+        return as_read
 
     def place(self, number: int, name: str) -> Path:
         """Return the folder of a stage."""
         return self.folder / f"{number}-{name}"
 
 
-def read_own(file: Path, say: Tell, *, former: bool = False) -> dict[str, Any] | None:
-    """Return a sealed document of what a command can do again, None without one; a damaged one is said and left out."""
+def read_own(file: Path, say: Tell) -> dict[str, Any] | None:
+    """Return a sealed document that a command can make again, None without one; a damaged one is reported."""
     if not file.exists():
         return None
     try:
-        remedy = "it is found again"
-        return read_sealed(file, "what an earlier call found", OutputError, remedy, MAX_DOCUMENT_BYTES, former=former)
+        return read_sealed(file, "a result of an earlier call", OutputError, "it is made again", MAX_DOCUMENT_BYTES)
     except OutputError as error:
         say(str(error))
         return None

@@ -35,7 +35,7 @@ class Scored:
 def score_slices(
     car: Car, names: Sequence[str], slices: Sequence[LogInput], mapping: SignalMapping | None, options: ReadOptions
 ) -> Scored:
-    """Run estimators of a car over slices of drives with truth.
+    """Run estimators of a car over slices of drives with ground truth.
 
     Raises
     ------

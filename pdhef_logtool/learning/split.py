@@ -20,6 +20,8 @@ PARTS = (TRAINING, NETWORK_TRAINING, VALIDATION, TEST)
 #: Shares of the driving that is not held out, without and with a part for the network.
 SHARES = {TRAINING: 0.82, VALIDATION: 0.18}
 SHARES_WITH_NETWORK = {TRAINING: 0.50, NETWORK_TRAINING: 0.32, VALIDATION: 0.18}
+#: Stages that use the training part; the others use the validation part alone.
+TRAINED = {IDENTIFY, NOISE, NETWORK}
 #: Usable driving from which on the network has a part of its own, that physics was not fitted to, and still leaves
 #: the fit enough to choose the model's parts; with less it learns from the fit part.
 OWN_NETWORK_PART_S = 600.0
@@ -86,8 +88,11 @@ def shares_of(usable_s: float, holdout: float, stages: Iterable[str] = STAGES) -
     """Return the share of each part in so much usable driving; their sum is 1."""
     least = LEAST_PART_S / max(usable_s, 1e-9)
     last = min(max(holdout, least), 0.5) if holdout > 0.0 else 0.0
-    both = NETWORK in stages and {IDENTIFY, NOISE} & set(stages)
+    stages = set(stages)
+    both = NETWORK in stages and len(TRAINED & stages) > 1
     shares = SHARES_WITH_NETWORK if both and usable_s >= OWN_NETWORK_PART_S else SHARES
+    if TRAINED.isdisjoint(stages):
+        shares = {TRAINING: 0.0, VALIDATION: 1.0}
     shares = {part: (1.0 - last) * share for part, share in shares.items()}
     lacks = min(max(0.0, least - shares[VALIDATION]), shares[TRAINING])
     return {**shares, TRAINING: shares[TRAINING] - lacks, VALIDATION: shares[VALIDATION] + lacks, TEST: last}

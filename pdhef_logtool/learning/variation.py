@@ -1,6 +1,6 @@
 """Wrong friction and wrong vehicle files on purpose: what a network must get along with (docs/method.md#limits).
 
-In service the nominal model is told a friction and a vehicle that are not quite those of the drive. A network that was
+In service the nominal model has a friction and a vehicle that are not quite those of the drive. A network that was
 trained on right ones takes a model error for something else. So a share of the drives of a training set is extracted
 with a nominal model that is wrong by a random amount, the same for the whole drive; features and targets follow from it
 as they would in service.
@@ -37,14 +37,14 @@ LIMIT = 2.5
 
 @dataclass(frozen=True, slots=True)
 class Variation:
-    """What the nominal model of a drive is told: a vehicle, and a factor on every friction."""
+    """Vehicle of the nominal model of a drive, and factor on every friction."""
 
     vehicle: VehicleParameters
     friction_factor: float
 
 
 def vary(vehicle: VehicleParameters, spread: float, key: str) -> Variation:
-    """Draw what the nominal model of a drive is told.
+    """Draw the vehicle and the friction factor of the nominal model of a drive.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def vary(vehicle: VehicleParameters, spread: float, key: str) -> Variation:
             "rear": tyre(vehicle.tyres.rear, axle),
         }
     )
-    told = vehicle.model_copy(
+    varied = vehicle.model_copy(
         update={
             "mass_kg": vehicle.mass_kg * factor["mass"],
             "yaw_inertia_kg_m2": vehicle.yaw_inertia_kg_m2 * factor["mass"] * factor["inertia"],
@@ -88,4 +88,4 @@ def vary(vehicle: VehicleParameters, spread: float, key: str) -> Variation:
             "tyres": tyres,
         }
     )
-    return Variation(told, factor["friction"])
+    return Variation(varied, factor["friction"])

@@ -122,7 +122,7 @@ def main(arguments: list[str] | None = None) -> int:
     validation = [work / "one_car", "--split", "validation", *told]
     if given.seed == 0:
         say("tune the noise of all tuned estimators alike, on validation drives")
-        pdhef("learn", *validation, "--stages", "noise", "--trials", given.trials, "--jobs", given.jobs, "-o", car)
+        pdhef("learn", *validation, "--stages", "noise", "--trials", given.trials, "-o", car)
     say("evidence that the network helps on this car")
     pdhef("learn", work / "evidence", *told, "--stages", "gain", "--any-split", "-o", car)
     if given.seed == 0:

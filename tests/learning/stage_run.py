@@ -18,9 +18,8 @@ def run_stage(
     output: Path | str,
     config: RunConfig,
     *,
-    jobs: int = 1,
     warn: Callable[[str], None] = lambda _text: None,
     **settings: Any,
 ) -> LearnResult:
     """Run one stage on logs and write the car to ``output``."""
-    return learn(logs, output, LearnSettings(config=config, stages=(stage,), **settings), jobs=jobs, warn=warn)
+    return learn(logs, output, LearnSettings(config=config, stages=(stage,), **settings), warn=warn)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from reference_car import drive, slalom
 
 from pdhef_logtool.car.car import Car, read_history
@@ -35,8 +34,8 @@ from pdhef_logtool.learning.engine import learn
 from pdhef_logtool.learning.evidence.calibrate import Coverage, Fitted, Samples
 from pdhef_logtool.learning.evidence.trust import BlockErrors, Bound, TrustDecision
 from pdhef_logtool.learning.network import extract_command
-from pdhef_logtool.learning.noise import benches
-from pdhef_logtool.learning.noise.benches import Benches, BenchSetup, DriveBench, choose_names
+from pdhef_logtool.learning.noise import bench
+from pdhef_logtool.learning.noise.bench import choose_names
 from pdhef_logtool.learning.noise.search import DriveError, Score, Trial
 from pdhef_logtool.learning.split import Split
 from pdhef_logtool.learning.stages import gain, intervals, noise
@@ -46,7 +45,6 @@ from pdhef_logtool.learning.stages.task import Task
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.records.supervisor import Ended, Failure
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.runs.config import RunConfig
 
@@ -435,7 +433,7 @@ def test_trust_tells_its_progress_warns_and_keeps_its_evidence(
 def test_the_evidence_is_one_sentence_with_its_figures() -> None:
     decision = TrustDecision(
         cap=0.25,
-        reason="a gain on the mean; 3 blocks are too few",
+        reason="an improvement on the mean; 3 blocks are too few",
         rmse_deg=(0.5, 0.41, 0.3, 0.45, 0.7),
         against_zero=(Bound(0.0, 0.0, 0.0),) * 4 + (Bound(0.24, -0.1, 0.5),),
         best_lower=0.5,
@@ -446,13 +444,14 @@ def test_the_evidence_is_one_sentence_with_its_figures() -> None:
     )
     said = gain.evidence(decision, 2, "0123456789abcdef" * 4)
     assert said == (
-        "a gain on the mean; 3 blocks are too few: 2 drives with truth, 62 s scored, 20 s of them above 2 m/s²; "
-        "sideslip RMSE 0.500° at trust 0, 0.410° at trust 0.25, 0.300° at trust 0.5, 0.700° at trust 1; squared error "
+        "an improvement on the mean; 3 blocks are too few: 2 drives with ground truth, 62 s scored, 20 s of them above "
+        "2 m/s²; "
+        "sideslip RMSE 0.500° at gain 0, 0.410° at gain 0.25, 0.300° at gain 0.5, 0.700° at gain 1; squared error "
         "at 1 less that at 0 0.24 (95 %: -0.1 to 0.5) deg² over 3 blocks; network 0123456789ab"
     )
     few = replace(decision, against_zero=(Bound(0.24, math.nan, math.nan),) * 5)
     assert "at 0 0.24 deg² over" in gain.evidence(few, 1, "0" * 64)
-    assert "1 drive with truth" in gain.evidence(few, 1, "0" * 64)
+    assert "1 drive with ground truth" in gain.evidence(few, 1, "0" * 64)
     assert gain._bound(Bound(0.24, math.nan, 1.0)) == {"value_deg2": 0.24, "low_deg2": None, "high_deg2": 1.0}
 
 
@@ -463,25 +462,16 @@ def error(rmse_deg: float, scored: int = 1000) -> DriveError:
     return DriveError(math.radians(rmse_deg) if scored else math.nan, math.radians(5.0), scored, 1000)
 
 
-class FakeBenches:
-    """Two drives and one that is left out; the error grows with the distance of q_v_y from an optimum."""
+class FakeBench:
+    """Drives of which the third is left out; the error grows with the distance of q_v_y from an optimum."""
 
-    made: list[tuple[Any, int]]
+    made: list[Any]
 
-    def __init__(self, setup: BenchSetup, jobs: int) -> None:
-        self.made.append((setup, jobs))
+    def __init__(self, *arguments: Any) -> None:
+        self.made.append(arguments)
 
-    def __enter__(self) -> FakeBenches:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def load(self, inputs: Any, _splits: Any, told: Callable[[DriveRecord], None]) -> list[DriveRecord]:
-        loaded = [record(i.stem, left_out="no true sideslip" if i.stem == "c" else "") for i in inputs]
-        for one in loaded:
-            told(one)
-        return loaded
+    def load(self, log: LogInput) -> Any:
+        return (record("c", left_out="no true sideslip"), None) if log.stem == "c" else (record(log.stem), WHOLE)
 
     def score(self, tunings: dict[str, FilterNoise]) -> dict[str, list[DriveError]]:
         def of(noise: FilterNoise) -> float:
@@ -491,10 +481,8 @@ class FakeBenches:
 
 
 def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(FakeBenches, "made", [], raising=False)
-    monkeypatch.setattr(noise, "Benches", FakeBenches)
-    figures: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: (figures.append(self), file.write(b"png")))
+    monkeypatch.setattr(FakeBench, "made", [], raising=False)
+    monkeypatch.setattr(noise, "Bench", FakeBench)
     folder = tmp_path / "set"
     arguments = logs(folder, "abc")
     (folder / "manifest.json").write_text(json.dumps({"drives": [{"file": "b.mcap", "split": "train"}]}))
@@ -502,17 +490,14 @@ def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkey
     warned: list[str] = []
     config = replace(SALOON, estimators=("phy-ukf:tuned", "physics"))
     settings = LearnSettings(config=config, stages=("noise",), trials=6, seed=1)
-    result = learn(
-        arguments, tmp_path / "car", settings, jobs=5, progress=lambda *x: told.append(x), warn=warned.append
-    )
+    result = learn(arguments, tmp_path / "car", settings, progress=lambda *x: told.append(x), warn=warned.append)
     assert dict(told) == pytest.approx(
-        {f"reading {n}": 0.2 * (i + 1) / 3 for i, n in enumerate("abc")}
+        {f"reading {n}": 0.2 * i / 3 for i, n in enumerate("abc")}
         | {f"trial {i} of 6": 0.2 + 0.8 * i / 6 for i in range(1, 7)}
         | {"done": 1.0}
     )
     assert told[-2] == ("trial 6 of 6", pytest.approx(1.0))
-    ((setup, jobs),) = FakeBenches.made
-    assert jobs == 3 and setup.names == ("physics", "phy-ukf:tuned")
+    assert FakeBench.made[0][-1] == ("physics", "phy-ukf:tuned")
     assert warned[0] == "c is left out: no true sideslip"
     assert result.figures["notes"] == warned[1:]
     car = Car.load(tmp_path / "car")
@@ -536,19 +521,10 @@ def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkey
     assert (told_search["exploring_share"], told_search["step_shares"]) == (0.5, [0.15, 0.02])
     assert (told_search["min_availability"], told_search["low_speed_m_s"]) == (0.9, 3.0)
     assert [f["name"] for f in told_search["space"]] == ["q_vy", "q_yaw_rate", "r_ay", "r_yaw_rate"]
-    lines = figures[0].axes[0].get_lines()
-    first = document["estimators"]["physics"]
-    values = [t["objective_deg"] for t in first["trials"]]
-    np.testing.assert_allclose(lines[0].get_xydata(), np.stack([np.arange(1, 7), values], axis=1))
-    np.testing.assert_allclose(lines[1].get_ydata(), np.minimum.accumulate(values))
-    assert lines[2].get_ydata()[0] == pytest.approx(first["before"]["objective_deg"])
-    assert lines[-1].get_xdata()[0] == 3.5  # between the third trial, the last that explores, and the fourth
     with pytest.raises(EstimatorError, match="noise"):
         learn(arguments[2:], tmp_path / "other", settings)
     with pytest.raises(UsageError, match="trials"):
         replace(settings, trials=3)
-    with pytest.raises(UsageError, match="jobs"):
-        learn(arguments, tmp_path / "other", settings, jobs=0)
 
 
 def test_only_a_search_that_ends_badly_is_noted() -> None:
@@ -577,123 +553,35 @@ def test_names_are_those_of_the_tables_in_their_order() -> None:
             choose_names(wrong, car)
 
 
-def test_a_bench_keeps_drives_by_number_and_scores_filters(monkeypatch: pytest.MonkeyPatch) -> None:
-    car = Car.of(VEHICLE)
-    setup = BenchSetup(replace(SALOON, sensors="esp"), car, None, ("phy-ukf:tuned", "physics"))
-    asked: list[Any] = []
-
-    def load(_log: Any, used: Car, _mapping: Any, _options: Any, *, refuse: Any, **named: Any) -> Any:
-        asked.append((used, refuse(SimpleNamespace(available=frozenset({"speed_m_s", "steer_rad", "ax_m_s2"}))), named))
-        assert refuse(ReadDrive()) == ""
-        return record("a"), loaded
-
-    monkeypatch.setattr(benches, "load_drive", load)
-    bench, loaded = DriveBench(setup), WHOLE
-    assert bench.load(3, LogInput(Path("a"), "a"), "test", 17).name == "a"
-    loaded = None
-    bench.load(4, LogInput(Path("b"), "b"), None, 17)
-    used, why, named = asked[0]
-    lacks = "ay_m_s2, yaw_rate_rad_s"
-    assert used is car and why == f"phy-ukf:tuned needs {lacks}; physics needs {lacks}"
-    assert named == {"split": "test", "least_scored": 100, "max_bytes": 17}
-    noise = FilterNoise(q_std=(0.1, 0.2, 0.3), r_std={"ay_m_s2": 0.5, "yaw_rate_rad_s": 0.004})
-    found = bench.score({"phy-ukf:tuned": noise})
+def test_a_bench_keeps_drives_within_the_memory_and_scores_filters(monkeypatch: pytest.MonkeyPatch) -> None:
     from pdhef_logtool.estimators.table import Options, spec_of
     from pdhef_logtool.learning.noise.search import drive_error
 
+    car = Car.of(VEHICLE)
+    asked: list[Any] = []
+
+    def load(log: LogInput, used: Car, _mapping: Any, _options: Any, *, refuse: Any, **named: Any) -> Any:
+        asked.append((used, refuse(SimpleNamespace(available=frozenset({"speed_m_s", "steer_rad", "ax_m_s2"}))), named))
+        assert refuse(ReadDrive()) == ""
+        return record(log.stem, bytes_held=40), None if log.stem == "b" else WHOLE
+
+    monkeypatch.setattr(bench, "load_drive", load)
+    monkeypatch.setattr(bench, "MAX_BYTES", 100)
+    config = replace(SALOON, sensors="esp")
+    made = bench.Bench(car, None, config.read_options, ("phy-ukf:tuned", "physics"))
+    loaded = [made.load(LogInput(Path(name), name)) for name in "ab"]
+    assert [(r.name, drive is not None) for r, drive in loaded] == [("a", True), ("b", False)]
+    used, why, _ = asked[0]
+    lacks = "ay_m_s2, yaw_rate_rad_s"
+    assert used is car and why == f"phy-ukf:tuned needs {lacks}; physics needs {lacks}"
+    assert [one[2] for one in asked] == [{"least_scored": 100, "max_bytes": n} for n in (100, 60)]
+    noise = FilterNoise(q_std=(0.1, 0.2, 0.3), r_std={"ay_m_s2": 0.5, "yaw_rate_rad_s": 0.004})
     own = spec_of("phy-ukf:tuned").make(car.with_noise("phy-ukf:tuned", noise), Options(use_speed=False))
     assert WHOLE.truth is not None
-    assert found == {"phy-ukf:tuned": {3: drive_error(run_window(own, WHOLE.signals)[0], WHOLE.truth, 3.0)}}
-    assert DriveBench(BenchSetup(SALOON, car, None, ("physics",)))._options.use_speed
-
-
-class FakeBench:
-    """A bench whose drives take 40 bytes and whose errors are their numbers."""
-
-    def __init__(self, _setup: Any = None) -> None:
-        self.loaded: list[tuple[int, str, str | None, int]] = []
-
-    def load(self, index: int, log: LogInput, split: str | None, max_bytes: int) -> DriveRecord:
-        self.loaded.append((index, log.stem, split, max_bytes))
-        return record(log.stem, bytes_held=40)
-
-    def score(self, tunings: dict[str, Any]) -> dict[str, dict[int, int]]:
-        return {n: {index: index for index, *_ in self.loaded} for n in tunings}
-
-
-class FakeCrew:
-    """A crew whose workers are this process, a bench each; what is asked of them ends as late as it can."""
-
-    made: list[FakeCrew]
-
-    def __class_getitem__(cls, _: Any) -> type[FakeCrew]:
-        return cls
-
-    def __init__(self, work: Any, *, jobs: int, **_: Any) -> None:
-        self.work, self.jobs = work, jobs
-        self.benches: list[dict[str, FakeBench]] = [{} for _ in range(jobs)]
-        self.ended = False
-        self.made.append(self)
-
-    def each(self, parts: Any, *, place: Any) -> Iterator[Ended[Any, Any]]:
-        under_way: list[tuple[int, Any]] = []
-        for number, part in enumerate(parts):
-            under_way.append((number, part))
-            if len(under_way) == self.jobs:
-                yield from map(self.end, reversed(under_way))
-                under_way.clear()
-        yield from map(self.end, under_way)
-
-    def end(self, what: tuple[int, Any]) -> Ended[Any, Any]:
-        number, part = what
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(benches, "_here", self.benches[part.place])
-            return Ended(number, part, self.work(part, None))
-
-    def __exit__(self, *_: Any) -> None:
-        self.ended = True
-
-
-def test_drives_are_dealt_out_in_turn_within_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(FakeCrew, "made", [], raising=False)
-    monkeypatch.setattr(benches, "Crew", FakeCrew)
-    monkeypatch.setattr(benches, "DriveBench", FakeBench)
-    monkeypatch.setattr(benches, "MAX_BYTES", 200)
-    inputs = [LogInput(Path(n), n) for n in "abcde"]
-    setup: Any = None
-    for jobs in (1, 2):
-        told: list[DriveRecord] = []
-        with Benches(setup, jobs) as pool:
-            loaded = pool.load(inputs, {"b": "test"}, told.append)
-            assert loaded == told and [r.name for r in told] == list("abcde")
-            assert pool.score({"x": FilterNoise()}) == {"x": [0, 1, 2, 3, 4]}
-            if jobs == 1:
-                seen = pool._local.loaded
-                assert seen == [(i, n, "test" if n == "b" else None, 200 - 40 * i) for i, n in enumerate("abcde")]
-    crew = FakeCrew.made[0]
-    assert [[one[1] for one in place["bench"].loaded] for place in crew.benches] == [["a", "c", "e"], ["b", "d"]]
-    assert [one[3] for one in crew.benches[0]["bench"].loaded] == [200, 120, 40]
-    assert crew.ended
-    monkeypatch.setattr(benches, "MAX_BYTES", 199)
-    with pytest.raises(EstimatorError, match="e: expected"), Benches(setup, 2) as pool:
-        pool.load(inputs, {}, lambda _: None)
-    assert FakeCrew.made[-1].ended
-
-
-def test_drives_that_went_with_their_process_end_the_tuning(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(FakeCrew, "made", [], raising=False)
-    monkeypatch.setattr(benches, "Crew", FakeCrew)
-    monkeypatch.setattr(benches, "DriveBench", FakeBench)
-    setup: Any = None
-    with Benches(setup, 2) as pool:
-        pool.load([LogInput(Path(n), n) for n in "abc"], {}, lambda _: None)
-        FakeCrew.made[0].benches[1].clear()
-        with pytest.raises(EstimatorError, match="one that died with its drives"):
-            pool.score({"x": FilterNoise()})
-        lost = Ended(0, None, failure=Failure("the worker was killed (signal 9)"))
-        monkeypatch.setattr(FakeCrew, "each", lambda *_, **__: iter([lost]))
-        with pytest.raises(EstimatorError, match="killed"):
-            pool.score({"x": FilterNoise()})
+    expected = drive_error(run_window(own, WHOLE.signals)[0], WHOLE.truth, 3.0)
+    assert made.score({"phy-ukf:tuned": noise}) == {"phy-ukf:tuned": [expected]}
+    with pytest.raises(EstimatorError, match="c: expected"):
+        made.load(LogInput(Path("c"), "c"))
 
 
 # ---- extract ----

@@ -120,6 +120,10 @@ def test_shares_are_of_usable_driving_and_the_network_has_its_own_where_there_is
     assert len(much[TRAINING]) == len(much[NETWORK_TRAINING]) == len(much[VALIDATION]) == 2 and len(much[TEST]) == 1
     # Without a fit the network is trained on the training part, however much there is.
     assert split_drives([_times("a", [(0.0, 900.0)])], 0.15, ("gain", "network"))[NETWORK_TRAINING] == ()
+    # Where nothing is trained all but the test part is for validation.
+    alone = split_drives([_times("a", [(0.0, 900.0)])], 0.15, ("gain", "intervals"))
+    assert alone[TRAINING] == () and len(alone[TEST]) == 1
+    assert sum(t.seconds for t in usable_in([_times("a", [(0.0, 900.0)])], alone[VALIDATION])) > 740.0
     for share in (0.0, 0.15, 0.5):
         assert sum(shares_of(100.0, share).values()) == pytest.approx(1.0)
         assert sum(shares_of(1000.0, share).values()) == pytest.approx(1.0)
@@ -395,6 +399,10 @@ def test_some_stages_start_from_the_parts_that_the_car_has(
     settings = LearnSettings(config=replace(config, car=tmp_path / "car"), stages=("intervals", "gain"))
     result = learn(logs, tmp_path / "car", settings)
     assert [(s.name, s.status) for s in result.stages] == [("gain", "not done"), ("intervals", "not done")]
+    assert {p.name for p in (tmp_path / "car/learn").iterdir()} >= {"0-start", "1-gain", "2-intervals", "3-end"}
+    (tmp_path / "car/learn/4-former").mkdir()
+    learn(logs, tmp_path / "car", settings)
+    assert not (tmp_path / "car/learn/4-former").exists()
     assert all(car.vehicle.tyres.rear.cornering_stiffness_n_per_rad == 125_000.0 for car in seen)
     assert Car.load(tmp_path / "car").vehicle.tyres.rear.cornering_stiffness_n_per_rad == 125_000.0
 

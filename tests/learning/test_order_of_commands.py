@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 #: Files by the command that writes them; the first is the part.
 FILES = {
     "identify": ("fit.toml", "fit.png"),
-    "noise": ("noise.toml", "noise.record.json", "noise.png"),
+    "noise": ("noise.toml", "noise.record.json"),
     "gain": ("network.toml", "network.record.json"),
     "intervals": ("intervals.json",),
 }

@@ -21,6 +21,7 @@ from pdhef_logtool.learning.drives import DriveRecord
 from pdhef_logtool.learning.network.dataset import read_dataset
 from pdhef_logtool.learning.resume import Stages
 from pdhef_logtool.learning.retrain import retrain_command
+from pdhef_logtool.learning.retrain.assignment import GATE, LEAST, SHARES, STOP, TRAIN, TRUST, Candidate, deal
 from pdhef_logtool.learning.retrain.retrain_command import (
     ACCEPTED,
     CAR_FOLDER,
@@ -30,7 +31,6 @@ from pdhef_logtool.learning.retrain.retrain_command import (
     RetrainSettings,
     retrain,
 )
-from pdhef_logtool.learning.retrain.roles import GATE, LEAST, SHARES, STOP, TRAIN, TRUST, Candidate, deal
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EstimatorError, OutputError
 from pdhef_logtool.reports import comparison
 from pdhef_logtool.runs.config import RunConfig
@@ -200,7 +200,7 @@ def test_a_candidate_goes_where_its_verdict_belongs_and_what_is_new_is_done_alon
     assert {r.name: r.split for r in grown.records if r.name in roles} == roles
     assert grown.document["judged"] == 2 and grown.folder.name == "b" * 12
     assert (
-        "z_copy: left out, it holds the same signals as d03" in fleet.told
+        "z_copy: left out, its signals equal those of d03" in fleet.told
         and "none is left out: no true sideslip" in fleet.told
     )
 

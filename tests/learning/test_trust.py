@@ -72,7 +72,7 @@ def test_a_network_that_helps_gets_full_trust() -> None:
 def test_a_network_that_hurts_gets_none() -> None:
     decision = decide_cap(_errors([0.2, 0.25, 0.3, 0.4, 0.5]))
     assert decision.cap == 0.0
-    assert "no gain" in decision.reason
+    assert "no improvement" in decision.reason
 
 
 def test_too_much_of_a_good_thing_is_capped_at_the_largest_trust_that_gains() -> None:
@@ -80,7 +80,7 @@ def test_too_much_of_a_good_thing_is_capped_at_the_largest_trust_that_gains() ->
     decision = decide_cap(_errors([0.5, 0.3, 0.1, 0.3, 0.4], spread=0.1))
     assert (decision.cap, decision.best_lower) == (0.5, 0.5)
     assert decision.against_zero[-1].high_deg2 < 0.0
-    assert "worse than trust 0.5" in decision.reason
+    assert "worse than residual gain 0.5" in decision.reason
     decision = decide_cap(_errors([0.5, 0.4, 0.6, 0.9, 1.2], spread=0.1))
     assert decision.cap == 0.25
     assert "confirmed to be worse" in decision.reason
@@ -130,12 +130,12 @@ def test_the_limits_of_the_rule_belong_to_what_they_allow() -> None:
     assert decide_cap(_errors([0.5, 0.4, 0.3, 0.2, 0.2099], spread=0.0)).cap == 1.0
     worse = decide_cap(_errors([0.5, 0.4, 0.3, 0.2, 0.2101], spread=0.0))
     assert (worse.cap, worse.best_lower) == (0.75, 0.75)
-    assert "0.75 is confirmed" in worse.reason and "more than 5% worse than trust 0.75" in worse.reason
+    assert "0.75 is confirmed" in worse.reason and "more than 5% worse than residual gain 0.75" in worse.reason
     assert worse.against_best.value_deg2 == pytest.approx(0.2101**2 - 0.2**2)
     assert [b.value_deg2 for b in worse.against_zero[:2]] == pytest.approx([0.0, 0.4**2 - 0.5**2])
     assert (worse.blocks, worse.scored_s, worse.excited_s) == (30, 300.0, 120.0)
     same = decide_cap(_errors([0.3] * 5, spread=0.0))
-    assert (same.cap, same.reason) == (0.0, "no gain over physics alone")
+    assert (same.cap, same.reason) == (0.0, "no improvement over physics alone")
     # Blocks count by their stamps.
     uneven = replace(helps, squares=np.tile([[4.0, 1.0]] + [[1.0, 0.25]] * 4, (1, 4)), counts=np.tile([4.0, 1.0], 4))
     assert decide_cap(uneven).rmse_deg[:2] == pytest.approx([math.degrees(1.0), math.degrees(0.5)])

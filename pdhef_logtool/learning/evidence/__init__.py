@@ -1,1 +1,1 @@
-"""Trust in a network, and calibrated intervals."""
+"""Residual gain of a network, and calibrated intervals."""

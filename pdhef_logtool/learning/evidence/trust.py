@@ -1,7 +1,8 @@
-"""The rule that turns errors at several trusts into the cap of a vehicle file (docs/method.md#gain). Pure functions.
+"""Rule that turns errors at several residual gains into the gain limit of a car (docs/method.md#gain). Pure functions.
 
-On a car that a network has never seen it may help or hurt. So trust above 0 needs driving with truth that neither the
-network nor the vehicle file was fitted to, trust above one half needs more than a mean: a paired bootstrap of blocks.
+On a car that a network has never seen it may help or hurt. So a residual gain above 0 needs driving with ground truth
+that neither the network nor the vehicle file was fitted to; one above one half needs more than a mean: a paired
+bootstrap of blocks.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
-#: Trusts that are tried, the first is physics alone.
+#: Residual gains that are tried; the first is physics alone.
 TRUSTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 #: Largest cap on a mean gain alone (docs/method.md#gain).
 UNCONFIRMED_CAP = 0.5
@@ -24,7 +25,7 @@ BLOCK_S = 10.0
 MIN_BLOCKS = 8
 #: Seconds of scored driving with a lateral acceleration above this, without which nothing is decided.
 EXCITED_M_S2, MIN_EXCITED_S = 2.0, 20.0
-#: Trust 1 is "not worse" than a lower one if its RMSE is by no more than this share above it, with the same confidence.
+#: Gain 1 is "not worse" than a lower one if its RMSE is by no more than this share above it, with the same confidence.
 TOLERANCE = 0.05
 RESAMPLES = 4000
 LEVEL = 0.95
@@ -32,13 +33,13 @@ LEVEL = 0.95
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockErrors:
-    """Squared sideslip errors in blocks, paired: every stamp counts at all trusts.
+    """Squared sideslip errors in blocks, paired: every stamp counts at all gains.
 
     Attributes
     ----------
     squares : [T, B], sums in rad², rows as in :data:`TRUSTS`. counts : [B], stamps.
     scored_s, excited_s : seconds that were scored, and those of them above :data:`EXCITED_M_S2`.
-    lost : stamps at which a trust above 0 gave no estimate and trust 0 did.
+    lost : stamps at which a gain above 0 gave no estimate and gain 0 did.
     """
 
     squares: FloatArray
@@ -59,12 +60,12 @@ class Bound:
 
 @dataclass(frozen=True, slots=True)
 class TrustDecision:
-    """The cap, why, and what it rests on.
+    """The gain limit, why, and the figures behind it.
 
     Attributes
     ----------
-    rmse_deg : by trust as in :data:`TRUSTS`. against_zero : squared error of each less that of trust 0.
-    best_lower : trust below 1 with the smallest RMSE. against_best : squared error of trust 1 less that of best_lower.
+    rmse_deg : by gain as in :data:`TRUSTS`. against_zero : squared error of each less that of gain 0.
+    best_lower : gain below 1 with the smallest RMSE. against_best : squared error of gain 1 less that of best_lower.
     """
 
     cap: float
@@ -85,8 +86,8 @@ def block_errors(
 
     Parameters
     ----------
-    errors : [T, N] in rad, NaN where not scored; where trust 0 has none the stamp does not count. A trust that gives no
-        estimate where trust 0 does is charged with the larger of trust 0's error and the sideslip itself: leaving hard
+    errors : [T, N] in rad, NaN where not scored; where gain 0 has none the stamp does not count. A gain that gives no
+        estimate where gain 0 does is charged with the larger of gain 0's error and the sideslip itself: leaving hard
         stamps out gains nothing.
     truth_sideslip : [N] in rad. stamps_ns : int64 [N]. excited : [N].
     """
@@ -127,9 +128,9 @@ def decide_cap(errors: BlockErrors, *, seed: int = 0) -> TrustDecision:
     """Return the cap that the errors allow.
 
     - Too little excited driving: 0.
-    - The largest trust of which the 95 % bounds of a paired block bootstrap confirm that its squared error is below
-      that at trust 0, and that it is no more than :data:`TOLERANCE` of the RMSE above that of the best lower trust.
-    - Else the largest trust up to :data:`UNCONFIRMED_CAP` whose squared error is below that at trust 0.
+    - The largest gain of which the 95 % bounds of a paired block bootstrap confirm that its squared error is below
+      that at gain 0, and that it is no more than :data:`TOLERANCE` of the RMSE above that of the best lower gain.
+    - Else the largest gain up to :data:`UNCONFIRMED_CAP` whose squared error is below that at gain 0.
     - Else 0.
     """
     squares, counts = errors.squares * math.degrees(1.0) ** 2, errors.counts
@@ -172,25 +173,25 @@ def decide_cap(errors: BlockErrors, *, seed: int = 0) -> TrustDecision:
 def _rule(
     errors: BlockErrors, mean: FloatArray, gain: Bound, confirmed: float, best: float, blocks: int
 ) -> tuple[float, str]:
-    """Return cap and reason; bounds that are NaN confirm nothing. ``gain`` is that of trust 1."""
+    """Return cap and reason; bounds that are NaN confirm nothing. ``gain`` is that of gain 1."""
     if not errors.excited_s >= MIN_EXCITED_S:
         return 0.0, (
             f"too little to decide on: {errors.excited_s:.1f} s above {EXCITED_M_S2:g} m/s², at least "
             f"{MIN_EXCITED_S:g} s are needed"
         )
     if confirmed == TRUSTS[-1]:
-        return 1.0, "the gain at trust 1 is confirmed"
+        return 1.0, "the improvement at residual gain 1 is confirmed"
     gained = [t for t, m in zip(TRUSTS, mean, strict=True) if 0.0 < t <= UNCONFIRMED_CAP and m < mean[0]]
     if not gained and confirmed <= UNCONFIRMED_CAP:
-        return 0.0, "no gain over physics alone"
+        return 0.0, "no improvement over physics alone"
     if blocks < MIN_BLOCKS:
-        why = f"{blocks} blocks are too few to confirm trust 1 ({MIN_BLOCKS} are needed)"
+        why = f"{blocks} blocks are too few to confirm residual gain 1 ({MIN_BLOCKS} are needed)"
     elif gain.low_deg2 > 0.0:
-        why = "trust 1 is confirmed to be worse"
+        why = "residual gain 1 is confirmed to be worse"
     elif not gain.high_deg2 < 0.0:
-        why = "the gain at trust 1 is not confirmed"
+        why = "the improvement at residual gain 1 is not confirmed"
     else:
-        why = f"trust 1 may be more than {TOLERANCE:.0%} worse than trust {best:g}"
+        why = f"residual gain 1 may be more than {TOLERANCE:.0%} worse than residual gain {best:g}"
     if confirmed > UNCONFIRMED_CAP:
-        return confirmed, f"the gain at trust {confirmed:g} is confirmed; {why}"
-    return max(gained), f"a gain on the mean; {why}"
+        return confirmed, f"the improvement at residual gain {confirmed:g} is confirmed; {why}"
+    return max(gained), f"an improvement on the mean; {why}"

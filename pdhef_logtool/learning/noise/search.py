@@ -7,10 +7,9 @@ same points for all. The rest are Gaussian steps from each estimator's own best 
 factors, with a width that shrinks on the same schedule and with the same random numbers for all. Nothing depends on
 the number of processes or on which other estimators take part.
 
-The objective is the mean over drives of ln √(RMSE² + floor²) of the sideslip, told as its exponential, a geometric mean
-in degrees: every drive counts by what is gained on it in per cent, so that neither one spin decides (as in a pooled
-RMSE) nor is half of the drives ignored (as in a median). The floor keeps drives that hardly turn from deciding instead:
-there a tenth of nothing would be as good as a tenth of a degree.
+The objective is the mean over drives of ln √(RMSE² + floor²) of the sideslip, reported as its exponential, a geometric
+mean in degrees: every drive counts by its relative error, so that neither one spin decides (as in a pooled RMSE) nor is
+half of the drives ignored (as in a median). The floor keeps drives that hardly turn from deciding instead.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ STEP_FIRST, STEP_LAST = 0.15, 0.02
 MIN_TRIALS = 4
 #: Significant digits of the values, so that what is written is what was scored.
 DIGITS = 4
-#: A best value this close to an end of its range, as a share of the range, is said to be there.
+#: A best value this close to an end of its range, as a share of the range, is reported.
 NEAR_END = 0.02
 
 
@@ -58,11 +57,11 @@ class Factor:
         return float(f"{self.low * (self.high / self.low) ** share:.{DIGITS}g}")
 
     def share(self, value: float) -> float:
-        """Return where in the logarithmic range a value stands."""
+        """Return the place of a value in the logarithmic range."""
         return math.log(value / self.low) / math.log(self.high / self.low)
 
 
-#: The space of every estimator. It holds sensor-level and model-error-level noise and more on both sides; the other
+#: The space of every estimator. It contains sensor-level and model-error-level noise and more on both sides; the other
 #: noises (speed, a_x bias, further states) stay what they are.
 FACTORS = (
     Factor("q_vy", "m/s/sqrt(s)", 0.002, 2.0),
@@ -121,13 +120,13 @@ def drive_error(estimate: StateTrack, truth: StateTrack, low_speed_m_s: float) -
 
 def scorable_stamps(truth: StateTrack, low_speed_m_s: float) -> BoolArray:
     """Return where [N] the truth's sideslip is known above the low-speed limit."""
-    known: BoolArray = np.isfinite(signal_error(truth, truth, "sideslip_rad", low_speed_m_s))
-    return known
+    finite: BoolArray = np.isfinite(signal_error(truth, truth, "sideslip_rad", low_speed_m_s))
+    return finite
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Figures of one trial over all drives, in degrees; ``objective_deg`` is minimised, the others hold no floor."""
+    """Figures of one trial over all drives, in degrees; ``objective_deg`` is minimised, the others have no floor."""
 
     objective_deg: float
     median_deg: float
@@ -179,23 +178,23 @@ def search(
     exploring = max(1, round(EXPLORING_SHARE * trials))
     shares = sobol_points(len(factors), exploring, seed)
     steps = local_steps(len(factors), trials - exploring, seed)
-    found: dict[str, list[Trial]] = {name: [] for name in names}
+    trials_of: dict[str, list[Trial]] = {name: [] for name in names}
     for number in range(trials):
         points: dict[str, tuple[float, ...]] = {}
         for name in names:
             if number < exploring:
-                at = shares[number]
+                place = shares[number]
             else:
-                best = best_trial(found[name])
+                best = best_trial(trials_of[name])
                 centre = np.array([f.share(v) for f, v in zip(factors, best.values, strict=True)])
-                at = np.clip(centre + steps[number - exploring], 0.0, 1.0)
-            points[name] = tuple(f.value(float(s)) for f, s in zip(factors, at, strict=True))
+                place = np.clip(centre + steps[number - exploring], 0.0, 1.0)
+            points[name] = tuple(f.value(float(s)) for f, s in zip(factors, place, strict=True))
         scores = evaluate(points)
         for name in names:
             stage: Literal["sobol", "refine"] = "sobol" if number < exploring else "refine"
-            found[name].append(Trial(number, stage, points[name], scores[name]))
+            trials_of[name].append(Trial(number, stage, points[name], scores[name]))
         progress(number + 1)
-    return {name: tuple(of_name) for name, of_name in found.items()}
+    return {name: tuple(of_name) for name, of_name in trials_of.items()}
 
 
 def best_trial(trials: Sequence[Trial]) -> Trial:
@@ -220,6 +219,6 @@ def local_steps(dimensions: int, count: int, seed: int) -> FloatArray:
 
 
 def at_an_end(trial: Trial, factors: Sequence[Factor] = FACTORS) -> tuple[str, ...]:
-    """Return the names of the factors whose value stands at an end of its range."""
+    """Return the names of the factors whose value is at an end of its range."""
     shares = ((f.name, f.share(v)) for f, v in zip(factors, trial.values, strict=True))
     return tuple(name for name, s in shares if not NEAR_END < s < 1.0 - NEAR_END)

@@ -1,7 +1,7 @@
-"""``pdhef retrain`` from logs and a car to a verdict: its network trained on, trust and intervals found anew, a gate.
+"""``pdhef retrain``: fine-tune the network of a car, find its residual gain and intervals, and compare by a gate.
 
-Each stage stands in ``work/`` of the output and is skipped while what it rests on is as it was. Each does one thing
-with drives of its own (``roles.py``). The candidate ends under ``accepted/`` or ``rejected/`` with what decided.
+The result of each stage is in ``work/`` of the output and is used again for the same inputs. Each stage has drives of
+its own (``assignment.py``). The candidate is written to ``accepted/`` or ``rejected/`` with the reasons.
 """
 
 from __future__ import annotations
@@ -37,7 +37,17 @@ from pdhef_logtool.learning.evidence.calibrate import MIN_DRIVES
 from pdhef_logtool.learning.network.dataset import MANIFEST
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
 from pdhef_logtool.learning.resume import Stages, read_own
-from pdhef_logtool.learning.retrain.roles import GATE, INTERVALS, LEAST, SHARES, STOP, TRAIN, TRUST, Candidate, deal
+from pdhef_logtool.learning.retrain.assignment import (
+    GATE,
+    INTERVALS,
+    LEAST,
+    SHARES,
+    STOP,
+    TRAIN,
+    TRUST,
+    Candidate,
+    deal,
+)
 from pdhef_logtool.learning.split import Split
 from pdhef_logtool.learning.stages.gain import find_gain
 from pdhef_logtool.learning.stages.intervals import fit_intervals
@@ -72,7 +82,6 @@ CALIBRATED = (HYBRID, "pd-hef-smoothed", "physics")
 #: Without a gate.toml: the error of the hybrid filter over the whole drive may grow by so much.
 DEFAULT_LIMIT = 0.02
 DEFAULT_GATE = Gate((Figure(estimator=HYBRID, limit=DEFAULT_LIMIT),))
-#: What is remembered of each log.
 #: Digits of a network's hash that name its folder.
 _NAME = 12
 
@@ -128,7 +137,7 @@ class RetrainResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Retraining:
-    """One call: its settings, the car, the drives by role, and what each log is known by, by its stem."""
+    """One call: its settings, the car, the drives by split, and the hash of each log by its stem."""
 
     settings: RetrainSettings
     car: Car
@@ -150,7 +159,7 @@ class _Retraining:
         return replace(self.settings.config, car=car, network=network, intervals=None, estimators=None)
 
     def basis(self, *rests_on: Any, role: str = "") -> list[Any]:
-        """Return what a stage rests on: the settings of all, the drives of a role, and what else."""
+        """Return the inputs of a stage: the settings of all, the drives of a split, and others."""
         config = self.settings.config
         mapping = None if config.mapping is None else digest(config.mapping.read_text(encoding="utf-8"))
         head = record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=config, seed=self.settings.seed), self.car)
@@ -179,19 +188,19 @@ def retrain(
     warn: Tell = lambda _text: None,
     say: Tell = lambda _text: None,
 ) -> RetrainResult:
-    """Train the network of a car on logs with truth, and hold the car with it against the car as it is.
+    """Fine-tune the network of a car on logs with ground truth, and compare the car with it to the car as it is.
 
     Parameters
     ----------
     arguments : logs, folders, glob patterns. jobs : processes that read and extract; changes nothing that is written.
-    say : told of each stage with the time it took.
+    say : receives each stage with the time it took.
 
     Raises
     ------
     UsageError
         An option is wrong, or no car is named.
     EstimatorError
-        There are too few drives with truth.
+        There are too few drives with ground truth.
     PdhefError
         A stage fails.
     """
@@ -245,14 +254,14 @@ class _Log:
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """What a log holds; ``signals_sha256`` is None where it cannot be used."""
+    """Record of a log and hash of its signals; None where it cannot be used."""
 
     record: DriveRecord
     signals_sha256: str | None
 
 
 def _read_log(log: _Log, tell: Progress) -> _Seen:
-    """Read a log once, for what its signals are known by and whether it has a truth."""
+    """Read a log once: hash of its signals, and whether it has ground truth."""
     try:
         with read_cached(log.log_input, log.car, log.mapping, log.config.read_options) as drive:
             if left_out := no_true_sideslip(drive.plan):
@@ -300,7 +309,7 @@ def _look(  # positional: what reading takes, where it is remembered, and how it
         if seen is None:
             reason = "it could not be read" if ended.failure is None else ended.failure.reason
             seen = _Seen(_unread(log_input, reason), None)
-        sha256 = seen.record.sha256 or hashes[log_input.stem]  # a slim log is known by that which it stands for
+        sha256 = seen.record.sha256 or hashes[log_input.stem]  # of a reduced log: its source's
         records[log_input.stem] = replace(seen.record, sha256=sha256)
         known[hashes[log_input.stem]] = {
             "sha256": sha256,
@@ -334,7 +343,7 @@ def _roles(
     settings: RetrainSettings,
     work: Path,
 ) -> tuple[list[DriveRecord], dict[str, tuple[LogInput, ...]]]:
-    """Return the records with the roles as their splits, and the drives by role; copies of a drive are left out."""
+    """Return the records with their splits, and the drives by split; copies of a drive are left out."""
     manifests = cache(set_manifest)
     parts = (car.learnt_on, () if car.trust is None else car.trust.drives)
     taught = {d.sha256 for part in parts for d in part} | (
@@ -348,9 +357,9 @@ def _roles(
             candidates.append(Candidate(key, split, record.sha256 in taught))
     before: dict[str, str] = {}
     if (file := work / ROLES_FILE).exists():
-        remedy = "restore it; without it, parts are drawn again by content and seed"
-        kept = read_sealed(file, "the parts of the drives", OutputError, remedy, MAX_DOCUMENT_BYTES, former=True)
-        before = {key: role for key, role in kept.get("roles", kept).items() if role in SHARES}
+        remedy = "restore it; without it, splits are assigned again by content and seed"
+        kept = read_sealed(file, "the split assignment", OutputError, remedy, MAX_DOCUMENT_BYTES)
+        before = {key: role for key, role in kept["roles"].items() if role in SHARES}
     roles = deal(candidates, before, settings.seed)
     write_bytes(work / ROLES_FILE, json_bytes(seal({"roles": roles})))
     told = list[DriveRecord]()
@@ -359,7 +368,7 @@ def _roles(
         if key is None:
             told.append(record)
         elif first[key] != log_input.stem:
-            told.append(replace(record, notes=(f"left out, it holds the same signals as {first[key]}",)))
+            told.append(replace(record, notes=(f"left out, its signals equal those of {first[key]}",)))
         else:
             told.append(replace(record, split=roles[key]))
             drives[roles[key]].append(log_input)
@@ -373,10 +382,10 @@ def _check_counts(drives: Mapping[str, Sequence[LogInput]]) -> None:
     if short:
         wanted = ", ".join(f"{LEAST[role]} for {role}" for role in (TRAIN, STOP, TRUST, GATE))
         raise EstimatorError(
-            expected=f"drives with truth for every part of a retraining: at least {wanted}",
+            expected=f"drives with ground truth for every split of a retraining: at least {wanted}",
             got=", ".join(short),
             where="retrain",
-            remedy="give more drives with truth; those of a set keep to its splits",
+            remedy="give more drives with ground truth; those of a set keep its splits",
         )
 
 
@@ -478,7 +487,7 @@ def _train(this: _Retraining, folder: Path, basis: str) -> dict[str, Any]:
 def _stage(
     this: _Retraining, number: int, role: str, folder: Path, config: RunConfig, run: Callable[[Task], StageOutput]
 ) -> StageOutput:
-    """Run a stage of ``learn`` on the drives of a role and write its car to a folder."""
+    """Run a stage of ``learn`` on the drives of a split and write its car to a folder."""
     car = Car.load(config.car, network=config.network)
     task = Task(
         car=car,

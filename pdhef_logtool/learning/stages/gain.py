@@ -33,7 +33,7 @@ from pdhef_logtool.learning.evidence.trust import (
     decide_cap,
     join_blocks,
 )
-from pdhef_logtool.learning.noise.benches import MIN_SCORED_STAMPS
+from pdhef_logtool.learning.noise.bench import MIN_SCORED_STAMPS
 from pdhef_logtool.learning.split import VALIDATION
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.logs.discovery import LogInput
@@ -104,9 +104,9 @@ def find_gain(task: Task) -> StageOutput:
 
 
 def errors_by_trust(car: Car, drive: WholeDrive, *, use_speed: bool) -> BlockErrors:
-    """Return the sideslip errors of ``pd-hef`` on a drive with truth at every trust, in blocks.
+    """Return the sideslip errors of ``pd-hef`` on a drive with ground truth at every residual gain, in blocks.
 
-    The truth's v_x times the gyro's yaw rate is the lateral acceleration that decides what counts as excited: no
+    The true v_x times the gyro's yaw rate is the lateral acceleration that decides what counts as excited: no
     bank, bias or vibration is in it.
     """
     signals, truth = drive.signals, drive.truth
@@ -123,9 +123,9 @@ def errors_by_trust(car: Car, drive: WholeDrive, *, use_speed: bool) -> BlockErr
 def seen_by_identification(car: Car, drives: Sequence[DriveRecord]) -> list[str]:
     """Return a warning for each drive that the car was identified on, as far as the spans overlap."""
 
-    def overlap(one: LearntOn, other: LearntOn) -> bool:
-        same = one.sha256 == other.sha256 if one.sha256 and other.sha256 else one.name == other.name
-        return same and min(one.end_s, other.end_s) - max(one.start_s, other.start_s) > EDGE_S
+    def overlap(a: LearntOn, b: LearntOn) -> bool:
+        same = a.sha256 == b.sha256 if a.sha256 and b.sha256 else a.name == b.name
+        return same and min(a.end_s, b.end_s) - max(a.start_s, b.start_s) > EDGE_S
 
     return [
         f"the car was identified on {seen.name}, {seen.start_s:.2f} to {seen.end_s:.2f} s: score another part "
@@ -139,11 +139,11 @@ def evidence(decision: TrustDecision, drives: int, network_sha256: str) -> str:
     """Return the sentence that the car keeps, with its figures."""
     d = decision
     rmse = dict(zip(TRUSTS, d.rmse_deg, strict=True))
-    shown = ", ".join(f"{rmse[t]:.3f}° at trust {t:g}" for t in sorted({0.0, 0.5, 1.0, d.cap}))
+    shown = ", ".join(f"{rmse[t]:.3f}° at gain {t:g}" for t in sorted({0.0, 0.5, 1.0, d.cap}))
     gain = d.against_zero[-1]
     bounds = "" if np.isnan(gain.low_deg2) else f" (95 %: {gain.low_deg2:.3g} to {gain.high_deg2:.3g})"
     return (
-        f"{d.reason}: {drives} {'drive' if drives == 1 else 'drives'} with truth, {d.scored_s:.0f} s scored, "
+        f"{d.reason}: {drives} {'drive' if drives == 1 else 'drives'} with ground truth, {d.scored_s:.0f} s scored, "
         f"{d.excited_s:.0f} s of them above {EXCITED_M_S2:g} m/s²; sideslip RMSE {shown}; squared error at 1 less "
         f"that at 0 {gain.value_deg2:.3g}{bounds} deg² over {d.blocks} blocks; network {network_sha256[:SHOWN_DIGITS]}"
     )

@@ -1,4 +1,4 @@
-"""Stage ``network``: the network trained on by drives with truth, stopped by others, and its residual gain."""
+"""Stage ``network``: the network fine-tuned on drives with ground truth, stopped by others, and its residual gain."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.learning.drives import NETWORK
 from pdhef_logtool.learning.split import divided
 from pdhef_logtool.learning.stages.gain import find_gain
 from pdhef_logtool.learning.stages.task import StageOutput, Task
@@ -41,7 +42,8 @@ def train_network(task: Task) -> StageOutput:
     train_on_parts({"train": (learns, config), "validation": (stops, config)}, work, init, progress=task.progress)
     network = work / "model"
     settings = replace(task.settings, config=replace(config, network=network))
-    return find_gain(replace(task, car=Car.load(config.car, network=network), settings=settings))
+    output = find_gain(replace(task, car=Car.load(config.car, network=network), settings=settings))
+    return replace(output, change=replace(output.change, command=f"learn --stages {NETWORK}"))
 
 
 def train_on_parts(

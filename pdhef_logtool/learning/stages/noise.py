@@ -13,8 +13,8 @@ from pdhef_logtool.car.car import NOISE_FILE, Car
 from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import FilterNoise, Noise
 from pdhef_logtool.car.store import Change
-from pdhef_logtool.learning.drives import NOISE, DriveRecord, drives_document, no_drive, record_head, tell_drive
-from pdhef_logtool.learning.noise.benches import Benches, BenchSetup, choose_names
+from pdhef_logtool.learning.drives import NOISE, DriveRecord, drives_document, no_drive, record_head
+from pdhef_logtool.learning.noise.bench import Bench, choose_names
 from pdhef_logtool.learning.noise.search import (
     EXPLORING_SHARE,
     FACTORS,
@@ -31,17 +31,14 @@ from pdhef_logtool.learning.noise.search import (
     score_drives,
     search,
 )
-from pdhef_logtool.learning.plots import new_figure, png_bytes
 from pdhef_logtool.learning.split import TRAINING
 from pdhef_logtool.learning.stages.task import StageOutput, Task
-from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.sinks.report import json_bytes
 
 FORMAT = "pdhef-tuning"
 FORMAT_VERSION = 2
 #: Share of the progress that reading takes.
 READING = 0.2
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,46 +70,34 @@ def tune(task: Task) -> StageOutput:
     EstimatorError
         No drive can be scored.
     """
-    car, settings, logs = task.car, task.settings, task.split.parts[TRAINING]
-    if task.jobs < 1:
-        raise UsageError(expected="at least one process", got=str(task.jobs), where="--jobs")
+    car, settings = task.car, task.settings
     names = choose_names(task.estimators, car)
-    with Benches(BenchSetup(settings.config, car, task.mapping, names), min(task.jobs, len(logs))) as benches:
-        read: list[DriveRecord] = []
+    bench = Bench(car, task.mapping, task.options, names)
+    records, drives = task.read(task.split.parts[TRAINING], bench.load, READING)
+    if not drives:
+        raise no_drive("a true sideslip and the signals of the estimators", NOISE)
+    before = bench.score({n: car.noise[n] for n in names if n in car.noise})
 
-        def after_reading(record: DriveRecord) -> None:
-            read.append(record)
-            task.progress(f"reading {record.name}", READING * len(read) / len(logs))
-            tell_drive(record, task.warn)
+    def after_trial(trial: int) -> None:
+        task.progress(f"trial {trial} of {settings.trials}", READING + (1.0 - READING) * trial / settings.trials)
 
-        records = tuple(benches.load(logs, task.set_splits, after_reading))
-        if all(d.left_out for d in records):
-            raise no_drive("a true sideslip and the signals of the estimators", NOISE)
-        before = benches.score({n: car.noise[n] for n in names if n in car.noise})
+    def evaluate(points: Mapping[str, tuple[float, ...]]) -> dict[str, Score]:
+        errors = bench.score({n: filter_tuning(values) for n, values in points.items()})
+        return {n: score_drives(e) for n, e in errors.items()}
 
-        def after_trial(trial: int) -> None:
-            task.progress(f"trial {trial} of {settings.trials}", READING + (1.0 - READING) * trial / settings.trials)
-
-        def evaluate(points: Mapping[str, tuple[float, ...]]) -> dict[str, Score]:
-            errors = benches.score({n: filter_tuning(values) for n, values in points.items()})
-            return {n: score_drives(e) for n, e in errors.items()}
-
-        trials = search(evaluate, names, trials=settings.trials, seed=settings.seed, progress=after_trial)
-        errors = benches.score({n: filter_tuning(best_trial(trials[n]).values) for n in names})
+    trials = search(evaluate, names, trials=settings.trials, seed=settings.seed, progress=after_trial)
+    errors = bench.score({n: filter_tuning(best_trial(trials[n]).values) for n in names})
     tuned = [Tuned(n, score_drives(before[n]) if n in before else None, trials[n], tuple(errors[n])) for n in names]
     notes = _notes(tuned)
     for note in notes:
         task.warn(note)
-    drives = tuple(d for d in records if not d.left_out)
-    return StageOutput(
-        _change(task, tuned, records, drives), records, _text(tuned), {"estimators": _figures(tuned), "notes": notes}
-    )
+    figures = {"estimators": _figures(tuned), "notes": notes}
+    return StageOutput(_change(task, tuned, records), records, _text(tuned), figures)
 
 
-def _change(
-    task: Task, tuned: Sequence[Tuned], records: Sequence[DriveRecord], drives: Sequence[DriveRecord]
-) -> Change:
-    """Return the part of the car with the record of all trials and its plot."""
+def _change(task: Task, tuned: Sequence[Tuned], records: Sequence[DriveRecord]) -> Change:
+    """Return the part of the car with the record of all trials."""
+    drives = [d for d in records if not d.left_out]
     noise = {**_kept(task.car), **{t.name: _noise(t, task.car) for t in tuned}}
     together = hashlib.sha256("".join(sorted(d.sha256 for d in drives)).encode()).hexdigest()
     objective = "geometric mean over drives of the sideslip RMSE, each with the floor added as squares"
@@ -139,7 +124,6 @@ def _change(
     files = {
         NOISE_FILE: part_toml(part, head, comments).encode(),
         "noise.record.json": json_bytes(record),
-        "noise.png": _plot(tuned, len(drives)),
     }
     return Change(f"learn --stages {NOISE}", NOISE_FILE, files, settings=task.settings.to_dict(), drives=part.drives)
 
@@ -215,26 +199,3 @@ def _trials(tuned: Tuned, drives: Sequence[DriveRecord]) -> dict[str, Any]:
             {"trial": x.number, "stage": x.stage, "values": _named(x.values), **asdict(x.score)} for x in tuned.trials
         ],
     }
-
-
-def _plot(tuned: Sequence[Tuned], drives: int) -> bytes:
-    """Draw the best objective so far over the trials, and every trial as a dot."""
-    figure = new_figure(8.0, 4.5)
-    axes = figure.subplots()
-    for colour, t in zip(_COLOURS, tuned, strict=False):
-        values = np.array([x.score.objective_deg for x in t.trials])
-        numbers = np.arange(1, len(values) + 1)
-        axes.semilogy(numbers, values, ".", ms=3, color=colour, alpha=0.35)
-        axes.step(numbers, np.minimum.accumulate(values), where="post", color=colour, label=t.name)
-        if t.before is not None:
-            axes.axhline(t.before.objective_deg, color=colour, lw=0.8, ls=":")
-    exploring = sum(x.stage == "sobol" for x in tuned[0].trials)
-    axes.axvline(exploring + 0.5, color="0.5", lw=0.8)
-    axes.set(
-        xlabel="trial (left of the line: Sobol points, right: refinement; dotted: the noise that the car had)",
-        ylabel="objective (°): geometric mean of drives' sideslip RMSE",
-        title=f"{drives} drives",
-    )
-    axes.grid(alpha=0.3, which="both")
-    axes.legend(frameon=False)
-    return png_bytes(figure)

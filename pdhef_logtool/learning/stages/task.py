@@ -30,7 +30,7 @@ class Task:
     settings : their configuration names this car and the network to start from.
     split : the slices of drives by their use. set_splits : by log, the split of its simulated set.
     estimators : whose noise is searched or whose intervals are fitted; None = the stage's default.
-    work : folder for files that nobody needs afterwards. jobs : worker processes; results do not depend on it.
+    work : folder for files that nobody needs afterwards.
     """
 
     car: Car
@@ -40,7 +40,6 @@ class Task:
     set_splits: Mapping[str, str] = field(default_factory=dict)
     estimators: tuple[str, ...] | None = None
     work: Path = Path()
-    jobs: int = 1
     progress: Progress = lambda _text, _share: None
     warn: Tell = lambda _text: None
 

@@ -1,6 +1,7 @@
 """Stage ``identify`` without ground truth: several logs calibrate their car by the sensors alone.
 
-One log's calibration serves that log, and on another it can be absurd: only the result of several logs is written.
+See docs/method.md#self-calibration. One log's calibration serves that log, and on another it can be absurd: only the
+result of several logs is written.
 """
 
 from __future__ import annotations
