@@ -59,13 +59,13 @@ class Stages:
         return self.folder / f"{number}-{name}"
 
 
-def read_own(file: Path, say: Tell, *, former: bool = False) -> dict[str, Any] | None:
+def read_own(file: Path, say: Tell) -> dict[str, Any] | None:
     """Return a sealed document of what a command can do again, None without one; a damaged one is said and left out."""
     if not file.exists():
         return None
     try:
         remedy = "it is found again"
-        return read_sealed(file, "what an earlier call found", OutputError, remedy, MAX_DOCUMENT_BYTES, former=former)
+        return read_sealed(file, "what an earlier call found", OutputError, remedy, MAX_DOCUMENT_BYTES)
     except OutputError as error:
         say(str(error))
         return None

@@ -15,8 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.flat import load_vehicle
 from pdhef_logtool.car.parts import LearntOn
+from pdhef_logtool.car.toml_files import load_vehicle
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.latency_compensation import run_window
@@ -288,10 +288,10 @@ def test_the_file_is_the_one_that_was_given_but_for_the_network(sample_logs_dir:
     options = replace(options, config=replace(options.config, car=source))
     logs = [str(sample_logs_dir / f"{n}.mcap") for n in ("dlc", "step", "no_truth")]
     told: list[str] = []
-    result = trust(logs, tmp_path / "trusted.toml", options, warn=told.append)
+    result = trust(logs, tmp_path / "trusted", options, warn=told.append)
     assert result.exit_code == 3
     assert any(line.startswith("no_truth is left out") for line in told)
-    before, after = Car.load(source), Car.load(tmp_path / "trusted.toml", network=tmp_path / "model")
+    before, after = Car.load(source), Car.load(tmp_path / "trusted", network=tmp_path / "model")
     assert (after.vehicle, after.noise, after.learnt_on) == (before.vehicle, before.noise, before.learnt_on)
     found = result.trust
     assert after.trust is not None
@@ -301,18 +301,17 @@ def test_the_file_is_the_one_that_was_given_but_for_the_network(sample_logs_dir:
     assert after.trust.has_evidence
     for figure in (f"{result.decision.rmse_deg[0]:.3f}°", f"{result.decision.rmse_deg[4]:.3f}°", "2 drives"):
         assert figure in after.trust.evidence
-    written = (tmp_path / "trusted.toml").read_text()
-    assert written.startswith("# A head.")
-    assert "# measured" in written
-    record = json.loads((tmp_path / "trusted.network.record.json").read_text())
+    assert (tmp_path / "trusted/vehicle.toml").read_text() == source.read_text()
+    written = (tmp_path / "trusted/network.toml").read_text()
+    record = json.loads((tmp_path / "trusted/network.record.json").read_text())
     assert record["trust_cap"] == result.decision.cap
     assert [d["name"] for d in record["drives"]] == ["dlc", "step"]
     assert record["drives"][0]["sha256"]
     assert record["network_sha256"] == _bundle().sha256
     # Once more, onto itself: the old evidence is replaced.
-    again = replace(options, config=replace(options.config, car=tmp_path / "trusted.toml"))
-    trust(logs[:2], tmp_path / "trusted.toml", again)
-    assert (tmp_path / "trusted.toml").read_text() == written
+    again = replace(options, config=replace(options.config, car=tmp_path / "trusted"))
+    trust(logs[:2], tmp_path / "trusted", again)
+    assert (tmp_path / "trusted/network.toml").read_text() == written
 
 
 def test_a_folder_gets_a_copy_of_the_network_that_was_tried(sample_logs_dir: Path, tmp_path: Path) -> None:
@@ -377,19 +376,19 @@ def test_wrong_options_are_usage_errors(sample_logs_dir: Path, tmp_path: Path) -
         replace(options, seed=-1)
     for one, message in wrong:
         with pytest.raises(UsageError, match=message):
-            trust(log, tmp_path / "out.toml", one)
+            trust(log, tmp_path / "out", one)
     (tmp_path / "out.txt").write_text("no folder")
     with pytest.raises(UsageError, match=r"\.toml"):
         trust(log, tmp_path / "out.txt", options)
     with pytest.raises(EstimatorError, match="at least one drive with a true sideslip"):
-        trust([str(sample_logs_dir / "no_truth.mcap")], tmp_path / "out.toml", options)
-    assert not (tmp_path / "out.toml").exists()
+        trust([str(sample_logs_dir / "no_truth.mcap")], tmp_path / "out", options)
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_command_prints_a_table_or_json(sample_logs_dir: Path, tmp_path: Path) -> None:
     _bundle().save(tmp_path / "model")
     words = ["trust", sample_logs_dir / "dlc.mcap", "--car", sample_logs_dir / "vehicle.toml",
-             "--network", tmp_path / "model", "-o", tmp_path / "car.toml"]  # fmt: skip
+             "--network", tmp_path / "model", "-o", tmp_path / "car"]  # fmt: skip
     shown = called(*words)
     assert shown.returncode == 0, shown.stderr
     # A double lane change is over too soon to decide on.
@@ -398,5 +397,5 @@ def test_the_command_prints_a_table_or_json(sample_logs_dir: Path, tmp_path: Pat
     assert document["trust_cap"] == 0.0
     assert document["trusts"] == list(TRUSTS)
     assert document["against_trust_0"][4]["low_deg2"] is None
-    found = Car.load(tmp_path / "car.toml").trust
+    found = Car.load(tmp_path / "car").trust
     assert found is not None and found.evidence == document["evidence"]

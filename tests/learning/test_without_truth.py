@@ -53,14 +53,6 @@ def test_the_car_says_what_it_rests_on_and_that_no_truth_was_looked_at(pool: Wit
     assert pool.to_dict()["self_calibration"]["logs"] == 2
 
 
-def test_a_flat_file_holds_the_same(
-    pool: WithoutTruthResult, sample_logs_dir: Path, config: RunConfig, tmp_path: Path
-) -> None:
-    logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "sweep")]
-    flat = identify_without_truth(logs, tmp_path / "car.toml", config).car
-    assert Car.load(flat).physics_sha256 == Car.load(pool.car).physics_sha256
-
-
 def test_one_log_is_no_pool(sample_logs_dir: Path, config: RunConfig, tmp_path: Path) -> None:
     with pytest.raises(EstimatorError, match="need not hold on another"):
         identify_without_truth([str(sample_logs_dir / "dlc.mcap")], tmp_path / "car", config)

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.car.car import FIT_FILE, NO_INTERVALS, Car
-from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import PHYSICS, Fit, FittedValues, LearntOn, physics_sha256
-from pdhef_logtool.car.store import Change, check_output, write_change
+from pdhef_logtool.car.store import Change, check_output, update_car
+from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters
 from pdhef_logtool.drive.proposals import apply_proposals
 from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
@@ -91,7 +91,7 @@ def identify(
     progress: Callable[[str, float], None] = lambda _text, _share: None,
     warn: Callable[[str], None] = lambda _text: None,
 ) -> IdentifyResult:
-    """Identify a car on logs with truth; write ``output`` (its folder, or a flat .toml) with a plot of the fit.
+    """Identify a car on logs with truth; write ``output`` (its folder) with a plot of the fit.
 
     Parameters
     ----------
@@ -169,13 +169,11 @@ def identify(
         "Written by pdhef identify. Values and filter noise belong together: use neither with another car's.\n"
         f"Understeer {understeer_deg_per_g(fitted):.2f} deg/g."
     )
-    comments = _comments(found)
-    text = part_toml(part, head, {f"values.{k}": v for k, v in comments.items()})
+    text = part_toml(part, head, {f"values.{k}": v for k, v in _comments(found).items()})
     files = {FIT_FILE: text.encode(), "fit.png": plot_identification(found)}
     settings = {**config_document(config), "holdout": holdout, "parts": "auto" if parts is None else parts.names}
-    told = {"holdout_share": holdout, "notes": list(found.notes)}
-    change = Change("identify", FIT_FILE, files, settings=settings, drives=drives, told=told)
-    write_change(car, car.with_fit(part), output, change, comments)
+    change = Change("identify", FIT_FILE, files, settings=settings, drives=drives)
+    update_car(car, output, change)
     return IdentifyResult(car=output, records=tuple(records), identification=found)
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.car.car import FIT_FILE, NO_INTERVALS, Car
-from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import Fit, FittedPhysics, FittedValues, physics_sha256
-from pdhef_logtool.car.store import Change, check_output, write_change
+from pdhef_logtool.car.store import Change, check_output, update_car
+from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.learning.drives import (
     LearnResult,
@@ -54,7 +54,7 @@ def identify_without_truth(
     progress: Callable[[str, float], None] = lambda _text, _share: None,
     warn: Callable[[str], None] = lambda _text: None,
 ) -> WithoutTruthResult:
-    """Calibrate a car on its logs without looking at a truth; write ``output`` (its folder, or a flat .toml).
+    """Calibrate a car on its logs without looking at a truth; write ``output`` (its folder).
 
     Parameters
     ----------
@@ -102,10 +102,9 @@ def identify_without_truth(
     part = fit_part(calibration, [r.learnt_on for r in records if not r.left_out])
     head = f"Written by pdhef identify --without-truth: no truth was looked at.\n{calibration.text}."
     files = {FIT_FILE: part_toml(part, head).encode()}
-    told = {"notes": list(part.notes)}
     settings = {**config_document(config), "without_truth": True}
-    change = Change("identify", FIT_FILE, files, settings=settings, drives=part.drives, told=told)
-    write_change(car, car.with_fit(part), output, change)
+    change = Change("identify", FIT_FILE, files, settings=settings, drives=part.drives)
+    update_car(car, output, change)
     return WithoutTruthResult(car=output, records=tuple(records), calibration=calibration)
 
 

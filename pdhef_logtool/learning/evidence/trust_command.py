@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pdhef_logtool.car.car import NETWORK_FILE, NETWORK_FOLDER, SHOWN_DIGITS, Car
-from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import LearntOn, Trust
-from pdhef_logtool.car.store import Change, write_change
+from pdhef_logtool.car.store import Change, update_car
+from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.drive.reading import Drive, Tell, WholeDrive
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import Options, spec_of
@@ -185,7 +185,7 @@ def trust(
     }
     folders = {} if shipped or car.network_folder is None else {NETWORK_FOLDER: car.network_folder}
     change = Change("trust", NETWORK_FILE, files, folders, settings.to_dict(), found.drives)
-    write_change(car, replace(car, trust=found), output, change)
+    update_car(car, output, change)
     progress("done", 1.0)
     return result
 

@@ -441,7 +441,7 @@ def _look(file: Path, spans: list[list[Any]], say: Tell = lambda _text: None) ->
 
     The file outlives ``--fresh`` and other settings: who tries until the last part looks well has fitted to it.
     """
-    earlier: list[list[list[Any]]] = (read_own(file, say, former=True) or {}).get("looks", [])
+    earlier: list[list[list[Any]]] = (read_own(file, say) or {}).get("looks", [])
     write_bytes(file, json_bytes(seal({"looks": [*earlier, spans]})))
 
     def meets(one: list[Any], other: list[Any]) -> bool:

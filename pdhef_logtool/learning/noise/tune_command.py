@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pdhef_logtool.car.car import NOISE_FILE, Car
-from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import FilterNoise, Noise
-from pdhef_logtool.car.store import Change, write_change
+from pdhef_logtool.car.store import Change, update_car
+from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.learning.drives import (
     DriveRecord,
@@ -200,9 +200,8 @@ def tune(
         "noise.record.json": json_bytes(record),
         "noise.png": _plot(result),
     }
-    in_words = {f"tuning_{k}": v for k, v in part.search.items()}
-    change = Change("tune", NOISE_FILE, files, settings=settings.to_dict(), drives=part.drives, told=in_words)
-    write_change(car, replace(car, noise={**car.noise, **noise}), output, change, comments)
+    change = Change("tune", NOISE_FILE, files, settings=settings.to_dict(), drives=part.drives)
+    update_car(car, output, change)
     return result
 
 

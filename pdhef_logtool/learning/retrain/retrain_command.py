@@ -337,7 +337,7 @@ def _roles(
     before: dict[str, str] = {}
     if (file := work / ROLES_FILE).exists():
         remedy = "restore it; without it, parts are drawn again by content and seed"
-        kept = read_sealed(file, "the parts of the drives", OutputError, remedy, MAX_DOCUMENT_BYTES, former=True)
+        kept = read_sealed(file, "the parts of the drives", OutputError, remedy, MAX_DOCUMENT_BYTES)
         before = {key: role for key, role in kept.get("roles", kept).items() if role in SHARES}
     roles = deal(candidates, before, settings.seed)
     write_bytes(work / ROLES_FILE, json_bytes(seal({"roles": roles})))
