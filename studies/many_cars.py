@@ -11,6 +11,7 @@ the second epoch on). Drives are split by car.
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.flat import flat_toml, load_vehicle, vehicle_toml
-from pdhef_logtool.car.parts import PHYSICS, FittedPhysics, FittedValues, physics_sha256
+from pdhef_logtool.car.car import FIT_FILE, VEHICLE_FILE, Car
+from pdhef_logtool.car.parts import Fit, FittedPhysics, FittedValues, physics_sha256
+from pdhef_logtool.car.toml_files import load_vehicle, part_toml, vehicle_toml
 from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.learning.car.fit_data import load_fit_drive
@@ -183,10 +184,12 @@ def identify_cars(folder: Path) -> list[str]:
     mapping.write_text(MAPPING, encoding="utf-8")
     kept = []
     for index, entries in by_car.items():
-        name = f"car_{index:04d}.toml"
-        if not (others / name).is_file():
+        name = f"car_{index:04d}"
+        if not (others / name / FIT_FILE).is_file():
             own, logs = folder / entries[0]["vehicle_file"], [folder / e["file"] for e in entries[:FIT_DRIVES]]
-            (others / name).write_text(identified(own, logs, mapping), encoding="utf-8")
+            (others / name).mkdir(exist_ok=True)
+            shutil.copy(own, others / name / VEHICLE_FILE)
+            (others / name / FIT_FILE).write_text(identified(own, logs, mapping), encoding="utf-8")
         for entry in entries[FIT_DRIVES:]:
             link = others / entry["file"]
             if not link.exists():
@@ -197,13 +200,12 @@ def identify_cars(folder: Path) -> list[str]:
 
 
 def identified(file: Path, logs: Sequence[Path], mapping: Path) -> str:
-    """Return a car's file with its ``physics`` as the tool identifies it on drives."""
+    """Return the fit of a car with its ``physics`` as the tool identifies it on drives."""
     own, given = load_vehicle(file), load_mapping(mapping)
     read = (load_fit_drive(LogInput(log, log.stem), Car.of(own), given, ReadOptions())[1] for log in logs)
     drives = [drive for drive in read if drive is not None]
     found = fit_physics(drives, own, PARTS, starts=({},), iterations=FIT_ITERATIONS)
     values = FittedValues.of(found.vehicle)
     noise = found.noise.model_copy(update={"physics_sha256": physics_sha256(values.applied_to(own))})
-    physics = FittedPhysics(values=values, noise=noise).model_dump(mode="json", exclude_none=True)
-    text = file.read_text(encoding="utf-8")
-    return flat_toml(text, own, own, {PHYSICS: noise}, None, {PHYSICS: physics})
+    fit = Fit(physics_sha256=physics_sha256(own), physics=FittedPhysics(values=values, noise=noise))
+    return part_toml(fit, "Written by python -m studies.many_cars.")

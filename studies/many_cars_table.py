@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.car import NO_INTERVALS, Car
-from pdhef_logtool.car.flat import load_vehicle, vehicle_toml
 from pdhef_logtool.car.parts import PHYSICS
+from pdhef_logtool.car.toml_files import load_vehicle, vehicle_toml
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.learning.drives import IDENTIFY, LearnSettings

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from pdhef_logtool.car.car import Car, WithoutTruth
-from pdhef_logtool.car.flat import load_vehicle
+from pdhef_logtool.car.toml_files import load_vehicle
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters
 from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.latency_compensation import run_window

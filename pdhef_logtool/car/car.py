@@ -1,9 +1,8 @@
 """Everything that is known of one vehicle, as estimators and commands take it.
 
-A car is a folder: ``vehicle.toml`` is a person's and never rewritten; beside it stand the parts that commands write,
-each one its own (:mod:`~.parts`). A bare ``vehicle.toml`` is a car too, and may hold ``[filter.*]`` and ``[network]``
-of an older file or of an export (:mod:`~.flat`). A part whose basis has changed is stale: it is not taken, and the car
-says so.
+A car is a folder: ``vehicle.toml`` is written by a person and never rewritten; each command writes its part beside it
+(:mod:`~.parts`). A bare ``vehicle.toml`` is a car without parts. A part whose basis has changed is stale: it is not
+used, and the car has a note of it.
 """
 
 from __future__ import annotations
@@ -16,9 +15,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
 
-from pdhef_logtool.car.flat import FlatCar, read_flat
 from pdhef_logtool.car.parts import (
-    FORMER_FILTERS,
     PHYSICS,
     FilterNoise,
     Fit,
@@ -32,6 +29,7 @@ from pdhef_logtool.car.parts import (
     noise_sha256,
     physics_sha256,
 )
+from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.car.vehicle import Record, VehicleParameters, default_vehicle
 from pdhef_logtool.records.documents import read_json, read_text, read_toml, validated
 from pdhef_logtool.records.errors import UsageError, VehicleError
@@ -156,10 +154,12 @@ class Car:
                     got=f"{what} folder",
                     where=str(folder),
                 )
-            flat = read_flat(folder / VEHICLE_FILE)
+            vehicle, trust = read_vehicle_file(folder / VEHICLE_FILE)
         else:
-            flat = FlatCar(default_vehicle()) if source is None else read_flat(source)
-        car = _with_parts(cls(flat.vehicle, flat.vehicle, source=source), flat, folder)
+            vehicle, trust = (default_vehicle(), None) if source is None else read_vehicle_file(source)
+        car = cls(vehicle, vehicle, trust=trust, source=source)
+        if folder is not None:
+            car = _with_parts(car, folder)
         name, home = _network_of(car, folder, network)
         bundle = None if home is None else load_bundle(home)
         found = _intervals_of(folder, name, intervals)
@@ -308,28 +308,20 @@ class Car:
         return replace(self, vehicle=vehicle, own=own, trust=trust, fitted_physics=physics)
 
 
-def _with_parts(car: Car, flat: FlatCar, folder: Path | None) -> Car:
-    """Return the car with fit, noise and trust: those of the file, then those of the folder that are not stale."""
+def _with_parts(car: Car, folder: Path) -> Car:
+    """Return the car with the parts of its folder that are not stale: fit, noise and residual gain."""
     notes: list[str] = []
-    car = replace(car, noise=dict(flat.noise), trust=flat.trust, learnt_on=flat.learnt_on, fitted_physics=flat.physics)
-    tuned: Mapping[str, FilterNoise] = {}
-    if folder is not None:
-        fit = _part(folder / FIT_FILE, Fit)
-        if fit is not None and fit.physics_sha256 == physics_sha256(car.own):
-            car = car.with_fit(fit)
-        elif fit is not None:
-            notes.append(_stale(FIT_FILE, f"{VEHICLE_FILE} has changed since", "identify"))
-        found = _part(folder / NOISE_FILE, Noise)
-        tuned = {} if found is None else found.filter
-        car = replace(car, trust=_part(folder / NETWORK_FILE, Trust) or car.trust)
-    noise = {**car.noise, **{n: one for n, one in tuned.items() if car.owns_noise(n, one)}}
-    if stale := [n for n, one in tuned.items() if n not in FORMER_FILTERS and not car.owns_noise(n, one)]:
+    fit = _part(folder / FIT_FILE, Fit)
+    if fit is not None and fit.physics_sha256 == physics_sha256(car.own):
+        car = car.with_fit(fit)
+    elif fit is not None:
+        notes.append(_stale(FIT_FILE, f"{VEHICLE_FILE} has changed since", "identify"))
+    tuned = _part(folder / NOISE_FILE, Noise)
+    noise: Mapping[str, FilterNoise] = {} if tuned is None else tuned.filter
+    if stale := [n for n, of_filter in noise.items() if not car.owns_noise(n, of_filter)]:
         notes.append(_stale(f"noise of {', '.join(stale)}", "it belongs to other physics", "noise"))
-    for name in sorted(FORMER_FILTERS.keys() & (noise.keys() | tuned.keys())):
-        now = FORMER_FILTERS[name]
-        notes.append(_stale(f"noise of {name}", f"{name} is {now} now", "noise"))
-        noise.pop(name, None)
-    return replace(car, noise=noise, notes=tuple(notes))
+    noise = {**car.noise, **{n: of_filter for n, of_filter in noise.items() if n not in stale}}
+    return replace(car, noise=noise, trust=_part(folder / NETWORK_FILE, Trust) or car.trust, notes=tuple(notes))
 
 
 def _stale(what: str, why: str, stage: str) -> str:
@@ -381,17 +373,10 @@ def load_intervals(path: Path) -> Intervals:
     Raises
     ------
     VehicleError
-        The file is missing or wrong, or of an older format that filed intervals under names.
+        The file is missing or wrong.
     """
     file = path / INTERVALS_FILE if path.is_dir() else path
     raw = read_json(file, "a file of pdhef learn --stages intervals", VehicleError)
-    if isinstance(raw, dict) and raw.get("format") == "pdhef-calibration":
-        raise VehicleError(
-            expected="intervals filed by algorithm (pdhef-intervals 1)",
-            got="a calibration filed by name, which does not say what ran",
-            where=str(file),
-            remedy="pdhef learn --stages intervals makes it anew",
-        )
     return validated(
         Intervals, raw, str(file), VehicleError, expected="the entries of a file of pdhef learn --stages intervals"
     )

@@ -30,32 +30,11 @@ Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 PHYSICS = "physics"
 #: Filters whose noise a car may hold, by the name of the estimator that it belongs to.
 NOISY_FILTERS = ("phy-ukf:tuned", PHYSICS)
-#: Filters of older versions by name, and what stands for them or for their noise now. A file may hold noise of theirs;
-#: it is not used.
-FORMER_FILTERS = {
-    "physics-plus": PHYSICS,
-    "pd-hef-trust0": PHYSICS,
-    "pd-hef": "physics with a network",
-    "pd-hef-smoothed": "physics with a network",
-}
 #: By what the process noise of v_y and yaw rate is multiplied where ``physics`` is smoothed, and nothing was found on
 #: truth: ``studies.defaults.tune_smoothing``, on simulated cars.
 SMOOTHING = (0.5, 3.0)
 #: Measurements that ``r_std`` is about.
 MEASUREMENTS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
-
-#: Defaults of the options of algorithms before these had a version: car folders then listed every option. Frozen.
-_FORMER_DEFAULTS: dict[str, Any] = {
-    "adaptive": True,
-    "bias_states": False,
-    "block_s": 120.0,
-    "force_scale": False,
-    "network": None,
-    "roll_correction": False,
-    "slip_gate": True,
-    "standstill": True,
-    "trust": 0.0,
-}
 
 #: Entries of a vehicle file that change no estimate.
 _NOT_PHYSICS = {"name", "truth_position_m"}
@@ -139,7 +118,7 @@ class FilterNoise(Record):
     q_std : per square root of second, of v_x, v_y and yaw rate, and of the a_x bias if it is not left out; for
         ``physics`` also of the two axle forces. Empty: the filter's own.
     r_std : by measurement; what is left out is the filter's own.
-    physics_sha256 : of the physics that it belongs to. network_sha256 : of the network, in files of older versions.
+    physics_sha256 : of the physics that it belongs to.
     score_deg : in ``pdhef learn --stages noise``, lower is better; None where nothing was compared. trial : its number.
     """
 
@@ -148,7 +127,6 @@ class FilterNoise(Record):
         Field(default_factory=dict)
     )
     physics_sha256: Sha256 | None = None
-    network_sha256: Sha256 | None = None
     score_deg: Positive | None = None
     trial: int | None = None
 
@@ -166,7 +144,7 @@ class FilterNoise(Record):
 
 def _axle_forces_belong_to_physics(tables: dict[str, FilterNoise]) -> dict[str, FilterNoise]:
     for name, table in tables.items():
-        if len(table.q_std) == 6 and name not in (PHYSICS, *FORMER_FILTERS):
+        if len(table.q_std) == 6 and name != PHYSICS:
             raise ValueError(f"q_std of {name} needs 3 or 4 entries, 6 are physics's")
     return tables
 
@@ -174,7 +152,7 @@ def _axle_forces_belong_to_physics(tables: dict[str, FilterNoise]) -> dict[str, 
 #: Noise by filter.
 FilterTables = Annotated[
     dict[
-        Annotated[str, one_of((*NOISY_FILTERS, *FORMER_FILTERS)), Field(json_schema_extra={"enum": [*NOISY_FILTERS]})],
+        Annotated[str, one_of(NOISY_FILTERS), Field(json_schema_extra={"enum": [*NOISY_FILTERS]})],
         FilterNoise,
     ],
     AfterValidator(_axle_forces_belong_to_physics),
@@ -293,10 +271,6 @@ class Inflation(Record):
     grip_factors: Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(strict=False)] = (1.0, 1.0, 1.0)
 
 
-def _is_former_default(name: str, value: Any) -> bool:
-    return name in _FORMER_DEFAULTS and bool(value == _FORMER_DEFAULTS[name])
-
-
 class Algorithm(Record):
     """What really runs under a name; names are presets, and may stand for another algorithm on another car.
 
@@ -327,28 +301,17 @@ class Algorithm(Record):
         options = ", ".join(f"{name}={self.options[name]}" for name in sorted(self.options))
         return f"{self.algorithm} {self.version}{options and f' ({options})'}"
 
-    @model_validator(mode="before")
-    @classmethod
-    def _read_former(cls, given: Any) -> Any:
-        """Remove the options that have their defaults from an entry without a version, which lists every option."""
-        if not isinstance(given, dict) or "version" in given or not isinstance(given.get("options"), dict):
-            return given
-        options = given["options"].items()
-        return {**given, "options": {k: v for k, v in options if not _is_former_default(k.rpartition(".")[2], v)}}
-
 
 class IntervalEntry(Record):
     """Intervals of one algorithm; ``estimator`` is the name under which it ran, for people.
 
-    ``wrong_vehicle_factor`` stands in files of older versions, ``unseen_factor`` says how much wider drives that a fit
-    had not seen asked the intervals to be, over all grip use.
+    ``unseen_factor``: ratio of the width that drives outside the fit need to the fitted width, over all grip use.
     """
 
     estimator: str
     algorithm: Algorithm
     inflation: Inflation
     unseen_factor: float = 1.0
-    wrong_vehicle_factor: float | None = None
     coverage: Annotated[tuple[dict[str, Any], ...], Field(strict=False)] = ()
 
 

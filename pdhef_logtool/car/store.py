@@ -1,4 +1,4 @@
-"""Writing what a command learnt of a car: into its folder, as one change that is there whole or not at all, or flat.
+"""Writing a part of a car into its folder, as a change that is either complete or absent.
 
 The folder is made beside the old one and takes its place by exchange, so that whoever reads sees one of the two.
 """
@@ -23,8 +23,8 @@ from pdhef_logtool.car.car import (
     VEHICLE_FILE,
     Car,
 )
-from pdhef_logtool.car.flat import flat_toml, vehicle_toml
 from pdhef_logtool.car.parts import HistoryLine, LearntOn
+from pdhef_logtool.car.toml_files import vehicle_toml
 from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.files import write_bytes, writing
@@ -45,7 +45,6 @@ class Change:
     files : content of the part's file and of what goes with it (records, plots), by name in the folder.
     folders : copied whole into the car's folder, by name.
     settings, drives : of the command, for the history.
-    told : of it in a flat file, under ``[identification]``.
     """
 
     command: str
@@ -54,7 +53,6 @@ class Change:
     folders: Mapping[str, Path] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     drives: Iterable[LearntOn] = ()
-    told: Mapping[str, Any] = field(default_factory=dict)
 
 
 def check_output(source: Car, output: Path) -> None:
@@ -63,14 +61,14 @@ def check_output(source: Car, output: Path) -> None:
     Raises
     ------
     UsageError
-        The folder is neither new nor this car's.
+        The output is neither a new folder nor this car's.
     """
-    if output.suffix == ".toml" or not output.exists():
+    if not output.exists() and output.suffix != ".toml":
         return
     theirs = output / VEHICLE_FILE
     if not output.is_dir() or (any(output.iterdir()) and not theirs.is_file()):
         raise UsageError(
-            expected="a new folder, a car's folder, or a file name that ends in .toml",
+            expected="a new folder or a car's folder",
             got=output.name,
             where="--output",
         )
@@ -140,36 +138,6 @@ def _remove_parts(folder: Path) -> None:
     shutil.rmtree(folder / NETWORK_FOLDER, ignore_errors=True)
     for name in (FIT_FILE, NOISE_FILE, NETWORK_FILE, INTERVALS_FILE, HISTORY_FILE):
         (folder / name).unlink(missing_ok=True)
-
-
-def write_change(
-    source: Car, after: Car, output: Path, change: Change, comments: Mapping[str, str] | None = None
-) -> Path:
-    """Write what a command learnt to a car's folder, or flat where ``output`` ends in ``.toml``; return where.
-
-    Parameters
-    ----------
-    after : the car with the change. comments : beside entries of the flat file, by dotted name.
-
-    Raises
-    ------
-    OutputError, UsageError
-        See :func:`update_car`.
-    """
-    if output.suffix != ".toml":
-        return update_car(source, output, change)
-    text = vehicle_file(source).decode("utf-8")
-    provenance = dict(change.told)
-    if after.learnt_on:
-        provenance["drives"] = [d.model_dump(mode="json") for d in after.learnt_on]
-    if after.fitted_physics is not None:
-        provenance["physics"] = after.fitted_physics.model_dump(mode="json", exclude_none=True)
-    flat = flat_toml(text, source.own, after.vehicle, after.noise, after.trust, provenance, comments)
-    write_bytes(output, flat.encode())
-    for name, content in change.files.items():
-        if name != change.part:
-            write_bytes(output.with_name(f"{output.stem}.{name}"), content)
-    return output
 
 
 def _log(folder: Path, change: Change) -> None:

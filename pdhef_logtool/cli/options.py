@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 from typer import Argument, Option
 
-from pdhef_logtool.cli.console import say
 from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
@@ -27,7 +26,7 @@ TruthLogs = Annotated[
     list[str], Argument(metavar="LOG", help="Logs with truth, folders that hold some, globs, URLs, or @list.txt.")
 ]
 CarOutput = Annotated[
-    Path, Option("--output", "-o", metavar="CAR", help="Car to write: a folder (may be that of --car), or a .toml.")
+    Path, Option("--output", "-o", metavar="CAR", help="Car to write: a folder (may be that of --car).")
 ]
 JsonFlag = Annotated[bool, Option("--json", help="One JSON document on stdout instead of tables.")]
 JunitFile = Annotated[Path | None, Option(help="Write the verdicts of --thresholds as JUnit XML, for CI.")]
@@ -111,13 +110,7 @@ _OPTIONS: dict[str, Any] = {
             help="Follow redirects of web servers to other hosts of this machine and its network: docs/remote.md.",
         ),
     ],
-    "vehicle": Annotated[_File, Option("--vehicle", "-v", hidden=True)],
-    "model": Annotated[_File, Option(hidden=True)],
-    "calibration": Annotated[_File, Option(hidden=True)],
-    "signal_map": Annotated[_File, Option(hidden=True)],
 }
-#: Options of old that still work, and what stands for them now.
-_ALIASES = {"vehicle": "car", "model": "network", "calibration": "intervals", "signal_map": "mapping"}
 
 
 def command(
@@ -134,7 +127,7 @@ def command(
         every ``config`` takes.
     car : what --car means to the command, which then has --start and --end too; empty = it has no car.
     """
-    wanted = f"mapping prefer_truth budget msgs {shared} {'car vehicle start end' if car else ''}".split()
+    wanted = f"mapping prefer_truth budget msgs {shared} {'car start end' if car else ''}".split()
     wanted.append("allow_private_redirects")
     wanted += ["cache_max_gb"] * ("cache" in wanted)
     taken = {key: option for key, option in _OPTIONS.items() if key in wanted}
@@ -176,17 +169,11 @@ def run_config(options: dict[str, Any]) -> RunConfig:
     Raises
     ------
     UsageError
-        A value is none of those allowed, or an option and its alias are both given.
+        A value is none of those allowed.
     """
     from pdhef_logtool.runs.config import load_config
 
     flags = {key: value for key, value in options.items() if value not in (None, [])}
-    for alias in [a for a in _ALIASES if a in flags]:
-        now = _ALIASES[alias]
-        say(f"notice: --{alias.replace('_', '-')} is now --{now}")
-        if now in flags:
-            raise UsageError(expected=f"--{now} or its alias", got="both", where=f"--{now}")
-        flags[now] = flags.pop(alias)
     return load_config(flags.pop("config_file", None), flags)
 
 

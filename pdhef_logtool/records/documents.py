@@ -57,12 +57,8 @@ def read_sealed(
     error: type[PdhefError],
     remedy: str = "",
     max_bytes: int = MAX_BYTES,
-    *,
-    former: bool = False,
 ) -> dict[str, Any]:
     """Return a document that :func:`seal` made, without its digest; otherwise as :func:`read_json`.
-
-    ``former``: whether earlier versions wrote it without a digest.
 
     Raises
     ------
@@ -70,7 +66,7 @@ def read_sealed(
         Of class ``error``: also a document that is not as it was written.
     """
     document = read_json(path, what, error, remedy, max_bytes)
-    if not (former and DIGEST not in document) and not is_sealed(document):
+    if not is_sealed(document):
         raise error(expected=what, got="one that is not as it was written", where=str(path), remedy=remedy)
     return {key: value for key, value in document.items() if key != DIGEST}
 

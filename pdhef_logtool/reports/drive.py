@@ -159,7 +159,7 @@ def _told(report: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 
 def verdicts_of(report: Mapping[str, Any]) -> list[Verdict]:
-    """Return the sentences at the head of a page; those of an older report are the words of its answer."""
+    """Return the sentences at the head of a page; without verdicts, the words of the answer."""
     told = []
     for v in _told(report):
         word, kind = _OUTCOMES.get(str(v.get("outcome")), (str(v.get("outcome")), ""))

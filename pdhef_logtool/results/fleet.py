@@ -66,7 +66,7 @@ class FleetDrive:
     truth : whether its sideslip is scored against an independent truth. unscored : why not, else empty.
     errors : RMSE by estimator and signal, where the truth is independent of both.
     nis, d2, naive_d2 : what needs no truth: NIS over its degrees of freedom and d2 of the answer, d2 of sideslip 0.
-    verdict : of sideslip: ``better``, ``worse`` and so on; empty in older reports. coverage : of the 95 % band.
+    verdict : of sideslip: ``better``, ``worse`` and so on. coverage : of the 95 % band.
     failed_checks : those that count. lost : what could not be used, empty for nothing. keys : what it can be told by.
     """
 

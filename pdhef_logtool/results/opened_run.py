@@ -134,11 +134,7 @@ class OpenedLog:
 
     def main(self) -> str:
         """Return the estimator that is the drive's answer; empty where there is none."""
-        if "main" in self.entry:
-            return str(self.entry["main"] or "")
-        with self.reading():
-            answer = (self.report() or {}).get("answer") or {}  # run.json of an older version does not say it
-            return str(answer.get("main") or "")
+        return str(self.entry.get("main") or "")
 
     def estimates(self) -> pl.LazyFrame | None:
         """Return estimates.parquet, of which only what is asked for is read; None where there is none."""
@@ -221,7 +217,7 @@ def open_run(output: Path | str) -> OpenedRun:
             where = str(folder) if mirror is None else mirror.objects.shown
             raise OutputError(expected="the outputs of a run", got=got, where=where, remedy=_REMEDY)
     what, path = "the run.json of a run", folder / RUN_FILE
-    document = read_sealed(path, what, OutputError, _REMEDY, MAX_DOCUMENT_BYTES, former=True)
+    document = read_sealed(path, what, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)
     if document.get("format") != "pdhef.run":
         got = f"format {document.get('format')!r}"
         raise OutputError(expected=what, got=got, where=str(path), remedy=_REMEDY)

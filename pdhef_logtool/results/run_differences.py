@@ -118,9 +118,9 @@ def _outcomes(pairs: Sequence[Pair]) -> Iterator[str]:
 
 
 def _unknown(pairs: Sequence[Pair]) -> Iterator[str]:
-    older = sum(pair.same("signals_sha256") is None and pair.a.outcome == pair.b.outcome == "ok" for pair in pairs)
-    if older:
-        yield f"signals, truth, mapping: nothing says whether they are the same{_of(older, len(pairs))} (an older run)"
+    unstated = sum(pair.same("signals_sha256") is None and pair.a.outcome == pair.b.outcome == "ok" for pair in pairs)
+    if unstated:
+        yield f"signals, truth, mapping: nothing says whether they are the same{_of(unstated, len(pairs))}"
 
 
 def _of(count: int, pairs: int) -> str:

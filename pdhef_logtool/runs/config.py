@@ -27,8 +27,6 @@ _KEYWORDS = {
     "network": (*SHIPPED_FOLDERS, NO_MODEL),
     "intervals": (NO_INTERVALS, UNSURE),
 }
-#: Keys of older files, and what they are now.
-FORMER_KEYS = {"vehicle": "car", "model": "network", "calibration": "intervals"}
 
 
 def _as_text(value: object) -> object:
@@ -182,9 +180,6 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
 
 def _read_file(path: Path) -> dict[str, Any]:
     raw = read_toml(path, "a configuration TOML file", UsageError)
-    if twice := [f"{old} and {new}" for old, new in FORMER_KEYS.items() if old in raw and new in raw]:
-        raise UsageError(expected="an entry or its former name", got=", ".join(twice), where=str(path))
-    raw = {FORMER_KEYS.get(key, key): value for key, value in raw.items()}
     if isinstance(raw.get("cache"), str) and "://" not in raw["cache"]:
         raw["cache"] = str(path.parent / raw["cache"])
     for key in _FILES:

@@ -311,7 +311,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
 
 
 def _detailed(details: DriveDetails) -> dict[str, Any]:
-    """Return the keys that only a run writes; readers of older reports do without them."""
+    """Return the keys that only a run writes."""
     space = {"speed_edges_m_s": SPEED_EDGES_M_S, "ay_edges_m_s2": AY_EDGES_M_S2, "cells": details.operating_space}
     found = {
         "faults": details.faults,

@@ -14,9 +14,9 @@ import sys
 from pathlib import Path
 
 from pdhef_logtool.car.car import FIT_FILE, NO_INTERVALS, SHIPPED_CARS, Car
-from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import Fit, FittedValues, LearntOn, physics_sha256
 from pdhef_logtool.car.store import Change, update_car
+from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.learning.car.fit_data import FitDrive
 from pdhef_logtool.learning.car.physics_fit import find_physics
 from pdhef_logtool.residual_model.bundle import NO_MODEL

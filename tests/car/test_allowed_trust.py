@@ -10,11 +10,10 @@ import pytest
 import torch
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.flat import load_vehicle, part_toml, read_flat, vehicle_toml
 from pdhef_logtool.car.parts import FilterNoise, Fit, FittedValues, Trust
+from pdhef_logtool.car.toml_files import load_vehicle, part_toml, vehicle_toml
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.records.errors import VehicleError
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
@@ -82,18 +81,12 @@ def test_other_physics_or_noise_need_evidence_of_their_own() -> None:
     assert tried.with_vehicle(heavier).allowed_trust.cap == 1.0  # a car made wrong on purpose is trusted as before
 
 
-def test_the_entries_survive_the_part_and_the_flat_file(tmp_path: Path) -> None:
+def test_the_entries_survive_the_part(tmp_path: Path) -> None:
     vehicle = default_vehicle()
     trust = Trust(trust_cap=0.25, evidence=EVIDENCE + ' "so to speak"', network_sha256="0" * 64)
     (tmp_path / "vehicle.toml").write_text(vehicle_toml(vehicle))
     (tmp_path / "network.toml").write_text(part_toml(trust, "Written by a test."))
     assert Car.load(tmp_path, network="none").trust == trust
-    flat = '[network]\ntrust_cap = 0.25\nevidence = "a gain"\nmodel_sha256 = "' + "0" * 64 + '"\n'
-    (tmp_path / "car.toml").write_text(vehicle_toml(vehicle) + flat)
-    assert read_flat(tmp_path / "car.toml").trust == Trust(trust_cap=0.25, evidence="a gain", network_sha256="0" * 64)
-    (tmp_path / "bad.toml").write_text(vehicle_toml(vehicle) + flat.replace("0" * 64, "0" * 63))
-    with pytest.raises(VehicleError, match=r"network\.model_sha256"):
-        Car.load(tmp_path / "bad.toml")
 
 
 def test_only_pd_hef_heeds_the_cap() -> None:
@@ -116,10 +109,12 @@ def test_the_report_says_the_cap_and_why(
     model = _bundle()
     model.save(tmp_path / "model")
     text = vehicle_toml(load_vehicle(sample_logs_dir / "vehicle.toml"))
-    tried = f'\n[network]\ntrust_cap = 0.25\nevidence = "{EVIDENCE}"\nmodel_sha256 = "{model.sha256}"\n'
-    for network, cap, why in ((tried, 0.25, EVIDENCE), ("", 0.0, "no evidence")):
-        file = tmp_path / f"car{cap}.toml"
-        file.write_text(text + network)
+    tried = Trust(trust_cap=0.25, evidence=EVIDENCE, network_sha256=model.sha256)
+    for trust, cap, why in ((tried, 0.25, EVIDENCE), (Trust(), 0.0, "no evidence")):
+        file = tmp_path / f"car{cap}"
+        file.mkdir()
+        (file / "vehicle.toml").write_text(text)
+        (file / "network.toml").write_text(part_toml(trust, "Written by a test."))
         config = RunConfig(
             car=file, network=tmp_path / "model", estimators=("pd-hef", "pd-hef:gain=1"), annotate="none"
         )

@@ -8,7 +8,6 @@ import shutil
 import tomllib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,6 @@ from pdhef_logtool.car.car import (
     Car,
     read_history,
 )
-from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import (
     FilterNoise,
     Fit,
@@ -42,7 +40,8 @@ from pdhef_logtool.car.parts import (
     car_folder,
     physics_sha256,
 )
-from pdhef_logtool.car.store import Change, check_output, update_car, write_change
+from pdhef_logtool.car.store import Change, check_output, update_car
+from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.physics_ukf import of_car
 from pdhef_logtool.estimators.table import make_estimator
@@ -221,7 +220,7 @@ def add_physics(folder: Path) -> Fit:
 
 
 def test_what_was_found_through_physics_is_its_own(folder: Path, tmp_path: Path) -> None:
-    """A folder and a flat export give it back equal; other filters do not see it."""
+    """Other filters do not see it."""
     add_physics(folder)
     car = load(folder)
     assert car.fitted_physics == FOUND
@@ -232,13 +231,6 @@ def test_what_was_found_through_physics_is_its_own(folder: Path, tmp_path: Path)
     assert car.physics_vehicle.physics.names == ("lag", "roll")
     assert of_car(car).vehicle == car.physics_vehicle
     assert make_estimator(TUNED, car).vehicle == car.vehicle
-    flat = write_change(car, car, tmp_path / "flat.toml", noise_change(NEW))
-    again = load(flat)
-    assert again.fitted_physics == FOUND
-    assert again.noise["physics"].q_std == FOUND.noise.q_std
-    assert write_change(again, again, tmp_path / "again.toml", noise_change(NEW)).read_text() == flat.read_text()
-    for comment in COMMENTS:
-        assert flat.read_text().count(comment) == 1
 
 
 def test_a_vehicle_made_wrong_is_wrong_for_physics_too_and_nothing_else_of_it(folder: Path) -> None:
@@ -392,7 +384,6 @@ TRUST = 'format = "pdhef-network"\nversion = 1\n'
     [
         (VEHICLE_FILE, PERSONS.replace("friction", "frictoin"), "frictoin: unknown, did you mean friction?"),
         (VEHICLE_FILE, PERSONS.replace("[tyres.rear]", "[tyres.reer]"), "did you mean tyres.rear?"),
-        (VEHICLE_FILE, PERSONS + "[filtre.x]\n", "filtre: unknown, did you mean filter?"),
         (VEHICLE_FILE, PERSONS + "[network]\ntrust = 1.0\n", "network.trust: unknown, did you mean network.trust_cap?"),
         (FIT_FILE, FIT + "drive = []\n[values]\n", "drive: unknown, did you mean drives?"),
         (FIT_FILE, FIT + "[values]\nmass_kg = 3.0\n", "values.mass_kg: unknown"),
@@ -412,7 +403,7 @@ TRUST = 'format = "pdhef-network"\nversion = 1\n'
         (
             INTERVALS_FILE,
             '{"format": "pdhef-calibration", "estimators": {}}',
-            "pdhef learn --stages intervals makes it anew",
+            "should be 'pdhef-intervals', got 'pdhef-calibration'",
         ),
     ],
 )
@@ -425,49 +416,10 @@ def test_wrong_entries_of_every_part_are_told_in_one_line(folder: Path, name: st
     assert "\n" not in str(caught.value)
 
 
-# --- one file, as older versions wrote it --------------------------------------------------------------------------
-
-FLAT = """
-[filter."phy-ukf:tuned"]
-q_std = [0.1, 0.1, 0.1]
-[filter.physics]
-q_std = [0.1, 0.1, 0.1]
-[network]
-trust_cap = 0.25
-evidence = "a drive of 300 s"
-[identification]
-drives = ["lap: 0 to 80.5 s", {name = "other", sha256 = "cd", start_s = 1.0, end_s = 2.0}]
-tuning_scores = ["physics: 0.1092 deg at trial 63", "phy-ukf:tuned: 0.1378 deg at trial 7"]
-tool = "pdhef 0.1"
-"""
-
-
-def test_scores_and_drives_of_older_files_are_understood(tmp_path: Path) -> None:
-    path = tmp_path / "old.toml"
-    path.write_text(PERSONS + FLAT)
-    car = load(path)
-    assert {n: (one.score_deg, one.trial) for n, one in car.noise.items()} == {OURS: (0.1092, 63), TUNED: (0.1378, 7)}
-    assert [(d.name, d.start_s, d.end_s) for d in car.learnt_on] == [("other", 1.0, 2.0), ("lap", 0.0, 80.5)]
-    assert car.allowed_trust.cap == 0.25
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("0.1092 deg at trial", "0.1092° at trial"),
-        ("0.1092 deg at trial 63", "0.1092 deg"),
-        ("physics: 0.1092", "physics 0.1092"),
-        ("lap: 0 to 80.5 s", "lap: all of it"),
-    ],
-)
-def test_a_sentence_that_is_not_understood_is_an_error_and_chooses_no_filter(
-    tmp_path: Path, old: str, new: str
-) -> None:
-    path = tmp_path / "old.toml"
-    path.write_text(PERSONS + FLAT.replace(old, new))
-    with pytest.raises(VehicleError, match=r"identification\.(tuning_scores|drives)") as caught:
-        load(path)
-    assert new in str(caught.value)
+def test_tables_of_parts_have_no_place_in_vehicle_toml(tmp_path: Path) -> None:
+    (tmp_path / "old.toml").write_text(PERSONS + '[filter."phy-ukf:tuned"]\nq_std = [0.1, 0.1, 0.1]\n')
+    with pytest.raises(VehicleError, match=r"old\.toml: expected the entries of vehicle\.toml, got filter: unknown"):
+        load(tmp_path / "old.toml")
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
@@ -607,87 +559,24 @@ def test_what_is_no_place_for_a_car_is_refused_and_untouched(folder: Path, tmp_p
     before = files_of(tmp_path)
     for output, said in (
         (another, r"got another, whose vehicle\.toml is another; name another folder, or give --car"),
-        (full, "a new folder, a car's folder"),
-        (file, "a new folder, a car's folder"),
+        (full, "a new folder or a car's folder"),
+        (file, "a new folder or a car's folder"),
+        (tmp_path / "new.toml", r"a new folder or a car's folder, got new\.toml"),
     ):
         for act in (lambda o=output: check_output(car, o), lambda o=output: update_car(car, o, noise_change(NEW))):
             with pytest.raises(UsageError, match=said):
                 act()
     assert files_of(tmp_path) == before
     (tmp_path / "empty").mkdir()
-    for output in (folder, tmp_path / "empty", tmp_path / "none", tmp_path / "flat.toml"):
+    for output in (folder, tmp_path / "empty", tmp_path / "none"):
         check_output(car, output)
-
-
-def test_a_flat_export_keeps_a_persons_comments_and_changes_only_what_differs(folder: Path, tmp_path: Path) -> None:
-    add_fit(folder, friction=0.6)
-    add_noise(folder, score_deg=0.1092, trial=63)
-    add_trust(folder)
-    car = load(folder, "default")
-    flat = tmp_path / "flat.toml"
-    change = noise_change({**car.noise, **NEW})
-    assert write_change(car, car.with_noise(OURS, NEW[OURS]), flat, change) == flat
-    text = flat.read_text()
-    for comment in COMMENTS:
-        assert text.count(comment) == 1
-    kept = [line for line in PERSONS.splitlines() if line and not line.startswith(("friction", "name"))]
-    assert [line for line in text.splitlines() if line in kept] == kept
-    again = load(flat, "default")
-    assert again.vehicle == car.vehicle
-    assert {n: (one.q_std, one.score_deg) for n, one in again.noise.items()} == {
-        n: (one.q_std, one.score_deg) for n, one in {**car.noise, **NEW}.items()
-    }
-    assert again.allowed_trust.cap == 0.5
-    assert again.learnt_on == DRIVES
-    assert {p.name for p in tmp_path.iterdir()} == {"car", "flat.toml"}
-
-
-def test_a_flat_export_again_and_again_does_not_grow(tmp_path: Path) -> None:
-    source = tmp_path / "old.toml"
-    source.write_text(PERSONS + FLAT)
-    sizes = []
-    for number in range(3):
-        car = load(source)
-        source = write_change(car, car.with_noise(OURS, NEW[OURS]), tmp_path / f"{number}.toml", noise_change(NEW))
-        sizes.append(len(source.read_text()))
-        assert all(source.read_text().count(comment) == 1 for comment in COMMENTS)
-    assert sizes[0] == sizes[1] == sizes[2] < 2 * len(PERSONS + FLAT)
-    told = tomllib.loads(source.read_text())
-    assert "tuning_scores" not in told["identification"]
-    assert told["identification"]["tool"] == "pdhef 0.1"
-    assert load(source).noise[TUNED].score_deg == 0.1378
-
-
-def test_tables_of_older_files_are_changed_where_they_stand(tmp_path: Path) -> None:
-    """What stands below a table in the file is a part of it for a parser, comments of what follows too."""
-    old, tyres = tmp_path / "old.toml", PERSONS.index("[tyres.front]")
-    text = PERSONS[:tyres] + FLAT.replace("trust_cap = 0.25", "trust_cap = 0.25  # my guess")
-    old.write_text(text + "\n# tyres of last summer\n" + PERSONS[tyres:])
-    car = load(old)
-    trusted = Trust(trust_cap=0.75, evidence="another drive")
-    flat = write_change(
-        car, replace(car.with_noise(OURS, NEW[OURS]), trust=trusted), tmp_path / "flat.toml", noise_change(NEW)
-    )
-    text = flat.read_text()
-    for comment in (*COMMENTS, "# my guess", "# tyres of last summer"):
-        assert text.count(comment) == 1, comment
-    again = load(flat)
-    assert (again.noise[OURS].q_std, again.noise[TUNED].q_std) == ((0.1, 0.2, 0.3), (0.1, 0.1, 0.1))
-    assert (again.allowed_trust.cap, again.vehicle) == (0.75, car.vehicle)
-
-
-def test_what_a_command_writes_beside_stands_beside_a_flat_export(folder: Path, tmp_path: Path) -> None:
-    change = noise_change(NEW)
-    change = Change("tune", NOISE_FILE, {**change.files, "noise.record.json": b"{}"})
-    write_change(load(folder), load(folder), tmp_path / "out" / "flat.toml", change)
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"flat.toml", "flat.noise.record.json"}
 
 
 def test_a_place_that_cannot_be_written_is_one_line(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     for output in (tmp_path / "file" / "car", tmp_path / "file" / "car.toml"):
         with pytest.raises(PdhefError) as caught:
-            write_change(load(folder), load(folder), output, noise_change(NEW))
+            update_car(load(folder), output, noise_change(NEW))
         assert "\n" not in str(caught.value)
 
 
@@ -721,31 +610,6 @@ def test_cars_beside_one_another_are_changed_at_once(folder: Path) -> None:
             list(pool.map(lambda output: update_car(car, output, change), names))
         assert all((name / "part.toml").is_file() for name in names)
     assert not [p for p in folder.parent.iterdir() if p.name.startswith(".")]
-
-
-# --- filters of older versions -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("where", ["noise.toml", "fit.toml", "vehicle.toml"])
-def test_noise_of_a_filter_that_is_no_more_is_left_out_with_one_notice(folder: Path, where: str) -> None:
-    former = FilterNoise(q_std=(0.1,) * 6, r_std={"ay_m_s2": 1.4}, score_deg=0.1, trial=3)
-    kept = FilterNoise(q_std=(0.4, 0.5, 0.6))
-    if where == "noise.toml":
-        write_part(folder / NOISE_FILE, Noise(filter={TUNED: kept, "physics-plus": former}))
-    elif where == "fit.toml":
-        fit = Fit(physics_sha256=physics_sha256(load(folder).own), filter={TUNED: kept, "physics-plus": former})
-        write_part(folder / FIT_FILE, fit)
-    else:
-        edit(
-            folder,
-            "# end",
-            '[filter."phy-ukf:tuned"]\nq_std = [0.4, 0.5, 0.6]\n[filter.physics-plus]\nq_std = []\n# end',
-        )
-    car = load(folder)
-    assert dict(car.noise) == {TUNED: kept}
-    assert car.notes == (
-        "noise of physics-plus is not used: physics-plus is physics now; pdhef learn --stages noise makes it anew",
-    )
 
 
 def test_noise_of_physics_belongs_to_the_values_that_were_found_through_it(folder: Path) -> None:

@@ -12,8 +12,8 @@ import jsonschema
 import pytest
 
 from pdhef_logtool.car.car import SHIPPED_CARS
-from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import FilterNoise, Fit, FittedSensors, FittedValues, Intervals, LearntOn, Noise, Trust
+from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.car.vehicle import Record, VehicleParameters, default_vehicle
 from pdhef_logtool.sinks.schema import load_schema
 

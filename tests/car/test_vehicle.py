@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.flat import load_vehicle, read_flat
-from pdhef_logtool.car.parts import Trust
+from pdhef_logtool.car.parts import Noise, Trust
+from pdhef_logtool.car.toml_files import load_vehicle, read_vehicle_file
 from pdhef_logtool.car.vehicle import default_vehicle, vehicle_from_dict
 from pdhef_logtool.records.errors import VehicleError
 
@@ -45,12 +45,6 @@ D_n = 7600.0
 E = 0.30
 [tyres.rear]
 cornering_stiffness_n_per_rad = 108000.0
-[filter."phy-ukf:tuned"]
-q_std = [0.02, 0.006, 0.002]
-r_std = { ay_m_s2 = 1.0, yaw_rate_rad_s = 0.003, speed_m_s = 0.1 }
-[network]
-trust_cap = 0.3
-evidence = "none"
 """
 
 
@@ -59,11 +53,6 @@ def as_plain(value):
     if isinstance(value, dict):
         return {k: as_plain(v) for k, v in value.items()}
     return [as_plain(v) for v in value] if isinstance(value, list | tuple) else value
-
-
-def physics_of(text: str) -> dict[str, Any]:
-    """The entries of a file that are a person's."""
-    return {k: v for k, v in tomllib.loads(text).items() if k not in ("filter", "network")}
 
 
 def write(tmp_path: Path, text: str | bytes) -> Path:
@@ -83,10 +72,11 @@ def problem(path: Path) -> str:
 
 
 def test_every_entry_of_the_example_is_read(tmp_path):
-    flat = read_flat(write(tmp_path, EXAMPLE))
-    vehicle, raw = flat.vehicle, tomllib.loads(EXAMPLE)
-    assert as_plain({name: one.model_dump(exclude_unset=True) for name, one in flat.noise.items()}) == raw.pop("filter")
-    assert flat.trust == Trust(**raw.pop("network"))
+    tried = '[network]\ntrust_cap = 0.3\nevidence = "a drive"\n'
+    vehicle, trust = read_vehicle_file(write(tmp_path, EXAMPLE + tried))
+    assert trust == Trust(trust_cap=0.3, evidence="a drive")
+    assert "network.trust_cap" in problem(write(tmp_path, EXAMPLE + tried.replace("0.3", "1.3")))
+    raw = tomllib.loads(EXAMPLE)
     assert as_plain(vehicle.model_dump(exclude_unset=True)) == raw
     assert vehicle_from_dict(as_plain(vehicle.model_dump(exclude_none=True)), where="again") == vehicle
 
@@ -94,15 +84,11 @@ def test_every_entry_of_the_example_is_read(tmp_path):
 def test_defaults_of_what_the_file_leaves_out(tmp_path):
     lines = "mass_kg = 1000\nyaw_inertia_kg_m2 = 1200\ncg_to_front_axle_m = 1.2\ncg_to_rear_axle_m = 1.3\n"
     tyres = "".join(f"[tyres.{a}]\ncornering_stiffness_n_per_rad = 8e4\n" for a in ("front", "rear"))
-    flat = read_flat(write(tmp_path, lines + tyres))
-    vehicle = flat.vehicle
+    vehicle = load_vehicle(write(tmp_path, lines + tyres))
     assert vehicle.friction is None
     assert vehicle.assumed_friction == 1.0
     assert vehicle.imu_position_m == (0.0, 0.0, 0.0)
-    assert flat.trust is None
     assert Car.load(tmp_path / "car.toml", network="none").allowed_trust.cap == 0.0
-    assert flat.noise == {}
-    assert flat.learnt_on == ()
     assert vehicle.sensors.ay_std_m_s2 == 0.12
 
 
@@ -137,14 +123,7 @@ def test_all_problems_are_reported_together(tmp_path):
         ("imu_position_m = [0.1, 0.0, 0.2]", "imu_position_m = [0.1, nan, 0.2]", "imu_position_m.1"),
         ("yaw_rate_std_rad_s = 0.004", "yaw_rate_std_rad_s = 0", "sensors.yaw_rate_std_rad_s"),
         ("yaw_rate_std_rad_s = 0.004", "yaw_rate_std_deg_s = 0.2", "sensors.yaw_rate_std_deg_s"),
-        ("q_std = [0.02, 0.006, 0.002]", "q_std = [0.02, -0.006]", "filter.phy-ukf:tuned.q_std.1"),
-        ("trust_cap = 0.3", "trust_cap = 1.3", "network.trust_cap"),
         ("[tyres.rear]", "[tyres.back]", "tyres.back"),
-        ("q_std = [0.02, 0.006, 0.002]", "q_std = [0.02]", "filter.phy-ukf:tuned: q_std needs 3 or 4 entries"),
-        ("q_std = [0.02, 0.006, 0.002]", f"q_std = {[0.02] * 9}", "filter.phy-ukf:tuned: q_std needs 3 or 4 entries"),
-        ("q_std = [0.02, 0.006, 0.002]", f"q_std = {[0.02] * 6}", "filter: q_std of phy-ukf:tuned needs 3 or 4"),
-        ("r_std = { ay_m_s2", "r_std = { ay", "filter.phy-ukf:tuned.r_std.ay: unknown, did you mean"),
-        ('[filter."phy-ukf:tuned"]', "[filter.phy_ukf_tuned]", "did you mean filter.phy-ukf:tuned?"),
         ("mass_kg = 1440.0", 'mass_kg = "1440"', "mass_kg: should be a valid number, got '1440'"),
         ("mass_kg = 1440.0", "mass_kg = true", "mass_kg: should be a valid number, got True"),
         ("imu_position_m = [0.1, 0.0, 0.2]", 'imu_position_m = "100"', "imu_position_m: should be a list, got '100'"),
@@ -160,16 +139,22 @@ def test_a_wrong_entry_is_named(tmp_path, old, new, named):
     assert named in problem(write(tmp_path, EXAMPLE.replace(old, new, 1)))
 
 
-@pytest.mark.parametrize("entries", [[], [0.02, 0.006, 0.002], [0.02, 0.006, 0.002, 0.001]])
-def test_noise_of_three_or_four_states_is_read(tmp_path, entries):
-    text = EXAMPLE.replace("q_std = [0.02, 0.006, 0.002]", f"q_std = {entries}")
-    assert read_flat(write(tmp_path, text)).noise["phy-ukf:tuned"].q_std == tuple(entries)
-
-
-def test_physics_has_two_states_more(tmp_path):
-    text = EXAMPLE.replace('filter."phy-ukf:tuned"', "filter.physics")
-    text = text.replace("q_std = [0.02, 0.006, 0.002]", f"q_std = {[0.02] * 6}")
-    assert len(read_flat(write(tmp_path, text)).noise["physics"].q_std) == 6
+@pytest.mark.parametrize(
+    ("name", "entries", "wrong"),
+    [
+        ("phy-ukf:tuned", (), ""),
+        ("phy-ukf:tuned", (0.02,) * 3, ""),
+        ("phy-ukf:tuned", (0.02,) * 4, ""),
+        ("physics", (0.02,) * 6, ""),
+        ("phy-ukf:tuned", (0.02,), "q_std needs 3 or 4 entries"),
+        ("physics", (0.02,) * 9, "q_std needs 3 or 4 entries"),
+        ("phy-ukf:tuned", (0.02,) * 6, "q_std of phy-ukf:tuned needs 3 or 4"),
+        ("phy-ukf:tuned", (0.02, -0.006, 0.002), "greater than or equal to 0"),
+    ],
+)
+def test_noise_has_an_entry_a_state(name: str, entries: tuple[float, ...], wrong: str) -> None:
+    with pytest.raises(ValueError, match=wrong) if wrong else contextlib.nullcontext():
+        Noise.model_validate({"filter": {name: {"q_std": entries}}})
 
 
 def test_a_mass_in_tonnes_contradicts_the_other_entries(tmp_path):
@@ -198,7 +183,7 @@ def test_a_mass_in_tonnes_contradicts_the_other_entries(tmp_path):
     ],
 )
 def test_relations_find_a_slip_that_the_ranges_let_pass(tmp_path, entry, factor, named):
-    raw = physics_of(EXAMPLE)
+    raw = tomllib.loads(EXAMPLE)
     raw["relaxation_length_m"] = 0.5
     place = next(t for t in (raw, raw["tyres"]["front"], raw["tyres"]["rear"]) if entry in t)
     place[entry] *= factor
@@ -305,7 +290,7 @@ def test_a_folder_is_no_vehicle_file(tmp_path):
 @settings(derandomize=True, deadline=None, max_examples=50)
 @given(st.floats(0.05, 2.0))
 def test_axle_quantities(friction):
-    vehicle = vehicle_from_dict(physics_of(EXAMPLE), where="example")
+    vehicle = vehicle_from_dict(tomllib.loads(EXAMPLE), where="example")
     assert vehicle.wheelbase_m == pytest.approx(2.87)
     weight = 1440.0 * 9.80665
     assert vehicle.axle_load_n(True) + vehicle.axle_load_n(False) == pytest.approx(weight)

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from pdhef_logtool.cli.removed_commands import REMOVED
+from pdhef_logtool.records.documents import seal
 from tests.command_line import called
 
 ROOT = Path(__file__).parents[2]
@@ -202,66 +203,6 @@ def test_interrupt_is_one_line_and_exit_code_130() -> None:
     assert "interrupted; nothing half-written" in _one_line_error(result)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "notices"),
-    [
-        (("run", "no", "-v", "a.toml"), ["--vehicle is now --car"]),
-        (("run", "no", "--vehicle", "a.toml"), ["--vehicle is now --car"]),
-        (
-            ("run", "no", "--vehicle", "a.toml", "--model", "none", "--calibration", "none"),
-            [
-                "--vehicle is now --car",
-                "--model is now --network",
-                "--calibration is now --intervals",
-            ],
-        ),
-        (("metrics", "no", "-v", "a.toml"), ["--vehicle is now --car"]),
-        (("extract", "no", "-v", "a.toml"), ["--vehicle is now --car"]),
-        (("run", "no", "--car", "a.toml"), []),
-    ],
-)
-@pytest.mark.slow
-def test_options_of_old_are_told_of_once(arguments: tuple[str, ...], notices: list[str], tmp_path: Path) -> None:
-    result = called(*arguments, "-o", str(tmp_path / "car.toml"), cwd=tmp_path)
-    assert result.returncode in (1, 2)
-    told = [line for line in result.stderr.splitlines() if line.startswith("notice: ")]
-    assert told == [f"notice: {notice}" for notice in notices]
-
-
-def test_options_of_old_mean_what_they_meant(capsys: pytest.CaptureFixture[str]) -> None:
-    from pdhef_logtool.cli.options import run_config
-    from pdhef_logtool.records.errors import UsageError
-
-    assert run_config({"car": Path("a"), "vehicle": None}) == run_config({"vehicle": Path("a")})
-    assert run_config({"signal_map": Path("m")}).mapping == Path("m")
-    assert run_config({"model": Path("n"), "calibration": Path("c")}) == run_config(
-        {"network": Path("n"), "intervals": Path("c")}
-    )
-    assert run_config({"estimators": "zero, phy-ukf,"}).estimators == ("zero", "phy-ukf")
-    with pytest.raises(UsageError, match="--car or its alias"):
-        run_config({"car": Path("a"), "vehicle": Path("a")})
-    assert capsys.readouterr().err.count("notice: ") == 5
-
-
-@pytest.mark.slow
-def test_a_run_with_options_of_old_is_the_same_run(sample_logs_dir: Path, tmp_path: Path) -> None:
-    car = str(sample_logs_dir / "vehicle.toml")
-    shipped = ROOT / "pdhef_logtool" / "models" / "default"
-    given = {
-        "new": ("--car", car, "--network", "many-cars", "--intervals", str(shipped / "intervals.json")),
-        "old": ("--vehicle", car, "--model", "many-cars", "--calibration", str(shipped / "intervals.json")),
-    }
-    for name, options in given.items():
-        result = called(
-            *("run", str(sample_logs_dir / "dlc.mcap"), "-o", str(tmp_path / name), "--annotate", "none"),
-            *("-e", "phy-ukf,pd-hef", "--end", "4", *options),
-        )
-        assert result.returncode == 0, result.stderr
-        assert result.stderr.count("notice: ") == (3 if name == "old" else 0)
-    for file in ("run.json", "metrics.parquet", "logs/dlc/estimates.parquet", "logs/dlc/report.json"):
-        assert (tmp_path / "old" / file).read_bytes() == (tmp_path / "new" / file).read_bytes(), file
-
-
 @pytest.mark.slow
 def test_unknown_manoeuvre_names_those_that_there_are(tmp_path: Path) -> None:
     result = called("simulate", "moose", "-o", str(tmp_path / "x.mcap"))
@@ -321,7 +262,7 @@ def _run_of(folder: Path, *names: str) -> Path:
         (folder / "logs" / name).mkdir(parents=True)
         (folder / "logs" / name / "recording.rrd").write_bytes(b"RRF2FOOT")
     logs = [{"log": name, "outcome": "ok"} for name in names]
-    (folder / "run.json").write_text(json.dumps({"format": "pdhef.run", "version": 1, "logs": logs}))
+    (folder / "run.json").write_text(json.dumps(seal({"format": "pdhef.run", "version": 1, "logs": logs})))
     (folder / "metrics.parquet").touch()
     return folder
 

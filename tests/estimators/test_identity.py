@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from pdhef_logtool.car.car import INTERVALS_FILE, SHIPPED_CARS, Car
-from pdhef_logtool.car.parts import Algorithm
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
@@ -41,17 +40,6 @@ SHIPPED = {
 }
 #: Fields that are no option: names and texts, and what counts as noise, physics or network.
 ROLES = {"name", "causal", "notes", "vehicle", "read_with", "network", "model", "q_std", "r_std", "use_speed"}
-#: The entry of pd-hef as the versions without versions of algorithms wrote it.
-FORMER = {
-    "algorithm": "adaptive-physics",
-    "options": {
-        "adaptive": True,
-        "physics": "physics-filter",
-        "physics.slip_gate": True,
-        "physics.standstill": True,
-        "trust": 0.75,
-    },
-}
 
 
 @pytest.fixture(scope="module")
@@ -97,15 +85,6 @@ def test_a_class_without_an_identity_is_refused() -> None:
 
     with pytest.raises(UsageError, match="version = 1 in class Nameless"):
         resolve(Nameless())  # type: ignore[arg-type]
-
-
-def test_an_entry_of_an_older_version_is_the_same_algorithm_without_its_defaults() -> None:
-    assert Algorithm.model_validate(FORMER).identity == _HYBRID
-    for changes in ({"trust": 0.5}, {"physics.slip_gate": False}, {"other": True}):
-        former = {**FORMER, "options": {**FORMER["options"], **changes}}  # type: ignore[dict-item]
-        assert Algorithm.model_validate(former).identity != _HYBRID
-    written = Algorithm.model_validate(FORMER)
-    assert Algorithm.model_validate(written.model_dump(mode="json")) == written
 
 
 @pytest.mark.slow

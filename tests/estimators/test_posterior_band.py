@@ -10,8 +10,17 @@ import pytest
 from reference_car import cut, drive, slalom, with_noise
 
 from pdhef_logtool.car.car import NO_INTERVALS, Car
-from pdhef_logtool.car.flat import flat_toml, vehicle_toml
-from pdhef_logtool.car.parts import PHYSICS, FilterNoise, FittedPhysics, FittedValues, IntervalEntry, Intervals
+from pdhef_logtool.car.parts import (
+    PHYSICS,
+    FilterNoise,
+    Fit,
+    FittedPhysics,
+    FittedValues,
+    IntervalEntry,
+    Intervals,
+    physics_sha256,
+)
+from pdhef_logtool.car.toml_files import part_toml, vehicle_toml
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.latency_compensation import run_window
@@ -113,9 +122,10 @@ def test_calibrated_intervals_come_first(signals: Signals) -> None:
 
 
 def test_a_file_keeps_the_posterior_and_a_wrong_car_stays_wrong(tmp_path: Path) -> None:
-    car, file = identified(), tmp_path / "car.toml"
-    told = {PHYSICS: car.fitted_physics.model_dump(mode="json", exclude_none=True)}  # type: ignore[union-attr]
-    file.write_text(flat_toml(vehicle_toml(OWN), OWN, OWN, dict(car.noise), None, told), encoding="utf-8")
+    car, file = identified(), tmp_path
+    fit = Fit(physics_sha256=physics_sha256(OWN), physics=car.fitted_physics)
+    (file / "vehicle.toml").write_text(vehicle_toml(OWN), encoding="utf-8")
+    (file / "fit.toml").write_text(part_toml(fit, "Written by a test."), encoding="utf-8")
     again = Car.load(file)
     assert again.intervals is None, "those of the shipped car are another car's"
     assert again.varied_physics == car.varied_physics

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdhef_logtool.car.flat import load_vehicle
+from pdhef_logtool.car.toml_files import load_vehicle
 from pdhef_logtool.drive.alignment import align, plan_alignment
 from pdhef_logtool.drive.truth import (
     Attitude,

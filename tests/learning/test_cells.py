@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -28,6 +27,7 @@ from pdhef_logtool.learning.network.cells import (
 from pdhef_logtool.learning.network.dataset import MANIFEST, read_dataset
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
 from pdhef_logtool.learning.network.train_command import LEAD_STEPS, gap_free_runs, weights_of
+from pdhef_logtool.records.documents import seal
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.runs.config import RunConfig
@@ -128,27 +128,10 @@ def test_extract_chooses_leaves_copies_out_and_older_sets_still_open(sample_logs
     extract([str(tmp_path / "b.mcap")], out, replace(asked, split="validation", per_cell_s=None))
     (other,) = read_dataset(out).drives
     assert (other.name, other.split, other.limits) == ("b", "validation", None)
-    # The format before: one folder of drives, no columns of choice.
-    document = json.loads((out / MANIFEST).read_text())
-    (entry,) = document["drives"]
-    (out / "drives").mkdir()
-    table = pq.read_table(out / entry["file"], partitioning=None).drop_columns(["chosen", "cell", "draw"])
-    pq.write_table(table, out / "drives/b.parquet")
-    import hashlib
-
-    sha = hashlib.sha256((out / "drives/b.parquet").read_bytes()).hexdigest()
-    old = {**entry, "file": "drives/b.parquet", "file_sha256": sha}
-    document = {k: v for k, v in document.items() if k not in ("cells", "choice", "duplicates", "digest")}
-    (out / MANIFEST).write_text(json.dumps({**document, "version": 3, "drives": [old]}))
-    (before,) = read_dataset(out).drives
-    np.testing.assert_array_equal(before.load().targets, other.load().targets)
-    assert before.load().chosen is None
-    with pytest.raises(UsageError, match="version 3"):
-        extract([str(log)], out, asked)
     for wrong in ({"where": "vx > 1"}, {"per_cell_s": 0.0}):
         with pytest.raises(UsageError):
             extract([str(log)], tmp_path / "new", replace(asked, **wrong))  # type: ignore[arg-type]
-    (out / MANIFEST).write_text(json.dumps({**document, "version": 2}))
+    (out / MANIFEST).write_text(json.dumps(seal({**json.loads((out / MANIFEST).read_text()), "version": 2})))
     with pytest.raises(OutputError, match="makes it anew"):
         read_dataset(out)
 

@@ -354,7 +354,7 @@ def test_calibrate_tells_its_progress_and_whom_it_leaves_out(tmp_path: Path, mon
     assert [len(s) for s in fitted] == [300]
     document = json.loads((tmp_path / "car/intervals.json").read_text())
     (entry,) = document["entries"]
-    assert (entry["estimator"], entry["unseen_factor"], entry["wrong_vehicle_factor"]) == ("phy-ukf", 1.5, None)
+    assert (entry["estimator"], entry["unseen_factor"]) == ("phy-ukf", 1.5)
     assert entry["coverage"][0]["covered_after"] == 0.95
     assert document["fit"] == {
         "covered": 0.95, "folds": 5, "wrong_runs": 2, "sample_every_s": 0.05,

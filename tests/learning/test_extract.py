@@ -19,7 +19,7 @@ import pytest
 from fake_drive_log import FakeLog, FakeTopic
 from residual_car import CAR, Motion, Wave, drive
 
-from pdhef_logtool.car.flat import vehicle_toml
+from pdhef_logtool.car.toml_files import vehicle_toml
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive import reading
 from pdhef_logtool.learning.network.dataset import MANIFEST, SPLITS, read_dataset

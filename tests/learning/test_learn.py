@@ -16,9 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.car.car import FIT_FILE, Car
-from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import Fit, FittedValues, physics_sha256
 from pdhef_logtool.car.store import Change
+from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres
 from pdhef_logtool.evaluation.comparison import Errors
 from pdhef_logtool.learning import engine, more_driving

@@ -15,8 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.flat import load_vehicle
 from pdhef_logtool.car.parts import LearntOn
+from pdhef_logtool.car.toml_files import load_vehicle
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.latency_compensation import run_window

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.records.documents import seal
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.sinks.parquet import EstimatesSink, write_metrics
 from pdhef_logtool.sinks.report import write_json
@@ -123,5 +124,5 @@ def write_run(
         write_json(place / "report.json", report_of(tracks, label, **changes))
     write_metrics(folder / "metrics.parquet", [])
     entry = {"log": label, "file": f"{label}.mcap", "sha256": None, "outcome": outcome, "car": None}
-    write_json(folder / "run.json", {"format": "pdhef.run", "version": 1, "logs": [entry]})
+    write_json(folder / "run.json", seal({"format": "pdhef.run", "version": 1, "logs": [entry]}))
     return folder

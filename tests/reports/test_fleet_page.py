@@ -15,6 +15,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from browser import CHROMIUM, WHY_NOT, Browser
 
 from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.records.documents import seal
 from pdhef_logtool.reports.fleet import fleet_page
 from pdhef_logtool.reports.pages import remove_pages, write_pages
 from pdhef_logtool.results.opened_run import open_run
@@ -48,7 +49,7 @@ def run_of(folder: Path, drives: Mapping[str, Mapping[str, Any]], failed: Mappin
         logs.append({"log": label, "outcome": "ok", "car": None})
     logs += [{"log": label, "outcome": f"failed: {reason}", "car": None} for label, reason in (failed or {}).items()]
     write_metrics(folder / "metrics.parquet", [MetricRow(*row, unit="rad", n=9) for row in rows])
-    (folder / "run.json").write_text(json.dumps({"format": "pdhef.run", "logs": logs, "versions": {"a": "1"}}))
+    (folder / "run.json").write_text(json.dumps(seal({"format": "pdhef.run", "logs": logs, "versions": {"a": "1"}})))
     return folder
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.records.documents import seal
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.sinks.parquet import EstimatesSink, write_metrics
 
@@ -61,7 +62,7 @@ def write_run(
     folder.mkdir(parents=True, exist_ok=True)
     logs = [entry(label) for label in rmse] if entries is None else list(entries)
     known = {"format": "pdhef.run", "version": 1, "config": {"friction": "auto"}, "versions": {"numpy": "2.0"}}
-    (folder / "run.json").write_text(json.dumps({**known, "logs": logs, **document}))
+    (folder / "run.json").write_text(json.dumps(seal({**known, "logs": logs, **document})))
     write_metrics(folder / "metrics.parquet", [*(row(label, value) for label, value in rmse.items()), *rows])
     return folder
 

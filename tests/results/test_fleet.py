@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.records.documents import seal
 from pdhef_logtool.results.fleet import ANSWER, Fleet, exact_median, read_fleet
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.sinks.parquet import write_metrics
@@ -64,7 +65,7 @@ class Run:
 
     def read(self, **options: Any) -> Fleet:
         write_metrics(self.folder / "metrics.parquet", [MetricRow(*row, unit="rad", n=9) for row in self.rows])
-        (self.folder / "run.json").write_text(json.dumps({"format": "pdhef.run", "logs": self.logs}))
+        (self.folder / "run.json").write_text(json.dumps(seal({"format": "pdhef.run", "logs": self.logs})))
         return read_fleet(open_run(self.folder), **options)
 
 

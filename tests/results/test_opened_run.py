@@ -7,13 +7,14 @@ from pathlib import Path
 
 import pytest
 
+from pdhef_logtool.records.documents import seal
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.results.opened_run import open_run
 
 
 def _run(folder: Path, logs: list[object], **changed: object) -> Path:
     (folder / "metrics.parquet").write_bytes(b"")
-    (folder / "run.json").write_text(json.dumps({"format": "pdhef.run", "logs": logs, **changed}))
+    (folder / "run.json").write_text(json.dumps(seal({"format": "pdhef.run", "logs": logs, **changed})))
     return folder
 
 

@@ -12,7 +12,7 @@ import polars as pl
 import pytest
 from rich.console import Console
 
-from pdhef_logtool.car.flat import load_vehicle, vehicle_toml
+from pdhef_logtool.car.toml_files import load_vehicle, vehicle_toml
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.estimators.friction_bank import USUAL_FRICTION
 from pdhef_logtool.learning.network.dataset import read_dataset

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pdhef_logtool.car.flat import load_vehicle
+from pdhef_logtool.car.toml_files import load_vehicle
 from pdhef_logtool.records.errors import OutputError
 from studies.defaults import fit_nominal_tyres
 from truthsim.drive import START_NS, Drive, simulate_drive, write_drive

@@ -19,7 +19,7 @@ from reference_car import cut, make_signals
 from rich.console import Console
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.flat import load_vehicle
+from pdhef_logtool.car.toml_files import load_vehicle
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_vehicle
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.drive.windows import DriveReader, plan_drive

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.car.car import INTERVALS_FILE, UNSURE_FILE, Car, load_intervals
-from pdhef_logtool.car.flat import vehicle_toml
 from pdhef_logtool.car.parts import Algorithm, Inflation, IntervalEntry, Intervals
+from pdhef_logtool.car.toml_files import vehicle_toml
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.records.errors import PdhefError, VehicleError
 from pdhef_logtool.records.reasons import STUCK_AY, STUCK_YAW_RATE

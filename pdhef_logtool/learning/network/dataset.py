@@ -40,8 +40,6 @@ from pdhef_logtool.sinks.schema import arrow_schema
 
 FORMAT = "pdhef.residual-dataset"
 FORMAT_VERSION = 4
-#: Versions that can be opened; what is written is of the last.
-READABLE = (3, FORMAT_VERSION)
 MANIFEST = "manifest.json"
 #: Of more vehicles a bundle names the number.
 NAMED_VEHICLES = 4
@@ -386,7 +384,7 @@ def read_dataset(folder: Path) -> Dataset:
     try:
         document = read_manifest(folder)
         kind = (document["format"], document["version"])
-        if kind[0] != FORMAT or kind[1] not in READABLE or document["features"] != list(FEATURES):
+        if kind[0] != FORMAT or kind[1] != FORMAT_VERSION or document["features"] != list(FEATURES):
             raise OutputError(
                 expected=f"{FORMAT} {FORMAT_VERSION} with the features {', '.join(FEATURES)}",
                 got=f"{kind[0]} {kind[1]} with {', '.join(document['features'])}",
@@ -423,4 +421,4 @@ def read_dataset(folder: Path) -> Dataset:
 
 def read_manifest(folder: Path) -> dict[str, Any]:
     """Return a dataset's manifest; raises OutputError where there is none or it is not as it was written."""
-    return read_sealed(folder / MANIFEST, _EXPECTED, OutputError, _REMEDY, MAX_DOCUMENT_BYTES, former=True)
+    return read_sealed(folder / MANIFEST, _EXPECTED, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)

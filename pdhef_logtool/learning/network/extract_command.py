@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.car import NO_INTERVALS, Car
+from pdhef_logtool.car.car import NO_INTERVALS, VEHICLE_FILE, Car
 from pdhef_logtool.car.parts import physics_sha256
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.cached import read_cached
@@ -549,11 +549,10 @@ def _listed(log: LogInput, manifest: Mapping[str, Mapping[str, Any]]) -> _Listed
     """Return what the manifest of a simulated set beside a log says of it: its split and its vehicle file."""
     entry = manifest.get(log.path.name, {})
     split, vehicle = entry.get("split"), entry.get("vehicle_file", entry.get("vehicle"))
-    named = log.folder is not None and isinstance(vehicle, str) and vehicle.endswith(".toml")
-    file = log.folder / str(vehicle) if log.folder is not None and named else None
+    car = log.folder / vehicle if log.folder is not None and isinstance(vehicle, str) else None
     return _Listed(
         split=split if isinstance(split, str) and split else None,
-        vehicle=file if file is not None and file.is_file() else None,
+        vehicle=car if car is not None and (car.is_file() or (car / VEHICLE_FILE).is_file()) else None,
     )
 
 

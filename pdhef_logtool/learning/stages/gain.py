@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.car import NETWORK_FILE, NETWORK_FOLDER, SHOWN_DIGITS, Car
-from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import LearntOn, Trust
 from pdhef_logtool.car.store import Change
+from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.drive.reading import Drive, WholeDrive
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import Options, spec_of

@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 from pdhef_logtool.car.car import FIT_FILE, Car
-from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import PHYSICS, Fit, FittedValues, LearntOn, physics_sha256
 from pdhef_logtool.car.store import Change
+from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.proposals import apply_proposals
 from pdhef_logtool.estimators.physics_tuned import NAME as TUNED

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.car import NOISE_FILE, Car
-from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import FilterNoise, Noise
 from pdhef_logtool.car.store import Change
+from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.learning.drives import NOISE, DriveRecord, drives_document, no_drive, record_head
 from pdhef_logtool.learning.noise.bench import Bench, choose_names
 from pdhef_logtool.learning.noise.search import (

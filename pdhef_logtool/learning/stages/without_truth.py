@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from pdhef_logtool.car.car import FIT_FILE, Car
-from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import Fit, FittedPhysics, FittedValues, LearntOn, physics_sha256
 from pdhef_logtool.car.store import Change
+from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.learning.drives import IDENTIFY, DriveRecord, record_of
 from pdhef_logtool.learning.split import TRAINING

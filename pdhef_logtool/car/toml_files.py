@@ -1,0 +1,109 @@
+"""TOML files of a car: reading vehicle.toml, and writing it and the parts of a car's folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from pdhef_logtool.car.parts import Trust
+from pdhef_logtool.car.vehicle import REMEDY, Record, VehicleParameters
+from pdhef_logtool.records.documents import read_toml, validated
+from pdhef_logtool.records.errors import VehicleError
+
+
+class _Network(Record):
+    trust_cap: Annotated[float, Field(ge=0, le=1)]
+    evidence: str
+
+
+class _VehicleFile(VehicleParameters):
+    """A vehicle.toml: physics and sensors, and optionally the residual gain that its author allows, with the reason."""
+
+    network: _Network | None = None
+
+
+def read_vehicle_file(path: Path) -> tuple[VehicleParameters, Trust | None]:
+    """Read a vehicle.toml: physics and sensors, and the residual gain in its table ``[network]``, None without one.
+
+    Raises
+    ------
+    VehicleError
+        The file is missing or no TOML, or has wrong, unknown or missing entries; the message names all of them.
+    """
+    raw, where = read_toml(path, "a vehicle TOML file", VehicleError), str(path)
+    file = validated(_VehicleFile, raw, where, VehicleError, expected="the entries of vehicle.toml", remedy=REMEDY)
+    fields = VehicleParameters.model_fields
+    vehicle = VehicleParameters.model_construct(
+        file.model_fields_set & fields.keys(), **{name: getattr(file, name) for name in fields}
+    )
+    return vehicle, None if file.network is None else Trust(**file.network.model_dump())
+
+
+def load_vehicle(path: Path) -> VehicleParameters:
+    """Return physics and sensors of a vehicle.toml; raises VehicleError as :func:`read_vehicle_file`."""
+    return read_vehicle_file(path)[0]
+
+
+def part_toml(part: Record, head: str, comments: Mapping[str, str] | None = None) -> str:
+    """Return a part of a car's folder as TOML with ``head`` above it and ``comments`` beside entries by dotted name."""
+    import tomlkit
+
+    document = tomlkit.document()
+    for line in head.splitlines():
+        document.add(tomlkit.comment(line))
+    plain: dict[str, Any] = part.model_dump(mode="json", exclude_none=True)
+    _fill(document, {k: v for k, v in plain.items() if v not in ([], {})})
+    _comment(document, comments or {})
+    return tomlkit.dumps(document)
+
+
+def vehicle_toml(vehicle: VehicleParameters, head: str = "", comments: Mapping[str, str] | None = None) -> str:
+    """Return vehicle.toml of physics and sensors; reading it back gives the same."""
+    return part_toml(vehicle, head, comments)
+
+
+def _fill(table: Any, entries: Mapping[str, Any]) -> None:
+    """Add entries to a TOML table in place; plain entries before lists and tables."""
+    import tomlkit
+
+    for key, value in sorted(entries.items(), key=lambda item: _rank(item[1])):
+        if isinstance(value, Mapping) and any(map(_rank, value.values())):
+            table[key] = tomlkit.table()
+            _fill(table[key], value)
+        else:
+            table[key] = _lines(value) if isinstance(value, list) and _rank(value) else value
+
+
+def _rank(value: Any) -> int:
+    """Return the position of an entry in a table: plain ones first, then lists with an item per line, then tables."""
+    if isinstance(value, Mapping):
+        return 2
+    return int(isinstance(value, list) and any(isinstance(item, Mapping | str) for item in value))
+
+
+def _lines(items: Sequence[Any]) -> Any:
+    """Return a list with an item per line."""
+    import tomlkit
+
+    array = tomlkit.array().multiline(True)
+    for item in items:
+        if isinstance(item, Mapping):
+            inline = tomlkit.inline_table()
+            inline.update(item)
+            item = inline
+        array.append(item)
+    return array
+
+
+def _comment(document: Any, comments: Mapping[str, str]) -> None:
+    """Write comments beside entries that exist, by dotted name; a table's name may contain no dot."""
+    for name, text in comments.items():
+        *tables, entry = name.split(".")
+        place: Any = document
+        for table in tables:
+            place = place.get(table, {})
+        if entry in place:
+            place[entry].comment(text).trivia.comment_ws = "  "
