@@ -172,26 +172,6 @@ def test_words_that_stand_for_files_stay_words(tmp_path: Path) -> None:
     assert config.car == tmp_path / "none"
 
 
-def test_keys_of_older_files_are_read(tmp_path: Path) -> None:
-    for name, words in (("old", ("vehicle", "model", "calibration")), ("new", ("car", "network", "intervals"))):
-        entries = zip(words, ("cars/mine", "none", "wide.json"), strict=True)
-        (tmp_path / f"{name}.toml").write_text("".join(f'{key} = "{value}"\n' for key, value in entries))
-    config = load_config(tmp_path / "old.toml", {})
-    assert config == load_config(tmp_path / "new.toml", {})
-    assert config.car == tmp_path / "cars/mine"
-    assert (config.network, config.intervals) == (Path("none"), tmp_path / "wide.json")
-    (tmp_path / "old.toml").write_text("vehicle = 3\n")
-    with pytest.raises(UsageError, match=r"car: should be a path, got 3"):
-        load_config(tmp_path / "old.toml", {})
-
-
-@pytest.mark.parametrize(("old", "new"), [("vehicle", "car"), ("model", "network"), ("calibration", "intervals")])
-def test_an_old_key_beside_its_new_one_is_refused(tmp_path: Path, old: str, new: str) -> None:
-    (tmp_path / "c.toml").write_text(f'{new} = "a"\n{old} = "b"\n')
-    with pytest.raises(UsageError, match=f"c.toml: expected an entry or its former name, got {old} and {new}"):
-        load_config(tmp_path / "c.toml", {})
-
-
 def test_a_car_and_a_network_may_be_named_by_word(tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text('car = "saloon"\nnetwork = "many-cars"\n')
     config = load_config(tmp_path / "c.toml", {})
