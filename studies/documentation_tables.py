@@ -1,16 +1,18 @@
 """Tables of the documentation that are made of the code when the site is built: a hook of MkDocs.
 
-In a page, ``<!-- table: metrics -->`` becomes the table of all metrics, ``<!-- table: checks -->`` that of all checks.
+In a page, ``<!-- table: metrics -->`` becomes the table of all metrics; ``checks`` and ``settings`` are the others.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 from typing import Any
 
 from pdhef_logtool.drive.checks import registry as checks
 from pdhef_logtool.evaluation.metrics import registry as metrics
+from pdhef_logtool.runs.config import RunConfig
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
@@ -34,4 +36,15 @@ def _checks() -> Iterator[str]:
         yield f"| `{kind.name}` | {kind.compares} | {kind.fails} | {'–' if remedy == '…' else remedy} |"
 
 
-_TABLES: dict[str, Callable[[], Iterator[str]]] = {"metrics": _metrics, "checks": _checks}
+def _settings() -> Iterator[str]:
+    yield "| key | default | meaning |"
+    yield "| --- | --- | --- |"
+    described = (RunConfig.__doc__ or "").partition("----------")[2]
+    texts = dict(re.findall(r"^    (\w+) : (.*(?:\n        .*)*)", described, re.MULTILINE))
+    for key in fields(RunConfig):
+        text = re.sub(r" \(:func:`[^`]*`\)", "", " ".join(texts[key.name].split())).replace("``", "`")
+        default = "–" if key.default in (None, ()) else str(key.default).lower()
+        yield f"| `{key.name}` | {default} | {text} |"
+
+
+_TABLES: dict[str, Callable[[], Iterator[str]]] = {"metrics": _metrics, "checks": _checks, "settings": _settings}

@@ -363,7 +363,7 @@ def _intervals_of(folder: Path | None, network: str, chosen: Path | str | None) 
     shipped = SHIPPED_CARS.values() if network == SHIPPED else ()
     homes = [h for h in (folder, *shipped) if h is not None and (h / file).is_file()]
     if not homes and chosen is not None:
-        raise UsageError(expected=f"a car with {file}", got="none", where=f"--intervals {UNSURE}")
+        raise UsageError(expected=f"a car with {file}", got="none", where=f"intervals = {UNSURE}")
     return load_intervals(homes[0] / file) if homes else None
 
 

@@ -11,10 +11,20 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from pdhef_logtool.cli import comparing, compiling, inspecting, learning, reporting, running, simulating, stopping
-from pdhef_logtool.cli.console import say
+from pdhef_logtool.cli import (
+    comparing,
+    compiling,
+    console,
+    inspecting,
+    learning,
+    panels,
+    reporting,
+    running,
+    simulating,
+    stopping,
+)
 from pdhef_logtool.cli.removed_commands import replacement
-from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, PdhefError
+from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, PdhefError, UsageError
 from pdhef_logtool.records.files import OF_WRITING, cannot_write
 
 #: The error of a word that no command takes; it belongs to click, or to the copy of it that newer typers carry.
@@ -22,20 +32,21 @@ _WrongWord: type[Any] = typer.BadParameter.__bases__[0]
 _INTERRUPTED = 130
 #: Whoever read the output has had enough, as of any command in a pipe.
 _NOT_READ = 141
+_GLOBAL = frozenset({"--quiet", "-q", "--verbose", "--no-color"})
 #: Standard input, output and error.
 _STREAMS = 3
 
 app = typer.Typer(
     name="pdhef",
-    cls=simulating.CommandGroup,
+    cls=panels.CommandGroup,
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
-    help="Estimate sideslip on recorded drives (MCAP, rosbag1, rosbag2), score it against truth, annotate the logs.",
+    help="Estimate sideslip on recorded drives (MCAP, rosbag1, rosbag2), score it against ground truth, and annotate "
+    "the logs.",
     epilog="Exit codes: 0 ok, 1 failure, 2 usage, 3 finished but some input was lost, a check or some logs failed, "
-    "4 a threshold or regression gate failed, 130 interrupted (Ctrl-C), 141 nobody read the output to its end, "
-    "143 terminated.",
+    "4 a threshold or regression gate failed, 130 interrupted (Ctrl-C), 141 stdout was closed early, 143 terminated.",
 )
 for _group in (inspecting, running, reporting, comparing, simulating, learning, compiling):
     app.registered_commands += _group.commands.registered_commands
@@ -54,8 +65,20 @@ def _root(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="Print errors and results only, no warnings, notes or progress.")
+    ] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Print progress as lines.")] = False,
+    no_color: Annotated[
+        bool, typer.Option("--no-color", help="Print without colours. NO_COLOR in the environment does the same.")
+    ] = False,
 ) -> None:
     del version
+    if quiet and verbose:
+        raise UsageError(expected="--quiet or --verbose", got="both", where="pdhef")
+    console.set_verbosity(quiet=quiet, verbose=verbose)
+    if no_color:
+        os.environ["NO_COLOR"] = "1"
 
 
 def main() -> NoReturn:
@@ -76,22 +99,22 @@ def main() -> NoReturn:
 
 def _run() -> int:
     try:
-        code = app(prog_name="pdhef", standalone_mode=False) or EXIT_OK
+        code = app(_global_options_first(sys.argv[1:]), prog_name="pdhef", standalone_mode=False) or EXIT_OK
         if code == _INTERRUPTED:
             raise KeyboardInterrupt
         sys.stdout.flush()
     except PdhefError as error:
         stopping.check()
-        say(f"pdhef: {error}")
+        console.error(f"pdhef: {error}")
         return error.exit_code
     except _WrongWord as error:
         if len(sys.argv) == 1:
             error.show()  # pdhef alone is asked for its help
         elif message := replacement(sys.argv[1:]):
-            say(f"pdhef: {message}")
+            console.error(f"pdhef: {message}")
         else:
             command = error.ctx.command_path if error.ctx else "pdhef"
-            say(f"{command}: {' '.join(error.format_message().split()).rstrip('.')}; see {command} --help")
+            console.error(f"{command}: {' '.join(error.format_message().split()).rstrip('.')}; see {command} --help")
         return int(error.exit_code)
     except (KeyboardInterrupt, typer.Abort) as error:
         return stopping.tell(stopping.Stopped(signal.SIGINT), error)
@@ -104,13 +127,23 @@ def _run() -> int:
         stopping.check()
         if isinstance(error, OSError) and error.errno in OF_WRITING:
             _drop_stdout()
-            say(f"pdhef: {cannot_write(Path(error.filename or 'standard output'), error)}")
+            console.error(f"pdhef: {cannot_write(Path(error.filename or 'standard output'), error)}")
             return EXIT_FAILURE
         if os.environ.get("PDHEF_TRACEBACK"):
             raise
-        say(f"pdhef: internal error, {type(error).__name__}: {error}; PDHEF_TRACEBACK=1 shows where, please report it")
+        console.error(
+            f"pdhef: internal error, {type(error).__name__}: {error}; please report it with the output of "
+            "PDHEF_TRACEBACK=1"
+        )
         return EXIT_FAILURE
     return int(code)
+
+
+def _global_options_first(words: list[str]) -> list[str]:
+    """Return the words of the command line with the global options first, as users also write them at the end."""
+    end = words.index("--") if "--" in words else len(words)
+    first = [word for word in words[:end] if word in _GLOBAL]
+    return [*first, *(word for word in words[:end] if word not in _GLOBAL), *words[end:]]
 
 
 def open_standard_streams() -> None:

@@ -1,4 +1,4 @@
-"""``pdhef compare`` and ``events``: whether a run is worse than another, and where in a run something holds."""
+"""``pdhef compare`` and ``events``: the difference between two runs, and events within one."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from pdhef_logtool.cli import console, options
+from pdhef_logtool.cli import console, options, panels
 from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
@@ -26,34 +26,36 @@ _PAD_S, _CLIP_PAD_S = 0.25, 5.0
     "pdhef compare before after --max-regression 5%",
     "pdhef compare before after --gate gate.toml --junit gate.xml --strict",
     "pdhef compare before after --cluster day --html change.html",
-    notes="Exit codes: 0 no regression, or nobody can tell; 1 no drive is in both; 3 files of drives are damaged, or "
-    "drives have no partner and there is no gate; 4 the gate is closed, or cannot tell with --strict. Without a gate a "
-    "change alone closes nothing.",
+    panel=panels.READ,
+    notes="Exit codes: 0 no significant regression; 1 no common drive; 3 some drives are damaged, or without a "
+    "counterpart and no gate is given; 4 the gate failed, or is inconclusive with --strict. Without a gate a "
+    "regression does not change the exit code.",
 )
 def compare(
-    a: Annotated[str, Argument(metavar="A", help="Outputs of the run that is the yardstick: folder or URL.")],
-    b: Annotated[str, Argument(metavar="B", help="Outputs of the run that is held against it.")],
+    a: Annotated[str, Argument(metavar="A", help="Output of the reference run: folder or URL.")],
+    b: Annotated[str, Argument(metavar="B", help="Output of the run to compare with it.")],
     *,
-    gate: Annotated[Path | None, Option(metavar="FILE", help="gate.toml: figures with their limits.")] = None,
+    gate: Annotated[Path | None, Option(metavar="FILE", help="gate.toml with metrics and their limits.")] = None,
     max_regression: Annotated[
-        str | None, Option(metavar="SHARE", help="Gate of one figure: how much worse it may be, 5% or 0.05.")
+        str | None, Option(metavar="SHARE", help="Largest accepted increase of the metric: 5% or 0.05.")
     ] = None,
     estimator: Annotated[
-        str | None, Option(help="Which estimator on both sides. Default: the main one of A, drive by drive.")
+        str | None, Option(help="Estimator to compare. Default: the selected estimate of A, per drive.")
     ] = None,
-    metric: Annotated[str | None, Option(help="Which figure of sideslip over the whole drive. Default: rmse.")] = None,
+    metric: Annotated[str | None, Option(help="Metric of sideslip over the whole drive. Default: rmse.")] = None,
     cluster: Annotated[
-        str | None, Option(metavar="KEY", help="car, day or a metadata key: its drives are drawn together.")
+        str | None,
+        Option(metavar="KEY", help="Group of dependent drives for the bootstrap: car, day, or a metadata key."),
     ] = None,
     allow_unpaired: Annotated[
-        bool, Option("--allow-unpaired", help="What is on one side only does not close the gate.")
+        bool, Option("--allow-unpaired", help="Accept drives that only one run contains.")
     ] = False,
-    strict: Annotated[bool, Option("--strict", help="That nobody can tell closes the gate.")] = False,
-    html: Annotated[Path | None, Option(help="Write the comparison as a page.")] = None,
-    junit: Annotated[Path | None, Option(help="Write the gate's verdicts as JUnit XML, for CI.")] = None,
+    strict: Annotated[bool, Option("--strict", help="An inconclusive gate fails.")] = False,
+    html: Annotated[Path | None, Option(help="HTML file for the comparison.")] = None,
+    junit: Annotated[Path | None, Option(help="JUnit XML file for the verdicts of the gate.")] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Say whether run B is better or worse than run A. Drives are paired; nobody can tell is an answer."""
+    """Compare two runs drive by drive: better, worse, or no significant difference."""
     from pdhef_logtool.cli.compare_tables import render_comparison, write_comparison_junit
     from pdhef_logtool.records.object_store import is_url
     from pdhef_logtool.records.outputs import check_no_input
@@ -107,30 +109,36 @@ def _gate(
     'pdhef events out --where "diverged or not valid" --json',
     'pdhef events out --where "abs(sideslip_deg) > 9" --clip --pad 3s',
     'pdhef events out --where "abs(ay_m_s2) > 6" --parquet events.parquet',
-    notes="Columns of estimates.parquet, speed_m_s, and errors against the truth: sideslip_error_rad, vx_error_m_s, "
-    "vy_error_m_s, yaw_rate_error_rad_s, ay_error_m_s2; _deg and _km_h in place of _rad and _m_s. They are of the main "
-    "estimator, or of truth. or NAME. before them. < <= > >= == !=, and or not, + - * /, abs(), (); for 0.5s: so long "
-    "at least.",
+    panel=panels.READ,
+    notes="Columns: those of estimates.parquet, speed_m_s, and errors relative to ground truth: sideslip_error_rad, "
+    "vx_error_m_s, vy_error_m_s, yaw_rate_error_rad_s, ay_error_m_s2; _deg and _km_h instead of _rad and _m_s. They "
+    'refer to the selected estimate, or to the track before a dot: truth.vx_m_s, "pd-hef:gain=1".vx_m_s. Operators: '
+    "< <= > >= == !=, and or not, + - * /, abs(), (). for 0.5s at the end is the minimum duration.",
 )
 def events(
-    output: Annotated[str, Argument(metavar="OUTPUT", help="Folder or URL of a run.")],
+    output: Annotated[str, Argument(metavar="OUTPUT", help="Output of a run: folder or URL.")],
     *,
-    where: Annotated[str, Option(metavar="EXPR", help="What is to hold; docs/compare.md.")],
+    where: Annotated[str, Option(metavar="EXPR", help="Condition on columns; docs/compare.md describes it.")],
     pad: Annotated[
         str | None,
         Option(
-            metavar="TIME", help="Room around an event; where it touches, two are one. Default: 0.25s, of clips 5s."
+            metavar="TIME",
+            help="Time before and after an event; overlapping events are merged. Default: 0.25s, clips 5s.",
         ),
     ] = None,
-    estimator: Annotated[str | None, Option(help="Which estimator columns are of. Default: each drive's main.")] = None,
-    clip: Annotated[bool, Option("--clip", help="Write an MCAP an event, with the source's topics and ours.")] = False,
-    source: Annotated[
-        Path | None, Option(metavar="DIR", help="Where the logs are, for clips of a run without full copies.")
+    estimator: Annotated[
+        str | None, Option(help="Estimator of the columns. Default: the selected estimate of each drive.")
     ] = None,
-    parquet: Annotated[Path | None, Option(metavar="FILE", help="Write the rows as Parquet.")] = None,
+    clip: Annotated[
+        bool, Option("--clip", help="Write one MCAP file per event, with the source's topics and the estimates.")
+    ] = False,
+    source: Annotated[
+        Path | None, Option(metavar="DIR", help="Folder of the logs, for clips of a run without annotated copies.")
+    ] = None,
+    parquet: Annotated[Path | None, Option(metavar="FILE", help="Parquet file for the events.")] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Find where in the drives of a run something holds. Each event can be cut out as a clip."""
+    """Find the times at which a condition is true, and cut clips there."""
     from pdhef_logtool.cli.event_tables import render_events
     from pdhef_logtool.records.object_store import is_url
     from pdhef_logtool.records.outputs import check_no_input

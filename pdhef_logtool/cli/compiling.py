@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from pdhef_logtool.cli import console, options
+from pdhef_logtool.cli import console, options, panels
 
 if TYPE_CHECKING:
     from pdhef_logtool.records.supervisor import Tell
@@ -21,11 +21,12 @@ _DRIVE = "banked-road"
     commands,
     "pdhef compile",
     "NUMBA_CACHE_DIR=/opt/pdhef pdhef compile",
-    notes="Uses all processors. The code is kept where the first run would keep it; a second call compiles nothing.",
+    panel=panels.TOOLS,
+    notes="Uses all processors. A second call compiles nothing.",
     name="compile",
 )
 def compile_(as_json: options.JsonFlag = False) -> None:
-    """Compile the filters now, so that no run waits. For installations."""
+    """Compile the filters in advance, so that the first run starts at once."""
     import time
 
     from pdhef_logtool.records.compiled_sources import compiled_digest

@@ -26,6 +26,7 @@ class _Result(Protocol):
 
 
 _Shown = TypeVar("_Shown", bound=_Result)
+_quiet = _verbose = False
 #: A line on stderr is an error or a warning of several parts.
 _MOST_SIGNS = 5000
 
@@ -66,13 +67,25 @@ def cell(value: float | None, factor: float = 1.0, digits: int = 2) -> str:
     return "-" if value is None else f"{value * factor:.{digits}f}"
 
 
-def say(text: str) -> None:
-    """Print a line on stderr."""
+def set_verbosity(*, quiet: bool = False, verbose: bool = False) -> None:
+    """Set what stderr shows beside errors: nothing (quiet), or also progress as lines (verbose)."""
+    global _quiet, _verbose
+    _quiet, _verbose = quiet, verbose
+
+
+def error(text: str) -> None:
+    """Print a line on stderr, also with ``--quiet``."""
     print(shown(text, _MOST_SIGNS), file=sys.stderr)  # noqa: T201
 
 
+def say(text: str) -> None:
+    """Print a note on stderr, except with ``--quiet``."""
+    if not _quiet:
+        error(text)
+
+
 def warn(text: str) -> None:
-    """Print a warning on stderr."""
+    """Print a warning on stderr, except with ``--quiet``."""
     say(f"warning: {text}")
 
 
@@ -105,11 +118,27 @@ def finish(
     raise typer.Exit(getattr(result, "exit_code", EXIT_OK) if exit_code is None else exit_code)
 
 
+def _progress_lines() -> Callable[[str, float], None]:
+    last = ""
+
+    def update(text: str, share: float) -> None:
+        nonlocal last
+        stopping.check()
+        if _verbose and text != last:
+            say(f"{share:4.0%}  {text}")
+            last = text
+
+    return update
+
+
 @contextmanager
 def progress() -> Iterator[Callable[[str, float], None]]:
-    """Yield ``update(text, share)``: a bar on a terminal's stderr, silence elsewhere; it notices a request to end."""
-    if not sys.stderr.isatty():
-        yield lambda _text, _share: stopping.check()
+    """Yield ``update(text, share)``: a bar on a terminal's stderr, lines with ``--verbose``, nothing elsewhere.
+
+    It raises :class:`~.stopping.Stopped` after a request to end.
+    """
+    if _quiet or _verbose or not sys.stderr.isatty():
+        yield _progress_lines()
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn

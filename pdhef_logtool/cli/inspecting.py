@@ -1,4 +1,4 @@
-"""``pdhef inspect``, ``map`` and ``estimators``: what there is in a log, what it means, and what can be run on it."""
+"""``pdhef inspect`` and ``map``: the contents of a log and how they map to signals."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from pdhef_logtool.cli import console, options
+from pdhef_logtool.cli import console, options, panels
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, UsageError
 
 if TYPE_CHECKING:
@@ -25,19 +25,26 @@ commands = typer.Typer()
     "pdhef inspect drive.mcap --write-mapping mapping.toml",
     "pdhef inspect drive.mcap --fields /imu/data",
     "pdhef inspect https://host/drive.mcap --all",
+    panel=panels.LOOK,
 )
 def inspect(
     log: options.Log,
     config: RunConfig,
-    write_mapping: Annotated[Path | None, Option(help="Write a ready-to-edit mapping.toml (never overwrites).")] = None,
-    fields: Annotated[bool, Option("--fields", help="Instead: every number of TOPIC, or of all topics.")] = False,
-    topic: Annotated[str | None, Argument(metavar="[TOPIC]", help="Topic of --fields.", show_default=False)] = None,
-    whole: Annotated[bool, Option("--all", help="Read all of a large log, and find damage within its chunks.")] = False,
+    write_mapping: Annotated[
+        Path | None, Option(help="Write a mapping.toml to edit. An existing file is not overwritten.")
+    ] = None,
+    fields: Annotated[
+        bool, Option("--fields", help="Show the numeric fields of TOPIC, or of all topics, instead.")
+    ] = False,
+    topic: Annotated[str | None, Argument(metavar="[TOPIC]", help="Topic for --fields.", show_default=False)] = None,
+    whole: Annotated[
+        bool, Option("--all", help="Read a large log completely, to find damage inside its chunks.")
+    ] = False,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Show what a log holds and what maps to what. Rates, gaps and jitter are shown too, and what is missing.
+    """Show topics, rates, gaps and clocks of a log, and how its fields map to signals.
 
-    Of a long MCAP above 32 MB whose index is sound a part of the chunks is read, and how many is said.
+    Of an MCAP file above 32 MB with an intact index, only a part of the chunks is read; the output states how many.
     """
     from pdhef_logtool.inspection import fields_of_log, inspect_log, render_fields, render_inspection
     from pdhef_logtool.inspection import write_mapping as write_mapping_file
@@ -66,14 +73,23 @@ def inspect(
 
 
 @options.command(
-    commands, "pdhef map drive.mcap -o mapping.toml", "pdhef run drive.mcap --mapping mapping.toml", name="map"
+    commands,
+    "pdhef map drive.mcap -o mapping.toml",
+    "pdhef run drive.mcap --mapping mapping.toml",
+    panel=panels.LOOK,
+    name="map",
 )
 def map_(
     log: options.Log,
     config: RunConfig,
-    output: Annotated[Path, Option("--output", "-o", help="File to write (never overwrites).")] = Path("mapping.toml"),
+    output: Annotated[Path, Option("--output", "-o", help="Mapping file. An existing file is not overwritten.")] = Path(
+        "mapping.toml"
+    ),
 ) -> None:
-    """Write a log's mapping by question and answer. Without a terminal it holds what was found, and all candidates."""
+    """Build a mapping file interactively.
+
+    Without a terminal, the file contains the recognised signals, and all candidates as comments.
+    """
     import sys
 
     from pdhef_logtool.inspection import ask_mapping, inspect_log, write_mapping
@@ -98,17 +114,3 @@ def map_(
 def _ask(question: str) -> str:
     """Ask on stderr and return the line that is typed."""
     return str(typer.prompt(question, default="", show_default=False, prompt_suffix="", err=True))
-
-
-@options.command(commands)
-def estimators(as_json: options.JsonFlag = False) -> None:
-    """List the estimators that run can use."""
-    from pdhef_logtool.estimators.table import all_specs
-
-    if as_json:
-        console.print_json({"estimators": [{"name": s.name, "description": s.text} for s in all_specs()]})
-        return
-    table = console.table("name", "what it is")
-    for spec in all_specs():
-        table.add_row(spec.name, spec.text)
-    console.stdout().print(table)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from pdhef_logtool.cli import console, learning_tables, options
+from pdhef_logtool.cli import console, learning_tables, options, panels
 from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ commands = typer.Typer()
     "pdhef learn logs/ --car mycar -o mycar --stages noise",
     "pdhef learn lap.mcap --car mycar -o mycar --start 155 --stages gain",
     "pdhef learn logs/ --car mycar -o mycar --stages intervals",
+    panel=panels.LEARN,
     notes="""Stages, in the order in which they run: identify (tyres, steering, biases, roll gradient, model structure),
 noise (filter noise by search), gain (residual gain of the network), network (fine-tuning of the network and its
 residual gain), intervals (95 % confidence intervals).
@@ -88,39 +89,43 @@ def learn(
 @options.command(
     commands,
     "pdhef extract logs/ -o residuals --car mycar --jobs 2",
-    "pdhef extract drive.mcap -o residuals --car mycar --prefer-truth rtk \\",
+    "pdhef extract drive.mcap -o residuals --car mycar --set prefer_truth=rtk \\",
     "  --truth-smoothing 0.15",
     "pdhef extract 'held_out/*.mcap' -o residuals_test --split test --resume",
     'pdhef extract logs/ -o residuals --where "vx_km_h > 30" --per-cell 600',
-    notes="Drives are split 70/15/15 by a hash of their content and --seed, unless the manifest of a simulated set "
-    "beside them has a split, or --split puts all of them into one. Of drives with the same signals one is taken. "
-    "Columns of --where: the features, truth_vx_m_s, truth_vy_m_s; _deg and _km_h in place of _rad and _m_s "
-    "(docs/retrain.md).",
+    panel=panels.LEARN,
+    notes="Drives are split 70/15/15 by a hash of their content and --seed, unless the manifest of a simulated set or "
+    "--split defines the split. Duplicates (drives with identical signals) are used once. Columns of --where: the "
+    "features, truth_vx_m_s, truth_vy_m_s; _deg and _km_h instead of _rad and _m_s (docs/retrain.md).",
     shared="cache sensors friction",
-    car="The nominal car (default: what a set's manifest names)",
+    car="Nominal car (default: from the manifest of a simulated set)",
 )
 def extract(
     *,
     logs: options.TruthLogs,
-    output: Annotated[Path, Option("--output", "-o", help="Folder of the dataset.")],
+    output: Annotated[Path, Option("--output", "-o", help="Folder for the dataset.")],
     config: RunConfig,
-    truth_smoothing: Annotated[str, Option(help="auto (by its noise), none, or seconds to either side.")] = "auto",
-    split: Annotated[str | None, Option(help="train, validation or test for all drives of this command.")] = None,
+    truth_smoothing: Annotated[
+        str, Option(help="Smoothing of the ground truth: auto (by its noise), none, or seconds to each side.")
+    ] = "auto",
+    split: Annotated[str | None, Option(help="Split of all drives of this command: train, validation or test.")] = None,
     seed: Annotated[int, Option(help="Seed of the split by drive.")] = 0,
-    vary: Annotated[float, Option(help="Make friction and car wrong by this spread for a part of the drives.")] = 0.0,
+    vary: Annotated[float, Option(help="Spread of wrong friction and vehicle in a part of the drives.")] = 0.0,
     model: Annotated[
-        str, Option("--filter", help="Whose residuals: physics, or phy-ukf for --paper and --baselines.")
+        str, Option("--filter", help="Filter of the residuals: physics, or phy-ukf for train --paper and --baselines.")
     ] = "physics",
-    where: Annotated[str | None, Option(metavar="EXPR", help="Learn only from rows on which this holds.")] = None,
+    where: Annotated[str | None, Option(metavar="EXPR", help="Condition on the rows to keep.")] = None,
     per_cell: Annotated[
         float | None,
-        Option(metavar="SECONDS", help="Of each cell of speed, |a_y| and friction at most so much, drawn by --seed."),
+        Option(
+            metavar="SECONDS", help="Largest duration per cell of speed, |a_y| and friction; a random sample is kept."
+        ),
     ] = None,
     jobs: options.Jobs = 1,
-    resume: Annotated[bool, Option("--resume", help="Keep drives whose log and settings are as they were.")] = False,
+    resume: Annotated[bool, Option("--resume", help="Keep drives whose log and settings have not changed.")] = False,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Write the residual dataset that train learns from. A residual is what a car's physics leave unexplained."""
+    """Write the residual dataset for train: the accelerations that the physics do not explain."""
     from pdhef_logtool.learning.network.extract_command import ExtractSettings
     from pdhef_logtool.learning.network.extract_command import extract as write_residuals
 
@@ -144,21 +149,22 @@ def extract(
     "pdhef train residuals/ -o model",
     "pdhef train mycar/ -o mycar_model --init model --epochs 10",
     "pdhef train residuals/ -o model --baselines",
-    notes="An interrupted training goes on from its last whole epoch when the same command is given again.",
+    panel=panels.LEARN,
+    notes="An interrupted training continues after its last complete epoch when the command is repeated.",
 )
 def train(
     *,
-    dataset: Annotated[Path, Argument(metavar="DATASET", help="Folder that pdhef extract wrote.")],
-    output: Annotated[Path, Option("--output", "-o", help="Folder of the model bundle to write.")],
-    init: Annotated[Path | None, Option(help="Model bundle to fine-tune, or many-cars, or default.")] = None,
+    dataset: Annotated[Path, Argument(metavar="DATASET", help="Dataset folder of pdhef extract.")],
+    output: Annotated[Path, Option("--output", "-o", help="Folder for the model bundle.")],
+    init: Annotated[Path | None, Option(help="Model bundle to fine-tune, many-cars, or default.")] = None,
     baselines: Annotated[bool, Option("--baselines", help="Train pure-lstm and linear-regression instead.")] = False,
-    paper: Annotated[bool, Option("--paper", help="The paper's Table 1 instead of the default recipe.")] = False,
-    seed: Annotated[int, Option(help="Seed of weights, order and dropout.")] = 0,
-    epochs: Annotated[int | None, Option(help="Default: the recipe's.")] = None,
+    paper: Annotated[bool, Option("--paper", help="Use the hyperparameters of Table 1 of the paper.")] = False,
+    seed: Annotated[int, Option(help="Seed of initial weights, sample order and dropout.")] = 0,
+    epochs: Annotated[int | None, Option(help="Number of epochs. Default: that of the hyperparameters.")] = None,
     device: Annotated[str, Option(help="PyTorch device: cpu or cuda.")] = "cpu",
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Train the residual network on a dataset of extract. Writes weights, loss history and plot."""
+    """Train the residual network on a dataset of extract."""
     from pdhef_logtool.learning.network.train_command import run_training
 
     if baselines:
@@ -181,32 +187,33 @@ def train(
     "pdhef retrain logs/ -o retrained --car mycar --jobs 2",
     "pdhef retrain logs/ -o retrained --car mycar --gate gate.toml --strict",
     "pdhef run new/ -o out --car retrained/accepted/0123456789ab/car",
-    notes="Every drive has one part in it: it trains the network, stops the training, says how far the network may be "
-    "followed, fits intervals, or decides at the end. Car and candidate run on the last ones, and pdhef compare says "
-    "whether the candidate is worse: then it is kept under rejected/ with the reason, else under accepted/ "
-    "(docs/retrain.md). The same command again does what is new and nothing else. Exit codes: 0 accepted, 3 accepted "
-    "with drives left out, 4 rejected.",
+    panel=panels.LEARN,
+    notes="Each drive is assigned to one split: training, validation, residual gain, intervals, or the final "
+    "comparison. If pdhef compare finds the candidate worse than the car on the last split, it is written to "
+    "rejected/ with the reason, otherwise to accepted/ (docs/retrain.md). Repeating the command processes new drives "
+    "only. Exit codes: 0 accepted, 3 accepted with drives left out, 4 rejected.",
     shared="cache sensors friction",
-    car="The car whose network is trained on",
+    car="Car whose network is trained further",
 )
 def retrain(
     *,
     logs: options.TruthLogs,
-    output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Folder of stages and candidates.")],
+    output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Folder for stages and candidates.")],
     config: RunConfig,
     gate: Annotated[
-        Path | None, Option(metavar="FILE", help="gate.toml of pdhef compare. Default: pd-hef at most 2 % worse.")
+        Path | None,
+        Option(metavar="FILE", help="gate.toml as for pdhef compare. Default: RMSE of pd-hef at most 2 % higher."),
     ] = None,
-    strict: Annotated[bool, Option("--strict", help="That nobody can tell closes the gate.")] = False,
+    strict: Annotated[bool, Option("--strict", help="An inconclusive gate rejects the candidate.")] = False,
     init: Annotated[
-        Path | None, Option(help="Model bundle to begin with, many-cars, or none. Default: the car's, else many-cars.")
+        Path | None, Option(help="Model bundle to start from, many-cars, or none. Default: the car's, else many-cars.")
     ] = None,
-    epochs: Annotated[int | None, Option(help="Default: 15, from nothing 30.")] = None,
-    seed: Annotated[int, Option(help="Of who does what, of training and of bootstraps.")] = 0,
+    epochs: Annotated[int | None, Option(help="Number of epochs. Default: 15; 30 without --init.")] = None,
+    seed: Annotated[int, Option(help="Seed of the split, of training and of bootstraps.")] = 0,
     jobs: options.Jobs = 1,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Train a car's network on, and let a gate judge it. The drives of the gate are kept aside."""
+    """Train a car's network further; accept it only if it is not worse on held-out drives."""
     from pdhef_logtool.learning.retrain.retrain_command import DEFAULT_GATE, RetrainSettings
     from pdhef_logtool.learning.retrain.retrain_command import retrain as train_again
     from pdhef_logtool.results.gate import load_gate

@@ -11,28 +11,37 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 from typer import Argument, Option
 
+from pdhef_logtool.cli.panels import PanelCommand
 from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
     from pdhef_logtool.runs.config import RunConfig
 
+#: Panels of the help, in order; options without one come first, under "Options".
+INPUT, ESTIMATION, OUTPUT, WORK, SETTINGS = "Input", "Estimation", "Output", "Processes", "Settings"
+
 Log = Annotated[
     str, Argument(metavar="LOG", help="MCAP file, rosbag1 file, rosbag2 folder, .db3 file, or URL of a file.")
 ]
 Logs = Annotated[
-    list[str], Argument(metavar="LOG", help="Logs, folders that hold some, glob patterns, URLs, or @list.txt.")
+    list[str], Argument(metavar="LOG", help="Log files, folders with logs, glob patterns, URLs, or @list.txt.")
 ]
 TruthLogs = Annotated[
-    list[str], Argument(metavar="LOG", help="Logs with truth, folders that hold some, globs, URLs, or @list.txt.")
+    list[str],
+    Argument(metavar="LOG", help="Logs with ground truth, folders with logs, glob patterns, URLs, or @list.txt."),
 ]
-CarOutput = Annotated[
-    Path, Option("--output", "-o", metavar="CAR", help="Car to write: a folder (may be that of --car).")
+JsonFlag = Annotated[bool, Option("--json", help="Print one JSON document instead of tables.", rich_help_panel=OUTPUT)]
+JunitFile = Annotated[
+    Path | None, Option(help="JUnit XML file for the verdicts of --thresholds.", rich_help_panel=OUTPUT)
 ]
-JsonFlag = Annotated[bool, Option("--json", help="One JSON document on stdout instead of tables.")]
-JunitFile = Annotated[Path | None, Option(help="Write the verdicts of --thresholds as JUnit XML, for CI.")]
-Split = Annotated[str | None, Option(help="Only drives of this split, by the manifest of their set.")]
-AnySplit = Annotated[bool, Option("--any-split", help="Take drives of every split, even of those refused otherwise.")]
-Jobs = Annotated[int, Option("--jobs", "-j", help="Processes at work; changes no number.")]
+Split = Annotated[str | None, Option(help="Only drives of this split of a simulated set.", rich_help_panel=INPUT)]
+AnySplit = Annotated[
+    bool, Option("--any-split", help="Accept drives of splits that are refused by default.", rich_help_panel=INPUT)
+]
+Jobs = Annotated[
+    int,
+    Option("--jobs", "-j", help="Number of worker processes. Results do not depend on it.", rich_help_panel=WORK),
+]
 
 
 def local_folder(argument: str) -> Path:
@@ -54,67 +63,113 @@ _Text = str | None
 _File = Path | None
 #: The shared options by the name of the configuration's entry, in the order of the help.
 _OPTIONS: dict[str, Any] = {
-    "car": Annotated[_File, Option()],
-    "cars": Annotated[_File, Option(help="cars.toml: a car per log, by folder, metadata or name: docs/car.md.")],
+    "car": Annotated[_File, Option(rich_help_panel=INPUT)],
+    "cars": Annotated[
+        _File,
+        Option(help="cars.toml, which assigns a car to each log by folder, metadata or name.", rich_help_panel=INPUT),
+    ],
+    "mapping": Annotated[
+        _File,
+        Option(
+            "--mapping",
+            "-m",
+            help="mapping.toml, which maps fields to signals. Default: recognised by message type, name and unit.",
+            rich_help_panel=INPUT,
+        ),
+    ],
+    "start": Annotated[
+        _Text, Option(help="Start of the time slice: 12.5, +10s, end-5s, ns or RFC 3339.", rich_help_panel=INPUT)
+    ],
+    "end": Annotated[_Text, Option(help="End of the time slice, same formats as --start.", rich_help_panel=INPUT)],
+    "cache": Annotated[
+        _Text,
+        Option(
+            metavar="DIR|URL",
+            help="Folder of reduced logs: written at the first run, read instead of the log later.",
+            rich_help_panel=INPUT,
+        ),
+    ],
+    "clock": Annotated[
+        _Text,
+        Option(
+            help="arrival: use a sample from its arrival on, as in a car. stamp: from its stamp on (not causal).",
+            rich_help_panel=ESTIMATION,
+        ),
+    ],
     "estimators": Annotated[
         _Text,
         Option(
             "--estimators",
             "-e",
-            help="Comma-separated (pdhef estimators), or all. Default: the main one, physics, zero.",
+            help="Comma-separated names, or all. Default: pd-hef, physics, zero.",
+            rich_help_panel=ESTIMATION,
         ),
     ],
-    "mapping": Annotated[
-        _File, Option("--mapping", "-m", help="mapping.toml: topic.field -> signal; default: by message type.")
-    ],
-    "start": Annotated[_Text, Option(help="Start of the slice of each log: 12.5, +10s, end-5s, ns, or RFC 3339.")],
-    "end": Annotated[_Text, Option(help="End of the slice of each log, as --start.")],
-    "annotate": Annotated[_Text, Option(help="full: copy of the log with our topics; sidecar: our topics only; none.")],
-    "keep": Annotated[
-        _Text, Option(help="Of each drive: metrics, estimates, or full. Default: full, above 50 logs metrics.")
-    ],
-    "cache": Annotated[
-        _Text,
-        Option(metavar="DIR|URL", help="Keep a slim log of each log there and read that the next time: docs/slim.md."),
-    ],
-    "cache_max_gb": Annotated[
-        float | None,
-        Option("--cache-max", metavar="GB", help="What --cache DIR may hold; what was not used for longest goes."),
-    ],
-    "sensors": Annotated[_Text, Option(help="full, or esp: no wheel speeds in the filters after the start.")],
-    "clock": Annotated[
-        _Text, Option(help="arrival: samples count when they arrived, as in a car; stamp: by their stamps, not causal.")
-    ],
     "friction": Annotated[
-        _Text, Option(help="auto (log's, else car's, else estimated), file, estimate, or a number; docs/friction.md")
+        _Text,
+        Option(
+            help="auto (from the log, else the car, else estimated), file, estimate, or a number.",
+            rich_help_panel=ESTIMATION,
+        ),
     ],
-    "prefer_truth": Annotated[_Text, Option(help="perfect or rtk: which truth of a simulated log counts.")],
-    "msgs": Annotated[_File, Option(metavar="DIR", help="Folder, zip or wheel of .msg files: types a log lacks.")],
-    "budget": Annotated[
-        float | None, Option(metavar="FACTOR", help="Raise what a log may cost in memory and time: docs/formats.md.")
+    "network": Annotated[
+        _File,
+        Option(help="Network folder, default, many-cars or none. Default: the car's.", rich_help_panel=ESTIMATION),
     ],
-    "thresholds": Annotated[_File, Option(help="thresholds.toml: limits on figures; exit code 4 if one is broken.")],
-    "config_file": Annotated[_File, Option("--config", help="pdhef.toml; flags win over it.")],
-    "network": Annotated[_File, Option(help="Instead of the car's: a folder, default, many-cars, or none.")],
-    "intervals": Annotated[_File, Option(help="Instead of the car's: a file of calibrate, unsure (wide), or none.")],
     "calibrate": Annotated[
-        _Text, Option(help="A car without evidence, without truth: each log for itself, the pool of all, or off.")
+        _Text,
+        Option(
+            help="Calibration of a car without validation data, without ground truth: per log, pool (all logs) or off.",
+            rich_help_panel=ESTIMATION,
+        ),
     ],
     "waived": Annotated[
-        list[str] | None, Option("--waive", metavar="NAME", help="A failed check that does not count; repeatable.")
+        list[str] | None,
+        Option("--waive", metavar="CHECK", help="Ignore the failure of this check. Repeatable.", rich_help_panel=INPUT),
     ],
-    "allow_private_redirects": Annotated[
-        bool | None,
+    "annotate": Annotated[
+        _Text,
+        Option(help="full: copy of the log with the estimates; sidecar: estimates only; none.", rich_help_panel=OUTPUT),
+    ],
+    "keep": Annotated[
+        _Text,
         Option(
-            "--allow-private-redirects",
-            help="Follow redirects of web servers to other hosts of this machine and its network: docs/remote.md.",
+            help="Files per log: metrics, estimates or full. Default: full, for more than 50 logs metrics.",
+            rich_help_panel=OUTPUT,
+        ),
+    ],
+    "thresholds": Annotated[
+        _File,
+        Option(help="thresholds.toml with limits on metrics. Exit code 4 if one is exceeded.", rich_help_panel=OUTPUT),
+    ],
+    "config_file": Annotated[
+        _File,
+        Option(
+            "--config",
+            help="Settings file. Default: pdhef.toml in the working directory. Options have priority.",
+            rich_help_panel=SETTINGS,
+        ),
+    ],
+    "assignments": Annotated[
+        list[str] | None,
+        Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="A setting of pdhef.toml, listed in docs/settings.md. Repeatable.",
+            rich_help_panel=SETTINGS,
         ),
     ],
 }
 
 
 def command(
-    group: typer.Typer, *examples: str, name: str | None = None, notes: str = "", shared: str = "", car: str = ""
+    group: typer.Typer,
+    *examples: str,
+    panel: str,
+    name: str | None = None,
+    notes: str = "",
+    shared: str = "",
+    car: str = "",
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Make a function a command; what it takes as ``config`` is the :class:`RunConfig` that the shared options make.
 
@@ -123,16 +178,14 @@ def command(
     group : commands to add it to.
     examples, notes : what stands below the options: lines as they are typed, and paragraphs.
     name : that of the command; None = the function's.
-    shared : shared options beside --mapping, --prefer-truth, --msgs, --budget and --allow-private-redirects, which
-        every ``config`` takes.
+    panel : group of commands in the help of ``pdhef``.
+    shared : shared options beside --mapping, --config and --set, which every ``config`` takes.
     car : what --car means to the command, which then has --start and --end too; empty = it has no car.
     """
-    wanted = f"mapping prefer_truth budget msgs {shared} {'car start end' if car else ''}".split()
-    wanted.append("allow_private_redirects")
-    wanted += ["cache_max_gb"] * ("cache" in wanted)
+    wanted = {"mapping", "config_file", "assignments", *shared.split(), *(("car", "start", "end") if car else ())}
     taken = {key: option for key, option in _OPTIONS.items() if key in wanted}
     if car:
-        taken["car"] = Annotated[_File, Option(help=f"{car}: a folder, or a bare vehicle.toml.")]
+        taken["car"] = Annotated[_File, Option(help=f"{car}: car folder or vehicle.toml.", rich_help_panel=INPUT)]
     # \b keeps the lines of a paragraph as they are.
     epilog = "\n  ".join(("\b\nExamples:", *examples)) + f"\n\n{notes}" if examples else None
 
@@ -158,7 +211,7 @@ def command(
             parameters += options if key == "config" else [own]
         run_command.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
         run_command.__annotations__ = {p.name: p.annotation for p in parameters}
-        return group.command(name, epilog=epilog)(run_command)
+        return group.command(name, epilog=epilog, cls=PanelCommand, rich_help_panel=panel)(run_command)
 
     return decorate
 
@@ -169,12 +222,13 @@ def run_config(options: dict[str, Any]) -> RunConfig:
     Raises
     ------
     UsageError
-        A value is none of those allowed.
+        A value is none of those allowed, or ``--set`` names no setting.
     """
-    from pdhef_logtool.runs.config import load_config
+    from pdhef_logtool.runs.config import load_config, parse_assignments
 
     flags = {key: value for key, value in options.items() if value not in (None, [])}
-    return load_config(flags.pop("config_file", None), flags)
+    assigned = parse_assignments(flags.pop("assignments", ()))
+    return load_config(flags.pop("config_file", None), assigned | flags)
 
 
 def split_names(text: str) -> tuple[str, ...]:

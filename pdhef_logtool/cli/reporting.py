@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from pdhef_logtool.cli import console, options
+from pdhef_logtool.cli import console, options, panels
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -26,21 +26,19 @@ commands = typer.Typer()
     "pdhef report out --open",
     "pdhef report out --by car --by vehicle_id",
     "pdhef report out --png --json",
+    panel=panels.READ,
 )
 def report(
-    output: Annotated[Path, Argument(parser=options.local_folder, metavar="OUT", help="Folder of a run.")],
+    output: Annotated[Path, Argument(parser=options.local_folder, metavar="OUT", help="Output folder of a run.")],
     show: Annotated[bool, Option("--open", help="Open the page in the browser.")] = False,
     by: Annotated[
         list[str] | None,
-        Option(metavar="KEY", help="Break drives down by this: a key of the logs' metadata, car, folder; repeatable."),
+        Option(metavar="KEY", help="Breakdown of the drives: car, folder, or a metadata key. Repeatable."),
     ] = None,
-    png: Annotated[bool, Option("--png", help="Each figure as a picture too, in logs/LOG/figures.")] = False,
+    png: Annotated[bool, Option("--png", help="Write each figure as a PNG file too, to logs/LOG/figures.")] = False,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Write the pages of a run: of all logs, and of each.
-
-    They are made from what the run left, as at the end of run itself.
-    """
+    """Write the HTML reports of a finished run again."""
     from pdhef_logtool.records.outputs import OutputFolder
     from pdhef_logtool.reports.pages import write_pages
     from pdhef_logtool.results.opened_run import LOGS, open_run

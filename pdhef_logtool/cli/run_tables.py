@@ -24,7 +24,6 @@ from pdhef_logtool.sinks.report import diverged_line, reasons_line
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pdhef_logtool.drive.slim import SlimResult
     from pdhef_logtool.evaluation.metrics.metric import Metric
     from pdhef_logtool.evaluation.thresholds import Verdict
     from pdhef_logtool.results.summary import RunSummary
@@ -388,20 +387,6 @@ def _table_of(
         figures = (cell(values.get((name, *c.key)), c.factor, c.digits) for c in columns)
         made.add_row(name + ("" if estimator["causal"] else " *"), *figures)
     return made
-
-
-def render_slim(result: SlimResult, console: Console) -> None:
-    """Print the sizes of logs and of their slim logs, and what was lost or failed."""
-    sizes = table("log", ">MB", ">slim MB", fold=1)
-    for one in result.logs:
-        if not one.failed:
-            sizes.add_row(one.log, cell(one.source_bytes, 1e-6), cell(one.slim_bytes, 1e-6))
-    if sizes.row_count:
-        console.print(sizes)
-        console.print(f"Slim logs: {result.output}")
-    for one in result.logs:
-        for text in (one.failed,) if one.failed else one.lost:
-            console.print(f"{one.log} {'failed' if one.failed else 'lost'}: {text}")
 
 
 def _joint_table(reports: Sequence[_Report]) -> Table:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 from typer import Argument, Option
 
-from pdhef_logtool.cli import console, options
+from pdhef_logtool.cli import console, options, panels
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 
 if TYPE_CHECKING:
@@ -21,6 +21,19 @@ if TYPE_CHECKING:
     from pdhef_logtool.runs.pipeline import RunResult
 
 commands = typer.Typer()
+
+
+def _list_estimators(show: bool) -> None:
+    if show:
+        from pdhef_logtool.estimators.table import all_specs
+
+        table = console.table("name", "description")
+        for spec in all_specs():
+            table.add_row(spec.name, spec.text)
+        console.stdout().print(table)
+        raise typer.Exit
+
+
 #: Thresholds that failed, of which each is told.
 _MOST_VERDICTS = 50
 
@@ -39,49 +52,63 @@ _MOST_VERDICTS = 50
     "pdhef run fleet/ -o out --only drive_0312",
     "pdhef run @list.txt -o /shared/out --ray auto --keep metrics",
     "pdhef run @list.txt -o s3://bucket/out --jobs 8 --keep metrics --resume",
-    "pdhef run @list.txt -o out --jobs 8 --keep metrics --cache ~/slim",
+    "pdhef run @list.txt -o out --keep metrics --cache ~/reduced",
+    "pdhef run logs/ -o out --set sensors=esp",
+    panel=panels.RUN,
     notes="Times: seconds from the log's start (12.5, +10s), before its end (end-5s), nanoseconds (an integer of "
     "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).\n\n"
-    'cars.toml, its cars and folders beside it: [folders] "fleet/golf" = "cars/golf"; [logs] "run_*.mcap" = '
+    'cars.toml, with paths relative to it: [folders] "fleet/golf" = "cars/golf"; [logs] "run_*.mcap" = '
     '"mini.toml"; [metadata.vehicle_id] "WVW-1" = "cars/golf"; default = "saloon" above them.',
-    shared="cars estimators annotate keep cache sensors clock friction thresholds config_file network intervals "
-    "calibrate waived model calibration",
-    car="Your car (default: a sedan)",
+    shared="cars estimators annotate keep cache clock friction thresholds network calibrate waived",
+    car="Car of the logs (default: a sedan)",
 )
 def run(  # positional: one an option of the command line
     logs: options.Logs,
     output: Annotated[
-        str, Option("--output", "-o", metavar="DIR|URL", help="Folder, or s3:// URL, for all that the run writes.")
+        str,
+        Option(
+            "--output", "-o", metavar="DIR|URL", help="Output folder, or s3:// URL.", rich_help_panel=options.OUTPUT
+        ),
     ],
     config: RunConfig,
     junit: options.JunitFile = None,
-    report: Annotated[bool, Option(help="Write pages for people: report.html of every log.")] = True,
+    report: Annotated[
+        bool, Option(help="Write HTML reports: report.html per log and for the run.", rich_help_panel=options.OUTPUT)
+    ] = True,
     jobs: options.Jobs = 1,
     ray: Annotated[
         str | None,
-        Option(metavar="ADDRESS", help="Work on this Ray cluster (auto, HOST:PORT), with a shared OUTPUT or a URL."),
+        Option(
+            metavar="ADDRESS",
+            help="Ray cluster (auto or HOST:PORT). The output must be a shared folder or a URL.",
+            rich_help_panel=options.WORK,
+        ),
     ] = None,
     resume: Annotated[
-        bool, Option("--resume", help="Go on with the run in the folder: only what is new or has changed.")
+        bool,
+        Option(
+            "--resume", help="Continue the run in the output: only new or changed logs.", rich_help_panel=options.WORK
+        ),
     ] = False,
-    retry: Annotated[bool, Option("--retry", help="As --resume, and try the logs that failed once more.")] = False,
+    retry: Annotated[
+        bool, Option("--retry", help="Like --resume, and repeat failed logs.", rich_help_panel=options.WORK)
+    ] = False,
     only: Annotated[
-        list[str] | None, Option(metavar="NAME", help="Everything of this log of the run; the rest stays. Repeatable.")
+        list[str] | None,
+        Option(
+            metavar="NAME",
+            help="Repeat this log of the run and keep all its files. Repeatable.",
+            rich_help_panel=options.WORK,
+        ),
     ] = None,
-    log_timeout_s: Annotated[
-        float | None,
-        Option("--log-timeout", metavar="S", min=1.0, help="Give up a log that is silent for S seconds."),
-    ] = None,
-    max_memory_mb: Annotated[
-        int | None, Option("--max-memory", metavar="MB", min=1, help="Give up a log that takes more, in a process.")
-    ] = None,
-    full_worst: Annotated[
-        int | None,
-        Option(metavar="K", min=0, help="Keep everything of the K worst drives; default above 50 logs: 5."),
-    ] = None,
+    list_estimators: Annotated[
+        bool,
+        Option("--list-estimators", callback=_list_estimators, is_eager=True, help="List the estimators and exit."),
+    ] = False,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Run estimators on logs, score and annotate them. Recordings and metrics are written too."""
+    """Run estimators on logs, score them, write reports and annotated logs."""
+    del list_estimators
     from pdhef_logtool.runs.fleet import limits_of, run_logs
 
     with console.progress() as bar:
@@ -94,8 +121,8 @@ def run(  # positional: one an option of the command line
             resume=resume,
             retry=retry,
             only=only or (),
-            limits=limits_of(log_timeout_s, max_memory_mb),
-            full_worst=full_worst,
+            limits=limits_of(config.log_timeout_s, config.max_memory_mb),
+            full_worst=config.full_worst,
             junit=junit,
             report=report,
             progress=bar,
@@ -113,32 +140,39 @@ def run(  # positional: one an option of the command line
     "pdhef metrics drive.mcap --estimate /pdhef/phy_ukf/state \\",
     "  --truth /ins/odometry --car mycar -o out",
     "pdhef metrics drive.mcap -m mapping.toml --thresholds limits.toml --json",
-    notes="The type tells the signals of nav_msgs/Odometry, geometry_msgs/Twist*Stamped and "
-    "pdhef_msgs/VehicleStateEstimate; others need SIGNAL=, one of vx_m_s, vy_m_s, yaw_rate_rad_s, sideslip_rad, "
-    "ay_m_s2, their *_std_*, valid. Scales, offsets, signs and several estimators stand in a mapping file, one "
-    "[estimates.NAME.SIGNAL] table a signal.",
-    shared="thresholds config_file",
-    car="The car (place of its truth, friction, lowest speed)",
+    panel=panels.RUN,
+    notes="Signals of nav_msgs/Odometry, geometry_msgs/Twist*Stamped and pdhef_msgs/VehicleStateEstimate are "
+    "recognised by type. Other topics need SIGNAL=, one of vx_m_s, vy_m_s, yaw_rate_rad_s, sideslip_rad, ay_m_s2, "
+    "their *_std_*, valid. A mapping file can contain scales, offsets, signs and several estimators, one table "
+    "[estimates.NAME.SIGNAL] per signal.",
+    shared="thresholds",
+    car="Car of the log (position of the ground truth, friction, lowest speed)",
 )
 def metrics(
     log: options.Log,
     config: RunConfig,
     estimate: Annotated[
         list[str] | None,
-        Option(metavar="SOURCE", help="[SIGNAL=]TOPIC[.FIELD], repeatable. Default: the mapping's [estimates]."),
+        Option(
+            metavar="SOURCE", help="Estimate: [SIGNAL=]TOPIC[.FIELD]. Repeatable. Default: [estimates] of the mapping."
+        ),
     ] = None,
     truth: Annotated[
         list[str] | None,
-        Option(metavar="SOURCE", help="[SIGNAL=]TOPIC[.FIELD], repeatable. Default: the mapped or recognised truth."),
+        Option(
+            metavar="SOURCE", help="Ground truth: [SIGNAL=]TOPIC[.FIELD]. Repeatable. Default: mapped or recognised."
+        ),
     ] = None,
-    name: Annotated[str | None, Option(help="What the estimator is called; or which of [estimates] is scored.")] = None,
+    name: Annotated[
+        str | None, Option(help="Name of the estimator in the results, or the one of [estimates] to score.")
+    ] = None,
     output: Annotated[
-        Path | None, Option("--output", "-o", help="Folder for tables and report. Default: print only.")
+        Path | None, Option("--output", "-o", help="Output folder for tables and report. Default: print only.")
     ] = None,
     junit: options.JunitFile = None,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Score an estimate that the log itself holds. The figures are those of pdhef run."""
+    """Score an estimate that the log contains, with the metrics of pdhef run."""
     from pdhef_logtool.runs.recorded_estimates import score_log
 
     with console.progress() as bar:
@@ -156,41 +190,18 @@ def metrics(
     _finish(result, as_json)
 
 
-@options.command(
-    commands,
-    "pdhef slim fleet/ -o slim",
-    "pdhef run slim/ -o out --car mycar",
-    "pdhef slim drive.bag -o slim --mapping mapping.toml",
-    notes="A slim log needs no mapping, no definitions and no DBC: it holds what it was made with.",
-)
-def slim(
-    logs: options.Logs,
-    output: Annotated[Path, Option("--output", "-o", help="Folder for the slim logs, one NAME.mcap each.")],
-    config: RunConfig,
-    jobs: options.Jobs = 1,
-    as_json: options.JsonFlag = False,
-) -> None:
-    """Keep only what a run reads of logs. A run of a slim log has the same figures, bit for bit."""
-    from pdhef_logtool.cli.run_tables import render_slim
-    from pdhef_logtool.drive.slim import slim_logs
-
-    with console.progress() as bar:
-        result = slim_logs(logs, output, config.mapping, config.read_options, jobs=jobs, progress=bar)
-    console.finish(result, render_slim, as_json)
-
-
-@options.command(commands, "pdhef view out", "pdhef view out --log drive", "pdhef view out --web")
+@options.command(commands, "pdhef view out", "pdhef view out --log drive", "pdhef view out --web", panel=panels.READ)
 def view(
     output: Annotated[
         Path,
         Argument(
-            parser=options.local_folder, metavar="OUTPUT", help="Folder of a run or of a log in it, or a .rrd file."
+            parser=options.local_folder,
+            metavar="OUTPUT",
+            help="Output folder of a run, folder of one log, or .rrd file.",
         ),
     ],
-    log: Annotated[
-        list[str] | None, Option(metavar="NAME", help="Which logs of the run, repeatable; default: all.")
-    ] = None,
-    web: Annotated[bool, Option("--web", help="In the browser, for machines without a display.")] = False,
+    log: Annotated[list[str] | None, Option(metavar="NAME", help="Log of the run. Repeatable. Default: all.")] = None,
+    web: Annotated[bool, Option("--web", help="Open in the browser, for machines without a display.")] = False,
 ) -> None:
     """Open the recordings of a run in the Rerun viewer."""
     from pdhef_logtool.sinks.base import is_finished_recording
@@ -232,17 +243,19 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
         console.show(result, render_run, as_json)
         for one in result.results:
             if one.outcome.failed is not None and one.report is not None:  # of the others the tables say it
-                console.say(f"pdhef: {one.outcome.log}: {one.outcome.failed}")
+                console.error(f"pdhef: {one.outcome.log}: {one.outcome.failed}")
     failed = [v for v in result.verdicts if v.failed]
     for verdict in failed[:_MOST_VERDICTS]:
         where = f"{verdict.log}: {verdict.estimator}: {verdict.threshold.label}"
-        console.say(f"pdhef: threshold failed: {where}: {verdict.reason}")
+        console.error(f"pdhef: threshold failed: {where}: {verdict.reason}")
     if len(failed) > _MOST_VERDICTS:
-        console.say(f"pdhef: {len(failed) - _MOST_VERDICTS} more of {len(result.verdicts)} thresholds failed (--junit)")
+        console.error(
+            f"pdhef: {len(failed) - _MOST_VERDICTS} more of {len(result.verdicts)} thresholds failed (--junit)"
+        )
     if failed and not result.is_fleet:
         for one in result.results:
             if one.outcome.outcome != "ok":
-                console.say(f"pdhef: {one.outcome.log} besides {one.outcome.outcome}")
+                console.error(f"pdhef: {one.outcome.log} besides {one.outcome.outcome}")
     raise typer.Exit(result.exit_code)
 
 

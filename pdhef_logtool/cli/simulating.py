@@ -8,30 +8,15 @@ from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
-from typer.core import TyperGroup
 
-from pdhef_logtool.cli import console, options
+from pdhef_logtool.cli import console, options, panels
 from pdhef_logtool.records.errors import UsageError
 
 commands = typer.Typer()
 
 
-class CommandGroup(TyperGroup):
-    """A group whose commands may have names of two words: ``simulate suite`` beside ``simulate dlc``."""
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Take the first word behind the command that is no option as the second word of its name, where it is one."""
-        family = [c for name, c in self.commands.items() if name.split()[0] == args[0]]
-        valued = {o for c in family for p in c.params if not getattr(p, "is_flag", False) for o in p.opts}
-        words = (i for i in range(1, len(args)) if not args[i].startswith("-") and args[i - 1] not in valued)
-        at = next(words, 0)
-        if at and f"{args[0]} {args[at]}" in self.commands:
-            args = [f"{args[0]} {args[at]}", *args[1:at], *args[at + 1 :]]
-        return super().resolve_command(ctx, args)
-
-
 _Many = list[str] | None
-SetOutput = Annotated[Path, Option("--output", "-o", help="Folder; drives that are there already are kept.")]
+SetOutput = Annotated[Path, Option("--output", "-o", help="Output folder. Existing drives are kept.")]
 
 
 @options.command(
@@ -41,43 +26,51 @@ SetOutput = Annotated[Path, Option("--output", "-o", help="Folder; drives that a
     "pdhef simulate road --seed 3 --sensor rtk_outages_per_h=30 -o road.mcap",
     "pdhef simulate dlc --vehicle suv --fault burst20:yaw_rate:3:5 \\",
     "  --fault dropout:wheels:6:end -o faulty.mcap",
-    notes="""Sets of drives are commands of their own: pdhef simulate suite writes one to train on, pdhef simulate
-conditions those of the condition table; --help behind either shows its options.
+    panel=panels.TOOLS,
+    notes="""Sets of drives: pdhef simulate suite writes a training set,
+pdhef simulate conditions writes the drives of the condition table.
 
 Faults: KIND:WHAT:START:END in seconds (END may be end). Kinds: burst<FACTOR>, stuck, dead, flip, bias<SI>, dropout,
 delay<MS>, jump<S> (of the stamps), float, lost (the RTK's fix). What: imu, steering, wheels, rtk, all (sensors), or one
-field: ax, ay, az, roll_rate, pitch_rate, yaw_rate, steer, wheel_fl, wheel_fr, wheel_rl, wheel_rr. delay and jump take
-whole messages.
+field: ax, ay, az, roll_rate, pitch_rate, yaw_rate, steer, wheel_fl, wheel_fr, wheel_rl, wheel_rr. delay and jump apply
+to whole messages.
 
-Vehicles: sedan, suv, hatchback or a TOML file; NAME~SEED is another car of its kind; changes follow commas: mass=1.2,
+Vehicles: sedan, suv, hatchback or a TOML file; NAME~SEED is a random variant of it; changes follow commas: mass=1.2,
 cg=0.1 (m to the rear), height=1.1, stiffness=0.85, tyres=suv.""",
 )
 def simulate(
     *,
-    manoeuvre: Annotated[str | None, Argument(metavar="MANOEUVRE", help="--list shows the names.")] = None,
+    manoeuvre: Annotated[
+        str | None, Argument(metavar="MANOEUVRE", help="Name of the manoeuvre; --list shows them.")
+    ] = None,
     output: Annotated[Path | None, Option("--output", "-o", help="MCAP file to write.")] = None,
-    speed_km_h: Annotated[float | None, Option("--speed", help="km/h; default: the manoeuvre's.")] = None,
-    friction: Annotated[float | None, Option("--mu", help="Friction; default: the manoeuvre's.")] = None,
+    speed_km_h: Annotated[
+        float | None, Option("--speed", help="Speed in km/h. Default: that of the manoeuvre.")
+    ] = None,
+    friction: Annotated[float | None, Option("--mu", help="Friction. Default: that of the manoeuvre.")] = None,
     seed: Annotated[int, Option(help="Seed of noise and of random profiles.")] = 0,
-    duration_s: Annotated[float | None, Option("--duration", help="s; default: the manoeuvre's.")] = None,
+    duration_s: Annotated[
+        float | None, Option("--duration", help="Duration in s. Default: that of the manoeuvre.")
+    ] = None,
     amplitude: Annotated[float, Option(help="Factor on the manoeuvre's own amplitude.")] = 1.0,
-    vehicle: Annotated[str | None, Option("--vehicle", "-v", help="See Vehicles; default sedan.")] = None,
-    faults: Annotated[_Many, Option("--fault", metavar="FAULT", help="See Faults; repeatable.")] = None,
+    vehicle: Annotated[str | None, Option("--vehicle", "-v", help="Vehicle, see below. Default: sedan.")] = None,
+    faults: Annotated[_Many, Option("--fault", metavar="FAULT", help="Sensor fault, see below. Repeatable.")] = None,
     sensors: Annotated[
-        _Many, Option("--sensor", metavar="NAME=VALUE", help="A sensor's error (docs/simulate.md); repeatable.")
+        _Many, Option("--sensor", metavar="NAME=VALUE", help="Sensor error parameter (docs/simulate.md). Repeatable.")
     ] = None,
     without: Annotated[
-        _Many, Option(metavar="WHAT", help="Leave out imu, steering, wheels, rtk, perfect or events.")
+        _Many, Option(metavar="WHAT", help="Omit imu, steering, wheels, rtk, perfect or events. Repeatable.")
     ] = None,
-    steering_wheel: Annotated[bool, Option("--steering-wheel", help="Record the steering wheel's angle too.")] = False,
+    steering_wheel: Annotated[bool, Option("--steering-wheel", help="Record the steering-wheel angle too.")] = False,
     rtk_rate_hz: Annotated[
-        int | None, Option("--rtk-rate", help="Hz of the truth: 10, 20, 50 or 100; default: the manoeuvre's.")
+        int | None,
+        Option("--rtk-rate", help="Rate of the ground truth in Hz: 10, 20, 50 or 100. Default: that of the manoeuvre."),
     ] = None,
     keep_spins: Annotated[bool, Option("--keep-spins", help="Keep |sideslip| > 20 degrees and lifted wheels.")] = False,
     list_all: Annotated[bool, Option("--list", help="List the manoeuvres and their defaults.")] = False,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Write a drive of the simulator as ROS 2 MCAP. It has noisy sensors, RTK truth and perfect truth."""
+    """Simulate a drive and write it as MCAP, with noisy sensors, RTK and exact ground truth."""
     if list_all:
         _list_manoeuvres(as_json)
         return
@@ -116,19 +109,20 @@ def simulate(
     commands,
     "pdhef simulate suite --count 200 --seed 1 --jobs 2 -o logs/",
     "pdhef simulate suite --count 2000 --vehicles randomised -o many_cars/",
-    notes="manifest.json tells of each drive its split and the command that makes it again.",
+    panel=panels.TOOLS,
+    notes="manifest.json contains, for each drive, its split and the command that reproduces it.",
     name="simulate suite",
 )
 def suite(
     output: SetOutput,
     count: Annotated[int, Option(help="Number of drives.")] = 200,
     seed: Annotated[int, Option(help="Seed of all draws.")] = 0,
-    duration_s: Annotated[float, Option("--duration", help="s a drive.")] = 12.5,
-    vehicles: Annotated[str, Option(help="default, or randomised: another each drive.")] = "default",
+    duration_s: Annotated[float, Option("--duration", help="Duration of a drive in s.")] = 12.5,
+    vehicles: Annotated[str, Option(help="default, or randomised (a different one per drive).")] = "default",
     jobs: options.Jobs = 1,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Write a set of simulated drives to train on. Each one is drawn by its own number, so --count changes none."""
+    """Simulate a training set of drives."""
     from truthsim.suite import write_suite
 
     with console.progress() as bar:
@@ -143,18 +137,19 @@ def suite(
     commands,
     "pdhef simulate conditions --drives 30 --jobs 2 -o table/",
     "pdhef simulate conditions --rows in-domain,gyro-dead -o table/",
-    notes="manifest.json tells of each row its drives and what the estimator is told.",
+    panel=panels.TOOLS,
+    notes="manifest.json contains, for each row, its drives and the settings of the estimator.",
     name="simulate conditions",
 )
 def conditions(
     output: SetOutput,
-    drives: Annotated[int, Option(help="Drives a row.")] = 30,
-    rows: Annotated[str | None, Option(help="Comma-separated rows; default: all.")] = None,
+    drives: Annotated[int, Option(help="Drives per row.")] = 30,
+    rows: Annotated[str | None, Option(help="Comma-separated rows. Default: all.")] = None,
     seed: Annotated[int, Option(help="Seed of all draws.")] = 0,
     jobs: options.Jobs = 1,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Write the simulated drives of the condition table. Each row has one thing wrong."""
+    """Simulate the drives of the condition table: one disturbance per row."""
     from truthsim.conditions import write_conditions
 
     names = None if rows is None else options.split_names(rows)

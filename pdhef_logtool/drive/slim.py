@@ -3,102 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
-from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
+from pdhef_logtool.drive.reading import Drive, read_drive
+from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.slim_copy import copy_topics, write_record
 from pdhef_logtool.logs.slim_log import FORMAT, SlimRecord
 from pdhef_logtool.logs.writer import McapLogWriter
-from pdhef_logtool.mapping import Mapping, mapping_of
+from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.mapping.frames import holds_fixed_frames
-from pdhef_logtool.records.documents import jsonable
-from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, LogError, PdhefError
-from pdhef_logtool.records.outputs import check_no_input
-from pdhef_logtool.records.supervisor import Tell, supervise
+from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.version import __version__
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.columnar_log import ColumnarLog
-
-
-@dataclass(frozen=True, slots=True)
-class SlimmedLog:
-    """What became of one log: sizes in bytes, what of the log could not be read, and why there is no slim log."""
-
-    log: str
-    slim: str
-    source_bytes: int = 0
-    slim_bytes: int = 0
-    lost: tuple[str, ...] = ()
-    failed: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class SlimResult:
-    """What became of all logs, in their order."""
-
-    output: str
-    logs: tuple[SlimmedLog, ...]
-
-    @property
-    def exit_code(self) -> int:
-        """0 if all is well, 3 if something was lost or some logs failed, 1 if all did."""
-        if all(one.failed for one in self.logs):
-            return EXIT_FAILURE
-        return EXIT_PARTIAL if any(one.failed or one.lost for one in self.logs) else EXIT_OK
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as JSON-able values."""
-        return {"output": self.output, "exit_code": self.exit_code, "logs": jsonable(self.logs)}
-
-
-def slim_logs(
-    arguments: Logs,
-    output: Path,
-    mapping: Path | None,
-    options: ReadOptions,
-    *,
-    jobs: int = 1,
-    progress: Callable[[str, float], None] = lambda _text, _share: None,
-) -> SlimResult:
-    """Write ``output/NAME.mcap`` for every log; a log that fails never stops the others.
-
-    Parameters
-    ----------
-    mapping : file; None recognises types. options : as for :func:`slim_log`. jobs : processes at work.
-
-    Raises
-    ------
-    UsageError, MappingError : There is no log, the mapping is wrong, or an output would replace an input.
-    """
-    inputs = find_logs(arguments, private_redirects=options.allow_private_redirects)
-    sources = mapping_of(mapping)
-    targets = [output / f"{log.stem}.mcap" for log in inputs]
-    check_no_input([*(log.local for log in inputs), mapping], targets)
-    items = [(log, target, sources, options) for log, target in zip(inputs, targets, strict=True)]
-    results: list[SlimmedLog] = [SlimmedLog(log.stem, "", failed="not reached") for log in inputs]
-    ended = supervise(_slim_one, items, jobs=jobs, preload=(__name__,))
-    for done, one in enumerate(ended, 1):
-        failed = "" if one.failure is None else one.failure.reason
-        results[one.number] = one.result or SlimmedLog(one.item[0].stem, "", failed=failed)
-        progress(one.item[0].stem, done / len(inputs))
-    return SlimResult(str(output), tuple(results))
-
-
-def _slim_one(item: tuple[LogInput, Path, Mapping | None, ReadOptions], tell: Tell) -> SlimmedLog:
-    log, target, mapping, options = item
-    tell(log.stem, 0.0)
-    try:
-        record = slim_log(log, target, mapping, options)
-    except PdhefError as error:
-        return SlimmedLog(log.stem, "", failed=str(error))
-    size = sum(file.size for file in record.byte_ledgers)
-    return SlimmedLog(log.stem, str(target), size, target.stat().st_size, lost_texts(record.losses))
 
 
 def slim_log(

@@ -1,7 +1,8 @@
 """What a log may cost before its claims count as damage: one object through all readers of untrusted input.
 
 A recording is somebody else's file: a hundred bytes can claim gigabytes, a short schema can unfold without end. Each
-limit lies far above what recorders write and far below what harms a machine; one factor raises them all (``--budget``).
+limit lies far above what recorders write and far below what harms a machine; one factor raises them all
+(``--set budget=FACTOR``).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass, fields
 
 from pdhef_logtool.records.errors import LogError
 
-_OPTION = "--budget"
+_OPTION = "--set budget=FACTOR"
 _MIB = 1 << 20
 _FEW_MESSAGES = 1 << 16
 

@@ -253,7 +253,7 @@ class ColumnarLog(DriveLog):
                 return ""
             if isinstance(schema, MissingDefinitionError):
                 missing = schema.type_name.replace("/msg/", "/")
-                reasons.append(f"the log holds no definition of {missing}; give --msgs DIR with its .msg file")
+                reasons.append(f"the log contains no definition of {missing}; give its .msg file by --set msgs=DIR")
             else:
                 reasons.append(str(schema))
         return reasons[0] if reasons else ""
@@ -451,7 +451,7 @@ class ColumnarLog(DriveLog):
                         expected="messages as ROS 2 CDR, ROS 1, JSON or protobuf with a schema that parses",
                         got=str(schema),
                         where=topic,
-                        remedy="give its definition with --msgs DIR, or map another topic",
+                        remedy="give its definition with --set msgs=DIR, or map another topic",
                     )
                 )
                 continue
@@ -552,7 +552,8 @@ def _out_of_time(container: Container, spans: Sequence[Span]) -> Loss:
     count = sum(sum(span.counts.values()) for span in spans)
     start, end = min(s.start_ns for s in spans), max(s.end_ns for s in spans)
     what = (
-        f"reading took longer than {container.meter.allowed_s:.3g} s: {count} messages of the rest are lost (--budget)"
+        f"reading took longer than {container.meter.allowed_s:.3g} s: {count} messages of the rest are lost "
+        "(--set budget=FACTOR)"
     )
     return Loss("over-budget", what, str(container.path), start, end, count)
 

@@ -91,7 +91,7 @@ def decompress_file(source: Path, target: Path, meter: Meter) -> str:
                 return "the compressed file ends early" if written < claimed else ""
             written += len(block)
             if written > allowed:
-                return f"the file decompresses to more than {allowed} bytes, above the budget (--budget)"
+                return f"the file decompresses to more than {allowed} bytes, above the budget (--set budget=FACTOR)"
             if written > free:
                 return "the disk has no room for the decompressed file (set TMPDIR to another)"
             unpacked.write(block)

@@ -186,7 +186,7 @@ class HttpObject(RemoteObject):
         except PrivateRedirectError as error:
             raise self.error(
                 f"a redirect to {error}, an address of this machine or its network",
-                "give the URL that it leads to, or allow it by --allow-private-redirects",
+                "give the URL that it leads to, or allow it by --set allow_private_redirects=true",
                 "an object, or a redirect to a public address",
             ) from None
         except (aiohttp.InvalidURL, aiohttp.NonHttpUrlClientError, aiohttp.TooManyRedirects, ValueError):

@@ -39,7 +39,7 @@ _LONGEST_NS = 366 * 86_400_000_000_000
 #: Losses that come up again when the kept messages are read.
 _FOUND_AGAIN = frozenset({"undecodable", "bad-schema"})
 _EXPECTED = f"a slim log of format {FORMAT}"
-_REMEDY = "make it anew from its source: pdhef slim LOG -o DIR"
+_REMEDY = "delete it; pdhef run LOG --cache DIR writes it again"
 
 
 @dataclass(frozen=True, slots=True)

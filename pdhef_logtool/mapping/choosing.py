@@ -61,15 +61,15 @@ def recorded_mapping(log: SlimLog, prefer_truth: Literal["perfect", "rtk"]) -> C
             expected="the mapping of a slim log",
             got="; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()[:3]),
             where=str(log.path),
-            remedy="make it anew from its source: pdhef slim LOG -o DIR",
+            remedy="delete it; pdhef run LOG --cache DIR writes it again",
         ) from error
     mapping = chosen.mapping
     if chosen.prefer_truth != prefer_truth and mapping.truth:
         raise MappingError(
-            expected=f"--prefer-truth {chosen.prefer_truth}, which this slim log was made with",
+            expected=f"prefer_truth = {chosen.prefer_truth}, which this slim log was made with",
             got=prefer_truth,
             where=str(log.path),
-            remedy=f"pdhef slim SOURCE -o DIR --prefer-truth {prefer_truth}",
+            remedy="read the source log",
         )
     if mapping.can is not None:
         dbc = tuple(log.attached(path.name) for path in mapping.can.dbc)

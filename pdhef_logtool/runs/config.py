@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import datetime as dt
+import tomllib
+from collections.abc import Sequence
 from dataclasses import asdict, fields
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,6 +24,8 @@ from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED_FOLDERS
 
 _FILES = ("car", "cars", "mapping", "msgs", "thresholds", "network", "intervals")
+#: Settings that change no result.
+_NO_RESULT = ("cache", "cache_max_gb", "allow_private_redirects", "log_timeout_s", "max_memory_mb", "full_worst")
 #: What may stand in place of a file.
 _KEYWORDS = {
     "car": tuple(SHIPPED_CARS),
@@ -48,36 +53,41 @@ Friction = Annotated[float, Field(ge=POSSIBLE_FRICTION[0], le=POSSIBLE_FRICTION[
 
 @dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid", strict=True))
 class RunConfig:
-    """Everything that decides a run's numbers and outputs; its types are checked wherever one is made.
+    """Settings of a run: the keys of ``pdhef.toml`` and of ``--set``. Types are checked at construction.
 
     Attributes
     ----------
-    estimators : names, in the order of the tables; ``all`` alone = every one that the car suits; None = the main one,
-        ``physics`` and ``zero``, with those that they are checked against (:func:`~.guard.default_names`).
-    car : a car's folder, a vehicle.toml, or ``saloon``, the shipped one; None = the default sedan.
-    cars : a table that says which car each log has, instead of ``car``; None = the same for all.
-    mapping : file; None = recognised types.
-    start, end : slice as given (:func:`~pdhef_logtool.drive.options.parse_time`); None = the log's own.
-    annotate : ``full`` copies the source into annotated.mcap, ``sidecar`` writes our topics only; None = ``full``
-        where everything is kept (``sidecar`` with a cache, as the source is not read), else ``none``.
-    keep : what is written of a drive: ``metrics`` (report.json and figures), ``estimates`` (its tracks too) or
-        ``full``; None = ``full``, of many logs ``metrics`` (:mod:`~pdhef_logtool.runs.fleet`).
-    sensors : ``esp`` is the paper's suite without wheel speeds in the filters.
-    friction : ``auto`` is the log's own, else the car's, else estimated; ``file``, ``estimate``, or a number.
-    prefer_truth : which truth counts in a simulated log that has both.
-    window_s : length of the windows that the log is processed in; changes no number.
-    clock : ``arrival`` takes a sample as known when it arrived, as in a car; ``stamp`` at its stamp (not causal).
-    budget : factor on what reading a log may cost before its claims count as damage.
-    msgs : folder with definitions of message types that a log does not define.
-    network : instead of the car's: a folder, ``default``, ``many-cars`` (the shipped one for any car), ``none``.
-    intervals : instead of the car's: a file of the stage intervals, ``none`` (as they are), ``unsure`` (wide ones, for
-        a car that may have changed since its file was made).
-    thresholds : limits that the figures are held against; None = no gate.
-    waived : names of checks whose failure does not count.
-    calibrate : a car without evidence, without truth: on each ``log`` for itself, on the ``pool`` of all, or ``off``.
-    cache : folder or URL of slim logs, which stand for logs that were read before; changes no number.
-    cache_max_gb : what the cache may hold, in GB, if it is a folder: what was not used for longest goes; None = any.
-    allow_private_redirects : whether a web server may redirect to other hosts of this machine and its network.
+    estimators : names, or ``all``; None = ``pd-hef``, ``physics`` and ``zero``, with the estimators of their selection
+        (:func:`~.guard.default_names`).
+    car : car folder, vehicle.toml, or ``saloon`` (the shipped car); None = the default sedan.
+    cars : cars.toml, which assigns a car to each log; replaces ``car``.
+    mapping : mapping.toml; None = signals are recognised.
+    start : start of the time slice (:func:`~pdhef_logtool.drive.options.parse_time`); None = that of the log.
+    end : end of the time slice; None = that of the log.
+    annotate : content of annotated.mcap: ``full`` (copy of the log with the estimates), ``sidecar`` (estimates only) or
+        ``none``; None = ``full`` if ``keep`` is ``full`` (``sidecar`` with ``cache``), otherwise ``none``.
+    keep : files per log: ``metrics`` (report and metrics), ``estimates`` (and the tracks) or ``full``; None = ``full``,
+        for more than 50 logs ``metrics``.
+    sensors : ``full``, or ``esp`` (sensor set of the paper: the speed sensor only initialises the filters).
+    friction : ``auto`` (from the log, else the car, else estimated), ``file``, ``estimate``, or a number.
+    prefer_truth : ground truth of a simulated log that has both: ``perfect`` or ``rtk``.
+    window_s : length of the windows in which a log is processed, in s. Results do not depend on it.
+    clock : ``arrival`` (a sample is available from its arrival on) or ``stamp`` (from its stamp on; not causal).
+    budget : factor on the limits of memory and time for reading a log.
+    msgs : folder, zip file or wheel with .msg files of types that a log does not define.
+    thresholds : thresholds.toml with limits on metrics; None = no limits.
+    network : network folder, ``default``, ``many-cars`` or ``none``; None = the car's.
+    intervals : intervals file, ``none``, or ``unsure`` (wide intervals, for a car that may have changed); None = the
+        car's.
+    calibrate : calibration of a car without validation data, without ground truth: per ``log``, on the ``pool`` of all
+        logs, or ``off``.
+    waived : names of checks whose failure is ignored.
+    cache : folder or URL of reduced logs, which replace logs that were read before. Results do not depend on it.
+    cache_max_gb : maximum cache size in GB; least recently used entries are evicted.
+    allow_private_redirects : follow redirects of web servers to hosts of this machine or its network.
+    log_timeout_s : abort a log after this time without progress, in s.
+    max_memory_mb : abort a log whose worker process exceeds this much memory, in MB.
+    full_worst : number of logs with the largest error that keep all files; None = 5 for more than 50 logs.
     """
 
     estimators: Names | None = None
@@ -103,6 +113,9 @@ class RunConfig:
     cache: Annotated[str, BeforeValidator(lambda v: str(v) if isinstance(v, Path) else v)] | None = None
     cache_max_gb: Annotated[float, Field(gt=0)] | None = None
     allow_private_redirects: bool = False
+    log_timeout_s: Annotated[float, Field(ge=1)] | None = None
+    max_memory_mb: Annotated[int, Field(ge=1)] | None = None
+    full_worst: Annotated[int, Field(ge=0)] | None = None
 
     @property
     def read_options(self) -> ReadOptions:
@@ -128,7 +141,8 @@ class RunConfig:
     def to_dict(self) -> dict[str, Any]:
         """Return the configuration as JSON-able values; files by name only, so that no machine's paths get out."""
         document = asdict(self)
-        del document["cache"], document["cache_max_gb"], document["allow_private_redirects"]
+        for key in _NO_RESULT:
+            del document[key]
         document["waived"] = list(self.waived)
         document |= {"annotate": self.annotation, "keep": self.kept}
         document["estimators"] = None if self.estimators is None else list(self.estimators)
@@ -170,12 +184,45 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
             remedy="a full copy reads all of each log: leave out --cache",
         )
     if config.cache_max_gb is not None and (config.cache is None or is_url(config.cache)):
-        raise UsageError(expected="--cache DIR", got=config.cache or "none", where="--cache-max")
+        raise UsageError(expected="--cache DIR", got=config.cache or "none", where="cache_max_gb")
     # Times are understood without a log, so that a typing error is told before the first log is opened.
     for name, text in (("--start", config.start), ("--end", config.end)):
         if text is not None:
             parse_time(text, 0, 0, option=name)
     return config
+
+
+def parse_assignments(texts: Sequence[str]) -> dict[str, Any]:
+    """Return the settings of ``KEY=VALUE`` texts; a value is read as TOML where it is valid TOML, else as text.
+
+    Raises
+    ------
+    UsageError
+        A text has no ``=``, or names no setting.
+    """
+    settings: dict[str, Any] = {}
+    names = [f.name for f in fields(RunConfig)]
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals or key not in names:
+            near = get_close_matches(key, names, n=1)
+            raise UsageError(
+                expected="KEY=VALUE with a setting of pdhef.toml",
+                got=text,
+                where="--set",
+                remedy=f"did you mean {near[0]}?" if near else "docs/settings.md lists the settings",
+            )
+        settings[key] = _toml_value(value)
+        if key in _FILES and isinstance(settings[key], str):
+            settings[key] = Path(settings[key])
+    return settings
+
+
+def _toml_value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except (tomllib.TOMLDecodeError, KeyError):
+        return text
 
 
 def _read_file(path: Path) -> dict[str, Any]:

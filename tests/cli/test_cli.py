@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -17,7 +18,7 @@ from tests.command_line import called
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = (
-    *("inspect", "map", "estimators", "run", "metrics", "slim", "report", "compare", "events", "view"),
+    *("inspect", "map", "run", "metrics", "report", "compare", "events", "view", "compile"),
     *("simulate", "simulate suite", "simulate conditions"),
     *("learn", "extract", "train", "retrain"),
 )
@@ -32,9 +33,11 @@ def _one_line_error(result: subprocess.CompletedProcess[str]) -> str:
 
 def test_help_names_every_command_with_a_whole_sentence() -> None:
     text = called("--help", env={"COLUMNS": "80"}).stdout
-    listed = text[text.index("Commands:") :].splitlines()[1 : len(COMMANDS) + 1]
-    assert sorted(line[:21].strip() for line in listed) == sorted(COMMANDS)
-    assert all(line.endswith(".") and not line.endswith("...") for line in listed)
+    commands = text[text.index("Look at logs:") : text.index("Exit codes:")]
+    listed = re.split(r"\n  (?=\S)", commands.replace("\n\n", "\n"))[1:]
+    assert sorted(re.split(r"  +", entry)[0] for entry in listed) == sorted(COMMANDS)
+    assert all(entry.splitlines()[0] and "..." not in entry for entry in listed)
+    assert all(re.search(r"\.(\n[A-Z].*:)?\s*$", entry) for entry in listed)
 
 
 #: Asks for help of all commands in one process, at two widths, and says after each what it has loaded.
@@ -70,10 +73,8 @@ def test_help_says_what_the_command_does(command: str, width: int, helps: dict[s
     text = helps[command][str(width)]
     assert f"Usage: pdhef {command} [OPTIONS]" in text
     assert all(len(line) <= width for line in text.splitlines())
-    assert not {"--vehicle", "--model", "--calibration"} & set(text.split()) or command == "simulate"
-    if command != "estimators":
-        examples = text[text.index("Examples:") :].splitlines()[1:]
-        assert examples[0].startswith(f"    pdhef {command} ")
+    examples = text[text.index("Examples:") :].splitlines()[1:]
+    assert f"{examples[0]} ".startswith(f"    pdhef {command} ")
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS])
@@ -187,7 +188,7 @@ def test_removed_commands_name_the_one_that_does_their_work(command: str) -> Non
 def test_bare_command_shows_its_help() -> None:
     result = called()
     assert result.returncode == 2
-    assert "Commands:" in result.stderr
+    assert "Look at logs:" in result.stderr
 
 
 def test_interrupt_is_one_line_and_exit_code_130() -> None:
@@ -201,6 +202,48 @@ def test_interrupt_is_one_line_and_exit_code_130() -> None:
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert result.returncode == 130
     assert "interrupted; nothing half-written" in _one_line_error(result)
+
+
+def test_settings_are_those_of_the_file_and_options_win(tmp_path: Path) -> None:
+    from pdhef_logtool.cli.options import run_config
+
+    file = tmp_path / "pdhef.toml"
+    file.write_text('sensors = "esp"\nbudget = 2\n')
+    given = {"config_file": file, "assignments": ["budget=3.5", "waived=imu.mounting", "msgs=types/", "friction=0.4"]}
+    config = run_config({**given, "friction": "0.9", "estimators": "zero, phy-ukf,"})
+    assert (config.sensors, config.budget, config.waived, config.msgs) == ("esp", 3.5, ("imu.mounting",), Path("types"))
+    assert (config.friction, config.estimators) == (0.9, ("zero", "phy-ukf"))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("budgt=2", r"--set: expected KEY=VALUE .*, got budgt=2; did you mean budget\?"),
+        ("budget", "--set: expected KEY=VALUE"),
+        ("budget=high", "got budget: should be a valid number, got 'high'"),
+        ("sensors=all", "sensors: should be 'full' or 'esp'"),
+    ],
+)
+def test_a_wrong_setting_is_one_line(text: str, expected: str) -> None:
+    from pdhef_logtool.cli.options import run_config
+    from pdhef_logtool.records.errors import UsageError
+
+    with pytest.raises(UsageError, match=expected) as error:
+        run_config({"assignments": [text]})
+    assert "\n" not in str(error.value)
+
+
+def test_quiet_leaves_errors_and_results_and_verbose_shows_progress(sample_logs_dir: Path, tmp_path: Path) -> None:
+    car, log = str(sample_logs_dir / "vehicle.toml"), str(sample_logs_dir / "no_truth.mcap")
+    run = ("run", log, "--car", car, "-e", "zero", "--end", "2", "--annotate", "none", "--no-report", "-o")
+    plain, quiet = called(*run, str(tmp_path / "a")), called(*run, str(tmp_path / "b"), "--quiet")
+    verbose = called("--verbose", *run, str(tmp_path / "c"))
+    assert quiet.returncode == plain.returncode == verbose.returncode
+    assert quiet.stderr == ""
+    assert quiet.stdout.replace(str(tmp_path / "b"), "") == plain.stdout.replace(str(tmp_path / "a"), "")
+    assert "no_truth" in verbose.stderr
+    assert called("run", str(tmp_path / "none"), "-o", str(tmp_path / "d"), "-q").stderr.startswith("pdhef: ")
+    assert called("-q", "--verbose", "run", log, "-o", str(tmp_path / "e")).returncode == 2
 
 
 @pytest.mark.slow

@@ -58,7 +58,7 @@ def test_the_fix_quality_gates_the_rtk_truth(tmp_path: Path) -> None:
     log, mapping, out = tmp_path / "gap.mcap", tmp_path / "mapping.toml", tmp_path / "out"
     made = called("simulate", "step-steer", "--fault", "lost:rtk:2:4", "-o", str(log))
     assert made.returncode == 0, made.stderr
-    found = called("inspect", str(log), "--prefer-truth", "rtk", "--write-mapping", str(mapping))
+    found = called("inspect", str(log), "--set", "prefer_truth=rtk", "--write-mapping", str(mapping))
     assert found.returncode == 0, found.stderr
     gate = '[truth_quality]\ntopic = "/rtk/quality"\nfield = "quality"\nvalues = [4]\n'
     mapping.write_text(mapping.read_text() + "\n" + gate)
@@ -86,7 +86,7 @@ def test_all_manoeuvres_are_listed_and_the_help_tells_of_faults() -> None:
 )
 def test_sets_have_a_help_of_their_own(command: str, own: set[str]) -> None:
     text = called("simulate", command, "--help").stdout
-    options = text[text.index("Options:") : text.index("Examples:")]
+    options = text[: text.index("Examples:")]
     assert set(re.findall(r"^  (?:-\w, )?(--[\w-]+)", options, re.MULTILINE)) == own
     assert f"pdhef simulate {command}" in called("simulate", "--help", env={"COLUMNS": "80"}).stdout
 

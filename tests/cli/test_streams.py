@@ -29,7 +29,7 @@ def test_a_reader_that_has_had_enough_hears_nothing(sample_logs_dir: Path, argum
 
 @pytest.mark.slow
 @pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")
-@pytest.mark.parametrize("arguments", [["simulate", "--list"], ["estimators", "--json"], ["--help"], ["--version"]])
+@pytest.mark.parametrize("arguments", [["simulate", "--list"], ["run", "--list-estimators"], ["--help"], ["--version"]])
 def test_an_output_that_takes_nothing_is_one_line(arguments: list[str]) -> None:
     with FULL.open("w") as full:
         done = subprocess.run([*PDHEF, *arguments], stdout=full, stderr=subprocess.PIPE, text=True, check=False)

@@ -242,7 +242,7 @@ def test_an_estimator_of_another_package_runs_under_its_name(tmp_path: Path, sam
     valid = rows.filter("valid")
     assert len(valid) > 900
     assert np.abs(valid["vy_m_s"].to_numpy()).max() > 0.05
-    listed = _python(tmp_path, "-m", "pdhef_logtool", "estimators")
+    listed = _python(tmp_path, "-m", "pdhef_logtool", "run", "--list-estimators")
     assert "half-slip" in listed.stdout
 
 

@@ -57,5 +57,5 @@ def test_the_bound_is_of_a_cache_that_is_a_folder() -> None:
         "annotate": "sidecar"
     }
     for cache in ({}, {"cache": "s3://cars/slim"}):
-        with pytest.raises(UsageError, match="--cache-max: expected --cache DIR"):
+        with pytest.raises(UsageError, match="cache_max_gb: expected --cache DIR"):
             load_config(None, {**cache, "cache_max_gb": 2.0})

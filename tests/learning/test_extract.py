@@ -432,7 +432,7 @@ def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
     assert result.stderr.splitlines() == ["warning: dlc: perfect truth taken; /rtk/fix, /rtk/odometry not used"]
     (drive,) = read_dataset(out).drives
     assert drive.usable_rows > 0.99 * drive.rows
-    rtk = called("extract", log, "-o", str(tmp_path / "rtk"), "--prefer-truth", "rtk", "--split", "train", "--json")
+    rtk = called("extract", log, "-o", str(tmp_path / "rtk"), "--set", "prefer_truth=rtk", "--split", "train", "--json")
     assert rtk.returncode == 0, rtk.stderr
     document = json.loads(rtk.stdout)
     jsonschema.validate(document["manifest"], SCHEMA)

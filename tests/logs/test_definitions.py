@@ -62,7 +62,7 @@ def test_a_missing_definition_is_the_cause_that_is_told(tmp_path: Path) -> None:
     log = open_log(path)
     assert log.fields("/steer") == ()
     assert "no definition of dbw_msgs/Steer" in log.unreadable("/steer")
-    with pytest.raises(MappingError, match="no definition of dbw_msgs/Steer; give --msgs DIR"):
+    with pytest.raises(MappingError, match=r"no definition of dbw_msgs/Steer; give its \.msg file by --set msgs=DIR"):
         choose_mapping(log, None, prefer_truth="perfect")
 
 

@@ -183,7 +183,7 @@ def test_decompression_stops_where_the_claim_ends(compression: str, monkeypatch:
             decompress(compression, stored, size, DEFAULT_BUDGET)
     with pytest.raises(SpanDamageError):
         decompress(compression, stored[:-10], 5000, DEFAULT_BUDGET)
-    with pytest.raises(BudgetError, match="--budget"):
+    with pytest.raises(BudgetError, match="--set budget"):
         decompress(compression, stored, 5000, Budget(chunk_bytes=4999))
     # By ratio: a hundred kilobytes of nothing may not become gigabytes, whatever is claimed.
     with pytest.raises(BudgetError, match="chunk ratio"):
@@ -256,7 +256,7 @@ def test_a_log_that_takes_too_long_loses_its_rest(tmp_path: Path, monkeypatch: p
     log.read_stamps()
     (loss,) = log.lost
     assert (loss.kind, loss.count) == ("over-budget", sum(sum(s.counts.values()) for s in container.spans[3:]))
-    assert "--budget" in loss.what
+    assert "--set budget" in loss.what
     (ledger,) = log.byte_ledgers
     assert ledger.lost == sum(end - at for at, end in map(container.extent, container.spans[3:]))
     log.close()

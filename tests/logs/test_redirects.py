@@ -87,7 +87,7 @@ def test_a_redirect_to_another_private_host_is_refused(server: CountingServer, t
         with pytest.raises(LogError) as refused:
             use(place)
         assert "a redirect to " in refused.value.got
-        assert "--allow-private-redirects" in refused.value.remedy
+        assert "allow_private_redirects=true" in refused.value.remedy
         assert "\n" not in str(refused.value)
     assert {r.path for r in server.requests} == {"away.mcap"}, "nothing else was asked for"
 
@@ -121,9 +121,9 @@ def test_an_option_allows_it(server: CountingServer, tmp_path: Path, monkeypatch
         assert drive.losses == ()
     options = ("-o", tmp_path / "out", "-e", "zero", "--annotate", "none", "--keep", "metrics", "--no-report")
     assert _exit_code("run", url, *options) == EXIT_FAILURE
-    assert _exit_code("run", url, *options, "--allow-private-redirects") == EXIT_OK
+    assert _exit_code("run", url, *options, "--set", "allow_private_redirects=true") == EXIT_OK
     assert _exit_code("inspect", url) == EXIT_FAILURE
-    assert _exit_code("inspect", url, "--fields", "--allow-private-redirects") == EXIT_OK
+    assert _exit_code("inspect", url, "--fields", "--set", "allow_private_redirects=true") == EXIT_OK
     (tmp_path / "pdhef.toml").write_text("allow_private_redirects = true\n")
     monkeypatch.chdir(tmp_path)
     assert _exit_code("inspect", url) == EXIT_OK

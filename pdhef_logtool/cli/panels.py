@@ -1,0 +1,65 @@
+"""Help texts in panels: commands and options under the heading of their group."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from typer.core import TyperCommand, TyperGroup
+
+#: The groups of commands, in the order of the help.
+LOOK, RUN, READ, LEARN, TOOLS = "Look at logs", "Run and score", "Read results", "Learn", "Tools"
+
+
+class PanelCommand(TyperCommand):
+    """A command whose options are listed by their ``rich_help_panel``."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the arguments, the options without a panel, then each panel."""
+        records = [(_panel_of(p), p.get_help_record(ctx)) for p in self.get_params(ctx)]
+        _write(formatter, records, "Options")
+
+
+class CommandGroup(TyperGroup):
+    """A group with panels, whose commands may have names of two words: ``simulate suite`` beside ``simulate dlc``."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the global options, then the commands."""
+        records = [("Options", p.get_help_record(ctx)) for p in self.get_params(ctx)]
+        _write(formatter, records, "Options")
+        self.format_commands(ctx, formatter)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands by panel."""
+        commands = [(name, c) for name in self.list_commands(ctx) if (c := self.get_command(ctx, name)) is not None]
+        records = [(getattr(c, "rich_help_panel", ""), (name, c.get_short_help_str(200))) for name, c in commands]
+        for panel in (LOOK, RUN, READ, LEARN, TOOLS):
+            _write(formatter, [r for r in records if r[0] == panel], panel)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Take the first word behind the command that is no option as the second word of its name, where it is one."""
+        family = [c for name, c in self.commands.items() if name.split()[0] == args[0]]
+        valued = {o for c in family for p in c.params if not getattr(p, "is_flag", False) for o in p.opts}
+        words = (i for i in range(1, len(args)) if not args[i].startswith("-") and args[i - 1] not in valued)
+        second = next(words, 0)
+        if second and f"{args[0]} {args[second]}" in self.commands:
+            args = [f"{args[0]} {args[second]}", *args[1:second], *args[second + 1 :]]
+        return super().resolve_command(ctx, args)
+
+
+def _panel_of(parameter: Any) -> str:
+    if parameter.param_type_name == "argument":
+        return "Arguments"
+    return getattr(parameter, "rich_help_panel", None) or "Options"
+
+
+def _write(formatter: Any, records: Iterable[tuple[str, tuple[str, str] | None]], first: str) -> None:
+    """Write a section for each panel: arguments, ``first``, then the others in the order of their first record."""
+    panels: dict[str, list[tuple[str, str]]] = {"Arguments": [], first: []}
+    for panel, record in records:
+        if record is not None:
+            panels.setdefault(panel, []).append(record)
+    for panel, rows in panels.items():
+        if rows:
+            with formatter.section(panel):
+                formatter.write_dl(rows)
