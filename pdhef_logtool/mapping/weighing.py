@@ -28,10 +28,10 @@ from pdhef_logtool.mapping.candidates import (
 from pdhef_logtool.mapping.checking import has_path
 from pdhef_logtool.mapping.evidence import Fit, fit, is_of_both_signs, is_of_one_sign, ratio, spread
 from pdhef_logtool.mapping.fields import CLEAR, Fields, mean_of
-from pdhef_logtool.mapping.nameless import identified, nameless_columns, wanted_nameless
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.signs import SLOW_M_S, WITNESSES, WORDS, judge_signs
 from pdhef_logtool.mapping.units import RADII_M, decide_units
+from pdhef_logtool.mapping.unlabelled_fields import identified, nameless_columns, wanted_nameless
 from pdhef_logtool.mapping.vendors import Vendors
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, FloatArray

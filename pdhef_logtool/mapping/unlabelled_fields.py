@@ -19,7 +19,7 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.candidates import MOST_FIELDS, Found, Role, stamp_of
 from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, is_of_both_signs, ratio, spread
 from pdhef_logtool.mapping.fields import EXCITED_A_M_S2, Fields
-from pdhef_logtool.mapping.naming import G_M_S2, Meaning, is_command, meaning_of, says_nothing
+from pdhef_logtool.mapping.naming import G_M_S2, Meaning, is_command, is_unlabelled, meaning_of
 from pdhef_logtool.mapping.path import path_speed
 from pdhef_logtool.records.signals import FloatArray
 
@@ -114,7 +114,7 @@ def nameless_columns(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], pi
             alone = topic.name if len(numbers) == 1 and not path.endswith("[]") else ""
             if path.count("[]") > path.endswith("[]") or meaning_of(topic.name, topic.type_name, path) is not None:
                 continue
-            if says_nothing(path) and says_nothing(alone):
+            if is_unlabelled(path) and is_unlabelled(alone):
                 requests.setdefault(topic.name, []).append(path.removesuffix("[]"))
     if not requests:
         return []
