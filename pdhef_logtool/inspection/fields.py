@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.mapping.evidence import PIECE_NS, Pieces
+from pdhef_logtool.mapping.evidence import PIECE_NS, Pieces, Seen
 from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import FloatArray
@@ -26,6 +27,8 @@ from pdhef_logtool.records.signals import FloatArray
 if TYPE_CHECKING:
     from rich.console import Console
 
+#: Arrays inside of arrays, or of structs.
+INNER_ARRAY = re.compile(r"\[\].")
 #: Fields of one topic that are read.
 MOST_FIELDS = 2000
 
@@ -89,14 +92,11 @@ def fields_of_log(
 
 
 def _topic_fields(log: DriveLog, pieces: Pieces, topic: TopicInfo) -> TopicFields:
-    lines = collapsed(log.fields(topic.name))
-    lines = [line for line in lines if all(p.count("[]") == p.endswith("[]") for p in line[2])][:MOST_FIELDS]
+    lines = [line for line in collapsed(log.fields(topic.name)) if not any(map(INNER_ARRAY.search, line[2]))]
+    lines = lines[:MOST_FIELDS]
     paths = {p.removesuffix("[]") for _, _, every in lines for p in every}
     samples = pieces.read({topic.name: [*paths]}) if paths and topic.messages else {}
-    values: dict[str, list[FloatArray]] = {}
-    for (_, path), sample in samples.items():
-        for name in {path} if path in paths else {path, INDEX.sub("", path)}:
-            values.setdefault(name, []).append(sample.values)
+    values = _values_by_path(samples, paths)
     reports = []
     for line, kind, every in lines:
         parts = [v for p in every for v in values.get(p.removesuffix("[]"), [])]
@@ -110,6 +110,15 @@ def _topic_fields(log: DriveLog, pieces: Pieces, topic: TopicInfo) -> TopicField
     rate_hz = max((sample.rate_hz for sample in samples.values()), default=float("nan"))
     name = topic.type_name.replace("/msg/", "/")
     return TopicFields(topic.name, name, topic.messages, rate_hz, tuple(reports), reason)
+
+
+def _values_by_path(samples: Mapping[tuple[str, str], Seen], paths: set[str]) -> dict[str, list[FloatArray]]:
+    """Return values by path; those of an array's elements by the array's path as well."""
+    values: dict[str, list[FloatArray]] = {}
+    for (_, path), sample in samples.items():
+        for name in {path} if path in paths else {path, INDEX.sub("", path)}:
+            values.setdefault(name, []).append(sample.values)
+    return values
 
 
 def _report(path: str, kind: str, values: Sequence[FloatArray]) -> FieldReport:
