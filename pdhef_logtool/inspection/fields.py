@@ -1,8 +1,9 @@
-"""Every number that a log holds: its type, how often it comes, and its least, mean and largest value."""
+"""All numeric fields of a log: type, rate, and minimum, mean and maximum."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +19,16 @@ from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.mapping.evidence import PIECE_NS, Pieces
+from pdhef_logtool.mapping.evidence import PIECE_NS, Pieces, Seen
 from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.signals import FloatArray
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+#: Arrays inside of arrays, or of structs.
+INNER_ARRAY = re.compile(r"\[\].")
 #: Fields of one topic that are read.
 MOST_FIELDS = 2000
 
@@ -42,7 +46,7 @@ class FieldReport:
 
 @dataclass(frozen=True, slots=True)
 class TopicFields:
-    """The fields of a topic; ``reason`` says why none is known."""
+    """The fields of a topic; ``reason`` is given where there are none."""
 
     name: str
     type: str
@@ -54,7 +58,7 @@ class TopicFields:
 
 @dataclass(frozen=True, slots=True)
 class FieldsOfLog:
-    """What :func:`fields_of_log` found; ``seconds`` of the log were read for it, ``whole`` if that is all of it."""
+    """Fields by topic over ``seconds`` of the log; ``whole`` if that is all of it."""
 
     path: str
     topics: tuple[TopicFields, ...]
@@ -69,12 +73,12 @@ class FieldsOfLog:
 def fields_of_log(
     path: LogPlace | str, topic: str | None = None, *, budget: Budget = DEFAULT_BUDGET, msgs: Path | str | None = None
 ) -> FieldsOfLog:
-    """Read the numbers of a topic, or of all, in a few pieces of the log.
+    """Return the numeric fields of a topic, or of all, over a few pieces of the log.
 
     Raises
     ------
     LogError : The file is no log.
-    UsageError : It has no such topic.
+    UsageError : The log has no such topic.
     """
     with closing(open_log(path, budget, msgs, Wanted(frozenset()))) as log:
         topics = [t for t in log.topics if topic in (None, t.name)]
@@ -88,30 +92,36 @@ def fields_of_log(
 
 
 def _topic_fields(log: DriveLog, pieces: Pieces, topic: TopicInfo) -> TopicFields:
-    known = log.fields(topic.name)
-    name = topic.type_name.replace("/msg/", "/")
-    nothing = "it has no messages" if not topic.messages else log.unreadable(topic.name) or "it holds no numbers"
-    lines = [line for line in collapsed(known) if all(p.count("[]") == p.endswith("[]") for p in line[2])][:MOST_FIELDS]
-    paths = [p.removesuffix("[]") for _, _, every in lines for p in every]
-    read = pieces.read({topic.name: paths}) if paths and topic.messages else {}
-    by_path: dict[str, list[np.ndarray[Any, Any]]] = {}
-    for (_, path), seen in read.items():
-        by_path.setdefault(path, []).append(seen.values)
-        if path not in paths:
-            by_path.setdefault(INDEX.sub("", path), []).append(seen.values)
-    rate = max((seen.rate_hz for seen in read.values()), default=float("nan"))
+    lines = [line for line in collapsed(log.fields(topic.name)) if not any(map(INNER_ARRAY.search, line[2]))]
+    lines = lines[:MOST_FIELDS]
+    paths = {p.removesuffix("[]") for _, _, every in lines for p in every}
+    samples = pieces.read({topic.name: [*paths]}) if paths and topic.messages else {}
+    values = _values_by_path(samples, paths)
     reports = []
     for line, kind, every in lines:
-        one = [v for p in every for v in by_path.get(p.removesuffix("[]"), [])]
-        reports.append(_report(line, kind, one))
-        if line.endswith("[]") and len(one) > 1 and not COVARIANCE.search(line):
-            columns = [p for p in by_path if INDEX.sub("", p) == line.removesuffix("[]") and p not in paths]
-            reports += [_report(p, kind, by_path[p]) for p in columns]
-    reason = "" if reports and topic.messages else nothing
-    return TopicFields(topic.name, name, topic.messages, rate, tuple(reports), reason)
+        parts = [v for p in every for v in values.get(p.removesuffix("[]"), [])]
+        reports.append(_report(line, kind, parts))
+        if line.endswith("[]") and len(parts) > 1 and not COVARIANCE.search(line):
+            columns = [p for p in values if INDEX.sub("", p) == line.removesuffix("[]") and p not in paths]
+            reports += [_report(p, kind, values[p]) for p in columns]
+    reason = ""
+    if not (reports and topic.messages):
+        reason = log.unreadable(topic.name) or "no numeric fields" if topic.messages else "no messages"
+    rate_hz = max((sample.rate_hz for sample in samples.values()), default=float("nan"))
+    name = topic.type_name.replace("/msg/", "/")
+    return TopicFields(topic.name, name, topic.messages, rate_hz, tuple(reports), reason)
 
 
-def _report(path: str, kind: str, values: Sequence[np.ndarray[Any, Any]]) -> FieldReport:
+def _values_by_path(samples: Mapping[tuple[str, str], Seen], paths: set[str]) -> dict[str, list[FloatArray]]:
+    """Return values by path; those of an array's elements by the array's path as well."""
+    values: dict[str, list[FloatArray]] = {}
+    for (_, path), sample in samples.items():
+        for name in {path} if path in paths else {path, INDEX.sub("", path)}:
+            values.setdefault(name, []).append(sample.values)
+    return values
+
+
+def _report(path: str, kind: str, values: Sequence[FloatArray]) -> FieldReport:
     every = np.concatenate([np.empty(0), *values])
     every = every[np.isfinite(every)]
     if every.shape[0] == 0:
@@ -120,17 +130,17 @@ def _report(path: str, kind: str, values: Sequence[np.ndarray[Any, Any]]) -> Fie
         return FieldReport(path, kind, float(every.min()), float(every.mean()), float(every.max()))
 
 
-def render_fields(found: FieldsOfLog, console: Console) -> None:
+def render_fields(report: FieldsOfLog, console: Console) -> None:
     """Print a table a topic, for a terminal of 80 columns or more."""
-    console.print(Text(found.path, "bold"), soft_wrap=True)
-    part = "all" if found.whole else "pieces"
-    console.print(f"values over {part} of the log, {found.seconds:.0f} s, in the units that it holds them in")
-    for topic in found.topics:
+    console.print(Text(report.path, "bold"), soft_wrap=True)
+    part = "all" if report.whole else "pieces"
+    console.print(f"Values over {part} of the log, {report.seconds:.0f} s, in recorded units.")
+    for topic in report.topics:
         title = f"{topic.name} ({topic.type}), {number_text(topic.rate_hz)} Hz"
         table = empty_table(title, "field", "type", "min", "mean", "max", words=2)
-        for one in topic.fields:
-            numbers = (number_text(v) for v in (one.minimum, one.mean, one.maximum))
-            table.add_row(Text(one.path), one.type, *numbers)
+        for row in topic.fields:
+            numbers = (number_text(v) for v in (row.minimum, row.mean, row.maximum))
+            table.add_row(Text(row.path), row.type, *numbers)
         if topic.fields and not topic.reason:
             console.print(table)
         else:

@@ -285,26 +285,7 @@ def inspect_drive_log(
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
     looked_at = survey_log(log, mapping, clocks, head)
     mapping = looked_at.mapping
-    steps = {t.name: StepStatistics() for t in log.topics}
-    delays = {t.name: DelayStatistics() for t in log.topics}
-    gathered: dict[tuple[str, str], _Gathered] = {}
-    losses: list[tuple[Loss, ...]] = []
-    if look.by_index is not None:
-        for start, end in windows(log.start_ns, log.end_ns, WINDOW_NS, log.occupied):
-            for name, times in look.by_index.index_times(start, end).items():
-                steps[name].add(times)
-    for start, end in look.windows:
-        if look.sample is not None:  # nothing is known of what lies between two windows
-            for one in (*(steps.values() if look.by_index is None else ()), *(g.steps for g in gathered.values())):
-                one.last_ns = None
-        channels = read_signals(log, mapping, clocks, start, end, stamps=look.stamps)
-        for name, columns in channels.stamps.items():
-            if look.by_index is None:
-                steps[name].add(columns.log_time_ns)
-            delays[name].add(columns.log_time_ns, columns.publish_time_ns)
-        losses.append(channels.losses)
-        _gather(channels, gathered)
-    reading = merge_losses(losses)
+    steps, delays, gathered, reading = _read_windows(log, mapping, clocks, look)
     signals, truth = (
         {n: _signal_report(s, section, gathered, clocks, reading, log, mapping.quality) for n, s in sources.items()}
         for section, sources in (("signals", mapping.signals), ("truth", mapping.truth))
@@ -330,6 +311,32 @@ def inspect_drive_log(
         sample=None if look.sample is None else look.sample(),
         checksummed_share=checksummed_share(log.byte_ledgers),
     )
+
+
+def _read_windows(
+    log: DriveLog, mapping: Mapping, clocks: dict[str, ClockModel], look: _Look
+) -> tuple[dict[str, StepStatistics], dict[str, DelayStatistics], dict[tuple[str, str], _Gathered], tuple[Loss, ...]]:
+    """Return steps and delays by topic, statistics by section and signal, and losses."""
+    steps = {t.name: StepStatistics() for t in log.topics}
+    delays = {t.name: DelayStatistics() for t in log.topics}
+    gathered: dict[tuple[str, str], _Gathered] = {}
+    losses: list[tuple[Loss, ...]] = []
+    if look.by_index is not None:
+        for start, end in windows(log.start_ns, log.end_ns, WINDOW_NS, log.occupied):
+            for name, times in look.by_index.index_times(start, end).items():
+                steps[name].add(times)
+    for start, end in look.windows:
+        if look.sample is not None:  # windows of a sample are not contiguous
+            for stream in (*(steps.values() if look.by_index is None else ()), *(g.steps for g in gathered.values())):
+                stream.last_ns = None
+        channels = read_signals(log, mapping, clocks, start, end, stamps=look.stamps)
+        for name, columns in channels.stamps.items():
+            if look.by_index is None:
+                steps[name].add(columns.log_time_ns)
+            delays[name].add(columns.log_time_ns, columns.publish_time_ns)
+        losses.append(channels.losses)
+        _gather(channels, gathered)
+    return steps, delays, gathered, merge_losses(losses)
 
 
 # ------------------------------------------------------------------------------------------------ what is read

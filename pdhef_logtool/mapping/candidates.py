@@ -8,7 +8,7 @@ taken one (its unit, its sign) becomes a check that is undecided. Other candidat
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
@@ -238,41 +238,44 @@ def look(
             paths = requests.setdefault(source.topic, [])
             paths += [p for p in source.paths if p not in paths]
     pieces = Pieces(log)
-    read = pieces.read(requests)
-    found: list[Found] = []
-    for topic, role, info, meaning, documented in named:
-        path = info.path.removesuffix("[]")
-        names = [path] if (topic.name, path) in read else [f"{path}[{i}]" for i in range(MOST_COLUMNS)]
-        for name in names:
-            seen = read.get((topic.name, name))
-            its = meaning if name == path else meaning_of(topic.name, topic.type_name, name, info.unit)
-            if its is None and meaning.quantity == "speed":
-                # One number of several under a name of one: which of them it is, values alone can tell.
-                its = replace(meaning, strength=0.5)
-            if seen is None or its is None or not np.isfinite(seen.values).any():
-                continue
-            stamp = stamp_of(log.fields(topic.name, quiet=True), name)
-            if role == "sensor" and set(words_of(name)) & _NAVIGATION:
-                role = "navigation"
+    samples = pieces.read(requests)
+    weighable = [one for entry in named for one in _weighable(log, entry, samples, vendors) if one.factors]
+    return pieces, weighable + sources_found(log, sources, samples)
+
+
+def _weighable(
+    log: DriveLog, named: Named, samples: Mapping[tuple[str, str], Seen], vendors: Vendors
+) -> Iterator[Found]:
+    """Yield a field, or each element of an array that has a meaning."""
+    topic, role, info, meaning, documented = named
+    fields = log.fields(topic.name, quiet=True)
+    path = info.path.removesuffix("[]")
+    for name in [path] if (topic.name, path) in samples else [f"{path}[{i}]" for i in range(MOST_COLUMNS)]:
+        seen = samples.get((topic.name, name))
+        its = meaning if name == path else meaning_of(topic.name, topic.type_name, name, info.unit)
+        if its is None and meaning.quantity == "speed":
+            its = replace(meaning, strength=0.5)  # one of several elements: only its values can identify it
+        if seen is None or its is None or not np.isfinite(seen.values).any():
+            continue
+        if role == "sensor" and set(words_of(name)) & _NAVIGATION:
+            role = "navigation"
+        factors = _factors(its, seen)
+        if its.quantity == "wheel speed" and not factors:  # too large for a speed: rotational
+            its = replace(its, quantity="wheel rate")
             factors = _factors(its, seen)
-            if its.quantity == "wheel speed" and not factors:  # too large for a speed: it turns
-                its = replace(its, quantity="wheel rate")
-                factors = _factors(its, seen)
-            one = Found(topic, name, its, role, stamp, seen, factors)
-            if _is_nested_imu(topic, log.fields(topic.name, quiet=True), name):
-                one.known = True
-                one.reasons.append("a nested sensor_msgs/Imu, in SI units")
-            if documented:
-                _document(one, vendors.fields_of(topic.type_name)[info.path])
-            elif its.scale is not None:
-                one.known = True
-                one.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")
-            if one.is_downward and not documented:
-                one.sign = -1.0
-                one.reasons.append("positive downward, as its name says")
-            if one.factors:
-                found.append(one)
-    return pieces, found + sources_found(log, sources, read)
+        one = Found(topic, name, its, role, stamp_of(fields, name), seen, factors)
+        if _is_nested_imu(topic, fields, name):
+            one.known = True
+            one.reasons.append("a nested sensor_msgs/Imu, in SI units")
+        if documented:
+            _document(one, vendors.fields_of(topic.type_name)[info.path])
+        elif its.scale is not None:
+            one.known = True
+            one.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")
+        if one.is_downward and not documented:
+            one.sign = -1.0
+            one.reasons.append("positive downward by its name")
+        yield one
 
 
 def _is_nested_imu(topic: TopicInfo, fields: tuple[FieldInfo, ...], path: str) -> bool:

@@ -100,31 +100,38 @@ def check_mapping(mapping: Mapping, log: DriveLog) -> None:
 
 def _field_problems(source: SignalSource, fields: tuple[FieldInfo, ...]) -> list[str]:
     kinds = {f.path: f.kind for f in fields}
-    problems = []
-    for path in source.paths:
-        kind = _kind_of(path, kinds)
-        if kind is None:
-            problems.append(f"{source.topic} has no field {path}{_near(path, set(kinds))}")
-        elif kind not in ("number", "bool", "struct"):
-            problems.append(f"{source.topic}.{path} is a {kind}, not a number")
-        elif kind == "struct" and (source.columns == 1 or len(source.paths) > 1):
-            below = next(p for p in kinds if p.startswith((f"{path}.", f"{path}[")))
-            problems.append(f"{source.topic}.{path} is no single number: name one, such as {below}")
-        elif kind != "struct" and source.columns > 1 and len(source.paths) == 1 and f"{path}[]" not in kinds:
-            problems.append(f"{source.topic}.{path} is one number, {source.name} needs {source.columns}")
-    if source.stamp in RECORDER_STAMPS or source.stamp == AUTO_STAMP:
-        return problems
-    kind = _kind_of(source.stamp, kinds)
+    problems = [_path_problem(source, path, kinds) for path in source.paths]
+    if source.stamp not in (*RECORDER_STAMPS, AUTO_STAMP):
+        problems.append(_stamp_problem(source, kinds))
+    return [problem for problem in problems if problem]
+
+
+def _path_problem(source: SignalSource, path: str, kinds: dict[str, str]) -> str:
+    kind = _kind_of(path, kinds)
+    if kind is None:
+        return f"{source.topic} has no field {path}{_near(path, set(kinds))}"
+    if kind not in ("number", "bool", "struct"):
+        return f"{source.topic}.{path} is a {kind}, not a number"
+    if kind == "struct" and (source.columns == 1 or len(source.paths) > 1):
+        below = next(p for p in kinds if p.startswith((f"{path}.", f"{path}[")))
+        return f"{source.topic}.{path} is no single number: name one, such as {below}"
+    if kind != "struct" and source.columns > len(source.paths) == 1 and f"{path}[]" not in kinds:
+        return f"{source.topic}.{path} is one number, {source.name} needs {source.columns}"
+    return ""
+
+
+def _stamp_problem(source: SignalSource, kinds: dict[str, str]) -> str:
+    stamp, kind = f"{source.topic}.{source.stamp}", _kind_of(source.stamp, kinds)
     if kind is None:
         times = {p for p, k in kinds.items() if k == "time"} | set(RECORDER_STAMPS)
-        problems.append(f"{source.topic} has no stamp {source.stamp}{_near(source.stamp, times)}")
-    elif source.stamp_unit == "ros" and kind == "number":
-        problems.append(f"stamp {source.topic}.{source.stamp} is a number: give stamp_unit (s, ms, us or ns)")
-    elif source.stamp_unit == "ros" and kind == "struct" and split_stamp(source.stamp, set(kinds)) is None:
-        problems.append(f"stamp {source.topic}.{source.stamp} is no time")
-    elif source.stamp_unit != "ros" and kind != "number":
-        problems.append(f'stamp {source.topic}.{source.stamp} is a {kind}: stamp_unit = "{source.stamp_unit}" is wrong')
-    return problems
+        return f"{source.topic} has no stamp {source.stamp}{_near(source.stamp, times)}"
+    if source.stamp_unit != "ros":
+        return "" if kind == "number" else f'stamp {stamp} is a {kind}: stamp_unit = "{source.stamp_unit}" is wrong'
+    if kind == "number":
+        return f"stamp {stamp} is a number: give stamp_unit (s, ms, us or ns)"
+    if kind == "struct" and split_stamp(source.stamp, set(kinds)) is None:
+        return f"stamp {stamp} is no time"
+    return ""
 
 
 def _kind_of(path: str, kinds: dict[str, str]) -> str | None:

@@ -66,27 +66,31 @@ def choose_estimates(
         raise UsageError(expected="a name of an estimator", got=repr(name), where="--name")
     if flags:
         signals, covariance = sources_of(log, flags, ESTIMATE_UNITS, "--estimate")
-        if not set(signals) & set(BASE_ORDER):
-            raise UsageError(expected=f"one of {', '.join(BASE_ORDER)}", got=", ".join(signals), where="--estimate")
-        base = next(signals[s] for s in BASE_ORDER if s in signals)
+        base = _base(signals, "--estimate")
         if covariance is not None and (base.topic != covariance.topic or set(STDS) & set(signals)):
-            covariance = None  # it belongs to other stamps, or named deviations win over it
+            covariance = None  # its stamps are not those of the estimate, or the flags name standard deviations
         return (EstimateSource(name or _name_of(base.topic), signals, covariance, can),)
-    chosen = {n: dict(t) for n, t in tables.items() if name is None or n == name}
+    chosen = {n: dict(t) for n, t in tables.items() if name in (None, n)}
     if not chosen:
-        got = "none" if name is None else f"none called {name!r}" + (f" but {', '.join(tables)}" if tables else "")
+        others = f" but {', '.join(tables)}" if tables else ""
         raise UsageError(
             expected="an estimate to score",
-            got=got,
+            got="none" if name is None else f"none called {name!r}{others}",
             where="pdhef metrics",
             remedy="give --estimate [SIGNAL=]TOPIC.FIELD, or [estimates.NAME.SIGNAL] tables in a mapping file",
         )
     for n, signals in chosen.items():
-        if not set(signals) & set(BASE_ORDER):
-            raise UsageError(
-                expected=f"one of {', '.join(BASE_ORDER)}", got=", ".join(signals) or "none", where=f"estimates.{n}"
-            )
+        _base(signals, f"estimates.{n}")
     return tuple(EstimateSource(n, signals, can=can) for n, signals in chosen.items())
+
+
+def _base(signals: Mapping[str, SignalSource], where: str) -> SignalSource:
+    """Return the quantity that sets the estimate's stamps. Raises UsageError without one."""
+    base = next((signals[s] for s in BASE_ORDER if s in signals), None)
+    if base is None:
+        got = ", ".join(signals) or "none"
+        raise UsageError(expected=f"one of {', '.join(BASE_ORDER)}", got=got, where=where)
+    return base
 
 
 def _name_of(topic: str) -> str:

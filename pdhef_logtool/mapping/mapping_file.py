@@ -219,23 +219,32 @@ def _shape_problem(name: str, model: _SourceTable) -> str:
     fields = model.field if isinstance(model.field, list) else [model.field]
     if model.combine == "norm" and (columns > 1 or len(fields) < 2):
         return f'combine = "norm" is the length of two or more fields, {name} has {columns} columns of {len(fields)}'
-    if columns == 1 and isinstance(model.offset, list):
-        return f"offset must be a single value, {name} is no vector"
-    if columns == 1 and (len(fields) > 1 or isinstance(model.scale, list)):
-        # A component of a sensor that is mounted askew.
-        scales = model.scale if isinstance(model.scale, list) else []
-        if len(fields) == 1:
-            return f"scale must be a single value, {name} is no vector and has one field"
-        if len(scales) != len(fields):
-            return f"{name} is the sum of its fields, each times its scale: scale must hold {len(fields)} entries"
-    for key, value in (("field", model.field), ("scale", model.scale), ("offset", model.offset)):
-        if isinstance(value, list) and columns > 1 and len(value) != columns:
-            return f"{key} must hold {columns} entries, got {len(value)}"
-    if (columns > 1 or len(fields) > 1) and any(f.startswith(CAN_PREFIX) for f in fields):
+    problem = _vector_problem(columns, model) if columns > 1 else _scalar_problem(name, len(fields), model)
+    from_can = [f for f in fields if f.startswith(CAN_PREFIX)]
+    if not problem and from_can and (columns > 1 or len(fields) > 1):
         what = "is a vector" if columns > 1 else "has several fields"
-        return f"{name} {what}: frames of several signals do not come together"
-    if any(f.startswith(CAN_PREFIX) and f.count(".") != 1 for f in fields):
+        return f"{name} {what}: CAN signals of different frames have no common stamp"
+    if not problem and any(f.count(".") != 1 for f in from_can):
         return f"field must be {CAN_PREFIX}<message>.<signal>"
+    return problem
+
+
+def _vector_problem(columns: int, model: _SourceTable) -> str:
+    for key in ("field", "scale", "offset"):
+        value = getattr(model, key)
+        if isinstance(value, list) and len(value) != columns:
+            return f"{key} must have {columns} entries, got {len(value)}"
+    return ""
+
+
+def _scalar_problem(name: str, fields: int, model: _SourceTable) -> str:
+    if isinstance(model.offset, list):
+        return f"offset must be a single value, {name} is no vector"
+    if fields == 1 and isinstance(model.scale, list):
+        return f"scale must be a single value, {name} is no vector and has one field"
+    # The sum of several fields: a component of a sensor whose axes are not the car's.
+    if fields > 1 and not (isinstance(model.scale, list) and len(model.scale) == fields):
+        return f"{name} is the sum of its fields, each times its scale: scale must have {fields} entries"
     return ""
 
 
@@ -293,50 +302,53 @@ def mapping_to_toml(
     """
     notes = dict(comments or {})
     lines = [
-        "# Where each signal of the log comes from: value_SI = scale * raw + offset, measured at stamp - latency_s.",
+        "# Sources of the log's signals: value_SI = scale * raw + offset, measured at stamp - latency_s.",
         "# ISO 8855: x forward, y left, z up; angles and rates are positive to the left. See docs/formats.md.",
     ]
-    lines += _comment(notes.get("", ""))
-    for note in mapping.notes:
-        lines += _comment(note)
+    lines += _comment("\n".join([notes.get("", ""), *mapping.notes]))
     if mapping.can is not None:
         lines += ["", *_can_lines(mapping.can)]
     for section, sources, units in (("signals", mapping.signals, SIGNAL_UNITS), ("truth", mapping.truth, TRUTH_UNITS)):
         for name in (n for n in units if n in sources):
-            source = sources[name]
-            lines.append("")
-            lines += _comment(notes.get(f"{section}.{name}", notes.get(name, "")))
-            lines.append(f"[{section}.{name}]{' ' * max(1, 30 - len(section) - len(name))}# {units[name]}")
-            lines += _source_lines(source)
+            lines += ["", *_comment(notes.get(f"{section}.{name}", notes.get(name, "")))]
+            lines += [_header(section, name, 32), *_source_lines(sources[name])]
             lines += _alternative_lines(section, name, alternatives)
     for estimator, sources in mapping.estimates.items():
         for name in (n for n in ESTIMATE_UNITS if n in sources):
             lines += ["", f"[estimates.{_toml(estimator)}.{name}]  # {ESTIMATE_UNITS[name]}"]
             lines += _source_lines(sources[name])
     if mapping.quality is not None:
-        lines.append("")
-        lines += _comment(notes.get("truth_quality", "truth is kept where this holds"))
-        lines.append("[truth_quality]")
-        lines += _gate_lines(mapping.quality)
+        lines += ["", *_comment(notes.get("truth_quality", "Ground truth is used where this condition is met."))]
+        lines += ["[truth_quality]", *_gate_lines(mapping.quality)]
     missing = missing_signals(mapping)
     if missing:
         lines += ["", "# Not mapped. To add one, remove the # and name its topic and field:"]
-        for name in missing:
-            others = _alternative_lines("signals", name, alternatives)
-            if others:
-                lines += others
-                continue
-            lines += ["#", f"# [signals.{name}]{' ' * max(1, 21 - len(name))}# {SIGNAL_UNITS[name]}"]
-            lines += [f"# {text}" for text in _example_lines()]
-            lines += _comment(notes.get(name, ""))
+    for name in missing:
+        lines += _alternative_lines("signals", name, alternatives) or [
+            *_example("signals", name),
+            *_comment(notes.get(name, "")),
+        ]
     if not mapping.truth:
-        lines += ["", "# No truth is mapped. For a comparison name at least a body velocity, for example:"]
-        others = [line for name in TRUTH_UNITS for line in _alternative_lines("truth", name, alternatives)]
-        lines += others
-        for name in ("vx_m_s", "vy_m_s") if not others else ():
-            lines += ["#", f"# [truth.{name}]{' ' * max(1, 23 - len(name))}# {TRUTH_UNITS[name]}"]
-            lines += [f"# {text}" for text in _example_lines()]
+        lines += ["", "# No ground truth is mapped. For a comparison name at least a body velocity, for example:"]
+        lines += [line for name in TRUTH_UNITS for line in _alternative_lines("truth", name, alternatives)] or [
+            line for name in ("vx_m_s", "vy_m_s") for line in _example("truth", name)
+        ]
     return "\n".join(lines) + "\n"
+
+
+def _header(section: str, name: str, width: int) -> str:
+    return f"{f'[{section}.{name}]':{width}} # {(SIGNAL_UNITS | TRUTH_UNITS)[name]}"
+
+
+def _example(section: str, name: str) -> list[str]:
+    """Return a commented table for a signal that is not mapped."""
+    return [
+        "#",
+        f"# {_header(section, name, 30)}",
+        '# topic = "/..."',
+        '# field = "..."          # dotted path, [3] indexes an array',
+        "# scale = 1.0            # to SI and ISO 8855: 0.017453292519943295 for deg, 0.2777777777777778 for km/h",
+    ]
 
 
 def _alternative_lines(section: str, name: str, candidates: Sequence[Candidate]) -> list[str]:
@@ -362,14 +374,6 @@ def missing_signals(mapping: Mapping) -> tuple[str, ...]:
     if "speed_m_s" not in have and not any(name.startswith("wheel_speed_") for name in have):
         out.append("speed_m_s")
     return tuple(out)
-
-
-def _example_lines() -> list[str]:
-    return [
-        'topic = "/..."',
-        'field = "..."          # dotted path, [3] indexes an array',
-        "scale = 1.0            # to SI and ISO 8855: 0.017453292519943295 for deg, 0.2777777777777778 for km/h",
-    ]
 
 
 def _source_lines(source: SignalSource) -> list[str]:

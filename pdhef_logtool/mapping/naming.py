@@ -1,4 +1,4 @@
-"""What the name of a field says: the quantity, its axis or wheel, its unit, and who sent it.
+"""Names of fields: their quantity, axis or wheel, and unit.
 
 Nothing here looks at values. Names are cut into words (``WheelSpd_FL``, ``steeringangle``, ``latAccelG``) before they
 are looked up, so that the spelling of a recorder does not matter.
@@ -10,6 +10,7 @@ import math
 import re
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TypeAlias
 
 #: Gravity by which accelerations in g are written.
 G_M_S2 = 9.80665
@@ -34,7 +35,7 @@ UNITS: dict[str, dict[str, float]] = {
     "position": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3},
 }  # fmt: skip
 
-#: Units as a person reads them.
+#: Units as they are written in reports.
 UNIT_TEXTS = {
     "mps2": "m/s²", "ms2": "m/s²", "mss": "m/s²", "radps": "rad/s", "rads": "rad/s", "rps": "rad/s", "degps": "deg/s",
     "dps": "deg/s", "degs": "deg/s", "mps": "m/s", "ms": "m/s", "kmh": "km/h", "kph": "km/h", "kmph": "km/h",
@@ -75,22 +76,22 @@ _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 @lru_cache(maxsize=8192)
 def words_of(name: str) -> tuple[str, ...]:
     """Cut a name into lower-case words: at signs, at capitals, and where known words are written as one."""
-    found: list[str] = []
+    words: list[str] = []
     for letter, latin in (("ä", "ae"), ("ö", "oe"), ("ü", "ue"), ("Ä", "Ae"), ("Ö", "Oe"), ("Ü", "Ue")):
         name = name.replace(letter, latin)
     for part in re.split(r"[^A-Za-z0-9]+", name):
         if part.lower() in _SYNONYMS:
-            found += _SYNONYMS[part.lower()].split()
+            words += _SYNONYMS[part.lower()].split()
             continue
         if part.lower() in _LEXICON or part.lower() in _WHOLE:
-            found.append(part.lower())
+            words.append(part.lower())
             continue
         for piece in _CAMEL.findall(part):
-            found += _SYNONYMS[piece.lower()].split() if piece.lower() in _SYNONYMS else _unglued(piece.lower())
-    return tuple(found)
+            words += _SYNONYMS[piece.lower()].split() if piece.lower() in _SYNONYMS else _unglued(piece.lower())
+    return tuple(words)
 
 
-#: Words of other languages and of data bases of CAN, as those that stand for them here.
+#: Words of other languages and of CAN databases, and their English equivalents.
 _SYNONYMS = {
     "lenkradwinkel": "steering wheel angle", "lenkwinkel": "steering angle", "gierrate": "yaw rate",
     "giergeschwindigkeit": "yaw rate", "querbeschleunigung": "lateral acceleration",
@@ -127,17 +128,17 @@ def _unglued(piece: str) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """What a name says a field is.
+    """Quantity of a field by its name.
 
     Attributes
     ----------
     quantity : ``acceleration``, ``rate``, ``steering``, ``speed``, ``wheel speed``, ``sideslip``, ``heading``,
         ``course``, ``velocity``, ``position``, ``latitude`` or ``longitude``.
     part : axis (x, y, z), wheel (fl, fr, rl, rr), frame of a velocity (``lateral``), or kind of a steering angle
-        (``wheel``, ``road``); empty where the name does not say.
-    strength : 0 to 1, how much of the meaning stands in the field's own name rather than around it.
-    unit : word of the unit, empty where none stands there. scale : factor to SI that it stands for, None without one.
-    why : the words that say so.
+        (``wheel``, ``road``); empty where the name does not give it.
+    strength : 0 to 1; 1 where the field's name alone gives the quantity, less where its parents or its topic do.
+    unit : word of the unit, empty without one. scale : its factor to SI, None without one.
+    why : the name, for reports.
     """
 
     quantity: str
@@ -148,7 +149,7 @@ class Meaning:
     why: str
 
 
-#: Words that make a field no measurement of what stands beside them.
+#: Words that make a field no measurement of the quantity that its other words name.
 _NOT_VALUES = _set(
     """
     covariance cov std stddev sigma sdev accuracy acc_accuracy uncertainty uncert variance var bias biases
@@ -172,18 +173,14 @@ _CORNERS = {
     "frontleft": "fl", "frontright": "fr", "rearleft": "rl", "rearright": "rr",
     "lb": "rl", "rb": "rr",
 }  # fmt: skip
-#: Front and rear as German data bases write them; too short to say it of anything but wheels.
+#: Front and rear in German databases; too short to be unambiguous except beside a word for wheel.
 _GERMAN = {"vl": "fl", "vr": "fr", "hl": "rl", "hr": "rr"}
 _AXES = {
     "x": "x", "y": "y", "z": "z", "ax": "x", "ay": "y", "az": "z", "wx": "x", "wy": "y", "wz": "z", "long": "x",
     "lng": "x", "longitudinal": "x", "forward": "x", "lat": "y", "lateral": "y", "vert": "z", "vertical": "z",
     "trans": "y", "transverse": "y", "transversal": "y", "down": "z",
 }  # fmt: skip
-_AXIS_LETTERS = frozenset("xyz")
-_ROLLS = frozenset({"roll", "pitch"})
-
-
-#: Field names that say no more than that they are the topic's number.
+#: Words of a leaf that identifies no quantity: the topic's name does.
 _BARE = _set(
     """
     data value val angle ang rad deg degrees radians position pos actual measured v x y z mps kmh kph mph ms
@@ -193,24 +190,20 @@ _BARE = _set(
 )
 
 
-def _is_bare(own: tuple[str, ...]) -> bool:
-    return all(w in _BARE or not w.isalpha() for w in own)
-
-
 #: Words that leave a delta a steering angle; a delta of anything else is a difference.
 _OF_DELTA = _set(
     """
     delta rad deg degrees radians f front roadwheel roadwheels road wheel wheels steer steering measured actual mean
     """
 )
-#: Devices whose numbers are named like a car's and are none.
+#: Devices whose quantities have the names of a car's.
 _OTHER_DEVICES = _set(
     "joint joints arm camera lidar disparity image battery temperature esc gimbal turtle radar tracks"
 )
 
 
 def is_command(*names: str) -> bool:
-    """Return whether a topic, type or field calls itself what somebody asks for, not what is measured."""
+    """Return whether the name of a topic, type or field is that of a command, not of a measurement."""
     return any(_COMMANDS & set(words_of(n)) for n in names)
 
 
@@ -223,17 +216,17 @@ _COUNTING = _set(
 )
 
 
-def says_nothing(name: str) -> bool:
-    """Return whether a name is no more than letters, numbers and words that only count; so is an empty one."""
+def is_unlabelled(name: str) -> bool:
+    """Return whether a name consists of letters, numbers and counting words only; so does an empty name."""
     return all(len(w) == 1 or w.isdigit() or w in _COUNTING for w in words_of(name))
 
 
 def unit_of(leaf: str, kind: str) -> tuple[str, float | None]:
-    """Return the unit that a name ends with or holds, and its factor to SI; ``("", None)`` without one.
+    """Return the unit that a name contains, and its factor to SI; ``("", None)`` without one.
 
     Parameters
     ----------
-    kind : of quantity, a key of ``UNITS``; words that are no unit of it count for nothing (``g`` of a speed).
+    kind : of quantity, a key of ``UNITS``; units of other kinds are ignored (``g`` of a speed).
     """
     words = [w for w in re.split(r"[^a-z0-9]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", leaf).lower()) if w]
     text = "_".join(words)
@@ -247,138 +240,159 @@ def unit_of(leaf: str, kind: str) -> tuple[str, float | None]:
 
 
 def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Meaning | None:
-    """Return what a field is by its name, its parents' and, where these say nothing of their own, its topic's.
+    """Return the quantity that a field's name gives, with its parents' or topic's words where the leaf has none.
 
     ``unit_text`` is the unit that the log gives (``km/h``, ``°/s``), empty where it gives none.
     """
-    parts = path.split(".")
-    leaf = parts[-1]
-    own = words_of(re.sub(r"\[\d*\]", "", leaf))
-    inner = [w for p in parts[:-1] for w in words_of(p)]
-    outer = [*words_of(topic), *words_of(type_name.rpartition("/")[2].rpartition(".")[2])]
-    if _OTHER_DEVICES & set(outer):
+    *parents, leaf = path.split(".")
+    leaf_words = words_of(re.sub(r"\[\d*\]", "", leaf))
+    inner = tuple(w for p in parents for w in words_of(p))
+    outer = (*words_of(topic), *words_of(type_name.rpartition("/")[2].rpartition(".")[2]))
+    if not leaf_words or _OTHER_DEVICES & set(outer):
         return None
-    if not own:
+    if _NOT_VALUES & set(leaf_words) or _NOT_VALUES & set(inner) - {"state", "status", "orientation"}:
         return None
     index = re.search(r"\[(\d+)\]$", leaf)
-    if _NOT_VALUES & set(own) or _NOT_VALUES & set(inner) - {"state", "status", "orientation"}:
-        return None
-    named = f"{leaf}_{unit_text.replace('°', 'deg').replace('²', '2')}" if unit_text else leaf
-    for strength, words in ((1.0, own), (0.9, (*inner, *own)), (0.7, (*outer, *inner, *own))):
-        if strength < 0.8 and not _is_bare(own):
-            break  # A topic's name says what its only number is, not what each of many is.
-        found = _quantity(tuple(words), own, None if index is None else int(index[1]), strength)
-        if found is None:
-            continue
-        quantity, part, kind = found
-        corner = _corner(tuple(inner), ())
-        if quantity == "speed" and corner:  # of the wheel that the struct around it is
-            quantity, part = "wheel speed", corner
-        if quantity == "speed" and unit_of(named, "wheel rate")[0]:
-            return None  # of something that turns
-        unit, scale = unit_of(named, kind)
-        if not unit and len(parts) > 1:
-            unit, scale = unit_of(parts[-2], kind)
-        if kind == "speed" and not unit and quantity == "wheel speed":
-            unit, scale = unit_of(named, "wheel rate")
-            quantity = "wheel rate" if unit else quantity
-        where = {1.0: leaf, 0.9: path}.get(strength, f"{topic} {path}")
-        return Meaning(quantity, part, strength, unit, scale, f"{where!r} names it")
+    column = None if index is None else int(index[1])
+    scopes = [(1.0, leaf_words, leaf), (0.9, (*inner, *leaf_words), path)]
+    if all(w in _BARE or not w.isalpha() for w in leaf_words):  # else a topic's name does not describe each field
+        scopes.append((0.7, (*outer, *inner, *leaf_words), f"{topic} {path}"))
+    for strength, words, where in scopes:
+        quantity = _quantity(words, leaf_words, column, strength)
+        if quantity is not None:
+            named = f"{leaf}_{unit_text.replace('°', 'deg').replace('²', '2')}" if unit_text else leaf
+            return _with_unit(quantity, strength, where, inner, (named, *parents[-1:]))
     return None
+
+
+def _with_unit(
+    quantity: _Quantity, strength: float, where: str, inner: tuple[str, ...], names: tuple[str, ...]
+) -> Meaning | None:
+    """Return the meaning with the unit that the leaf or its struct (``names``) gives; None for a rotational speed."""
+    name, part, kind = quantity
+    corner = _corner(inner, ())
+    if name == "speed" and corner:
+        name, part = "wheel speed", corner
+    if name == "speed" and unit_of(names[0], "wheel rate")[0]:
+        return None
+    unit, scale = next((u for n in names if (u := unit_of(n, kind))[0]), ("", None))
+    if not unit and name == "wheel speed":
+        unit, scale = unit_of(names[0], "wheel rate")
+        name = "wheel rate" if unit else name
+    return Meaning(name, part, strength, unit, scale, f"named by {where!r}")
+
+
+#: Quantity, part and kind of unit.
+_Quantity: TypeAlias = tuple[str, str, str]
+#: A condition on tokens: of each pair any of the tokens is there, or, with False, none.
+_Rule: TypeAlias = tuple[tuple[bool, frozenset[str]], ...]
+
+
+def _rule(text: str) -> _Rule:
+    return tuple((not term.startswith("!"), frozenset(term.removeprefix("!").split("|"))) for term in text.split())
+
+
+def _matches(rule: _Rule, tokens: set[str]) -> bool:
+    return all(tokens.isdisjoint(words) != wanted for wanted, words in rule)
+
+
+# Tokens of the rules: words of the name; ``.word`` for those of its leaf, ``.a_b`` for its last two, ``=a_b`` for all;
+# ``@x`` for its axis, ``@place_x`` for the last word where only words of positions precede it, and traits.
+#: Traits, each given by any of its rules, in the order in which they use one another.
+_TRAITS = tuple(
+    (trait, _rule(text))
+    for trait, texts in (
+        ("@wheel", ("wheel|wheels|whl|tire|tyre|tires|tyres|corner",)),
+        ("@rate", ("rate|gyro|gyroscope|omega|gyr", "angular|ang velocity|vel|velocities", ".psi_dot|.yaw_dot|.w_z",
+                   "angular speed|twist")),
+        ("@accelerates", ("accel|acceleration|accelerometer|accelerations|accels|acc|specific", ".ax|.ay|.az",
+                          ".a|.g .lat|.long")),
+        ("@steers", ("steer|steering|swa|handwheel|roadwheel|roadwheels", "@delta", "road|hand wheel angle",
+                     "@corner wheel angle")),
+        ("@slips", ("sideslip|beta", "slip angle", "side slip")),
+        ("@turns", ("@rate", "yaw vel|velocity|speed", ".yawrate|.wz")),
+        ("@speeds", ("speed|speeds|velocity|velocities|vel|spd|kmh|kph|mph|ux|vx", "twist linear", "@v_axis")),
+        ("@road", ("road|tire|tyre|tires|tyres|roadwheel|roadwheels|axle|delta|@any_corner",)),
+        ("@hand", ("hand|handwheel|swa|pinion", "steering|steer wheel")),
+    )
+    for text in texts
+)  # fmt: skip
+#: Quantities by the first rule that matches; None: no quantity. A part ``@axis`` or ``@corner`` is the name's.
+_QUANTITIES: tuple[tuple[_Rule, _Quantity | None], ...] = tuple(
+    (_rule(text), quantity)
+    for text, quantity in (
+        (".roll|.pitch !@accelerates", None),
+        ("@steers @rate|@accelerates|.velocity|.speed|.vel|.column|.motor", None),
+        ("@steers @road", ("steering", "road", "angle")),
+        ("@steers @hand", ("steering", "wheel", "angle")),
+        ("@steers", ("steering", "", "angle")),
+        ("@slips @rate", None),
+        ("@slips", ("sideslip", "", "angle")),
+        ("@accelerates !angular|yaw|pedal @x|@y|@z", ("acceleration", "@axis", "acceleration")),
+        ("@accelerates !angular|yaw|pedal", None),
+        ("@turns @corner @wheel|.omega", ("wheel rate", "@corner", "wheel rate")),
+        ("@turns yaw|yawrate|turn|wz|psi|@z", ("rate", "z", "rate")),
+        ("@turns @x|@y", ("rate", "@axis", "rate")),
+        ("@turns", None),
+        ("@corner @wheel|@speeds @speeds|@around", ("wheel speed", "@corner", "speed")),
+        ("@corner @wheel|@speeds", None),
+        ("@place_lat !@speeds", ("latitude", "", "position")),
+        ("@place_lon|@place_lng|@place_long !@speeds", ("longitude", "", "position")),
+        ("wheel|wheels|whl @index|left|right", None),  # which wheel it is, is not given
+        ("ecef|enu|ned|east|north|up|down @speeds", None),
+        (".lat|.lateral|.vy @speeds|.vy", ("velocity", "y", "speed")),
+        ("=vl", ("velocity", "y", "speed")),
+        ("=vf|.vx|.ux", ("speed", "x", "speed")),
+        ("@speeds .long|.lng|.longitudinal|.forward", ("speed", "x", "speed")),
+        ("@speeds .heading|.course", None),
+        ("@speeds @letters !twist|linear|body", None),  # north or forward: the frame of the vector is not given
+        ("@speeds @y", ("velocity", "y", "speed")),
+        ("@speeds @z", None),
+        ("@speeds", ("speed", "@axis", "speed")),
+        ("latitude", ("latitude", "", "position")),
+        ("longitude", ("longitude", "", "position")),
+        (".course|.cog", ("course", "", "angle")),
+        ("track angle", ("course", "", "angle")),
+        (".heading|.head|.azimuth|=yaw", ("heading", "", "angle")),
+        (".yaw .angle", ("heading", "", "angle")),
+    )
+)
+_PLACE_WORDS = frozenset({"gps", "gnss", "ins", "pos", "position", "abs"})
 
 
 def _quantity(
-    words: tuple[str, ...], own: tuple[str, ...], index: int | None, strength: float
-) -> tuple[str, str, str] | None:
-    """Return quantity, part and kind of unit that words stand for."""
-    have = set(words)
-    axis = next((_AXES[w] for w in reversed(own) if w in _AXES), "") or next(
-        (_AXES[w] for w in reversed(words) if w in _AXES), ""
-    )
+    words: tuple[str, ...], leaf_words: tuple[str, ...], index: int | None, strength: float
+) -> _Quantity | None:
+    """Return the quantity of the first rule that the words match."""
+    axis = next((_AXES[w] for w in (*reversed(leaf_words), *reversed(words)) if w in _AXES), "")
     if not axis and index is not None and index < 3:
         axis = "xyz"[index]
-    corner = _corner(words, own)
-    wheel = bool(have & {"wheel", "wheels", "whl", "tire", "tyre", "tires", "tyres", "corner"})
-    rate = bool(have & {"rate", "gyro", "gyroscope", "omega", "gyr"}) or (
-        bool(have & {"angular", "ang"}) and bool(have & {"velocity", "vel", "velocities"})
-    )
-    rate |= own[-2:] in (("psi", "dot"), ("yaw", "dot"), ("w", "z")) or (
-        "angular" in have and bool(have & {"speed", "twist"})
-    )
-    accelerates = bool(have & {"accel", "acceleration", "accelerometer", "accelerations", "accels", "acc", "specific"})
-    accelerates |= bool(set(own) & {"ax", "ay", "az"}) or bool({"a", "g"} & set(own) and {"lat", "long"} & set(own))
-    steers = bool(have & {"steer", "steering", "swa", "handwheel", "roadwheel", "roadwheels"}) or (
-        ("delta" in own and set(own) <= _OF_DELTA)
-        or {"road", "wheel", "angle"} <= have
-        or {"hand", "wheel", "angle"} <= have
-        or (bool(corner) and {"wheel", "angle"} <= have)
-    )
-    if have & _ROLLS & set(own) and not accelerates:
+    corner = _corner(words, leaf_words)
+    leaf = set(leaf_words)
+    tokens = {*words, *(f".{w}" for w in leaf), f".{'_'.join(leaf_words[-2:])}", f"={'_'.join(leaf_words)}", f"@{axis}"}
+    flags = {
+        "@corner": bool(corner),
+        "@any_corner": bool(_corner(tuple(set(words)), ())),
+        "@index": index is not None,
+        "@around": strength < 1.0,
+        "@delta": "delta" in leaf <= _OF_DELTA,
+        "@letters": leaf <= set("xyz"),
+        "@v_axis": leaf_words[0] == "v" and leaf_words[1:2] != () and leaf_words[1] in _AXES,
+        f"@place_{leaf_words[-1]}": set(leaf_words[:-1]) <= _PLACE_WORDS,
+    }
+    tokens |= {flag for flag, is_set in flags.items() if is_set}
+    for trait, rule in _TRAITS:
+        if _matches(rule, tokens):
+            tokens.add(trait)
+    quantity = next((q for rule, q in _QUANTITIES if _matches(rule, tokens)), None)
+    if quantity is None:
         return None
-    if steers:
-        if (
-            rate
-            or accelerates
-            or have & {"velocity", "speed", "vel"} & set(own)
-            or have & {"column", "motor"} & set(own)
-        ):
-            return None
-        return "steering", _steering_kind(have), "angle"
-    if have & {"sideslip", "beta"} or ("slip" in have and "angle" in have) or {"side", "slip"} <= have:
-        return None if rate else ("sideslip", "", "angle")
-    if accelerates and not have & {"angular", "yaw", "pedal"}:
-        return ("acceleration", axis, "acceleration") if axis else None
-    if rate or (have & {"yaw"} and have & {"vel", "velocity", "speed"}) or have & {"yawrate", "wz"} & set(own):
-        if corner and (wheel or "omega" in own):
-            return "wheel rate", corner, "wheel rate"
-        if have & {"yaw", "yawrate", "turn", "wz", "psi"} or axis == "z":
-            return "rate", "z", "rate"
-        return ("rate", axis, "rate") if axis else None
-    speeds = bool(have & {"speed", "speeds", "velocity", "velocities", "vel", "spd", "kmh", "kph", "mph", "ux", "vx"})
-    speeds |= {"twist", "linear"} <= have
-    speeds |= own[:1] == ("v",) and len(own) > 1 and own[1] in _AXES
-    if corner and (wheel or speeds):
-        return ("wheel speed", corner, "speed") if speeds or strength < 1.0 else None
-    return _motion(have, own, axis, speeds, index)
+    name, part, kind = quantity
+    return name, {"@axis": axis, "@corner": corner}.get(part, part), kind
 
 
-def _motion(
-    have: set[str], own: tuple[str, ...], axis: str, speeds: bool, index: int | None
-) -> tuple[str, str, str] | None:
-    place = own[-1] if set(own[:-1]) <= {"gps", "gnss", "ins", "pos", "position", "abs"} else ""
-    if place in ("lat", "lon", "lng", "long") and not speeds:
-        return "latitude" if place == "lat" else "longitude", "", "position"
-    if have & {"wheel", "wheels", "whl"} and (index is not None or have & {"left", "right"}):
-        return None  # which wheel it is does not stand there
-    if have & {"ecef", "enu", "ned", "east", "north", "up", "down"} and speeds:
-        return None
-    if have & {"lat", "lateral", "vy"} & set(own) and (speeds or "vy" in own):
-        return "velocity", "y", "speed"
-    if own == ("vl",):
-        return "velocity", "y", "speed"
-    if own == ("vf",):
-        return "speed", "x", "speed"
-    if set(own) & {"vx", "ux"} or (speeds and set(own) & {"long", "lng", "longitudinal", "forward"}):
-        return "speed", "x", "speed"
-    if speeds and have & {"heading", "course"} & set(own):
-        return None
-    if speeds and set(own) <= _AXIS_LETTERS and own and not have & {"twist", "linear", "body"}:
-        return None  # north or forward: a vector of a velocity does not say
-    if speeds:
-        return {"y": ("velocity", "y", "speed"), "z": None}.get(axis, ("speed", axis, "speed"))
-    if have & {"latitude"}:
-        return "latitude", "", "position"
-    if have & {"longitude"}:
-        return "longitude", "", "position"
-    if set(own) & {"course", "cog"} or {"track", "angle"} <= have:
-        return "course", "", "angle"
-    if set(own) & {"heading", "head", "azimuth"} or own == ("yaw",) or {"yaw", "angle"} <= set(own):
-        return "heading", "", "angle"
-    return None
-
-
-def _corner(words: tuple[str, ...], own: tuple[str, ...]) -> str:
-    for group in (own, words):
+def _corner(words: tuple[str, ...], leaf_words: tuple[str, ...]) -> str:
+    for group in (leaf_words, words):
         for word in group:
             if word in _CORNERS:
                 return _CORNERS[word]
@@ -387,22 +401,12 @@ def _corner(words: tuple[str, ...], own: tuple[str, ...]) -> str:
         ends = {"front": "f", "rear": "r", "back": "r"}, {"left": "l", "right": "r"}
         if "axle" in group:
             ends[0].update({"1": "f", "2": "r"})
-        found = ["".join({e[w] for w in group if w in e}) for e in ends]
-        if all(len(f) == 1 for f in found):
-            return "".join(found)
+        letters = ["".join({e[w] for w in group if w in e}) for e in ends]
+        if all(len(end) == 1 for end in letters):
+            return "".join(letters)
     return ""
 
 
 def corner_of(words: tuple[str, ...]) -> str:
     """Return the wheel (fl, fr, rl, rr) that words name; empty without one."""
     return _corner(words, words)
-
-
-def _steering_kind(have: set[str]) -> str:
-    if have & {"road", "tire", "tyre", "tires", "tyres", "roadwheel", "roadwheels", "axle", "delta"}:
-        return "road"
-    if _corner(tuple(have), ()):
-        return "road"
-    if have & {"hand", "handwheel", "swa", "pinion"} or {"steering", "wheel"} <= have or {"steer", "wheel"} <= have:
-        return "wheel"
-    return ""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,84 +51,83 @@ class NavigationTruth:
 
 
 def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo]) -> NavigationTruth | None:
-    """Return the truth of the topic that says most of where the car goes and points; None without any.
+    """Return the ground truth of the topic with most quantities of position, velocity and heading; None without any.
 
     Parameters
     ----------
-    topics : of navigation systems and references, whose types are not known.
+    topics : of navigation systems and references whose types are not documented.
     """
-    best: NavigationTruth | None = None
-    for topic in topics:
-        found = _of_topic(log, topic)
-        if found is not None and (best is None or len(found.truth) > len(best.truth)):
-            best = found
-    return best
+    truths = [truth for t in topics if (truth := _of_topic(log, t)) is not None]
+    return max(truths, key=lambda t: len(t.truth), default=None)
 
 
 def _of_topic(log: DriveLog, topic: TopicInfo) -> NavigationTruth | None:
     fields = log.fields(topic.name, quiet=True)
     stamp = stamp_path_of(fields)
-    truth = {s.name: s for s in _vectors(topic, fields, stamp)}
-    meanings = {f.path: meaning_of(topic.name, topic.type_name, f.path) for f in fields if f.kind == "number"}
+    truth = {s.name: s for s in (*_enu_velocities(topic, fields, stamp), *_ecef_vectors(topic, fields, stamp))}
+    named = ((f.path, meaning_of(topic.name, topic.type_name, f.path)) for f in fields if f.kind == "number")
+    meanings = {path: meaning for path, meaning in named if meaning is not None}
     for quantity, name in (("latitude", "lat_deg"), ("longitude", "lon_deg")):
-        path = next((p for p, m in meanings.items() if m is not None and m.quantity == quantity), "")
+        path = next((p for p, m in meanings.items() if m.quantity == quantity), "")
         if path:
             truth[name] = SignalSource(name, topic.name, path, stamp)
-    headings = [p for p, m in meanings.items() if m is not None and m.quantity == "heading"]
+    headings = {p: m.scale for p, m in meanings.items() if m.quantity == "heading"}
     pieces = Pieces(log)
     paths = [p for s in truth.values() for p in s.paths if "ecef" not in p.lower()]
-    read = pieces.read({topic.name: [*dict.fromkeys([*paths, *headings])]}) if paths or headings else {}
-    places = [read.get((topic.name, truth[n].paths[0])) for n in ("lat_deg", "lon_deg") if n in truth]
-    if len(places) < 2 or not all(_is_place(p, most) for p, most in zip(places, (90.0, 180.0), strict=True)):
-        truth.pop("lat_deg", None)
-        truth.pop("lon_deg", None)
-    note = f"truth is taken from {topic.name}, by the names of its fields"
-    course = _course(truth, read, topic.name, pieces)
-    for path in headings if course is not None else ():
-        meaning = meanings[path]
-        convention = _convention(read.get((topic.name, path)), course, None if meaning is None else meaning.scale)
+    samples = pieces.read({topic.name: [*dict.fromkeys([*paths, *headings])]}) if paths or headings else {}
+    for name, most in (("lat_deg", 90.0), ("lon_deg", 180.0)):
+        if name not in truth or not _is_place(samples.get((topic.name, truth[name].paths[0])), most):
+            truth = {n: s for n, s in truth.items() if n not in ("lat_deg", "lon_deg")}
+    note = f"Ground truth is taken from {topic.name}, by the names of its fields."
+    course = _course(truth, samples, topic.name, pieces)
+    conventions = {p: _convention(samples.get((topic.name, p)), course, unit) for p, unit in headings.items()}
+    for path, convention in conventions.items():
         if convention is not None:
             words, scale, offset = convention
             truth["yaw_rad"] = SignalSource("yaw_rad", topic.name, path, stamp, scale, offset)
-            note += f"; {path} counts in {words}, as the path shows"
+            note += f" {path} is in {words}: it agrees with the course over ground."
             break
     useful = {"enu_velocity_m_s", "ecef_velocity_m_s", "ecef_position_m", "lat_deg"} & set(truth)
     return NavigationTruth(topic.name, truth, note) if useful else None
 
 
-def _vectors(topic: TopicInfo, fields: tuple[FieldInfo, ...], stamp: str) -> list[SignalSource]:
-    """Return velocities east, north, up and vectors in ECEF that the names of a topic's fields make up."""
-    found = []
-    sides: dict[str, dict[str, str]] = {}
+def _enu_velocities(topic: TopicInfo, fields: tuple[FieldInfo, ...], stamp: str) -> Iterator[SignalSource]:
+    """Yield the first velocity east, north, up (or down) that the names of one struct's fields give."""
+    structs: dict[str, dict[str, str]] = {}
     for info in fields:
         prefix, _, leaf = info.path.rpartition(".")
-        words = words_of(leaf)
-        if info.kind != "number" or "ecef" in info.path.lower():
-            continue
-        short = "".join(words)
-        side = next((_SIDES[w] for w in (*words, short) if w in _SIDES and len(w) > 1), "")
-        side = side or (_SIDES[words[-1]] if len(words) > 1 and words[-1] in "neud" else "")
-        speeds = {"velocity", "vel", "speed"} & {*words, *words_of(prefix)} or re.fullmatch("(v|vel)[neud]", short)
-        if side and speeds and not {"std", "stddev", "stdev", "var", "cov", "accuracy", "sigma", "acc"} & set(words):
-            sides.setdefault(prefix, {}).setdefault(side, info.path)
-    for by_side in sides.values():
-        vertical = next((s for s in "ud" if s in by_side), "")
-        if {"n", "e"} <= set(by_side) and vertical:
-            paths = (by_side["e"], by_side["n"], by_side[vertical])
+        if info.kind == "number" and "ecef" not in info.path.lower() and (side := _side_of(prefix, leaf)):
+            structs.setdefault(prefix, {}).setdefault(side, info.path)
+    for paths_of in structs.values():
+        vertical = next((s for s in "ud" if s in paths_of), "")
+        if {"n", "e"} <= set(paths_of) and vertical:
+            paths = (paths_of["e"], paths_of["n"], paths_of[vertical])
             factor = unit_of(paths[0].rpartition(".")[2], "speed")[1] or 1.0
             scale = (factor, factor, factor if vertical == "u" else -factor)
-            found.append(SignalSource("enu_velocity_m_s", topic.name, paths, stamp, scale))
-            break
-    elements = dict.fromkeys(f.path for f in fields)  # in order, which the report follows
-    for base in dict.fromkeys(p.removesuffix("[0]") for p in elements if p.endswith("[0]") and "ecef" in p.lower()):
-        if f"{base}[2]" not in elements or f"{base}[3]" in elements:
-            continue
-        said = set(words_of(base))
-        kind = "velocity" if said & {"velocity", "vel"} else "position" if said & {"position", "pos"} else ""
-        if kind:
-            name = "ecef_velocity_m_s" if kind == "velocity" else "ecef_position_m"
-            found.append(SignalSource(name, topic.name, tuple(f"{base}[{i}]" for i in range(3)), stamp))
-    return found
+            yield SignalSource("enu_velocity_m_s", topic.name, paths, stamp, scale)
+            return
+
+
+def _side_of(struct: str, leaf: str) -> str:
+    """Return the direction (n, e, u, d) of a field's velocity; empty where its name is none of one."""
+    words = words_of(leaf)
+    short = "".join(words)
+    side = next((_SIDES[w] for w in (*words, short) if w in _SIDES and len(w) > 1), "")
+    side = side or (_SIDES[words[-1]] if len(words) > 1 and words[-1] in "neud" else "")
+    if {"std", "stddev", "stdev", "var", "cov", "accuracy", "sigma", "acc"} & set(words):
+        return ""
+    is_speed = {"velocity", "vel", "speed"} & {*words, *words_of(struct)} or re.fullmatch("(v|vel)[neud]", short)
+    return side if is_speed else ""
+
+
+def _ecef_vectors(topic: TopicInfo, fields: tuple[FieldInfo, ...], stamp: str) -> Iterator[SignalSource]:
+    """Yield the arrays of three in ECEF whose names give a position or a velocity, in the order of the fields."""
+    paths = dict.fromkeys(f.path for f in fields)
+    for base in dict.fromkeys(p.removesuffix("[0]") for p in paths if p.endswith("[0]") and "ecef" in p.lower()):
+        words = set(words_of(base))
+        name = "ecef_velocity_m_s" if words & {"velocity", "vel"} else "ecef_position_m"
+        if f"{base}[2]" in paths and f"{base}[3]" not in paths and words & {"velocity", "vel", "position", "pos"}:
+            yield SignalSource(name, topic.name, tuple(f"{base}[{i}]" for i in range(3)), stamp)
 
 
 def _is_place(seen: Seen | None, most: float) -> bool:

@@ -471,33 +471,34 @@ def _probe(log: DriveLog, topics: list[TopicInfo]) -> dict[str, dict[str, FloatA
     """Read a few seconds here and there of what tells a measured field from a filler."""
     requests: dict[str, list[str]] = {}
     for topic in topics:
-        kind = _type(topic)
-        paths: list[str] = []
-        if kind in IMU_TYPES:
-            paths += _IMU_PATHS
-            paths += ["linear_acceleration_covariance[0]", "angular_velocity_covariance[0]"]
-        if kind in TWIST_FIELDS:
-            paths += [_twist(topic, "linear", axis) for axis in "xyz"] + [_twist(topic, "angular", "z")]
-            paths += [TWIST_COVARIANCES[kind]] if kind in TWIST_COVARIANCES else []
-        if kind in POSE_FIELDS:
-            base = POSE_FIELDS[kind]
-            paths += [_join(base, f"position.{a}") for a in "xy"] + [_join(base, f"orientation.{a}") for a in "xyzw"]
-            paths += [POSE_COVARIANCES[kind]] if kind in POSE_COVARIANCES else []
-        if kind in FIX_TYPES:
-            paths += ["latitude", "longitude", "altitude", "status.status", "heading", "course"]
-        if paths:
+        if paths := _probed_paths(topic):
             fields = log.fields(topic.name)
             requests[topic.name] = [p for p in dict.fromkeys(paths) if has_path(fields, p)]
     if not requests:
         return {}
     span = max(0, log.end_ns - log.start_ns - PROBE_NS)
-    starts = sorted({log.start_ns + int(span * at) for at in PROBE_AT})
     pieces: dict[str, dict[str, list[FloatArray]]] = {t: {p: [] for p in paths} for t, paths in requests.items()}
-    for start in starts:
+    for start in sorted({log.start_ns + int(span * share) for share in PROBE_AT}):
         for name, columns in log.read(requests, start, start + PROBE_NS).items():
             for path in requests[name]:
                 pieces[name][path].append(np.asarray(columns.fields[path], dtype=np.float64))
     return {t: {p: np.concatenate(v) for p, v in paths.items() if v} for t, paths in pieces.items()}
+
+
+def _probed_paths(topic: TopicInfo) -> list[str]:
+    """Return the paths of a well-known type that may be fillers."""
+    kind = _type(topic)
+    paths: list[str] = []
+    if kind in IMU_TYPES:
+        paths += [*_IMU_PATHS, "linear_acceleration_covariance[0]", "angular_velocity_covariance[0]"]
+    if kind in TWIST_FIELDS:
+        paths += [*(_twist(topic, "linear", axis) for axis in "xyz"), _twist(topic, "angular", "z")]
+    if kind in POSE_FIELDS:
+        parts = [*(f"position.{a}" for a in "xy"), *(f"orientation.{a}" for a in "xyzw")]
+        paths += [_join(POSE_FIELDS[kind], part) for part in parts]
+    if kind in FIX_TYPES:
+        paths += ["latitude", "longitude", "altitude", "status.status", "heading", "course"]
+    return [*paths, *(table[kind] for table in (TWIST_COVARIANCES, POSE_COVARIANCES) if kind in table)]
 
 
 # ------------------------------------------------------------------------------------------------ sensors

@@ -61,48 +61,55 @@ def judge_signs(
     ----------
     trio : by ``steer``, ``rate``, ``ay``. wheels : right minus left wheel speed on the grid [M].
     """
-    si = {name: None if one is None else one.si for name, one in trio.items()}
-    turns: dict[str, FloatArray] = {}
-    if speed is not None:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            v = np.where(speed.si > SLOW_M_S, speed.si, np.nan)
-            # Each as a yaw rate, but for its scale.
-            turns |= {"steer": si["steer"] * v} if si["steer"] is not None else {}
-            turns |= {"ay": si["ay"] / v} if si["ay"] is not None else {}
-    turns |= {"rate": si["rate"]} if si["rate"] is not None else {}
-    turns = {name: fields.pieces.smooth(values) for name, values in turns.items()}
-    votes = {pair: _sign(turns[pair[0]], turns[pair[1]], TELLS) for pair in itertools.combinations(turns, 2)}
-    truly = {"wheels": wheels, "path": path_turn(fields), "heading": heading_turn(fields)}
-    for source, values in truly.items():
-        if values is not None:
-            votes |= {(n, source): _sign(x, values, CLEAR if source == "wheels" else TELLS) for n, x in turns.items()}
-    rate = trio["rate"]
-    if rate is not None and rate.is_axis:
-        votes["rate", "gravity"] = upright(fields, rate) * rate.sign
-    votes = {pair: vote for pair, vote in votes.items() if vote}
-    absolute = any(source in {*truly, "gravity"} for _, source in votes)
-    absolute |= any(one is not None and _sign_is_said(one) for one in trio.values())
+    present = {name: one for name, one in trio.items() if one is not None}
+    turns = _turns(fields, present, speed)
+    votes = _votes(fields, turns, present.get("rate"), wheels)
+    absolute = any(source in WITNESSES for _, source in votes) or any(map(_has_documented_sign, present.values()))
     against = [f"{_word(a)} and {_word(b)}" for (a, b), vote in votes.items() if vote < 0.0]
     if not against:
         return Signs(absolute=absolute)
-    free = [n for n in turns if (one := trio[n]) is not None and may_turn(one)]
-    # An IMU whose axes may lie in any way may be the odd one: they are found later, and the signs with them.
-    imu = tuple(n for n in turns if (one := trio[n]) is not None and one.is_axis and not one.fixed and n not in free)
+    free = [n for n in turns if may_turn(present[n])]
+    # The axes of an IMU may point anywhere: its mounting is identified later, and the signs with it.
+    imu = tuple(n for n in turns if present[n].is_axis and not present[n].fixed and n not in free)
     ways = _ways([*((n,) for n in free), *([imu] if imu else [])], votes)
-    decided = (
-        len(ways) == 1 and set(ways[0]) <= set(free) and (absolute or (len(votes) > 1 and len(free) == len(turns)))
-    )
+    decided = len(ways) == 1 and set(ways[0]) <= set(free)
+    decided = decided and (absolute or (len(votes) > 1 and len(free) == len(turns)))
     return Signs(ways[0] if decided else (), absolute, ", ".join(against), decided)
+
+
+def _turns(fields: Fields, present: Mapping[str, Found], speed: Found | None) -> dict[str, FloatArray]:
+    """Return steering, a_y and yaw rate, each as a yaw rate but for its scale."""
+    turns: dict[str, FloatArray] = {}
+    if speed is not None:
+        v = np.where(speed.si > SLOW_M_S, speed.si, np.nan)
+        turns |= {"steer": present["steer"].si * v} if "steer" in present else {}
+        turns |= {"ay": present["ay"].si / v} if "ay" in present else {}
+    turns |= {"rate": present["rate"].si} if "rate" in present else {}
+    return {name: fields.pieces.smooth(values) for name, values in turns.items()}
+
+
+def _votes(
+    fields: Fields, turns: Mapping[str, FloatArray], rate: Found | None, wheels: FloatArray | None
+) -> dict[tuple[str, str], float]:
+    """Return 1 for each pair whose signs agree and -1 for each pair whose signs contradict one another."""
+    votes = {pair: _sign(turns[pair[0]], turns[pair[1]], TELLS) for pair in itertools.combinations(turns, 2)}
+    references = {"wheels": wheels, "path": path_turn(fields), "heading": heading_turn(fields)}
+    for source, values in references.items():
+        if values is not None:
+            votes |= {(n, source): _sign(x, values, CLEAR if source == "wheels" else TELLS) for n, x in turns.items()}
+    if rate is not None and rate.is_axis:
+        votes["rate", "gravity"] = upright(fields, rate) * rate.sign
+    return {pair: vote for pair, vote in votes.items() if vote}
 
 
 def may_turn(one: Found) -> bool:
     """Return whether the sign of a field is free: neither documented nor a matter of its mounting."""
-    if one.anchor or _sign_is_said(one):
+    if one.anchor or _has_documented_sign(one):
         return False
     return one.meaning.quantity == "steering" or not one.is_axis
 
 
-def _sign_is_said(one: Found) -> bool:
+def _has_documented_sign(one: Found) -> bool:
     """Return whether documentation or a name says the sign; of a well-known type it depends on the mounting."""
     return not one.anchor and (one.fixed or one.is_downward)
 

@@ -129,25 +129,28 @@ def _speeds(fields: Fields) -> None:
 def _by_turning(fields: Fields) -> None:
     """Tell units of a_y, yaw rate and speed by a_y ≈ v r, where one combination alone gives it."""
     speed = fields.best("speed") or fields.wheel_mean()
+    if speed is None:
+        return
     for rate in fields.open("rate", "z")[:4]:
         for ay in fields.open("acceleration", "y")[:4]:
-            if speed is None or (rate.known and ay.known and speed.known):
-                continue
-            fits = []
-            units = [f.factors[:1] if f.known or f.fixed else f.factors for f in (ay, rate, speed)]
-            for combination in itertools.product(*units):
-                a, r, v = (c[1] for c in combination)
-                relation = fields.turning(ay.seen.cells * a, rate.seen.cells * r, speed.seen.cells * v)
-                if relation is not None and abs(relation.correlation) > CLEAR:
-                    size = abs(relation.slope)
-                    if SLOPES[0] < size < SLOPES[1]:
-                        fits.append((abs(math.log(size)), combination))
-            if len(fits) == 1 or (fits and all(f[1][1:] == fits[0][1][1:] for f in fits)):
-                for one, (unit, _) in zip((ay, rate, speed), fits[0][1], strict=True):
-                    if not one.known and not one.fixed:
-                        one.use(unit)
-                        one.reasons.append(f"unit {unit} by a_y ≈ v r")
-                        one.bonus += 0.3 if one.score < LEAST_SCORE else 0.0
+            trio = (ay, rate, speed)
+            units = () if all(f.known for f in trio) else _units_of_turning(fields, trio)
+            for one, unit in zip(trio, units, strict=False):
+                if not one.known and not one.fixed:
+                    one.use(unit)
+                    one.reasons.append(f"unit {unit} by a_y ≈ v r")
+                    one.bonus += 0.3 if one.score < LEAST_SCORE else 0.0
+
+
+def _units_of_turning(fields: Fields, trio: tuple[Found, Found, Found]) -> tuple[str, ...]:
+    """Return the units of a_y, yaw rate and speed with a slope near 1; empty where several combinations have one."""
+    fits = []
+    for units in itertools.product(*(f.factors[:1] if f.known or f.fixed else f.factors for f in trio)):
+        relation = fields.turning(*(f.seen.cells * factor for f, (_, factor) in zip(trio, units, strict=True)))
+        if relation is not None and abs(relation.correlation) > CLEAR and SLOPES[0] < abs(relation.slope) < SLOPES[1]:
+            fits.append(units)
+    # Combinations that differ in the unit of a_y alone: the first is by convention.
+    return tuple(unit for unit, _ in fits[0]) if fits and all(f[1:] == fits[0][1:] for f in fits) else ()
 
 
 def _by_speeding_up(fields: Fields) -> None:

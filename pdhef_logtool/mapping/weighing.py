@@ -28,16 +28,21 @@ from pdhef_logtool.mapping.candidates import (
 from pdhef_logtool.mapping.checking import has_path
 from pdhef_logtool.mapping.evidence import Fit, fit, is_of_both_signs, is_of_one_sign, ratio, spread
 from pdhef_logtool.mapping.fields import CLEAR, Fields, mean_of
-from pdhef_logtool.mapping.nameless import identified, nameless_columns, wanted_nameless
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.signs import SLOW_M_S, WITNESSES, WORDS, judge_signs
 from pdhef_logtool.mapping.units import RADII_M, decide_units
+from pdhef_logtool.mapping.unlabelled_fields import identified, nameless_columns, wanted_nameless
 from pdhef_logtool.mapping.vendors import Vendors
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, FloatArray
 
 #: Truth quantities that show the path.
 _POSITIONS = ("lat_deg", "lon_deg", "x_m", "y_m")
+#: Signals that one field gives: name, quantity and parts, in the order in which they are chosen.
+_SENSORS = (
+    ("speed_m_s", "speed", ("", "x")), ("ax_m_s2", "acceleration", ("x",)), ("ay_m_s2", "acceleration", ("y",)),
+    ("yaw_rate_rad_s", "rate", ("z",)),
+)  # fmt: skip
 #: Below (standard deviation) the path is straight.
 EXCITED_CURVATURE_1_M = 0.0001
 #: An acceleration (standard deviation) from which on a sensor must follow it, and the correlation that it must have.
@@ -46,8 +51,7 @@ FOLLOWS = 0.5
 #: How near wheels must be to a speed in a unit of speed; beyond they turn in rad/s.
 WHEEL_UNIT = 0.04
 #: Metres by which curvature becomes an angle: wheelbases of model cars to lorries, and those times a steering ratio.
-ROAD_WHEEL_M = (0.15, 8.0)
-STEERING_WHEEL_M = (12.0, 160.0)
+_STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
 #: Units of wheel speeds, and the usual radius of wheels that turn.
 SPEEDS = (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704))
 RPM = 2.0 * math.pi / 60.0
@@ -150,15 +154,12 @@ class _Weighing:
         for one in usable:
             # A message that holds the answer gives the sensors too only where no other one does.
             one.bonus -= 0.2 if one.topic.name == self.truth_from else 0.0
-        if "speed_m_s" not in have and not any(n.startswith("wheel_speed") for n in have):
-            self._take("speed_m_s", [f for f in usable if f.meaning.quantity == "speed"])
-        for name, part in (("ax_m_s2", "x"), ("ay_m_s2", "y")):
-            if name not in have:
-                self._take(name, [f for f in usable if f.meaning.quantity == "acceleration" and f.meaning.part == part])
-        if "yaw_rate_rad_s" not in have:
-            self._take("yaw_rate_rad_s", [f for f in usable if f.meaning.quantity == "rate" and f.meaning.part == "z"])
+        wheels = any(n.startswith("wheel_speed") for n in have)
+        for name, quantity, part in _SENSORS:
+            if name not in have and not (wheels and quantity == "speed"):
+                self._take(name, [f for f in usable if f.meaning.quantity == quantity and f.meaning.part in part])
         self._one_imu()
-        if not any(n.startswith("wheel_speed") for n in have):
+        if not wheels:
             self._wheels(usable)
         if not have & {"steer_rad", "steering_wheel_rad"}:
             self._steering([f for f in usable if f.meaning.quantity == "steering"])
@@ -243,17 +244,7 @@ class _Weighing:
                     self.taken[name] = max(same, key=lambda f: f.score)
 
     def _wheels(self, usable: Sequence[Found]) -> None:
-        sets: dict[tuple[str, str, str], dict[str, Found]] = {}
-        for one in usable:
-            if one.meaning.quantity in ("wheel speed", "wheel rate") and one.meaning.part in WHEELS:
-                key = (one.topic.name, one.path.rpartition(".")[0], one.meaning.quantity)
-                sets.setdefault(key, {}).setdefault(one.meaning.part, one)
-        apart: dict[str, Found] = {}
-        for group in sets.values():
-            if len(group) == 1:
-                apart.update({c: f for c, f in group.items() if c not in apart})
-        complete = [g for g in sets.values() if len(g) >= 2]
-        wheels = max(complete, key=lambda g: (len(g), sum(f.score for f in g.values())), default=apart)
+        wheels = _wheel_set(usable)
         if len(wheels) < 2:
             return
         reference = self._chosen("speed_m_s")
@@ -321,32 +312,19 @@ class _Weighing:
 
     def _steering_kind(self, one: Found, relation: Fit | None) -> tuple[str, bool | None]:
         """Return the signal that a steering angle is, and whether it follows the car's turning (None: cannot tell)."""
-        part, units = one.meaning.part, one.factors[:1] if one.known or one.fixed else one.factors
-        kinds = {"road": ("steer_rad",), "wheel": ("steering_wheel_rad",)}.get(
-            part, ("steer_rad", "steering_wheel_rad")
-        )
+        kinds = {"road": ("steer_rad",), "wheel": ("steering_wheel_rad",)}.get(one.meaning.part, tuple(_STEERING_M))
         if relation is None or abs(relation.correlation) < CLEAR:
-            name = kinds[0]
-            if len(kinds) == 2 and one.seen.largest * one.factors[0][1] > 0.9:
-                name = kinds[1]
-            if not one.fixed and len(kinds) == 2:
-                one.doubts.append(f"whether it is the steering wheel or the road wheels is not said; taken as {name}")
-            if not one.fixed and relation is not None:
-                one.doubts.append(
-                    f"it follows the path's curvature with a correlation of {relation.correlation:.2f} only"
-                )
-            hopeless = relation is not None and abs(relation.correlation) < 0.25 and not one.fixed
-            return name, False if hopeless and one.meaning.strength < 0.9 else None
+            return _steering_by_range(one, kinds, relation)
         length = abs(relation.slope)
-        limits = {"steer_rad": ROAD_WHEEL_M, "steering_wheel_rad": STEERING_WHEEL_M}
-        fits = [(k, u) for k in kinds for u in units if limits[k][0] <= length * u[1] <= limits[k][1]]
+        units = one.factors[:1] if one.known or one.fixed else one.factors
+        fits = [(k, u) for k in kinds for u in units if _STEERING_M[k][0] <= length * u[1] <= _STEERING_M[k][1]]
         if not fits:
             metres = length * one.factors[0][1]
-            one.doubts.append(f"against the path's curvature it is {metres:.3g} m, no car's in its unit")
+            one.doubts.append(f"its ratio to the path's curvature is {metres:.3g} m, which no car has in this unit")
             return kinds[0], None
         name, (unit, factor) = min(fits, key=lambda f: _unlikely(f[0], length * f[1][1]))
         one.use(unit)
-        one.reasons.append(f"against the path's curvature it is {length * factor:.3g} m: {name} in {unit}")
+        one.reasons.append(f"ratio to the path's curvature {length * factor:.3g} m: {name} in {unit}")
         rest = [f for f in fits if f != (name, (unit, factor)) and _unlikely(f[0], length * f[1][1]) < 1.0]
         if rest and not one.fixed:
             one.doubts.append(f"it could be {rest[0][0]} in {rest[0][1][0]} as well")
@@ -440,20 +418,10 @@ class _Weighing:
         if not self.truth_from:
             return
         its = [f for f in self.fields.found if f.topic.name == self.truth_from and f.section != "signals"]
-        its = [f for f in its if f.fixed] or its  # what is documented goes before names
-        if not its:
+        its = [f for f in its if f.fixed] or its  # documented fields before names
+        self.truth = _truth_of(its)
+        if not self.truth:
             return
-        for one in sorted(its, key=lambda f: -f.score):
-            name = _truth_name(one)
-            if name and one.seen.changes:
-                self.truth.setdefault(name, one)
-        if "vy_m_s" not in self.truth and "sideslip_rad" not in self.truth and "lat_deg" not in self.truth:
-            self.truth.clear()
-            return
-        if "vx_m_s" in self.truth and "vy_m_s" not in self.truth and "sideslip_rad" not in self.truth:
-            del self.truth["vx_m_s"]
-        if {"vx_m_s", "vy_m_s"} <= set(self.truth):
-            self.truth.pop("sideslip_rad", None)
         first = its[0]
         agrees = self._truth_turns()
         # What is truth is no input, unless a navigation system is the only speed there is.
@@ -532,8 +500,52 @@ class _Weighing:
         )
 
 
+def _truth_of(candidates: Sequence[Found]) -> dict[str, Found]:
+    """Return truth quantities of one topic's fields; empty without sideslip, lateral velocity or a position."""
+    truth: dict[str, Found] = {}
+    for one in sorted(candidates, key=lambda f: -f.score):
+        name = _truth_name(one)
+        if name and one.seen.changes:
+            truth.setdefault(name, one)
+    if not {"vy_m_s", "sideslip_rad", "lat_deg"} & set(truth):
+        return {}
+    if not {"vy_m_s", "sideslip_rad"} & set(truth):
+        truth.pop("vx_m_s", None)
+    if {"vx_m_s", "vy_m_s"} <= set(truth):
+        truth.pop("sideslip_rad", None)
+    return truth
+
+
+def _wheel_set(usable: Sequence[Found]) -> dict[str, Found]:
+    """Return the wheels of the struct with most of them, or else wheels of a struct each."""
+    sets: dict[tuple[str, str, str], dict[str, Found]] = {}
+    for one in usable:
+        if one.meaning.quantity in ("wheel speed", "wheel rate") and one.meaning.part in WHEELS:
+            key = (one.topic.name, one.path.rpartition(".")[0], one.meaning.quantity)
+            sets.setdefault(key, {}).setdefault(one.meaning.part, one)
+    apart: dict[str, Found] = {}
+    for group in sets.values():
+        if len(group) == 1:
+            apart = group | apart
+    complete = [g for g in sets.values() if len(g) >= 2]
+    return max(complete, key=lambda g: (len(g), sum(f.score for f in g.values())), default=apart)
+
+
+def _steering_by_range(one: Found, kinds: tuple[str, ...], relation: Fit | None) -> tuple[str, bool | None]:
+    """Return what :meth:`_Weighing._steering_kind` does, where the path's curvature does not decide."""
+    name = kinds[-1] if one.seen.largest * one.factors[0][1] > 0.9 else kinds[0]
+    if one.fixed:
+        return name, None
+    if len(kinds) == 2:
+        one.doubts.append(f"its name gives neither steering wheel nor road wheels; taken as {name}")
+    if relation is None:
+        return name, None
+    one.doubts.append(f"its correlation with the path's curvature is only {relation.correlation:.2f}")
+    return name, False if abs(relation.correlation) < 0.25 and one.meaning.strength < 0.9 else None
+
+
 def truth_topic(found: Sequence[Found]) -> str:
-    """Return the topic that has sideslip or a lateral velocity, one that calls itself truth first; empty without."""
+    """Return the topic with sideslip or a lateral velocity, reference topics first; empty without one."""
     topics: dict[str, list[Found]] = {}
     for one in found:
         if one.role in ("truth", "navigation", "sensor"):
@@ -545,9 +557,8 @@ def truth_topic(found: Sequence[Found]) -> str:
         worth += 0.5 * (fields[0].role == "truth") + 0.2 * ("latitude" in kinds) if worth else 0.0
         if worth == 0.0 and fields[0].fixed and {"latitude", "longitude"} <= kinds:
             worth = 0.1
-        if fields[0].role == "sensor" and "sideslip" not in kinds and not fields[0].fixed:
-            continue
-        best = max(best, (worth, name)) if worth > best[0] else best
+        if worth > best[0] and (fields[0].role != "sensor" or "sideslip" in kinds or fields[0].fixed):
+            best = (worth, name)
     return best[1]
 
 

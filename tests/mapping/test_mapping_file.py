@@ -103,7 +103,7 @@ def test_all_problems_come_in_one_line(tmp_path: Path) -> None:
         ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\n[signals.ay_m_s2]\ntopic="/a"\nfield="x"', "duplicates"),
         ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\n[signals.ax_m_s2]\ntopic="/a"\nfield="y"', "ax_m_s2"),
         ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\nscale=[1.0,1.0]', "no vector"),
-        ('[truth.ecef_position_m]\ntopic="/a"\nfield="x"\nscale=[1.0,1.0]', "must hold 3 entries"),
+        ('[truth.ecef_position_m]\ntopic="/a"\nfield="x"\nscale=[1.0,1.0]', "must have 3 entries"),
         ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\nscale=nan', "finite"),
         ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\nvalid_min=2\nvalid_max=1', "valid_min must be below valid_max"),
         ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\nclock="device"\nstamp="log_time"', "needs a stamp of the device"),

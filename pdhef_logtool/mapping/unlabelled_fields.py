@@ -19,7 +19,7 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.candidates import MOST_FIELDS, Found, Role, stamp_of
 from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, is_of_both_signs, ratio, spread
 from pdhef_logtool.mapping.fields import EXCITED_A_M_S2, Fields
-from pdhef_logtool.mapping.naming import G_M_S2, Meaning, is_command, meaning_of, says_nothing
+from pdhef_logtool.mapping.naming import G_M_S2, Meaning, is_command, is_unlabelled, meaning_of
 from pdhef_logtool.mapping.path import path_speed
 from pdhef_logtool.records.signals import FloatArray
 
@@ -114,7 +114,7 @@ def nameless_columns(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], pi
             alone = topic.name if len(numbers) == 1 and not path.endswith("[]") else ""
             if path.count("[]") > path.endswith("[]") or meaning_of(topic.name, topic.type_name, path) is not None:
                 continue
-            if says_nothing(path) and says_nothing(alone):
+            if is_unlabelled(path) and is_unlabelled(alone):
                 requests.setdefault(topic.name, []).append(path.removesuffix("[]"))
     if not requests:
         return []
@@ -184,25 +184,33 @@ def _choices(fields: Fields, nameless: Sequence[Found]) -> Iterator[_Choice]:
     smooth = {id(f): fields.pieces.smooth(_values(f)) for f in {id(f): f for f in (*ays, *axs)}.values()}
     for v in speeds:
         change = fields.pieces.rate_of(_values(v))
+        fits = [(x, fit(change, smooth[id(x)])) for x in axs if x is not v]
+        # The slope the way round in which grade and noise of a_x do not make it smaller.
         ways: list[tuple[Found | None, Fit | None]] = [(None, None)]
-        for other in axs:
-            relation = fit(change, smooth[id(other)])
-            if other is not v and relation is not None and abs(relation.correlation) > LOOSE_SPEEDS_UP:
-                # The slope the way round in which grade and noise of a_x do not make it smaller.
-                ways.append((other, replace(relation, slope=relation.correlation**2 / relation.slope)))
+        ways += [
+            (x, replace(relation, slope=relation.correlation**2 / relation.slope))
+            for x, relation in fits
+            if relation is not None and abs(relation.correlation) > LOOSE_SPEEDS_UP
+        ]
         for r, y in itertools.product(rates, ays):
-            if r is y or v is r or v is y:
-                continue
-            turning, by_speed, ahead_s = _turning(fields, v, r, smooth[id(y)])
-            for x, speeding in ways if turning is not None else ():
-                explained = None if turning is None or x is r or x is y else _explained((v, r, y, x), turning, speeding)
-                if turning is None or explained is None:
-                    continue
-                units, off = explained
-                plausible = off < math.log(SLOPE) and spread(smooth[id(y)]) * units[2][1] > LEAST_AY_M_S2
-                speeds_up = speeding is not None and abs(speeding.correlation) > SPEEDS_UP
-                strict = by_speed and plausible and speeds_up
-                yield _Choice(v, r, y, x, turning, speeding, units, strict, plausible, ahead_s)
+            if r is not y and v is not r and v is not y:
+                yield from _choices_of(
+                    fields, (v, r, y), smooth[id(y)], [w for w in ways if w[0] is not r and w[0] is not y]
+                )
+
+
+def _choices_of(
+    fields: Fields, columns: tuple[Found, Found, Found], ay: FloatArray, ways: Sequence[tuple[Found | None, Fit | None]]
+) -> Iterator[_Choice]:
+    """Yield the choices of one speed, yaw rate and a_y."""
+    turning, by_speed, ahead_s = _turning(fields, *columns[:2], ay)
+    for x, speeding in ways if turning is not None else ():
+        explained = None if turning is None else _explained((*columns, x), turning, speeding)
+        if turning is not None and explained is not None:
+            units, off = explained
+            plausible = off < math.log(SLOPE) and spread(ay) * units[2][1] > LEAST_AY_M_S2
+            strict = by_speed and plausible and speeding is not None and abs(speeding.correlation) > SPEEDS_UP
+            yield _Choice(*columns, x, turning, speeding, units, strict, plausible, ahead_s)
 
 
 def _turning(fields: Fields, v: Found, r: Found, ay: FloatArray) -> tuple[Fit | None, bool, float]:
