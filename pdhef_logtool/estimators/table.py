@@ -132,7 +132,7 @@ SPECS: tuple[Spec, ...] = (
     ),
     Spec(
         "phy-ukf", "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",
-        "physics:build", _ESP, 0x0072B2,
+        "phy_ukf:build", _ESP, 0x0072B2,
     ),
     Spec(
         "physics", "the strongest filter on physics alone, with the parts that driving of the car gave evidence for",
@@ -140,7 +140,7 @@ SPECS: tuple[Spec, ...] = (
     ),
     Spec(
         "phy-ukf:tuned", "the same with the noise of an identified car, corrected for body roll",
-        "physics_tuned:build", _ESP, 0x56B4E9, needs_noise=True, tunable=True,
+        "phy_ukf:build", _ESP, 0x56B4E9, needs_noise=True, tunable=True,
     ),
     Spec(
         "pure-lstm", "a network that says v_y itself, from the same inputs, no filter (needs a network with baselines)",

@@ -53,7 +53,7 @@ class RunConfig:
     Attributes
     ----------
     estimators : names, in the order of the tables; ``all`` alone = every one that the car suits; None = the main one,
-        ``physics`` and ``zero``, with those that they are checked against (:func:`~.guard.default_names`).
+        ``physics`` and ``zero``, with those that they are checked against (:func:`~.selection.default_names`).
     car : a car's folder, a vehicle.toml, or ``saloon``, the shipped one; None = the default sedan.
     cars : a table that says which car each log has, instead of ``car``; None = the same for all.
     mapping : file; None = recognised types.
