@@ -376,15 +376,15 @@ def _filter(window, tuning, layout, p, f, estimate, out, links):  # type: ignore
     """Run over one window; ``estimate`` is moved in place. ``links`` are of length 0 where nobody asks for them."""
     dt, steer, ax, ay, yaw_rate, speed, friction, residual_rate, extra_r = window
     q_std, r_std, initial_std, standstill_std, _, _, scale, rules = tuning
-    belief_x, belief_P, memory = estimate
+    state_x, state_P, memory = estimate
     out_x, out_P, out_inputs, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     out_link, out_predicted_P, out_cross = links
     linked = out_link.shape[0] > 0
     places = places_of(layout)
     layout = spread_layout(layout)
-    x, there = _in_places(belief_x, places, 0.0), _in_places(np.ones(places.shape[0]), places, 0.0) > 0.0
+    x, there = _in_places(state_x, places, 0.0), _in_places(np.ones(places.shape[0]), places, 0.0) > 0.0
     P, L = aligned(ROOM * ROOM).reshape((ROOM, ROOM)), aligned(ROOM * ROOM).reshape((ROOM, ROOM))
-    _matrix_in_places(belief_P, places, P)
+    _matrix_in_places(state_P, places, P)
     q_std, initial_std = _in_places(q_std, places, 0.0), _in_places(initial_std, places, 0.0)
     standstill_std = _in_places(standstill_std, places, math.nan)
     points, before, row = aligned(PLACES * WIDTH), aligned(PLACES * WIDTH), aligned(ROOM)
@@ -453,8 +453,8 @@ def _filter(window, tuning, layout, p, f, estimate, out, links):  # type: ignore
         base.finish_step(k, now, residual_rate, rules, memory, out_inputs)
         _take(x, places, out_x[k])
         _take_matrix(P, places, out_P[k])
-    _take(x, places, belief_x)
-    _take_matrix(P, places, belief_P)
+    _take(x, places, state_x)
+    _take_matrix(P, places, state_P)
 
 
 @njit(cache=True)

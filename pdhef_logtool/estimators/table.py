@@ -122,7 +122,7 @@ SPECS: tuple[Spec, ...] = (
         frozenset({"steer_rad", "speed_m_s"}), 0xE69F00,
     ),
     Spec(
-        OPEN_LOOP, "the same on the car as its log calibrated it, without truth: not causal",
+        OPEN_LOOP, "open-loop on the car as its log calibrated it, without truth: not causal",
         "open_loop:build", frozenset({"steer_rad", "speed_m_s"}), 0x661100, causal=False,
     ),
     Spec(
@@ -139,7 +139,7 @@ SPECS: tuple[Spec, ...] = (
         "adaptive_physics:build", _ESP, 0x44AA99, tunable=True,
     ),
     Spec(
-        "phy-ukf:tuned", "the same with the noise of an identified car, corrected for body roll",
+        "phy-ukf:tuned", "phy-ukf with the noise of an identified car, corrected for body roll",
         "phy_ukf:build", _ESP, 0x56B4E9, needs_noise=True, tunable=True,
     ),
     Spec(

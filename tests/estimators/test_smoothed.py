@@ -499,7 +499,7 @@ def test_links_cost_the_filter_no_bit(rough):
     steps, again, links = PhysicsUkf(VEHICLE).linked_steps(rough, None)
     for name in (f.name for f in fields(PosteriorSteps)):
         np.testing.assert_array_equal(getattr(plain, name), getattr(steps, name))
-    np.testing.assert_array_equal(after.belief.P, again.belief.P)
+    np.testing.assert_array_equal(after.estimate.P, again.estimate.P)
     starts = ~np.isfinite(steps.prior[:, 0])
     np.testing.assert_array_equal(links.kind == LINK_NONE, starts)
     assert starts.sum() == 2
