@@ -12,9 +12,9 @@ import numpy as np
 from benchmarks.measuring import Row, best_seconds
 from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model_parameters, rk4_step, substeps
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
-from pdhef_logtool.estimators.filter_shell import INITIAL_STD
-from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, PhysicsUkf
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
+from pdhef_logtool.estimators.filter_base import INITIAL_STD
+from pdhef_logtool.estimators.phy_ukf import PHY_UKF_Q_STD, PhysicsUkf
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.records.signals import FloatArray, Signals
 
 STEPS = 60_000

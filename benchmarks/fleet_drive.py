@@ -20,7 +20,7 @@ from pdhef_logtool.estimators.table import ALL_ESTIMATORS, make_estimator
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import estimate_windows
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.guard import default_names
+from pdhef_logtool.runs.selection import default_names
 from truthsim.suite import write_suite
 
 #: Drives of a fleet, and of what takes longer.

@@ -15,8 +15,8 @@ import numpy as np
 from benchmarks.filtering import FRICTION, R_STD
 from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model_parameters, rk4_step, substeps
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.filter_shell import INITIAL_STD
-from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD
+from pdhef_logtool.estimators.filter_base import INITIAL_STD
+from pdhef_logtool.estimators.phy_ukf import PHY_UKF_Q_STD
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.sinks.mcap import STATE_TYPE, topic_of
 

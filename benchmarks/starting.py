@@ -21,7 +21,7 @@ from pdhef_logtool.car.car import SHIPPED_CARS, Car
 from pdhef_logtool.car.vehicle import PhysicsParts
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS, ModelBundle, load_bundle
 from pdhef_logtool.residual_model.service import NetworkService

@@ -31,7 +31,7 @@ from pdhef_logtool.evaluation.reasons import ReasonIntervals
 from pdhef_logtool.records import reasons
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.watches.sensor_faults import AY, YAW_RATE, FaultCarry, SensorFaults, find_faults
+from pdhef_logtool.watches.sensor_faults import AY, YAW_RATE, FaultState, SensorFaults, find_faults
 from studies import real
 from studies.condition_drives import as_logged, independent_runs, read_drive, root_mean_square
 from studies.pages import DOCS, DRIVES, INDEPENDENT, number, options, table, write
@@ -324,8 +324,8 @@ def changed(
     choice: Callable[[SensorFaults], SensorFaults],
     signals: Signals,
     vehicle: VehicleParameters,
-    carry: FaultCarry | None,
-) -> tuple[SensorFaults, FaultCarry]:
+    carry: FaultState | None,
+) -> tuple[SensorFaults, FaultState]:
     """Return what is found, with another choice of what filters make of it."""
     faults, after = find_faults(signals, vehicle, carry)
     return choice(faults), after

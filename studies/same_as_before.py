@@ -20,12 +20,20 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from pdhef_logtool.sinks.mcap import topic_of
 from studies.pages import DRIVES, ROOT, options
 
-_REFERENCE = ["--vehicle", "tests/reference/vehicles/revs_250lm.toml"]
+_REFERENCE = ["--car", "tests/reference/vehicles/revs_250lm.toml"]
 _MAPPING = ["--mapping", "tests/reference/mappings/revs_250lm.toml"]
 _SAMPLES = ("dlc.mcap", "road.mcap", "step.mcap", "step_rosbag2", "fishhook.mcap", "faults.mcap", "no_truth.mcap")
-_STATES = (("vy", "m_s"), ("yaw_rate", "rad_s"), ("sideslip", "rad"))
+#: Names of estimators in the older commit, and the names of the same estimators now.
+RENAMED = {
+    "gyro": "zero:no-lateral",
+    "open-loop-calibrated": "open-loop:calibrated",
+    "phy-ukf:tuned": "phy-ukf:tuned",
+    "pd-hef:fixed-r": "pd-hef:fixed-r",
+    "pd-hef:gain=1": "pd-hef:gain=1",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,25 +50,34 @@ class Case:
         return any("{drives}" in w for w in self.words)
 
 
-def cases(shipped: str) -> tuple[Case, ...]:
-    """Return the command lines; ``shipped`` is the vehicle file or folder of the shipped car in that tree."""
+def cases() -> tuple[Case, ...]:
+    """Return the command lines."""
     samples = tuple(f"sample_logs/{name}" for name in _SAMPLES)
     lm = "{drives}/revs_250lm_a.mcap"
     known = (*_REFERENCE, *_MAPPING)
-    samples_car = ("--vehicle", "sample_logs/vehicle.toml")
+    samples_car = ("--car", "sample_logs/vehicle.toml")
     return (
-        Case("samples", ("run", *samples, "--vehicle", shipped)),
-        Case("low-friction", ("run", "sample_logs/sweep.mcap", "--vehicle", shipped, "--friction", "0.3")),
+        Case("samples", ("run", *samples, "--car", "saloon")),
+        Case("low-friction", ("run", "sample_logs/sweep.mcap", "--car", "saloon", "--friction", "0.3")),
         Case("untuned", ("run", *samples[:1], "sample_logs/faults.mcap", *samples_car, "--sensors", "esp")),
         Case(
             "default-car",
-            ("run", "sample_logs/dlc.mcap", "--model", "many-cars", "--friction", "estimate", "--annotate", "sidecar"),
+            (
+                "run",
+                "sample_logs/dlc.mcap",
+                "--network",
+                "many-cars",
+                "--friction",
+                "estimate",
+                "--annotate",
+                "sidecar",
+            ),
         ),
         Case("250lm", ("run", lm, *known)),
         Case("250lm-truncated", ("run", "{drives}/faulty/revs_250lm_a_truncated60.mcap", *known), 3),
         Case("250lm-flipped", ("run", "{drives}/faulty/revs_250lm_a_flipped_byte.mcap", *known), 3),
         Case("250lm-car", ("learn", lm, *known, "--stages", "identify", "--end", "150", "--holdout", "0")),
-        Case("250lm-identified", ("run", lm, "--vehicle", "{out}/250lm-car", *_MAPPING, "--start", "155")),
+        Case("250lm-identified", ("run", lm, "--car", "{out}/250lm-car", *_MAPPING, "--start", "155")),
         Case(
             "recorded",
             ("metrics", "{out}/samples/logs/dlc/annotated.mcap", "--estimate", "/pdhef/phy_ukf/state", *samples_car),
@@ -69,16 +86,7 @@ def cases(shipped: str) -> tuple[Case, ...]:
 
 
 #: By case, estimator and column (metric, topic): the fault that a difference mends.
-MENDED: dict[tuple[str, str, str], str] = {
-    (case, *place): "without evidence for its network pd-hef-smoothed is another filter than the one at trust 1 whose "
-    "intervals were put on it by its name; those of its own algorithm do not exist"
-    for case in ("250lm", "250lm-truncated", "250lm-flipped", "250lm-identified")
-    for place in (
-        *(("pd-hef-smoothed", f"{state}_std_{unit}") for state, unit in _STATES),
-        *(("pd-hef-smoothed", metric) for metric in ("coverage95", "nees")),
-        *(("pd_hef_smoothed", f"/pdhef/pd_hef_smoothed/{topic}") for topic in ("odometry", "state")),
-    )
-}
+MENDED: dict[tuple[str, str, str], str] = {}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -117,17 +125,14 @@ def _git(*words: str) -> None:
 def _run(tree: Path, out: Path) -> None:
     """Run every case with the sources of a tree."""
     out.mkdir(parents=True, exist_ok=True)
-    folder = "pdhef_logtool/models/default"
-    shipped = folder if (tree / folder / "noise.toml").is_file() else f"{folder}/vehicle.toml"
-    # An older tree runs them all without being asked.
-    table = (tree / "pdhef_logtool" / "estimators" / "table.py").read_text(encoding="utf-8")
-    every = ["--estimators", "all"] if "ALL_ESTIMATORS" in table else []
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(tree)}
-    for case in cases(shipped):
+    for case in cases():
         if case.needs_drives and not DRIVES.is_dir():
             print(f"{case.name}: no ../shared, left out")
             continue
-        words = [w.format(drives=DRIVES, out=out) for w in case.words] + (every if case.words[0] == "run" else [])
+        words = [w.format(drives=DRIVES, out=out) for w in case.words] + ["--estimators", "all"] * (
+            case.words[0] == "run"
+        )
         command = [sys.executable, "-m", "pdhef_logtool", *words, "-o", str(out / case.name)]
         done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, check=False)
         print(f"{tree.name}: {case.name} ended with {done.returncode}", flush=True)
@@ -146,7 +151,7 @@ def compare(before: Path, after: Path) -> Iterator[tuple[str, str, str, str]]:
 
 
 def _estimates(old: Path, new: Path) -> Iterator[tuple[str, str, str]]:
-    one, other = (pl.read_parquet(p).sort("estimator", "stamp_ns") for p in (old, new))
+    one, other = (_renamed(pl.read_parquet(p)).sort("estimator", "stamp_ns") for p in (old, new))
     for name in one["estimator"].unique().sort():
         a, b = (t.filter(pl.col("estimator") == name) for t in (one, other))
         if len(a) != len(b):
@@ -161,15 +166,24 @@ def _estimates(old: Path, new: Path) -> Iterator[tuple[str, str, str]]:
 
 def _figures(old: Path, new: Path) -> Iterator[tuple[str, str, str]]:
     keys = ("estimator", "signal", "segment", "metric")
-    one, other = ({tuple(r[k] for k in keys): (r["value"], r["unit"], r["n"]) for r in pl.read_parquet(p).to_dicts()}
-                  for p in (old, new))  # fmt: skip
+    tables = (_renamed(pl.read_parquet(p)) for p in (old, new))
+    one, other = ({tuple(r[k] for k in keys): (r["value"], r["unit"], r["n"]) for r in t.to_dicts()} for t in tables)
     for key in sorted(one.keys() | other.keys()):
         if one.get(key) != other.get(key):
             yield key[0], key[-1], f"{'/'.join(key[1:-1])}: {one.get(key)} before, {other.get(key)} now"
 
 
+def _renamed(table: pl.DataFrame) -> pl.DataFrame:
+    """Return a table with the names of estimators as they are now; ``a~b`` names a pair of estimators."""
+    names = {n: "~".join(RENAMED.get(one, one) for one in n.split("~")) for n in table["estimator"].unique()}
+    return table.with_columns(pl.col("estimator").cast(pl.String).replace(names))
+
+
 def _messages(old: Path, new: Path) -> Iterator[tuple[str, str, str]]:
+    topics = {topic_of(before, ""): topic_of(now, "") for before, now in RENAMED.items()}
     one, other = _ours(old), _ours(new)
+    for place, now in topics.items():
+        one = {now + t.removeprefix(place) if t.startswith(place) else t: messages for t, messages in one.items()}
     for topic in sorted(one.keys() | other.keys()):
         if one.get(topic) != other.get(topic):
             yield topic.split("/")[2], topic, "payloads or stamps"

@@ -33,7 +33,7 @@ from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.guard import FACTOR, SIMPLE
+from pdhef_logtool.runs.selection import FACTOR, SIMPLE
 from pdhef_logtool.runs.self_calibrating import log_sensors
 from pdhef_logtool.self_calibration.calibration import (
     LEAST_KNOWN,

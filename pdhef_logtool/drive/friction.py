@@ -16,7 +16,7 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 
 if TYPE_CHECKING:
     from pdhef_logtool.drive.windows import DriveWindow
-    from pdhef_logtool.estimators.friction_bank import FrictionBank, FrictionCarry
+    from pdhef_logtool.estimators.friction_bank import FrictionBank, FrictionState
 
 #: What may be asked for beside a number.
 CHOICES = ("auto", "file", "estimate")
@@ -64,7 +64,7 @@ class FrictionSource:
     factor: float = 1.0
     stamps: int = 0
     observable_stamps: int = 0
-    _carry: FrictionCarry | None = None
+    _carry: FrictionState | None = None
     _std: list[FloatArray] = field(default_factory=list)
     _observable: list[BoolArray] = field(default_factory=list)
 

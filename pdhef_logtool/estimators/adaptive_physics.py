@@ -28,10 +28,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputCarry, check_inputs, r_scale, residual_rate
-from pdhef_logtool.estimators.filter_shell import VX, PosteriorSteps, sideslip_std
-from pdhef_logtool.estimators.physics import FilterCarry
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter, of_car
+from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputState, check_inputs, r_scale, residual_rate
+from pdhef_logtool.estimators.filter_base import VX, FilterState, PosteriorSteps, sideslip_std
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter, of_car
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.release import RESTART_GAP_S, Extrapolation, StepColumns, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
@@ -69,11 +68,11 @@ class MixtureSteps(StepColumns):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AdaptiveCarry:
+class AdaptiveState:
     """State of the inputs, the filters [H] and their evidence between windows."""
 
-    inputs: InputCarry
-    filters: tuple[FilterCarry, ...]
+    inputs: InputState
+    filters: tuple[FilterState, ...]
     evidence: FloatArray
 
 
@@ -92,7 +91,7 @@ def _gather(dt, likelihood, starts, evidence, out):  # type: ignore[no-untyped-d
 
 
 def gather_evidence(
-    steps: Sequence[PosteriorSteps], before: Sequence[FilterCarry] | None, evidence: FloatArray | None
+    steps: Sequence[PosteriorSteps], before: Sequence[FilterState] | None, evidence: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
     """Return Λ [K, H] of the filters' steps, and that after the last.
 
@@ -252,26 +251,26 @@ class AdaptivePhysics:
         vehicles = [vehicle.model_copy(update={"physics": p}) for p in parts]
         return tuple(replace(self.physics, vehicle=v, read_with=self.physics.read_with or vehicle) for v in vehicles)
 
-    def inputs(self, signals: Signals, carry: InputCarry | None) -> tuple[CheckedInputs, InputCarry]:
-        """Return what the filters take: checked signals with the residual at trust 1; and the carry."""
+    def inputs(self, signals: Signals, state: InputState | None) -> tuple[CheckedInputs, InputState]:
+        """Return what the filters take: checked signals with the residual at trust 1; and the state."""
         if self.adaptive:
-            return check_inputs(self.physics, self.network, signals, carry)
-        rate, after = residual_rate(self.physics, self.network, signals, carry)
+            return check_inputs(self.physics, self.network, signals, state)
+        rate, after = residual_rate(self.physics, self.network, signals, state)
         return CheckedInputs(no_faults(signals), rate), after
 
-    def run(self, signals: Signals, carry: AdaptiveCarry | None) -> tuple[MixtureSteps, AdaptiveCarry]:
+    def run(self, signals: Signals, state: AdaptiveState | None) -> tuple[MixtureSteps, AdaptiveState]:
         """Process one window (see :class:`~.base.Estimator`)."""
-        c = carry
+        c = state
         checked, inputs = self.inputs(signals, c.inputs if c else None)
         faults, rate = checked.faults, self.trust * checked.rate
         filters = self.filters
-        before: Sequence[FilterCarry | None] = c.filters if c else [None] * len(filters)
+        before: Sequence[FilterState | None] = c.filters if c else [None] * len(filters)
         runs = [f.run(faults.filtered, b, rate, faults.extra_r) for f, b in zip(filters, before, strict=True)]
         steps = tuple(one for one, _ in runs)
         gathered, evidence = gather_evidence(steps, c.filters if c else None, c.evidence if c else None)
         weights = weigh(gathered, np.stack([one.valid for one in steps], axis=1))
         raised = r_scale(faults.extra_r, self.physics.measurement_std)
-        after = AdaptiveCarry(inputs, tuple(state for _, state in runs), evidence)
+        after = AdaptiveState(inputs, tuple(state for _, state in runs), evidence)
         return MixtureSteps(steps, weights, raised, faults.reason), after
 
     def predict(self, steps: MixtureSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:

@@ -11,20 +11,20 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.estimators.filter_base import FilterState
 from pdhef_logtool.estimators.parallel_physics import run_features
-from pdhef_logtool.estimators.physics import FilterCarry
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
-from pdhef_logtool.watches.sensor_faults import FaultCarry, SensorFaults, find_faults
+from pdhef_logtool.watches.sensor_faults import FaultState, SensorFaults, find_faults
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class InputCarry:
+class InputState:
     """What the detector, the parallel filter and the network take from window to window; None: there is none."""
 
-    faults: FaultCarry | None
-    physics: FilterCarry | None = None
+    faults: FaultState | None
+    physics: FilterState | None = None
     network: NetworkCarry | None = None
 
 
@@ -53,38 +53,38 @@ class CheckedInputs:
 
 
 def check_inputs(
-    physics: PhysicsFilter, network: NetworkService | None, signals: Signals, carry: InputCarry | None
-) -> tuple[CheckedInputs, InputCarry]:
+    physics: PhysicsFilter, network: NetworkService | None, signals: Signals, state: InputState | None
+) -> tuple[CheckedInputs, InputState]:
     """Look for faults in one window, and run parallel filter and network on what they leave.
 
     Joined windows give the same bits as one call over the whole log.
     """
     read_with = physics.read_with or physics.vehicle
-    faults, fault_carry = find_faults(signals, read_with, carry.faults if carry else None)
-    rate, carried = residual_rate(physics, network, faults.filtered, carry, faults)
-    return CheckedInputs(faults, rate), InputCarry(fault_carry, carried.physics, carried.network)
+    faults, fault_carry = find_faults(signals, read_with, state.faults if state else None)
+    rate, carried = residual_rate(physics, network, faults.filtered, state, faults)
+    return CheckedInputs(faults, rate), InputState(fault_carry, carried.physics, carried.network)
 
 
 def residual_rate(
     physics: PhysicsFilter,
     network: NetworkService | None,
     signals: Signals,
-    carry: InputCarry | None,
+    state: InputState | None,
     faults: SensorFaults | None = None,
-) -> tuple[FloatArray, InputCarry]:
+) -> tuple[FloatArray, InputState]:
     """Return the network's residual rate [N, 2] in m/s² and rad/s², 0 without a network; trust is not yet applied."""
     if network is None:
-        return np.zeros((len(signals), 2)), InputCarry(None)
+        return np.zeros((len(signals), 2)), InputState(None)
     features, steps, after = run_features(
         physics,
         signals,
-        carry.physics if carry else None,
+        state.physics if state else None,
         seen=None if faults is None else faults.network,
         extra_r=None if faults is None else faults.extra_r,
     )
     starts = ~np.isfinite(steps.prior[:, 0])
-    rate, said = network.run(features, starts, carry.network if carry else None)
-    return rate, InputCarry(None, after, said)
+    rate, said = network.run(features, starts, state.network if state else None)
+    return rate, InputState(None, after, said)
 
 
 def r_scale(extra_r: FloatArray, r_std: FloatArray) -> FloatArray:

@@ -14,8 +14,8 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.estimators.base import AY, VX, VY, YAW_RATE, Steps
+from pdhef_logtool.estimators.filter_base import FilterState
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
-from pdhef_logtool.estimators.physics import FilterCarry
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
@@ -46,10 +46,10 @@ def direct_steps(vehicle: VehicleParameters, features: FloatArray, vy_m_s: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DirectCarry:
+class DirectState:
     """State of the parallel filter and the network between windows."""
 
-    physics: FilterCarry
+    physics: FilterState
     network: NetworkCarry
 
 
@@ -73,17 +73,17 @@ class DirectNetwork:
         """Say which file ran: run.json has the residual network's hash alone."""
         return (f"network {self.network.bundle.sha256}",)
 
-    def run(self, signals: Signals, carry: DirectCarry | None) -> tuple[Steps, DirectCarry]:
+    def run(self, signals: Signals, state: DirectState | None) -> tuple[Steps, DirectState]:
         """Process one window (see :class:`~.base.Estimator`)."""
         features, physics, after = run_features(
             parallel_filter(self.vehicle, use_speed=self.use_speed, slip_gate=self.slip_gate),
             signals,
-            carry.physics if carry else None,
+            state.physics if state else None,
         )
         starts = ~np.isfinite(physics.prior[:, 0])
-        output, network = self.network.run(features, starts, carry.network if carry else None)
+        output, network = self.network.run(features, starts, state.network if state else None)
         known = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
-        return direct_steps(self.vehicle, features, output[:, 0], known), DirectCarry(after, network)
+        return direct_steps(self.vehicle, features, output[:, 0], known), DirectState(after, network)
 
 
 def build(name: str, car: Car, options: Options) -> DirectNetwork:

@@ -29,8 +29,8 @@ from pdhef_logtool.car.nominal_model import (
     substeps,
 )
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.estimators.filter_shell import U_STEER, VX
-from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
+from pdhef_logtool.estimators.filter_base import U_STEER, VX, FilterState
+from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.release import last_stamp_ns, step_durations_s
@@ -72,15 +72,15 @@ _STEP_VY, _STEP_YAW_RATE = 0.02, 0.002  # for difference quotients
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FrictionCarry:
-    """What the bank takes from window to window; ``speed_filter`` is the carry of the ``phy-ukf`` beside it."""
+class FrictionState:
+    """What the bank takes from window to window; ``speed_filter`` is the state of the ``phy-ukf`` beside it."""
 
     weights: FloatArray
     x: FloatArray
     P: FloatArray
     memory: FloatArray
     last_stamp_ns: int | None
-    speed_filter: FilterCarry
+    speed_filter: FilterState
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -228,7 +228,7 @@ def _bank(drive, grid, prior, p, ay_per_friction, bank, out_mu, out_std):  # typ
 
 @dataclass(frozen=True, slots=True)
 class FrictionBank:
-    """The bank of this file; immutable, its only memory is the carry.
+    """The bank of this file; immutable, its only memory is the state.
 
     Parameters
     ----------
@@ -252,20 +252,20 @@ class FrictionBank:
         roll_gain = max(0.0, GRAVITY_M_S2 * self.vehicle.roll_gradient_rad_per_m_s2)
         return (1.0 + roll_gain) * (front + rear) / self.vehicle.mass_kg
 
-    def run(self, signals: Signals, carry: FrictionCarry | None) -> tuple[FrictionEstimate, FrictionCarry]:
+    def run(self, signals: Signals, state: FrictionState | None) -> tuple[FrictionEstimate, FrictionState]:
         """Estimate over one window; windows join bit for bit. ``signals.friction`` is not looked at."""
         signals = without_impossible(signals)
         steps, speed_carry = self._speed_filter.run(
-            _without_friction(signals), None if carry is None else carry.speed_filter
+            _without_friction(signals), None if state is None else state.speed_filter
         )
         parameters = model_parameters(self.vehicle, roll_correction=True)
         grid, prior = np.array(GRID), np.array(PRIOR)
         count = len(signals)
-        if carry is None:
+        if state is None:
             weights, x, P, memory = prior.copy(), np.zeros((len(grid), 2)), np.zeros((len(grid), 3)), np.zeros(_MEMORY)
         else:
-            weights, x, P, memory = carry.weights.copy(), carry.x.copy(), carry.P.copy(), carry.memory.copy()
-        before_ns = carry.last_stamp_ns if carry else None
+            weights, x, P, memory = state.weights.copy(), state.x.copy(), state.P.copy(), state.memory.copy()
+        before_ns = state.last_stamp_ns if state else None
         dt = step_durations_s(signals.stamps_ns, before_ns)
         vx = np.where(steps.valid, steps.x[:, VX], np.nan)
         usable = np.asarray(vx > LEAST_SPEED_BLENDS * parameters.blend_high_m_s)
@@ -275,7 +275,7 @@ class FrictionBank:
         )  # fmt: skip
         bank = (weights, x, P, memory)
         _bank(drive, grid, prior, parameters, self.ay_per_friction, bank, friction, std)
-        after = FrictionCarry(weights, x, P, memory, last_stamp_ns(signals.stamps_ns, before_ns), speed_carry)
+        after = FrictionState(weights, x, P, memory, last_stamp_ns(signals.stamps_ns, before_ns), speed_carry)
         return FrictionEstimate(friction, std, std < OBSERVABLE_STD), after
 
 

@@ -33,16 +33,11 @@ from pdhef_logtool.car.nominal_model import (
 )
 from pdhef_logtool.car.nominal_points import AT_VX, AT_VY, AT_YAW_RATE, advance_points, place, work_size
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.estimators import filter_shell as shell
+from pdhef_logtool.estimators import filter_base as base
+from pdhef_logtool.estimators.filter_base import FilterState
 from pdhef_logtool.estimators.fuzzy_trust import NOMINAL_TRUST, fuzzy_trust
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
-from pdhef_logtool.estimators.physics import (
-    PHY_UKF_Q_STD,
-    FilterCarry,
-    StateLayout,
-    measure_sigma_points,
-    set_points,
-)
+from pdhef_logtool.estimators.phy_ukf import PHY_UKF_Q_STD, StateLayout, measure_sigma_points, set_points
 from pdhef_logtool.estimators.unscented import (
     draw_sigma_points,
     innovation_moments,
@@ -68,12 +63,12 @@ PROCESS_NOISE_GAIN = 3.0
 PAPER_R_NORM = 0.1
 
 # Behind the entries of the shell's memory: β, and C of Eq 22 a measurement.
-M_TRUST, M_INNOVATION = shell.MEMORY, shell.MEMORY + 1
-MEMORY = M_INNOVATION + shell.MEASUREMENTS
+M_TRUST, M_INNOVATION = base.MEMORY, base.MEMORY + 1
+MEMORY = M_INNOVATION + base.MEASUREMENTS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PaperSteps(shell.PosteriorSteps):
+class PaperSteps(base.PosteriorSteps):
     """Posteriors, and by step, [K]: ``trust`` is β_k, ``r_scale`` R_k / R_0 of a_y.
 
     ``residual_rate`` is the network's at the step, before β.
@@ -84,12 +79,12 @@ class PaperSteps(shell.PosteriorSteps):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PaperCarry:
+class PaperState:
     """What the parallel filter, the network and this filter take from window to window."""
 
-    physics: FilterCarry
+    physics: FilterState
     network: NetworkCarry
-    own: shell.ShellCarry
+    own: base.FilterState
 
 
 class Parallel(NamedTuple):
@@ -112,14 +107,14 @@ def _propagate(chi, over, rate, dt, p, points):  # type: ignore[no-untyped-def]
     A residual counts where the model is dynamic: it knows nothing of the kinematic range. ``points`` is work space.
     """
     rate_vy, rate_r = rate
-    share = dynamic_share(chi[0, shell.VX], p) * dt
+    share = dynamic_share(chi[0, base.VX], p) * dt
     set_points(chi, over.steer, over.ax, (0.0, 0.0), _LAYOUT, points)
-    advance_points(points, over.friction, dt, substeps(chi[0, shell.VX], dt, over.friction, p), p)
+    advance_points(points, over.friction, dt, substeps(chi[0, base.VX], dt, over.friction, p), p)
     for i in range(chi.shape[0]):
         at = place(i)
-        chi[i, shell.VX] = points[at + AT_VX]
-        chi[i, shell.VY] = points[at + AT_VY] + share * rate_vy
-        chi[i, shell.YAW_RATE] = points[at + AT_YAW_RATE] + share * rate_r
+        chi[i, base.VX] = points[at + AT_VX]
+        chi[i, base.VY] = points[at + AT_VY] + share * rate_vy
+        chi[i, base.YAW_RATE] = points[at + AT_YAW_RATE] + share * rate_r
 
 
 @njit(cache=True)
@@ -138,8 +133,8 @@ def adapted_noise(innovation_variance, innovation, predicted_variance, r0):  # t
 
 
 @njit(cache=True)
-def _filter(window, tuning, r0, p, parallel, belief, out, adapted):  # type: ignore[no-untyped-def]
-    """Run over one window; ``belief`` is moved in place.
+def _filter(window, tuning, r0, p, parallel, estimate, out, adapted):  # type: ignore[no-untyped-def]
+    """Run over one window; ``estimate`` is moved in place.
 
     Where the prior of the parallel filter is missing it starts, and this filter with it. ``r0`` [3] is R_0, and
     ``adapted`` trust and scale of R at each step, [K] each.
@@ -147,60 +142,60 @@ def _filter(window, tuning, r0, p, parallel, belief, out, adapted):  # type: ign
     dt, _, _, ay, yaw_rate, speed, _, rate, _ = window
     q_std, _, initial_std, _, wm, wc, scale, rules = tuning
     start_x, prior, inputs, start_ok = parallel
-    x, P, memory = belief
+    x, P, memory = estimate
     out_x, out_P, _, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     out_trust, out_r_scale = adapted
-    n = shell.STATES
-    chi, L, zeta, z_hat, S, Pxz, nu, _, _, use = shell.make_work(n)
+    n = base.STATES
+    chi, L, zeta, z_hat, S, Pxz, nu, _, _, use = base.make_work(n)
     points = np.empty(work_size(2 * n + 1))
     for k in range(dt.shape[0]):
         steer, friction, has_ax, ok = (
-            inputs[k, shell.U_STEER],
-            inputs[k, shell.U_FRICTION],
-            inputs[k, shell.U_AX_KNOWN] > 0.0,
+            inputs[k, base.U_STEER],
+            inputs[k, base.U_FRICTION],
+            inputs[k, base.U_AX_KNOWN] > 0.0,
             start_ok[k],
         )
         z_ay = ay[k] if ok else math.nan  # without steering no a_y can be predicted
         z_speed = speed[k] if rules.use_speed else math.nan
-        now = shell.Now(dt[k], steer, inputs[k, shell.U_AX], has_ax, friction, ok, ok, z_ay, yaw_rate[k], z_speed)
+        now = base.StepInputs(dt[k], steer, inputs[k, base.U_AX], has_ax, friction, ok, ok, z_ay, yaw_rate[k], z_speed)
         out_r_scale[k] = 1.0
-        if not math.isfinite(prior[k, shell.VX]):
-            memory[shell.M_INITIALISED] = 0.0
-        if memory[shell.M_INITIALISED] == 0.0:
+        if not math.isfinite(prior[k, base.VX]):
+            memory[base.M_INITIALISED] = 0.0
+        if memory[base.M_INITIALISED] == 0.0:
             if ok:
-                memory[shell.M_INITIALISED] = 1.0
+                memory[base.M_INITIALISED] = 1.0
                 memory[M_TRUST] = NOMINAL_TRUST
                 P[:, :] = 0.0
                 for i in range(n):
                     x[i] = start_x[k, i]
                     P[i, i] = initial_std[i] ** 2
-                for i in range(shell.MEASUREMENTS):
+                for i in range(base.MEASUREMENTS):
                     memory[M_INNOVATION + i] = math.nan
                 out_valid[k] = True
         else:
             nominal = measured_lateral_acceleration(
-                prior[k, shell.VX], prior[k, shell.VY], prior[k, shell.YAW_RATE], steer, friction, p
+                prior[k, base.VX], prior[k, base.VY], prior[k, base.YAW_RATE], steer, friction, p
             )  # fmt: skip
             trust = fuzzy_trust(abs(ay[k] - nominal), abs(ay[k]) / (friction * GRAVITY_M_S2))
             if math.isfinite(trust):
                 memory[M_TRUST] = trust
             trust = memory[M_TRUST]
-            rate_vy, rate_r = trust * memory[shell.M_RATE_VY], trust * memory[shell.M_RATE_R]
+            rate_vy, rate_r = trust * memory[base.M_RATE_VY], trust * memory[base.M_RATE_R]
             draw_sigma_points(x, P, scale, L, chi)
-            over = shell.meanwhile(now, memory)
+            over = base.held_over_step(now, memory)
             _propagate(chi, over, (rate_vy, rate_r), dt[k], p, points)
             mean_and_covariance(chi, wm, wc, x, P)
-            shell.add_process_noise(P, q_std, over.ax_known, (1.0 + PROCESS_NOISE_GAIN * trust) * dt[k])  # Eq 26
-            alive = shell.all_finite(x, P)
+            base.add_process_noise(P, q_std, over.ax_known, (1.0 + PROCESS_NOISE_GAIN * trust) * dt[k])  # Eq 26
+            alive = base.all_finite(x, P)
             out_prior[k] = x
             if alive:
                 draw_sigma_points(x, P, scale, L, chi)
                 measure_sigma_points(chi, steer, friction, rate_vy, _LAYOUT, p, points, zeta)
                 innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
-                nu[shell.Z_AY] = now.ay - z_hat[shell.Z_AY]
-                nu[shell.Z_YAW_RATE] = now.yaw_rate - z_hat[shell.Z_YAW_RATE]
-                nu[shell.Z_SPEED] = now.speed - z_hat[shell.Z_SPEED]
-                for i in range(shell.MEASUREMENTS):
+                nu[base.Z_AY] = now.ay - z_hat[base.Z_AY]
+                nu[base.Z_YAW_RATE] = now.yaw_rate - z_hat[base.Z_YAW_RATE]
+                nu[base.Z_SPEED] = now.speed - z_hat[base.Z_SPEED]
+                for i in range(base.MEASUREMENTS):
                     use[i] = math.isfinite(nu[i])
                     r = r0[i]
                     if use[i]:
@@ -209,19 +204,19 @@ def _filter(window, tuning, r0, p, parallel, belief, out, adapted):  # type: ign
                         memory[M_INNOVATION + i] = c
                     elif math.isfinite(memory[M_INNOVATION + i]):
                         r = max(r0[i], memory[M_INNOVATION + i] - S[i, i])
-                    if i == shell.Z_AY:
+                    if i == base.Z_AY:
                         out_r_scale[k] = r / r0[i]
                     S[i, i] += r
                 nis, dof, out_likelihood[k] = kalman_update(x, P, nu, S, Pxz, use)
                 if dof > 0:
                     out_nis[k] = nis
                     out_dof[k] = dof
-                alive = shell.all_finite(x, P)
+                alive = base.all_finite(x, P)
             out_valid[k] = alive and ok
-            out_diverged[k] = not alive or shell.diverges(rules, x, memory)
+            out_diverged[k] = not alive or base.diverges(rules, x, memory)
             if not alive:
-                memory[shell.M_INITIALISED] = 0.0
-        shell.remember(k, now, rate, memory)
+                memory[base.M_INITIALISED] = 0.0
+        base.remember(k, now, rate, memory)
         out_trust[k] = memory[M_TRUST]
         out_x[k] = x
         out_P[k] = P
@@ -234,7 +229,7 @@ def _predict_outputs(due, held, trust, tuning, p, predicted):  # type: ignore[no
     held_x, held_P, inputs, rate = held
     out_x, out_P, out_ay = predicted
     q_std, _, _, _, wm, wc, scale, _ = tuning
-    n = shell.STATES
+    n = base.STATES
     chi, points = np.empty((2 * n + 1, n)), np.empty(work_size(2 * n + 1))
     L = np.empty((n, n))
     x = np.empty(n)
@@ -247,18 +242,16 @@ def _predict_outputs(due, held, trust, tuning, p, predicted):  # type: ignore[no
         if k >= 0:
             x[:] = held_x[k]
             P[:, :] = held_P[k]
-            over = shell.held_inputs(inputs, k)
+            over = base.held_inputs(inputs, k)
             rate_vy, rate_r = trust[k] * rate[k, 0], trust[k] * rate[k, 1]
             if horizon_s[m] > 0.0:
                 draw_sigma_points(x, P, scale, L, chi)
                 _propagate(chi, over, (rate_vy, rate_r), horizon_s[m], p, points)
                 mean_and_covariance(chi, wm, wc, x, P)
-                shell.add_process_noise(P, q_std, over.ax_known, (1.0 + PROCESS_NOISE_GAIN * trust[k]) * horizon_s[m])
-            if shell.all_finite(x, P):
-                ay = planar_lateral_acceleration(
-                    x[shell.VX], x[shell.VY], x[shell.YAW_RATE], over.steer, over.friction, p
-                )
-                out_ay[m] = ay + dynamic_share(x[shell.VX], p) * rate_vy
+                base.add_process_noise(P, q_std, over.ax_known, (1.0 + PROCESS_NOISE_GAIN * trust[k]) * horizon_s[m])
+            if base.all_finite(x, P):
+                ay = planar_lateral_acceleration(x[base.VX], x[base.VY], x[base.YAW_RATE], over.steer, over.friction, p)
+                out_ay[m] = ay + dynamic_share(x[base.VX], p) * rate_vy
             else:
                 x[:] = math.nan
                 P[:, :] = math.nan
@@ -303,7 +296,7 @@ class PaperHybridUkf:
         s = self.vehicle.sensors
         std = np.array([s.ay_std_m_s2, s.yaw_rate_std_rad_s, s.speed_std_m_s])
         variance: FloatArray = std**2
-        variance[shell.Z_AY] = max(variance[shell.Z_AY], PAPER_R_NORM)
+        variance[base.Z_AY] = max(variance[base.Z_AY], PAPER_R_NORM)
         return variance
 
     @property
@@ -311,28 +304,28 @@ class PaperHybridUkf:
         return model_parameters(self.vehicle)
 
     @property
-    def _tuning(self) -> shell.Tuning:
+    def _tuning(self) -> base.Tuning:
         r_std = np.sqrt(self.measurement_variance)
-        return shell.make_tuning(self.vehicle, self.q_std, r_std, shell.INITIAL_STD, use_speed=self.use_speed)
+        return base.make_tuning(self.vehicle, self.q_std, r_std, base.INITIAL_STD, use_speed=self.use_speed)
 
-    def run(self, signals: Signals, carry: PaperCarry | None) -> tuple[PaperSteps, PaperCarry]:
+    def run(self, signals: Signals, state: PaperState | None) -> tuple[PaperSteps, PaperState]:
         """Process one window (see :class:`~.base.Estimator`)."""
         features, physics, after = run_features(
             parallel_filter(self.vehicle, use_speed=self.use_speed, slip_gate=self.slip_gate),
             signals,
-            carry.physics if carry else None,
+            state.physics if state else None,
         )
-        starts = ~np.isfinite(physics.prior[:, shell.VX])
-        rate, network = self.network.run(features, starts, carry.network if carry else None)
-        steps, own = self._filter_steps(signals, physics, rate, carry.own if carry else None)
-        return steps, PaperCarry(after, network, own)
+        starts = ~np.isfinite(physics.prior[:, base.VX])
+        rate, network = self.network.run(features, starts, state.network if state else None)
+        steps, own = self._filter_steps(signals, physics, rate, state.own if state else None)
+        return steps, PaperState(after, network, own)
 
     def predict(self, steps: PaperSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate steps with the nominal model and the residual held (see :class:`~.base.ModelPredictor`)."""
-        held = shell.Held(steps.x, steps.P, steps.inputs, steps.residual_rate)
-        predicted = shell.no_prediction(len(stamps_ns), steps.x.shape[1])
-        _predict_outputs(shell.due(ahead), held, steps.trust, self._tuning, self._parameters, predicted)
-        track = shell.predicted_track(self.name, stamps_ns, steps, ahead, predicted)
+        held = base.PredictionStart(steps.x, steps.P, steps.inputs, steps.residual_rate)
+        predicted = base.no_prediction(len(stamps_ns), steps.x.shape[1])
+        _predict_outputs(base.pending_predictions(ahead), held, steps.trust, self._tuning, self._parameters, predicted)
+        track = base.predicted_track(self.name, stamps_ns, steps, ahead, predicted)
         return replace(
             track,
             network_trust=np.where(track.valid, steps.trust[ahead.step], np.nan),
@@ -342,23 +335,23 @@ class PaperHybridUkf:
     def _filter_steps(
         self,
         signals: Signals,
-        physics: shell.PosteriorSteps,
+        physics: base.PosteriorSteps,
         rate: FloatArray,
-        carry: shell.ShellCarry | None,
-    ) -> tuple[PaperSteps, shell.ShellCarry]:
+        state: base.FilterState | None,
+    ) -> tuple[PaperSteps, base.FilterState]:
         """Filter one window; return its steps, and the state for the next one."""
         speed_std_m_s = self.vehicle.sensors.speed_std_m_s
-        signals, slip = believable(signals, speed_std_m_s, carry.slip if carry else None, gate=self.slip_gate)
-        belief, count = shell.resume(carry, shell.STATES, MEMORY), len(signals)
+        signals, slip = believable(signals, speed_std_m_s, state.slip if state else None, gate=self.slip_gate)
+        estimate, count = base.resume(state, base.STATES, MEMORY), len(signals)
         parallel = Parallel(physics.x, physics.prior, physics.inputs, physics.valid)
         out, adapted = (
-            shell.no_posterior(count, shell.STATES)._replace(inputs=physics.inputs),
+            base.no_posterior(count, base.STATES)._replace(inputs=physics.inputs),
             (np.empty(count), np.empty(count)),
         )
-        window, r0 = shell.make_window(signals, carry, rate), self.measurement_variance
-        _filter(window, self._tuning, r0, self._parameters, parallel, belief, out, adapted)
+        window, r0 = base.make_window(signals, state, rate), self.measurement_variance
+        _filter(window, self._tuning, r0, self._parameters, parallel, estimate, out, adapted)
         steps = PaperSteps(signals.stamps_ns, *out, rate, *adapted)
-        return steps, shell.carry_on(belief, signals.stamps_ns, carry, slip)
+        return steps, base.next_state(estimate, signals.stamps_ns, state, slip)
 
 
 def build(name: str, car: Car, options: Options) -> PaperHybridUkf:

@@ -57,7 +57,7 @@ class Kinematic:
     name: str = "kinematic"
     causal: bool = True
 
-    def run(self, signals: Signals, carry: StepState | None) -> tuple[Steps, StepState]:
+    def run(self, signals: Signals, state: StepState | None) -> tuple[Steps, StepState]:
         """Process one window (see :class:`~.base.Estimator`)."""
 
         def step(
@@ -66,7 +66,7 @@ class Kinematic:
             sensors = (dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s)
             _kinematic(sensors, self.leak_s, state, values, rates, valid)
 
-        return run_stepwise(signals, carry, 4, step, slip_gate=self.slip_gate)
+        return run_stepwise(signals, state, 4, step, slip_gate=self.slip_gate)
 
 
 def build(name: str, car: Car, options: Options) -> Kinematic:

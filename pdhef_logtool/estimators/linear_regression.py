@@ -10,9 +10,8 @@ import numpy as np
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.base import Steps
 from pdhef_logtool.estimators.direct_network import direct_steps
-from pdhef_logtool.estimators.filter_shell import VX
+from pdhef_logtool.estimators.filter_base import VX, FilterState
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
-from pdhef_logtool.estimators.physics import FilterCarry
 from pdhef_logtool.records.release import last_stamp_ns, step_durations_s
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.linear_model import LinearModel
@@ -24,10 +23,10 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RegressionCarry:
+class RegressionState:
     """State of the parallel filter and the low-pass between windows."""
 
-    physics: FilterCarry
+    physics: FilterState
     sideslip: FloatArray
     last_stamp_ns: int | None
 
@@ -52,17 +51,17 @@ class LinearRegression:
         """Say which file ran: run.json has the residual network's hash alone."""
         return (f"coefficients {self.model.sha256}",)
 
-    def run(self, signals: Signals, carry: RegressionCarry | None) -> tuple[Steps, RegressionCarry]:
+    def run(self, signals: Signals, state: RegressionState | None) -> tuple[Steps, RegressionState]:
         """Process one window (see :class:`~.base.Estimator`)."""
         features, physics, after = run_features(
             parallel_filter(self.vehicle, use_speed=self.use_speed, slip_gate=self.slip_gate),
             signals,
-            carry.physics if carry else None,
+            state.physics if state else None,
         )
         known = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
         starts = ~np.isfinite(physics.prior[:, VX])
-        before_ns = carry.last_stamp_ns if carry else None
-        sideslip = np.zeros(1) if carry is None else carry.sideslip.copy()
+        before_ns = state.last_stamp_ns if state else None
+        sideslip = np.zeros(1) if state is None else state.sideslip.copy()
         beta = self.model.sideslip_rad(features)[:, None]
         # The low-pass restarts wherever the parallel filter does.
         dt = np.where(starts, np.nan, step_durations_s(signals.stamps_ns, before_ns))
@@ -70,7 +69,7 @@ class LinearRegression:
         # Sideslip is an angle of the velocity: beyond 80 degrees the line has left its range.
         vy = features[:, 0] * np.tan(np.clip(beta[:, 0], -1.4, 1.4))
         steps = direct_steps(self.vehicle, features, vy, known)
-        return steps, RegressionCarry(after, sideslip, last_stamp_ns(signals.stamps_ns, before_ns))
+        return steps, RegressionState(after, sideslip, last_stamp_ns(signals.stamps_ns, before_ns))
 
 
 def build(name: str, car: Car, options: Options) -> LinearRegression:

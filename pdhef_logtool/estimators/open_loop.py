@@ -82,7 +82,7 @@ class OpenLoop:
     name: str = "open-loop"
     causal: bool = True
 
-    def run(self, signals: Signals, carry: StepState | None) -> tuple[Steps, StepState]:
+    def run(self, signals: Signals, state: StepState | None) -> tuple[Steps, StepState]:
         """Process one window (see :class:`~.base.Estimator`)."""
         p = model_parameters(self.vehicle)
         mu = self.vehicle.assumed_friction
@@ -94,7 +94,7 @@ class OpenLoop:
             _open_loop(inputs, mu, p, state, values, rates, valid)
 
         std = self.vehicle.sensors.speed_std_m_s
-        return run_stepwise(signals, carry, 6, step, slip_gate=self.slip_gate, speed_std_m_s=std)
+        return run_stepwise(signals, state, 6, step, slip_gate=self.slip_gate, speed_std_m_s=std)
 
 
 def build(name: str, car: Car, options: Options) -> OpenLoop:

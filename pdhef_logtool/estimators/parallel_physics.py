@@ -13,10 +13,18 @@ import numpy as np
 
 from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model_parameters
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.filter_shell import U_FRICTION, U_SPEED, U_STEER, VX, PosteriorSteps, rolls_forward
-from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
+from pdhef_logtool.estimators.filter_base import (
+    U_FRICTION,
+    U_SPEED,
+    U_STEER,
+    VX,
+    FilterState,
+    PosteriorSteps,
+    rolls_forward,
+)
+from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter, of_car
 from pdhef_logtool.estimators.physics_model import FRONT, REAR, Layout, PhysicsParameters, sensed_ay
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter, of_car
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -85,24 +93,24 @@ def filter_of(car: Car, model: str, *, use_speed: bool = True) -> PhysicsUkf | P
 def run_features(
     physics: PhysicsUkf | PhysicsFilter,
     signals: Signals,
-    carry: FilterCarry | None,
+    state: FilterState | None,
     *,
     seen: Signals | None = None,
     extra_r: FloatArray | None = None,
-) -> tuple[FloatArray, PosteriorSteps, FilterCarry]:
+) -> tuple[FloatArray, PosteriorSteps, FilterState]:
     """Run the parallel filter over a window.
 
     Parameters
     ----------
     seen : the measurements that the network may see; those of ``signals`` when None.
-    extra_r : [K, 2], as for :meth:`~.physics.PhysicsUkf.run`.
+    extra_r : [K, 2], as for :meth:`~.phy_ukf.PhysicsUkf.run`.
 
     Returns
     -------
     features : [K, 28], NaN where the filter has no state, or one that goes backwards against the speed sensor.
-    steps, carry : of the filter.
+    steps, state : of the filter.
     """
-    steps, after = physics.run(signals, carry, extra_r=extra_r)
+    steps, after = physics.run(signals, state, extra_r=extra_r)
     seen = signals if seen is None else seen
     friction, predicted = steps.inputs[:, U_FRICTION], np.empty(len(signals))
     body, parameters = np.zeros((len(signals), _BODY)), np.zeros((len(signals), _PARAMETERS))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from pdhef_logtool.car.parts import SMOOTHING
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
-from pdhef_logtool.estimators.physics_ukf import of_car
+from pdhef_logtool.estimators.physics_filter import of_car
 from pdhef_logtool.estimators.presets import options_of
 from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_smoothing
 

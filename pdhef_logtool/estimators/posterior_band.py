@@ -19,11 +19,11 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.adaptive_physics import CURES
 from pdhef_logtool.estimators.latency_compensation import WindowState, run_window
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter, of_car
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter, of_car
 from pdhef_logtool.estimators.self_calibrated import widened
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.watches.error_features import TERMS, FeatureCarry, error_terms
+from pdhef_logtool.watches.error_features import TERMS, FeatureState, error_terms
 
 #: k_o above, chosen on 8 simulated cars, identified on one drive and judged on drives of other manoeuvres. The other
 #: two count as they are.
@@ -42,7 +42,7 @@ class PosteriorBand:
     _window: Signals | None = None
     _vy: list[FloatArray] = field(default_factory=list)
     _states: tuple[WindowState, ...] = ()
-    _features: dict[str, FeatureCarry] = field(default_factory=dict)
+    _features: dict[str, FeatureState] = field(default_factory=dict)
 
     def add(self, track: StateTrack, signals: Signals) -> StateTrack:
         """Return the next window of a track [N] with 1-sigmas as the head of this file has them."""

@@ -32,7 +32,7 @@ from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.watches.intervals import MAX_SIDESLIP_STD_RAD
 
 if TYPE_CHECKING:
-    from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
+    from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 
 #: Presets built on ``physics``. They use the calibrated vehicle if there is one; all others use the vehicle file.
 SELF_CALIBRATED = frozenset({"physics", "pd-hef", "pd-hef-smoothed"})
@@ -69,7 +69,7 @@ class CalibratedBand:
     @property
     def _filters(self) -> tuple[PhysicsFilter, ...]:
         """The physics filter on the calibrated vehicle and on its variations; none without variations."""
-        from pdhef_logtool.estimators.physics_ukf import physics_filter
+        from pdhef_logtool.estimators.physics_filter import physics_filter
 
         found = self.calibration
         vehicles = (found.vehicle, *found.varied) if found.varied else ()

@@ -40,16 +40,23 @@ from pdhef_logtool.estimators.adaptive_physics import (
     gather_evidence,
     weigh,
 )
-from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputCarry, r_scale
-from pdhef_logtool.estimators.filter_shell import AX_BIAS, VX, PosteriorSteps
-from pdhef_logtool.estimators.physics import LINK_BIASES, LINK_NONE, FilterCarry, StepLinks
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
-from pdhef_logtool.estimators.unscented import ROOM, wide_root
+from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputState, r_scale
+from pdhef_logtool.estimators.filter_base import (
+    AX_BIAS,
+    LINK_BIASES,
+    LINK_NONE,
+    VX,
+    FilterState,
+    PosteriorSteps,
+    StepLinks,
+)
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
+from pdhef_logtool.estimators.unscented import wide_root
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.release import RESTART_GAP_S, Extrapolation, StepColumns, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.records.vectors import LANES, aligned, load, spread, store
+from pdhef_logtool.records.vectors import LANES, ROOM, aligned, load, spread, store
 
 #: A step sees at least this much ahead and at most twice as much. Sensor biases remember for minutes: against a
 #: smoother that sees all of a drive of 300 s this changed v_y by less than 5e-5 m/s (60 s: 5e-4 m/s).
@@ -325,7 +332,7 @@ Piece: TypeAlias = tuple[ForwardSteps, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SmoothedCarry:
+class SmoothedState:
     """State of the inputs, the forward filters [H] and their evidence behind all steps that are taken; those ahead.
 
     The steps ahead lie in pieces, which are handed on and
@@ -333,8 +340,8 @@ class SmoothedCarry:
     filter.
     """
 
-    inputs: InputCarry | None
-    forward: tuple[FilterCarry, ...] | None
+    inputs: InputState | None
+    forward: tuple[FilterState, ...] | None
     evidence: FloatArray | None
     ahead: tuple[Piece, ...]
     shared: SharedSteps | None
@@ -371,9 +378,9 @@ class SmoothedPhysics:
     def run(
         self,
         signals: Signals,
-        carry: SmoothedCarry | None,
+        state: SmoothedState | None,
         ahead: Signals | None = None,
-    ) -> tuple[MixtureSteps, SmoothedCarry]:
+    ) -> tuple[MixtureSteps, SmoothedState]:
         """Process one window (see :class:`~.base.LookingAhead`).
 
         Parameters
@@ -382,22 +389,22 @@ class SmoothedPhysics:
             with it. Without it the log ends here for all that the smoother knows.
         """
         given = signals if ahead is None else join_signals([signals, ahead])
-        if carry is None:
+        if state is None:
             origin_ns = int(given.stamps_ns[0]) if len(given) else None
-            carry = SmoothedCarry(None, None, None, (), None, origin_ns, None)
-        elif carry.origin_ns is None and len(given):
-            carry = replace(carry, origin_ns=int(given.stamps_ns[0]))
+            state = SmoothedState(None, None, None, (), None, origin_ns, None)
+        elif state.origin_ns is None and len(given):
+            state = replace(state, origin_ns=int(given.stamps_ns[0]))
         parts = []
         for first in range(0, max(len(signals), 1), STEPS_AT_ONCE):
             end = min(first + STEPS_AT_ONCE, len(signals))
-            taken = first + (0 if carry.shared is None else len(carry.shared))
-            seen = max(taken, self._seen(given.stamps_ns, end, carry.origin_ns))
-            checked, after = self.filtered.inputs(given.rows(taken, seen), carry.inputs)
-            carry = self._filtered(checked, replace(carry, inputs=after))
-            part, done = self._smoothed(end - first, carry)
+            taken = first + (0 if state.shared is None else len(state.shared))
+            seen = max(taken, self._seen(given.stamps_ns, end, state.origin_ns))
+            checked, after = self.filtered.inputs(given.rows(taken, seen), state.inputs)
+            state = self._filtered(checked, replace(state, inputs=after))
+            part, done = self._smoothed(end - first, state)
             parts.append(part)
-            carry = _without(carry, end - first, done)
-        return reduce(MixtureSteps.joined, parts), carry
+            state = _without(state, end - first, done)
+        return reduce(MixtureSteps.joined, parts), state
 
     def _seen(self, stamps_ns: IntArray, end: int, origin_ns: int | None) -> int:
         """Return how many steps there are up to the end of the block behind that of the last of the first ``end``."""
@@ -407,42 +414,42 @@ class SmoothedPhysics:
         block = (int(stamps_ns[end - 1]) - origin_ns) // block_ns
         return int(np.searchsorted(stamps_ns, origin_ns + (block + 2) * block_ns))
 
-    def _filtered(self, checked: CheckedInputs, carry: SmoothedCarry) -> SmoothedCarry:
+    def _filtered(self, checked: CheckedInputs, state: SmoothedState) -> SmoothedState:
         """Run the filters forward over steps that they have not taken yet; they follow those ahead."""
         filters = self.filtered.filters
         for begin in range(0, max(len(checked.rate), 1), STEPS_AT_ONCE):
             part = checked.cut(begin, begin + STEPS_AT_ONCE)
             faults, rate = part.faults, self.filtered.trust * part.rate
-            before = carry.forward or [None] * len(filters)
+            before = state.forward or [None] * len(filters)
             runs = [
                 f.linked_steps(faults.filtered, b, rate, faults.extra_r) for f, b in zip(filters, before, strict=True)
             ]
             steps = [one for one, _, _ in runs]
-            gathered, evidence = gather_evidence(steps, carry.forward, carry.evidence)
+            gathered, evidence = gather_evidence(steps, state.forward, state.evidence)
             likelihood = np.stack([one.log_likelihood for one in steps], axis=1)
             starts: BoolArray = ~np.isfinite(steps[0].prior[:, VX])
             shared = SharedSteps(steps[0].stamps_ns, gathered, likelihood, starts, faults.extra_r, faults.reason)
-            carry = replace(
-                carry,
+            state = replace(
+                state,
                 forward=tuple(after for _, after, _ in runs),
                 evidence=evidence,
-                ahead=(*carry.ahead, tuple(ForwardSteps(one, links) for one, _, links in runs)),
-                shared=shared if carry.shared is None else carry.shared.joined(shared),
+                ahead=(*state.ahead, tuple(ForwardSteps(one, links) for one, _, links in runs)),
+                shared=shared if state.shared is None else state.shared.joined(shared),
             )
-        return carry
+        return state
 
-    def _smoothed(self, count: int, carry: SmoothedCarry) -> tuple[MixtureSteps, tuple[Smoothed, ...]]:
+    def _smoothed(self, count: int, state: SmoothedState) -> tuple[MixtureSteps, tuple[Smoothed, ...]]:
         """Smooth the first ``count`` of the steps ahead, with all of them.
 
         Also returns, by filter, the smoothed steps that follow, as far as they are done.
         """
-        shared = carry.shared
+        shared = state.shared
         assert shared is not None
-        block_ns, origin_ns = round(self.block_s * 1e9), carry.origin_ns or 0
+        block_ns, origin_ns = round(self.block_s * 1e9), state.origin_ns or 0
         smoothed, following = [], []
         for i in range(len(self.filtered.filters)):
-            steps = [piece[i] for piece in carry.ahead]
-            done = None if carry.smoothed is None else carry.smoothed[i]
+            steps = [piece[i] for piece in state.ahead]
+            done = None if state.smoothed is None else state.smoothed[i]
             x, P = smooth_blocks(steps, shared.stamps_ns, count, origin_ns, block_ns, done)
             following.append((x[count:].copy(), P[count:].copy()))
             posterior = _first_of([piece.posterior for piece in steps], count)
@@ -483,12 +490,12 @@ def _first_of(pieces: Sequence[PosteriorSteps], count: int) -> PosteriorSteps:
     return first
 
 
-def _without(carry: SmoothedCarry, passed: int, smoothed: tuple[Smoothed, ...]) -> SmoothedCarry:
-    """Return the carry behind the first steps ahead, with what is smoothed of those that follow."""
-    assert carry.shared is not None
-    ahead, rest = list(carry.ahead), passed
+def _without(state: SmoothedState, passed: int, smoothed: tuple[Smoothed, ...]) -> SmoothedState:
+    """Return the state behind the first steps ahead, with what is smoothed of those that follow."""
+    assert state.shared is not None
+    ahead, rest = list(state.ahead), passed
     while ahead and len(ahead[0][0]) <= rest:
         rest -= len(ahead.pop(0)[0])
     if ahead:
         ahead[0] = tuple(one.since(rest) for one in ahead[0])
-    return replace(carry, ahead=tuple(ahead), shared=carry.shared.since(passed), smoothed=smoothed)
+    return replace(state, ahead=tuple(ahead), shared=state.shared.since(passed), smoothed=smoothed)

@@ -12,7 +12,7 @@ from pdhef_logtool.estimators.base import VX, Steps
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.release import last_stamp_ns, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
-from pdhef_logtool.watches.speed_slip import ASSUMED_STD_M_S, SlipCarry, believable
+from pdhef_logtool.watches.speed_slip import ASSUMED_STD_M_S, SlipState, believable
 
 #: A speed sample is carried on by a_x for this long.
 SPEED_HOLD_S = 0.5
@@ -24,7 +24,7 @@ class StepState:
 
     state: FloatArray
     last_stamp_ns: int | None
-    slip: SlipCarry | None = None
+    slip: SlipState | None = None
 
 
 #: (dt [K], signals, state, values [K, 4], rates [K, 4], valid [K]) -> None; writes the last four in place.

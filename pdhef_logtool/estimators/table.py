@@ -122,7 +122,7 @@ SPECS: tuple[Spec, ...] = (
         frozenset({"steer_rad", "speed_m_s"}), 0xE69F00,
     ),
     Spec(
-        OPEN_LOOP, "the same on the car as its log calibrated it, without truth: not causal",
+        OPEN_LOOP, "open-loop on the car as its log calibrated it, without truth: not causal",
         "open_loop:build", frozenset({"steer_rad", "speed_m_s"}), 0x661100, causal=False,
     ),
     Spec(
@@ -132,15 +132,15 @@ SPECS: tuple[Spec, ...] = (
     ),
     Spec(
         "phy-ukf", "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",
-        "physics:build", _ESP, 0x0072B2,
+        "phy_ukf:build", _ESP, 0x0072B2,
     ),
     Spec(
         "physics", "the strongest filter on physics alone, with the parts that driving of the car gave evidence for",
         "adaptive_physics:build", _ESP, 0x44AA99, tunable=True,
     ),
     Spec(
-        "phy-ukf:tuned", "the same with the noise of an identified car, corrected for body roll",
-        "physics_tuned:build", _ESP, 0x56B4E9, needs_noise=True, tunable=True,
+        "phy-ukf:tuned", "phy-ukf with the noise of an identified car, corrected for body roll",
+        "phy_ukf:build", _ESP, 0x56B4E9, needs_noise=True, tunable=True,
     ),
     Spec(
         "pure-lstm", "a network that says v_y itself, from the same inputs, no filter (needs a network with baselines)",

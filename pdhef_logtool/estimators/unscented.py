@@ -8,20 +8,13 @@ All functions work on small float64 arrays in place of allocation where it matte
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.records.vectors import LANES, chosen, transposed, vectors_at
+from pdhef_logtool.records.vectors import factor
 
-#: Room for the entries of a wide state, whole vectors, and how many entries it may have.
-ROOM, MOST = 2 * LANES, 13
 #: Smallest variance that a repaired covariance keeps on its diagonal.
 COVARIANCE_FLOOR = 1e-12
 
@@ -60,62 +53,6 @@ def cholesky_lower(P, L):  # type: ignore[no-untyped-def]
     return True
 
 
-@intrinsic
-def wide_factor(_typing, P, there, L):  # type: ignore[no-untyped-def]
-    """Write the lower Cholesky factor of P [ROOM, ROOM] to L; False if P is not positive definite.
-
-    Entries of the first MOST that are not ``there`` [ROOM] have zeros in P, and get zeros. All of it stays in
-    registers: a loop would wait for its own numbers to be written.
-    """
-
-    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        P, L = (vectors_at(context, builder, signature.args[i], args[i]) for i in (0, 2))
-        is_there = context.make_array(signature.args[1])(context, builder, args[1]).data
-        number, lane = ir.DoubleType(), ir.IntType(32)
-        vector = ir.VectorType(number, LANES)
-        one, nothing, unknown = number(1.0), number(0.0), ir.Constant(vector, ir.Undefined)
-        root = cgutils.get_or_insert_function(builder.module, ir.FunctionType(number, (number,)), "llvm.sqrt.f64")
-
-        def spread(of: Any, at: int) -> Any:
-            return builder.shuffle_vector(of, unknown, ir.Constant(ir.VectorType(lane, LANES), [at] * LANES))
-
-        def everywhere(value: Any) -> Any:
-            return spread(builder.insert_element(unknown, value, lane(0)), 0)
-
-        zeros = ir.Constant(vector, [0.0] * LANES)
-        rows = {(i, half): P.load(i * ROOM + half * LANES) for i in range(MOST) for half in range(i // LANES, 2)}
-        good = ir.IntType(1)(1)
-        for k in range(MOST):
-            own = range(k // LANES, 2)
-            pivot = builder.extract_element(rows[k, k // LANES], lane(k % LANES))
-            positive = builder.fcmp_ordered(">", pivot, nothing)
-            lacks = builder.icmp_unsigned(
-                "==", builder.load(builder.gep(is_there, [ir.IntType(64)(k)])), ir.IntType(8)(0)
-            )
-            good = builder.and_(good, builder.or_(positive, lacks))
-            per_pivot = builder.select(positive, builder.fdiv(one, pivot), nothing)
-            per_root = builder.select(positive, builder.fdiv(one, builder.call(root, (pivot,))), nothing)
-            shares = {half: builder.fmul(rows[k, half], everywhere(per_pivot)) for half in own}
-            for i in range(k + 1, MOST):  # what the pivot's row leaves of those behind it
-                share = spread(shares[i // LANES], i % LANES)
-                for half in range(i // LANES, 2):
-                    taken = builder.fmul(share, rows[k, half], flags=("contract",))
-                    rows[i, half] = builder.fsub(rows[i, half], taken, flags=("contract",))
-            for half in own:
-                rows[k, half] = builder.fmul(rows[k, half], everywhere(per_root))
-            before = k % LANES  # what stands before the diagonal is no part of the column
-            lanes = [LANES + i if i < before else i for i in range(LANES)]
-            rows[k, k // LANES] = chosen(builder, rows[k, k // LANES], zeros, lanes)
-        for columns, half in ((0, 0), (0, 1), (1, 1)):
-            block = [rows.get((columns * LANES + i, half), zeros) for i in range(LANES)]
-            for i, row in enumerate(transposed(builder, block)):
-                if half * LANES + i < MOST:
-                    L.store((half * LANES + i) * ROOM + columns * LANES, row)
-        return good
-
-    return types.boolean(P, there, L), generate
-
-
 @njit(cache=True)
 def repair_covariance(P):  # type: ignore[no-untyped-def]
     """Make P [n, n] symmetric positive definite in place: eigenvalues below the floor are raised to it."""
@@ -137,8 +74,11 @@ def repair_covariance(P):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def wide_root(P, places, there, L):  # type: ignore[no-untyped-def]
-    """Write the factor of P as :func:`wide_factor`, ``places`` being what is there; P is repaired if needed."""
-    if wide_factor(P, there, L):
+    """Write the factor of P (see :func:`~pdhef_logtool.records.vectors.factor`); P is repaired if needed.
+
+    ``places`` are the entries that are ``there``.
+    """
+    if factor(P, there, L):
         return
     n = places.shape[0]
     dense = np.empty((n, n))
@@ -149,7 +89,7 @@ def wide_root(P, places, there, L):  # type: ignore[no-untyped-def]
     for i in range(n):
         for j in range(n):
             P[places[i], places[j]] = dense[i, j]
-    wide_factor(P, there, L)
+    factor(P, there, L)
 
 
 @njit(cache=True)

@@ -26,8 +26,6 @@ from pdhef_logtool.records.processes import is_alive, own_name
 WORK = ".pdhef"
 #: Stands for the kernel's lock where the file system has none.
 LOCK_FILE = ".pdhef.lock"
-#: What versions before this left in a log's folder when they were killed.
-_FORMER = re.compile(r"\.tracks-\w{8}|\.[\w.]+\.partial|\.annotated\.mcap\.\d+\.part")
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+:)/.")
 _NO_LOCK = (errno.EBADF, errno.EINVAL, errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EISDIR)
 _POLL_S = 0.05
@@ -186,8 +184,6 @@ class OutputFolder:
             with contextlib.suppress(OSError):
                 for folder in [p for p in part.iterdir() if p.is_dir() and not p.is_symlink()]:
                     sweep_files(folder, held=True)
-                    for path in [p for p in folder.iterdir() if _FORMER.fullmatch(p.name)]:
-                        _remove(path)
 
     def __enter__(self) -> Self:
         """Take hold of the folder and sweep it."""

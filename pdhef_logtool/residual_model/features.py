@@ -65,7 +65,7 @@ ODD_FEATURES = frozenset(
 
 #: As in car.vehicle, which stands above this.
 _GRAVITY_M_S2 = 9.80665
-# Entries of the filter's state, as in estimators.filter_shell.
+# Entries of the filter's state, as in estimators.filter_base.
 _VX, _VY, _YAW_RATE = 0, 1, 2
 
 

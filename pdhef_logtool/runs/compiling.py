@@ -25,8 +25,8 @@ _FILTER, _CHECKS = "filter", "checks"
 _FILTERED = ("physics", "pd-hef", "pd-hef-smoothed")
 #: By part the function that is compiled last. The longest parts come first.
 _LAST = {
-    "phy-ukf": "physics._filter",
-    _FILTER: "physics_ukf._filter",
+    "phy-ukf": "phy_ukf._filter",
+    _FILTER: "physics_filter._filter",
     "pd-hef-smoothed": "smoothed._smooth",
     "pd-hef-paper": "hybrid_paper._filter",
     _CHECKS: "error_features._advance",
@@ -75,7 +75,7 @@ def compile_parts(parts: Sequence[str], work: Callable[[str, Tell], None] = comp
 
 
 def _compile_filter() -> None:
-    from pdhef_logtool.estimators.physics_ukf import of_car
+    from pdhef_logtool.estimators.physics_filter import of_car
 
     # The gate of the wheels' speed is one of the checks.
     run_window(replace(of_car(Car.load("saloon")), slip_gate=False), _windows()[0])

@@ -58,7 +58,7 @@ class RunConfig:
     Attributes
     ----------
     estimators : names, or ``all``; None = ``pd-hef``, ``physics`` and ``zero``, with the estimators of their selection
-        (:func:`~.guard.default_names`).
+        (:func:`~.selection.default_names`).
     car : car folder, vehicle.toml, or ``saloon`` (the shipped car); None = the default sedan.
     cars : cars.toml, which assigns a car to each log; replaces ``car``.
     mapping : mapping.toml; None = signals are recognised.

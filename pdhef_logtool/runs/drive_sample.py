@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.fallback import Fallback
 from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
-from pdhef_logtool.estimators.stand_in import StandIn
 from pdhef_logtool.evaluation.blocks import row_blocks
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
@@ -86,7 +86,7 @@ def sample_drive(signals: Signals, truth: StateTrack | None, weight: FloatArray)
 
 def bare_filter(estimator: Estimator, signals: Signals) -> tuple[Estimator, Signals]:
     """Return what runs under stand-in and self-calibration, and what it is given of a drive's signals."""
-    while isinstance(estimator, StandIn | SelfCalibrated):
+    while isinstance(estimator, Fallback | SelfCalibrated):
         if isinstance(estimator, SelfCalibrated):
             signals = estimator.given(signals)
         estimator = estimator.estimator

@@ -14,7 +14,7 @@ from pdhef_logtool.estimators.table import Options, Skipped, runnable
 from pdhef_logtool.records.signals import Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
-from pdhef_logtool.runs.guard import default_names
+from pdhef_logtool.runs.selection import default_names
 from pdhef_logtool.sinks.base import TRUTH
 
 if TYPE_CHECKING:

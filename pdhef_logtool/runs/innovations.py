@@ -13,8 +13,8 @@ import numpy as np
 
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.physics import PhysicsUkf
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
+from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.records.signals import SIGNAL_UNITS, FloatArray, Signals
 from pdhef_logtool.runs.drive_sample import DriveSample, bare_filter
 

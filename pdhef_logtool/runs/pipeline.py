@@ -18,7 +18,7 @@ from pdhef_logtool.drive.reading import Drive, lost_texts
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.causality_check import CausalityCheck
-from pdhef_logtool.estimators.stand_in import StandIn
+from pdhef_logtool.estimators.fallback import Fallback
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, Skipped, all_specs, runnable
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
 from pdhef_logtool.mapping import Mapping, merge_losses
@@ -45,8 +45,8 @@ from pdhef_logtool.results.opened_run import (
 )
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
-from pdhef_logtool.runs.guard import GUARDED, Distrust, choose_main, default_names, distrust
 from pdhef_logtool.runs.scoring import evaluate, in_time
+from pdhef_logtool.runs.selection import PREFERRED, Contradiction, choose_main, contradiction, default_names
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore
 from pdhef_logtool.sinks.base import LONGEST_WHOLE_NS, TRUTH, Event, Shown, Sink
@@ -273,7 +273,7 @@ def run_log(
             unproven = config.calibrate != "off" and not drive.car.has_evidence
             result = _run_estimators(job, outputs, config, progress, falls_back=unproven)
         except _FallBackError as found:
-            job = replace(job, ready=_with_stand_in(ready, found.distrust))
+            job = replace(job, ready=_with_fallback(ready, found.contradiction))
             result = _run_estimators(job, outputs, config, progress, falls_back=False)
     progress(result.outcome.log, 1.0)
     return result
@@ -294,16 +294,16 @@ class _Job:
 class _FallBackError(Exception):
     """The default estimate is much worse than a simple one: nothing of the run stays."""
 
-    def __init__(self, distrust: Distrust) -> None:
-        super().__init__(distrust.text)
-        self.distrust = distrust
+    def __init__(self, contradiction: Contradiction) -> None:
+        super().__init__(contradiction.text)
+        self.contradiction = contradiction
 
 
-def _with_stand_in(ready: Sequence[Estimator], found: Distrust) -> list[Estimator]:
-    """Return the estimators with the best of the simple ones under the name of the guarded one."""
+def _with_fallback(ready: Sequence[Estimator], found: Contradiction) -> list[Estimator]:
+    """Return the estimators with the best simple one as fallback under the name of the preferred one."""
     best = next(e for e in ready if e.name == found.best)
     reason = f"not causal: {found.text}; {found.best} stands in its place"
-    return [StandIn(best, e.name, reason) if e.name == GUARDED else e for e in ready]
+    return [Fallback(best, e.name, reason) if e.name == PREFERRED else e for e in ready]
 
 
 def _run_estimators(
@@ -326,7 +326,7 @@ def _run_estimators(
         if drive.friction.bank is not None:
             observable = friction_events(drive.friction, signals)
             found = replace(found, events=sorted([*found.events, *observable], key=in_time))
-        if against := distrust(found.rows):
+        if against := contradiction(found.rows):
             drive.notes.append(f"WARNING: {against.text}")  # the answer's words say what comes of it
             if falls_back:
                 raise _FallBackError(against)

@@ -24,7 +24,7 @@ from pdhef_logtool.estimators.table import ALL_ESTIMATORS, make_estimator
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.errors import PdhefError
-from pdhef_logtool.runs import guard
+from pdhef_logtool.runs import selection
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
@@ -87,13 +87,13 @@ def checked(drive: Drive, calibration: SelfCalibration | None) -> SelfCalibratio
     """
     if calibration is None or calibration.refused:
         return calibration
-    from pdhef_logtool.estimators.physics_ukf import of_car
+    from pdhef_logtool.estimators.physics_filter import of_car
 
     alone = self_calibrated(drive, replace(calibration, varied=()))  # d2 asks for no interval
     estimators = (of_car(drive.car), make_estimator("physics", alone))
     (file, _), (found, driven) = _d2_of(drive, estimators, log_sensors(drive.car.vehicle, calibration))
     calibration = replace(calibration, driven_d2_m_s=driven)
-    if not found > guard.FACTOR * file:
+    if not found > selection.FACTOR * file:
         return calibration
     why = f"physics contradicts the sensors more on it than on the file, d2 is {found:.3g} against {file:.3g} m/s"
     return replace(calibration, refused=why)

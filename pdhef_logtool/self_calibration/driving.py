@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, join_signals
 from pdhef_logtool.self_calibration.single_track import AY, FRICTION, SLOW_TURN, SPEED, STEER, YAW_RATE
-from pdhef_logtool.watches.speed_slip import SlipCarry, believable
+from pdhef_logtool.watches.speed_slip import SlipState, believable
 
 #: Step of the grid. The model follows 4 Hz, and the lag of a tyre at 40 m/s is 12 ms, which its step takes exactly.
 STEP_S = 0.02
@@ -54,7 +54,7 @@ class DrivingReader:
 
     def __init__(self, vehicle: VehicleParameters) -> None:
         self._vehicle = vehicle
-        self._slip: SlipCarry | None = None
+        self._slip: SlipState | None = None
         self._start_ns: int | None = None
         self._open: Signals | None = None  # samples of a cell that the next window may add to
         self._cells: list[NDArray[np.int64]] = []

@@ -58,7 +58,7 @@ class FlagSteps(StepColumns):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DivergenceCarry:
+class DivergenceState:
     """State between windows: the sum, and the flags of steps that later stamps need."""
 
     memory: FloatArray
@@ -74,7 +74,7 @@ class DivergenceWatch:
     """
 
     vehicle: VehicleParameters
-    _carries: dict[str, DivergenceCarry] = field(default_factory=dict)
+    _carries: dict[str, DivergenceState] = field(default_factory=dict)
 
     def add(self, track: StateTrack, signals: Signals) -> StateTrack:
         """Return the next window of a track with ``diverged`` updated."""
@@ -85,20 +85,20 @@ class DivergenceWatch:
 
 
 def wrong_branch(
-    track: StateTrack, signals: Signals, vehicle: VehicleParameters, carry: DivergenceCarry | None = None
-) -> tuple[BoolArray, DivergenceCarry]:
+    track: StateTrack, signals: Signals, vehicle: VehicleParameters, state: DivergenceState | None = None
+) -> tuple[BoolArray, DivergenceState]:
     """Return where a track departs from the sensors' motion, [N]; joined windows equal the whole bit for bit.
 
     Computed on measurement time; a scored stamp has the flag of the newest step that had arrived.
 
     Parameters
     ----------
-    track, signals : [N] at the same stamps. carry : of the previous window, None at the start of a log.
+    track, signals : [N] at the same stamps. state : of the previous window, None at the start of a log.
     """
     signals = without_impossible(signals)
     count = len(signals)
-    before_ns = carry.last_stamp_ns if carry else None
-    memory = np.zeros(MEMORY_SIZE) if carry is None else carry.memory.copy()
+    before_ns = state.last_stamp_ns if state else None
+    memory = np.zeros(MEMORY_SIZE) if state is None else state.memory.copy()
     friction = np.where(np.isfinite(track.friction), track.friction, signals.friction)
     steps = FlagSteps(signals.ready_ns, np.empty(count, dtype=np.bool_))
     dt_s = step_durations_s(signals.stamps_ns, before_ns)
@@ -112,12 +112,12 @@ def wrong_branch(
         sensors.yaw_rate_std_rad_s, *vehicle.imu_position_m[:2], LEAST_SPEED_BLENDS * vehicle.low_speed_blend_m_s,
     )  # fmt: skip
     _watch(motion, car, memory, steps.flags)
-    if carry is not None:
-        steps = carry.waiting.joined(steps)
+    if state is not None:
+        steps = state.waiting.joined(steps)
     released = release(steps.ready_ns, signals.stamps_ns)
     flags: BoolArray = steps.flags[released.at] & released.arrived
     last = last_stamp_ns(signals.stamps_ns, before_ns)
-    return flags, DivergenceCarry(memory, last, steps.since(released.needed))
+    return flags, DivergenceState(memory, last, steps.since(released.needed))
 
 
 @njit(cache=True)

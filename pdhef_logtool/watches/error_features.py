@@ -66,7 +66,7 @@ class TermSteps(StepColumns):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FeatureCarry:
+class FeatureState:
     """Memory between windows: the filters' state, and the steps that coming stamps still need."""
 
     memory: FloatArray
@@ -75,30 +75,30 @@ class FeatureCarry:
 
 
 def error_terms(
-    track: StateTrack, signals: Signals, roll_gradient_rad_per_m_s2: float, carry: FeatureCarry | None
-) -> tuple[FloatArray, FeatureCarry]:
+    track: StateTrack, signals: Signals, roll_gradient_rad_per_m_s2: float, state: FeatureState | None
+) -> tuple[FloatArray, FeatureState]:
     """Return the terms [N, 9] of :data:`TERMS` at the stamps of a window; joined windows equal the whole.
 
     Terms that cannot be known count as 0, for instance before the first sample has arrived.
 
     Parameters
     ----------
-    track, signals : at the same stamps. carry : what the previous window's call returned.
+    track, signals : at the same stamps. state : what the previous window's call returned.
     """
     signals = without_impossible(signals)
     count = len(signals)
-    before_ns = carry.last_stamp_ns if carry else None
+    before_ns = state.last_stamp_ns if state else None
     friction = np.where(np.isfinite(track.friction), track.friction, signals.friction)
     friction = np.where(np.isfinite(friction), friction, ASSUMED_FRICTION)
-    memory = np.zeros(MEMORY_SIZE) if carry is None else carry.memory.copy()
+    memory = np.zeros(MEMORY_SIZE) if state is None else state.memory.copy()
     steps = TermSteps(signals.ready_ns, np.empty((count, STEP_SIZE)))
     dt_s = step_durations_s(signals.stamps_ns, before_ns)
     motion = (
         dt_s, *believed(track, signals), friction, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s
     )  # fmt: skip
     _advance(motion, 1.0 + GRAVITY_M_S2 * roll_gradient_rad_per_m_s2, memory, steps.terms)
-    if carry is not None:
-        steps = carry.waiting.joined(steps)
+    if state is not None:
+        steps = state.waiting.joined(steps)
     released = release(steps.ready_ns, signals.stamps_ns)
     known = np.where(released.arrived[:, None], steps.terms[released.at], 0.0)
     grip = known[:, 0]
@@ -117,7 +117,7 @@ def error_terms(
         axis=1,
     )
     last = last_stamp_ns(signals.stamps_ns, before_ns)
-    return terms, FeatureCarry(memory, last, steps.since(released.needed))
+    return terms, FeatureState(memory, last, steps.since(released.needed))
 
 
 def believed(track: StateTrack, signals: Signals) -> tuple[FloatArray, FloatArray]:

@@ -31,7 +31,7 @@ from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
 if TYPE_CHECKING:
-    from pdhef_logtool.watches.error_features import FeatureCarry
+    from pdhef_logtool.watches.error_features import FeatureState
 
 #: Terms of the sideslip's variance; terms of the yaw rate's, where ``filter`` is its standard deviation.
 SIDESLIP_TERMS = ("floor", "filter", "sideslip", "grip", "grip2", "kinematic", "yaw_rate", "cure", "bank")
@@ -66,7 +66,7 @@ class TrackCalibrator:
     own: Mapping[str, str] = field(default_factory=dict)
     posterior: Mapping[str, Widening] = field(default_factory=dict)
     of_car: bool = True
-    _carries: dict[str, FeatureCarry] = field(default_factory=dict)
+    _carries: dict[str, FeatureState] = field(default_factory=dict)
     _has_interval: set[str] = field(default_factory=set)
 
     def add(self, track: StateTrack, signals: Signals) -> StateTrack:
@@ -146,19 +146,19 @@ def calibrated(
     signals: Signals,
     inflation: Inflation,
     roll_gradient_rad_per_m_s2: float,
-    carry: FeatureCarry | None = None,
-) -> tuple[StateTrack, FeatureCarry]:
+    state: FeatureState | None = None,
+) -> tuple[StateTrack, FeatureState]:
     """Return a track with calibrated 1-sigmas and covariance; joined windows equal the whole bit for bit.
 
     Parameters
     ----------
     track, signals : [N] at the same stamps. roll_gradient_rad_per_m_s2 : of the car of the fit.
-    carry : state after the previous window.
+    state : state after the previous window.
     """
     from pdhef_logtool.watches.error_features import error_terms
 
-    terms, carry = error_terms(track, signals, roll_gradient_rad_per_m_s2, carry)
-    return inflated(track, terms, inflation), carry
+    terms, state = error_terms(track, signals, roll_gradient_rad_per_m_s2, state)
+    return inflated(track, terms, inflation), state
 
 
 def inflated(track: StateTrack, terms: FloatArray, inflation: Inflation) -> StateTrack:

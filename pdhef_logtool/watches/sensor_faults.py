@@ -149,7 +149,7 @@ WITNESS_MEMORY = 9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FaultCarry:
+class FaultState:
     """State between windows: memory of the channels [2, m] and of the open-loop model [w]."""
 
     channels: FloatArray
@@ -497,19 +497,19 @@ def no_faults(signals: Signals) -> SensorFaults:
 
 
 def find_faults(
-    signals: Signals, vehicle: VehicleParameters, carry: FaultCarry | None
-) -> tuple[SensorFaults, FaultCarry]:
+    signals: Signals, vehicle: VehicleParameters, state: FaultState | None
+) -> tuple[SensorFaults, FaultState]:
     """Detect faults of a_y and yaw rate in one window, causally: step k depends on samples up to k.
 
     Joined windows give the same bits as one call over the whole log.
     """
     signals = without_impossible(signals)
     count = len(signals)
-    channels = np.zeros((CHANNELS, CHANNEL_MEMORY)) if carry is None else carry.channels.copy()
-    witness = np.zeros(WITNESS_MEMORY) if carry is None else carry.witness.copy()
-    if carry is None:
+    channels = np.zeros((CHANNELS, CHANNEL_MEMORY)) if state is None else state.channels.copy()
+    witness = np.zeros(WITNESS_MEMORY) if state is None else state.witness.copy()
+    if state is None:
         witness[W_SPEED_AGE] = np.inf
-    before_ns = carry.last_stamp_ns if carry else None
+    before_ns = state.last_stamp_ns if state else None
     window = (
         step_durations_s(signals.stamps_ns, before_ns), signals.steer_rad, signals.ay_m_s2, signals.yaw_rate_rad_s,
         signals.speed_m_s, signals.friction,
@@ -533,4 +533,4 @@ def find_faults(
         "yaw_rate_rad_s": np.where(extra[:, YAW_RATE] > 0.0, np.nan, usable[:, YAW_RATE]),
     }
     faults = SensorFaults(extra, noise, reason, replace(signals, **filtered), replace(signals, **seen))
-    return faults, FaultCarry(channels, witness, last)
+    return faults, FaultState(channels, witness, last)

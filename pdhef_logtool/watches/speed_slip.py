@@ -72,7 +72,7 @@ _MEMORY = 28
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SlipCarry:
+class SlipState:
     """Memory between windows; ``last_stamp_ns`` is that of the last step."""
 
     memory: FloatArray
@@ -268,41 +268,41 @@ def _gate(window, bound, m, believed, reckoned):  # type: ignore[no-untyped-def]
 
 
 def _run(
-    signals: Signals, speed_std_m_s: float, carry: SlipCarry | None
-) -> tuple[bool, FloatArray, FloatArray, SlipCarry]:
+    signals: Signals, speed_std_m_s: float, state: SlipState | None
+) -> tuple[bool, FloatArray, FloatArray, SlipState]:
     count = len(signals)
-    before_ns = carry.last_stamp_ns if carry else None
-    memory = np.zeros(_MEMORY) if carry is None else carry.memory.copy()
+    before_ns = state.last_stamp_ns if state else None
+    memory = np.zeros(_MEMORY) if state is None else state.memory.copy()
     believed, reckoned = np.empty(count), np.empty(count)
     dt_s = step_durations_s(signals.stamps_ns, before_ns)
     window = (dt_s, signals.ax_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s, signals.wheel_speed_m_s)
     bound = max(LEAST_BOUND_M_S, BOUND_SIGMAS * speed_std_m_s)
     changed = _gate(window, bound, memory, believed, reckoned)
     last = last_stamp_ns(signals.stamps_ns, before_ns)
-    return changed, believed, reckoned, SlipCarry(memory, last)
+    return changed, believed, reckoned, SlipState(memory, last)
 
 
 def without_slip(
-    signals: Signals, speed_std_m_s: float, carry: SlipCarry | None, *, reckoned: bool = False
-) -> tuple[Signals, SlipCarry]:
+    signals: Signals, speed_std_m_s: float, state: SlipState | None, *, reckoned: bool = False
+) -> tuple[Signals, SlipState]:
     """Return the signals without the speed samples of slipping wheels; the same object if there are none.
 
     Causal: step k depends on samples up to k. Joined windows give the same bits as one call over the whole log.
 
     Parameters
     ----------
-    speed_std_m_s : standard deviation of the speed sensor. carry : state after the previous window.
+    speed_std_m_s : standard deviation of the speed sensor. state : state after the previous window.
     reckoned : replace missing samples by the dead-reckoned speed, for estimators that need one.
     """
-    changed, believed, with_reckoned, after = _run(signals, speed_std_m_s, carry)
+    changed, believed, with_reckoned, after = _run(signals, speed_std_m_s, state)
     if not changed:
         return signals, after
     return replace(signals, speed_m_s=with_reckoned if reckoned else believed), after
 
 
 def believable(
-    signals: Signals, speed_std_m_s: float, carry: SlipCarry | None, *, gate: bool, reckoned: bool = False
-) -> tuple[Signals, SlipCarry | None]:
+    signals: Signals, speed_std_m_s: float, state: SlipState | None, *, gate: bool, reckoned: bool = False
+) -> tuple[Signals, SlipState | None]:
     """Return signals without impossible readings and, with ``gate``, without the speed of slipping wheels."""
     signals = without_impossible(signals)
-    return without_slip(signals, speed_std_m_s, carry, reckoned=reckoned) if gate else (signals, None)
+    return without_slip(signals, speed_std_m_s, state, reckoned=reckoned) if gate else (signals, None)

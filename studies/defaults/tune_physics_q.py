@@ -19,8 +19,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters
-from pdhef_logtool.estimators.physics import PhysicsUkf
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
+from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.records.signals import FloatArray
 from studies.defaults.tuning_drives import VEHICLE_FILE, TuningDrive, sideslip_rmse_deg, tuning_drives, write_result
 from studies.pages import options

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import filtering, peers, writing
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, PhysicsUkf
+from pdhef_logtool.estimators.phy_ukf import PHY_UKF_Q_STD, PhysicsUkf
 from pdhef_logtool.logs.open_log import open_log
 
 

@@ -43,7 +43,7 @@ from pdhef_logtool.car.parts import (
 from pdhef_logtool.car.store import Change, check_output, update_car
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
-from pdhef_logtool.estimators.physics_ukf import of_car
+from pdhef_logtool.estimators.physics_filter import of_car
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records import outputs
 from pdhef_logtool.records.documents import digest

@@ -13,7 +13,7 @@ import pytest
 from pdhef_logtool.car.car import INTERVALS_FILE, SHIPPED_CARS, Car
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.algorithm import resolve
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.estimators.table import SPECS, all_names, make_estimator
 from pdhef_logtool.records.errors import UsageError
 from tests.command_line import pdhef

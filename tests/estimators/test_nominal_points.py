@@ -30,8 +30,8 @@ from pdhef_logtool.car.nominal_points import (
     work_size,
 )
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
-from pdhef_logtool.estimators import filter_shell as shell
-from pdhef_logtool.estimators import physics
+from pdhef_logtool.estimators import filter_base as base
+from pdhef_logtool.estimators import phy_ukf
 
 pytestmark = pytest.mark.slow
 
@@ -58,10 +58,10 @@ CARS = {
     ),
 }
 LAYOUTS = {
-    "no optional state": physics.StateLayout(-1, -1),
-    "biases": physics.StateLayout(shell.STATES, -1),
-    "force scale": physics.StateLayout(-1, shell.STATES),
-    "biases and force scale": physics.StateLayout(shell.STATES, shell.STATES + physics.BIAS_STATES),
+    "no optional state": phy_ukf.StateLayout(-1, -1),
+    "biases": phy_ukf.StateLayout(base.STATES, -1),
+    "force scale": phy_ukf.StateLayout(-1, base.STATES),
+    "biases and force scale": phy_ukf.StateLayout(base.STATES, base.STATES + phy_ukf.BIAS_STATES),
 }
 STATES = {"no optional state": 4, "biases": 7, "force scale": 5, "biases and force scale": 8}
 TOLERANCE = 1e-11
@@ -146,7 +146,7 @@ def test_points_move_as_one_state_does(car, seed, count, mu, dt, n):
     np.testing.assert_allclose(got, want, rtol=TOLERANCE, atol=TOLERANCE)
 
 
-def optional(state: np.ndarray, layout: physics.StateLayout) -> tuple[float, float, float, float]:
+def optional(state: np.ndarray, layout: phy_ukf.StateLayout) -> tuple[float, float, float, float]:
     """Return force factor and the biases of a_y, yaw rate and steering angle of a state."""
     force = 1.0 if layout.force_scale < 0 else max(0.1, 1.0 + state[layout.force_scale])
     return (force, 0.0, 0.0, 0.0) if layout.bias < 0 else (force, *state[layout.bias : layout.bias + 3])
@@ -168,8 +168,8 @@ def test_sigma_points_move_and_measure_as_one_state_does(car, name, seed, mu, dt
     n = nominal_model.substeps(chi[0, 0], dt, mu, p)
     points = np.full(work_size(len(chi)), np.nan)
 
-    zeta = np.empty((len(chi), shell.MEASUREMENTS))
-    physics.measure_sigma_points(chi, steer, mu, rate_vy, layout, p, points, zeta)
+    zeta = np.empty((len(chi), base.MEASUREMENTS))
+    phy_ukf.measure_sigma_points(chi, steer, mu, rate_vy, layout, p, points, zeta)
     want_zeta, want = np.empty_like(zeta), chi.copy()
     for i, state in enumerate(chi):
         force, ay_bias, yaw_rate_bias, steer_bias = optional(state, layout)
@@ -182,11 +182,11 @@ def test_sigma_points_move_and_measure_as_one_state_does(car, name, seed, mu, dt
         )
         want[i, :3] = moved[0], *(moved[1:] + half)
         if layout.force_scale >= 0:
-            want[i, layout.force_scale] *= math.exp(-dt / physics.FORCE_SCALE_TIME_S)
+            want[i, layout.force_scale] *= math.exp(-dt / phy_ukf.FORCE_SCALE_TIME_S)
     np.testing.assert_allclose(zeta, want_zeta, rtol=TOLERANCE, atol=TOLERANCE)
 
-    over = shell.Meanwhile(steer, ax, ax_known=True, friction=mu)
-    physics._propagate(chi, over, (rate_vy, rate_r), dt, layout, p, points)
+    over = base.HeldInputs(steer, ax, ax_known=True, friction=mu)
+    phy_ukf._propagate(chi, over, (rate_vy, rate_r), dt, layout, p, points)
     np.testing.assert_allclose(chi, want, rtol=TOLERANCE, atol=TOLERANCE)
 
 

@@ -10,7 +10,7 @@ import pytest
 from reference_car import drive, magic_tyre, slalom, with_noise
 
 from pdhef_logtool.car.vehicle import AxleTyre, Sensors, Tyres, VehicleParameters, default_vehicle
-from pdhef_logtool.estimators.physics import FORCE_SCALE_STD, PhysicsUkf
+from pdhef_logtool.estimators.phy_ukf import FORCE_SCALE_STD, PhysicsUkf
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ from reference_car import REAR_M, drive, forces, runge_kutta, with_noise
 from scipy.stats import multivariate_normal
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.physics import PhysicsUkf
+from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
 
 Q_STD = (0.05, 0.3, 0.15, 0.05)
 R_STD = (0.12, 0.004, 0.08)

@@ -24,7 +24,7 @@ from pdhef_logtool.car.toml_files import part_toml, vehicle_toml
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.physics_ukf import physics_filter
+from pdhef_logtool.estimators.physics_filter import physics_filter
 from pdhef_logtool.estimators.posterior_band import OWN_SHARE
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals

@@ -13,10 +13,10 @@ from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.parts import FilterNoise, IntervalEntry, Intervals
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.fallback import Fallback
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter, physics_filter
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter, physics_filter
 from pdhef_logtool.estimators.self_calibrated import D2_SHARE, OPEN_LOOP, OWN_SHARE, SELF_CALIBRATED, SelfCalibrated
-from pdhef_logtool.estimators.stand_in import StandIn
 from pdhef_logtool.estimators.table import SPECS, all_names, make_estimator
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import Signals
@@ -193,7 +193,7 @@ def test_intervals_of_other_driving_are_not_taken(signals: Signals) -> None:
     algorithms = map(resolve, (estimator, estimator.estimator))
     entries = tuple(IntervalEntry(estimator="e", algorithm=a, inflation=inflation) for a in algorithms)
     intervals = Intervals(car="c", physics_sha256="ab" * 32, roll_gradient_rad_per_m_s2=0.0, entries=entries)
-    for one in (estimator, StandIn(estimator, "pd-hef", "why")):
+    for one in (estimator, Fallback(estimator, "pd-hef", "why")):
         track, _ = run_window(one, signals)
         applied = calibrator(replace(with_band(), intervals=intervals), [one])
         without = calibrator(with_band(), [one]).add(track, signals)

@@ -28,10 +28,10 @@ from pdhef_logtool.drive.windows import DriveWindow, with_look_ahead
 from pdhef_logtool.estimators import smoothed
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import LookingAhead, look_ahead_of
-from pdhef_logtool.estimators.filter_shell import AX_BIAS, PosteriorSteps
+from pdhef_logtool.estimators.filter_base import AX_BIAS, LINK_BIASES, LINK_NONE, LINK_WHOLE, PosteriorSteps, StepLinks
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.physics import LINK_BIASES, LINK_NONE, LINK_WHOLE, PhysicsUkf, StepLinks
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
+from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.estimators.smoothed import SmoothedPhysics, smooth_steps
 from pdhef_logtool.estimators.table import SPECS, make_estimator
 from pdhef_logtool.records.reasons import (
@@ -499,7 +499,7 @@ def test_links_cost_the_filter_no_bit(rough):
     steps, again, links = PhysicsUkf(VEHICLE).linked_steps(rough, None)
     for name in (f.name for f in fields(PosteriorSteps)):
         np.testing.assert_array_equal(getattr(plain, name), getattr(steps, name))
-    np.testing.assert_array_equal(after.belief.P, again.belief.P)
+    np.testing.assert_array_equal(after.estimate.P, again.estimate.P)
     starts = ~np.isfinite(steps.prior[:, 0])
     np.testing.assert_array_equal(links.kind == LINK_NONE, starts)
     assert starts.sum() == 2

@@ -26,7 +26,7 @@ from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import LookingAhead
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD
+from pdhef_logtool.estimators.physics_filter import PHYSICS_Q_STD
 from pdhef_logtool.estimators.presets import OPTIONS, options_of, preset_of, split_names
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
 from pdhef_logtool.estimators.table import (

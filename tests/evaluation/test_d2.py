@@ -13,7 +13,7 @@ from pdhef_logtool.evaluation.metrics.d2 import d2_rows, driven_d2, driving_prod
 from pdhef_logtool.evaluation.metrics.metric import SensorErrors
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
-from pdhef_logtool.runs.guard import FACTOR, distrust
+from pdhef_logtool.runs.selection import FACTOR, contradiction
 
 T = np.arange(0, 60, 0.01)
 STAMPS = 1_700_000_000_000_000_000 + np.round(T * 1e9).astype(np.int64)
@@ -124,14 +124,14 @@ def rows(**values: float) -> list[MetricRow]:
 
 
 def test_the_guard_speaks_where_the_default_estimate_is_much_worse_than_a_simple_one() -> None:
-    assert distrust(rows(zero=1.0, pd_hef=FACTOR * 0.99)) is None
-    found = distrust(rows(zero=1.0, phy_ukf=0.5, pd_hef=FACTOR))
+    assert contradiction(rows(zero=1.0, pd_hef=FACTOR * 0.99)) is None
+    found = contradiction(rows(zero=1.0, phy_ukf=0.5, pd_hef=FACTOR))
     assert found is not None
     assert found.best == "phy-ukf"
     assert "pd-hef contradicts the sensors" in found.text
 
 
 def test_the_guard_is_silent_without_something_to_compare_with() -> None:
-    assert distrust(rows(pd_hef=3.0)) is None
-    assert distrust(rows(kinematic=0.01, pd_hef=3.0)) is None  # it integrates what d2 compares with
-    assert distrust(rows(zero=1.0)) is None
+    assert contradiction(rows(pd_hef=3.0)) is None
+    assert contradiction(rows(kinematic=0.01, pd_hef=3.0)) is None  # it integrates what d2 compares with
+    assert contradiction(rows(zero=1.0)) is None

@@ -14,7 +14,7 @@ import pytest
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
-from pdhef_logtool.estimators.physics_tuned import NAME
+from pdhef_logtool.estimators.phy_ukf import TUNED as NAME
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.learning.car import physics_fit
 from pdhef_logtool.learning.car.axle_forces import AxleCurve, axle_samples, fit_axle

@@ -18,9 +18,8 @@ from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, Tr
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Sensors, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, PhysicsUkf
-from pdhef_logtool.estimators.physics_tuned import physics_ukf_tuned
-from pdhef_logtool.estimators.physics_ukf import physics_filter
+from pdhef_logtool.estimators.phy_ukf import PHY_UKF_Q_STD, PhysicsUkf, physics_ukf_tuned
+from pdhef_logtool.estimators.physics_filter import physics_filter
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.car import fit_data, identify, identify_plot
 from pdhef_logtool.learning.car.axle_forces import AxleCurve, AxleSamples, axle_samples, fit_axle, usable_stamps

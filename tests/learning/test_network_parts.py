@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from residual_car import CAR, START_NS, drive, window
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.learning.network import baselines, extract_command, fit, train_command
 from pdhef_logtool.learning.network.baselines import SideslipSequence, fit_dataset, run_baselines
 from pdhef_logtool.learning.network.cells import Picked

@@ -13,7 +13,7 @@ from reference_car import FRONT_TYRE, MASS_KG, REAR_TYRE, Drive, drive, keep, wi
 
 from pdhef_logtool.car.parts import FittedPhysics
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, default_vehicle
-from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD
+from pdhef_logtool.estimators.physics_filter import PHYSICS_Q_STD
 from pdhef_logtool.learning.car import physics_fit
 from pdhef_logtool.learning.car.axle_forces import axle_samples
 from pdhef_logtool.learning.car.fit_data import FitDrive, part_of

@@ -16,7 +16,7 @@ from residual_car import CAR, FRICTION, START_NS, Motion, Wave, drive, pick, tru
 
 from pdhef_logtool.drive.windows import DriveWindow
 from pdhef_logtool.estimators.parallel_physics import parallel_filter
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.learning.network.dataset import DriveArrays
 from pdhef_logtool.learning.network.residuals import (
     ResidualRows,

@@ -12,7 +12,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import SMOOTHING, FilterNoise, FittedPhysics, FittedValues
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.algorithm import resolve
-from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD
+from pdhef_logtool.estimators.physics_filter import PHYSICS_Q_STD
 from pdhef_logtool.estimators.table import Options, spec_of
 from pdhef_logtool.learning.car import smoothing_fit
 from pdhef_logtool.learning.car.fit_data import FitDrive, part_of

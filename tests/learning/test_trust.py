@@ -20,7 +20,7 @@ from pdhef_logtool.car.toml_files import load_vehicle
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.physics_ukf import of_car
+from pdhef_logtool.estimators.physics_filter import of_car
 from pdhef_logtool.evaluation.bootstrap import block_bootstrap_difference
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.drives import LearnSettings, choose_drives, load_drive

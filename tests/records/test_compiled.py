@@ -251,7 +251,7 @@ def test_the_code_of_other_sources_of_this_installation_is_removed_and_no_other(
 def test_what_compiled_code_is_made_of() -> None:
     names = {p.relative_to(_ROOT).as_posix() for p in compiled_sources.compiled_sources()}
     assert {
-        "pdhef_logtool/estimators/physics_ukf.py",
+        "pdhef_logtool/estimators/physics_filter.py",
         "truthsim/motion.py",
         "pdhef_logtool/records/vectors.py",
     } <= names

@@ -297,13 +297,10 @@ def test_processes_are_known_by_host_number_and_start() -> None:
 def test_what_killed_processes_left_is_swept_and_what_others_own_is_not(tmp_path: Path) -> None:
     host, pid, start = own_name().split("-")
     dead, foreign = f"{host}-{pid}-{int(start) + 1}", "00000000-1-1"
-    folder = tmp_path / "logs" / "x"
     mine = {"notes.partial": "mine", ".notes.partial": "mine", "logs/x/.vimrc": "mine", "logs/x/a.part": "mine"}
     alive = {f".run.json.{own_name()}.partial": "half"}
     make(tmp_path, mine | alive)
     make(tmp_path, {f".run.json.{dead}.partial": "", f"logs/x/.report.json.{foreign}.partial": ""})
-    former = (".estimates.parquet.partial", ".annotated.mcap.1234.part", ".tracks-ab12_cd3/zero-0.npz")
-    make(folder, dict.fromkeys(former, ""))
     make(tmp_path / "logs" / ".pdhef" / "y" / "new", {"report.json": ""})
     with OutputFolder(tmp_path, ("logs",)):
         assert texts(tmp_path) == mine | alive

@@ -14,7 +14,7 @@ from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.pass_through import PassThrough
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track

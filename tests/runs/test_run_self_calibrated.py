@@ -18,7 +18,7 @@ from pdhef_logtool.drive.reading import Tell, read_drive
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping
-from pdhef_logtool.runs import guard
+from pdhef_logtool.runs import selection
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, checked, read_driving, self_calibrated
@@ -141,7 +141,7 @@ def test_a_default_estimate_that_contradicts_the_sensors_is_replaced_and_the_run
     """Whatever pd-hef is on this car, it stands for a large d2 here."""
     if Car.load().network is None:
         pytest.skip("no network is shipped, without which there is no pd-hef")
-    monkeypatch.setattr(guard, "FACTOR", 0.0)
+    monkeypatch.setattr(selection, "FACTOR", 0.0)
     log, found = sample_logs_dir / "sweep.mcap", {}
     for calibrate in ("off", "log"):
         options = {"calibrate": calibrate, "estimators": ("zero", "phy-ukf", "pd-hef"), "end": None}
@@ -161,7 +161,7 @@ def test_a_car_with_evidence_keeps_its_estimate_and_is_warned_of(
 ) -> None:
     if Car.load().network is None:
         pytest.skip("no network is shipped, without which there is no pd-hef")
-    monkeypatch.setattr(guard, "FACTOR", 0.0)
+    monkeypatch.setattr(selection, "FACTOR", 0.0)
     car = sample_logs_dir / "vehicle.toml"
     report = run(sample_logs_dir / "sweep.mcap", car, tmp_path, estimators=("zero", "pd-hef"), end=None)
     assert all(e["causal"] for e in report["estimators"])
@@ -171,7 +171,7 @@ def test_a_car_with_evidence_keeps_its_estimate_and_is_warned_of(
 def test_a_calibration_that_contradicts_the_sensors_more_than_the_file_is_refused(
     sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(guard, "FACTOR", 1.1)
+    monkeypatch.setattr(selection, "FACTOR", 1.1)
     car = Car.load(sample_logs_dir / "vehicle.toml")
     with read_drive(sample_logs_dir / "sweep.mcap", car) as drive:
         good = self_calibrate([read_driving(drive)] * 2, car.vehicle)  # twice, so that it is long enough

@@ -9,8 +9,8 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Steps, make_steps
-from pdhef_logtool.estimators.physics import PhysicsUkf
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
+from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track

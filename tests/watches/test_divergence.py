@@ -32,7 +32,7 @@ from pdhef_logtool.records.tracks import StateTrack, concatenate, make_track
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.sinks.report import diverged_line, report_markdown
-from pdhef_logtool.watches.divergence import DivergenceCarry, DivergenceWatch, wrong_branch
+from pdhef_logtool.watches.divergence import DivergenceState, DivergenceWatch, wrong_branch
 from truthsim.drive import simulate_drive, write_drive
 
 pytestmark = pytest.mark.slow
@@ -189,7 +189,7 @@ def test_windows_change_no_bit(borders: list[int], delay_ms: int) -> None:
     wrong = off_by(truth, 9.0, 5.0, 8.0)
     whole, last = wrong_branch(wrong, signals, VEHICLE)
     parts: list[np.ndarray] = []
-    carry: DivergenceCarry | None = None
+    carry: DivergenceState | None = None
     for a, b in pairwise([0, *sorted(borders), len(signals)]):
         found, carry = wrong_branch(_cut_track(wrong, a, b), cut(signals, a, b), VEHICLE, carry)
         parts.append(found)

@@ -223,20 +223,6 @@ def test_a_factor_holds_where_its_share_of_the_grip_is_used() -> None:
     np.testing.assert_allclose(std[1] / std[0], [0.5, 0.5, 1.0, 1.5, 2.0])
 
 
-def test_intervals_of_older_versions_are_read_and_mean_the_same(tmp_path: Path) -> None:
-    document = _document()
-    for entry in document["entries"]:
-        entry["wrong_vehicle_factor"] = 0.5
-        del (
-            entry["inflation"]["grip_factors"],
-            entry["inflation"]["sideslip"]["cure"],
-            entry["inflation"]["sideslip"]["bank"],
-        )
-    (tmp_path / "old.json").write_text(json.dumps(document))
-    inflation = load_intervals(tmp_path / "old.json").entries[0].inflation
-    assert (inflation.grip_factors, inflation.sideslip.cure, inflation.sideslip.bank) == ((1.0, 1.0, 1.0), 0.0, 0.0)
-
-
 def test_nothing_is_made_of_missing_samples() -> None:
     signals, track = _drive(60)
     nothing = np.full(60, np.nan)
@@ -320,7 +306,6 @@ def _with_entry(**changes: Any) -> dict[str, Any]:
     ("change", "said"),
     [
         ({"format": "pdhef-tuning"}, "format: should be 'pdhef-intervals'"),
-        ({"format": "pdhef-calibration"}, "a calibration filed by name"),
         ({"version": 2}, "version: should be 1"),
         ({"physics_sha256": "ab"}, "physics_sha256"),
         (_with_entry(inflation={"sideslip": {}, "yaw_rate": {}, "vy_factor": 1.0}), "inflation.sideslip.floor"),

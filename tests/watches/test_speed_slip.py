@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from reference_car import cut, drive, rolling_drive, slalom, with_noise
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.filter_shell import U_SPEED
+from pdhef_logtool.estimators.filter_base import U_SPEED
 from pdhef_logtool.estimators.kinematic import Kinematic
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.open_loop import OpenLoop
-from pdhef_logtool.estimators.physics import PhysicsUkf
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
+from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.watches.speed_slip import TIMEOUT_S, without_slip

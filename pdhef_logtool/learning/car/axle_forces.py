@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.filter_shell import PosteriorSteps
+from pdhef_logtool.estimators.filter_base import PosteriorSteps
 from pdhef_logtool.evaluation.segments import smooth
 from pdhef_logtool.learning.car.fit_data import FitDrive, period_s
 from pdhef_logtool.records.geometry import wrap_angle

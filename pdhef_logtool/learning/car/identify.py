@@ -24,9 +24,8 @@ from pdhef_logtool.car.prior import Prior
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, AxleTyre, PhysicsParts, Tyres, VehicleParameters
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.pass_through import PassThrough
-from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, PhysicsUkf
-from pdhef_logtool.estimators.physics_tuned import physics_ukf_tuned
-from pdhef_logtool.estimators.physics_ukf import physics_filter
+from pdhef_logtool.estimators.phy_ukf import PHY_UKF_Q_STD, PhysicsUkf, physics_ukf_tuned
+from pdhef_logtool.estimators.physics_filter import physics_filter
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.car.axle_forces import (
     PEAK_LOG_STD,

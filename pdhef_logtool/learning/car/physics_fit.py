@@ -26,8 +26,8 @@ from pdhef_logtool.car.descent import descend
 from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, TriedParts
 from pdhef_logtool.car.prior import Prior
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
-from pdhef_logtool.estimators.filter_shell import PosteriorSteps
-from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD, physics_filter
+from pdhef_logtool.estimators.filter_base import PosteriorSteps
+from pdhef_logtool.estimators.physics_filter import PHYSICS_Q_STD, physics_filter
 from pdhef_logtool.learning.car.axle_forces import (
     PEAK_LOG_STD,
     SHAPE,

@@ -16,7 +16,7 @@ import numpy as np
 from pdhef_logtool.car.descent import descend
 from pdhef_logtool.car.parts import SMOOTHING
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.physics_ukf import physics_filter
+from pdhef_logtool.estimators.physics_filter import physics_filter
 from pdhef_logtool.estimators.smoothed import BLOCK_S, for_smoothing, smooth_steps
 from pdhef_logtool.learning.car.fit_data import FitDrive, signals_of
 from pdhef_logtool.learning.car.physics_fit import (

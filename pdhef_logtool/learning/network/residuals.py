@@ -28,9 +28,10 @@ import numpy as np
 
 from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters, state_derivative
 from pdhef_logtool.drive.windows import DriveWindow
-from pdhef_logtool.estimators.filter_shell import U_AX, U_FRICTION, U_STEER, Meanwhile
+from pdhef_logtool.estimators.filter_base import U_AX, U_FRICTION, U_STEER, FilterState, HeldInputs
 from pdhef_logtool.estimators.parallel_physics import run_features
-from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
+from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.estimators.physics_model import (
     AX_BIAS,
     FRONT,
@@ -42,7 +43,6 @@ from pdhef_logtool.estimators.physics_model import (
     settle_forces,
     step_count,
 )
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.release import StepColumns
@@ -170,7 +170,7 @@ def _run_model(stamps_ns, states, inputs, good, max_step_s, model, run, out):  #
             run[0] = 0.0
             continue
         x = states[k].copy()
-        over = Meanwhile(
+        over = HeldInputs(
             0.5 * (inputs[k, U_STEER] + inputs[k + 1, U_STEER]),
             0.5 * (inputs[k, U_AX] + inputs[k + 1, U_AX]),
             True,
@@ -315,7 +315,7 @@ def residual_windows(
     The rows of all stamps; a window's last rows come with the next one, since their targets look ahead. Memory is
     bounded by one window.
     """
-    carry: FilterCarry | None = None
+    carry: FilterState | None = None
     waiting: _Steps | None = None
     increments, run = np.empty((0, 2)), np.zeros(_RUN)
     emitted = 0  # rows at the head of ``waiting`` that are there for smoothing only

@@ -22,7 +22,7 @@ from typing import Literal
 import numpy as np
 
 from pdhef_logtool.car.parts import FilterNoise
-from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD
+from pdhef_logtool.estimators.phy_ukf import PHY_UKF_Q_STD
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.records.tracks import StateTrack

@@ -12,7 +12,7 @@ from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.proposals import apply_proposals
-from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
+from pdhef_logtool.estimators.phy_ukf import TUNED
 from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive, sensors_of, split_drive
 from pdhef_logtool.learning.car.identify import Identification, Identified, fit_car, understeer_deg_per_g
 from pdhef_logtool.learning.car.identify_plot import plot_identification

@@ -12,13 +12,13 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.stand_in import StandIn
+from pdhef_logtool.estimators.fallback import Fallback
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS
-from pdhef_logtool.runs import frames, guard
+from pdhef_logtool.runs import frames, selection
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.guard import choose_main, default_names
+from pdhef_logtool.runs.selection import choose_main, default_names
 from pdhef_logtool.sinks.answer import MainFacts
 
 EVERY = frozenset(ALIGNED_SIGNALS)
@@ -88,7 +88,7 @@ def test_evidence_goes_before_d2_and_d2_before_the_order() -> None:
 
 def test_what_stands_in_for_the_main_one_is_told() -> None:
     best = ran("open-loop")[0]
-    found = main([*ran("zero", "physics"), StandIn(best, "pd-hef", "because")], d2(pd_hef=0.1, zero=0.9))
+    found = main([*ran("zero", "physics"), Fallback(best, "pd-hef", "because")], d2(pd_hef=0.1, zero=0.9))
     assert (found.name, found.stands_in, found.distrusted) == ("pd-hef", "open-loop", True)
     assert "open-loop stands in its place" in found.why
 
@@ -112,7 +112,7 @@ def test_the_truth_of_a_log_never_chooses(
     sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calibrate: Any
 ) -> None:
     """Whatever is best by d2 is taken here, so that a choice by the truth would show."""
-    monkeypatch.setattr(guard, "FACTOR", 0.0)
+    monkeypatch.setattr(selection, "FACTOR", 0.0)
     answers, best = [], set()
     for name, text in (("right", TRUTH), ("shuffled", SHUFFLED)):
         (tmp_path / f"{name}.toml").write_text(text)

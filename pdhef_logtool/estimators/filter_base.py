@@ -1,17 +1,17 @@
-"""What the unscented filters do alike at a step, whatever their state and model: one shell about the state.
+"""Base of the unscented filters: everything at a step that does not depend on state and model.
 
-Reset after a time gap, zero-order hold of missing inputs, start, gate, standstill, divergence and the track of
-predicted steps are here. The first
-entries of every state are [v_x, v_y, r, b_ax]; any number of others follow, and :class:`Tuning` says of each how it
-walks, starts and stands still. A filter's own file says how sigma points move and what sensors read there. Its loop is
+These functions reset after a time gap, hold missing inputs, start the filter, gate samples, hold a standstill, detect
+divergence and make the track of predicted steps. The first entries of every state are [v_x, v_y, r, b_ax]; a filter may
+append others, and :class:`Tuning` has noise, initial and standstill 1-sigma of each. A filter's own file moves sigma
+points and predicts measurements. The loop of its kernel is
 
-    begin_step; start, or: move the points, ``predicted``; measure, ``innovate``, ``gate``; ``update``; ``conclude``;
+    begin_step; starts, or: move the points; predict measurements, ``innovate``, ``gate``; update; ``settle``;
     ``finish_step``
 
-with the model between the calls: compiled functions are not passed to compiled ones, which could then not be kept.
+with the model between the calls, because functions that are passed to compiled functions cannot be cached.
 
-Over a step the inputs are the mean of those at its two ends: both are known when the step is taken, and the residual
-targets are made the same way.
+The inputs over a step are the mean of those at its two ends, which are both known when the step is computed. The
+residual targets use the same rule.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from pdhef_logtool.records.release import (
 )
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
-from pdhef_logtool.watches.speed_slip import SlipCarry
+from pdhef_logtool.watches.speed_slip import SlipState, believable
 
 # State entries and measurement entries, by name.
 VX, VY, YAW_RATE, AX_BIAS = 0, 1, 2, 3
@@ -86,7 +86,7 @@ JUST_REJECTED_S = 1e-9
 
 
 class Window(NamedTuple):
-    """What the sensors say at the steps of a window, [K]; NaN where nothing. ``dt_s`` ends at its step, NaN = start.
+    """Samples of a window, [K], NaN where missing. ``dt_s`` is the duration before each step, NaN at the start.
 
     ``residual_rate`` [K, 2] is what is added to v̇_y and ṙ from the step on, m/s² and rad/s²; ``extra_r`` [K, 2] the
     variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
@@ -104,7 +104,7 @@ class Window(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """What the shell goes by, beside its constants."""
+    """Settings of the filter base, beside its constants."""
 
     use_speed: bool  # False: the speed sensor only starts the filter
     still_after_s: float
@@ -128,7 +128,7 @@ class Tuning(NamedTuple):
     rules: Rules
 
 
-class Belief(NamedTuple):
+class StateEstimate(NamedTuple):
     """State [n], covariance [n, n] and scalar memory [MEMORY] of a filter, moved in place."""
 
     x: FloatArray
@@ -137,7 +137,7 @@ class Belief(NamedTuple):
 
 
 class Posterior(NamedTuple):
-    """What a filter writes of each step (see :class:`PosteriorSteps`)."""
+    """Output arrays of a kernel, one row per step (see :class:`PosteriorSteps`)."""
 
     x: FloatArray
     P: FloatArray
@@ -152,7 +152,7 @@ class Posterior(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Work space of a step: sigma points and what sensors read there, innovation, and which samples count."""
+    """Work space of a step: sigma points, their measurements, innovation, and which samples are used."""
 
     chi: FloatArray
     L: FloatArray
@@ -167,7 +167,7 @@ class Work(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """What the sensors say at a step, as the columns of :class:`Window`."""
+    """Samples of one step, as the columns of :class:`Window`."""
 
     dt: float
     steer: float
@@ -178,8 +178,8 @@ class Sample(NamedTuple):
     friction: float
 
 
-class Now(NamedTuple):
-    """Inputs at a step, held where they miss, and its measurements.
+class StepInputs(NamedTuple):
+    """Inputs at step k, held where they are missing, and its measurements.
 
     ``steers`` says that the steering was measured, ``steer_ok`` that it is not held for too long.
     """
@@ -196,8 +196,8 @@ class Now(NamedTuple):
     speed: float
 
 
-class Meanwhile(NamedTuple):
-    """Inputs over a step: the mean of its two ends."""
+class HeldInputs(NamedTuple):
+    """Held inputs over a step: the mean of its two ends."""
 
     steer: float
     ax: float
@@ -205,8 +205,8 @@ class Meanwhile(NamedTuple):
     friction: float
 
 
-class Verdict(NamedTuple):
-    """What the gate says of the samples of a step: does it open, is any beyond it, how many, sum of their squares."""
+class GateResult(NamedTuple):
+    """Result of the gate: whether it opens, whether a sample is outside, number of samples, sum of squares."""
 
     opens: bool
     outside: bool
@@ -214,8 +214,8 @@ class Verdict(NamedTuple):
     squares: float
 
 
-class Held(NamedTuple):
-    """Steps that predictions start from (see :class:`PosteriorSteps`)."""
+class PredictionStart(NamedTuple):
+    """Steps from which predictions start (see :class:`PosteriorSteps`)."""
 
     x: FloatArray
     P: FloatArray
@@ -223,15 +223,15 @@ class Held(NamedTuple):
     residual_rate: FloatArray
 
 
-class Due(NamedTuple):
-    """What is to be predicted, [M]: step (−1 for none) and time ahead of it in s."""
+class PendingPredictions(NamedTuple):
+    """Pending predictions, [M]: step (−1 for none) and horizon in s."""
 
     step: IntArray
     horizon_s: FloatArray
 
 
 class Predicted(NamedTuple):
-    """What becomes of steps: state [M, n], covariance of the motion [M, 3, 3], planar a_y [M]; NaN for none."""
+    """Predictions: state [M, n], covariance of the motion [M, 3, 3], planar a_y [M]; NaN for none."""
 
     x: FloatArray
     P: FloatArray
@@ -272,7 +272,7 @@ def all_finite(x, P):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def begin_step(sample, rules, memory):  # type: ignore[no-untyped-def]
-    """Restart behind a gap and hold what misses; returns :class:`Now`."""
+    """Reset after a time gap and zero-order-hold missing inputs. Return the inputs of this step."""
     restart = not sample.dt <= RESTART_GAP_S
     if restart:
         memory[:] = 0.0
@@ -291,18 +291,18 @@ def begin_step(sample, rules, memory):  # type: ignore[no-untyped-def]
     if math.isfinite(speed):
         memory[M_SPEED] = speed
     ax = sample.ax if has_ax else 0.0
-    return Now(sample.dt, steer, ax, has_ax, friction, steers, steer_ok, sample.ay, sample.yaw_rate, speed)
+    return StepInputs(sample.dt, steer, ax, has_ax, friction, steers, steer_ok, sample.ay, sample.yaw_rate, speed)
 
 
 @njit(cache=True)
-def meanwhile(now, memory):  # type: ignore[no-untyped-def]
-    """Return the inputs over a step; a missing a_x at one end leaves that of the other."""
+def held_over_step(now, memory):  # type: ignore[no-untyped-def]
+    """Return the mean of the inputs at both ends of a step; where a_x is missing at one end, that of the other."""
     ax = now.ax
     if not now.has_ax:
         ax = memory[M_AX]
     elif memory[M_AX_KNOWN] > 0.0:
         ax = 0.5 * (memory[M_AX] + now.ax)
-    return Meanwhile(
+    return HeldInputs(
         0.5 * (memory[M_STEER] + now.steer),
         ax,
         now.has_ax or memory[M_AX_KNOWN] > 0.0,
@@ -312,8 +312,8 @@ def meanwhile(now, memory):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def held_inputs(inputs, k):  # type: ignore[no-untyped-def]
-    """Return the inputs of step k, which a prediction holds."""
-    return Meanwhile(inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_AX_KNOWN] > 0.0, inputs[k, U_FRICTION])
+    """Return the inputs of step k, held during a prediction."""
+    return HeldInputs(inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_AX_KNOWN] > 0.0, inputs[k, U_FRICTION])
 
 
 @njit(cache=True)
@@ -382,7 +382,7 @@ def gate(now, memory, nu, S, at_gate, given, use):  # type: ignore[no-untyped-de
                 memory[M_REJECTED + i] = max(memory[M_REJECTED + i], JUST_REJECTED_S)
                 use[i] = memory[M_REJECTED + i] > GATE_OPENS_AFTER_S
                 opens = opens or use[i]
-    return Verdict(opens, outside, seen, squares)
+    return GateResult(opens, outside, seen, squares)
 
 
 @njit(cache=True)
@@ -394,11 +394,11 @@ def open_gate(use, memory):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def settle(now, verdict, rules, standstill_std, x, P, memory):  # type: ignore[no-untyped-def]
+def settle(now, gated, rules, standstill_std, x, P, memory):  # type: ignore[no-untyped-def]
     """Average how far innovations are from what the filter expects, and hold a car that stands."""
-    if verdict.seen > 0:
+    if gated.seen > 0:
         share = min(1.0, now.dt / DIVERGED_AVERAGE_S)
-        memory[M_NIS] += share * (verdict.squares / verdict.seen - memory[M_NIS])
+        memory[M_NIS] += share * (gated.squares / gated.seen - memory[M_NIS])
     # Standstill: the speed sensor reads zero and nothing turns, for a while.
     turns = abs(now.yaw_rate) > STANDSTILL_YAW_RATE_RAD_S
     if math.isfinite(now.speed):
@@ -473,24 +473,51 @@ class PosteriorSteps(StepColumns):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ShellCarry:
-    """State that a filter passes from window to window."""
+class FilterState:
+    """Filter state between windows."""
 
-    belief: Belief
+    estimate: StateEstimate
     last_stamp_ns: int | None
-    slip: SlipCarry | None
+    slip: SlipState | None
+
+
+#: How a step hangs together with the one before it: not at all (start, failure), through the whole state, or through
+#: what a standstill does not overwrite (the entries from AX_BIAS on).
+LINK_NONE, LINK_WHOLE, LINK_BIASES = 0, 1, 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepLinks(StepColumns):
+    """What a smoother needs beside the posteriors, one row a step, or of length 0 where nobody asked.
+
+    ``kind`` [K] is one of LINK_NONE, LINK_WHOLE, LINK_BIASES; ``predicted_P`` [K, n, n] the covariance before the
+    update, with what an opened gate added to it; ``cross`` [K, n, n] the covariance between the state of the step
+    before (rows) and the predicted state (columns), from the sigma points before Q is added and they are drawn anew.
+    """
+
+    kind: IntArray
+    predicted_P: FloatArray
+    cross: FloatArray
+
+
+class LinkColumns(NamedTuple):
+    """The columns of :class:`StepLinks`, for the kernel to write."""
+
+    kind: IntArray
+    predicted_P: FloatArray
+    cross: FloatArray
 
 
 def make_window(
     signals: Signals,
-    carry: ShellCarry | None,
+    state: FilterState | None,
     residual_rate: FloatArray | None = None,
     extra_r: FloatArray | None = None,
 ) -> Window:
     """Return the window that a kernel reads; without ``residual_rate`` or ``extra_r`` they are 0."""
     nothing = np.zeros((len(signals), 2))
     return Window(
-        step_durations_s(signals.stamps_ns, carry.last_stamp_ns if carry else None),
+        step_durations_s(signals.stamps_ns, state.last_stamp_ns if state else None),
         signals.steer_rad,
         signals.ax_m_s2,
         signals.ay_m_s2,
@@ -532,11 +559,11 @@ def make_tuning(
     )
 
 
-def resume(carry: ShellCarry | None, n: int, memory_size: int = MEMORY) -> Belief:
-    """Return the belief that a window starts with, which the kernel then moves."""
-    if carry is None:
-        return Belief(np.zeros(n), np.eye(n), np.zeros(memory_size))
-    return Belief(*(part.copy() for part in carry.belief))
+def resume(state: FilterState | None, n: int, memory_size: int = MEMORY) -> StateEstimate:
+    """Return a copy of the state before a window, which the kernel updates in place."""
+    if state is None:
+        return StateEstimate(np.zeros(n), np.eye(n), np.zeros(memory_size))
+    return StateEstimate(*(part.copy() for part in state.estimate))
 
 
 def no_posterior(count: int, n: int) -> Posterior:
@@ -560,14 +587,16 @@ def no_prediction(count: int, n: int) -> Predicted:
     return Predicted(*(np.full((count, *shape), np.nan) for shape in ((n,), (MOTION, MOTION), ())))
 
 
-def carry_on(belief: Belief, stamps_ns: IntArray, carry: ShellCarry | None, slip: SlipCarry | None) -> ShellCarry:
+def next_state(
+    estimate: StateEstimate, stamps_ns: IntArray, state: FilterState | None, slip: SlipState | None
+) -> FilterState:
     """Return the state after a window with these stamps."""
-    return ShellCarry(belief, last_stamp_ns(stamps_ns, carry.last_stamp_ns if carry else None), slip)
+    return FilterState(estimate, last_stamp_ns(stamps_ns, state.last_stamp_ns if state else None), slip)
 
 
-def due(ahead: Extrapolation) -> Due:
-    """Return what a kernel is to predict."""
-    return Due(np.where(ahead.usable, ahead.step, -1), ahead.horizon_s)
+def pending_predictions(ahead: Extrapolation) -> PendingPredictions:
+    """Return the pending predictions as a kernel reads them."""
+    return PendingPredictions(np.where(ahead.usable, ahead.step, -1), ahead.horizon_s)
 
 
 def predicted_track(
@@ -615,3 +644,99 @@ def sideslip_std(vx_m_s: FloatArray, vy_m_s: FloatArray, covariance: FloatArray)
     gx, gy = -vy_m_s / v2, vx_m_s / v2
     variance = gx**2 * covariance[:, VX, VX] + gy**2 * covariance[:, VY, VY] + 2.0 * gx * gy * covariance[:, VX, VY]
     return np.sqrt(np.maximum(variance, 0.0))
+
+
+class LinkedFilter:
+    """Interface of a filter whose kernels work on :class:`Window` and write :class:`Posterior` and :class:`StepLinks`.
+
+    A filter is a dataclass with the fields below. It adds its noise and its two kernels.
+    """
+
+    __slots__ = ()
+
+    name: str
+    vehicle: VehicleParameters
+    r_std: tuple[float, float, float] | None
+    slip_gate: bool
+
+    @property
+    def measurement_std(self) -> FloatArray:
+        """1-sigma of [a_y, r, v_x], [3]."""
+        return np.array(self.r_std or self.vehicle.sensors.measurement_std)
+
+    @property
+    def _tuning(self) -> Tuning:
+        raise NotImplementedError
+
+    @property
+    def _columns(self) -> Mapping[str, int]:
+        """Entries of the state that have a column in the track, beside the motion."""
+        return {}
+
+    def _run_kernel(
+        self, window: Window, tuning: Tuning, estimate: StateEstimate, out: Posterior, links: LinkColumns
+    ) -> None:
+        raise NotImplementedError
+
+    def _predict_kernel(self, pending: PendingPredictions, start: PredictionStart, predicted: Predicted) -> None:
+        raise NotImplementedError
+
+    def corrected(self, signals: Signals) -> Signals:
+        """Return signals as the filter's vehicle corrects them."""
+        return signals
+
+    def run(
+        self,
+        signals: Signals,
+        state: FilterState | None,
+        residual_rate: FloatArray | None = None,
+        extra_r: FloatArray | None = None,
+    ) -> tuple[PosteriorSteps, FilterState]:
+        """Filter one window (see :class:`~.base.Estimator`).
+
+        ``residual_rate`` [N, 2]: what is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
+        ``extra_r`` [N, 2]: variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
+        """
+        steps, after, _ = self._steps(signals, state, residual_rate, extra_r, linked=False)
+        return steps, after
+
+    def linked_steps(
+        self,
+        signals: Signals,
+        state: FilterState | None,
+        residual_rate: FloatArray | None = None,
+        extra_r: FloatArray | None = None,
+    ) -> tuple[PosteriorSteps, FilterState, StepLinks]:
+        """Return what :meth:`run` returns, bit for bit, and the links between the steps."""
+        return self._steps(signals, state, residual_rate, extra_r, linked=True)
+
+    def predict(self, steps: PosteriorSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
+        """Extrapolate steps with the filter's model (see :class:`~.base.ModelPredictor`)."""
+        start = PredictionStart(steps.x, steps.P, steps.inputs, steps.residual_rate)
+        predicted = no_prediction(len(stamps_ns), steps.x.shape[1])
+        self._predict_kernel(pending_predictions(ahead), start, predicted)
+        return predicted_track(self.name, stamps_ns, steps, ahead, predicted, self._columns)
+
+    def _steps(
+        self,
+        signals: Signals,
+        state: FilterState | None,
+        residual_rate: FloatArray | None,
+        extra_r: FloatArray | None,
+        *,
+        linked: bool,
+    ) -> tuple[PosteriorSteps, FilterState, StepLinks]:
+        signals, slip = believable(
+            self.corrected(signals),
+            self.vehicle.sensors.speed_std_m_s,
+            state.slip if state else None,
+            gate=self.slip_gate,
+        )
+        window, tuning = make_window(signals, state, residual_rate, extra_r), self._tuning
+        count, n = len(signals), len(tuning.initial_std)
+        estimate, out = resume(state, n), no_posterior(count, n)
+        rows = count if linked else 0
+        links = LinkColumns(np.full(rows, LINK_NONE), np.zeros((rows, n, n)), np.zeros((rows, n, n)))
+        self._run_kernel(window, tuning, estimate, out, links)
+        steps = PosteriorSteps(signals.stamps_ns, *out, window.residual_rate)
+        return steps, next_state(estimate, signals.stamps_ns, state, slip), StepLinks(*links)

@@ -5,14 +5,14 @@ behind it: the biases of a_y, yaw rate and steering angle, and the force scale s
 to be wrong: (1 + s) times their forces, an Ornstein-Uhlenbeck process (docs/method.md#physics). Measurements [a_y, r,
 v_x], each of which may be missing at any step. Without options this is the paper's physics baseline and frozen: R at
 sensor level from the vehicle file, Q by innovation likelihood (``studies/defaults/tune_physics_q.py``). What is not the
-model is in :mod:`~.filter_shell`.
+model is in :mod:`~.filter_base`.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -37,8 +37,9 @@ from pdhef_logtool.car.nominal_points import (
     place_count,
     work_size,
 )
+from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators import filter_shell as shell
+from pdhef_logtool.estimators import filter_base as base
 from pdhef_logtool.estimators.unscented import (
     draw_sigma_points,
     innovation_moments,
@@ -46,15 +47,14 @@ from pdhef_logtool.estimators.unscented import (
     mean_and_covariance,
 )
 from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.release import Extrapolation, StepColumns
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
-from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.watches.speed_slip import believable
+from pdhef_logtool.records.signals import Signals
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
     from pdhef_logtool.estimators.presets import Options
 
+#: The variant with the noise of an identified car.
+TUNED = "phy-ukf:tuned"
 BIAS_STATES = 3
 #: Process noise, 1-sigma per square root of second, of v_x, v_y, r and the a_x bias. Chosen by innovation likelihood
 #: over simulated drives (``studies/defaults/tune_physics_q.py``, its result beside it) and frozen: the drives were
@@ -65,35 +65,6 @@ BIAS_WALK_STD = (0.004, 0.00008, 0.00002)
 #: Force scale: its spread, and the time constant with which it returns to 0 (docs/method.md#physics).
 FORCE_SCALE_STD = 0.05
 FORCE_SCALE_TIME_S = 2.0
-
-#: How a step hangs together with the one before it: not at all (start, failure), through the whole state, or through
-#: what a standstill does not overwrite (the entries from AX_BIAS on).
-LINK_NONE, LINK_WHOLE, LINK_BIASES = 0, 1, 2
-
-#: What this filter takes from window to window.
-FilterCarry: TypeAlias = shell.ShellCarry
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StepLinks(StepColumns):
-    """What a smoother needs beside the posteriors, one row a step, or of length 0 where nobody asked.
-
-    ``kind`` [K] is one of LINK_NONE, LINK_WHOLE, LINK_BIASES; ``predicted_P`` [K, n, n] the covariance before the
-    update, with what an opened gate added to it; ``cross`` [K, n, n] the covariance between the state of the step
-    before (rows) and the predicted state (columns), from the sigma points before Q is added and they are drawn anew.
-    """
-
-    kind: IntArray
-    predicted_P: FloatArray
-    cross: FloatArray
-
-
-class LinkColumns(NamedTuple):
-    """The columns of :class:`StepLinks`, for the kernel to write."""
-
-    kind: IntArray
-    predicted_P: FloatArray
-    cross: FloatArray
 
 
 class StateLayout(NamedTuple):
@@ -110,7 +81,7 @@ def _propagate(chi, over, rate, dt, layout, p, points):  # type: ignore[no-untyp
     Half of the residual's increment goes in before the model's step and half after it: all of it at the end, as Eq 19
     has it, would leave the tyres' answer to it out of the step, 3 % of a residual at 25 m/s and 10 ms. A residual
     counts where the model is dynamic: it knows nothing of the kinematic range. ``over`` are the inputs
-    (:class:`~.filter_shell.Meanwhile`), ``rate`` the residual of v̇_y and ṙ, ``points`` [work_size(s)] is work space.
+    (:class:`~.filter_base.HeldInputs`), ``rate`` the residual of v̇_y and ṙ, ``points`` [work_size(s)] is work space.
     """
     rate_vy, rate_r = rate
     share = 0.5 * dynamic_share(chi[0, 0], p) * dt
@@ -120,9 +91,9 @@ def _propagate(chi, over, rate, dt, layout, p, points):  # type: ignore[no-untyp
     for i in range(chi.shape[0]):
         at = place(i)
         half = share * points[at + AT_FORCE]
-        chi[i, shell.VX] = points[at + AT_VX]
-        chi[i, shell.VY] = points[at + AT_VY] + half * rate_vy
-        chi[i, shell.YAW_RATE] = points[at + AT_YAW_RATE] + half * rate_r
+        chi[i, base.VX] = points[at + AT_VX]
+        chi[i, base.VY] = points[at + AT_VY] + half * rate_vy
+        chi[i, base.YAW_RATE] = points[at + AT_YAW_RATE] + half * rate_r
         if layout.force_scale >= 0:
             chi[i, layout.force_scale] *= keep
 
@@ -139,11 +110,11 @@ def set_points(chi, steer, ax, more, layout, points):  # type: ignore[no-untyped
         i = column if column < s else 0
         force = 1.0 if layout.force_scale < 0 else max(0.1, 1.0 + chi[i, layout.force_scale])
         at = place(column)
-        points[at + AT_VX] = chi[i, shell.VX]
-        points[at + AT_VY] = chi[i, shell.VY] + more_vy * force
-        points[at + AT_YAW_RATE] = chi[i, shell.YAW_RATE] + more_r * force
+        points[at + AT_VX] = chi[i, base.VX]
+        points[at + AT_VY] = chi[i, base.VY] + more_vy * force
+        points[at + AT_YAW_RATE] = chi[i, base.YAW_RATE] + more_r * force
         points[at + AT_STEER] = steer if layout.bias < 0 else steer - chi[i, layout.bias + 2]
-        points[at + AT_AX] = ax - chi[i, shell.AX_BIAS]
+        points[at + AT_AX] = ax - chi[i, base.AX_BIAS]
         points[at + AT_FORCE] = force
 
 
@@ -155,18 +126,18 @@ def measure_sigma_points(chi, steer, friction, rate_vy, layout, p, points, zeta)
     measure_points(points, friction, p)
     for i in range(chi.shape[0]):
         at = place(i)
-        zeta[i, shell.Z_AY] = points[at + AT_AY] + points[at + AT_FORCE] * residual
-        zeta[i, shell.Z_YAW_RATE] = chi[i, shell.YAW_RATE]
-        zeta[i, shell.Z_SPEED] = chi[i, shell.VX]
+        zeta[i, base.Z_AY] = points[at + AT_AY] + points[at + AT_FORCE] * residual
+        zeta[i, base.Z_YAW_RATE] = chi[i, base.YAW_RATE]
+        zeta[i, base.Z_SPEED] = chi[i, base.VX]
         if layout.bias >= 0:
-            zeta[i, shell.Z_AY] += chi[i, layout.bias]
-            zeta[i, shell.Z_YAW_RATE] += chi[i, layout.bias + 1]
+            zeta[i, base.Z_AY] += chi[i, layout.bias]
+            zeta[i, base.Z_YAW_RATE] += chi[i, layout.bias + 1]
 
 
 @njit(cache=True)
 def add_process_noise(P, q_std, ax_known, dt, layout):  # type: ignore[no-untyped-def]
     """Add what a step of ``dt`` s makes uncertain: random walks, and the force scale that returns to 0."""
-    shell.add_process_noise(P, q_std, ax_known, dt)
+    base.add_process_noise(P, q_std, ax_known, dt)
     if layout.force_scale >= 0:
         forgotten = 1.0 - math.exp(-2.0 * dt / FORCE_SCALE_TIME_S)
         P[layout.force_scale, layout.force_scale] += FORCE_SCALE_STD**2 * forgotten
@@ -188,35 +159,35 @@ def _cross_covariance(chi_before, chi, x_after, wc, out):  # type: ignore[no-unt
 
 
 @njit(cache=True)
-def _filter(window, tuning, layout, p, belief, out, links):  # type: ignore[no-untyped-def]
-    """Run over one window; ``belief`` is moved in place. ``links`` are of length 0 where nobody asks for them."""
+def _filter(window, tuning, layout, p, estimate, out, links):  # type: ignore[no-untyped-def]
+    """Run over one window; ``estimate`` is moved in place. ``links`` are of length 0 where nobody asks for them."""
     dt, steer, ax, ay, yaw_rate, speed, friction, residual_rate, extra_r = window
     q_std, r_std, initial_std, standstill_std, wm, wc, scale, rules = tuning
-    x, P, memory = belief
+    x, P, memory = estimate
     out_x, out_P, out_inputs, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     out_link, out_predicted_P, out_cross = links
     linked = out_link.shape[0] > 0
     n = x.shape[0]
-    chi, L, zeta, z_hat, S, Pxz, nu, at_gate, given, use = shell.make_work(n)
+    chi, L, zeta, z_hat, S, Pxz, nu, at_gate, given, use = base.make_work(n)
     chi_before = np.empty((2 * n + 1, n))
     points = np.empty(work_size(2 * n + 1))
     for k in range(dt.shape[0]):
-        sample = shell.Sample(dt[k], steer[k], ax[k], ay[k], yaw_rate[k], speed[k], friction[k])
-        now = shell.begin_step(sample, rules, memory)
-        if memory[shell.M_INITIALISED] == 0.0:
-            out_valid[k] = shell.starts(now, p.rear_m, initial_std, x, P, memory)
+        sample = base.Sample(dt[k], steer[k], ax[k], ay[k], yaw_rate[k], speed[k], friction[k])
+        now = base.begin_step(sample, rules, memory)
+        if memory[base.M_INITIALISED] == 0.0:
+            out_valid[k] = base.starts(now, p.rear_m, initial_std, x, P, memory)
         else:
-            rate_vy, rate_r = memory[shell.M_RATE_VY], memory[shell.M_RATE_R]
+            rate_vy, rate_r = memory[base.M_RATE_VY], memory[base.M_RATE_R]
             draw_sigma_points(x, P, scale, L, chi)
             if linked:
                 chi_before[:, :] = chi
-            over = shell.meanwhile(now, memory)
+            over = base.held_over_step(now, memory)
             _propagate(chi, over, (rate_vy, rate_r), now.dt, layout, p, points)
             mean_and_covariance(chi, wm, wc, x, P)
             if linked:
                 _cross_covariance(chi_before, chi, x, wc, out_cross[k])
             add_process_noise(P, q_std, over.ax_known, now.dt, layout)
-            alive = shell.all_finite(x, P)
+            alive = base.all_finite(x, P)
             if linked:
                 out_predicted_P[k] = P
             for i in range(n):
@@ -225,39 +196,39 @@ def _filter(window, tuning, layout, p, belief, out, links):  # type: ignore[no-u
                 draw_sigma_points(x, P, scale, L, chi)
                 measure_sigma_points(chi, now.steer, now.friction, rate_vy, layout, p, points, zeta)
                 innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
-                shell.innovate(k, now, r_std, extra_r, z_hat, S, nu)
-                verdict = shell.gate(now, memory, nu, S, at_gate, given, use)
-                for i in range(shell.MEASUREMENTS):
+                base.innovate(k, now, r_std, extra_r, z_hat, S, nu)
+                gated = base.gate(now, memory, nu, S, at_gate, given, use)
+                for i in range(base.MEASUREMENTS):
                     if given[i]:
                         out_nu[k, i] = nu[i]
-                if verdict.outside:  # a sample counts in the likelihood even if rejected, as if it stood at the gate
+                if gated.outside:  # a sample counts in the likelihood even if rejected, as if it stood at the gate
                     _, _, out_likelihood[k] = kalman_update(x.copy(), P.copy(), at_gate, S, Pxz, given)
-                if verdict.opens:
+                if gated.opens:
                     for i in range(n):
                         for j in range(n):
-                            P[i, j] *= shell.GATE_INFLATION
+                            P[i, j] *= base.GATE_INFLATION
                     if linked:  # to a smoother the inflation is process noise of the step that led here
                         out_predicted_P[k] = P
                     draw_sigma_points(x, P, scale, L, chi)
                     measure_sigma_points(chi, now.steer, now.friction, rate_vy, layout, p, points, zeta)
                     innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
-                    shell.innovate(k, now, r_std, extra_r, z_hat, S, nu)
-                    shell.open_gate(use, memory)
+                    base.innovate(k, now, r_std, extra_r, z_hat, S, nu)
+                    base.open_gate(use, memory)
                 nis, dof, likelihood = kalman_update(x, P, nu, S, Pxz, use)
                 if dof > 0:
                     out_nis[k] = nis
                     out_dof[k] = dof
-                    if not verdict.outside:
+                    if not gated.outside:
                         out_likelihood[k] = likelihood
-                shell.settle(now, verdict, rules, standstill_std, x, P, memory)
-                alive = shell.all_finite(x, P)
+                base.settle(now, gated, rules, standstill_std, x, P, memory)
+                alive = base.all_finite(x, P)
             out_valid[k] = alive and now.steer_ok
-            out_diverged[k] = not alive or shell.diverges(rules, x, memory)
+            out_diverged[k] = not alive or base.diverges(rules, x, memory)
             if not alive:
-                memory[shell.M_INITIALISED] = 0.0
+                memory[base.M_INITIALISED] = 0.0
             elif linked:
-                out_link[k] = LINK_BIASES if memory[shell.M_STILL] >= rules.still_after_s else LINK_WHOLE
-        shell.finish_step(k, now, residual_rate, rules, memory, out_inputs)
+                out_link[k] = base.LINK_BIASES if memory[base.M_STILL] >= rules.still_after_s else base.LINK_WHOLE
+        base.finish_step(k, now, residual_rate, rules, memory, out_inputs)
         for i in range(n):
             out_x[k, i] = x[i]
             for j in range(n):
@@ -284,25 +255,25 @@ def _predict_outputs(due, held, tuning, layout, p, predicted):  # type: ignore[n
         x[:] = held_x[k]
         P[:, :] = held_P[k]
         rate_vy, rate_r = residual_rate[k, 0], residual_rate[k, 1]
-        over = shell.held_inputs(inputs, k)
+        over = base.held_inputs(inputs, k)
         if horizon_s[m] > 0.0:
             draw_sigma_points(x, P, scale, L, chi)
             _propagate(chi, over, (rate_vy, rate_r), horizon_s[m], layout, p, points)
             mean_and_covariance(chi, wm, wc, x, P)
             add_process_noise(P, q_std, over.ax_known, horizon_s[m], layout)
-            if not shell.all_finite(x, P):
+            if not base.all_finite(x, P):
                 x[:] = math.nan
                 P[:, :] = math.nan
         out_x[m] = x
         out_P[m] = P[:3, :3]
         angle = over.steer if layout.bias < 0 else over.steer - x[layout.bias + 2]
         force = 1.0 if layout.force_scale < 0 else max(0.1, 1.0 + x[layout.force_scale])
-        ay = planar_lateral_acceleration(x[shell.VX], x[shell.VY], x[shell.YAW_RATE], angle, over.friction, p, force)
-        out_ay[m] = ay + force * dynamic_share(x[shell.VX], p) * rate_vy
+        ay = planar_lateral_acceleration(x[base.VX], x[base.VY], x[base.YAW_RATE], angle, over.friction, p, force)
+        out_ay[m] = ay + force * dynamic_share(x[base.VX], p) * rate_vy
 
 
 @dataclass(frozen=True, slots=True)
-class PhysicsUkf:
+class PhysicsUkf(base.LinkedFilter):
     """The filter of this file as an estimator.
 
     Parameters
@@ -337,26 +308,21 @@ class PhysicsUkf:
         return model_parameters(self.vehicle, roll_correction=self.roll_correction)
 
     @property
-    def measurement_std(self) -> FloatArray:
-        """1-sigma of [a_y, r, v_x], [3]."""
-        return np.array(self.r_std or self.vehicle.sensors.measurement_std)
-
-    @property
     def layout(self) -> StateLayout:
         """Where the optional states stand."""
-        after = shell.STATES + (BIAS_STATES if self.bias_states else 0)
-        return StateLayout(shell.STATES if self.bias_states else -1, after if self.force_scale else -1)
+        after = base.STATES + (BIAS_STATES if self.bias_states else 0)
+        return StateLayout(base.STATES if self.bias_states else -1, after if self.force_scale else -1)
 
     @property
-    def _tuning(self) -> shell.Tuning:
+    def _tuning(self) -> base.Tuning:
         s = self.vehicle.sensors
-        initial, walk = [*shell.INITIAL_STD], [*self.q_std]
+        initial, walk = [*base.INITIAL_STD], [*self.q_std]
         if self.bias_states:
             initial += [s.ay_bias_std_m_s2, s.yaw_rate_bias_std_rad_s, s.steer_bias_std_rad]
             walk += BIAS_WALK_STD
         if self.force_scale:
             initial += [FORCE_SCALE_STD]
-        return shell.make_tuning(
+        return base.make_tuning(
             self.vehicle,
             walk,
             self.measurement_std,
@@ -365,57 +331,20 @@ class PhysicsUkf:
             standstill=self.standstill,
         )
 
-    def run(
+    def _run_kernel(
         self,
-        signals: Signals,
-        carry: FilterCarry | None,
-        residual_rate: FloatArray | None = None,
-        extra_r: FloatArray | None = None,
-    ) -> tuple[shell.PosteriorSteps, FilterCarry]:
-        """Filter one window (see :class:`~.base.Estimator`).
+        window: base.Window,
+        tuning: base.Tuning,
+        estimate: base.StateEstimate,
+        out: base.Posterior,
+        links: base.LinkColumns,
+    ) -> None:
+        _filter(window, tuning, self.layout, self._parameters, estimate, out, links)
 
-        ``residual_rate`` [N, 2]: what is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
-        ``extra_r`` [N, 2]: variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
-        """
-        steps, after, _ = self._steps(signals, carry, residual_rate, extra_r, linked=False)
-        return steps, after
-
-    def linked_steps(
-        self,
-        signals: Signals,
-        carry: FilterCarry | None,
-        residual_rate: FloatArray | None = None,
-        extra_r: FloatArray | None = None,
-    ) -> tuple[shell.PosteriorSteps, FilterCarry, StepLinks]:
-        """Return what :meth:`run` returns, bit for bit, and the links between the steps."""
-        return self._steps(signals, carry, residual_rate, extra_r, linked=True)
-
-    def _steps(
-        self,
-        signals: Signals,
-        carry: FilterCarry | None,
-        residual_rate: FloatArray | None,
-        extra_r: FloatArray | None,
-        *,
-        linked: bool,
-    ) -> tuple[shell.PosteriorSteps, FilterCarry, StepLinks]:
-        speed_std_m_s = self.vehicle.sensors.speed_std_m_s
-        signals, slip = believable(signals, speed_std_m_s, carry.slip if carry else None, gate=self.slip_gate)
-        window, tuning = shell.make_window(signals, carry, residual_rate, extra_r), self._tuning
-        count, n = len(signals), len(tuning.initial_std)
-        belief, out = shell.resume(carry, n), shell.no_posterior(count, n)
-        tied = count if linked else 0
-        links = LinkColumns(np.full(tied, LINK_NONE), np.zeros((tied, n, n)), np.zeros((tied, n, n)))
-        _filter(window, tuning, self.layout, self._parameters, belief, out, links)
-        steps = shell.PosteriorSteps(signals.stamps_ns, *out, window.residual_rate)
-        return steps, shell.carry_on(belief, signals.stamps_ns, carry, slip), StepLinks(*links)
-
-    def predict(self, steps: shell.PosteriorSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
-        """Extrapolate steps with the nominal model (see :class:`~.base.ModelPredictor`)."""
-        held = shell.Held(steps.x, steps.P, steps.inputs, steps.residual_rate)
-        predicted = shell.no_prediction(len(stamps_ns), steps.x.shape[1])
-        _predict_outputs(shell.due(ahead), held, self._tuning, self.layout, self._parameters, predicted)
-        return shell.predicted_track(self.name, stamps_ns, steps, ahead, predicted)
+    def _predict_kernel(
+        self, pending: base.PendingPredictions, start: base.PredictionStart, predicted: base.Predicted
+    ) -> None:
+        _predict_outputs(pending, start, self._tuning, self.layout, self._parameters, predicted)
 
 
 def innovation_log_likelihood(estimator: PhysicsUkf, signals: Signals) -> tuple[float, int]:
@@ -428,7 +357,21 @@ def innovation_log_likelihood(estimator: PhysicsUkf, signals: Signals) -> tuple[
     return float(steps.log_likelihood.sum()), int(np.isfinite(steps.innovation).sum())
 
 
+def physics_ukf_tuned(vehicle: VehicleParameters, noise: FilterNoise, *, use_speed: bool = True) -> PhysicsUkf:
+    """Return ``phy-ukf:tuned``: with the car's noise (the rest is ``phy-ukf``'s) and the roll correction."""
+    q = (*noise.q_std, *PHY_UKF_Q_STD[len(noise.q_std) :])
+    return PhysicsUkf(
+        vehicle,
+        q_std=(q[0], q[1], q[2], q[3]),
+        r_std=noise.measurement_std(vehicle.sensors),
+        use_speed=use_speed,
+        roll_correction=True,
+        name=TUNED,
+    )
+
+
 def build(name: str, car: Car, options: Options) -> PhysicsUkf:
-    """Return ``phy-ukf`` of a car, as it is frozen."""
-    del name
+    """Return the frozen ``phy-ukf`` of a car, or its variant ``tuned`` with the car's noise."""
+    if name == TUNED:
+        return physics_ukf_tuned(car.vehicle, car.noise[name], use_speed=options.use_speed)
     return PhysicsUkf(car.vehicle, use_speed=options.use_speed)

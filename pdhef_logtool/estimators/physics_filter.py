@@ -14,6 +14,7 @@ Inputs, gate, standstill, restart, wheel speed and delay are those of ``phy-ukf`
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -22,17 +23,9 @@ import numpy as np
 from pdhef_logtool.car.nominal_model import ModelParameters, dynamic_share, model_parameters
 from pdhef_logtool.car.parts import PHYSICS, FilterNoise
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, corrected_anew
-from pdhef_logtool.estimators import filter_shell as shell
-from pdhef_logtool.estimators.physics import (
-    BIAS_WALK_STD,
-    FORCE_SCALE_STD,
-    FORCE_SCALE_TIME_S,
-    LINK_NONE,
-    LINK_WHOLE,
-    FilterCarry,
-    LinkColumns,
-    StepLinks,
-)
+from pdhef_logtool.estimators import filter_base as base
+from pdhef_logtool.estimators.filter_base import LINK_WHOLE
+from pdhef_logtool.estimators.phy_ukf import BIAS_WALK_STD, FORCE_SCALE_STD, FORCE_SCALE_TIME_S
 from pdhef_logtool.estimators.physics_model import (
     AX_BIAS,
     AY_BIAS,
@@ -60,13 +53,12 @@ from pdhef_logtool.estimators.physics_model import (
     spread_layout,
     step_count,
 )
-from pdhef_logtool.estimators.unscented import ROOM, whiten, wide_root
+from pdhef_logtool.estimators.unscented import whiten, wide_root
 from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.release import Extrapolation
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
-from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.vectors import (
     LANES,
+    ROOM,
     aligned,
     first_half_twice,
     inner_products,
@@ -75,7 +67,6 @@ from pdhef_logtool.records.vectors import (
     store,
     total,
 )
-from pdhef_logtool.watches.speed_slip import believable
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
@@ -165,7 +156,7 @@ def _moments(points, scale, q, constants, x, P, whole):  # type: ignore[no-untyp
         store(points, at + 2 * LANES, c)
         x[j] = centre + moved
     share = spread(weight)
-    for i in range(PLACES if whole else shell.MOTION):
+    for i in range(PLACES if whole else base.MOTION):
         at = i * ROOM
         product = share * inner_products(points, WIDTH, i * WIDTH, 0, LANES)
         store(P, at, product + spread(q[i]) * load(constants.unit, ROOM - i))
@@ -228,7 +219,7 @@ def _process_noise(q_std, ax_known, dt, layout, q):  # type: ignore[no-untyped-d
     for i in range(ROOM):
         q[i] = q_std[i] * q_std[i] * dt
     if not ax_known:
-        q[VX] = shell.NO_AX_Q_STD**2 * dt
+        q[VX] = base.NO_AX_Q_STD**2 * dt
     if layout.force_scale >= 0:
         q[FORCE_SCALE] += FORCE_SCALE_STD**2 * (1.0 - math.exp(-2.0 * dt / FORCE_SCALE_TIME_S))
     if layout.bank >= 0:
@@ -263,37 +254,37 @@ def _measure(x, P, steer, rate_vy, layout, p, f, row, z_hat, S, Pxz):  # type: i
 
     ``rate_vy`` is the residual of v̇_y, which the accelerometer feels as it does the tyres' forces.
     """
-    z_hat[shell.Z_AY] = sensed_ay(x, steer, layout, p, f, row)
+    z_hat[base.Z_AY] = sensed_ay(x, steer, layout, p, f, row)
     if rate_vy != 0.0:
         felt = (1.0 if layout.roll >= 0 else 1.0 + GRAVITY_M_S2 * f.roll_gradient) * dynamic_share(x[VX], p) * rate_vy
-        z_hat[shell.Z_AY] += _force(x) * felt
+        z_hat[base.Z_AY] += _force(x) * felt
         if layout.force_scale >= 0:
             row[FORCE_SCALE] = felt
-    z_hat[shell.Z_YAW_RATE] = x[YAW_RATE] + x[RATE_BIAS]
-    z_hat[shell.Z_SPEED] = x[VX]
+    z_hat[base.Z_YAW_RATE] = x[YAW_RATE] + x[RATE_BIAS]
+    z_hat[base.Z_SPEED] = x[VX]
     low, high = spread(0.0), spread(0.0)
     for b in range(PLACES):
         if row[b] != 0.0:
             low = low + spread(row[b]) * load(P, b * ROOM)
             high = high + spread(row[b]) * load(P, b * ROOM + LANES)
-    store(Pxz, shell.Z_AY * ROOM, low)
-    store(Pxz, shell.Z_AY * ROOM + LANES, high)
+    store(Pxz, base.Z_AY * ROOM, low)
+    store(Pxz, base.Z_AY * ROOM + LANES, high)
     for at in (0, LANES):
         rate = load(P, YAW_RATE * ROOM + at) + load(P, RATE_BIAS * ROOM + at)
-        store(Pxz, shell.Z_YAW_RATE * ROOM + at, rate)
-        store(Pxz, shell.Z_SPEED * ROOM + at, load(P, VX * ROOM + at))
+        store(Pxz, base.Z_YAW_RATE * ROOM + at, rate)
+        store(Pxz, base.Z_SPEED * ROOM + at, load(P, VX * ROOM + at))
     of_ay, of_rate, of_speed = 0.0, 0.0, 0.0
     for b in range(PLACES):
         if row[b] != 0.0:
-            of_ay += row[b] * Pxz[shell.Z_AY, b]
-            of_rate += row[b] * Pxz[shell.Z_YAW_RATE, b]
-            of_speed += row[b] * Pxz[shell.Z_SPEED, b]
-    S[shell.Z_AY, shell.Z_AY] = of_ay
-    S[shell.Z_AY, shell.Z_YAW_RATE] = S[shell.Z_YAW_RATE, shell.Z_AY] = of_rate
-    S[shell.Z_AY, shell.Z_SPEED] = S[shell.Z_SPEED, shell.Z_AY] = of_speed
-    for k in (shell.Z_YAW_RATE, shell.Z_SPEED):
-        S[shell.Z_YAW_RATE, k] = Pxz[k, YAW_RATE] + Pxz[k, RATE_BIAS]
-        S[shell.Z_SPEED, k] = Pxz[k, VX]
+            of_ay += row[b] * Pxz[base.Z_AY, b]
+            of_rate += row[b] * Pxz[base.Z_YAW_RATE, b]
+            of_speed += row[b] * Pxz[base.Z_SPEED, b]
+    S[base.Z_AY, base.Z_AY] = of_ay
+    S[base.Z_AY, base.Z_YAW_RATE] = S[base.Z_YAW_RATE, base.Z_AY] = of_rate
+    S[base.Z_AY, base.Z_SPEED] = S[base.Z_SPEED, base.Z_AY] = of_speed
+    for k in (base.Z_YAW_RATE, base.Z_SPEED):
+        S[base.Z_YAW_RATE, k] = Pxz[k, YAW_RATE] + Pxz[k, RATE_BIAS]
+        S[base.Z_SPEED, k] = Pxz[k, VX]
 
 
 # positional: as _predict.
@@ -371,8 +362,8 @@ def _write_prediction(m, x, P, steer, rate_vy, places, p, predicted):  # type: i
     if not _finite(x, P):
         return
     _take(x, places, out_x[m])
-    for i in range(shell.MOTION):
-        for j in range(shell.MOTION):
+    for i in range(base.MOTION):
+        for j in range(base.MOTION):
             out_P[m, i, j] = P[i, j]
     out_ay[m] = planar_ay(x, steer, p)
     if rate_vy != 0.0:
@@ -381,38 +372,38 @@ def _write_prediction(m, x, P, steer, rate_vy, places, p, predicted):  # type: i
 
 # positional: as _predict.
 @njit(cache=True)
-def _filter(window, tuning, layout, p, f, belief, out, links):  # type: ignore[no-untyped-def]
-    """Run over one window; ``belief`` is moved in place. ``links`` are of length 0 where nobody asks for them."""
+def _filter(window, tuning, layout, p, f, estimate, out, links):  # type: ignore[no-untyped-def]
+    """Run over one window; ``estimate`` is moved in place. ``links`` are of length 0 where nobody asks for them."""
     dt, steer, ax, ay, yaw_rate, speed, friction, residual_rate, extra_r = window
     q_std, r_std, initial_std, standstill_std, _, _, scale, rules = tuning
-    belief_x, belief_P, memory = belief
+    state_x, state_P, memory = estimate
     out_x, out_P, out_inputs, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     out_link, out_predicted_P, out_cross = links
     linked = out_link.shape[0] > 0
     places = places_of(layout)
     layout = spread_layout(layout)
-    x, there = _in_places(belief_x, places, 0.0), _in_places(np.ones(places.shape[0]), places, 0.0) > 0.0
+    x, there = _in_places(state_x, places, 0.0), _in_places(np.ones(places.shape[0]), places, 0.0) > 0.0
     P, L = aligned(ROOM * ROOM).reshape((ROOM, ROOM)), aligned(ROOM * ROOM).reshape((ROOM, ROOM))
-    _matrix_in_places(belief_P, places, P)
+    _matrix_in_places(state_P, places, P)
     q_std, initial_std = _in_places(q_std, places, 0.0), _in_places(initial_std, places, 0.0)
     standstill_std = _in_places(standstill_std, places, math.nan)
     points, before, row = aligned(PLACES * WIDTH), aligned(PLACES * WIDTH), aligned(ROOM)
     Pxz, gain = aligned(3 * ROOM).reshape((3, ROOM)), aligned(3 * ROOM).reshape((3, ROOM))
-    _, _, _, z_hat, S, _, nu, at_gate, given, use = shell.make_work(shell.MEASUREMENTS)
-    index, root, w = np.empty(shell.MEASUREMENTS, np.int64), np.empty_like(S), np.empty_like(nu)
+    _, _, _, z_hat, S, _, nu, at_gate, given, use = base.make_work(base.MEASUREMENTS)
+    index, root, w = np.empty(base.MEASUREMENTS, np.int64), np.empty_like(S), np.empty_like(nu)
     noise, constants = (q_std, aligned(ROOM), scale), _make_constants()
     factored = False  # whether L is the factor of P
     for k in range(dt.shape[0]):
-        sample = shell.Sample(dt[k], steer[k], ax[k], ay[k], yaw_rate[k], speed[k], friction[k])
-        now = shell.begin_step(sample, rules, memory)
-        if memory[shell.M_INITIALISED] == 0.0:
+        sample = base.Sample(dt[k], steer[k], ax[k], ay[k], yaw_rate[k], speed[k], friction[k])
+        now = base.begin_step(sample, rules, memory)
+        if memory[base.M_INITIALISED] == 0.0:
             factored = False
-            out_valid[k] = shell.starts(now, p.rear_m, initial_std, x, P, memory)
+            out_valid[k] = base.starts(now, p.rear_m, initial_std, x, P, memory)
             if out_valid[k]:
                 settle_forces(x, now.steer, now.ax, now.friction, layout, p, f)
         else:
-            over = shell.meanwhile(now, memory)
-            rate = (memory[shell.M_RATE_VY], memory[shell.M_RATE_R])
+            over = base.held_over_step(now, memory)
+            rate = (memory[base.M_RATE_VY], memory[base.M_RATE_R])
             if not factored:
                 wide_root(P, places, there, L)
             factored = False
@@ -427,43 +418,43 @@ def _filter(window, tuning, layout, p, f, belief, out, links):  # type: ignore[n
             _take(x, places, out_prior[k])
             if alive:
                 _measure(x, P, now.steer, rate[0], layout, p, f, row, z_hat, S, Pxz)
-                shell.innovate(k, now, r_std, extra_r, z_hat, S, nu)
-                verdict = shell.gate(now, memory, nu, S, at_gate, given, use)
-                for i in range(shell.MEASUREMENTS):
+                base.innovate(k, now, r_std, extra_r, z_hat, S, nu)
+                gated = base.gate(now, memory, nu, S, at_gate, given, use)
+                for i in range(base.MEASUREMENTS):
                     if given[i]:
                         out_nu[k, i] = nu[i]
-                if verdict.outside:  # a sample counts in the likelihood even if rejected, as if it stood at the gate
+                if gated.outside:  # a sample counts in the likelihood even if rejected, as if it stood at the gate
                     _, _, out_likelihood[k] = whiten(at_gate, S, given, index, root, w)
-                if verdict.opens:
-                    P *= shell.GATE_INFLATION
+                if gated.opens:
+                    P *= base.GATE_INFLATION
                     if linked:  # to a smoother the inflation is process noise of the step that led here
                         _take_matrix(P, places, out_predicted_P[k])
                     _measure(x, P, now.steer, rate[0], layout, p, f, row, z_hat, S, Pxz)
-                    shell.innovate(k, now, r_std, extra_r, z_hat, S, nu)
-                    shell.open_gate(use, memory)
+                    base.innovate(k, now, r_std, extra_r, z_hat, S, nu)
+                    base.open_gate(use, memory)
                 nis, dof, likelihood = _update(x, P, nu, S, Pxz, use, index, root, w, gain)
                 if dof > 0:
                     wide_root(P, places, there, L)
                     factored = True
                     out_nis[k] = nis
                     out_dof[k] = dof
-                    if not verdict.outside:
+                    if not gated.outside:
                         out_likelihood[k] = likelihood
-                shell.settle(now, verdict, rules, standstill_std, x, P, memory)
-                if memory[shell.M_STILL] >= rules.still_after_s:
+                base.settle(now, gated, rules, standstill_std, x, P, memory)
+                if memory[base.M_STILL] >= rules.still_after_s:
                     factored = False
                 alive = _finite(x, P)
             out_valid[k] = alive and now.steer_ok
-            out_diverged[k] = not alive or shell.diverges(rules, x, memory)
+            out_diverged[k] = not alive or base.diverges(rules, x, memory)
             if not alive:
-                memory[shell.M_INITIALISED] = 0.0
-            elif linked and memory[shell.M_STILL] < rules.still_after_s:
+                memory[base.M_INITIALISED] = 0.0
+            elif linked and memory[base.M_STILL] < rules.still_after_s:
                 out_link[k] = LINK_WHOLE
-        shell.finish_step(k, now, residual_rate, rules, memory, out_inputs)
+        base.finish_step(k, now, residual_rate, rules, memory, out_inputs)
         _take(x, places, out_x[k])
         _take_matrix(P, places, out_P[k])
-    _take(x, places, belief_x)
-    _take_matrix(P, places, belief_P)
+    _take(x, places, state_x)
+    _take_matrix(P, places, state_P)
 
 
 @njit(cache=True)
@@ -485,7 +476,7 @@ def _predict_outputs(due, held, tuning, layout, p, f, predicted):  # type: ignor
         for i in range(places.shape[0]):
             x[places[i]] = held_x[k, i]
         _matrix_in_places(held_P[k], places, P)
-        over, rate = shell.held_inputs(inputs, k), (residual_rate[k, 0], residual_rate[k, 1])
+        over, rate = base.held_inputs(inputs, k), (residual_rate[k, 0], residual_rate[k, 1])
         if horizon_s[m] > 0.0:
             wide_root(P, places, there, L)
             _draw(x, L, scale, constants, points)
@@ -494,7 +485,7 @@ def _predict_outputs(due, held, tuning, layout, p, f, predicted):  # type: ignor
 
 
 @dataclass(frozen=True, slots=True)
-class PhysicsFilter:
+class PhysicsFilter(base.LinkedFilter):
     """The filter of this file as an estimator.
 
     Parameters
@@ -524,11 +515,6 @@ class PhysicsFilter:
     causal: bool = True
 
     @property
-    def measurement_std(self) -> FloatArray:
-        """1-sigma of [a_y, r, v_x], [3]."""
-        return np.array(self.r_std or self.vehicle.sensors.measurement_std)
-
-    @property
     def layout(self) -> Layout:
         """Where the states of the car's parts stand."""
         return layout_of(self.vehicle)
@@ -539,13 +525,13 @@ class PhysicsFilter:
         return self.layout, model_parameters(self.vehicle), physics_parameters(self.vehicle)
 
     @property
-    def _tuning(self) -> shell.Tuning:
+    def _tuning(self) -> base.Tuning:
         layout, s = self.layout, self.vehicle.sensors
         walk, initial = np.zeros(layout.size), np.zeros(layout.size)
         still = np.full(layout.size, math.nan)
         walk[: len(self.q_std)] = self.q_std
-        initial[:CORE] = (*shell.INITIAL_STD, _FORCE_STD, _FORCE_STD)
-        still[: AX_BIAS + 1] = shell.STANDSTILL_STD
+        initial[:CORE] = (*base.INITIAL_STD, _FORCE_STD, _FORCE_STD)
+        still[: AX_BIAS + 1] = base.STANDSTILL_STD
         still[FRONT : REAR + 1] = _STANDSTILL_FORCE_STD
         if (i := layout.roll) >= 0:
             initial[i : i + 2], still[i : i + 2], walk[i + 1] = _ROLL_STD, _STANDSTILL_ROLL_STD, _ROLL_WALK
@@ -558,7 +544,7 @@ class PhysicsFilter:
             initial[layout.steer_bias], walk[layout.steer_bias] = s.steer_bias_std_rad, of_steer
             for at, std, of in ((0, s.ay_bias_std_m_s2, of_ay), (1, s.yaw_rate_bias_std_rad_s, of_rate)):
                 initial[layout.sensor_bias + at], walk[layout.sensor_bias + at] = std, of
-        return shell.make_tuning(
+        return base.make_tuning(
             self.vehicle,
             walk.tolist(),
             self.measurement_std,
@@ -572,59 +558,24 @@ class PhysicsFilter:
         """Return signals as this filter's vehicle corrects them, where they were read with another one."""
         return signals if self.read_with is None else corrected_anew(signals, self.read_with, self.vehicle)
 
-    def run(
+    def _run_kernel(
         self,
-        signals: Signals,
-        carry: FilterCarry | None,
-        residual_rate: FloatArray | None = None,
-        extra_r: FloatArray | None = None,
-    ) -> tuple[shell.PosteriorSteps, FilterCarry]:
-        """Filter one window (see :class:`~.base.Estimator`).
+        window: base.Window,
+        tuning: base.Tuning,
+        estimate: base.StateEstimate,
+        out: base.Posterior,
+        links: base.LinkColumns,
+    ) -> None:
+        _filter(window, tuning, *self.parameters, estimate, out, links)
 
-        ``residual_rate`` [N, 2]: what is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
-        ``extra_r`` [N, 2]: variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
-        """
-        steps, after, _ = self._steps(signals, carry, residual_rate, extra_r)
-        return steps, after
+    def _predict_kernel(
+        self, pending: base.PendingPredictions, start: base.PredictionStart, predicted: base.Predicted
+    ) -> None:
+        _predict_outputs(pending, start, self._tuning, *self.parameters, predicted)
 
-    def linked_steps(
-        self,
-        signals: Signals,
-        carry: FilterCarry | None,
-        residual_rate: FloatArray | None = None,
-        extra_r: FloatArray | None = None,
-    ) -> tuple[shell.PosteriorSteps, FilterCarry, StepLinks]:
-        """Return what :meth:`run` returns, bit for bit, and the links between the steps."""
-        return self._steps(signals, carry, residual_rate, extra_r, linked=True)
-
-    # positional: what all of them take.
-    def _steps(
-        self,
-        signals: Signals,
-        carry: FilterCarry | None,
-        residual_rate: FloatArray | None,
-        extra_r: FloatArray | None,
-        *,
-        linked: bool = False,
-    ) -> tuple[shell.PosteriorSteps, FilterCarry, StepLinks]:
-        signals = self.corrected(signals)
-        speed_std_m_s = self.vehicle.sensors.speed_std_m_s
-        signals, slip = believable(signals, speed_std_m_s, carry.slip if carry else None, gate=self.slip_gate)
-        window, tuning = shell.make_window(signals, carry, residual_rate, extra_r), self._tuning
-        count, n = len(signals), self.layout.size
-        belief, out = shell.resume(carry, n), shell.no_posterior(count, n)
-        tied = count if linked else 0
-        links = LinkColumns(np.full(tied, LINK_NONE), np.zeros((tied, n, n)), np.zeros((tied, n, n)))
-        _filter(window, tuning, *self.parameters, belief, out, links)
-        steps = shell.PosteriorSteps(signals.stamps_ns, *out, window.residual_rate)
-        return steps, shell.carry_on(belief, signals.stamps_ns, carry, slip), StepLinks(*links)
-
-    def predict(self, steps: shell.PosteriorSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
-        """Extrapolate steps with the car's model (see :class:`~.base.ModelPredictor`)."""
-        held = shell.Held(steps.x, steps.P, steps.inputs, steps.residual_rate)
-        predicted = shell.no_prediction(len(stamps_ns), self.layout.size)
-        _predict_outputs(shell.due(ahead), held, self._tuning, *self.parameters, predicted)
-        return shell.predicted_track(self.name, stamps_ns, steps, ahead, predicted, self.layout.named)
+    @property
+    def _columns(self) -> Mapping[str, int]:
+        return self.layout.named
 
 
 def physics_filter(

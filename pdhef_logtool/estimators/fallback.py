@@ -1,4 +1,4 @@
-"""Another estimator under the name of one that cannot be relied on: what a run falls back to."""
+"""The fallback estimator: a simpler estimator under the name of one that contradicts the sensors."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from pdhef_logtool.records.tracks import StateTrack
 
 
 @dataclass(frozen=True, slots=True)
-class StandIn:
-    """An estimator under another name; ``reason`` is why. It was chosen on the whole log: not causal."""
+class Fallback:
+    """An estimator under another name, for a ``reason``. It is selected on the whole log, so it is not causal."""
 
     algorithm = "stand-in"
     version = 1
