@@ -19,10 +19,12 @@ from pdhef_logtool.car.parts import physics_sha256
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.correlation import GAP_PERIODS as TRUTH_GAP_PERIODS
-from pdhef_logtool.drive.reading import Tell, friction_of, no_samples
+from pdhef_logtool.drive.reading import Drive, Tell, friction_of, no_samples
 from pdhef_logtool.drive.truth import derive_truth
-from pdhef_logtool.drive.windows import DrivePlan
+from pdhef_logtool.drive.windows import DrivePlan, DriveWindow
 from pdhef_logtool.estimators.parallel_physics import filter_of
+from pdhef_logtool.estimators.physics import PhysicsUkf
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.estimators.table import FILTERS, spec_of
 from pdhef_logtool.learning.drives import (
     DriveRecord,
@@ -258,25 +260,7 @@ def extract(
     check_no_input(read, [output / MANIFEST])
     kept = [d for d in before.get("drives", []) if d["name"] not in names]
     vehicles = {v["sha256"]: v for v in before.get("vehicles", [])}
-
-    def write(results: Sequence[DriveResult]) -> dict[str, Any]:
-        entries = [r.entry for r in results if r.entry is not None]
-        held = {e["signals_sha256"] for e in entries} - {None}
-        entries += [d for d in kept if d["signals_sha256"] not in held]
-        _check_apart(entries)
-        left_out = [r.record for r in results if r.record.left_out]
-        failed = [{"log": r.name, "file": r.file, "reason": r.left_out} for r in left_out]
-        copies = [{"log": r.record.name, "file": r.record.file, "of": r.copy_of} for r in results if r.copy_of]
-        return write_manifest(
-            output,
-            entries,
-            failed,
-            settings=settings.to_dict(),
-            seed=settings.seed,
-            vehicles=vehicles,
-            duplicates=copies,
-        )
-
+    write = partial(_write, output, settings, kept, vehicles)
     folders = {split_folder(s) for s in (*SPLITS, settings.split, *(job.listed_split for job in work)) if s}
     with OutputFolder(output, sorted(folders)):
         # Until the new manifest stands, what the old one says of the files that change is no longer true.
@@ -292,15 +276,36 @@ def extract(
         manifest = write(results)
         with writing(output):
             remove_unnamed(output, manifest)
-    if (
-        splits is None
-        and settings.split is None
-        and manifest["drives"]
-        and not all(manifest["splits"][s]["drives"] for s in SPLITS)
-    ):
-        empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
+    empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
+    if empty and manifest["drives"] and splits is None and settings.split is None:
         warn(f"no drive fell to {' and '.join(empty)}: with few drives choose with --split, or another --seed")
     return ExtractResult(output, manifest, results)
+
+
+def _write(
+    output: Path,
+    settings: ExtractSettings,
+    kept: Sequence[dict[str, Any]],
+    vehicles: Mapping[str, Any],
+    results: Sequence[DriveResult],
+) -> dict[str, Any]:
+    """Write the manifest of the results and of the ``kept`` entries of earlier calls; return it."""
+    entries = [r.entry for r in results if r.entry is not None]
+    signals = {e["signals_sha256"] for e in entries} - {None}
+    entries += [d for d in kept if d["signals_sha256"] not in signals]
+    _check_apart(entries)
+    left_out = [r.record for r in results if r.record.left_out]
+    failed = [{"log": r.name, "file": r.file, "reason": r.left_out} for r in left_out]
+    copies = [{"log": r.record.name, "file": r.record.file, "of": r.copy_of} for r in results if r.copy_of]
+    return write_manifest(
+        output,
+        entries,
+        failed,
+        settings=settings.to_dict(),
+        seed=settings.seed,
+        vehicles=vehicles,
+        duplicates=copies,
+    )
 
 
 def _without_copies(results: Sequence[DriveResult], warn: Tell) -> tuple[DriveResult, ...]:
@@ -452,54 +457,31 @@ def _failure(job: _Job, reason: str) -> DriveResult:
 
 
 def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
-    stem, name, settings = job.log_input.stem, job.log_input.path.name, job.settings
-    source = identity_of(job.log_input)
+    settings, source = job.settings, identity_of(job.log_input)
     split, split_from = choose_split(source, settings.seed, chosen=settings.split, listed=job.listed_split)
-    fingerprint = _fingerprint(job, split)
-    target = job.target(split)
-    if job.resume:
-        entry = read_entry(target)
-        if (
-            entry is not None
-            and entry.get("settings_sha256") == fingerprint
-            and entry.get("source") == {"file": name, "sha256": source}
-        ):
-            losses = tuple(Loss(**x) for x in entry["losses"])
-            record = DriveRecord(stem, name, source, split, entry["duration_s"], losses=losses)
-            return DriveResult(record, entry, kept=True)
+    fingerprint, target = _fingerprint(job, split), job.target(split)
+    if job.resume and (kept := _kept(job, target, source, split, fingerprint)) is not None:
+        return kept
     with read_cached(job.log_input, job.car, job.mapping, settings.config.read_options) as drive:
         drive.plan = plan = _strict_truth(drive.plan)
         _check_plan(plan, job)
         smoothing = _choose_smoothing(plan, settings)
         physics = filter_of(job.car, settings.model, use_speed=drive.options.use_speed)
-        told = vary(physics.vehicle, settings.vary, f"{settings.seed}:{source}")
-        physics = replace(physics, vehicle=told.vehicle)
-        drive.friction = friction_of(plan, told.vehicle, drive.options, told.friction_factor)
-
-        def windows() -> Iterator[Any]:
-            for window in drive.windows():
-                yield window
-                progress(window.share_done)
-
+        varied = vary(physics.vehicle, settings.vary, f"{settings.seed}:{source}")
+        physics = replace(physics, vehicle=varied.vehicle)
+        drive.friction = friction_of(plan, varied.vehicle, drive.options, varied.friction_factor)
         condition = None if settings.where is None else condition_of(settings.where)
         writer = DriveWriter(target, Picking(condition, f"{settings.seed}:{source}"))
         try:
-            counts = _Counts()
-            for rows in residual_windows(
-                windows(),
-                physics,
-                period_s=plan.alignment.grid_period_s,
-                half_window=round(smoothing.half_s / plan.alignment.grid_period_s),
-            ):
-                counts.add(rows, writer.append(rows))
+            counts = _counted(drive, physics, smoothing, writer, progress)
             if not counts.rows:
                 raise no_samples(job.log_input.path)
             friction = drive.friction
             entry = {
                 "name": job.name,
-                "log": stem,
+                "log": job.log_input.stem,
                 **counts.span(drive.log.start_ns),
-                "source": {"file": name, "sha256": source},
+                "source": {"file": job.log_input.path.name, "sha256": source},
                 "signals_sha256": drive.signals_sha256,
                 "split": split,
                 "split_from": split_from,
@@ -510,7 +492,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
                 **counts.to_dict(),
                 "truth": _truth_facts(plan, smoothing),
                 "friction_from": friction.label + (f", {friction.summary}" if friction.summary else ""),
-                **({"friction_factor": told.friction_factor} if settings.vary else {}),
+                **({"friction_factor": varied.friction_factor} if settings.vary else {}),
                 "losses": [asdict(x) for x in drive.losses],
             }
         except BaseException:
@@ -521,6 +503,41 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             drive.tell("not one usable target: no truth above the low-speed limit")
         record = record_of(drive, split=split)
     return DriveResult(replace(record, seconds=entry["duration_s"]), entry)
+
+
+def _kept(job: _Job, target: Path, source: str, split: str, fingerprint: str) -> DriveResult | None:
+    """Return the drive that an earlier command has written, None if its log or settings have changed."""
+    entry, name = read_entry(target), job.log_input.path.name
+    if (
+        entry is None
+        or entry.get("settings_sha256") != fingerprint
+        or entry.get("source") != {"file": name, "sha256": source}
+    ):
+        return None
+    losses = tuple(Loss(**x) for x in entry["losses"])
+    record = DriveRecord(job.log_input.stem, name, source, split, entry["duration_s"], losses=losses)
+    return DriveResult(record, entry, kept=True)
+
+
+def _counted(
+    drive: Drive,
+    physics: PhysicsFilter | PhysicsUkf,
+    smoothing: _Smoothing,
+    writer: DriveWriter,
+    progress: Callable[[float], None],
+) -> _Counts:
+    """Write the residuals of a drive and return their sums."""
+
+    def windows() -> Iterator[DriveWindow]:
+        for window in drive.windows():
+            yield window
+            progress(window.share_done)
+
+    counts, period_s = _Counts(), drive.plan.alignment.grid_period_s
+    half_window = round(smoothing.half_s / period_s)
+    for rows in residual_windows(windows(), physics, period_s=period_s, half_window=half_window):
+        counts.add(rows, writer.append(rows))
+    return counts
 
 
 def choose_split(
