@@ -50,7 +50,13 @@ def learn(
         bool, Option("--without-truth", help="Identify from the sensors of several logs; ground truth is not read.")
     ] = False,
     estimators: Annotated[
-        str | None, Option("--estimators", "-e", help="Estimators of the stages noise and intervals. Default: theirs.")
+        str | None,
+        Option(
+            "--estimators",
+            "-e",
+            help="Estimators of the stages noise and intervals. Default: physics with its variants; for one stage "
+            "alone, all that the car can run.",
+        ),
     ] = None,
     holdout: Annotated[float, Option(help="Share of the driving that is only scored, once.")] = 0.15,
     trials: Annotated[int, Option(help="Trials of the noise search, per estimator.")] = 64,
@@ -63,7 +69,7 @@ def learn(
     fresh: Annotated[bool, Option("--fresh", help="Forget the results of an earlier call with this output.")] = False,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Identify, tune, train and calibrate a car. Each stage can run alone."""
+    """Identify, tune, train and calibrate a car. Each stage can also run alone."""
     from pdhef_logtool.learning.drives import IDENTIFY, STAGES, LearnSettings
     from pdhef_logtool.learning.engine import learn as run_stages
 
