@@ -23,7 +23,7 @@ from pdhef_logtool.drive.reading import Drive, Tell, friction_of, no_samples
 from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.drive.windows import DrivePlan, DriveWindow
 from pdhef_logtool.estimators.parallel_physics import filter_of
-from pdhef_logtool.estimators.physics import PhysicsUkf
+from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.estimators.table import FILTERS, spec_of
 from pdhef_logtool.learning.drives import (
