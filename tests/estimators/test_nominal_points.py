@@ -57,17 +57,9 @@ CARS = {
         }
     ),
 }
-LAYOUTS = {
-    "no optional state": phy_ukf.StateLayout(-1, -1),
-    "biases": phy_ukf.StateLayout(base.STATES, -1),
-    "force scale": phy_ukf.StateLayout(-1, base.STATES),
-    "biases and force scale": phy_ukf.StateLayout(base.STATES, base.STATES + phy_ukf.BIAS_STATES),
-}
-STATES = {"no optional state": 4, "biases": 7, "force scale": 5, "biases and force scale": 8}
 TOLERANCE = 1e-11
 
 cars = pytest.mark.parametrize("car", CARS.values(), ids=CARS)
-layouts = pytest.mark.parametrize("name", LAYOUTS)
 random_states = settings(derandomize=True, deadline=None, max_examples=60)
 seeds = st.integers(0, 2**32 - 1)
 frictions = st.floats(0.05, 1.5)
@@ -146,22 +138,14 @@ def test_points_move_as_one_state_does(car, seed, count, mu, dt, n):
     np.testing.assert_allclose(got, want, rtol=TOLERANCE, atol=TOLERANCE)
 
 
-def optional(state: np.ndarray, layout: phy_ukf.StateLayout) -> tuple[float, float, float, float]:
-    """Return force factor and the biases of a_y, yaw rate and steering angle of a state."""
-    force = 1.0 if layout.force_scale < 0 else max(0.1, 1.0 + state[layout.force_scale])
-    return (force, 0.0, 0.0, 0.0) if layout.bias < 0 else (force, *state[layout.bias : layout.bias + 3])
-
-
 @cars
-@layouts
 @random_states
 @given(
     seeds, frictions, steps_s, st.floats(-0.6, 0.6), st.floats(-5.0, 5.0), st.floats(-3.0, 3.0), st.floats(-2.0, 2.0)
 )
-def test_sigma_points_move_and_measure_as_one_state_does(car, name, seed, mu, dt, steer, ax, rate_vy, rate_r):
-    layout, size = LAYOUTS[name], STATES[name]
+def test_sigma_points_move_and_measure_as_one_state_does(car, seed, mu, dt, steer, ax, rate_vy, rate_r):
     p = model_parameters(car, roll_correction=True)
-    chi = drawn(seed, 2 * size + 1, size)
+    chi = drawn(seed, 2 * base.STATES + 1, base.STATES)
     share = nominal_model.dynamic_share(chi[0, 0], p)
     if nominal_model.substeps(chi[:, 0].min(), dt, mu, p) > nominal_model.substeps(chi[0, 0], dt, mu, p):
         dt = 1e-3  # the first point says how many substeps there are: slow ones beside it would grow without bound
@@ -169,24 +153,19 @@ def test_sigma_points_move_and_measure_as_one_state_does(car, name, seed, mu, dt
     points = np.full(work_size(len(chi)), np.nan)
 
     zeta = np.empty((len(chi), base.MEASUREMENTS))
-    phy_ukf.measure_sigma_points(chi, steer, mu, rate_vy, layout, p, points, zeta)
+    phy_ukf.measure_sigma_points(chi, steer, mu, rate_vy, p, points, zeta)
     want_zeta, want = np.empty_like(zeta), chi.copy()
     for i, state in enumerate(chi):
-        force, ay_bias, yaw_rate_bias, steer_bias = optional(state, layout)
-        ay = nominal_model.measured_lateral_acceleration(*state[:3], steer - steer_bias, mu, p, force)
-        ay += (1.0 + p.ay_roll_gain) * share * force * rate_vy
-        want_zeta[i] = ay + ay_bias, state[2] + yaw_rate_bias, state[0]
-        half = 0.5 * share * dt * force * np.array([rate_vy, rate_r])
-        moved = nominal_model.rk4_step(
-            state[0], *(state[1:3] + half), steer - steer_bias, ax - state[3], mu, dt, n, p, force
-        )
+        ay = nominal_model.measured_lateral_acceleration(*state[:3], steer, mu, p)
+        ay += (1.0 + p.ay_roll_gain) * share * rate_vy
+        want_zeta[i] = ay, state[2], state[0]
+        half = 0.5 * share * dt * np.array([rate_vy, rate_r])
+        moved = nominal_model.rk4_step(state[0], *(state[1:3] + half), steer, ax - state[3], mu, dt, n, p)
         want[i, :3] = moved[0], *(moved[1:] + half)
-        if layout.force_scale >= 0:
-            want[i, layout.force_scale] *= math.exp(-dt / phy_ukf.FORCE_SCALE_TIME_S)
     np.testing.assert_allclose(zeta, want_zeta, rtol=TOLERANCE, atol=TOLERANCE)
 
     over = base.HeldInputs(steer, ax, ax_known=True, friction=mu)
-    phy_ukf._propagate(chi, over, (rate_vy, rate_r), dt, layout, p, points)
+    phy_ukf._propagate(chi, over, (rate_vy, rate_r), dt, p, points)
     np.testing.assert_allclose(chi, want, rtol=TOLERANCE, atol=TOLERANCE)
 
 

@@ -228,7 +228,7 @@ def test_command_refuses_what_it_cannot_use(sample_logs_dir: Path, tmp_path: Pat
     with pytest.raises(UsageError, match="holdout"):
         identify(log, tmp_path / "car", RunConfig(), holdout=1.0)
     (tmp_path / "car.json").write_text("{}")
-    with pytest.raises(UsageError, match=r"\.toml"):
+    with pytest.raises(UsageError, match="a car's folder"):
         identify(log, tmp_path / "car.json", RunConfig())
     for name in ("car", "mycar"):
         with pytest.raises(EstimatorError, match="20 s"):
