@@ -24,7 +24,6 @@ from pdhef_logtool.car.nominal_model import (
 from pdhef_logtool.car.nominal_points import (
     AT_AX,
     AT_AY,
-    AT_FORCE,
     AT_STEER,
     AT_VX,
     AT_VY,
@@ -95,7 +94,6 @@ def set_points(chi, steer, ax, more, points):  # type: ignore[no-untyped-def]
         points[at + AT_YAW_RATE] = chi[i, base.YAW_RATE] + more_r
         points[at + AT_STEER] = steer
         points[at + AT_AX] = ax - chi[i, base.AX_BIAS]
-        points[at + AT_FORCE] = 1.0
 
 
 @njit(cache=True)

@@ -15,7 +15,6 @@ from pdhef_logtool.car.nominal_model import model_parameters
 from pdhef_logtool.car.nominal_points import (
     AT_AX,
     AT_AY,
-    AT_FORCE,
     AT_STEER,
     AT_VX,
     AT_VY,
@@ -118,23 +117,21 @@ def test_points_move_as_one_state_does(car, seed, count, mu, dt, n):
     p = model_parameters(car, roll_correction=True)
     rng = np.random.default_rng(seed)
     state = drawn(seed, count, 3)
-    steer, ax, force = rng.uniform(-0.6, 0.6, count), rng.normal(0.0, 4.0, count), rng.uniform(0.1, 1.5, count)
+    steer, ax = rng.uniform(-0.6, 0.6, count), rng.normal(0.0, 4.0, count)
     points = np.ones(work_size(count))
     at = np.array([place.py_func(i) for i in range(count)])
     for row, values in ((AT_VX, state[:, 0]), (AT_VY, state[:, 1]), (AT_YAW_RATE, state[:, 2])):
         points[at + row] = values
-    for row, values in ((AT_STEER, steer), (AT_AX, ax), (AT_FORCE, force)):
+    for row, values in ((AT_STEER, steer), (AT_AX, ax)):
         points[at + row] = values
     assert place_count(points) >= count and place_count(points) % WIDTH == 0
     measure_points(points, mu, p)
-    read = [nominal_model.measured_lateral_acceleration(*state[i], steer[i], mu, p, force[i]) for i in range(count)]
+    read = [nominal_model.measured_lateral_acceleration(*state[i], steer[i], mu, p) for i in range(count)]
     np.testing.assert_allclose(points[at + AT_AY], read, rtol=TOLERANCE, atol=TOLERANCE)
     stable = nominal_model.substeps(float(state[:, 0].min()), dt, mu, p)
     advance_points(points, mu, dt, max(n, stable), p)
     got = np.column_stack([points[at + AT_VX], points[at + AT_VY], points[at + AT_YAW_RATE]])
-    want = [
-        nominal_model.rk4_step(*state[i], steer[i], ax[i], mu, dt, max(n, stable), p, force[i]) for i in range(count)
-    ]
+    want = [nominal_model.rk4_step(*state[i], steer[i], ax[i], mu, dt, max(n, stable), p) for i in range(count)]
     np.testing.assert_allclose(got, want, rtol=TOLERANCE, atol=TOLERANCE)
 
 
