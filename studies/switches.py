@@ -125,13 +125,9 @@ def option_switch(title: str, drives: str, name: str, default: dict[str, bool]) 
 
 
 _ALL = dict.fromkeys(ESTIMATORS, True)
-_OF_TUNED = {"phy-ukf:tuned": False}
 _ROLLING = {"phy-ukf:tuned": True}
 _PART = {"physics": True}
 SWITCHES = (
-    option_switch("bias states of a_y, yaw rate, steering", "bias", "bias_states", _OF_TUNED),
-    option_switch("bias states of a_y, yaw rate, steering", "in-domain", "bias_states", _OF_TUNED),
-    option_switch("bias states of a_y, yaw rate, steering", "bank-and-grade", "bias_states", _OF_TUNED),
     option_switch("part biases", "bias", "biases", _PART),
     *(option_switch(f"part {p.replace('_', ' ')}", "in-domain", p, _PART) for p in PhysicsParts.model_fields),
     option_switch("part bank", "bank-and-grade", "bank", _PART),

@@ -12,7 +12,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, TypeVar
 
 from pdhef_logtool.car.parts import (
@@ -106,7 +105,7 @@ class Car:
 
     vehicle: VehicleParameters
     own: VehicleParameters
-    noise: Mapping[str, FilterNoise] = field(default_factory=lambda: MappingProxyType({}))
+    noise: Mapping[str, FilterNoise] = field(default_factory=dict)
     network: ModelBundle | None = None
     network_name: str = NO_MODEL
     network_folder: Path | None = None

@@ -92,23 +92,19 @@ def dynamic_share(vx, p):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def lateral_acceleration_and_yaw_acceleration(vx, vy, r, steer, friction, p, force_scale=1.0):  # type: ignore[no-untyped-def]
-    """Return (F_yf cos δ + F_yr)/m in m/s² and (l_f F_yf cos δ − l_r F_yr)/I_z in rad/s² (Eq 1-4).
-
-    ``force_scale`` multiplies both axles' forces.
-    """
+def lateral_acceleration_and_yaw_acceleration(vx, vy, r, steer, friction, p):  # type: ignore[no-untyped-def]
+    """Return (F_yf cos δ + F_yr)/m in m/s² and (l_f F_yf cos δ − l_r F_yr)/I_z in rad/s² (Eq 1-4)."""
     v = max(vx, p.blend_low_m_s)
     alpha_f = steer - math.atan((vy + p.front_m * r) / v)
     alpha_r = -math.atan((vy - p.rear_m * r) / v)
     ff = magic_formula_force(alpha_f, p.front_B, p.front_C, p.front_D_n, p.front_E, p.front_fixed_stiffness, friction)
     fr = magic_formula_force(alpha_r, p.rear_B, p.rear_C, p.rear_D_n, p.rear_E, p.rear_fixed_stiffness, friction)
-    ffc = force_scale * ff * math.cos(steer)
-    fr *= force_scale
+    ffc = ff * math.cos(steer)
     return (ffc + fr) / p.mass_kg, (p.front_m * ffc - p.rear_m * fr) / p.yaw_inertia_kg_m2
 
 
 @njit(cache=True)
-def state_derivative(vx, vy, r, steer, ax, friction, p, force_scale=1.0):  # type: ignore[no-untyped-def]
+def state_derivative(vx, vy, r, steer, ax, friction, p):  # type: ignore[no-untyped-def]
     """Return d/dt [v_x, v_y, r] (Eq 1-4, blended to the kinematic model at low speed).
 
     ``ax`` is the accelerometer's longitudinal acceleration at the IMU, m/s².
@@ -117,7 +113,7 @@ def state_derivative(vx, vy, r, steer, ax, friction, p, force_scale=1.0):  # typ
     ay = 0.0
     rdot = 0.0
     if w > 0.0:
-        ay, rdot = lateral_acceleration_and_yaw_acceleration(vx, vy, r, steer, friction, p, force_scale)
+        ay, rdot = lateral_acceleration_and_yaw_acceleration(vx, vy, r, steer, friction, p)
     vy_dot = w * (ay - vx * r)
     r_dot = w * rdot
     if w < 1.0:
@@ -130,23 +126,23 @@ def state_derivative(vx, vy, r, steer, ax, friction, p, force_scale=1.0):  # typ
 
 
 @njit(cache=True)
-def planar_lateral_acceleration(vx, vy, r, steer, friction, p, force_scale=1.0):  # type: ignore[no-untyped-def]
+def planar_lateral_acceleration(vx, vy, r, steer, friction, p):  # type: ignore[no-untyped-def]
     """Return the lateral acceleration at the centre of gravity in m/s²; v_x r in the kinematic range."""
     w = dynamic_share(vx, p)
     if w == 0.0:
         return vx * r
-    ay, _ = lateral_acceleration_and_yaw_acceleration(vx, vy, r, steer, friction, p, force_scale)
+    ay, _ = lateral_acceleration_and_yaw_acceleration(vx, vy, r, steer, friction, p)
     return w * ay + (1.0 - w) * vx * r
 
 
 @njit(cache=True)
-def measured_lateral_acceleration(vx, vy, r, steer, friction, p, force_scale=1.0):  # type: ignore[no-untyped-def]
+def measured_lateral_acceleration(vx, vy, r, steer, friction, p):  # type: ignore[no-untyped-def]
     """Return the accelerometer's reading: planar a_y at the IMU plus the gravity component of body roll."""
     w = dynamic_share(vx, p)
     ay = vx * r
     r_dot = 0.0
     if w > 0.0:
-        force_ay, r_dot = lateral_acceleration_and_yaw_acceleration(vx, vy, r, steer, friction, p, force_scale)
+        force_ay, r_dot = lateral_acceleration_and_yaw_acceleration(vx, vy, r, steer, friction, p)
         ay = w * force_ay + (1.0 - w) * ay
         r_dot *= w
     return (1.0 + p.ay_roll_gain) * ay + r_dot * p.imu_x_m - r * r * p.imu_y_m
@@ -166,15 +162,15 @@ def substeps(vx, dt, friction, p):  # type: ignore[no-untyped-def]
 
 # positional: scalars, as in the model's other functions.
 @njit(cache=True)
-def rk4_step(vx, vy, r, steer, ax, friction, dt, n, p, force_scale=1.0):  # type: ignore[no-untyped-def]
+def rk4_step(vx, vy, r, steer, ax, friction, dt, n, p):  # type: ignore[no-untyped-def]
     """Advance [v_x, v_y, r] by ``dt`` s in ``n`` RK4 steps with constant inputs."""
     h = dt / n
     for _ in range(n):
-        a1, b1, c1 = state_derivative(vx, vy, r, steer, ax, friction, p, force_scale)
+        a1, b1, c1 = state_derivative(vx, vy, r, steer, ax, friction, p)
         g = 0.5 * h
-        a2, b2, c2 = state_derivative(vx + g * a1, vy + g * b1, r + g * c1, steer, ax, friction, p, force_scale)
-        a3, b3, c3 = state_derivative(vx + g * a2, vy + g * b2, r + g * c2, steer, ax, friction, p, force_scale)
-        a4, b4, c4 = state_derivative(vx + h * a3, vy + h * b3, r + h * c3, steer, ax, friction, p, force_scale)
+        a2, b2, c2 = state_derivative(vx + g * a1, vy + g * b1, r + g * c1, steer, ax, friction, p)
+        a3, b3, c3 = state_derivative(vx + g * a2, vy + g * b2, r + g * c2, steer, ax, friction, p)
+        a4, b4, c4 = state_derivative(vx + h * a3, vy + h * b3, r + h * c3, steer, ax, friction, p)
         vx += h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
         vy += h / 6.0 * (b1 + 2.0 * b2 + 2.0 * b3 + b4)
         r += h / 6.0 * (c1 + 2.0 * c2 + 2.0 * c3 + c4)

@@ -17,8 +17,8 @@ from pdhef_logtool.records.compiled import njit
 #: Points of one inner loop: a constant, so that no remainder is left and every point is computed alike.
 WIDTH = 16
 #: Where the quantities of a block of points begin: state, inputs, what a step needs of the steering angle, and a_y.
-AT_VX, AT_VY, AT_YAW_RATE, AT_STEER, AT_AX, AT_FORCE, AT_COS_STEER, AT_TAN_STEER, AT_AY = range(0, 9 * WIDTH, WIDTH)
-BLOCK = 9 * WIDTH
+AT_VX, AT_VY, AT_YAW_RATE, AT_STEER, AT_AX, AT_COS_STEER, AT_TAN_STEER, AT_AY = range(0, 8 * WIDTH, WIDTH)
+BLOCK = 8 * WIDTH
 
 _TAN_PI_8 = 0.41421356237309503
 _TAN_3_PI_8 = 2.414213562373095
@@ -113,15 +113,15 @@ def _constants(friction, p):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def _axle_accelerations(vx, vy, r, steer, cos_steer, force, c, p):  # type: ignore[no-untyped-def]
+def _axle_accelerations(vx, vy, r, steer, cos_steer, c, p):  # type: ignore[no-untyped-def]
     """Return a_y in m/s² and the yaw acceleration in rad/s² (Eq 1-4), as the function of the nominal model does."""
     v = max(vx, p.blend_low_m_s)
     front = c.b_front * (steer - arctangent(vy + p.front_m * r, v))
     rear = -c.b_rear * arctangent(vy - p.rear_m * r, v)
     front = arctangent(front - p.front_E * (front - arctangent(front, 1.0)), 1.0)
     rear = arctangent(rear - p.rear_E * (rear - arctangent(rear, 1.0)), 1.0)
-    ff = c.peak_front_n * force * cos_steer * sine(p.front_C * front)
-    fr = c.peak_rear_n * force * sine(p.rear_C * rear)
+    ff = c.peak_front_n * cos_steer * sine(p.front_C * front)
+    fr = c.peak_rear_n * sine(p.rear_C * rear)
     return c.per_mass * (ff + fr), c.per_inertia * (p.front_m * ff - p.rear_m * fr)
 
 
@@ -133,10 +133,10 @@ def _share(vx, c, p):  # type: ignore[no-untyped-def]
 
 # positional: numbers of one point in an inner loop that is to become vector instructions.
 @_inline
-def _derivative(vx, vy, r, steer, cos_steer, tan_steer, ax, force, c, p):  # type: ignore[no-untyped-def]
+def _derivative(vx, vy, r, steer, cos_steer, tan_steer, ax, c, p):  # type: ignore[no-untyped-def]
     """Return d/dt [v_x, v_y, r] (Eq 1-4 with the blend to the kinematic model)."""
     w = _share(vx, c, p)
-    ay, rdot = _axle_accelerations(vx, vy, r, steer, cos_steer, force, c, p)
+    ay, rdot = _axle_accelerations(vx, vy, r, steer, cos_steer, c, p)
     r_kin = vx * tan_steer * c.per_wheelbase
     follow = (1.0 - w) * (1.0 / KINEMATIC_TIME_CONSTANT_S)
     vy_dot = w * (ay - vx * r) + (follow * (p.rear_m * r_kin - vy) if w < 1.0 else 0.0)
@@ -175,7 +175,7 @@ def place(i):  # type: ignore[no-untyped-def]
 def advance_points(points, friction, dt, n, p):  # type: ignore[no-untyped-def]
     """Advance v_x, v_y and r of the points [work_size] by ``dt`` s in ``n`` RK4 steps with constant inputs, in place.
 
-    Inputs: STEER in rad, AX the accelerometer's at the IMU in m/s², FORCE the factor on both axles' forces.
+    Inputs: STEER in rad, AX the accelerometer's at the IMU in m/s².
     """
     k = _constants(friction, p)
     h = dt / n
@@ -188,11 +188,11 @@ def advance_points(points, friction, dt, n, p):  # type: ignore[no-untyped-def]
             for j in range(WIDTH):
                 x, y, r = block[AT_VX + j], block[AT_VY + j], block[AT_YAW_RATE + j]
                 steer, cos, tan = block[AT_STEER + j], block[AT_COS_STEER + j], block[AT_TAN_STEER + j]
-                ax, force = block[AT_AX + j], block[AT_FORCE + j]
-                x1, y1, r1 = _derivative(x, y, r, steer, cos, tan, ax, force, k, p)
-                x2, y2, r2 = _derivative(x + g * x1, y + g * y1, r + g * r1, steer, cos, tan, ax, force, k, p)
-                x3, y3, r3 = _derivative(x + g * x2, y + g * y2, r + g * r2, steer, cos, tan, ax, force, k, p)
-                x4, y4, r4 = _derivative(x + h * x3, y + h * y3, r + h * r3, steer, cos, tan, ax, force, k, p)
+                ax = block[AT_AX + j]
+                x1, y1, r1 = _derivative(x, y, r, steer, cos, tan, ax, k, p)
+                x2, y2, r2 = _derivative(x + g * x1, y + g * y1, r + g * r1, steer, cos, tan, ax, k, p)
+                x3, y3, r3 = _derivative(x + g * x2, y + g * y2, r + g * r2, steer, cos, tan, ax, k, p)
+                x4, y4, r4 = _derivative(x + h * x3, y + h * y3, r + h * r3, steer, cos, tan, ax, k, p)
                 block[AT_VX + j] = x + sixth * (x1 + 2.0 * x2 + 2.0 * x3 + x4)
                 block[AT_VY + j] = y + sixth * (y1 + 2.0 * y2 + 2.0 * y3 + y4)
                 block[AT_YAW_RATE + j] = r + sixth * (r1 + 2.0 * r2 + 2.0 * r3 + r4)
@@ -200,15 +200,13 @@ def advance_points(points, friction, dt, n, p):  # type: ignore[no-untyped-def]
 
 @_compiled
 def measure_points(points, friction, p):  # type: ignore[no-untyped-def]
-    """Write to AY of the points [work_size] what the accelerometer reads there, m/s²; inputs STEER and FORCE."""
+    """Write to AY of the points [work_size] what the accelerometer reads there, m/s²; input STEER."""
     k = _constants(friction, p)
     for start in range(0, points.shape[0], BLOCK):
         block = points[start : start + BLOCK]
         for j in range(WIDTH):
             vx, r, steer = block[AT_VX + j], block[AT_YAW_RATE + j], block[AT_STEER + j]
-            ay, r_dot = _axle_accelerations(
-                vx, block[AT_VY + j], r, steer, sine(steer + _HALF_PI), block[AT_FORCE + j], k, p
-            )
+            ay, r_dot = _axle_accelerations(vx, block[AT_VY + j], r, steer, sine(steer + _HALF_PI), k, p)
             w = _share(vx, k, p)
             ay = w * ay + (1.0 - w) * vx * r
             block[AT_AY + j] = (1.0 + p.ay_roll_gain) * ay + w * r_dot * p.imu_x_m - r * r * p.imu_y_m

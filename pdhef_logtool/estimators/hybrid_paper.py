@@ -37,7 +37,7 @@ from pdhef_logtool.estimators import filter_base as base
 from pdhef_logtool.estimators.filter_base import FilterState
 from pdhef_logtool.estimators.fuzzy_trust import NOMINAL_TRUST, fuzzy_trust
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
-from pdhef_logtool.estimators.phy_ukf import PHY_UKF_Q_STD, StateLayout, measure_sigma_points, set_points
+from pdhef_logtool.estimators.phy_ukf import PHY_UKF_Q_STD, measure_sigma_points, set_points
 from pdhef_logtool.estimators.unscented import (
     draw_sigma_points,
     innovation_moments,
@@ -96,10 +96,6 @@ class Parallel(NamedTuple):
     valid: BoolArray
 
 
-#: This filter has no state beside those that all have.
-_LAYOUT = StateLayout(-1, -1)
-
-
 @njit(cache=True)
 def _propagate(chi, over, rate, dt, p, points):  # type: ignore[no-untyped-def]
     """Move sigma points [s, 4] by ``dt`` and add the increment of the residual ``rate`` whole at the end (Eq 19).
@@ -108,7 +104,7 @@ def _propagate(chi, over, rate, dt, p, points):  # type: ignore[no-untyped-def]
     """
     rate_vy, rate_r = rate
     share = dynamic_share(chi[0, base.VX], p) * dt
-    set_points(chi, over.steer, over.ax, (0.0, 0.0), _LAYOUT, points)
+    set_points(chi, over.steer, over.ax, (0.0, 0.0), points)
     advance_points(points, over.friction, dt, substeps(chi[0, base.VX], dt, over.friction, p), p)
     for i in range(chi.shape[0]):
         at = place(i)
@@ -190,7 +186,7 @@ def _filter(window, tuning, r0, p, parallel, estimate, out, adapted):  # type: i
             out_prior[k] = x
             if alive:
                 draw_sigma_points(x, P, scale, L, chi)
-                measure_sigma_points(chi, steer, friction, rate_vy, _LAYOUT, p, points, zeta)
+                measure_sigma_points(chi, steer, friction, rate_vy, p, points, zeta)
                 innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
                 nu[base.Z_AY] = now.ay - z_hat[base.Z_AY]
                 nu[base.Z_YAW_RATE] = now.yaw_rate - z_hat[base.Z_YAW_RATE]

@@ -1,18 +1,16 @@
 """``phy-ukf``: the pure physics unscented Kalman filter on the nominal single-track model (docs/method.md#filter).
 
-State [v_x, v_y, r, b_ax]; b_ax is a slow bias of the longitudinal accelerometer (grade, pitch). Optional states
-behind it: the biases of a_y, yaw rate and steering angle, and the force scale s, by which model and residual are taken
-to be wrong: (1 + s) times their forces, an Ornstein-Uhlenbeck process (docs/method.md#physics). Measurements [a_y, r,
-v_x], each of which may be missing at any step. Without options this is the paper's physics baseline and frozen: R at
-sensor level from the vehicle file, Q by innovation likelihood (``studies/defaults/tune_physics_q.py``). What is not the
-model is in :mod:`~.filter_base`.
+State [v_x, v_y, r, b_ax]; b_ax is a slow bias of the longitudinal accelerometer (grade, pitch). Measurements
+[a_y, r, v_x], each of which may be missing at any step. Without options this is the paper's physics baseline and
+frozen: R at sensor level from the vehicle file, Q by innovation likelihood (``studies/defaults/tune_physics_q.py``).
+Everything that is not the model is in :mod:`~.filter_base`.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,7 +24,6 @@ from pdhef_logtool.car.nominal_model import (
 from pdhef_logtool.car.nominal_points import (
     AT_AX,
     AT_AY,
-    AT_FORCE,
     AT_STEER,
     AT_VX,
     AT_VY,
@@ -55,27 +52,14 @@ if TYPE_CHECKING:
 
 #: The variant with the noise of an identified car.
 TUNED = "phy-ukf:tuned"
-BIAS_STATES = 3
 #: Process noise, 1-sigma per square root of second, of v_x, v_y, r and the a_x bias. Chosen by innovation likelihood
 #: over simulated drives (``studies/defaults/tune_physics_q.py``, its result beside it) and frozen: the drives were
 #: those of the simulator's first, planar vehicle, and a baseline does not follow every change of the simulator.
 PHY_UKF_Q_STD = (0.089, 0.31, 0.062, 0.021)
-#: Random walk of the a_y (m/s²), yaw-rate (rad/s) and steering (rad) bias, 1-sigma per square root of second.
-BIAS_WALK_STD = (0.004, 0.00008, 0.00002)
-#: Force scale: its spread, and the time constant with which it returns to 0 (docs/method.md#physics).
-FORCE_SCALE_STD = 0.05
-FORCE_SCALE_TIME_S = 2.0
-
-
-class StateLayout(NamedTuple):
-    """Where the optional states stand; −1 = not there. The three biases follow each other: a_y, yaw rate, steering."""
-
-    bias: int
-    force_scale: int
 
 
 @njit(cache=True)
-def _propagate(chi, over, rate, dt, layout, p, points):  # type: ignore[no-untyped-def]
+def _propagate(chi, over, rate, dt, p, points):  # type: ignore[no-untyped-def]
     """Move sigma points [s, n] by ``dt`` s through the nominal model and add the residual (Eq 19), in place.
 
     Half of the residual's increment goes in before the model's step and half after it: all of it at the end, as Eq 19
@@ -85,22 +69,18 @@ def _propagate(chi, over, rate, dt, layout, p, points):  # type: ignore[no-untyp
     """
     rate_vy, rate_r = rate
     share = 0.5 * dynamic_share(chi[0, 0], p) * dt
-    set_points(chi, over.steer, over.ax, (share * rate_vy, share * rate_r), layout, points)
+    set_points(chi, over.steer, over.ax, (share * rate_vy, share * rate_r), points)
     advance_points(points, over.friction, dt, substeps(chi[0, 0], dt, over.friction, p), p)
-    keep = math.exp(-dt / FORCE_SCALE_TIME_S) if layout.force_scale >= 0 else 1.0
     for i in range(chi.shape[0]):
         at = place(i)
-        half = share * points[at + AT_FORCE]
         chi[i, base.VX] = points[at + AT_VX]
-        chi[i, base.VY] = points[at + AT_VY] + half * rate_vy
-        chi[i, base.YAW_RATE] = points[at + AT_YAW_RATE] + half * rate_r
-        if layout.force_scale >= 0:
-            chi[i, layout.force_scale] *= keep
+        chi[i, base.VY] = points[at + AT_VY] + share * rate_vy
+        chi[i, base.YAW_RATE] = points[at + AT_YAW_RATE] + share * rate_r
 
 
 @njit(cache=True)
-def set_points(chi, steer, ax, more, layout, points):  # type: ignore[no-untyped-def]
-    """Write sigma points [s, n] to ``points``, with the increments of v_y and r times their force; the rest is filled.
+def set_points(chi, steer, ax, more, points):  # type: ignore[no-untyped-def]
+    """Write sigma points [s, n] to ``points``, with increments of v_y and r; the rest is filled.
 
     What is left of the last block is the first point again: numbers that cannot overflow.
     """
@@ -108,39 +88,25 @@ def set_points(chi, steer, ax, more, layout, points):  # type: ignore[no-untyped
     s = chi.shape[0]
     for column in range(place_count(points)):
         i = column if column < s else 0
-        force = 1.0 if layout.force_scale < 0 else max(0.1, 1.0 + chi[i, layout.force_scale])
         at = place(column)
         points[at + AT_VX] = chi[i, base.VX]
-        points[at + AT_VY] = chi[i, base.VY] + more_vy * force
-        points[at + AT_YAW_RATE] = chi[i, base.YAW_RATE] + more_r * force
-        points[at + AT_STEER] = steer if layout.bias < 0 else steer - chi[i, layout.bias + 2]
+        points[at + AT_VY] = chi[i, base.VY] + more_vy
+        points[at + AT_YAW_RATE] = chi[i, base.YAW_RATE] + more_r
+        points[at + AT_STEER] = steer
         points[at + AT_AX] = ax - chi[i, base.AX_BIAS]
-        points[at + AT_FORCE] = force
 
 
 @njit(cache=True)
-def measure_sigma_points(chi, steer, friction, rate_vy, layout, p, points, zeta):  # type: ignore[no-untyped-def]
+def measure_sigma_points(chi, steer, friction, rate_vy, p, points, zeta):  # type: ignore[no-untyped-def]
     """Write what the sensors would read at sigma points chi [s, n] to zeta [s, 3]; the residual belongs to a_y too."""
     residual = (1.0 + p.ay_roll_gain) * dynamic_share(chi[0, 0], p) * rate_vy
-    set_points(chi, steer, 0.0, (0.0, 0.0), layout, points)
+    set_points(chi, steer, 0.0, (0.0, 0.0), points)
     measure_points(points, friction, p)
     for i in range(chi.shape[0]):
         at = place(i)
-        zeta[i, base.Z_AY] = points[at + AT_AY] + points[at + AT_FORCE] * residual
+        zeta[i, base.Z_AY] = points[at + AT_AY] + residual
         zeta[i, base.Z_YAW_RATE] = chi[i, base.YAW_RATE]
         zeta[i, base.Z_SPEED] = chi[i, base.VX]
-        if layout.bias >= 0:
-            zeta[i, base.Z_AY] += chi[i, layout.bias]
-            zeta[i, base.Z_YAW_RATE] += chi[i, layout.bias + 1]
-
-
-@njit(cache=True)
-def add_process_noise(P, q_std, ax_known, dt, layout):  # type: ignore[no-untyped-def]
-    """Add what a step of ``dt`` s makes uncertain: random walks, and the force scale that returns to 0."""
-    base.add_process_noise(P, q_std, ax_known, dt)
-    if layout.force_scale >= 0:
-        forgotten = 1.0 - math.exp(-2.0 * dt / FORCE_SCALE_TIME_S)
-        P[layout.force_scale, layout.force_scale] += FORCE_SCALE_STD**2 * forgotten
 
 
 @njit(cache=True)
@@ -159,7 +125,7 @@ def _cross_covariance(chi_before, chi, x_after, wc, out):  # type: ignore[no-unt
 
 
 @njit(cache=True)
-def _filter(window, tuning, layout, p, estimate, out, links):  # type: ignore[no-untyped-def]
+def _filter(window, tuning, p, estimate, out, links):  # type: ignore[no-untyped-def]
     """Run over one window; ``estimate`` is moved in place. ``links`` are of length 0 where nobody asks for them."""
     dt, steer, ax, ay, yaw_rate, speed, friction, residual_rate, extra_r = window
     q_std, r_std, initial_std, standstill_std, wm, wc, scale, rules = tuning
@@ -182,11 +148,11 @@ def _filter(window, tuning, layout, p, estimate, out, links):  # type: ignore[no
             if linked:
                 chi_before[:, :] = chi
             over = base.held_over_step(now, memory)
-            _propagate(chi, over, (rate_vy, rate_r), now.dt, layout, p, points)
+            _propagate(chi, over, (rate_vy, rate_r), now.dt, p, points)
             mean_and_covariance(chi, wm, wc, x, P)
             if linked:
                 _cross_covariance(chi_before, chi, x, wc, out_cross[k])
-            add_process_noise(P, q_std, over.ax_known, now.dt, layout)
+            base.add_process_noise(P, q_std, over.ax_known, now.dt)
             alive = base.all_finite(x, P)
             if linked:
                 out_predicted_P[k] = P
@@ -194,7 +160,7 @@ def _filter(window, tuning, layout, p, estimate, out, links):  # type: ignore[no
                 out_prior[k, i] = x[i]
             if alive:
                 draw_sigma_points(x, P, scale, L, chi)
-                measure_sigma_points(chi, now.steer, now.friction, rate_vy, layout, p, points, zeta)
+                measure_sigma_points(chi, now.steer, now.friction, rate_vy, p, points, zeta)
                 innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
                 base.innovate(k, now, r_std, extra_r, z_hat, S, nu)
                 gated = base.gate(now, memory, nu, S, at_gate, given, use)
@@ -210,7 +176,7 @@ def _filter(window, tuning, layout, p, estimate, out, links):  # type: ignore[no
                     if linked:  # to a smoother the inflation is process noise of the step that led here
                         out_predicted_P[k] = P
                     draw_sigma_points(x, P, scale, L, chi)
-                    measure_sigma_points(chi, now.steer, now.friction, rate_vy, layout, p, points, zeta)
+                    measure_sigma_points(chi, now.steer, now.friction, rate_vy, p, points, zeta)
                     innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
                     base.innovate(k, now, r_std, extra_r, z_hat, S, nu)
                     base.open_gate(use, memory)
@@ -236,7 +202,7 @@ def _filter(window, tuning, layout, p, estimate, out, links):  # type: ignore[no
 
 
 @njit(cache=True)
-def _predict_outputs(due, held, tuning, layout, p, predicted):  # type: ignore[no-untyped-def]
+def _predict_outputs(due, held, tuning, p, predicted):  # type: ignore[no-untyped-def]
     """Predict the steps that are due with their inputs held; writes state, covariance and planar a_y."""
     step, horizon_s = due
     held_x, held_P, inputs, residual_rate = held
@@ -258,18 +224,16 @@ def _predict_outputs(due, held, tuning, layout, p, predicted):  # type: ignore[n
         over = base.held_inputs(inputs, k)
         if horizon_s[m] > 0.0:
             draw_sigma_points(x, P, scale, L, chi)
-            _propagate(chi, over, (rate_vy, rate_r), horizon_s[m], layout, p, points)
+            _propagate(chi, over, (rate_vy, rate_r), horizon_s[m], p, points)
             mean_and_covariance(chi, wm, wc, x, P)
-            add_process_noise(P, q_std, over.ax_known, horizon_s[m], layout)
+            base.add_process_noise(P, q_std, over.ax_known, horizon_s[m])
             if not base.all_finite(x, P):
                 x[:] = math.nan
                 P[:, :] = math.nan
         out_x[m] = x
         out_P[m] = P[:3, :3]
-        angle = over.steer if layout.bias < 0 else over.steer - x[layout.bias + 2]
-        force = 1.0 if layout.force_scale < 0 else max(0.1, 1.0 + x[layout.force_scale])
-        ay = planar_lateral_acceleration(x[base.VX], x[base.VY], x[base.YAW_RATE], angle, over.friction, p, force)
-        out_ay[m] = ay + force * dynamic_share(x[base.VX], p) * rate_vy
+        ay = planar_lateral_acceleration(x[base.VX], x[base.VY], x[base.YAW_RATE], over.steer, over.friction, p)
+        out_ay[m] = ay + dynamic_share(x[base.VX], p) * rate_vy
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,23 +245,19 @@ class PhysicsUkf(base.LinkedFilter):
     vehicle : parameters; ``sensors`` gives R unless ``r_std`` does.
     q_std : process 1-sigma per √s of [v_x, v_y, r, b_ax].
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
-    bias_states : estimate the biases of a_y, yaw rate and steering angle; their priors stand in ``sensors``.
-    force_scale : estimate a factor on all lateral forces.
     slip_gate : leave out the speed of wheels that spin or lock (:mod:`~.speed_slip`).
     standstill : hold v_x, v_y and r at zero while the car stands.
     """
 
     algorithm = "physics-ukf"
     version = 1
-    options = ("roll_correction", "bias_states", "force_scale", "slip_gate", "standstill")
+    options = ("roll_correction", "slip_gate", "standstill")
 
     vehicle: VehicleParameters
     q_std: tuple[float, float, float, float] = PHY_UKF_Q_STD
     r_std: tuple[float, float, float] | None = None
     use_speed: bool = True
     roll_correction: bool = False
-    bias_states: bool = False
-    force_scale: bool = False
     slip_gate: bool = True
     standstill: bool = True
     name: str = "phy-ukf"
@@ -308,25 +268,12 @@ class PhysicsUkf(base.LinkedFilter):
         return model_parameters(self.vehicle, roll_correction=self.roll_correction)
 
     @property
-    def layout(self) -> StateLayout:
-        """Where the optional states stand."""
-        after = base.STATES + (BIAS_STATES if self.bias_states else 0)
-        return StateLayout(base.STATES if self.bias_states else -1, after if self.force_scale else -1)
-
-    @property
     def _tuning(self) -> base.Tuning:
-        s = self.vehicle.sensors
-        initial, walk = [*base.INITIAL_STD], [*self.q_std]
-        if self.bias_states:
-            initial += [s.ay_bias_std_m_s2, s.yaw_rate_bias_std_rad_s, s.steer_bias_std_rad]
-            walk += BIAS_WALK_STD
-        if self.force_scale:
-            initial += [FORCE_SCALE_STD]
         return base.make_tuning(
             self.vehicle,
-            walk,
+            self.q_std,
             self.measurement_std,
-            initial,
+            base.INITIAL_STD,
             use_speed=self.use_speed,
             standstill=self.standstill,
         )
@@ -339,12 +286,12 @@ class PhysicsUkf(base.LinkedFilter):
         out: base.Posterior,
         links: base.LinkColumns,
     ) -> None:
-        _filter(window, tuning, self.layout, self._parameters, estimate, out, links)
+        _filter(window, tuning, self._parameters, estimate, out, links)
 
     def _predict_kernel(
         self, pending: base.PendingPredictions, start: base.PredictionStart, predicted: base.Predicted
     ) -> None:
-        _predict_outputs(pending, start, self._tuning, self.layout, self._parameters, predicted)
+        _predict_outputs(pending, start, self._tuning, self._parameters, predicted)
 
 
 def innovation_log_likelihood(estimator: PhysicsUkf, signals: Signals) -> tuple[float, int]:

@@ -25,7 +25,6 @@ from pdhef_logtool.car.parts import PHYSICS, FilterNoise
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, corrected_anew
 from pdhef_logtool.estimators import filter_base as base
 from pdhef_logtool.estimators.filter_base import LINK_WHOLE
-from pdhef_logtool.estimators.phy_ukf import BIAS_WALK_STD, FORCE_SCALE_STD, FORCE_SCALE_TIME_S
 from pdhef_logtool.estimators.physics_model import (
     AX_BIAS,
     AY_BIAS,
@@ -33,6 +32,7 @@ from pdhef_logtool.estimators.physics_model import (
     BANK_TIME_S,
     CORE,
     FORCE_SCALE,
+    FORCE_SCALE_TIME_S,
     FRONT,
     PLACES,
     RATE_BIAS,
@@ -81,6 +81,11 @@ _FORCE_STD, _STANDSTILL_FORCE_STD = 0.5, 0.05
 _ROLL_STD, _STANDSTILL_ROLL_STD, _ROLL_WALK = (0.01, 0.03), (0.005, 0.01), 0.02
 #: Spread of the bank, rad: a crowned road has 0.02-0.03, motorway bends to 0.07.
 _BANK_STD = 0.02
+
+#: Random walk of the a_y (m/s²), yaw-rate (rad/s) and steering (rad) bias, 1-sigma per square root of second.
+BIAS_WALK_STD = (0.004, 0.00008, 0.00002)
+#: Spread of the force scale (docs/method.md#adaptation).
+FORCE_SCALE_STD = 0.05
 
 #: The column of a block of points that holds the centre.
 _CENTRE = AY_BIAS

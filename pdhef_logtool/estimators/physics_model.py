@@ -37,7 +37,6 @@ import numpy as np
 from pdhef_logtool.car.nominal_model import KINEMATIC_TIME_CONSTANT_S, MAX_SUBSTEPS, dynamic_share, substeps
 from pdhef_logtool.car.nominal_points import arctangent, sine
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.estimators.phy_ukf import FORCE_SCALE_TIME_S
 from pdhef_logtool.records.compiled import njit
 
 #: Entries of the state that every car has, and how many of the others its parts add.
@@ -51,6 +50,8 @@ PLACES = 13
 LANES = 8
 WIDTH = 3 * LANES
 
+#: Time constant with which the force scale returns to 0, s (docs/method.md#physics).
+FORCE_SCALE_TIME_S = 2.0
 #: Time constant with which the bank returns to 0 (docs/method.md#physics).
 BANK_TIME_S = 5.0
 #: Largest product of step and the roll mode's frequency; longer steps are divided.

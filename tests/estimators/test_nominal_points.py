@@ -15,7 +15,6 @@ from pdhef_logtool.car.nominal_model import model_parameters
 from pdhef_logtool.car.nominal_points import (
     AT_AX,
     AT_AY,
-    AT_FORCE,
     AT_STEER,
     AT_VX,
     AT_VY,
@@ -57,17 +56,9 @@ CARS = {
         }
     ),
 }
-LAYOUTS = {
-    "no optional state": phy_ukf.StateLayout(-1, -1),
-    "biases": phy_ukf.StateLayout(base.STATES, -1),
-    "force scale": phy_ukf.StateLayout(-1, base.STATES),
-    "biases and force scale": phy_ukf.StateLayout(base.STATES, base.STATES + phy_ukf.BIAS_STATES),
-}
-STATES = {"no optional state": 4, "biases": 7, "force scale": 5, "biases and force scale": 8}
 TOLERANCE = 1e-11
 
 cars = pytest.mark.parametrize("car", CARS.values(), ids=CARS)
-layouts = pytest.mark.parametrize("name", LAYOUTS)
 random_states = settings(derandomize=True, deadline=None, max_examples=60)
 seeds = st.integers(0, 2**32 - 1)
 frictions = st.floats(0.05, 1.5)
@@ -126,42 +117,32 @@ def test_points_move_as_one_state_does(car, seed, count, mu, dt, n):
     p = model_parameters(car, roll_correction=True)
     rng = np.random.default_rng(seed)
     state = drawn(seed, count, 3)
-    steer, ax, force = rng.uniform(-0.6, 0.6, count), rng.normal(0.0, 4.0, count), rng.uniform(0.1, 1.5, count)
+    steer, ax = rng.uniform(-0.6, 0.6, count), rng.normal(0.0, 4.0, count)
     points = np.ones(work_size(count))
     at = np.array([place.py_func(i) for i in range(count)])
     for row, values in ((AT_VX, state[:, 0]), (AT_VY, state[:, 1]), (AT_YAW_RATE, state[:, 2])):
         points[at + row] = values
-    for row, values in ((AT_STEER, steer), (AT_AX, ax), (AT_FORCE, force)):
+    for row, values in ((AT_STEER, steer), (AT_AX, ax)):
         points[at + row] = values
     assert place_count(points) >= count and place_count(points) % WIDTH == 0
     measure_points(points, mu, p)
-    read = [nominal_model.measured_lateral_acceleration(*state[i], steer[i], mu, p, force[i]) for i in range(count)]
+    read = [nominal_model.measured_lateral_acceleration(*state[i], steer[i], mu, p) for i in range(count)]
     np.testing.assert_allclose(points[at + AT_AY], read, rtol=TOLERANCE, atol=TOLERANCE)
     stable = nominal_model.substeps(float(state[:, 0].min()), dt, mu, p)
     advance_points(points, mu, dt, max(n, stable), p)
     got = np.column_stack([points[at + AT_VX], points[at + AT_VY], points[at + AT_YAW_RATE]])
-    want = [
-        nominal_model.rk4_step(*state[i], steer[i], ax[i], mu, dt, max(n, stable), p, force[i]) for i in range(count)
-    ]
+    want = [nominal_model.rk4_step(*state[i], steer[i], ax[i], mu, dt, max(n, stable), p) for i in range(count)]
     np.testing.assert_allclose(got, want, rtol=TOLERANCE, atol=TOLERANCE)
 
 
-def optional(state: np.ndarray, layout: phy_ukf.StateLayout) -> tuple[float, float, float, float]:
-    """Return force factor and the biases of a_y, yaw rate and steering angle of a state."""
-    force = 1.0 if layout.force_scale < 0 else max(0.1, 1.0 + state[layout.force_scale])
-    return (force, 0.0, 0.0, 0.0) if layout.bias < 0 else (force, *state[layout.bias : layout.bias + 3])
-
-
 @cars
-@layouts
 @random_states
 @given(
     seeds, frictions, steps_s, st.floats(-0.6, 0.6), st.floats(-5.0, 5.0), st.floats(-3.0, 3.0), st.floats(-2.0, 2.0)
 )
-def test_sigma_points_move_and_measure_as_one_state_does(car, name, seed, mu, dt, steer, ax, rate_vy, rate_r):
-    layout, size = LAYOUTS[name], STATES[name]
+def test_sigma_points_move_and_measure_as_one_state_does(car, seed, mu, dt, steer, ax, rate_vy, rate_r):
     p = model_parameters(car, roll_correction=True)
-    chi = drawn(seed, 2 * size + 1, size)
+    chi = drawn(seed, 2 * base.STATES + 1, base.STATES)
     share = nominal_model.dynamic_share(chi[0, 0], p)
     if nominal_model.substeps(chi[:, 0].min(), dt, mu, p) > nominal_model.substeps(chi[0, 0], dt, mu, p):
         dt = 1e-3  # the first point says how many substeps there are: slow ones beside it would grow without bound
@@ -169,24 +150,19 @@ def test_sigma_points_move_and_measure_as_one_state_does(car, name, seed, mu, dt
     points = np.full(work_size(len(chi)), np.nan)
 
     zeta = np.empty((len(chi), base.MEASUREMENTS))
-    phy_ukf.measure_sigma_points(chi, steer, mu, rate_vy, layout, p, points, zeta)
+    phy_ukf.measure_sigma_points(chi, steer, mu, rate_vy, p, points, zeta)
     want_zeta, want = np.empty_like(zeta), chi.copy()
     for i, state in enumerate(chi):
-        force, ay_bias, yaw_rate_bias, steer_bias = optional(state, layout)
-        ay = nominal_model.measured_lateral_acceleration(*state[:3], steer - steer_bias, mu, p, force)
-        ay += (1.0 + p.ay_roll_gain) * share * force * rate_vy
-        want_zeta[i] = ay + ay_bias, state[2] + yaw_rate_bias, state[0]
-        half = 0.5 * share * dt * force * np.array([rate_vy, rate_r])
-        moved = nominal_model.rk4_step(
-            state[0], *(state[1:3] + half), steer - steer_bias, ax - state[3], mu, dt, n, p, force
-        )
+        ay = nominal_model.measured_lateral_acceleration(*state[:3], steer, mu, p)
+        ay += (1.0 + p.ay_roll_gain) * share * rate_vy
+        want_zeta[i] = ay, state[2], state[0]
+        half = 0.5 * share * dt * np.array([rate_vy, rate_r])
+        moved = nominal_model.rk4_step(state[0], *(state[1:3] + half), steer, ax - state[3], mu, dt, n, p)
         want[i, :3] = moved[0], *(moved[1:] + half)
-        if layout.force_scale >= 0:
-            want[i, layout.force_scale] *= math.exp(-dt / phy_ukf.FORCE_SCALE_TIME_S)
     np.testing.assert_allclose(zeta, want_zeta, rtol=TOLERANCE, atol=TOLERANCE)
 
     over = base.HeldInputs(steer, ax, ax_known=True, friction=mu)
-    phy_ukf._propagate(chi, over, (rate_vy, rate_r), dt, layout, p, points)
+    phy_ukf._propagate(chi, over, (rate_vy, rate_r), dt, p, points)
     np.testing.assert_allclose(chi, want, rtol=TOLERANCE, atol=TOLERANCE)
 
 

@@ -81,7 +81,6 @@ def test_a_persons_files_and_what_the_run_does_not_write_stay(sample_logs_dir: P
     run_logs([log], tmp_path, config(sample_logs_dir))
     folder = tmp_path / "logs" / "dlc"
     (folder / "notes.txt").write_text("mine")
-    (folder / ".estimates.parquet.partial").write_text("of a killed run of long ago")
     before = contents(tmp_path)
     run_logs([log], tmp_path, config(sample_logs_dir, estimators=("kinematic",), annotate="none"))
     after = contents(tmp_path)
