@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from pdhef_logtool.inspection.report import Inspection
-from pdhef_logtool.inspection.uses import what_it_lacks
+from pdhef_logtool.inspection.uses import missing_for_sideslip
 from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.mapping.candidates import Candidate
 
@@ -46,7 +46,7 @@ def ask_mapping(inspection: Inspection, ask: Callable[[str], str], tell: Callabl
         if answer is not None:
             sources[answer.name] = answer
         mapping = replace(mapping, signals=sources) if section == "signals" else replace(mapping, truth=sources)
-    lacking = what_it_lacks(mapping)
+    lacking = missing_for_sideslip(mapping)
     tell(f"to get sideslip you still need: {lacking}" if lacking else "this is all that sideslip needs")
     return replace(mapping, checks=())
 

@@ -30,7 +30,7 @@ def usable_signals(mapping: Mapping) -> frozenset[str]:
     return frozenset(have)
 
 
-def what_it_is_good_for(mapping: Mapping) -> str:
+def possible_uses(mapping: Mapping) -> str:
     """Return what can be done with a log that is mapped so."""
     have = usable_signals(mapping)
     names = [s.name for s in all_specs() if s.needs <= have and not s.network and not s.needs_noise]
@@ -47,7 +47,7 @@ def what_it_is_good_for(mapping: Mapping) -> str:
     return "; ".join(uses) or "look at its topics and fields (--fields)"
 
 
-def what_it_lacks(mapping: Mapping) -> str:
+def missing_for_sideslip(mapping: Mapping) -> str:
     """Return what sideslip still needs; empty where nothing is missing."""
     lacking = sorted(spec_of(_MAIN).needs - usable_signals(mapping), key=list(_WORDS).index)
     return ", ".join(_WORDS.get(n, n) for n in lacking)
@@ -55,7 +55,7 @@ def what_it_lacks(mapping: Mapping) -> str:
 
 def uses_of(mapping: Mapping) -> MappingABC[str, str]:
     """Return both sentences by name, as ``pdhef inspect --json`` prints them."""
-    return {"can": what_it_is_good_for(mapping), "sideslip_needs": what_it_lacks(mapping)}
+    return {"can": possible_uses(mapping), "sideslip_needs": missing_for_sideslip(mapping)}
 
 
 def _scored(mapping: Mapping) -> str:

@@ -106,27 +106,27 @@ def choose_mapping(
         return ChosenMapping(mapping, missing, prefer_truth, (), (*mapping.notes, *_borrowed(log, mapping)))
     if log.slim is not None:
         return recorded_mapping(log.slim, prefer_truth)
-    found = auto_map(log, prefer_truth=prefer_truth)
-    if require_signals and not found.mapping.signals:
+    auto = auto_map(log, prefer_truth=prefer_truth)
+    if require_signals and not auto.mapping.signals:
         raise MappingError(
             expected="fields that are a car's sensors",
-            got="; ".join(found.mapping.notes) or _topics_there_are(log),
+            got="; ".join(auto.mapping.notes) or _topics_there_are(log),
             where=str(log.path),
             remedy="pdhef inspect LOG --fields shows every number, pdhef map LOG helps to write a mapping.toml",
         )
-    remarks = (*found.mapping.notes, *_borrowed(log, found.mapping))
-    return ChosenMapping(found.mapping, found.missing, prefer_truth, found.ambiguities, remarks)
+    remarks = (*auto.mapping.notes, *_borrowed(log, auto.mapping))
+    return ChosenMapping(auto.mapping, auto.missing, prefer_truth, auto.ambiguities, remarks)
 
 
-def _filled(mapping: Mapping, found: Mapping) -> Mapping:
+def _filled(mapping: Mapping, auto: Mapping) -> Mapping:
     """Return the mapping with what recognised types give for the signals, and the truth as a whole, that it lacks."""
     return replace(
         mapping,
-        signals={**found.signals, **mapping.signals},
-        truth=mapping.truth or found.truth,
-        quality=mapping.quality if mapping.truth else mapping.quality or found.quality,
-        notes=(*mapping.notes, *found.notes),
-        checks=tuple(c for c in found.checks if c.subject not in mapping.signals),
+        signals={**auto.signals, **mapping.signals},
+        truth=mapping.truth or auto.truth,
+        quality=mapping.quality if mapping.truth else mapping.quality or auto.quality,
+        notes=(*mapping.notes, *auto.notes),
+        checks=tuple(c for c in auto.checks if c.subject not in mapping.signals),
     )
 
 

@@ -63,10 +63,10 @@ def path_speed(fields: Fields) -> FloatArray | None:
 
 def heading_turn(fields: Fields) -> FloatArray | None:
     """Return how fast a navigation system's heading turns to the left, rad/s but for its scale; None without one."""
-    for one in fields.found:
-        if one.meaning.quantity == "heading" and one.role == "navigation" and one.seen.changes:
-            degrees = one.seen.largest > 7.0
-            return -_turn_rate(fields, np.radians(one.seen.cells) if degrees else one.seen.cells)
+    for item in fields.candidates:
+        if item.meaning.quantity == "heading" and item.role == "navigation" and item.seen.changes:
+            degrees = item.seen.largest > 7.0
+            return -_turn_rate(fields, np.radians(item.seen.cells) if degrees else item.seen.cells)
     return None
 
 
