@@ -109,7 +109,7 @@ def _sources_table(inspection: Inspection) -> Table:
 
 
 def _candidates_table(candidates: tuple[Candidate, ...]) -> Table:
-    """Return what was weighed beside recognised types: what was taken, and the best others of each signal."""
+    """Return the candidates beside recognised types: those taken, and the best others of each signal."""
     table = empty_table("Candidates by name and physics (* taken)", "signal", "field and reason", "score", words=2)
     shown: dict[str, int] = {}
     order = [*SIGNAL_UNITS, *TRUTH_UNITS]
@@ -126,13 +126,13 @@ def _candidates_table(candidates: tuple[Candidate, ...]) -> Table:
 def _uses(inspection: Inspection) -> list[tuple[str, str, str]]:
     """Return the last lines: what the log is good for, and what it lacks."""
     uses = inspection.uses
-    lines = [("can", "green", f"What you can do with this log: {uses['can']}")]
+    lines = [("can", "green", f"Possible uses of this log: {uses['can']}")]
     if uses["sideslip_needs"]:
-        lines.append(("needs", "yellow", f"to get sideslip you still need: {uses['sideslip_needs']}"))
+        lines.append(("needs", "yellow", f"sideslip estimation still needs: {uses['sideslip_needs']}"))
         if any(not c.taken for c in inspection.candidates):
-            lines.append(("next", "cyan", "pdhef map LOG asks its way through the candidates to a mapping.toml"))
+            lines.append(("next", "cyan", "pdhef map LOG builds a mapping.toml interactively from the candidates"))
         else:
-            lines.append(("next", "cyan", "pdhef inspect LOG --fields shows every number that the log holds"))
+            lines.append(("next", "cyan", "pdhef inspect LOG --fields lists all numeric fields of the log"))
     return lines
 
 
@@ -162,12 +162,12 @@ def _statistics_row(report: SignalReport) -> tuple[str, ...]:
 
 
 def _findings(inspection: Inspection) -> list[tuple[str, str, str]]:
-    """Return what to look at: a heading, its style and the text."""
+    """Return lines of findings: a heading, its style and the text."""
     rows: list[tuple[str, str, str]] = []
     if inspection.missing:
         rows.append(("missing", "yellow", ", ".join(inspection.missing)))
     if not inspection.truth:
-        rows.append(("missing", "yellow", "truth: nothing to score an estimate against"))
+        rows.append(("missing", "yellow", "ground truth: needed to score an estimate"))
     rows += [("ambiguous", "yellow", str(a)) for a in inspection.ambiguities]
     for verdict, style in (("failed", "red"), ("undecided", "yellow")):
         checks = [c for c in inspection.checks if c.verdict == verdict]
@@ -184,7 +184,7 @@ def _findings(inspection: Inspection) -> list[tuple[str, str, str]]:
         rows.append((head, style, f"{loss.where}: {loss.what}{' (' + ', '.join(facts) + ')' if facts else ''}"))
     rows += [("note", "cyan", n) for n in inspection.notes]
     if inspection.mapping.quality is not None:
-        rows.append(("note", "cyan", f"truth is used where {inspection.mapping.quality.describe()}"))
+        rows.append(("note", "cyan", f"ground truth is used where {inspection.mapping.quality.describe()}"))
     return rows
 
 

@@ -1,4 +1,4 @@
-"""What a log is good for, and what it still lacks for sideslip, in a sentence each."""
+"""Possible uses of a log, and the signals that sideslip estimation still needs."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ def possible_uses(mapping: Mapping) -> str:
     elif names and have:
         uses.append(f"run {', '.join(names[:3])}{_scored(mapping)}")
     if mapping.truth and not (names and have):
-        uses.append("look at the truth")
+        uses.append("plot the ground truth")
     if have:
-        uses.append("look at its signals in Rerun or MCAP")
-    return "; ".join(uses) or "look at its topics and fields (--fields)"
+        uses.append("export its signals to Rerun or MCAP")
+    return "; ".join(uses) or "list its topics and fields (--fields)"
 
 
 def missing_for_sideslip(mapping: Mapping) -> str:
@@ -62,7 +62,7 @@ def _scored(mapping: Mapping) -> str:
     truth = set(mapping.truth)
     place = {"x_m", "lat_deg", "ecef_position_m", "enu_velocity_m_s", "ecef_velocity_m_s"} & truth
     if {"vx_m_s", "vy_m_s"} <= truth or "sideslip_rad" in truth or (place and {"quat_wxyz", "yaw_rad"} & truth):
-        return " and score it against the truth"
+        return " and score it against ground truth"
     if place or {"course_rad", "vx_m_s"} & truth:
-        return ", and compare speed or course with the truth, which holds no sideslip"
-    return "; there is no truth to score it against"
+        return ", and compare speed or course with ground truth, which contains no sideslip"
+    return "; without ground truth it has no score"

@@ -174,7 +174,7 @@ class CanSignalLog(DriveLog):
                 expected="CAN frames, and messages and signals of the DBC",
                 got="; ".join(dict.fromkeys(problems)),
                 where=", ".join(p.name for p in settings.dbc),
-                remedy='write field = "can:<message>.<signal>"; [can] says where frames keep their parts',
+                remedy='write field = "can:<message>.<signal>"; [can] names the fields of a frame',
             )
 
     @property
@@ -371,7 +371,7 @@ def _frame_paths(topic: str, fields: tuple[FieldInfo, ...], settings: CanSetting
             return given
         matches = _best([p for p, kind in kinds.items() if kind in allowed], names)
         if len(matches) > 1:
-            problems.append(f"{topic} has {' and '.join(matches)}: say which in [can] {entry}")
+            problems.append(f"{topic} has {' and '.join(matches)}: name the field in [can] {entry}")
         return matches[0] if matches else None
 
     numbers = ("number", "bool")
@@ -383,7 +383,7 @@ def _frame_paths(topic: str, fields: tuple[FieldInfo, ...], settings: CanSetting
     if data is not None and settings.data_encoding != "bytes":
         data += f"|{settings.data_encoding}"
     elif data is not None and kinds.get(data) == "string":
-        problems.append(f'{topic}.{data} is a text: say [can] data_encoding = "hex" or "base64"')
+        problems.append(f'{topic}.{data} is a text: set [can] data_encoding = "hex" or "base64"')
     length = find(LENGTH_NAMES, settings.length_field, "length_field", ("number",))
     extended = find(EXTENDED_NAMES, settings.extended_field, "extended_field", numbers)
     flags = [_best([p for p, k in kinds.items() if k in numbers], n) for n in (ERROR_NAMES, REMOTE_NAMES)]

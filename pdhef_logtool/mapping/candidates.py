@@ -1,4 +1,4 @@
-"""Candidates for signals and truth among all numeric fields of a log: names first, then what the values say.
+"""Candidates for signals and ground truth among all numeric fields of a log: by names first, then by values.
 
 Recognised message types come before (``recognition.py``); what they leave open is looked for here. A candidate is
 *taken* when its name or a documented type says what it is and nothing speaks against it; what remains unsure about a
@@ -130,13 +130,13 @@ class Field:
 
     @property
     def unit_doubt(self) -> list[str]:
-        """What is to be said of a unit that neither the name nor the drive tells."""
+        """Doubt about a unit that neither the name nor the drive gives."""
         if self.unit_known or self.fixed:
             return []
         unit = self.factors[0][0]
         if unit != HYPOTHESES[self.meaning.quantity][0][0]:
-            return [f"its unit is not said; taken as {unit}, the others are out of any car's range"]
-        return [f"its unit is not said and the drive does not tell; taken as {unit}"]
+            return [f"unit not given; taken as {unit}: values in other units are out of a car's range"]
+        return [f"unit not given and not observable in this drive; taken as {unit}"]
 
     @property
     def is_axis(self) -> bool:
@@ -146,12 +146,12 @@ class Field:
 
     @property
     def is_downward(self) -> bool:
-        """Return whether its name says that it counts about, or along, the downward axis."""
+        """Return whether it is positive about, or along, the downward axis by its name."""
         return "down" in words_of(self.path.rpartition(".")[2]) and self.meaning.part == "z"
 
     @property
     def score(self) -> float:
-        """How far to believe that the field is what its name says, 0 to 1."""
+        """Confidence that the field is the quantity that its name gives, 0 to 1."""
         if self.fixed:
             return 0.95
         score = 0.45 * self.meaning.strength + 0.1 + self.bonus
@@ -172,14 +172,14 @@ class Field:
         self.unit_known = True
 
     def candidate(self, name: str, section: Literal["signals", "truth"], *, taken: bool) -> Candidate:
-        """Return the record of what was found."""
+        """Return the record of the field as a source of a signal."""
         source = SignalSource(name, self.topic.name, self.path, self.stamp, self.scale, self.offset)
         most = MOST.get(self.meaning.quantity)
         finite = self.seen.values[np.isfinite(self.seen.values)] * self.scale + self.offset
         if most is not None and finite.shape[0] and float(np.abs(finite).max()) > most:
             source = replace(source, valid_min=-most, valid_max=most)
         reason = "; ".join([self.meaning.why, *self.reasons])
-        doubts = [*self.doubts, *([] if self.seen.changes else ["it does not change in what was read of the log"])]
+        doubts = [*self.doubts, *([] if self.seen.changes else ["constant in the parts of the log that were read"])]
         return Candidate(section, source, round(self.score, 2), reason, "; ".join(doubts), taken)
 
 
@@ -295,7 +295,7 @@ def _document(item: Field, entry: VendorField) -> None:
 
 
 def anchors_of(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tuple[str, str], Seen]) -> list[Field]:
-    """Return what is mapped already, as fields that nothing here changes."""
+    """Return mapped sources as fields that are not changed."""
     topics = {t.name: t for t in log.topics}
     results = []
     for source in sources:

@@ -29,7 +29,7 @@ LOSS_TEXTS = {
     "out-of-range": "sample outside valid_min and valid_max dropped",
     "duplicate-stamp": "message that repeats the stamp of another dropped, the first to arrive kept",
     "out-of-order": "message recorded after a later one, sorted back by stamp",
-    "truth-quality": "truth sample that the quality gate rejects dropped",
+    "truth-quality": "ground-truth sample rejected by the quality gate dropped",
     "delay-unknown": "log time is not 0 to 1 s after the stamps: the delay is unknown, arrival is taken as the stamp",
 }
 LOST_KINDS = frozenset({"nan", "bad-stamp"})

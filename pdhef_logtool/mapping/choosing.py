@@ -1,4 +1,4 @@
-"""The mapping in effect for one log: the one given, or what its types tell, with every ambiguity said."""
+"""The mapping in effect for one log: the given mapping, or the recognised one with its ambiguities."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pdhef_logtool.records.signals import ALIGNED_SIGNALS
 
 @dataclass(frozen=True, slots=True)
 class ChosenMapping:
-    """The mapping in effect, and what is to be said of it.
+    """The mapping in effect and its open points.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class ChosenMapping:
 
 
 def recorded_mapping(log: SlimLog, prefer_truth: Literal["perfect", "rtk"]) -> ChosenMapping:
-    """Return the mapping that a slim log was made with.
+    """Return the mapping of a reduced log.
 
     Raises
     ------
@@ -58,15 +58,15 @@ def recorded_mapping(log: SlimLog, prefer_truth: Literal["perfect", "rtk"]) -> C
         chosen = TypeAdapter(ChosenMapping).validate_python(log.record.mapped)
     except ValidationError as error:
         raise LogError(
-            expected="the mapping of a slim log",
+            expected="the mapping of a reduced log",
             got="; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()[:3]),
             where=str(log.path),
-            remedy="make it anew from its source: pdhef slim LOG -o DIR",
+            remedy="regenerate it from its source: pdhef slim LOG -o DIR",
         ) from error
     mapping = chosen.mapping
     if chosen.prefer_truth != prefer_truth and mapping.truth:
         raise MappingError(
-            expected=f"--prefer-truth {chosen.prefer_truth}, which this slim log was made with",
+            expected=f"--prefer-truth {chosen.prefer_truth}, which this reduced log was made with",
             got=prefer_truth,
             where=str(log.path),
             remedy=f"pdhef slim SOURCE -o DIR --prefer-truth {prefer_truth}",
@@ -86,11 +86,7 @@ def recognise(log: DriveLog, *, prefer_truth: Literal["perfect", "rtk"]) -> Auto
 
 
 def choose_mapping(
-    log: DriveLog,
-    mapping: Mapping | None,
-    *,
-    prefer_truth: Literal["perfect", "rtk"],
-    require_signals: bool = True,
+    log: DriveLog, mapping: Mapping | None, *, prefer_truth: Literal["perfect", "rtk"], require_signals: bool = True
 ) -> ChosenMapping:
     """Return the mapping in effect: the one given, or what is recognised. Ambiguities are never settled silently.
 

@@ -1,4 +1,4 @@
-"""Which fields of a log are an estimate that somebody else recorded: flags ``[SIGNAL=]TOPIC[.FIELD]`` and tables."""
+"""Recorded estimates of other estimators: flags ``[SIGNAL=]TOPIC[.FIELD]`` and tables."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def sources_of(
                     expected="each signal once",
                     got=f"{name} from {sources[name].label} and from {topic.name}.{field_path}",
                     where=option,
-                    remedy="several estimators stand in a mapping file, one [estimates.NAME.SIGNAL] table a signal",
+                    remedy="for several estimators use a mapping file with [estimates.NAME.SIGNAL] tables",
                 )
             sources[name] = SignalSource(name=name, topic=topic.name, field=field_path)
     return sources, covariances[0] if len(covariances) == 1 else None
@@ -185,7 +185,7 @@ def _recognise(
     matches = {name: field_path for name, field_path in path_of.items() if name in units and path in ("", field_path)}
     if not matches:
         raise UsageError(
-            expected="SIGNAL=TOPIC.FIELD, as the type does not tell which signal this is",
+            expected="SIGNAL=TOPIC.FIELD, as the type does not give the signal",
             got=f"{text} ({topic.type_name or 'no type'})",
             where=option,
             remedy=f"SIGNAL is one of {', '.join(units)}",

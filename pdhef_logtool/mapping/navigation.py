@@ -78,14 +78,14 @@ def _of_topic(log: DriveLog, topic: TopicInfo) -> NavigationTruth | None:
     for name, most in (("lat_deg", 90.0), ("lon_deg", 180.0)):
         if name not in truth or not _is_place(samples.get((topic.name, truth[name].paths[0])), most):
             truth = {n: s for n, s in truth.items() if n not in ("lat_deg", "lon_deg")}
-    note = f"Ground truth is taken from {topic.name}, by the names of its fields."
+    note = f"ground truth is taken from {topic.name}, by the names of its fields"
     course = _course(truth, samples, topic.name, pieces)
     conventions = {p: _convention(samples.get((topic.name, p)), course, unit) for p, unit in headings.items()}
     for path, convention in conventions.items():
         if convention is not None:
             words, scale, offset = convention
             truth["yaw_rad"] = SignalSource("yaw_rad", topic.name, path, stamp, scale, offset)
-            note += f" {path} is in {words}: it agrees with the course over ground."
+            note += f"; {path} is in {words}, which agrees with the course over ground"
             break
     useful = {"enu_velocity_m_s", "ecef_velocity_m_s", "ecef_position_m", "lat_deg"} & set(truth)
     return NavigationTruth(topic.name, truth, note) if useful else None

@@ -1,4 +1,4 @@
-"""A mapping by recognising well-known message types; what is ambiguous is said, never guessed silently."""
+"""Mapping by well-known message types; every ambiguity is reported."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ NO_SENSORS = (
     "sensor_msgs/CameraInfo", "visualization_msgs/", "tf2_msgs/", "tf/", "rosgraph_msgs/", "rcl_interfaces/",
     "diagnostic_msgs/", "nav_msgs/Path", "nav_msgs/OccupancyGrid", "foxglove.CompressedImage", "foxglove.PointCloud",
 )  # fmt: skip
-#: Start of the note on a steering angle that nobody measured.
+#: Start of the note on a steering angle that is a command.
 FROM_COMMAND = "steer_rad comes from the command"
 PERFECT_PREFIX = "/truth/perfect"
 OWN_PREFIX = "/pdhef/"
@@ -97,10 +97,10 @@ IMU_TYPES = frozenset({"sensor_msgs/Imu"})
 FIX_TYPES = frozenset({"sensor_msgs/NavSatFix", "foxglove.LocationFix"})
 #: Types that hold positions of which nobody says which one is the vehicle's.
 SEVERAL_POSITIONS = {
-    "foxglove.PosesInFrame": "it holds a list of poses, and which one is the vehicle's is not said",
-    "foxglove.LocationFixes": "it holds a list of fixes, and which one is the vehicle's is not said",
-    "foxglove.FrameTransform": "which of its frames is the vehicle is not said",
-    "foxglove.FrameTransforms": "which of its frames is the vehicle is not said",
+    "foxglove.PosesInFrame": "it is a list of poses, and the type does not give which pose is the vehicle's",
+    "foxglove.LocationFixes": "it is a list of fixes, and the type does not give which fix is the vehicle's",
+    "foxglove.FrameTransform": "the type does not give which frame is the vehicle",
+    "foxglove.FrameTransforms": "the type does not give which frame is the vehicle",
 }
 #: What a type must have to be what its name says; of an IMU any of them, of others all.
 _IMU_PATHS = ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z")
@@ -112,9 +112,9 @@ class Ambiguity:
 
     Attributes
     ----------
-    subject : what could be read in several ways, for example ``imu``.
+    subject : subject with several readings, for example ``imu``.
     candidates : topics (and fields).
-    chosen : what was taken, None when nothing was.
+    chosen : candidate that is taken, None without one.
     reason : why.
     remedy : how to decide.
     """
@@ -133,7 +133,7 @@ class Ambiguity:
 
 @dataclass(frozen=True, slots=True)
 class AutoMapping:
-    """A recognised mapping, and what is to be said of it.
+    """A recognised mapping and its open points.
 
     Attributes
     ----------
@@ -149,7 +149,7 @@ class AutoMapping:
 
 @dataclass(slots=True)
 class _Draft:
-    """What one call of :func:`auto_map` has gathered so far."""
+    """A mapping while :func:`auto_map` builds it."""
 
     log: DriveLog
     samples: dict[str, dict[str, FloatArray]]
@@ -163,14 +163,14 @@ class _Draft:
         return self.samples.get(topic, {}).get(path, np.empty(0))
 
     def is_given(self, topic: str, path: str) -> bool:
-        """Return whether the type has a field that holds anything: nothing seen counts as given, only NaN does not."""
+        """Return whether the type has a field whose samples, if any, are not all NaN."""
         if not has_path(self.log.fields(topic), path):
             return False
         seen = self.values(topic, path)
         return seen.shape[0] == 0 or bool(np.isfinite(seen).any())
 
     def is_disowned(self, topic: str, covariance: str) -> bool:
-        """Return whether the message says, by −1 in its covariance, that it does not provide a quantity (REP 145)."""
+        """Return whether a covariance of −1 marks a quantity as not provided (REP 145)."""
         seen = self.values(topic, covariance)
         return seen.shape[0] > 0 and bool((seen == -1.0).all())
 
@@ -225,7 +225,7 @@ def auto_map(
         f"{t.name} ({_type(t)}) has no messages" for t in log.topics if not t.messages and _is_well_known(t)
     ]
     draft.notes += [
-        f'{t.name} holds raw CAN frames: a mapping file with [can] dbc = ["car.dbc"] tells what stands in them'
+        f'{t.name} contains raw CAN frames: describe them in a mapping file with [can] dbc = ["car.dbc"]'
         for t in topics
         if "can" in _words(f"{t.name} {t.type_name}") and holds_frames(t.name, log.fields(t.name, quiet=True))
     ]
@@ -250,13 +250,13 @@ def auto_map(
 
 
 def _why_unused(log: DriveLog, topic: TopicInfo) -> str:
-    """Say why a topic of a well-known type is not used: no definition, or another type's fields."""
+    """Return why a topic of a well-known type is not used: no definition, or another type's fields."""
     reason = log.unreadable(topic.name)
     return f"{topic.name} is not used: {reason or f'its fields are not those of {topic.type_name}'}"
 
 
 def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:
-    """Say of which other topics no field is known, those of one reason together."""
+    """Return notes on the topics without readable fields, grouped by reason."""
     by_reason: dict[str, list[str]] = {}
     for topic in topics:
         reason = "" if log.fields(topic.name, quiet=True) else log.unreadable(topic.name)
@@ -283,7 +283,7 @@ def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
     elif command is not None:
         draft.notes = [n for n in draft.notes if not n.startswith(FROM_COMMAND)]
         measured = next(s.label for n, s in weighed.signals.items() if n.startswith("steer"))
-        draft.doubt("steering", (measured, command.label), measured, "a measured angle before a command")
+        draft.doubt("steering", (measured, command.label), measured, "a measured angle is preferred to a command")
     draft.signals.update(weighed.signals)
     both = (
         mean_of_sides(draft.log, {t.name: t for t in topics}, draft.signals["steer_rad"])
@@ -294,7 +294,7 @@ def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
         draft.signals["steer_rad"] = both
         draft.notes.append(f"steer_rad is the mean of the two steered wheels in {both.topic}")
     draft.notes += [
-        f"{t.name} holds other joints, or in another order, from message to message: none of them is used"
+        f"{t.name} is not used: the joints or their order differ between messages"
         for t, role in rest
         if is_joints(t) and role != "command" and not joint_names(draft.log, t)
     ]
@@ -327,8 +327,8 @@ def _map_documented_truth(draft: _Draft, topics: list[TopicInfo], vendors: Vendo
         return
     if draft.truth:
         others = ", ".join(sorted({s.topic for s in draft.truth.values()}))
-        draft.notes = [n for n in draft.notes if not n.startswith("truth is kept where")]
-        draft.notes.append(f"truth is taken from {chosen.name}, which has a velocity too; {others} is not used")
+        draft.notes = [n for n in draft.notes if not n.startswith("ground truth is used where")]
+        draft.notes.append(f"ground truth is taken from {chosen.name}, which also has a velocity; {others} is not used")
     draft.truth, draft.quality = whole[chosen.name], None
 
 
@@ -341,7 +341,7 @@ def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
     if truth is None or (draft.truth and len(truth.truth) <= len(draft.truth)):
         return
     draft.truth, draft.quality = truth.truth, None
-    draft.notes = [n for n in draft.notes if not n.startswith("truth is kept where")]
+    draft.notes = [n for n in draft.notes if not n.startswith("ground truth is used where")]
     draft.notes.append(truth.note)
 
 
@@ -367,7 +367,7 @@ def _role(topic: TopicInfo) -> Role:
 
 
 def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
-    """Stand in for an IMU's yaw rate by an odometry's, and for a speed sensor by a navigation system's; say so."""
+    """Take yaw rate from an odometry and speed from a navigation system where no sensor gives them, with a note."""
     twists = [t for t in topics if _type(t) in TWIST_FIELDS]
     twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | COMMAND_WORDS | ESTIMATE_WORDS)]
     if "yaw_rate_rad_s" not in draft.signals:
@@ -404,8 +404,8 @@ def _speed_of_navigation(draft: _Draft, topics: list[TopicInfo]) -> None:
     forward = truth.name == "vx_m_s"
     draft.signals["speed_m_s"] = replace(truth, name="speed_m_s") if forward else length_of(truth)
     draft.notes.append(
-        f"speed_m_s comes from {source.name}, which is the truth too, as nothing else gives a speed: "
-        "an estimator is told the true speed" + ("" if forward else f"; it is {NEVER_NEGATIVE}")
+        f"speed_m_s comes from {source.name}, which is also the ground truth, as nothing else gives a speed: "
+        "the estimator's input is the true speed" + ("" if forward else f"; it is {NEVER_NEGATIVE}")
     )
 
 
@@ -510,19 +510,19 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
         "imu",
         imus,
         lambda t: (bool(_words(t.name) & DEVICE_WORDS),),
-        "an IMU of the vehicle before one of a camera or lidar",
+        "an IMU of the vehicle is preferred to one of a camera or lidar",
     )
     if imu is None:
         return
     if draft.is_disowned(imu.name, "linear_acceleration_covariance[0]"):
-        draft.notes.append(f"{imu.name} says that it gives no acceleration (covariance -1)")
+        draft.notes.append(f"{imu.name} provides no acceleration (covariance -1)")
     else:
         for name, axis in (("ax_m_s2", "x"), ("ay_m_s2", "y")):
             path = f"linear_acceleration.{axis}"
             if draft.is_given(imu.name, path):
                 draft.take(draft.signals, name, imu.name, path)
     if draft.is_disowned(imu.name, "angular_velocity_covariance[0]"):
-        draft.notes.append(f"{imu.name} says that it gives no angular rate (covariance -1)")
+        draft.notes.append(f"{imu.name} provides no angular rate (covariance -1)")
     elif draft.is_given(imu.name, "angular_velocity.z"):
         draft.take(draft.signals, "yaw_rate_rad_s", imu.name, "angular_velocity.z")
 
@@ -534,7 +534,9 @@ def _map_steering(draft: _Draft, topics: list[TopicInfo]) -> None:
     if chosen is None:
         return
     if not measured:
-        draft.notes.append(f"{FROM_COMMAND} {chosen.name}, not from a measured angle: no lag, no slack")
+        draft.notes.append(
+            f"{FROM_COMMAND} {chosen.name}, not from a measured angle: actuator lag and steering play are missing"
+        )
     draft.take(draft.signals, "steer_rad", chosen.name, STEERING_FIELDS[_type(chosen)])
 
 
@@ -553,17 +555,17 @@ def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
                 "speed",
                 (topic.name,),
                 None,
-                "its name says that it is an estimate, which is neither a sensor nor the truth",
+                "its name is that of an estimate, which is neither a sensor nor ground truth",
             )
         elif _words(topic.name) & VEHICLE_WORDS:
             twists.append(topic)
         else:
-            draft.doubt("speed", (topic.name,), None, "its name says neither speed sensor nor truth")
+            draft.doubt("speed", (topic.name,), None, "its name is neither that of a speed sensor nor of ground truth")
     chosen = draft.choose(
         "speed",
         [*reports, *twists],
         lambda t: (_type(t) not in SPEED_FIELDS,),
-        "a velocity report before an odometry or a twist",
+        "a velocity report is preferred to an odometry or a twist",
     )
     if chosen is None:
         return
@@ -611,7 +613,7 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
         "truth velocity",
         twists,
         lambda t: (not _words(t.name) & TRUTH_WORDS, not _has_pose(draft, t)),
-        "a topic that calls itself truth first, then one that has a pose too",
+        "topics named as ground truth first, then topics with a pose",
     )
     if chosen is None:
         return None
@@ -623,7 +625,7 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
         up = draft.values(chosen.name, _twist(chosen, "linear", "z"))
         readings = (f"{chosen.name} as body velocity", f"{chosen.name} as east, north, up")
         if body is None or not np.isfinite(up).any():
-            draft.doubt("truth velocity frame", readings, None, "too little motion to tell the frame")
+            draft.doubt("truth velocity frame", readings, None, "too little motion to identify the frame")
             return None
         draft.doubt("truth velocity frame", readings, readings[1], "x is not the direction of travel")
         paths = tuple(_twist(chosen, "linear", a) for a in "xyz")
@@ -699,7 +701,7 @@ def _map_truth_position(draft: _Draft, candidates: list[TopicInfo], velocity: To
             "truth position",
             positions,
             lambda t: (not _words(t.name) & TRUTH_WORDS, _type(t) in FIX_TYPES),
-            "a topic that calls itself truth first, then a pose before a satellite fix",
+            "topics named as ground truth first, then poses before satellite fixes",
         )
     if chosen is None:
         return
@@ -726,12 +728,14 @@ def _map_fix(draft: _Draft, fix: TopicInfo, *, alone: bool) -> None:
     given = {p for p, values in angles.items() if np.isfinite(values).any()}
     if given == {"heading", "course"} and np.array_equal(angles["heading"], angles["course"], equal_nan=True):
         given.remove("heading")
-        draft.notes.append(f"{fix.name}.heading is not used: it repeats the course, so that it tells no sideslip")
+        draft.notes.append(f"{fix.name}.heading is not used: it repeats the course, so that it gives no sideslip")
     for name, path in (("yaw_rad", "heading"), ("course_rad", "course")):
         if path in given:
             draft.take(draft.truth, name, fix.name, path, scale=-1.0, offset=np.pi / 2.0)
     if "heading" in given:
-        draft.notes.append(f"truth yaw comes from {fix.name}.heading: only two antennas or an INS make it a truth")
+        draft.notes.append(
+            f"ground-truth yaw comes from {fix.name}.heading: it is one only with two antennas or an INS"
+        )
     status = draft.values(fix.name, "status.status")
     if not alone or status.shape[0] == 0:
         return
@@ -740,4 +744,4 @@ def _map_fix(draft: _Draft, fix: TopicInfo, *, alone: bool) -> None:
     draft.quality = QualityGate(
         topic=fix.name, field="status.status", minimum=lowest, stamp=stamp_path_of(draft.log.fields(fix.name))
     )
-    draft.notes.append(f"truth is kept where {fix.name}.status.status is at least {lowest:g}")
+    draft.notes.append(f"ground truth is used where {fix.name}.status.status is at least {lowest:g}")

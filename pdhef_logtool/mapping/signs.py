@@ -37,7 +37,7 @@ WITNESSES = {
 
 @dataclass(frozen=True, slots=True)
 class Signs:
-    """What the signs say.
+    """Result of the comparison of signs.
 
     Attributes
     ----------

@@ -1,9 +1,9 @@
-"""Fields whose names say nothing (``data[3]``, ``ch7``, ``k``): what they are by how they move with one another.
+"""Unlabelled fields (``data[3]``, ``ch7``, ``k``): their quantities by physical relations between them.
 
-Speed, yaw rate and the accelerations are believed where one choice of columns alone satisfies a_y = v r and a_x = v̇ at
+Speed, yaw rate and the accelerations are accepted where only one choice of columns satisfies a_y = v r and a_x = v̇ at
 once, with slopes that units explain: the second slope gives the units of speed and accelerations, the ratio of the two
-that of the yaw rate. A steering angle looks like a yaw rate over a speed too, but for that ratio. Left and right
-nothing tells. What is not believed is a candidate that is not taken.
+that of the yaw rate. A steering angle looks like a yaw rate over a speed too, but for that ratio. Left and
+right are not observable. Choices that are not accepted remain candidates that are not taken.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def unlabelled_columns(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], 
         if seen.changes and len(results) < MOST_UNLABELLED:
             topic, role = by_name[name]
             stamp = stamp_of(log.fields(name, quiet=True), path)
-            meaning = Meaning("", "", 0.5, "", None, f"{path!r} says nothing")
+            meaning = Meaning("", "", 0.5, "", None, f"{path!r} gives no quantity")
             results.append(Field(topic, path, meaning, role, stamp, seen, (("", 1.0),)))
     return results
 
@@ -200,10 +200,7 @@ def _choices(fields: Fields, unlabelled: Sequence[Field]) -> Iterator[_Choice]:
 
 
 def _choices_of(
-    fields: Fields,
-    columns: tuple[Field, Field, Field],
-    ay: FloatArray,
-    ways: Sequence[tuple[Field | None, Fit | None]],
+    fields: Fields, columns: tuple[Field, Field, Field], ay: FloatArray, ways: Sequence[tuple[Field | None, Fit | None]]
 ) -> Iterator[_Choice]:
     """Yield the choices of one speed, yaw rate and a_y."""
     turning, by_speed, ahead_s = _turning(fields, *columns[:2], ay)
@@ -232,9 +229,7 @@ def _turning(fields: Fields, v: Field, r: Field, ay: FloatArray) -> tuple[Fit | 
 
 
 def _explained(
-    columns: tuple[Field, Field, Field, Field | None],
-    turning: Fit,
-    speeding: Fit | None,
+    columns: tuple[Field, Field, Field, Field | None], turning: Fit, speeding: Fit | None
 ) -> tuple[tuple[tuple[str, float], tuple[str, float], tuple[str, float]], float] | None:
     """Return the units of speed, yaw rate and accelerations that explain the slopes, and the logarithm of how far off.
 
@@ -303,7 +298,7 @@ def _named(item: Field, meaning: Meaning, sign: float, *, sure: bool) -> Field:
     named = replace(item, meaning=meaning, factors=factors, sign=sign, unit_known=sure, reasons=[], doubts=[])
     if not sure:
         named.is_weak = True
-        named.doubts.append("its name says nothing, and its values do not decide")
+        named.doubts.append("its name gives no quantity, and its values do not decide")
     return named
 
 
@@ -331,9 +326,11 @@ def _steering(
     meaning = Meaning("steering", "", 1.0 if sure and not rivals else WEAK, "", None, why)
     results = replace(best, meaning=meaning, factors=kinds, reasons=[], doubts=[], is_weak=not sure or bool(rivals))
     if not sure:
-        results.doubts.append("its name says nothing, and its values do not decide")
+        results.doubts.append("its name gives no quantity, and its values do not decide")
     if rivals:
-        results.doubts.append(f"its name says nothing, and {rivals[0].path} follows the path's curvature as well")
+        results.doubts.append(
+            f"its name gives no quantity, and {rivals[0].path} follows the path's curvature equally well"
+        )
     return [results]
 
 

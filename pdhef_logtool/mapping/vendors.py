@@ -45,11 +45,11 @@ class _FieldTable(BaseModel):
     @model_validator(mode="after")
     def _is_one_quantity(self) -> _FieldTable:
         if bool(self.signal) == bool(self.truth):
-            raise ValueError("give signal or truth")
+            raise ValueError("give signal or truth, not both")
         if self.signal and self.signal not in SIGNAL_UNITS:
             raise ValueError(f"{self.signal!r} is no signal")
         if self.truth and self.truth not in TRUTH_UNITS:
-            raise ValueError(f"{self.truth!r} is no truth quantity")
+            raise ValueError(f"{self.truth!r} is no ground-truth quantity")
         if 0.0 in (self.scale if isinstance(self.scale, list) else [self.scale]):
             raise ValueError("scale must not be 0")
         if isinstance(self.scale, list) and not isinstance(self.field, list):

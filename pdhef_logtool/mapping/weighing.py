@@ -1,7 +1,7 @@
-"""Choosing among candidates by physics: gravity, a_y ≈ v r, a_x ≈ v̇, steering against curvature, wheels against yaw.
+"""Choice among candidates by physics: gravity, a_y ≈ v r, a_x ≈ v̇, steering against curvature, wheels against yaw.
 
-What a recognised type already gives is an anchor: it is held against the candidates and never changed. What decides a
-unit or a sign is said; what stays open becomes a check that is undecided, with what to do about it.
+Signals of recognised types are anchors: candidates are compared with them, and they are never changed. Reports give
+the evidence for a unit or a sign; an open point becomes an undecided check with a remedy.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ USUAL_RADIUS_M = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Weighed:
-    """What the candidates give: sources to take, all candidates, notes, and checks that are undecided."""
+    """Result of weighing: sources to take, all candidates, notes, and undecided checks."""
 
     signals: dict[str, SignalSource] = field(default_factory=dict)
     truth: dict[str, SignalSource] = field(default_factory=dict)
@@ -77,7 +77,7 @@ def weigh(
     truth: Mapping[str, SignalSource],
     vendors: Vendors,
 ) -> Weighed:
-    """Look for the signals that are not mapped, and for truth if there is none.
+    """Choose fields for the signals that are not mapped, and for ground truth if there is none.
 
     Parameters
     ----------
@@ -169,9 +169,11 @@ class _Weighing:
             self._tell(name, item)
 
     def note_unlabelled(self, topic: str, evidence: str) -> None:
-        """Say that values alone told what the fields of a topic are."""
-        self.notes.append(f"values alone tell what {topic} holds: left and right may be exchanged in all of it")
-        evidence = f"the names of {topic} say nothing; {evidence}; nothing tells left from right"
+        """Note that the fields of a topic are identified by values alone."""
+        self.notes.append(
+            f"quantities of {topic} are identified by values alone: left and right may be exchanged in all of it"
+        )
+        evidence = f"the names of {topic} give no quantities; {evidence}; left and right are not observable"
         remedy = 'look at them (pdhef inspect --fields), name them in a mapping file, or --waive "mapping.names"'
         self.checks.append(Check("mapping.names", "mapping", "undecided", evidence, remedy))
 
@@ -185,7 +187,7 @@ class _Weighing:
             return
         best = good[0]
         if best.meaning.strength < 0.6:
-            best.doubts.append("which number of its array it is was told by values alone")
+            best.doubts.append("its element of the array is identified by values alone")
         near = [f for f in good[1:] if f.score > best.score - 0.1 and not self.fields.agree(best, f)]
         if near:
             best = self._better([best, *near])
@@ -198,7 +200,7 @@ class _Weighing:
         self.taken[name] = best
 
     def _follows_ax(self, item: Field) -> None:
-        """Believe a speed with a weak name more where its rate of change is a_x."""
+        """Raise the score of a speed with a weak name where its rate of change follows a_x."""
         if item.score >= LEAST_SCORE or item.meaning.strength >= 0.7:
             return
         for ax in self.fields.all("acceleration", "x")[:2]:
@@ -280,7 +282,7 @@ class _Weighing:
             ways.append((1.0 + off, "wheel rate", turning))
         (_, kind, taken), (_, _, other) = sorted(ways)[:2]
         said = f"{1.0 / metres:.4g} of it is 1 m/s by a_y ≈ v r"
-        doubt = f"the unit of the wheel speeds is not said: by a_y ≈ v r {taken[0]} is likeliest, then {other[0]}"
+        doubt = f"the unit of the wheel speeds is not given: by a_y ≈ v r {taken[0]} is likeliest, then {other[0]}"
         return kind, taken, said, doubt
 
     # --------------------------------------------------------------------------------------------- steering
@@ -353,7 +355,7 @@ class _Weighing:
         hangs = signs.contradiction == f"{WORDS['rate']} and {WITNESSES['gravity']}"  # imu.mounting says so
         if signs.contradiction and not hangs and not (signs.decided and signs.absolute):
             turned = ", ".join(WORDS[n] for n in signs.turned)
-            taken = f"{turned} was turned as the odd one" if turned else "nothing tells which of them is wrong"
+            taken = f"{turned} was turned as the odd one" if turned else "the wrong one is not observable"
             self.checks.append(
                 Check(
                     "mapping.sign",
@@ -398,7 +400,7 @@ class _Weighing:
         for item in there.values():
             if is_of_one_sign(item.seen.values) and not item.anchor:
                 item.doubts.append(
-                    "it is never negative although the car turns both ways: its sign may stand elsewhere"
+                    "it is never negative although the car turns both ways: its sign may be in another field"
                 )
 
     def _chosen(self, *names: str) -> Field | None:
@@ -439,11 +441,11 @@ class _Weighing:
                     "truth.source",
                     "truth",
                     "undecided",
-                    f"{first.topic.name} holds a sideslip and does not say whether it was measured or estimated",
+                    f"{first.topic.name} contains a sideslip, measured or estimated: its name does not give which",
                     'name it under [truth] in a mapping file, or --waive "truth.source"',
                 )
             )
-        self.notes.append(f"truth is taken from {first.topic.name}, by the names of its fields")
+        self.notes.append(f"ground truth is taken from {first.topic.name}, by the names of its fields")
         for name, item in self.truth.items():
             self._tell(f"truth.{name}", item)
 
@@ -467,7 +469,7 @@ class _Weighing:
         if name == "speed_m_s" and item.role == "navigation":
             self.notes.append(
                 f"speed_m_s comes from the navigation system's {item.topic.name}.{item.path}: "
-                "where that is the truth too, an estimator is told the true speed"
+                "if it is the ground truth too, the estimator's input is the true speed"
             )
         item.doubts += item.unit_doubt
         if item.doubts:
@@ -604,9 +606,9 @@ def _wheel_unit(times: float | None, reference: Field | None) -> tuple[str, tupl
     times : how many of them are 1 m/s by the reference, a speed; None where there is none, or no one number.
     """
     if times is None or reference is None:
-        doubt = "the unit of the wheel speeds is not said, and no speed tells it; taken as m/s"
+        doubt = "the unit of the wheel speeds is not given, and no speed to compare with; taken as m/s"
         return "wheel speed", ("m/s", 1.0), "", doubt
-    unsure = "" if reference.unit_known else "the unit of the speed that tells theirs is unsure itself"
+    unsure = "" if reference.unit_known else "the unit of the speed that they are compared with is unsure"
     said = f"{times:.4g} of it is 1 m/s of speed"
     for unit, factor in SPEEDS:
         off = abs(times * factor - 1.0)
