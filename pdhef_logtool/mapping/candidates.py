@@ -41,17 +41,15 @@ MOST_READ = 160
 LEAST_SCORE = 0.45
 
 #: Factors that a field without a unit may have, the first one by convention, and the kind of unit by quantity.
+SPEEDS = (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704))
+ANGLES = (("rad", 1.0), ("deg", math.radians(1.0)))
 HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
     "acceleration": (("m/s²", 1.0), ("g", UNITS["acceleration"]["g"]), ("mg", UNITS["acceleration"]["mg"])),
     "rate": (("rad/s", 1.0), ("deg/s", math.radians(1.0))),
-    "steering": (("rad", 1.0), ("deg", math.radians(1.0))),
-    "sideslip": (("rad", 1.0), ("deg", math.radians(1.0))),
-    "speed": (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704)),
-    "velocity": (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704)),
-    "wheel speed": (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704)),
+    **dict.fromkeys(("steering", "sideslip"), ANGLES),
+    **dict.fromkeys(("speed", "velocity", "wheel speed"), SPEEDS),
     "wheel rate": (("rad/s", 1.0), ("rpm", 2.0 * math.pi / 60.0)),
-    "latitude": (("deg", 1.0),),
-    "longitude": (("deg", 1.0),),
+    **dict.fromkeys(("latitude", "longitude"), (("deg", 1.0),)),
 }
 #: What a car can do, in SI, by quantity: a value beyond is of another unit, or no such quantity.
 MOST = {

@@ -42,10 +42,6 @@ class Fields:
         """Return the surest of a quantity that changes."""
         return next((f for f in self.all(quantity) if f.seen.changes), None)
 
-    def anchor(self, name: str) -> Field | None:
-        """Return what is mapped to a signal already."""
-        return self.anchors.get(name)
-
     def agree(self, a: Field, b: Field) -> bool:
         """Return whether two fields have the same values."""
         relation = fit(a.si, b.si)

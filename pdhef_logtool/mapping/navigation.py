@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -41,13 +41,8 @@ _CONVENTIONS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class NavigationTruth:
-    """Truth quantities of one topic, and what is to be said of them."""
-
-    topic: str
-    truth: dict[str, SignalSource]
-    note: str
+#: Ground-truth quantities of one topic, and the note on their source.
+NavigationTruth: TypeAlias = tuple[dict[str, SignalSource], str]
 
 
 def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo]) -> NavigationTruth | None:
@@ -58,7 +53,7 @@ def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo]) -> NavigationTr
     topics : of navigation systems and references whose types are not documented.
     """
     truths = [truth for t in topics if (truth := _of_topic(log, t)) is not None]
-    return max(truths, key=lambda t: len(t.truth), default=None)
+    return max(truths, key=lambda t: len(t[0]), default=None)
 
 
 def _of_topic(log: DriveLog, topic: TopicInfo) -> NavigationTruth | None:
@@ -88,7 +83,7 @@ def _of_topic(log: DriveLog, topic: TopicInfo) -> NavigationTruth | None:
             note += f"; {path} is in {words}, which agrees with the course over ground"
             break
     useful = {"enu_velocity_m_s", "ecef_velocity_m_s", "ecef_position_m", "lat_deg"} & set(truth)
-    return NavigationTruth(topic.name, truth, note) if useful else None
+    return (truth, note) if useful else None
 
 
 def _enu_velocities(topic: TopicInfo, fields: tuple[FieldInfo, ...], stamp: str) -> Iterator[SignalSource]:

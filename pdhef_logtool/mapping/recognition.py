@@ -338,11 +338,11 @@ def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
         return
     unknown = [t for t in topics if not _is_well_known(t) and not vendors.fields_of(t.type_name)]
     truth = navigation_truth(draft.log, [t for t in unknown if _role(t) in ("navigation", "truth")])
-    if truth is None or (draft.truth and len(truth.truth) <= len(draft.truth)):
+    if truth is None or (draft.truth and len(truth[0]) <= len(draft.truth)):
         return
-    draft.truth, draft.quality = truth.truth, None
+    draft.truth, draft.quality = truth[0], None
     draft.notes = [n for n in draft.notes if not n.startswith("ground truth is used where")]
-    draft.notes.append(truth.note)
+    draft.notes.append(truth[1])
 
 
 def _is_well_known(topic: TopicInfo) -> bool:

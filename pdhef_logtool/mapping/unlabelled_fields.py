@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
-from pdhef_logtool.mapping.candidates import MOST_FIELDS, Field, Role, stamp_of
+from pdhef_logtool.mapping.candidates import ANGLES, HYPOTHESES, MOST_FIELDS, Field, Role, stamp_of
 from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, is_of_both_signs, ratio, spread
 from pdhef_logtool.mapping.fields import EXCITED_A_M_S2, Fields
 from pdhef_logtool.mapping.naming import G_M_S2, Meaning, is_command, is_unlabelled, meaning_of
@@ -50,11 +50,7 @@ STEERS = 0.9
 MOST_DOUBTFUL = 3
 #: Strength of a name that values give without deciding.
 WEAK = 0.3
-_UNITS = {
-    "speed": (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704)),
-    "rate": (("rad/s", 1.0), ("deg/s", math.radians(1.0))),
-    "acceleration": (("m/s²", 1.0), ("g", G_M_S2)),
-}
+_UNITS = HYPOTHESES | {"acceleration": (("m/s²", 1.0), ("g", G_M_S2))}
 
 
 @dataclass(frozen=True, slots=True)
@@ -321,10 +317,9 @@ def _steering(
         return []
     first, best = ranked[0]
     rivals = [o for c, o in ranked[1:] if c > first - CLEARER and not _is_copy(best, o)]
-    kinds = (("rad", 1.0), ("deg", math.radians(1.0)))
     why = f"it follows the path's curvature (correlation {first:.2f})"
     meaning = Meaning("steering", "", 1.0 if sure and not rivals else WEAK, "", None, why)
-    results = replace(best, meaning=meaning, factors=kinds, reasons=[], doubts=[], is_weak=not sure or bool(rivals))
+    results = replace(best, meaning=meaning, factors=ANGLES, reasons=[], doubts=[], is_weak=not sure or bool(rivals))
     if not sure:
         results.doubts.append("its name gives no quantity, and its values do not decide")
     if rivals:

@@ -15,6 +15,7 @@ import numpy as np
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.candidates import (
     LEAST_SCORE,
+    SPEEDS,
     Candidate,
     Field,
     Role,
@@ -52,8 +53,7 @@ FOLLOWS = 0.5
 WHEEL_UNIT = 0.04
 #: Metres by which curvature becomes an angle: wheelbases of model cars to lorries, and those times a steering ratio.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
-#: Units of wheel speeds, and the usual radius of wheels that turn.
-SPEEDS = (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704))
+#: Unit of rotational speeds, and the usual radius of a wheel.
 RPM = 2.0 * math.pi / 60.0
 USUAL_RADIUS_M = 0.3
 
@@ -405,7 +405,7 @@ class _Weighing:
 
     def _chosen(self, *names: str) -> Field | None:
         """Return what is taken for the first of these signals that there is, or mapped already."""
-        return next((f for n in names if (f := self.taken.get(n) or self.fields.anchor(n)) is not None), None)
+        return next((f for n in names if (f := self.taken.get(n) or self.fields.anchors.get(n)) is not None), None)
 
     def _wheels_turn(self) -> FloatArray | None:
         """Return right minus left wheel speed, positive in a turn to the left; None without two of an axle."""
