@@ -64,7 +64,7 @@ class Candidate:
 
     Attributes
     ----------
-    section : ``signals`` or ``truth``. source : the field, with scale and offset as they are believed to be.
+    section : ``signals`` or ``truth``. source : the field, with its likeliest scale and offset.
     score : 0 to 1. reason : what speaks for it. doubt : what is unsure of it, empty if nothing is.
     taken : it stands in the mapping.
     """

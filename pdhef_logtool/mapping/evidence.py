@@ -51,7 +51,7 @@ class Seen:
 
     @property
     def largest(self) -> float:
-        """Largest magnitude that is not one of a few stray samples; NaN without a number."""
+        """Largest magnitude without a few outliers; NaN without a number."""
         finite = np.abs(self.values[np.isfinite(self.values)])
         return float(np.quantile(finite, 0.995)) if finite.shape[0] else float("nan")
 

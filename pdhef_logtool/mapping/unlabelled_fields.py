@@ -26,7 +26,7 @@ from pdhef_logtool.records.signals import FloatArray
 #: Columns that are looked at, and of one array.
 MOST_UNLABELLED = 40
 MOST_OF_ARRAY = 32
-#: Correlations of a_y with v r, and of a_x with v̇, that are believed; others may do with less, and decide nothing.
+#: Correlations of a_y with v r, and of a_x with v̇, that are accepted; rival choices may have lower ones.
 TURNS, SPEEDS_UP = 0.92, 0.75
 LOOSE_TURNS, LOOSE_SPEEDS_UP = 0.8, 0.6
 #: How much nearer to 1 than that of any other choice their product must be.
@@ -46,7 +46,7 @@ COPY = 0.98
 ITSELF = 0.999
 #: A steering angle follows the path's curvature so well.
 STEERS = 0.9
-#: Choices that are shown where none is believed.
+#: Choices that are shown where none is accepted.
 MOST_DOUBTFUL = 3
 #: Strength of a name that values give without deciding.
 WEAK = 0.3
@@ -58,7 +58,7 @@ class _Choice:
     """Columns that are speed, yaw rate, a_y and a_x, the relations between them, and the units of the first three.
 
     ``x`` and ``speeding`` are None where no column is the speed's change. ``is_plausible``: its slopes are near to what
-    units explain, and a_y is as large as one; ``is_strict``: both relations hold so well that it is believed if no
+    units explain, and a_y is as large as one; ``is_strict``: both relations hold so well that it is accepted if no
     other is as near. ``ahead_s`` : how far a_y is ahead of v r.
     """
 
@@ -127,7 +127,7 @@ def unlabelled_columns(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], 
 
 
 def identified(fields: Fields, unlabelled: Sequence[Field]) -> tuple[list[Field], str, str]:
-    """Return what unlabelled columns are, or may be with weak names; topic and evidence of what is believed.
+    """Return what unlabelled columns are, or may be with weak names; topic and evidence of the accepted choice.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def _as_chosen(fields: Fields, unlabelled: Sequence[Field], choice: _Choice, why
     if choice.x is not None and choice.speeding is not None:
         sign = math.copysign(1.0, choice.speeding.slope)
         meanings.append((choice.x, Meaning("acceleration", "x", 1.0, *unit, why), sign, sure))
-    results = [_named(item, meaning, sign, sure=believed) for item, meaning, sign, believed in meanings if _open(item)]
+    results = [_named(item, meaning, sign, sure=is_sure) for item, meaning, sign, is_sure in meanings if _open(item)]
     rest = [f for f in unlabelled if not any(f is c for c in choice.columns)]
     speed, rate = _values(choice.v) * speed_unit[1], _values(choice.r) * rate_unit[1]
     return results + _steering(fields, rest, speed, rate, sure=sure)
@@ -288,7 +288,7 @@ def _speed_is_sure(fields: Fields, speed: Field, unit: tuple[str, float]) -> boo
 
 
 def _named(item: Field, meaning: Meaning, sign: float, *, sure: bool) -> Field:
-    """Return a column as what it was found to be; with a weak name where it is not believed."""
+    """Return a column with its quantity; with a weak name where it is not sure."""
     meaning = replace(meaning, strength=1.0 if sure else WEAK)
     factors = ((meaning.unit, meaning.scale or 1.0),)
     named = replace(item, meaning=meaning, factors=factors, sign=sign, unit_known=sure, reasons=[], doubts=[])
