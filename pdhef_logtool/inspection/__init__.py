@@ -1,4 +1,4 @@
-"""What a log holds, how it maps to signals, and whether that makes sense."""
+"""Contents of a log, its mapping to signals, and plausibility checks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A mapping by question and answer: for each signal what was found, what else there is, and what the person says."""
+"""A mapping by questions: for each signal the field that is taken, its alternatives, and the user's answer."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from pdhef_logtool.inspection.report import Inspection
-from pdhef_logtool.inspection.uses import what_it_lacks
+from pdhef_logtool.inspection.uses import missing_for_sideslip
 from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.mapping.candidates import Candidate
 
-#: What is asked for, in this order; a steering angle is one of two signals.
+#: Questions in order; a steering angle is either of two signals.
 QUESTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("signals", "steering angle (left positive)", ("steer_rad", "steering_wheel_rad")),
     ("signals", "yaw rate (left positive)", ("yaw_rate_rad_s",)),
@@ -21,7 +21,7 @@ QUESTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("truth", "true lateral velocity (left positive)", ("vy_m_s",)),
     ("truth", "true sideslip (left positive)", ("sideslip_rad",)),
 )
-HELP = "Enter keeps *, a number takes that one, - takes none, or type: TOPIC FIELD [SCALE]"
+HELP = "Enter keeps *, a number takes that candidate, - takes none, or type: TOPIC FIELD [SCALE]"
 
 
 def ask_mapping(inspection: Inspection, ask: Callable[[str], str], tell: Callable[[str], None]) -> Mapping:
@@ -46,8 +46,8 @@ def ask_mapping(inspection: Inspection, ask: Callable[[str], str], tell: Callabl
         if answer is not None:
             sources[answer.name] = answer
         mapping = replace(mapping, signals=sources) if section == "signals" else replace(mapping, truth=sources)
-    lacking = what_it_lacks(mapping)
-    tell(f"to get sideslip you still need: {lacking}" if lacking else "this is all that sideslip needs")
+    lacking = missing_for_sideslip(mapping)
+    tell(f"sideslip estimation still needs: {lacking}" if lacking else "sideslip estimation needs no further signal")
     return replace(mapping, checks=())
 
 

@@ -97,8 +97,8 @@ def _topics_table(topics: tuple[TopicReport, ...]) -> Table:
 
 
 def _sources_table(inspection: Inspection) -> Table:
-    found = "recognised types and candidates" if any(c.taken for c in inspection.candidates) else "recognised types"
-    origin = found if inspection.mapping.origin == "auto" else "mapping file"
+    rows = "recognised types and candidates" if any(c.taken for c in inspection.candidates) else "recognised types"
+    origin = rows if inspection.mapping.origin == "auto" else "mapping file"
     table = empty_table(f"Mapping ({origin})", "signal", "topic", "field", words=3)
     for section in (inspection.signals, inspection.truth):
         for report in section.values():
@@ -109,30 +109,30 @@ def _sources_table(inspection: Inspection) -> Table:
 
 
 def _candidates_table(candidates: tuple[Candidate, ...]) -> Table:
-    """Return what was weighed beside recognised types: what was taken, and the best others of each signal."""
+    """Return the candidates beside recognised types: those taken, and the best others of each signal."""
     table = empty_table("Candidates by name and physics (* taken)", "signal", "field and reason", "score", words=2)
     shown: dict[str, int] = {}
     order = [*SIGNAL_UNITS, *TRUTH_UNITS]
-    for one in sorted(candidates, key=lambda c: (c.section, order.index(c.source.name), not c.taken, -c.score)):
-        name = f"{'truth ' if one.section == 'truth' else ''}{one.source.name}"
+    for item in sorted(candidates, key=lambda c: (c.section, order.index(c.source.name), not c.taken, -c.score)):
+        name = f"{'truth ' if item.section == 'truth' else ''}{item.source.name}"
         shown[name] = shown.get(name, 0) + 1
         if shown[name] <= (1 + CANDIDATES_SHOWN):
-            doubt = Text(f"\nunsure: {one.doubt}", "yellow") if one.doubt else ""
-            text = Text.assemble(one.source.label, Text(f"\n{one.reason}", "dim"), doubt)
-            table.add_row(f"{'* ' if one.taken else '  '}{name}", text, f"{one.score:.2f}")
+            doubt = Text(f"\nunsure: {item.doubt}", "yellow") if item.doubt else ""
+            text = Text.assemble(item.source.label, Text(f"\n{item.reason}", "dim"), doubt)
+            table.add_row(f"{'* ' if item.taken else '  '}{name}", text, f"{item.score:.2f}")
     return table
 
 
 def _uses(inspection: Inspection) -> list[tuple[str, str, str]]:
     """Return the last lines: what the log is good for, and what it lacks."""
     uses = inspection.uses
-    lines = [("can", "green", f"What you can do with this log: {uses['can']}")]
+    lines = [("can", "green", f"Possible uses of this log: {uses['can']}")]
     if uses["sideslip_needs"]:
-        lines.append(("needs", "yellow", f"to get sideslip you still need: {uses['sideslip_needs']}"))
+        lines.append(("needs", "yellow", f"sideslip estimation still needs: {uses['sideslip_needs']}"))
         if any(not c.taken for c in inspection.candidates):
-            lines.append(("next", "cyan", "pdhef map LOG asks its way through the candidates to a mapping.toml"))
+            lines.append(("next", "cyan", "pdhef map LOG builds a mapping.toml interactively from the candidates"))
         else:
-            lines.append(("next", "cyan", "pdhef inspect LOG --fields shows every number that the log holds"))
+            lines.append(("next", "cyan", "pdhef inspect LOG --fields lists all numeric fields of the log"))
     return lines
 
 
@@ -162,30 +162,30 @@ def _statistics_row(report: SignalReport) -> tuple[str, ...]:
 
 
 def _findings(inspection: Inspection) -> list[tuple[str, str, str]]:
-    """Return what to look at: a heading, its style and the text."""
-    found: list[tuple[str, str, str]] = []
+    """Return lines of findings: a heading, its style and the text."""
+    rows: list[tuple[str, str, str]] = []
     if inspection.missing:
-        found.append(("missing", "yellow", ", ".join(inspection.missing)))
+        rows.append(("missing", "yellow", ", ".join(inspection.missing)))
     if not inspection.truth:
-        found.append(("missing", "yellow", "truth: nothing to score an estimate against"))
-    found += [("ambiguous", "yellow", str(a)) for a in inspection.ambiguities]
+        rows.append(("missing", "yellow", "ground truth: needed to score an estimate"))
+    rows += [("ambiguous", "yellow", str(a)) for a in inspection.ambiguities]
     for verdict, style in (("failed", "red"), ("undecided", "yellow")):
         checks = [c for c in inspection.checks if c.verdict == verdict]
-        found += [(verdict, style, f"{c.name}: {c.evidence}; {c.remedy}") for c in checks]
+        rows += [(verdict, style, f"{c.name}: {c.evidence}; {c.remedy}") for c in checks]
     if passed := [c for c in inspection.checks if c.verdict == "passed"]:
         subjects = ", ".join(dict.fromkeys(c.subject for c in passed))
-        found.append(("passed", "green", f"{len(passed)} checks of {subjects}"))
+        rows.append(("passed", "green", f"{len(passed)} checks of {subjects}"))
     for loss in inspection.lost:
         facts = [f"{loss.count} times"] if loss.count is not None and loss.count != 1 else []
         if loss.start_ns is not None:
             until = "" if loss.end_ns is None else f" to {(loss.end_ns - inspection.start_ns) * 1e-9:.2f} s"
             facts.append(f"from {(loss.start_ns - inspection.start_ns) * 1e-9:.2f} s{until}")
         head, style = ("lost", "red") if loss.severity == "lost" else ("note", "cyan")
-        found.append((head, style, f"{loss.where}: {loss.what}{' (' + ', '.join(facts) + ')' if facts else ''}"))
-    found += [("note", "cyan", n) for n in inspection.notes]
+        rows.append((head, style, f"{loss.where}: {loss.what}{' (' + ', '.join(facts) + ')' if facts else ''}"))
+    rows += [("note", "cyan", n) for n in inspection.notes]
     if inspection.mapping.quality is not None:
-        found.append(("note", "cyan", f"truth is used where {inspection.mapping.quality.describe()}"))
-    return found
+        rows.append(("note", "cyan", f"ground truth is used where {inspection.mapping.quality.describe()}"))
+    return rows
 
 
 def _short(field: str) -> str:

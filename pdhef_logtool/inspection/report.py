@@ -255,10 +255,12 @@ def inspect_log(
             long = index is not None and (index.far or log.end_ns - log.start_ns > 2 * WINDOW_NS)
             if index is not None and not (long and index.size > WHOLE_BYTES):
                 index = None
-            found = inspect_drive_log(log, mapping, prefer_truth=prefer_truth, index=index)
+            partial = inspect_drive_log(log, mapping, prefer_truth=prefer_truth, index=index)
             damaged = any(loss.severity == "lost" for loss in log.lost)
-            if found.sample is None or not (damaged or found.sample.chunks > MOST_SAMPLED * found.sample.of_chunks):
-                return found
+            if partial.sample is None or not (
+                damaged or partial.sample.chunks > MOST_SAMPLED * partial.sample.of_chunks
+            ):
+                return partial
     with closing(open_log(path, budget, msgs)) as log:
         return inspect_drive_log(log, mapping, prefer_truth=prefer_truth)
 
@@ -385,8 +387,8 @@ class _Gathered:
 
 
 def _gather(channels: MappedChannels, gathered: dict[tuple[str, str], _Gathered]) -> None:
-    for section, found in (("signals", channels.signals), ("truth", channels.truth)):
-        for name, channel in found.items():
+    for section, partial in (("signals", channels.signals), ("truth", channels.truth)):
+        for name, channel in partial.items():
             entry = gathered.setdefault((section, name), _Gathered(StepStatistics(), ValueStatistics()))
             stamps = channel.stamps_ns
             if entry.steps.last_ns is not None:
@@ -445,11 +447,11 @@ def _signal_report(
     entry = gathered.get((section, source.name), _Gathered(StepStatistics(), ValueStatistics()))
     gaps = entry.steps.gaps()
     largest = max(gaps, key=lambda g: g[0]) if gaps else None
-    known = entry.values.count > 0
-    own = {f"{source.name} ({source.label})"}
+    has_values = entry.values.count > 0
+    places = {f"{source.name} ({source.label})"}
     if section == "truth" and quality is not None:
-        own.add(f"{source.name} ({quality.describe()})")
-    dropped = {x.kind: x.count or 0 for x in losses if x.where in own}
+        places.add(f"{source.name} ({quality.describe()})")
+    dropped = {x.kind: x.count or 0 for x in losses if x.where in places}
     # Messages that were sorted back are used.
     dropped |= {x.kind: x.count or 0 for x in losses if x.where == source.read_topic and x.kind in TOPIC_DROPS}
     clock = clocks[clock_key(source)]
@@ -461,10 +463,10 @@ def _signal_report(
         samples=entry.steps.count,
         rate_hz=_inverse(entry.steps.median_s),
         latency_s=clock.median_delay_s + source.latency_s,
-        mean=entry.values.mean if known else float("nan"),
+        mean=entry.values.mean if has_values else float("nan"),
         std=entry.values.std,
-        minimum=entry.values.low if known else float("nan"),
-        maximum=entry.values.high if known else float("nan"),
+        minimum=entry.values.low if has_values else float("nan"),
+        maximum=entry.values.high if has_values else float("nan"),
         gaps=len(gaps),
         largest_gap_s=largest[0] if largest else float("nan"),
         largest_gap_at_s=(largest[1] - log.start_ns) * 1e-9 if largest else float("nan"),

@@ -71,13 +71,13 @@ class StepStatistics:
     @property
     def median_s(self) -> float:
         """Median step; NaN with fewer than two times."""
-        steps = self._steps()
+        steps = self.steps_s.values
         return float(np.median(steps)) if steps.shape[0] else float("nan")
 
     @property
     def jitter_p95_s(self) -> float:
         """95th percentile of |step − median|; NaN with fewer than two times."""
-        steps = self._steps()
+        steps = self.steps_s.values
         return float(np.quantile(np.abs(steps - np.median(steps)), 0.95)) if steps.shape[0] else float("nan")
 
     @property
@@ -89,9 +89,6 @@ class StepStatistics:
         """Return the steps that are gaps: their length in s and start in ns, in time order."""
         limit = max(MIN_GAP_S, GAP_PERIODS * self.median_s)
         return sorted((s for s in self.long_steps if s[0] > limit), key=lambda s: s[1])
-
-    def _steps(self) -> FloatArray:
-        return self.steps_s.values
 
 
 @dataclass(slots=True)

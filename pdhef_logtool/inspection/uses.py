@@ -1,4 +1,4 @@
-"""What a log is good for, and what it still lacks for sideslip, in a sentence each."""
+"""Possible uses of a log, and the signals that sideslip estimation still needs."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def usable_signals(mapping: Mapping) -> frozenset[str]:
     return frozenset(have)
 
 
-def what_it_is_good_for(mapping: Mapping) -> str:
+def possible_uses(mapping: Mapping) -> str:
     """Return what can be done with a log that is mapped so."""
     have = usable_signals(mapping)
     names = [preset_of(s.name) for s in all_specs() if s.needs <= have and not s.network and not s.needs_noise]
@@ -42,13 +42,13 @@ def what_it_is_good_for(mapping: Mapping) -> str:
     elif names and have:
         uses.append(f"run {', '.join(list(dict.fromkeys(names))[:3])}{_scored(mapping)}")
     if mapping.truth and not (names and have):
-        uses.append("look at the truth")
+        uses.append("plot the ground truth")
     if have:
-        uses.append("look at its signals in Rerun or MCAP")
-    return "; ".join(uses) or "look at its topics and fields (--fields)"
+        uses.append("export its signals to Rerun or MCAP")
+    return "; ".join(uses) or "list its topics and fields (--fields)"
 
 
-def what_it_lacks(mapping: Mapping) -> str:
+def missing_for_sideslip(mapping: Mapping) -> str:
     """Return what sideslip still needs; empty where nothing is missing."""
     lacking = sorted(spec_of(_MAIN).needs - usable_signals(mapping), key=list(_WORDS).index)
     return ", ".join(_WORDS.get(n, n) for n in lacking)
@@ -56,14 +56,14 @@ def what_it_lacks(mapping: Mapping) -> str:
 
 def uses_of(mapping: Mapping) -> MappingABC[str, str]:
     """Return both sentences by name, as ``pdhef inspect --json`` prints them."""
-    return {"can": what_it_is_good_for(mapping), "sideslip_needs": what_it_lacks(mapping)}
+    return {"can": possible_uses(mapping), "sideslip_needs": missing_for_sideslip(mapping)}
 
 
 def _scored(mapping: Mapping) -> str:
     truth = set(mapping.truth)
     place = {"x_m", "lat_deg", "ecef_position_m", "enu_velocity_m_s", "ecef_velocity_m_s"} & truth
     if {"vx_m_s", "vy_m_s"} <= truth or "sideslip_rad" in truth or (place and {"quat_wxyz", "yaw_rad"} & truth):
-        return " and score it against the truth"
+        return " and score it against ground truth"
     if place or {"course_rad", "vx_m_s"} & truth:
-        return ", and compare speed or course with the truth, which holds no sideslip"
-    return "; there is no truth to score it against"
+        return ", and compare speed or course with ground truth, which contains no sideslip"
+    return "; without ground truth it has no score"

@@ -156,11 +156,11 @@ class CanSignalLog(DriveLog):
         self._views: dict[str, _CanView] = {}
         self.short_frames: tuple[Loss, ...] = ()
         databases = [(path, _load_dbc(path)) for path in settings.dbc]
-        known = {t.name for t in log.topics}
+        valid_ids = {t.name for t in log.topics}
         paths: dict[str, _FramePaths | str] = {}
         problems: list[str] = []
         for source in sources:
-            if source.topic not in known:
+            if source.topic not in valid_ids:
                 continue  # check_mapping names it, with the nearest topic.
             if source.topic not in paths:
                 paths[source.topic] = _frame_paths(source.topic, log.fields(source.topic), settings)
@@ -174,17 +174,17 @@ class CanSignalLog(DriveLog):
                 expected="CAN frames, and messages and signals of the DBC",
                 got="; ".join(dict.fromkeys(problems)),
                 where=", ".join(p.name for p in settings.dbc),
-                remedy='write field = "can:<message>.<signal>"; [can] says where frames keep their parts',
+                remedy='write field = "can:<message>.<signal>"; [can] names the fields of a frame',
             )
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
         """The log's topics, and one for each view."""
-        own = {t.name: t for t in self._log.topics}
+        wanted = {t.name: t for t in self._log.topics}
         views = (
-            TopicInfo(name, v.message.name, "can", own[v.source.topic].messages) for name, v in self._views.items()
+            TopicInfo(name, v.message.name, "can", wanted[v.source.topic].messages) for name, v in self._views.items()
         )
-        return (*own.values(), *views)
+        return (*wanted.values(), *views)
 
     @property
     def occupied(self) -> OccupiedTime:
@@ -231,17 +231,17 @@ class CanSignalLog(DriveLog):
         raw: dict[str, list[str]] = {}
         for topic, paths in requests.items():
             view = self._views.get(topic)
-            own = paths if view is None else (*view.paths.all, *(p for p in paths if p not in view.source.paths))
+            wanted = paths if view is None else (*view.paths.all, *(p for p in paths if p not in view.source.paths))
             merged = raw.setdefault(topic if view is None else view.source.topic, [])
-            merged += [p for p in own if p not in merged]
+            merged += [p for p in wanted if p not in merged]
         read = self._log.read(raw, start_ns, end_ns, quiet=quiet, stamps=stamps) if raw or stamps else {}
         short: dict[str, Loss] = {}
-        found = {topic: read[topic] for topic in stamps}
+        matches = {topic: read[topic] for topic in stamps}
         for topic, paths in requests.items():
             view = self._views.get(topic)
-            found[topic] = read[topic] if view is None else self._view_columns(view, read, topic, paths, short)
+            matches[topic] = read[topic] if view is None else self._view_columns(view, read, topic, paths, short)
         self.short_frames = tuple(short.values())
-        return found
+        return matches
 
     @property
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:
@@ -279,11 +279,11 @@ class CanSignalLog(DriveLog):
 def _is_message(frames: Columns, view: _CanView, settings: CanSettings) -> BoolArray:
     """Return which frames [N] carry data of the view's message."""
     number = np.asarray(frames.fields[view.paths.identifier], dtype=np.float64)
-    known = np.isfinite(number) & (number >= 0.0) & (number < 2.0**32)
+    valid_ids = np.isfinite(number) & (number >= 0.0) & (number < 2.0**32)
     # Signed 32-bit fields hold an identifier with the extended flag as a negative number.
     negative = np.isfinite(number) & (number < 0.0) & (number >= -(2.0**31))
-    ids: IntArray = np.where(known, number, np.where(negative, number + 2.0**32, 0.0)).astype(np.int64)
-    fits = (known | negative) & ((ids & NO_DATA_FLAGS) == 0)
+    ids: IntArray = np.where(valid_ids, number, np.where(negative, number + 2.0**32, 0.0)).astype(np.int64)
+    fits = (valid_ids | negative) & ((ids & NO_DATA_FLAGS) == 0)
     bare = ids & ID_BITS
     fits &= (bare & settings.id_mask) == (view.message.frame_id & settings.id_mask)
     flagged = (ids & EXTENDED_FLAG) != 0
@@ -308,10 +308,10 @@ def _payload(frames: Columns, paths: _FramePaths, rows: IntArray) -> tuple[NDArr
     valid = np.isfinite(number) & (number >= 0.0) & (number <= 255.0)
     available = np.cumprod(valid, axis=1, dtype=np.int64).sum(axis=1)
     if paths.length is not None:
-        told = np.asarray(frames.fields[paths.length], dtype=np.float64)[rows]
+        stated_length = np.asarray(frames.fields[paths.length], dtype=np.float64)[rows]
         # Above 8 a length code of CAN FD is no number of bytes, and the array itself has the right length.
-        shorter = (told >= 0.0) & (told <= 8.0) & (told < available)
-        available = np.where(shorter, told, available).astype(np.int64)
+        shorter = (stated_length >= 0.0) & (stated_length <= 8.0) & (stated_length < available)
+        available = np.where(shorter, stated_length, available).astype(np.int64)
     return np.where(valid, number, 0.0).astype(np.uint8), available
 
 
@@ -369,10 +369,10 @@ def _frame_paths(topic: str, fields: tuple[FieldInfo, ...], settings: CanSetting
     def find(names: Sequence[str], given: str, entry: str, allowed: tuple[str, ...]) -> str | None:
         if given:
             return given
-        found = _best([p for p, kind in kinds.items() if kind in allowed], names)
-        if len(found) > 1:
-            problems.append(f"{topic} has {' and '.join(found)}: say which in [can] {entry}")
-        return found[0] if found else None
+        matches = _best([p for p, kind in kinds.items() if kind in allowed], names)
+        if len(matches) > 1:
+            problems.append(f"{topic} has {' and '.join(matches)}: name the field in [can] {entry}")
+        return matches[0] if matches else None
 
     numbers = ("number", "bool")
     identifier = find(ID_NAMES, settings.id_field, "id_field", ("number",))
@@ -383,13 +383,13 @@ def _frame_paths(topic: str, fields: tuple[FieldInfo, ...], settings: CanSetting
     if data is not None and settings.data_encoding != "bytes":
         data += f"|{settings.data_encoding}"
     elif data is not None and kinds.get(data) == "string":
-        problems.append(f'{topic}.{data} is a text: say [can] data_encoding = "hex" or "base64"')
+        problems.append(f'{topic}.{data} is a text: set [can] data_encoding = "hex" or "base64"')
     length = find(LENGTH_NAMES, settings.length_field, "length_field", ("number",))
     extended = find(EXTENDED_NAMES, settings.extended_field, "extended_field", numbers)
     flags = [_best([p for p, k in kinds.items() if k in numbers], n) for n in (ERROR_NAMES, REMOTE_NAMES)]
     if problems or identifier is None or data is None:
         return "; ".join(problems)
-    no_data = tuple(p for found in flags for p in found)
+    no_data = tuple(p for matches in flags for p in matches)
     return _FramePaths(identifier, data, length, extended, no_data, settings.bus_field or None)
 
 
@@ -408,15 +408,15 @@ def _plain_kinds(fields: tuple[FieldInfo, ...]) -> dict[str, str]:
 def _best(paths: Sequence[str], names: Sequence[str]) -> list[str]:
     """Return the paths whose last part bears the first of the names that any has, the least nested of them."""
     for name in names:
-        found = [p for p in paths if p.rsplit(".", 1)[-1].replace("_", "").lower() == name]
-        if found:
-            depth = min(p.count(".") for p in found)
-            return [p for p in found if p.count(".") == depth]
+        matches = [p for p in paths if p.rsplit(".", 1)[-1].replace("_", "").lower() == name]
+        if matches:
+            depth = min(p.count(".") for p in matches)
+            return [p for p in matches if p.count(".") == depth]
     return []
 
 
-def _near(name: str, known: Sequence[str]) -> str:
-    close = get_close_matches(name, known, n=1, cutoff=0.3)
+def _near(name: str, valid_ids: Sequence[str]) -> str:
+    close = get_close_matches(name, valid_ids, n=1, cutoff=0.3)
     return f" (did you mean {close[0]}?)" if close else ""
 
 
@@ -445,12 +445,12 @@ def _load_cached(path: Path, _modified_ns: int, _size: int) -> Database:
     expected = "a DBC file"
     try:
         # Overlapping signals are an error of the file, not of the signals that are asked for.
-        found = cantools.database.load_file(path, strict=False)
+        matches = cantools.database.load_file(path, strict=False)
     except Exception as error:  # noqa: BLE001  cantools' parsers raise whatever a malformed file leads them to.
         reason = (str(error).splitlines() or [""])[0] or type(error).__name__
         raise MappingFileError(expected=expected, got=reason, where=str(path), remedy="correct [can] dbc") from None
-    if not isinstance(found, Database):
+    if not isinstance(matches, Database):
         raise MappingFileError(
             expected=expected, got="a file of another kind", where=str(path), remedy="correct [can] dbc"
         )
-    return found
+    return matches

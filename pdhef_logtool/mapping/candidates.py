@@ -1,4 +1,4 @@
-"""Candidates for signals and truth among all numeric fields of a log: names first, then what the values say.
+"""Candidates for signals and ground truth among all numeric fields of a log: by names first, then by values.
 
 Recognised message types come before (``recognition.py``); what they leave open is looked for here. A candidate is
 *taken* when its name or a documented type says what it is and nothing speaks against it; what remains unsure about a
@@ -41,17 +41,15 @@ MOST_READ = 160
 LEAST_SCORE = 0.45
 
 #: Factors that a field without a unit may have, the first one by convention, and the kind of unit by quantity.
+SPEEDS = (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704))
+ANGLES = (("rad", 1.0), ("deg", math.radians(1.0)))
 HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
     "acceleration": (("m/s²", 1.0), ("g", UNITS["acceleration"]["g"]), ("mg", UNITS["acceleration"]["mg"])),
     "rate": (("rad/s", 1.0), ("deg/s", math.radians(1.0))),
-    "steering": (("rad", 1.0), ("deg", math.radians(1.0))),
-    "sideslip": (("rad", 1.0), ("deg", math.radians(1.0))),
-    "speed": (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704)),
-    "velocity": (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704)),
-    "wheel speed": (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704)),
+    **dict.fromkeys(("steering", "sideslip"), ANGLES),
+    **dict.fromkeys(("speed", "velocity", "wheel speed"), SPEEDS),
     "wheel rate": (("rad/s", 1.0), ("rpm", 2.0 * math.pi / 60.0)),
-    "latitude": (("deg", 1.0),),
-    "longitude": (("deg", 1.0),),
+    **dict.fromkeys(("latitude", "longitude"), (("deg", 1.0),)),
 }
 #: What a car can do, in SI, by quantity: a value beyond is of another unit, or no such quantity.
 MOST = {
@@ -66,7 +64,7 @@ class Candidate:
 
     Attributes
     ----------
-    section : ``signals`` or ``truth``. source : the field, with scale and offset as they are believed to be.
+    section : ``signals`` or ``truth``. source : the field, with its likeliest scale and offset.
     score : 0 to 1. reason : what speaks for it. doubt : what is unsure of it, empty if nothing is.
     taken : it stands in the mapping.
     """
@@ -89,7 +87,7 @@ def _short(scale: float | tuple[float, ...]) -> str:
 
 
 @dataclass(slots=True)
-class Found:
+class Field:
     """A field with a meaning, while it is being judged.
 
     Attributes
@@ -109,7 +107,7 @@ class Found:
     factors: tuple[tuple[str, float], ...]
     fixed: bool = False
     section: str = ""
-    known: bool = False
+    unit_known: bool = False
     anchor: bool = False
     sign: float = 1.0
     bonus: float = 0.0
@@ -130,28 +128,28 @@ class Found:
 
     @property
     def unit_doubt(self) -> list[str]:
-        """What is to be said of a unit that neither the name nor the drive tells."""
-        if self.known or self.fixed:
+        """Doubt about a unit that neither the name nor the drive gives."""
+        if self.unit_known or self.fixed:
             return []
         unit = self.factors[0][0]
         if unit != HYPOTHESES[self.meaning.quantity][0][0]:
-            return [f"its unit is not said; taken as {unit}, the others are out of any car's range"]
-        return [f"its unit is not said and the drive does not tell; taken as {unit}"]
+            return [f"unit not given; taken as {unit}: values in other units are out of a car's range"]
+        return [f"unit not given and not observable in this drive; taken as {unit}"]
 
     @property
     def is_axis(self) -> bool:
         """Return whether an axis letter names it: where its axes point is a question of its mounting."""
-        own = words_of(self.path.rpartition(".")[2])
-        return "yaw" not in own and not _CAR_AXES & set(own)
+        leaf_words = words_of(self.path.rpartition(".")[2])
+        return "yaw" not in leaf_words and not _CAR_AXES & set(leaf_words)
 
     @property
     def is_downward(self) -> bool:
-        """Return whether its name says that it counts about, or along, the downward axis."""
+        """Return whether it is positive about, or along, the downward axis by its name."""
         return "down" in words_of(self.path.rpartition(".")[2]) and self.meaning.part == "z"
 
     @property
     def score(self) -> float:
-        """How far to believe that the field is what its name says, 0 to 1."""
+        """Confidence that the field is the quantity that its name gives, 0 to 1."""
         if self.fixed:
             return 0.95
         score = 0.45 * self.meaning.strength + 0.1 + self.bonus
@@ -160,26 +158,26 @@ class Found:
         score -= {"device": 0.2, "navigation": 0.1 if self.meaning.quantity == "speed" else 0.0}.get(self.role, 0.0)
         return min(LEAST_SCORE - 0.01 if self.is_weak else 0.94, max(0.0, score))
 
-    def standing_for(self, speed: FloatArray) -> Found:
+    def standing_for(self, speed: FloatArray) -> Field:
         """Return a known speed on the grid [M], m/s, that is made of this field and others like it."""
         meaning = Meaning("speed", "x", 1.0, "m/s", 1.0, "mean of wheel speeds")
         seen = Seen(speed, speed, self.seen.rate_hz)
-        return replace(self, meaning=meaning, seen=seen, factors=(("m/s", 1.0),), sign=1.0, offset=0.0, known=True)
+        return replace(self, meaning=meaning, seen=seen, factors=(("m/s", 1.0),), sign=1.0, offset=0.0, unit_known=True)
 
     def use(self, unit: str) -> None:
         """Take the field in a unit."""
         self.factors = tuple(sorted(self.factors, key=lambda f: f[0] != unit))
-        self.known = True
+        self.unit_known = True
 
     def candidate(self, name: str, section: Literal["signals", "truth"], *, taken: bool) -> Candidate:
-        """Return the record of what was found."""
+        """Return the record of the field as a source of a signal."""
         source = SignalSource(name, self.topic.name, self.path, self.stamp, self.scale, self.offset)
         most = MOST.get(self.meaning.quantity)
         finite = self.seen.values[np.isfinite(self.seen.values)] * self.scale + self.offset
         if most is not None and finite.shape[0] and float(np.abs(finite).max()) > most:
             source = replace(source, valid_min=-most, valid_max=most)
         reason = "; ".join([self.meaning.why, *self.reasons])
-        doubts = [*self.doubts, *([] if self.seen.changes else ["it does not change in what was read of the log"])]
+        doubts = [*self.doubts, *([] if self.seen.changes else ["constant in the parts of the log that were read"])]
         return Candidate(section, source, round(self.score, 2), reason, "; ".join(doubts), taken)
 
 
@@ -200,31 +198,31 @@ def names_of(quantity: str, part: str) -> tuple[str, ...]:
 
 def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendors: Vendors) -> list[Named]:
     """Return the fields whose name or documented type gives them a meaning; the last entry tells a documented one."""
-    found = []
+    results = []
     for topic, role in topics:
         fields = log.fields(topic.name, quiet=True)
         if len(fields) > MOST_FIELDS or vendors.why_left_out(topic.type_name):
             continue
         if is_joints(topic):
             joints = () if role == "command" else joint_meanings(log, topic)
-            found += [(topic, role, FieldInfo(path, "number"), meaning, False) for path, meaning in joints]
+            results += [(topic, role, FieldInfo(path, "number"), meaning, False) for path, meaning in joints]
             continue
-        known = vendors.fields_of(topic.type_name)
+        documented_fields = vendors.fields_of(topic.type_name)
         for info in fields:
             if is_command(info.path) or info.kind != "number" or info.path.count("[]") > info.path.endswith("[]"):
                 continue
-            if info.path in known:
-                found.append((topic, role, info, known[info.path].meaning, True))
-            elif not known or info.path.count(".") or vendors.is_export(topic.type_name):
+            if info.path in documented_fields:
+                results.append((topic, role, info, documented_fields[info.path].meaning, True))
+            elif not documented_fields or info.path.count(".") or vendors.is_export(topic.type_name):
                 meaning = meaning_of(topic.name, topic.type_name, info.path, info.unit)
                 if meaning is not None:
-                    found.append((topic, role, info, meaning, False))
-    return found
+                    results.append((topic, role, info, meaning, False))
+    return results
 
 
 def look(
     log: DriveLog, named: Sequence[Named], vendors: Vendors, sources: Sequence[SignalSource]
-) -> tuple[Pieces, list[Found]]:
+) -> tuple[Pieces, list[Field]]:
     """Read what has a meaning, and what is mapped already, in a few pieces of the log.
 
     Fields without a number and those that no unit brings into a car's range are left out.
@@ -239,13 +237,13 @@ def look(
             paths += [p for p in source.paths if p not in paths]
     pieces = Pieces(log)
     samples = pieces.read(requests)
-    weighable = [one for entry in named for one in _weighable(log, entry, samples, vendors) if one.factors]
-    return pieces, weighable + sources_found(log, sources, samples)
+    weighable = [item for entry in named for item in _weighable(log, entry, samples, vendors) if item.factors]
+    return pieces, weighable + anchors_of(log, sources, samples)
 
 
 def _weighable(
     log: DriveLog, named: Named, samples: Mapping[tuple[str, str], Seen], vendors: Vendors
-) -> Iterator[Found]:
+) -> Iterator[Field]:
     """Yield a field, or each element of an array that has a meaning."""
     topic, role, info, meaning, documented = named
     fields = log.fields(topic.name, quiet=True)
@@ -263,19 +261,19 @@ def _weighable(
         if its.quantity == "wheel speed" and not factors:  # too large for a speed: rotational
             its = replace(its, quantity="wheel rate")
             factors = _factors(its, seen)
-        one = Found(topic, name, its, role, stamp_of(fields, name), seen, factors)
+        item = Field(topic, name, its, role, stamp_of(fields, name), seen, factors)
         if _is_nested_imu(topic, fields, name):
-            one.known = True
-            one.reasons.append("a nested sensor_msgs/Imu, in SI units")
+            item.unit_known = True
+            item.reasons.append("a nested sensor_msgs/Imu, in SI units")
         if documented:
-            _document(one, vendors.fields_of(topic.type_name)[info.path])
+            _document(item, vendors.fields_of(topic.type_name)[info.path])
         elif its.scale is not None:
-            one.known = True
-            one.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")
-        if one.is_downward and not documented:
-            one.sign = -1.0
-            one.reasons.append("positive downward by its name")
-        yield one
+            item.unit_known = True
+            item.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")
+        if item.is_downward and not documented:
+            item.sign = -1.0
+            item.reasons.append("positive downward by its name")
+        yield item
 
 
 def _is_nested_imu(topic: TopicInfo, fields: tuple[FieldInfo, ...], path: str) -> bool:
@@ -286,18 +284,18 @@ def _is_nested_imu(topic: TopicInfo, fields: tuple[FieldInfo, ...], path: str) -
     return any(f.path.startswith(f"{struct}_covariance[") for f in fields)
 
 
-def _document(one: Found, entry: VendorField) -> None:
-    one.fixed = one.known = True
-    one.section = entry.section
-    one.factors = ((entry.unit, abs(entry.scale)),)
-    one.sign, one.offset = math.copysign(1.0, entry.scale), entry.offset
-    one.reasons.append(f"documented: {entry.page}")
+def _document(item: Field, entry: VendorField) -> None:
+    item.fixed = item.unit_known = True
+    item.section = entry.section
+    item.factors = ((entry.unit, abs(entry.scale)),)
+    item.sign, item.offset = math.copysign(1.0, entry.scale), entry.offset
+    item.reasons.append(f"documented: {entry.page}")
 
 
-def sources_found(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tuple[str, str], Seen]) -> list[Found]:
-    """Return what is mapped already, as fields that nothing here changes."""
+def anchors_of(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tuple[str, str], Seen]) -> list[Field]:
+    """Return mapped sources as fields that are not changed."""
     topics = {t.name: t for t in log.topics}
-    found = []
+    results = []
     for source in sources:
         seen = read.get((source.topic, source.paths[0]))
         if seen is None or isinstance(source.scale, tuple) or not isinstance(source.offset, float):
@@ -305,17 +303,17 @@ def sources_found(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[
         if not isinstance(source.field, str):
             continue
         meaning = meaning_of_signal(source.name)
-        one = Found(topics[source.topic], source.paths[0], meaning, "sensor", source.stamp, seen, (("", 1.0),))
-        one.factors, one.sign = (("", abs(source.scale)),), math.copysign(1.0, source.scale)
-        one.offset, one.fixed, one.known, one.anchor = source.offset, True, True, True
-        found.append(one)
-    return found
+        item = Field(topics[source.topic], source.paths[0], meaning, "sensor", source.stamp, seen, (("", 1.0),))
+        item.factors, item.sign = (("", abs(source.scale)),), math.copysign(1.0, source.scale)
+        item.offset, item.fixed, item.unit_known, item.anchor = source.offset, True, True, True
+        results.append(item)
+    return results
 
 
-def source_found(source: SignalSource, found: Sequence[Found]) -> Found | None:
+def anchor_of(source: SignalSource, results: Sequence[Field]) -> Field | None:
     """Return the anchor that a mapped source became."""
     meaning = meaning_of_signal(source.name)
-    return next((f for f in found if f.anchor and f.meaning == meaning), None)
+    return next((f for f in results if f.anchor and f.meaning == meaning), None)
 
 
 def _factors(meaning: Meaning, seen: Seen) -> tuple[tuple[str, float], ...]:
@@ -340,12 +338,12 @@ def stamp_of(fields: tuple[FieldInfo, ...], path: str) -> str:
     return stamp_path_of(fields)
 
 
-def triad_of(one: Found) -> str:
+def triad_of(item: Field) -> str:
     """Return what the three axes of one vector share: topic and struct, or name without the axis."""
-    return f"{one.topic.name}.{one.path.rpartition('.')[0] or one.path.rstrip('xyzXYZ0123[]_')}"
+    return f"{item.topic.name}.{item.path.rpartition('.')[0] or item.path.rstrip('xyzXYZ0123[]_')}"
 
 
-def leaf_group(one: Found) -> tuple[str, str]:
+def leaf_group(item: Field) -> tuple[str, str]:
     """Return topic and innermost-but-one struct: accelerations and rates of one IMU share it."""
-    parts = one.path.split(".")
-    return one.topic.name, ".".join(parts[: max(0, len(parts) - 2)])
+    parts = item.path.split(".")
+    return item.topic.name, ".".join(parts[: max(0, len(parts) - 2)])

@@ -29,7 +29,7 @@ LOSS_TEXTS = {
     "out-of-range": "sample outside valid_min and valid_max dropped",
     "duplicate-stamp": "message that repeats the stamp of another dropped, the first to arrive kept",
     "out-of-order": "message recorded after a later one, sorted back by stamp",
-    "truth-quality": "truth sample that the quality gate rejects dropped",
+    "truth-quality": "ground-truth sample rejected by the quality gate dropped",
     "delay-unknown": "log time is not 0 to 1 s after the stamps: the delay is unknown, arrival is taken as the stamp",
 }
 LOST_KINDS = frozenset({"nan", "bad-stamp"})
@@ -131,9 +131,9 @@ def gate_mask(
     if gate.values:
         passes |= np.isin(gate_values, np.asarray(gate.values))
     last = np.searchsorted(gate_stamps_ns, stamps_ns, side="right") - 1
-    known = last >= 0
+    follows_gate = last >= 0
     last = np.maximum(last, 0)
-    return np.asarray(known & passes[last] & (stamps_ns - gate_stamps_ns[last] <= hold_ns), dtype=np.bool_)
+    return np.asarray(follows_gate & passes[last] & (stamps_ns - gate_stamps_ns[last] <= hold_ns), dtype=np.bool_)
 
 
 def read_signals(
@@ -167,11 +167,11 @@ def read_signals(
     counts: dict[tuple[Role, str], Counter[str]] = {}
 
     def channels(role: Role, sources: Mapped[str, SignalSource], units: Mapped[str, str]) -> dict[str, Channel]:
-        found = {}
+        result = {}
         for name, source in sources.items():
             count = counts[role, name] = Counter()
-            found[name] = _channel(log, source, units.get(name, ""), clocks, columns, losses, count)
-        return found
+            result[name] = _channel(log, source, units.get(name, ""), clocks, columns, losses, count)
+        return result
 
     signals = channels("signal", resolved.signals, SIGNAL_UNITS)
     truth = channels("truth", resolved.truth, TRUTH_UNITS)
@@ -347,10 +347,10 @@ def _apply_gate(
     values = np.empty(0)
     if topic is not None and len(topic):
         on_log_clock, usable = stamps_on_log_clock(log, topic, source, clock)
-        at = on_log_clock[usable] - np.int64(round(source.latency_s * 1e9))
+        gate_stamps = on_log_clock[usable] - np.int64(round(source.latency_s * 1e9))
         raw_values = si_values(topic, source)[usable]
-        order = np.lexsort((raw_values, topic.log_time_ns[usable], at))
-        stamps, values = at[order], raw_values[order]
+        order = np.lexsort((raw_values, topic.log_time_ns[usable], gate_stamps))
+        stamps, values = gate_stamps[order], raw_values[order]
     gated: dict[str, Channel] = {}
     for name, channel in truth.items():
         keep = gate_mask(channel.stamps_ns, stamps, values, gate, hold_ns)

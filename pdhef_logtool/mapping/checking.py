@@ -54,10 +54,10 @@ def resolve_mapping(log: DriveLog, mapping: Mapping) -> Mapping:
     """Return the mapping with every ``auto`` stamp replaced by what the log's schemas offer."""
     if all(s.stamp != AUTO_STAMP for s in mapping.sources()):
         return mapping
-    known = {t.name for t in log.topics}
+    names = {t.name for t in log.topics}
 
     def resolved(source: TimedT) -> TimedT:
-        is_auto = source.stamp == AUTO_STAMP and source.topic in known
+        is_auto = source.stamp == AUTO_STAMP and source.topic in names
         return replace(source, stamp=stamp_path_of(log.fields(source.topic))) if is_auto else source
 
     return replace(
@@ -79,11 +79,11 @@ def check_mapping(mapping: Mapping, log: DriveLog) -> None:
     """
     log = with_can_signals(log, mapping)
     topics = {t.name: t for t in log.topics}
-    own = {s.name for s in log.topics if s.encoding != "can"}
+    recorded = {s.name for s in log.topics if s.encoding != "can"}
     problems: list[str] = []
     for source in mapping.sources():
         if source.read_topic not in topics:
-            problems.append(f"{source.name}: no topic {source.topic}{_near(source.topic, own)}")
+            problems.append(f"{source.name}: no topic {source.topic}{_near(source.topic, recorded)}")
             continue
         fields = log.fields(source.read_topic)
         if not fields:
@@ -139,18 +139,18 @@ def _kind_of(path: str, kinds: dict[str, str]) -> str | None:
     if path in kinds:
         return kinds[path]
     as_sequence = _INDEX.sub("[]", path)
-    for known, kind in kinds.items():
-        if _INDEX.sub("[]", known) == as_sequence and (known == as_sequence or "[]" in known):
+    for names, kind in kinds.items():
+        if _INDEX.sub("[]", names) == as_sequence and (names == as_sequence or "[]" in names):
             return kind
     if any(k.startswith((f"{path}.", f"{path}[")) for k in kinds):
         return "struct"
     return None
 
 
-def _near(name: str, known: set[str]) -> str:
-    close = get_close_matches(name, sorted(known), n=1, cutoff=0.5)
+def _near(name: str, names: set[str]) -> str:
+    close = get_close_matches(name, sorted(names), n=1, cutoff=0.5)
     if close:
         return f" (did you mean {close[0]}?)"
     tail = name.rsplit(".", 1)[-1].rsplit("/", 1)[-1]
-    same_tail = sorted(k for k in known if k.rsplit(".", 1)[-1].rsplit("/", 1)[-1] == tail)
+    same_tail = sorted(k for k in names if k.rsplit(".", 1)[-1].rsplit("/", 1)[-1] == tail)
     return f" (did you mean {same_tail[0]}?)" if same_tail else ""

@@ -1,4 +1,4 @@
-"""The mapping in effect for one log: the one given, or what its types tell, with every ambiguity said."""
+"""The mapping in effect for one log: the given mapping, or the recognised one with its ambiguities."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pdhef_logtool.records.signals import ALIGNED_SIGNALS
 
 @dataclass(frozen=True, slots=True)
 class ChosenMapping:
-    """The mapping in effect, and what is to be said of it.
+    """The mapping in effect and its open points.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class ChosenMapping:
 
 
 def recorded_mapping(log: SlimLog, prefer_truth: Literal["perfect", "rtk"]) -> ChosenMapping:
-    """Return the mapping that a slim log was made with.
+    """Return the mapping of a reduced log.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def recorded_mapping(log: SlimLog, prefer_truth: Literal["perfect", "rtk"]) -> C
         chosen = TypeAdapter(ChosenMapping).validate_python(log.record.mapped)
     except ValidationError as error:
         raise LogError(
-            expected="the mapping of a slim log",
+            expected="the mapping of a reduced log",
             got="; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()[:3]),
             where=str(log.path),
             remedy="delete it; pdhef run LOG --cache DIR writes it again",
@@ -66,7 +66,7 @@ def recorded_mapping(log: SlimLog, prefer_truth: Literal["perfect", "rtk"]) -> C
     mapping = chosen.mapping
     if chosen.prefer_truth != prefer_truth and mapping.truth:
         raise MappingError(
-            expected=f"prefer_truth = {chosen.prefer_truth}, which this slim log was made with",
+            expected=f"prefer_truth = {chosen.prefer_truth}, which this reduced log was made with",
             got=prefer_truth,
             where=str(log.path),
             remedy="read the source log",
@@ -86,11 +86,7 @@ def recognise(log: DriveLog, *, prefer_truth: Literal["perfect", "rtk"]) -> Auto
 
 
 def choose_mapping(
-    log: DriveLog,
-    mapping: Mapping | None,
-    *,
-    prefer_truth: Literal["perfect", "rtk"],
-    require_signals: bool = True,
+    log: DriveLog, mapping: Mapping | None, *, prefer_truth: Literal["perfect", "rtk"], require_signals: bool = True
 ) -> ChosenMapping:
     """Return the mapping in effect: the one given, or what is recognised. Ambiguities are never settled silently.
 
@@ -106,27 +102,27 @@ def choose_mapping(
         return ChosenMapping(mapping, missing, prefer_truth, (), (*mapping.notes, *_borrowed(log, mapping)))
     if log.slim is not None:
         return recorded_mapping(log.slim, prefer_truth)
-    found = auto_map(log, prefer_truth=prefer_truth)
-    if require_signals and not found.mapping.signals:
+    auto = auto_map(log, prefer_truth=prefer_truth)
+    if require_signals and not auto.mapping.signals:
         raise MappingError(
             expected="fields that are a car's sensors",
-            got="; ".join(found.mapping.notes) or _topics_there_are(log),
+            got="; ".join(auto.mapping.notes) or _topics_there_are(log),
             where=str(log.path),
             remedy="pdhef inspect LOG --fields shows every number, pdhef map LOG helps to write a mapping.toml",
         )
-    remarks = (*found.mapping.notes, *_borrowed(log, found.mapping))
-    return ChosenMapping(found.mapping, found.missing, prefer_truth, found.ambiguities, remarks)
+    remarks = (*auto.mapping.notes, *_borrowed(log, auto.mapping))
+    return ChosenMapping(auto.mapping, auto.missing, prefer_truth, auto.ambiguities, remarks)
 
 
-def _filled(mapping: Mapping, found: Mapping) -> Mapping:
+def _filled(mapping: Mapping, auto: Mapping) -> Mapping:
     """Return the mapping with what recognised types give for the signals, and the truth as a whole, that it lacks."""
     return replace(
         mapping,
-        signals={**found.signals, **mapping.signals},
-        truth=mapping.truth or found.truth,
-        quality=mapping.quality if mapping.truth else mapping.quality or found.quality,
-        notes=(*mapping.notes, *found.notes),
-        checks=tuple(c for c in found.checks if c.subject not in mapping.signals),
+        signals={**auto.signals, **mapping.signals},
+        truth=mapping.truth or auto.truth,
+        quality=mapping.quality if mapping.truth else mapping.quality or auto.quality,
+        notes=(*mapping.notes, *auto.notes),
+        checks=tuple(c for c in auto.checks if c.subject not in mapping.signals),
     )
 
 

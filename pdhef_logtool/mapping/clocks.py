@@ -37,7 +37,7 @@ ENVELOPE_QUANTILE = 0.02
 MIN_BIN_SAMPLES = 20
 
 #: No transport takes longer, so that a stamp further off from log time than the others is no time at all.
-STRAY_STAMP_NS = 60_000_000_000
+OUTLIER_STAMP_NS = 60_000_000_000
 #: From this share on of stamps that are wrong in one way, all of them are given up and log time serves.
 UNUSABLE_SHARE = 0.1
 #: Messages of one stamp were measured apart, by a clock too coarse for them, when they were recorded apart by at
@@ -82,10 +82,10 @@ def clock_key(source: SignalSource) -> str:
 
 def sources_by_clock(mapping: Mapping) -> dict[str, SignalSource]:
     """Return the first source of each clock, by :func:`clock_key`."""
-    found: dict[str, SignalSource] = {}
+    first_sources: dict[str, SignalSource] = {}
     for source in mapping.sources():
-        found.setdefault(clock_key(source), source)
-    return found
+        first_sources.setdefault(clock_key(source), source)
+    return first_sources
 
 
 def apply_clock(stamps_ns: IntArray, clock: ClockModel) -> IntArray:
@@ -169,8 +169,8 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
     clocks = {}
     for key, source in wanted.items():
         raw, log_time, steps = (np.concatenate(column) for column in zip(*parts[key], strict=True))
-        seen, at, _ = (np.concatenate(column) for column in zip(*whole.get(key, parts[key]), strict=True))
-        unusable = "" if source.stamp == "log_time" else why_unusable(seen, at)
+        seen, recorded_ns, _ = (np.concatenate(column) for column in zip(*whole.get(key, parts[key]), strict=True))
+        unusable = "" if source.stamp == "log_time" else why_unusable(seen, recorded_ns)
         if unusable:  # they do not tell the period either
             steps = np.concatenate([np.diff(part[1]) for part in parts[key]]) * 1e-9
         clocks[key] = _clock_of(source, raw, log_time, steps, unusable)
@@ -188,7 +188,7 @@ def _of_other_clocks(clocks: Mapped[str, ClockModel]) -> dict[str, str]:
     return {
         key: f"it is {abs(delay_s):.1f} s {'behind' if delay_s > 0.0 else 'ahead of'} log time, other topics are not"
         for key, delay_s in delays_s.items()
-        if delay_s * 1e9 < -MAX_CREDIBLE_DELAY_NS or delay_s * 1e9 > STRAY_STAMP_NS
+        if delay_s * 1e9 < -MAX_CREDIBLE_DELAY_NS or delay_s * 1e9 > OUTLIER_STAMP_NS
     }
 
 
@@ -241,7 +241,7 @@ def why_unusable(stamps_ns: IntArray, log_time_ns: IntArray) -> str:
             return f"{repeats.size / n:.0%} of its stamps repeat another although the messages were recorded apart"
     delay_ns = (log_time_ns - stamps_ns).astype(np.float64)
     median_ns = float(np.median(delay_ns))
-    far = np.abs(delay_ns - median_ns) > STRAY_STAMP_NS
+    far = np.abs(delay_ns - median_ns) > OUTLIER_STAMP_NS
     if 0.0 <= median_ns <= MAX_CREDIBLE_DELAY_NS:
         far |= delay_ns < -MAX_CREDIBLE_DELAY_NS  # no message arrives before it is measured
     share = float(far.mean())
@@ -258,7 +258,7 @@ def stamps_on_log_clock(
     stamps = apply_clock(raw, clock)
     if source.stamp != "log_time" and clock.samples:
         delay_ns = (columns.log_time_ns - stamps).astype(np.float64)
-        usable = usable & (np.abs(delay_ns - clock.median_delay_s * 1e9) <= STRAY_STAMP_NS)
+        usable = usable & (np.abs(delay_ns - clock.median_delay_s * 1e9) <= OUTLIER_STAMP_NS)
     return stamps, usable
 
 
@@ -336,10 +336,10 @@ def _clock_of(
     delays_ns = log_time_ns - apply_clock(stamps_ns, line)
     median_ns = float(np.median(delays_ns))
     low_ns, high_ns = (float(q) for q in np.quantile(delays_ns, [0.0, 0.95]))
-    known = source.clock == "device" or 0.0 <= median_ns <= MAX_CREDIBLE_DELAY_NS
+    is_known = source.clock == "device" or 0.0 <= median_ns <= MAX_CREDIBLE_DELAY_NS
     return replace(
         line,
-        delay_known=known,
+        delay_known=is_known,
         median_delay_s=median_ns * 1e-9,
         p95_delay_s=high_ns * 1e-9,
         min_delay_s=low_ns * 1e-9,

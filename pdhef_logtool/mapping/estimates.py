@@ -1,4 +1,4 @@
-"""Which fields of a log are an estimate that somebody else recorded: flags ``[SIGNAL=]TOPIC[.FIELD]`` and tables."""
+"""Recorded estimates of other estimators: flags ``[SIGNAL=]TOPIC[.FIELD]`` and tables."""
 
 from __future__ import annotations
 
@@ -120,17 +120,17 @@ def sources_of(
         if signal is not None:
             if not path:
                 raise UsageError(expected=f"{signal}={topic.name}.FIELD", got=text, where=option)
-            found = {signal: path}
+            matches = {signal: path}
         else:
-            found, covariance = _recognise(topic, path, units, text, option)
+            matches, covariance = _recognise(topic, path, units, text, option)
             covariances += covariance
-        for name, field_path in found.items():
+        for name, field_path in matches.items():
             if name in sources:
                 raise UsageError(
                     expected="each signal once",
                     got=f"{name} from {sources[name].label} and from {topic.name}.{field_path}",
                     where=option,
-                    remedy="several estimators stand in a mapping file, one [estimates.NAME.SIGNAL] table a signal",
+                    remedy="for several estimators use a mapping file with [estimates.NAME.SIGNAL] tables",
                 )
             sources[name] = SignalSource(name=name, topic=topic.name, field=field_path)
     return sources, covariances[0] if len(covariances) == 1 else None
@@ -173,21 +173,21 @@ def _recognise(
 ) -> tuple[dict[str, str], list[CovarianceSource]]:
     """Return the fields by signal that a topic's type tells, all of them or the one that was named."""
     kind = topic.type_name.replace("/msg/", "/")
-    known: dict[str, str] = {}
+    path_of: dict[str, str] = {}
     covariance: list[CovarianceSource] = []
     if kind == STATE_TYPE:
-        known = {name: name for name in _STATE_FIELDS}
+        path_of = {name: name for name in _STATE_FIELDS}
         covariance = [CovarianceSource(topic.name, "covariance", 3, (0, 1, 2))]
     elif kind in TWIST_FIELDS:
-        known = {name: f"{TWIST_FIELDS[kind].format(part)}.{axis}" for name, (part, axis) in _TWIST.items()}
+        path_of = {name: f"{TWIST_FIELDS[kind].format(part)}.{axis}" for name, (part, axis) in _TWIST.items()}
         if kind in TWIST_COVARIANCES:
             covariance = [CovarianceSource(topic.name, TWIST_COVARIANCES[kind].removesuffix("[0]"), 6, (0, 1, 5))]
-    found = {name: field_path for name, field_path in known.items() if name in units and path in ("", field_path)}
-    if not found:
+    matches = {name: field_path for name, field_path in path_of.items() if name in units and path in ("", field_path)}
+    if not matches:
         raise UsageError(
-            expected="SIGNAL=TOPIC.FIELD, as the type does not tell which signal this is",
+            expected="SIGNAL=TOPIC.FIELD, as the type does not give the signal",
             got=f"{text} ({topic.type_name or 'no type'})",
             where=option,
             remedy=f"SIGNAL is one of {', '.join(units)}",
         )
-    return found, covariance if path == "" else []
+    return matches, covariance if path == "" else []

@@ -51,7 +51,7 @@ class Seen:
 
     @property
     def largest(self) -> float:
-        """Largest magnitude that is not one of a few stray samples; NaN without a number."""
+        """Largest magnitude without a few outliers; NaN without a number."""
         finite = np.abs(self.values[np.isfinite(self.values)])
         return float(np.quantile(finite, 0.995)) if finite.shape[0] else float("nan")
 
@@ -81,16 +81,16 @@ class Pieces:
         parts: dict[tuple[str, str], list[tuple[int, IntArray, FloatArray]]] = {}
         for number, start in enumerate(self.starts):
             for topic, columns in self._columns(requests, start).items():
-                at = (columns.log_time_ns - start) // CELL_NS
+                cell = (columns.log_time_ns - start) // CELL_NS
                 for path in requests[topic]:
                     values = np.asarray(columns.fields[path], dtype=np.float64)
                     values = np.where(np.abs(values) < LARGEST, values, np.nan)
                     if values.ndim == 1:
-                        parts.setdefault((topic, path), []).append((number, at, values))
+                        parts.setdefault((topic, path), []).append((number, cell, values))
                         continue
                     for i, column in enumerate(values.T[:most]):
-                        parts.setdefault((topic, f"{path}[{i}]"), []).append((number, at, column))
-        return {key: self._seen(found) for key, found in parts.items()}
+                        parts.setdefault((topic, f"{path}[{i}]"), []).append((number, cell, column))
+        return {key: self._seen(samples) for key, samples in parts.items()}
 
     def _columns(self, requests: Mapping[str, Sequence[str]], start: int) -> dict[str, Columns]:
         try:
@@ -99,17 +99,17 @@ class Pieces:
             if len(requests) == 1:
                 return {}
             one_by_one = (self._columns({t: p}, start) for t, p in requests.items())
-            return {t: c for found in one_by_one for t, c in found.items()}
+            return {t: c for samples in one_by_one for t, c in samples.items()}
 
-    def _seen(self, found: list[tuple[int, IntArray, FloatArray]]) -> Seen:
+    def _seen(self, samples: list[tuple[int, IntArray, FloatArray]]) -> Seen:
         total = np.zeros(len(self.starts) * self.cells_a_piece)
         count = np.zeros_like(total)
-        values = np.concatenate([c for _, _, c in found])
+        values = np.concatenate([c for _, _, c in samples])
         low, high = _usual(values)
-        for number, at, column in found:
+        for number, cell, column in samples:
             use = (column >= low) & (column <= high)
-            use &= (at >= 0) & (at < self.cells_a_piece)
-            where = number * self.cells_a_piece + at[use]
+            use &= (cell >= 0) & (cell < self.cells_a_piece)
+            where = number * self.cells_a_piece + cell[use]
             np.add.at(total, where, column[use])
             np.add.at(count, where, 1.0)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -173,8 +173,8 @@ def is_of_both_signs(values: FloatArray) -> bool:
 
 def spread(cells: FloatArray) -> float:
     """Return the standard deviation of what is known; 0 without anything."""
-    known = cells[np.isfinite(cells)]
-    return float(known.std()) if known.shape[0] else 0.0
+    finite_cells = cells[np.isfinite(cells)]
+    return float(finite_cells.std()) if finite_cells.shape[0] else 0.0
 
 
 def _usual(values: FloatArray) -> tuple[float, float]:
@@ -189,15 +189,15 @@ def _usual(values: FloatArray) -> tuple[float, float]:
 
 def _filled(rows: FloatArray) -> FloatArray:
     """Join the neighbours of an empty cell by a line where one is at most ``BRIDGED_CELLS`` away [pieces, cells]."""
-    at = np.arange(rows.shape[1])
+    cell = np.arange(rows.shape[1])
     for row in rows:
-        known = np.flatnonzero(np.isfinite(row))
-        if known.shape[0] < 2 or known.shape[0] == row.shape[0]:
+        finite_cells = np.flatnonzero(np.isfinite(row))
+        if finite_cells.shape[0] < 2 or finite_cells.shape[0] == row.shape[0]:
             continue
-        after = np.minimum(np.searchsorted(known, at), known.shape[0] - 1)
-        away = np.minimum(np.abs(at - known[after]), np.abs(at - known[np.maximum(after - 1, 0)]))
-        inside = (at >= known[0]) & (at <= known[-1]) & (away <= BRIDGED_CELLS)
-        row[inside] = np.interp(at[inside], known, row[known])
+        after = np.minimum(np.searchsorted(finite_cells, cell), finite_cells.shape[0] - 1)
+        away = np.minimum(np.abs(cell - finite_cells[after]), np.abs(cell - finite_cells[np.maximum(after - 1, 0)]))
+        inside = (cell >= finite_cells[0]) & (cell <= finite_cells[-1]) & (away <= BRIDGED_CELLS)
+        row[inside] = np.interp(cell[inside], finite_cells, row[finite_cells])
     return rows
 
 

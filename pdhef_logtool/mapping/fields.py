@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pdhef_logtool.mapping.candidates import Found
+from pdhef_logtool.mapping.candidates import Field
 from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, spread
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
@@ -23,45 +23,43 @@ class Fields:
     """Candidates, what is mapped already (``anchors``, by signal), and positions, on one grid of time."""
 
     pieces: Pieces
-    anchors: dict[str, Found]
-    found: list[Found]
-    positions: list[Found]
+    anchors: dict[str, Field]
+    candidates: list[Field]
+    positions: list[Field]
     checks: list[Check] = field(default_factory=list)
 
-    def all(self, quantity: str, part: str | None = None) -> list[Found]:
+    def all(self, quantity: str, part: str | None = None) -> list[Field]:
         """Return anchors and candidates of a quantity, the surest first."""
-        every = [f for f in (*self.anchors.values(), *self.found) if f.meaning.quantity == quantity]
+        every = [f for f in (*self.anchors.values(), *self.candidates) if f.meaning.quantity == quantity]
         every = [f for f in every if f.role not in ("command", "estimate", "truth") or f.anchor]
         return sorted((f for f in every if part is None or f.meaning.part == part), key=lambda f: -f.score)
 
-    def open(self, quantity: str, part: str) -> list[Found]:
+    def open(self, quantity: str, part: str) -> list[Field]:
         """Return those of a quantity and part that change."""
         return [f for f in self.all(quantity, part) if f.seen.changes]
 
-    def best(self, quantity: str) -> Found | None:
+    def best(self, quantity: str) -> Field | None:
         """Return the surest of a quantity that changes."""
         return next((f for f in self.all(quantity) if f.seen.changes), None)
 
-    def anchor(self, name: str) -> Found | None:
-        """Return what is mapped to a signal already."""
-        return self.anchors.get(name)
-
-    def agree(self, a: Found, b: Found) -> bool:
+    def agree(self, a: Field, b: Field) -> bool:
         """Return whether two fields have the same values."""
         relation = fit(a.si, b.si)
         return relation is not None and relation.correlation > 0.97 and 0.9 < relation.slope < 1.1
 
-    def wheel_mean(self) -> Found | None:
+    def wheel_mean(self) -> Field | None:
         """Return the wheel speeds' mean as a speed, where their unit is one of speed and known."""
-        wheels = [f for f in self.found if f.meaning.quantity == "wheel speed" and (f.known or f.fixed)]
+        wheels = [f for f in self.candidates if f.meaning.quantity == "wheel speed" and (f.unit_known or f.fixed)]
         wheels += [f for n, f in self.anchors.items() if n.startswith("wheel_speed_") and n.endswith("m_s")]
         if not wheels:
             return None
         return wheels[0].standing_for(mean_of([f.si for f in wheels]))
 
-    def wheel_turns(self) -> Found | None:
+    def wheel_turns(self) -> Field | None:
         """Return how fast the wheels turn, which is a speed but for their radius."""
-        wheels = [f for f in (*self.found, *self.anchors.values()) if f.meaning.quantity == "wheel rate" and f.known]
+        wheels = [
+            f for f in (*self.candidates, *self.anchors.values()) if f.meaning.quantity == "wheel rate" and f.unit_known
+        ]
         return wheels[0].standing_for(mean_of([f.si for f in wheels])) if wheels else None
 
     def turning(self, ay: FloatArray, rate: FloatArray, speed: FloatArray) -> Fit | None:
@@ -71,19 +69,19 @@ class Fields:
             return None
         return fit(self.pieces.smooth(ay), self.pieces.smooth(expected))
 
-    def settle(self, one: Found, slope: float, by: str, tolerance: float) -> None:
+    def settle(self, item: Field, slope: float, by: str, tolerance: float) -> None:
         """Take the one unit that a slope is near to, if there is one."""
-        if one.known or one.fixed:
+        if item.unit_known or item.fixed:
             return
-        near = [u for u, s in one.factors if abs(slope / s - 1.0) < tolerance]
+        near = [u for u, s in item.factors if abs(slope / s - 1.0) < tolerance]
         if len(near) == 1:
-            one.use(near[0])
-            one.reasons.append(f"unit {near[0]} by {by}")
+            item.use(near[0])
+            item.reasons.append(f"unit {near[0]} by {by}")
 
 
 def mean_of(columns: Sequence[FloatArray]) -> FloatArray:
     """Return the mean of columns [M] over those that are known in each cell."""
     stacked = np.stack(columns)
-    known = np.isfinite(stacked)
+    finite = np.isfinite(stacked)
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.where(known, stacked, 0.0).sum(axis=0) / known.sum(axis=0))
+        return np.asarray(np.where(finite, stacked, 0.0).sum(axis=0) / finite.sum(axis=0))

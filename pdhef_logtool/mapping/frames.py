@@ -45,14 +45,18 @@ def placement_of(log: DriveLog, topic: str) -> Placement | None:
     steps = _fixed_frames(log) if frame else {}
     if frame not in steps:
         return None
-    at, rotation, position = frame, np.eye(3), np.zeros(3)
+    current, rotation, position = frame, np.eye(3), np.zeros(3)
     for _ in range(MOST_STEPS):
-        step = steps.get(at)
-        if step is None or at.rpartition("/")[2] in BASES:
+        step = steps.get(current)
+        if step is None or current.rpartition("/")[2] in BASES:
             break
         rotation, position = step.rotation @ rotation, step.rotation @ position + step.position_m
-        at = step.parent
-    return Placement(frame, at, rotation, position) if at.rpartition("/")[2] in BASES and at != frame else None
+        current = step.parent
+    return (
+        Placement(frame, current, rotation, position)
+        if current.rpartition("/")[2] in BASES and current != frame
+        else None
+    )
 
 
 def holds_fixed_frames(topic: TopicInfo) -> bool:
@@ -62,22 +66,22 @@ def holds_fixed_frames(topic: TopicInfo) -> bool:
 
 def _fixed_frames(log: DriveLog) -> Mapping[str, _Step]:
     """Return the frames that never move, by name; one that is told twice in different places is none."""
-    found: dict[str, _Step] = {}
+    by_name: dict[str, _Step] = {}
     moved: set[str] = set()
     for topic in log.topics:
         if not holds_fixed_frames(topic):
             continue
         for message in log.first_messages(topic.name, MOST_MESSAGES):
             transforms = value_at(message, ("transforms",))
-            for one in transforms if isinstance(transforms, list | tuple) else ():
-                name, step = _name(one, "child_frame_id"), _step(one)
+            for item in transforms if isinstance(transforms, list | tuple) else ():
+                name, step = _name(item, "child_frame_id"), _step(item)
                 if step is None:
                     continue
-                known = found.setdefault(name, step)
-                same = known.parent == step.parent and np.allclose(known.rotation, step.rotation, atol=1e-6)
-                if not (same and np.allclose(known.position_m, step.position_m, atol=1e-6)):
+                first = by_name.setdefault(name, step)
+                same = first.parent == step.parent and np.allclose(first.rotation, step.rotation, atol=1e-6)
+                if not (same and np.allclose(first.position_m, step.position_m, atol=1e-6)):
                     moved.add(name)
-    return {name: step for name, step in found.items() if name not in moved}
+    return {name: step for name, step in by_name.items() if name not in moved}
 
 
 def _step(transform: object) -> _Step | None:

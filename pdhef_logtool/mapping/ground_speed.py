@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
-from pdhef_logtool.mapping.candidates import source_found, sources_found
+from pdhef_logtool.mapping.candidates import anchor_of, anchors_of
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.evidence import Pieces, fit, ratio
 from pdhef_logtool.mapping.fields import CLEAR, Fields
@@ -55,20 +55,20 @@ def speed_over_ground(
     signals, truth : what is mapped already.
     """
     vectors = [v for topic, base in topics for v in _vectors(log, topic, base)]
-    known = [s for n, s in signals.items() if n == "ax_m_s2"]
-    known += [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m")]
-    if not vectors or not known:
+    references = [s for n, s in signals.items() if n == "ax_m_s2"]
+    references += [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m")]
+    if not vectors or not references:
         return None
     pieces = Pieces(log)
     requests: dict[str, list[str]] = {}
-    for source in (*vectors, *known):
+    for source in (*vectors, *references):
         paths = requests.setdefault(source.topic, [])
         paths += [p for p in source.paths if p not in paths]
     read = pieces.read(requests)
-    anchors = sources_found(log, known, read)
+    anchors = anchors_of(log, references, read)
     fields = Fields(pieces, {}, [], [f for f in anchors if f.meaning.quantity != "acceleration"])
     path = path_speed(fields)
-    ax = next((f for s in known if s.name == "ax_m_s2" and (f := source_found(s, anchors)) is not None), None)
+    ax = next((f for s in references if s.name == "ax_m_s2" and (f := anchor_of(s, anchors)) is not None), None)
     for source in vectors:
         x, y = (read.get((source.topic, p)) for p in source.paths)
         if x is None or y is None or not (x.changes and y.changes):

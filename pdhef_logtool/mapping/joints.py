@@ -51,10 +51,10 @@ def mean_of_sides(log: DriveLog, topics: Mapping[str, TopicInfo], steering: Sign
     if topic is None or not is_joints(topic) or not isinstance(steering.field, str):
         return None
     names = joint_names(log, topic)
-    own = names[int(steering.field[len("position[") : -1])]
+    joint = names[int(steering.field[len("position[") : -1])]
     for this, other in (("left", "right"), ("right", "left"), ("fl", "fr"), ("fr", "fl"), ("l", "r"), ("r", "l")):
-        there = re.sub(rf"(?<![a-z]){this}(?![a-z])", other, own)
-        if there != own and there in names:
+        there = re.sub(rf"(?<![a-z]){this}(?![a-z])", other, joint)
+        if there != joint and there in names:
             scale = float(steering.scale if isinstance(steering.scale, float) else steering.scale[0])
             fields = (steering.field, f"position[{names.index(there)}]")
             return replace(steering, field=fields, scale=(0.5 * scale, 0.5 * scale))

@@ -165,7 +165,7 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
 
 
 def _read_section(
-    raw: object, section: str, known: tuple[str, ...], other: tuple[str, ...], problems: list[str]
+    raw: object, section: str, allowed: tuple[str, ...], other: tuple[str, ...], problems: list[str]
 ) -> dict[str, SignalSource]:
     if not isinstance(raw, dict):
         problems.append(f"{section}: must be a table of tables, one a signal")
@@ -173,11 +173,11 @@ def _read_section(
     out: dict[str, SignalSource] = {}
     for name, table in raw.items():
         where = f"{section}.{name}"
-        if name not in known:
+        if name not in allowed:
             if name in other:
                 problems.append(f"{where}: belongs under [{'truth' if section == 'signals' else 'signals'}.{name}]")
             else:
-                problems.append(unknown(name, known, section))
+                problems.append(unknown(name, allowed, section))
             continue
         model = checked(_SourceTable, table, where, problems)
         if model is None:
@@ -356,11 +356,14 @@ def _alternative_lines(section: str, name: str, candidates: Sequence[Candidate])
     names = {"steer_rad": _STEERING, "steering_wheel_rad": _STEERING}.get(name, (name,))
     mine = [c for c in candidates if c.section == section and c.source.name in names and not c.taken]
     lines: list[str] = []
-    for one in mine[:ALTERNATIVES]:
-        unit = (SIGNAL_UNITS | TRUTH_UNITS)[one.source.name]
-        doubt = f"; unsure: {one.doubt}" if one.doubt else ""
-        lines += ["#", *_comment(f"Instead, score {one.score:.2f}: {one.reason}{doubt}")]
-        lines += [f"# [{section}.{one.source.name}]  # {unit}", *(f"# {x}" for x in _source_lines(one.source))]
+    for candidate in mine[:ALTERNATIVES]:
+        unit = (SIGNAL_UNITS | TRUTH_UNITS)[candidate.source.name]
+        doubt = f"; unsure: {candidate.doubt}" if candidate.doubt else ""
+        lines += ["#", *_comment(f"Instead, score {candidate.score:.2f}: {candidate.reason}{doubt}")]
+        lines += [
+            f"# [{section}.{candidate.source.name}]  # {unit}",
+            *(f"# {x}" for x in _source_lines(candidate.source)),
+        ]
     return lines
 
 

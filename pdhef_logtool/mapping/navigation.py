@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -41,13 +41,8 @@ _CONVENTIONS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class NavigationTruth:
-    """Truth quantities of one topic, and what is to be said of them."""
-
-    topic: str
-    truth: dict[str, SignalSource]
-    note: str
+#: Ground-truth quantities of one topic, and the note on their source.
+NavigationTruth: TypeAlias = tuple[dict[str, SignalSource], str]
 
 
 def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo]) -> NavigationTruth | None:
@@ -58,7 +53,7 @@ def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo]) -> NavigationTr
     topics : of navigation systems and references whose types are not documented.
     """
     truths = [truth for t in topics if (truth := _of_topic(log, t)) is not None]
-    return max(truths, key=lambda t: len(t.truth), default=None)
+    return max(truths, key=lambda t: len(t[0]), default=None)
 
 
 def _of_topic(log: DriveLog, topic: TopicInfo) -> NavigationTruth | None:
@@ -78,17 +73,17 @@ def _of_topic(log: DriveLog, topic: TopicInfo) -> NavigationTruth | None:
     for name, most in (("lat_deg", 90.0), ("lon_deg", 180.0)):
         if name not in truth or not _is_place(samples.get((topic.name, truth[name].paths[0])), most):
             truth = {n: s for n, s in truth.items() if n not in ("lat_deg", "lon_deg")}
-    note = f"Ground truth is taken from {topic.name}, by the names of its fields."
+    note = f"ground truth is taken from {topic.name}, by the names of its fields"
     course = _course(truth, samples, topic.name, pieces)
     conventions = {p: _convention(samples.get((topic.name, p)), course, unit) for p, unit in headings.items()}
     for path, convention in conventions.items():
         if convention is not None:
             words, scale, offset = convention
             truth["yaw_rad"] = SignalSource("yaw_rad", topic.name, path, stamp, scale, offset)
-            note += f" {path} is in {words}: it agrees with the course over ground."
+            note += f"; {path} is in {words}, which agrees with the course over ground"
             break
     useful = {"enu_velocity_m_s", "ecef_velocity_m_s", "ecef_position_m", "lat_deg"} & set(truth)
-    return NavigationTruth(topic.name, truth, note) if useful else None
+    return (truth, note) if useful else None
 
 
 def _enu_velocities(topic: TopicInfo, fields: tuple[FieldInfo, ...], stamp: str) -> Iterator[SignalSource]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,16 +16,8 @@ _HALF = 5
 DEGREE_M = 111_200.0
 
 
-@dataclass(frozen=True, slots=True)
-class _Steps:
-    """Steps of a position over a second, in m [M]."""
-
-    north: FloatArray
-    east: FloatArray
-
-
-def _path(fields: Fields) -> _Steps | None:
-    """Return the steps of the first positions that move; None without any."""
+def _path(fields: Fields) -> tuple[FloatArray, FloatArray] | None:
+    """Return the steps north and east over a second, in m [M], of the first positions that move; None without any."""
     pairs = {"latitude": "longitude", "position": "position"}
     for north in (f for f in fields.positions if f.meaning.quantity in pairs and f.meaning.part in ("", "y")):
         wanted = (pairs[north.meaning.quantity], "x" if north.meaning.part else "")
@@ -40,7 +31,7 @@ def _path(fields: Fields) -> _Steps | None:
         if north.meaning.quantity == "latitude":
             up, right = up * DEGREE_M, right * DEGREE_M * math.cos(math.radians(float(np.nanmean(north.si))))
         if np.isfinite(up).any():
-            return _Steps(up, right)
+            return up, right
     return None
 
 
@@ -49,24 +40,24 @@ def path_turn(fields: Fields) -> FloatArray | None:
     steps = _path(fields)
     if steps is None:
         return None
-    moved = np.hypot(steps.north, steps.east)
+    moved = np.hypot(*steps)
     with np.errstate(invalid="ignore"):
         far = moved > 0.3 * float(np.nanquantile(moved, 0.9))
-        return _turn_rate(fields, np.where(far, np.arctan2(steps.north, steps.east), np.nan))
+        return _turn_rate(fields, np.where(far, np.arctan2(*steps), np.nan))
 
 
 def path_speed(fields: Fields) -> FloatArray | None:
     """Return the speed along the positions' path, m/s [M]; None without positions."""
     steps = _path(fields)
-    return None if steps is None else np.hypot(steps.north, steps.east) / (2 * _HALF * CELL_NS * 1e-9)
+    return None if steps is None else np.hypot(*steps) / (2 * _HALF * CELL_NS * 1e-9)
 
 
 def heading_turn(fields: Fields) -> FloatArray | None:
     """Return how fast a navigation system's heading turns to the left, rad/s but for its scale; None without one."""
-    for one in fields.found:
-        if one.meaning.quantity == "heading" and one.role == "navigation" and one.seen.changes:
-            degrees = one.seen.largest > 7.0
-            return -_turn_rate(fields, np.radians(one.seen.cells) if degrees else one.seen.cells)
+    for item in fields.candidates:
+        if item.meaning.quantity == "heading" and item.role == "navigation" and item.seen.changes:
+            degrees = item.seen.largest > 7.0
+            return -_turn_rate(fields, np.radians(item.seen.cells) if degrees else item.seen.cells)
     return None
 
 

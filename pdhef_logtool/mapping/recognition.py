@@ -1,4 +1,4 @@
-"""A mapping by recognising well-known message types; what is ambiguous is said, never guessed silently."""
+"""Mapping by well-known message types; every ambiguity is reported."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ NO_SENSORS = (
     "sensor_msgs/CameraInfo", "visualization_msgs/", "tf2_msgs/", "tf/", "rosgraph_msgs/", "rcl_interfaces/",
     "diagnostic_msgs/", "nav_msgs/Path", "nav_msgs/OccupancyGrid", "foxglove.CompressedImage", "foxglove.PointCloud",
 )  # fmt: skip
-#: Start of the note on a steering angle that nobody measured.
+#: Start of the note on a steering angle that is a command.
 FROM_COMMAND = "steer_rad comes from the command"
 PERFECT_PREFIX = "/truth/perfect"
 OWN_PREFIX = "/pdhef/"
@@ -97,10 +97,10 @@ IMU_TYPES = frozenset({"sensor_msgs/Imu"})
 FIX_TYPES = frozenset({"sensor_msgs/NavSatFix", "foxglove.LocationFix"})
 #: Types that hold positions of which nobody says which one is the vehicle's.
 SEVERAL_POSITIONS = {
-    "foxglove.PosesInFrame": "it holds a list of poses, and which one is the vehicle's is not said",
-    "foxglove.LocationFixes": "it holds a list of fixes, and which one is the vehicle's is not said",
-    "foxglove.FrameTransform": "which of its frames is the vehicle is not said",
-    "foxglove.FrameTransforms": "which of its frames is the vehicle is not said",
+    "foxglove.PosesInFrame": "it is a list of poses, and the type does not give which pose is the vehicle's",
+    "foxglove.LocationFixes": "it is a list of fixes, and the type does not give which fix is the vehicle's",
+    "foxglove.FrameTransform": "the type does not give which frame is the vehicle",
+    "foxglove.FrameTransforms": "the type does not give which frame is the vehicle",
 }
 #: What a type must have to be what its name says; of an IMU any of them, of others all.
 _IMU_PATHS = ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z")
@@ -112,9 +112,9 @@ class Ambiguity:
 
     Attributes
     ----------
-    subject : what could be read in several ways, for example ``imu``.
+    subject : subject with several readings, for example ``imu``.
     candidates : topics (and fields).
-    chosen : what was taken, None when nothing was.
+    chosen : candidate that is taken, None without one.
     reason : why.
     remedy : how to decide.
     """
@@ -133,7 +133,7 @@ class Ambiguity:
 
 @dataclass(frozen=True, slots=True)
 class AutoMapping:
-    """A recognised mapping, and what is to be said of it.
+    """A recognised mapping and its open points.
 
     Attributes
     ----------
@@ -148,8 +148,8 @@ class AutoMapping:
 
 
 @dataclass(slots=True)
-class _Finding:
-    """What one call of :func:`auto_map` has gathered so far."""
+class _Draft:
+    """A mapping while :func:`auto_map` builds it."""
 
     log: DriveLog
     samples: dict[str, dict[str, FloatArray]]
@@ -163,14 +163,14 @@ class _Finding:
         return self.samples.get(topic, {}).get(path, np.empty(0))
 
     def is_given(self, topic: str, path: str) -> bool:
-        """Return whether the type has a field that holds anything: nothing seen counts as given, only NaN does not."""
+        """Return whether the type has a field whose samples, if any, are not all NaN."""
         if not has_path(self.log.fields(topic), path):
             return False
         seen = self.values(topic, path)
         return seen.shape[0] == 0 or bool(np.isfinite(seen).any())
 
     def is_disowned(self, topic: str, covariance: str) -> bool:
-        """Return whether the message says, by −1 in its covariance, that it does not provide a quantity (REP 145)."""
+        """Return whether a covariance of −1 marks a quantity as not provided (REP 145)."""
         seen = self.values(topic, covariance)
         return seen.shape[0] > 0 and bool((seen == -1.0).all())
 
@@ -218,45 +218,45 @@ def auto_map(
     there = [vendors.typed(t, log.fields(t.name, quiet=True)) for t in there]
     unlike = [t for t in there if not _has_its_fields(log, t)]
     topics = [t for t in there if t not in unlike]
-    found = _Finding(log=log, samples=_probe(log, topics))
-    found.notes += [_why_unused(log, t) for t in unlike]
-    found.notes += _what_cannot_be_read(log, [t for t in topics if not _type(t).startswith(NO_SENSORS)])
-    found.notes += [
+    draft = _Draft(log=log, samples=_probe(log, topics))
+    draft.notes += [_why_unused(log, t) for t in unlike]
+    draft.notes += _what_cannot_be_read(log, [t for t in topics if not _type(t).startswith(NO_SENSORS)])
+    draft.notes += [
         f"{t.name} ({_type(t)}) has no messages" for t in log.topics if not t.messages and _is_well_known(t)
     ]
-    found.notes += [
-        f'{t.name} holds raw CAN frames: a mapping file with [can] dbc = ["car.dbc"] tells what stands in them'
+    draft.notes += [
+        f'{t.name} contains raw CAN frames: describe them in a mapping file with [can] dbc = ["car.dbc"]'
         for t in topics
         if "can" in _words(f"{t.name} {t.type_name}") and holds_frames(t.name, log.fields(t.name, quiet=True))
     ]
-    _map_imu(found, topics)
-    _map_steering(found, topics)
-    _map_speed(found, topics)
-    _map_wheel_speeds(found, topics)
-    _map_truth(found, topics, prefer_truth)
-    _map_documented_truth(found, topics, vendors)
-    weighed = _weigh_the_rest(found, topics, vendors)
-    _map_navigation(found, topics, vendors)
-    _fall_back(found, topics)
+    _map_imu(draft, topics)
+    _map_steering(draft, topics)
+    _map_speed(draft, topics)
+    _map_wheel_speeds(draft, topics)
+    _map_truth(draft, topics, prefer_truth)
+    _map_documented_truth(draft, topics, vendors)
+    weighed = _weigh_the_rest(draft, topics, vendors)
+    _map_navigation(draft, topics, vendors)
+    _fall_back(draft, topics)
     mapping = Mapping(
-        signals=found.signals,
-        truth=found.truth,
-        quality=found.quality,
+        signals=draft.signals,
+        truth=draft.truth,
+        quality=draft.quality,
         origin="auto",
-        notes=tuple(found.notes),
+        notes=tuple(draft.notes),
         checks=weighed.checks,
     )
-    return AutoMapping(mapping, tuple(found.ambiguities), missing_signals(mapping), weighed.candidates)
+    return AutoMapping(mapping, tuple(draft.ambiguities), missing_signals(mapping), weighed.candidates)
 
 
 def _why_unused(log: DriveLog, topic: TopicInfo) -> str:
-    """Say why a topic of a well-known type is not used: no definition, or another type's fields."""
+    """Return why a topic of a well-known type is not used: no definition, or another type's fields."""
     reason = log.unreadable(topic.name)
     return f"{topic.name} is not used: {reason or f'its fields are not those of {topic.type_name}'}"
 
 
 def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:
-    """Say of which other topics no field is known, those of one reason together."""
+    """Return notes on the topics without readable fields, grouped by reason."""
     by_reason: dict[str, list[str]] = {}
     for topic in topics:
         reason = "" if log.fields(topic.name, quiet=True) else log.unreadable(topic.name)
@@ -268,50 +268,50 @@ def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:
 # ------------------------------------------------------------------------------------------------ candidates
 
 
-def _weigh_the_rest(found: _Finding, topics: list[TopicInfo], vendors: Vendors) -> Weighed:
+def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> Weighed:
     """Take candidates for what no well-known type gives."""
     for topic in topics:
         reason = vendors.why_left_out(topic.type_name)
         if reason:
-            found.notes.append(f"{topic.name} ({topic.type_name.replace('/msg/', '/')}) is left out: {reason}")
+            draft.notes.append(f"{topic.name} ({topic.type_name.replace('/msg/', '/')}) is left out: {reason}")
     rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not _type(t).startswith(NO_SENSORS)]
     # A measured steering angle goes before a command, whatever its type.
-    command = found.signals.pop("steer_rad", None) if any(n.startswith(FROM_COMMAND) for n in found.notes) else None
-    weighed = weigh(found.log, rest, found.signals, found.truth, vendors)
+    command = draft.signals.pop("steer_rad", None) if any(n.startswith(FROM_COMMAND) for n in draft.notes) else None
+    weighed = weigh(draft.log, rest, draft.signals, draft.truth, vendors)
     if command is not None and not {"steer_rad", "steering_wheel_rad"} & set(weighed.signals):
-        found.signals["steer_rad"] = command
+        draft.signals["steer_rad"] = command
     elif command is not None:
-        found.notes = [n for n in found.notes if not n.startswith(FROM_COMMAND)]
+        draft.notes = [n for n in draft.notes if not n.startswith(FROM_COMMAND)]
         measured = next(s.label for n, s in weighed.signals.items() if n.startswith("steer"))
-        found.doubt("steering", (measured, command.label), measured, "a measured angle before a command")
-    found.signals.update(weighed.signals)
+        draft.doubt("steering", (measured, command.label), measured, "a measured angle is preferred to a command")
+    draft.signals.update(weighed.signals)
     both = (
-        mean_of_sides(found.log, {t.name: t for t in topics}, found.signals["steer_rad"])
+        mean_of_sides(draft.log, {t.name: t for t in topics}, draft.signals["steer_rad"])
         if "steer_rad" in weighed.signals
         else None
     )
     if both is not None:
-        found.signals["steer_rad"] = both
-        found.notes.append(f"steer_rad is the mean of the two steered wheels in {both.topic}")
-    found.notes += [
-        f"{t.name} holds other joints, or in another order, from message to message: none of them is used"
+        draft.signals["steer_rad"] = both
+        draft.notes.append(f"steer_rad is the mean of the two steered wheels in {both.topic}")
+    draft.notes += [
+        f"{t.name} is not used: the joints or their order differ between messages"
         for t, role in rest
-        if is_joints(t) and role != "command" and not joint_names(found.log, t)
+        if is_joints(t) and role != "command" and not joint_names(draft.log, t)
     ]
-    found.truth.update(weighed.truth)
-    found.notes += weighed.notes
+    draft.truth.update(weighed.truth)
+    draft.notes += weighed.notes
     for name, fields in weighed.rivals:
-        found.doubt(name, fields, fields[0], "the best score, then most messages")
+        draft.doubt(name, fields, fields[0], "the best score, then most messages")
     return weighed
 
 
-def _map_documented_truth(found: _Finding, topics: list[TopicInfo], vendors: Vendors) -> None:
+def _map_documented_truth(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
     """Take truth from an INS whose type is documented, where recognised types give a position at most."""
-    if {"vx_m_s", "enu_velocity_m_s", "quat_wxyz", "yaw_rad", "x_m"} & set(found.truth):
+    if {"vx_m_s", "enu_velocity_m_s", "quat_wxyz", "yaw_rad", "x_m"} & set(draft.truth):
         return
     whole: dict[str, dict[str, SignalSource]] = {}
     for topic in topics:
-        fields = found.log.fields(topic.name, quiet=True)
+        fields = draft.log.fields(topic.name, quiet=True)
         sources = [
             SignalSource(f.name, topic.name, path, stamp_path_of(fields), f.scale, f.offset)
             for path, f in vendors.fields_of(topic.type_name).items()
@@ -322,27 +322,27 @@ def _map_documented_truth(found: _Finding, topics: list[TopicInfo], vendors: Ven
         if vectors:
             whole[topic.name] = {s.name: s for s in sources}
     candidates = [t for t in topics if t.name in whole]
-    chosen = found.choose("truth", candidates, lambda t: (-len(whole[t.name]),), "the one with most quantities")
+    chosen = draft.choose("truth", candidates, lambda t: (-len(whole[t.name]),), "the one with most quantities")
     if chosen is None:
         return
-    if found.truth:
-        others = ", ".join(sorted({s.topic for s in found.truth.values()}))
-        found.notes = [n for n in found.notes if not n.startswith("truth is kept where")]
-        found.notes.append(f"truth is taken from {chosen.name}, which has a velocity too; {others} is not used")
-    found.truth, found.quality = whole[chosen.name], None
+    if draft.truth:
+        others = ", ".join(sorted({s.topic for s in draft.truth.values()}))
+        draft.notes = [n for n in draft.notes if not n.startswith("ground truth is used where")]
+        draft.notes.append(f"ground truth is taken from {chosen.name}, which also has a velocity; {others} is not used")
+    draft.truth, draft.quality = whole[chosen.name], None
 
 
-def _map_navigation(found: _Finding, topics: list[TopicInfo], vendors: Vendors) -> None:
+def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
     """Take truth from a navigation system by the names of its vectors, where there is a position at most."""
-    if set(found.truth) - {"lat_deg", "lon_deg", "alt_m", "course_rad"}:
+    if set(draft.truth) - {"lat_deg", "lon_deg", "alt_m", "course_rad"}:
         return
     unknown = [t for t in topics if not _is_well_known(t) and not vendors.fields_of(t.type_name)]
-    truth = navigation_truth(found.log, [t for t in unknown if _role(t) in ("navigation", "truth")])
-    if truth is None or (found.truth and len(truth.truth) <= len(found.truth)):
+    truth = navigation_truth(draft.log, [t for t in unknown if _role(t) in ("navigation", "truth")])
+    if truth is None or (draft.truth and len(truth[0]) <= len(draft.truth)):
         return
-    found.truth, found.quality = truth.truth, None
-    found.notes = [n for n in found.notes if not n.startswith("truth is kept where")]
-    found.notes.append(truth.note)
+    draft.truth, draft.quality = truth[0], None
+    draft.notes = [n for n in draft.notes if not n.startswith("ground truth is used where")]
+    draft.notes.append(truth[1])
 
 
 def _is_well_known(topic: TopicInfo) -> bool:
@@ -366,46 +366,46 @@ def _role(topic: TopicInfo) -> Role:
     return "navigation" if (words | _words(topic.type_name)) & NAVIGATION_WORDS else "sensor"
 
 
-def _fall_back(found: _Finding, topics: list[TopicInfo]) -> None:
-    """Stand in for an IMU's yaw rate by an odometry's, and for a speed sensor by a navigation system's; say so."""
+def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
+    """Take yaw rate from an odometry and speed from a navigation system where no sensor gives them, with a note."""
     twists = [t for t in topics if _type(t) in TWIST_FIELDS]
     twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | COMMAND_WORDS | ESTIMATE_WORDS)]
-    if "yaw_rate_rad_s" not in found.signals:
+    if "yaw_rate_rad_s" not in draft.signals:
         odometries = [t for t in twists if _type(t) in BODY_TWIST_TYPES and not _is_truth(t)]
         odometries = [t for t in odometries if _words(t.name) & VEHICLE_WORDS]
-        odometries = [t for t in odometries if _span(found.values(t.name, _twist(t, "angular", "z"))) > 0.0]
-        chosen = found.choose("yaw rate", odometries, lambda _: (), "the first of its kind")
+        odometries = [t for t in odometries if _span(draft.values(t.name, _twist(t, "angular", "z"))) > 0.0]
+        chosen = draft.choose("yaw rate", odometries, lambda _: (), "the first of its kind")
         if chosen is not None:
-            found.take(found.signals, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
-            found.notes.append(f"yaw_rate_rad_s comes from the odometry {chosen.name}, as no IMU gives it")
-    if "speed_m_s" in found.signals or any(n.startswith("wheel_speed_") for n in found.signals) or not found.signals:
+            draft.take(draft.signals, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
+            draft.notes.append(f"yaw_rate_rad_s comes from the odometry {chosen.name}, as no IMU gives it")
+    if "speed_m_s" in draft.signals or any(n.startswith("wheel_speed_") for n in draft.signals) or not draft.signals:
         return
-    _speed_of_navigation(found, topics)
-    if "speed_m_s" not in found.signals:
+    _speed_of_navigation(draft, topics)
+    if "speed_m_s" not in draft.signals:
         unsaid = [(t, TWIST_FIELDS[_type(t)].format("linear")) for t in twists if not _words(t.name) & VEHICLE_WORDS]
         other = [t for t in topics if _role(t) in ("sensor", "navigation") and not _is_well_known(t)]
         vectors = [*unsaid, *((t, "") for t in other if not _type(t).startswith(NO_SENSORS))]
-        speed = speed_over_ground(found.log, vectors, found.signals, found.truth)
+        speed = speed_over_ground(draft.log, vectors, draft.signals, draft.truth)
         if speed is not None:
-            found.signals["speed_m_s"], evidence = speed
-            found.notes.append(f"speed_m_s comes from {speed[0].topic}, {evidence}: it is {NEVER_NEGATIVE}")
-            found.ambiguities = [a for a in found.ambiguities if (a.subject, a.chosen) != ("speed", None)]
+            draft.signals["speed_m_s"], evidence = speed
+            draft.notes.append(f"speed_m_s comes from {speed[0].topic}, {evidence}: it is {NEVER_NEGATIVE}")
+            draft.ambiguities = [a for a in draft.ambiguities if (a.subject, a.chosen) != ("speed", None)]
 
 
-def _speed_of_navigation(found: _Finding, topics: list[TopicInfo]) -> None:
+def _speed_of_navigation(draft: _Draft, topics: list[TopicInfo]) -> None:
     """Take the speed of a navigation system that is the truth too."""
     names = ("vx_m_s", "enu_velocity_m_s", "ecef_velocity_m_s")
-    truth = next((found.truth[n] for n in names if n in found.truth), None)
+    truth = next((draft.truth[n] for n in names if n in draft.truth), None)
     source = None if truth is None else next((t for t in topics if t.name == truth.topic), None)
     if truth is None or source is None:
         return
     if _role(source) != "navigation" and (_role(source) != "sensor" or _is_well_known(source)):
         return
     forward = truth.name == "vx_m_s"
-    found.signals["speed_m_s"] = replace(truth, name="speed_m_s") if forward else length_of(truth)
-    found.notes.append(
-        f"speed_m_s comes from {source.name}, which is the truth too, as nothing else gives a speed: "
-        "an estimator is told the true speed" + ("" if forward else f"; it is {NEVER_NEGATIVE}")
+    draft.signals["speed_m_s"] = replace(truth, name="speed_m_s") if forward else length_of(truth)
+    draft.notes.append(
+        f"speed_m_s comes from {source.name}, which is also the ground truth, as nothing else gives a speed: "
+        "the estimator's input is the true speed" + ("" if forward else f"; it is {NEVER_NEGATIVE}")
     )
 
 
@@ -504,82 +504,84 @@ def _probed_paths(topic: TopicInfo) -> list[str]:
 # ------------------------------------------------------------------------------------------------ sensors
 
 
-def _map_imu(found: _Finding, topics: list[TopicInfo]) -> None:
+def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
     imus = [t for t in topics if _type(t) in IMU_TYPES and not _words(t.name) & TRUTH_WORDS]
-    imu = found.choose(
+    imu = draft.choose(
         "imu",
         imus,
         lambda t: (bool(_words(t.name) & DEVICE_WORDS),),
-        "an IMU of the vehicle before one of a camera or lidar",
+        "an IMU of the vehicle is preferred to one of a camera or lidar",
     )
     if imu is None:
         return
-    if found.is_disowned(imu.name, "linear_acceleration_covariance[0]"):
-        found.notes.append(f"{imu.name} says that it gives no acceleration (covariance -1)")
+    if draft.is_disowned(imu.name, "linear_acceleration_covariance[0]"):
+        draft.notes.append(f"{imu.name} provides no acceleration (covariance -1)")
     else:
         for name, axis in (("ax_m_s2", "x"), ("ay_m_s2", "y")):
             path = f"linear_acceleration.{axis}"
-            if found.is_given(imu.name, path):
-                found.take(found.signals, name, imu.name, path)
-    if found.is_disowned(imu.name, "angular_velocity_covariance[0]"):
-        found.notes.append(f"{imu.name} says that it gives no angular rate (covariance -1)")
-    elif found.is_given(imu.name, "angular_velocity.z"):
-        found.take(found.signals, "yaw_rate_rad_s", imu.name, "angular_velocity.z")
+            if draft.is_given(imu.name, path):
+                draft.take(draft.signals, name, imu.name, path)
+    if draft.is_disowned(imu.name, "angular_velocity_covariance[0]"):
+        draft.notes.append(f"{imu.name} provides no angular rate (covariance -1)")
+    elif draft.is_given(imu.name, "angular_velocity.z"):
+        draft.take(draft.signals, "yaw_rate_rad_s", imu.name, "angular_velocity.z")
 
 
-def _map_steering(found: _Finding, topics: list[TopicInfo]) -> None:
+def _map_steering(draft: _Draft, topics: list[TopicInfo]) -> None:
     candidates = [t for t in topics if _type(t) in STEERING_FIELDS]
     measured = [t for t in candidates if not _is_command(t)]
-    chosen = found.choose("steering", measured or candidates, lambda _: (), "the first of its kind")
+    chosen = draft.choose("steering", measured or candidates, lambda _: (), "the first of its kind")
     if chosen is None:
         return
     if not measured:
-        found.notes.append(f"{FROM_COMMAND} {chosen.name}, not from a measured angle: no lag, no slack")
-    found.take(found.signals, "steer_rad", chosen.name, STEERING_FIELDS[_type(chosen)])
+        draft.notes.append(
+            f"{FROM_COMMAND} {chosen.name}, not from a measured angle: actuator lag and steering play are missing"
+        )
+    draft.take(draft.signals, "steer_rad", chosen.name, STEERING_FIELDS[_type(chosen)])
 
 
 def _is_command(topic: TopicInfo) -> bool:
     return _type(topic).startswith("ackermann_msgs/") or bool(_words(topic.name) & COMMAND_WORDS)
 
 
-def _map_speed(found: _Finding, topics: list[TopicInfo]) -> None:
+def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
     reports = [t for t in topics if _type(t) in SPEED_FIELDS]
     twists = []
     for topic in topics:
         if _type(topic) not in TWIST_FIELDS or _is_truth(topic) or _words(topic.name) & COMMAND_WORDS:
             continue
         if _words(topic.name) & ESTIMATE_WORDS:
-            found.doubt(
+            draft.doubt(
                 "speed",
                 (topic.name,),
                 None,
-                "its name says that it is an estimate, which is neither a sensor nor the truth",
+                "its name is that of an estimate, which is neither a sensor nor ground truth",
             )
         elif _words(topic.name) & VEHICLE_WORDS:
             twists.append(topic)
         else:
-            found.doubt("speed", (topic.name,), None, "its name says neither speed sensor nor truth")
-    chosen = found.choose(
+            draft.doubt("speed", (topic.name,), None, "its name is neither that of a speed sensor nor of ground truth")
+    chosen = draft.choose(
         "speed",
         [*reports, *twists],
         lambda t: (_type(t) not in SPEED_FIELDS,),
-        "a velocity report before an odometry or a twist",
+        "a velocity report is preferred to an odometry or a twist",
     )
     if chosen is None:
         return
     kind = _type(chosen)
     path = SPEED_FIELDS[kind] if kind in SPEED_FIELDS else _twist(chosen, "linear", "x")
-    found.take(found.signals, "speed_m_s", chosen.name, path)
+    draft.take(draft.signals, "speed_m_s", chosen.name, path)
 
 
-def _map_wheel_speeds(found: _Finding, topics: list[TopicInfo]) -> None:
+def _map_wheel_speeds(draft: _Draft, topics: list[TopicInfo]) -> None:
     candidates = [t for t in topics if _type(t) in WHEEL_SPEED_TYPES and not _words(t.name) & TRUTH_WORDS]
-    chosen = found.choose("wheel speeds", candidates, lambda _: (), "the first of its kind")
+    chosen = draft.choose("wheel speeds", candidates, lambda _: (), "the first of its kind")
     if chosen is None:
         return
     for wheel in WHEELS:
         name = f"wheel_speed_{wheel}_m_s"
-        found.take(found.signals, name, chosen.name, f"{wheel}_m_s")
+        draft.take(draft.signals, name, chosen.name, f"{wheel}_m_s")
 
 
 # ------------------------------------------------------------------------------------------------ truth
@@ -589,48 +591,48 @@ def _truth_group(topic: TopicInfo) -> str:
     return "perfect" if topic.name.startswith(PERFECT_PREFIX) else "rtk"
 
 
-def _map_truth(found: _Finding, topics: list[TopicInfo], prefer: str) -> None:
-    known = set(TWIST_FIELDS) | set(POSE_FIELDS) | FIX_TYPES
-    candidates = [t for t in topics if _type(t) in known and (_is_truth(t) or _type(t) in FIX_TYPES)]
+def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
+    types = set(TWIST_FIELDS) | set(POSE_FIELDS) | FIX_TYPES
+    candidates = [t for t in topics if _type(t) in types and (_is_truth(t) or _type(t) in FIX_TYPES)]
     groups = {_truth_group(t) for t in candidates}
     if len(groups) > 1:
         kept = [t for t in candidates if _truth_group(t) == prefer]
         left = sorted(t.name for t in candidates if _truth_group(t) != prefer)
-        found.notes.append(f"{prefer} truth taken; {', '.join(left)} not used")
+        draft.notes.append(f"{prefer} truth taken; {', '.join(left)} not used")
         candidates = kept
     for topic in topics:
         if _is_truth(topic) and _type(topic) in SEVERAL_POSITIONS:
-            found.doubt("truth position", (topic.name,), None, SEVERAL_POSITIONS[_type(topic)])
-    velocity = _map_truth_velocity(found, candidates)
-    _map_truth_position(found, candidates, velocity)
+            draft.doubt("truth position", (topic.name,), None, SEVERAL_POSITIONS[_type(topic)])
+    velocity = _map_truth_velocity(draft, candidates)
+    _map_truth_position(draft, candidates, velocity)
 
 
-def _map_truth_velocity(found: _Finding, candidates: list[TopicInfo]) -> TopicInfo | None:
-    twists = [t for t in candidates if _type(t) in TWIST_FIELDS and _has_twist(found, t)]
-    chosen = found.choose(
+def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo | None:
+    twists = [t for t in candidates if _type(t) in TWIST_FIELDS and _has_twist(draft, t)]
+    chosen = draft.choose(
         "truth velocity",
         twists,
-        lambda t: (not _words(t.name) & TRUTH_WORDS, not _has_pose(found, t)),
-        "a topic that calls itself truth first, then one that has a pose too",
+        lambda t: (not _words(t.name) & TRUTH_WORDS, not _has_pose(draft, t)),
+        "topics named as ground truth first, then topics with a pose",
     )
     if chosen is None:
         return None
-    forward = found.values(chosen.name, _twist(chosen, "linear", "x"))
-    left = found.values(chosen.name, _twist(chosen, "linear", "y"))
+    forward = draft.values(chosen.name, _twist(chosen, "linear", "x"))
+    left = draft.values(chosen.name, _twist(chosen, "linear", "y"))
     body = _looks_like_body_frame(forward, left)
     if _type(chosen) not in BODY_TWIST_TYPES and _words(chosen.name) & NAVIGATION_WORDS and body is not True:
         # Receivers publish their velocity in east, north, up under the same type.
-        up = found.values(chosen.name, _twist(chosen, "linear", "z"))
+        up = draft.values(chosen.name, _twist(chosen, "linear", "z"))
         readings = (f"{chosen.name} as body velocity", f"{chosen.name} as east, north, up")
         if body is None or not np.isfinite(up).any():
-            found.doubt("truth velocity frame", readings, None, "too little motion to tell the frame")
+            draft.doubt("truth velocity frame", readings, None, "too little motion to identify the frame")
             return None
-        found.doubt("truth velocity frame", readings, readings[1], "x is not the direction of travel")
+        draft.doubt("truth velocity frame", readings, readings[1], "x is not the direction of travel")
         paths = tuple(_twist(chosen, "linear", a) for a in "xyz")
-        found.take(found.truth, "enu_velocity_m_s", chosen.name, paths)
+        draft.take(draft.truth, "enu_velocity_m_s", chosen.name, paths)
         return chosen
     if body is False:
-        found.doubt(
+        draft.doubt(
             "truth velocity frame",
             (f"{chosen.name} as body velocity",),
             chosen.name,
@@ -638,10 +640,10 @@ def _map_truth_velocity(found: _Finding, candidates: list[TopicInfo]) -> TopicIn
         )
     for name, part, axis in (("vx_m_s", "linear", "x"), ("vy_m_s", "linear", "y"), ("yaw_rate_rad_s", "angular", "z")):
         full = _twist(chosen, part, axis)
-        values = found.values(chosen.name, full)
+        values = draft.values(chosen.name, full)
         filler = name == "yaw_rate_rad_s" and values.shape[0] > 0 and bool((values == 0.0).all())
-        if found.is_given(chosen.name, full) and not filler:
-            found.take(found.truth, name, chosen.name, full)
+        if draft.is_given(chosen.name, full) and not filler:
+            draft.take(draft.truth, name, chosen.name, full)
     return chosen
 
 
@@ -655,17 +657,17 @@ def _looks_like_body_frame(forward: FloatArray, left: FloatArray) -> bool | None
     return bool(np.mean(along[moving]) > 0.6)
 
 
-def _has_twist(found: _Finding, topic: TopicInfo) -> bool:
+def _has_twist(draft: _Draft, topic: TopicInfo) -> bool:
     forward, left = _twist(topic, "linear", "x"), _twist(topic, "linear", "y")
-    if found.is_disowned(topic.name, TWIST_COVARIANCES.get(_type(topic), "")):
+    if draft.is_disowned(topic.name, TWIST_COVARIANCES.get(_type(topic), "")):
         return False
-    if not (found.is_given(topic.name, forward) and found.is_given(topic.name, left)):
+    if not (draft.is_given(topic.name, forward) and draft.is_given(topic.name, left)):
         return False
-    v = np.concatenate([found.values(topic.name, forward), found.values(topic.name, left)])
+    v = np.concatenate([draft.values(topic.name, forward), draft.values(topic.name, left)])
     if v.shape[0] and (v == 0.0).all() and _type(topic) in POSE_FIELDS:
         # Converters from fixes to odometry leave the twist at zero while the pose moves.
-        x = found.values(topic.name, _join(POSE_FIELDS[_type(topic)], "position.x"))
-        y = found.values(topic.name, _join(POSE_FIELDS[_type(topic)], "position.y"))
+        x = draft.values(topic.name, _join(POSE_FIELDS[_type(topic)], "position.x"))
+        y = draft.values(topic.name, _join(POSE_FIELDS[_type(topic)], "position.y"))
         return not (_span(x) > 1.0 or _span(y) > 1.0)
     return True
 
@@ -675,69 +677,71 @@ def _span(values: FloatArray) -> float:
     return float(np.ptp(finite)) if finite.shape[0] else 0.0
 
 
-def _has_pose(found: _Finding, topic: TopicInfo) -> bool:
-    if _type(topic) not in POSE_FIELDS or found.is_disowned(topic.name, POSE_COVARIANCES.get(_type(topic), "")):
+def _has_pose(draft: _Draft, topic: TopicInfo) -> bool:
+    if _type(topic) not in POSE_FIELDS or draft.is_disowned(topic.name, POSE_COVARIANCES.get(_type(topic), "")):
         return False
     base = POSE_FIELDS[_type(topic)]
-    if not all(found.is_given(topic.name, _join(base, f"position.{a}")) for a in "xy"):
+    if not all(draft.is_given(topic.name, _join(base, f"position.{a}")) for a in "xy"):
         return False
     # A pose that stays at the origin while messages come is a filler.
-    xy = np.concatenate([found.values(topic.name, _join(base, f"position.{a}")) for a in "xy"])
+    xy = np.concatenate([draft.values(topic.name, _join(base, f"position.{a}")) for a in "xy"])
     return xy.shape[0] == 0 or bool((xy != 0.0).any())
 
 
-def _has_fix(found: _Finding, topic: TopicInfo) -> bool:
-    return _type(topic) in FIX_TYPES and all(found.is_given(topic.name, p) for p in ("latitude", "longitude"))
+def _has_fix(draft: _Draft, topic: TopicInfo) -> bool:
+    return _type(topic) in FIX_TYPES and all(draft.is_given(topic.name, p) for p in ("latitude", "longitude"))
 
 
-def _map_truth_position(found: _Finding, candidates: list[TopicInfo], velocity: TopicInfo | None) -> None:
-    if velocity is not None and _has_pose(found, velocity):
+def _map_truth_position(draft: _Draft, candidates: list[TopicInfo], velocity: TopicInfo | None) -> None:
+    if velocity is not None and _has_pose(draft, velocity):
         chosen: TopicInfo | None = velocity
     else:
-        positions = [t for t in candidates if _has_pose(found, t) or _has_fix(found, t)]
-        chosen = found.choose(
+        positions = [t for t in candidates if _has_pose(draft, t) or _has_fix(draft, t)]
+        chosen = draft.choose(
             "truth position",
             positions,
             lambda t: (not _words(t.name) & TRUTH_WORDS, _type(t) in FIX_TYPES),
-            "a topic that calls itself truth first, then a pose before a satellite fix",
+            "topics named as ground truth first, then poses before satellite fixes",
         )
     if chosen is None:
         return
     if _type(chosen) in FIX_TYPES:
-        _map_fix(found, chosen, alone=velocity is None)
+        _map_fix(draft, chosen, alone=velocity is None)
         return
     base = POSE_FIELDS[_type(chosen)]
     for name, axis in (("x_m", "x"), ("y_m", "y")):
-        found.take(found.truth, name, chosen.name, _join(base, f"position.{axis}"))
+        draft.take(draft.truth, name, chosen.name, _join(base, f"position.{axis}"))
     paths = tuple(_join(base, f"orientation.{a}") for a in "wxyz")
-    if not all(found.is_given(chosen.name, path) for path in paths):  # the log's own definition decides
+    if not all(draft.is_given(chosen.name, path) for path in paths):  # the log's own definition decides
         return
-    norms = np.linalg.norm(np.stack([found.values(chosen.name, path) for path in paths]), axis=0)
+    norms = np.linalg.norm(np.stack([draft.values(chosen.name, path) for path in paths]), axis=0)
     if norms.shape[0] == 0 or bool(np.any(np.abs(norms - 1.0) < 0.01)):
-        found.take(found.truth, "quat_wxyz", chosen.name, paths)
+        draft.take(draft.truth, "quat_wxyz", chosen.name, paths)
 
 
-def _map_fix(found: _Finding, fix: TopicInfo, *, alone: bool) -> None:
+def _map_fix(draft: _Draft, fix: TopicInfo, *, alone: bool) -> None:
     for name, path in (("lat_deg", "latitude"), ("lon_deg", "longitude"), ("alt_m", "altitude")):
-        if found.is_given(fix.name, path):
-            found.take(found.truth, name, fix.name, path)
+        if draft.is_given(fix.name, path):
+            draft.take(draft.truth, name, fix.name, path)
     # Foxglove's fixes may have angles, clockwise from north; those of vehicles count counter-clockwise from east.
-    angles = {p: found.values(fix.name, p) for p in ("heading", "course")}
+    angles = {p: draft.values(fix.name, p) for p in ("heading", "course")}
     given = {p for p, values in angles.items() if np.isfinite(values).any()}
     if given == {"heading", "course"} and np.array_equal(angles["heading"], angles["course"], equal_nan=True):
         given.remove("heading")
-        found.notes.append(f"{fix.name}.heading is not used: it repeats the course, so that it tells no sideslip")
+        draft.notes.append(f"{fix.name}.heading is not used: it repeats the course, so that it gives no sideslip")
     for name, path in (("yaw_rad", "heading"), ("course_rad", "course")):
         if path in given:
-            found.take(found.truth, name, fix.name, path, scale=-1.0, offset=np.pi / 2.0)
+            draft.take(draft.truth, name, fix.name, path, scale=-1.0, offset=np.pi / 2.0)
     if "heading" in given:
-        found.notes.append(f"truth yaw comes from {fix.name}.heading: only two antennas or an INS make it a truth")
-    status = found.values(fix.name, "status.status")
+        draft.notes.append(
+            f"ground-truth yaw comes from {fix.name}.heading: it is one only with two antennas or an INS"
+        )
+    status = draft.values(fix.name, "status.status")
     if not alone or status.shape[0] == 0:
         return
     # 0 is any fix, 2 a ground-based augmented one, which receivers use for RTK.
     lowest = 2.0 if "rtk" in _words(fix.name) and bool((status == 2.0).any()) else 0.0
-    found.quality = QualityGate(
-        topic=fix.name, field="status.status", minimum=lowest, stamp=stamp_path_of(found.log.fields(fix.name))
+    draft.quality = QualityGate(
+        topic=fix.name, field="status.status", minimum=lowest, stamp=stamp_path_of(draft.log.fields(fix.name))
     )
-    found.notes.append(f"truth is kept where {fix.name}.status.status is at least {lowest:g}")
+    draft.notes.append(f"ground truth is used where {fix.name}.status.status is at least {lowest:g}")

@@ -11,12 +11,7 @@ from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.documents import digest, jsonable
 
 #: Number of columns of the truth channels that are vectors; all other signals are scalars.
-VECTOR_COLUMNS: dict[str, int] = {
-    "ecef_position_m": 3,
-    "ecef_velocity_m_s": 3,
-    "enu_velocity_m_s": 3,
-    "quat_wxyz": 4,
-}
+VECTOR_COLUMNS: dict[str, int] = {"ecef_position_m": 3, "ecef_velocity_m_s": 3, "enu_velocity_m_s": 3, "quat_wxyz": 4}
 
 StampUnit: TypeAlias = Literal["ros", "s", "ms", "us", "ns"]
 Clock: TypeAlias = Literal["utc", "device"]

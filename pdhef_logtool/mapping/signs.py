@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.mapping.candidates import Found, leaf_group
+from pdhef_logtool.mapping.candidates import Field, leaf_group
 from pdhef_logtool.mapping.evidence import fit
 from pdhef_logtool.mapping.fields import CLEAR, Fields
 from pdhef_logtool.mapping.naming import G_M_S2
@@ -37,7 +37,7 @@ WITNESSES = {
 
 @dataclass(frozen=True, slots=True)
 class Signs:
-    """What the signs say.
+    """Result of the comparison of signs.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Signs:
 
 
 def judge_signs(
-    fields: Fields, trio: Mapping[str, Found | None], speed: Found | None, wheels: FloatArray | None
+    fields: Fields, trio: Mapping[str, Field | None], speed: Field | None, wheels: FloatArray | None
 ) -> Signs:
     """Hold the signs of steering, yaw rate and a_y against one another and against the way the car turned.
 
@@ -61,7 +61,7 @@ def judge_signs(
     ----------
     trio : by ``steer``, ``rate``, ``ay``. wheels : right minus left wheel speed on the grid [M].
     """
-    present = {name: one for name, one in trio.items() if one is not None}
+    present = {name: item for name, item in trio.items() if item is not None}
     turns = _turns(fields, present, speed)
     votes = _votes(fields, turns, present.get("rate"), wheels)
     absolute = any(source in WITNESSES for _, source in votes) or any(map(_has_documented_sign, present.values()))
@@ -77,7 +77,7 @@ def judge_signs(
     return Signs(ways[0] if decided else (), absolute, ", ".join(against), decided)
 
 
-def _turns(fields: Fields, present: Mapping[str, Found], speed: Found | None) -> dict[str, FloatArray]:
+def _turns(fields: Fields, present: Mapping[str, Field], speed: Field | None) -> dict[str, FloatArray]:
     """Return steering, a_y and yaw rate, each as a yaw rate but for its scale."""
     turns: dict[str, FloatArray] = {}
     if speed is not None:
@@ -89,7 +89,7 @@ def _turns(fields: Fields, present: Mapping[str, Found], speed: Found | None) ->
 
 
 def _votes(
-    fields: Fields, turns: Mapping[str, FloatArray], rate: Found | None, wheels: FloatArray | None
+    fields: Fields, turns: Mapping[str, FloatArray], rate: Field | None, wheels: FloatArray | None
 ) -> dict[tuple[str, str], float]:
     """Return 1 for each pair whose signs agree and -1 for each pair whose signs contradict one another."""
     votes = {pair: _sign(turns[pair[0]], turns[pair[1]], TELLS) for pair in itertools.combinations(turns, 2)}
@@ -102,23 +102,23 @@ def _votes(
     return {pair: vote for pair, vote in votes.items() if vote}
 
 
-def may_turn(one: Found) -> bool:
+def may_turn(item: Field) -> bool:
     """Return whether the sign of a field is free: neither documented nor a matter of its mounting."""
-    if one.anchor or _has_documented_sign(one):
+    if item.anchor or _has_documented_sign(item):
         return False
-    return one.meaning.quantity == "steering" or not one.is_axis
+    return item.meaning.quantity == "steering" or not item.is_axis
 
 
-def _has_documented_sign(one: Found) -> bool:
+def _has_documented_sign(item: Field) -> bool:
     """Return whether documentation or a name says the sign; of a well-known type it depends on the mounting."""
-    return not one.anchor and (one.fixed or one.is_downward)
+    return not item.anchor and (item.fixed or item.is_downward)
 
 
-def upright(fields: Fields, rate: Found) -> float:
+def upright(fields: Fields, rate: Field) -> float:
     """Return 1 where gravity is along +z of the sensor that a rate about z comes from, -1 along -z, 0 if unknown."""
-    for one in (*fields.found, *fields.anchors.values()):
-        if (one.meaning.quantity, one.meaning.part) == ("acceleration", "z") and leaf_group(one) == leaf_group(rate):
-            mean = float(np.nanmean(one.si))
+    for item in (*fields.candidates, *fields.anchors.values()):
+        if (item.meaning.quantity, item.meaning.part) == ("acceleration", "z") and leaf_group(item) == leaf_group(rate):
+            mean = float(np.nanmean(item.si))
             # Gravity alone is that large for so long, but in a sensor that takes it away.
             return math.copysign(1.0, mean) if abs(mean) > 0.9 * G_M_S2 else 0.0
     return 0.0

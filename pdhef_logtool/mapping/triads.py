@@ -56,8 +56,8 @@ class Triad:
 
 def find_triads(log: DriveLog, mapping: Mapping) -> tuple[Triad | None, Triad | None]:
     """Return the triads of accelerations and of rates that a mapping reads one or more axes of; None: there is none."""
-    found = [_triad(log, mapping, names) for names in (("ay_m_s2", "ax_m_s2"), ("yaw_rate_rad_s",))]
-    return found[0], found[1]
+    triads = [_triad(log, mapping, names) for names in (("ay_m_s2", "ax_m_s2"), ("yaw_rate_rad_s",))]
+    return triads[0], triads[1]
 
 
 def _triad(log: DriveLog, mapping: Mapping, names: tuple[str, ...]) -> Triad | None:
@@ -84,13 +84,13 @@ def _siblings(paths: tuple[str, ...]) -> Iterator[tuple[str, str, str]]:
         yield f"{index[1]}[{start}]", f"{index[1]}[{start + 1}]", f"{index[1]}[{start + 2}]"
     leaf = path.rfind(".") + 1
     for word in _RATE_WORDS:
-        at = path.lower().find(word, leaf)
-        if at >= 0:
-            written = [w.capitalize() if path[at].isupper() else w for w in _RATE_WORDS]
-            a, b, c = (path[:at] + w + path[at + len(word) :] for w in written)
+        position = path.lower().find(word, leaf)
+        if position >= 0:
+            written = [w.capitalize() if path[position].isupper() else w for w in _RATE_WORDS]
+            a, b, c = (path[:position] + w + path[position + len(word) :] for w in written)
             yield a, b, c
-    for at in range(len(path) - 1, leaf - 1, -1):
-        if path[at] in "xyzXYZ":
-            axes = "XYZ" if path[at].isupper() else "xyz"
-            a, b, c = (path[:at] + axis + path[at + 1 :] for axis in axes)
+    for position in range(len(path) - 1, leaf - 1, -1):
+        if path[position] in "xyzXYZ":
+            axes = "XYZ" if path[position].isupper() else "xyz"
+            a, b, c = (path[:position] + axis + path[position + 1 :] for axis in axes)
             yield a, b, c

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from pdhef_logtool.mapping.candidates import LEAST_SCORE, Found, leaf_group, triad_of
+from pdhef_logtool.mapping.candidates import LEAST_SCORE, Field, leaf_group, triad_of
 from pdhef_logtool.mapping.evidence import fit, ratio, spread
 from pdhef_logtool.mapping.fields import CLEAR, EXCITED_A_M_S2, Fields, mean_of
 from pdhef_logtool.mapping.naming import G_M_S2
@@ -39,26 +39,26 @@ def decide_units(fields: Fields) -> None:
 
 
 def _by_gravity(fields: Fields) -> None:
-    groups: dict[str, dict[str, Found]] = {}
-    for one in fields.found:
-        if one.meaning.quantity == "acceleration" and one.is_axis:
-            groups.setdefault(triad_of(one), {})[one.meaning.part] = one
+    groups: dict[str, dict[str, Field]] = {}
+    for item in fields.candidates:
+        if item.meaning.quantity == "acceleration" and item.is_axis:
+            groups.setdefault(triad_of(item), {})[item.meaning.part] = item
     for axes in groups.values():
         if set(axes) != set("xyz"):
             continue
         means = np.array([np.nanmean(axes[a].seen.values) for a in "xyz"])
         size = float(np.linalg.norm(means))
         _say_mounting(fields, axes["z"], means / size if size > 0.0 else means)
-        for one in axes.values():
-            if one.known or one.fixed:
+        for item in axes.values():
+            if item.unit_known or item.fixed:
                 continue
-            near = [u for u, s in one.factors if abs(size * s / G_M_S2 - 1.0) < 0.08]
+            near = [u for u, s in item.factors if abs(size * s / G_M_S2 - 1.0) < 0.08]
             if near:
-                one.use(near[0])
-                one.reasons.append(f"gravity: the mean of its three axes is {size:.4g}, so it is in {near[0]}")
+                item.use(near[0])
+                item.reasons.append(f"gravity: the mean of its three axes is {size:.4g}, so it is in {near[0]}")
 
 
-def _say_mounting(fields: Fields, z: Found, gravity: FloatArray) -> None:
+def _say_mounting(fields: Fields, z: Field, gravity: FloatArray) -> None:
     """Say where gravity is not along +z of an accelerometer that names its axes: its axes are not the car's."""
     if z.fixed or gravity[2] > MOST_TILTED or z.role in ("command", "estimate", "truth"):
         return
@@ -77,14 +77,14 @@ def _say_mounting(fields: Fields, z: Found, gravity: FloatArray) -> None:
 
 def _by_wheel_rates(fields: Fields) -> None:
     """Tell the unit of a gyro where wheels turn in rad/s and their radius is not known: only one gives a wheel's."""
-    wheels = [f for f in fields.found if f.meaning.quantity == "wheel rate" and f.known]
+    wheels = [f for f in fields.candidates if f.meaning.quantity == "wheel rate" and f.unit_known]
     if not wheels:
         return
     turning = mean_of([f.si for f in wheels])
     for rate in fields.open("rate", "z"):
         for ay in fields.open("acceleration", "y")[:2]:
             relation = fields.turning(ay.si, rate.seen.cells, turning)
-            if rate.known or relation is None or abs(relation.correlation) < CLEAR:
+            if rate.unit_known or relation is None or abs(relation.correlation) < CLEAR:
                 continue
             radii = {unit: abs(relation.slope) / factor for unit, factor in rate.factors}
             near = [unit for unit, radius_m in radii.items() if RADII_M[0] < radius_m < RADII_M[1]]
@@ -96,33 +96,33 @@ def _by_wheel_rates(fields: Fields) -> None:
 def _rank(fields: Fields) -> None:
     """Prefer fields of a message that has both accelerations and rates, and the sensor to its copies."""
     kinds: dict[tuple[str, str], set[str]] = {}
-    for one in fields.found:
-        kinds.setdefault(leaf_group(one), set()).add(one.meaning.quantity)
-    for one in fields.found:
-        if one.meaning.quantity in ("acceleration", "rate") and kinds[leaf_group(one)] >= {"acceleration", "rate"}:
-            one.bonus += 0.1
-        if any(w in one.path.lower() for w in _SECOND_CHOICE):
-            one.bonus -= 0.15
+    for item in fields.candidates:
+        kinds.setdefault(leaf_group(item), set()).add(item.meaning.quantity)
+    for item in fields.candidates:
+        if item.meaning.quantity in ("acceleration", "rate") and kinds[leaf_group(item)] >= {"acceleration", "rate"}:
+            item.bonus += 0.1
+        if any(w in item.path.lower() for w in _SECOND_CHOICE):
+            item.bonus -= 0.15
 
 
 def _speeds(fields: Fields) -> None:
     """Tell units of speeds by one another: what is known, then a_x, then the least assuming."""
-    known = [f for f in fields.all("speed") if f.known or f.fixed]
-    reference = max(known, key=lambda f: f.score, default=None)
+    settled = [f for f in fields.all("speed") if f.unit_known or f.fixed]
+    reference = max(settled, key=lambda f: f.score, default=None)
     path = path_speed(fields)
-    for one in fields.all("speed"):
-        if reference is not None and one is not reference:
-            times = ratio(reference.si, one.seen.cells, SLOWEST)
-            fields.settle(one, times or 0.0, f"{reference.path} of {reference.topic.name}", 0.08)
+    for item in fields.all("speed"):
+        if reference is not None and item is not reference:
+            times = ratio(reference.si, item.seen.cells, SLOWEST)
+            fields.settle(item, times or 0.0, f"{reference.path} of {reference.topic.name}", 0.08)
         if path is not None:
-            fields.settle(one, ratio(path, one.seen.cells, SLOWEST) or 0.0, "the positions' speed", 0.12)
-    for one in fields.all("speed"):
-        if one.known or one.fixed:
+            fields.settle(item, ratio(path, item.seen.cells, SLOWEST) or 0.0, "the positions' speed", 0.12)
+    for item in fields.all("speed"):
+        if item.unit_known or item.fixed:
             continue
         for ax in fields.all("acceleration", "x"):
-            relation = fit(fields.pieces.smooth(ax.si), fields.pieces.rate_of(one.seen.cells))
+            relation = fit(fields.pieces.smooth(ax.si), fields.pieces.rate_of(item.seen.cells))
             if relation is not None and relation.correlation > CLEAR:
-                fields.settle(one, relation.slope, "its rate of change against a_x", 0.25)
+                fields.settle(item, relation.slope, "its rate of change against a_x", 0.25)
                 break
 
 
@@ -134,18 +134,18 @@ def _by_turning(fields: Fields) -> None:
     for rate in fields.open("rate", "z")[:4]:
         for ay in fields.open("acceleration", "y")[:4]:
             trio = (ay, rate, speed)
-            units = () if all(f.known for f in trio) else _units_of_turning(fields, trio)
-            for one, unit in zip(trio, units, strict=False):
-                if not one.known and not one.fixed:
-                    one.use(unit)
-                    one.reasons.append(f"unit {unit} by a_y ≈ v r")
-                    one.bonus += 0.3 if one.score < LEAST_SCORE else 0.0
+            units = () if all(f.unit_known for f in trio) else _units_of_turning(fields, trio)
+            for item, unit in zip(trio, units, strict=False):
+                if not item.unit_known and not item.fixed:
+                    item.use(unit)
+                    item.reasons.append(f"unit {unit} by a_y ≈ v r")
+                    item.bonus += 0.3 if item.score < LEAST_SCORE else 0.0
 
 
-def _units_of_turning(fields: Fields, trio: tuple[Found, Found, Found]) -> tuple[str, ...]:
+def _units_of_turning(fields: Fields, trio: tuple[Field, Field, Field]) -> tuple[str, ...]:
     """Return the units of a_y, yaw rate and speed with a slope near 1; empty where several combinations have one."""
     fits = []
-    for units in itertools.product(*(f.factors[:1] if f.known or f.fixed else f.factors for f in trio)):
+    for units in itertools.product(*(f.factors[:1] if f.unit_known or f.fixed else f.factors for f in trio)):
         relation = fields.turning(*(f.seen.cells * factor for f, (_, factor) in zip(trio, units, strict=True)))
         if relation is not None and abs(relation.correlation) > CLEAR and SLOPES[0] < abs(relation.slope) < SLOPES[1]:
             fits.append(units)
@@ -155,25 +155,30 @@ def _units_of_turning(fields: Fields, trio: tuple[Found, Found, Found]) -> tuple
 
 def _by_speeding_up(fields: Fields) -> None:
     speed = fields.best("speed")
-    if speed is None or not (speed.known or speed.fixed):
+    if speed is None or not (speed.unit_known or speed.fixed):
         return
     change = fields.pieces.rate_of(speed.si)
-    for one in fields.open("acceleration", "x"):
-        if one.known or one.fixed or not spread(change) > EXCITED_A_M_S2:
+    for item in fields.open("acceleration", "x"):
+        if item.unit_known or item.fixed or not spread(change) > EXCITED_A_M_S2:
             continue
-        relation = fit(change, fields.pieces.smooth(one.seen.cells))
+        relation = fit(change, fields.pieces.smooth(item.seen.cells))
         if relation is not None and abs(relation.correlation) > CLEAR:
-            fields.settle(one, abs(relation.slope), "the speed's rate of change", 0.4)
+            fields.settle(item, abs(relation.slope), "the speed's rate of change", 0.4)
 
 
 def _by_siblings(fields: Fields) -> None:
     """Take the unit of the other accelerations, or velocities, of a message: nobody mixes them."""
     for kinds in ({"acceleration"}, {"speed", "velocity"}):
-        known = {leaf_group(f): f for f in fields.found if f.meaning.quantity in kinds and f.known}
-        for one in fields.found:
-            other = known.get(leaf_group(one))
-            if one.meaning.quantity in kinds and not one.known and other is not None and one.meaning.strength > 0.6:
-                same = [u for u, s in one.factors if math.isclose(s, other.factors[0][1], rel_tol=1e-6)]
+        settled = {leaf_group(f): f for f in fields.candidates if f.meaning.quantity in kinds and f.unit_known}
+        for item in fields.candidates:
+            other = settled.get(leaf_group(item))
+            if (
+                item.meaning.quantity in kinds
+                and not item.unit_known
+                and other is not None
+                and item.meaning.strength > 0.6
+            ):
+                same = [u for u, s in item.factors if math.isclose(s, other.factors[0][1], rel_tol=1e-6)]
                 if same:
-                    one.use(same[0])
-                    one.reasons.append(f"unit {same[0]} as of {other.path}")
+                    item.use(same[0])
+                    item.reasons.append(f"unit {same[0]} as of {other.path}")

@@ -1,9 +1,9 @@
-"""Fields whose names say nothing (``data[3]``, ``ch7``, ``k``): what they are by how they move with one another.
+"""Unlabelled fields (``data[3]``, ``ch7``, ``k``): their quantities by physical relations between them.
 
-Speed, yaw rate and the accelerations are believed where one choice of columns alone satisfies a_y = v r and a_x = v̇ at
+Speed, yaw rate and the accelerations are accepted where only one choice of columns satisfies a_y = v r and a_x = v̇ at
 once, with slopes that units explain: the second slope gives the units of speed and accelerations, the ratio of the two
-that of the yaw rate. A steering angle looks like a yaw rate over a speed too, but for that ratio. Left and right
-nothing tells. What is not believed is a candidate that is not taken.
+that of the yaw rate. A steering angle looks like a yaw rate over a speed too, but for that ratio. Left and
+right are not observable. Choices that are not accepted remain candidates that are not taken.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
-from pdhef_logtool.mapping.candidates import MOST_FIELDS, Found, Role, stamp_of
+from pdhef_logtool.mapping.candidates import ANGLES, HYPOTHESES, MOST_FIELDS, Field, Role, stamp_of
 from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, is_of_both_signs, ratio, spread
 from pdhef_logtool.mapping.fields import EXCITED_A_M_S2, Fields
 from pdhef_logtool.mapping.naming import G_M_S2, Meaning, is_command, is_unlabelled, meaning_of
@@ -24,9 +24,9 @@ from pdhef_logtool.mapping.path import path_speed
 from pdhef_logtool.records.signals import FloatArray
 
 #: Columns that are looked at, and of one array.
-MOST_NAMELESS = 40
+MOST_UNLABELLED = 40
 MOST_OF_ARRAY = 32
-#: Correlations of a_y with v r, and of a_x with v̇, that are believed; others may do with less, and decide nothing.
+#: Correlations of a_y with v r, and of a_x with v̇, that are accepted; rival choices may have lower ones.
 TURNS, SPEEDS_UP = 0.92, 0.75
 LOOSE_TURNS, LOOSE_SPEEDS_UP = 0.8, 0.6
 #: How much nearer to 1 than that of any other choice their product must be.
@@ -46,15 +46,11 @@ COPY = 0.98
 ITSELF = 0.999
 #: A steering angle follows the path's curvature so well.
 STEERS = 0.9
-#: Choices that are shown where none is believed.
+#: Choices that are shown where none is accepted.
 MOST_DOUBTFUL = 3
 #: Strength of a name that values give without deciding.
 WEAK = 0.3
-_UNITS = {
-    "speed": (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704)),
-    "rate": (("rad/s", 1.0), ("deg/s", math.radians(1.0))),
-    "acceleration": (("m/s²", 1.0), ("g", G_M_S2)),
-}
+_UNITS = HYPOTHESES | {"acceleration": (("m/s²", 1.0), ("g", G_M_S2))}
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,14 +58,14 @@ class _Choice:
     """Columns that are speed, yaw rate, a_y and a_x, the relations between them, and the units of the first three.
 
     ``x`` and ``speeding`` are None where no column is the speed's change. ``is_plausible``: its slopes are near to what
-    units explain, and a_y is as large as one; ``is_strict``: both relations hold so well that it is believed if no
+    units explain, and a_y is as large as one; ``is_strict``: both relations hold so well that it is accepted if no
     other is as near. ``ahead_s`` : how far a_y is ahead of v r.
     """
 
-    v: Found
-    r: Found
-    y: Found
-    x: Found | None
+    v: Field
+    r: Field
+    y: Field
+    x: Field | None
     turning: Fit
     speeding: Fit | None
     units: tuple[tuple[str, float], tuple[str, float], tuple[str, float]]
@@ -78,7 +74,7 @@ class _Choice:
     ahead_s: float
 
     @property
-    def columns(self) -> tuple[Found, ...]:
+    def columns(self) -> tuple[Field, ...]:
         """All that there are."""
         return (self.v, self.r, self.y, *([] if self.x is None else [self.x]))
 
@@ -102,7 +98,7 @@ class _Choice:
         return f"{first} and {second}" + (", and units explain both slopes" if self.is_strict else "")
 
 
-def nameless_columns(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], pieces: Pieces) -> list[Found]:
+def unlabelled_columns(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], pieces: Pieces) -> list[Field]:
     """Return the columns of sensors' topics whose names say nothing, with what stands in them."""
     requests: dict[str, list[str]] = {}
     for topic, role in topics:
@@ -120,73 +116,73 @@ def nameless_columns(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], pi
         return []
     read = pieces.read(requests, MOST_OF_ARRAY)
     by_name = {topic.name: (topic, role) for topic, role in topics}
-    found: list[Found] = []
+    results: list[Field] = []
     for (name, path), seen in read.items():
-        if seen.changes and len(found) < MOST_NAMELESS:
+        if seen.changes and len(results) < MOST_UNLABELLED:
             topic, role = by_name[name]
             stamp = stamp_of(log.fields(name, quiet=True), path)
-            meaning = Meaning("", "", 0.5, "", None, f"{path!r} says nothing")
-            found.append(Found(topic, path, meaning, role, stamp, seen, (("", 1.0),)))
-    return found
+            meaning = Meaning("", "", 0.5, "", None, f"{path!r} gives no quantity")
+            results.append(Field(topic, path, meaning, role, stamp, seen, (("", 1.0),)))
+    return results
 
 
-def identified(fields: Fields, nameless: Sequence[Found]) -> tuple[list[Found], str, str]:
-    """Return what nameless columns are, or may be with weak names; topic and evidence of what is believed.
+def identified(fields: Fields, unlabelled: Sequence[Field]) -> tuple[list[Field], str, str]:
+    """Return what unlabelled columns are, or may be with weak names; topic and evidence of the accepted choice.
 
     Parameters
     ----------
-    nameless : columns with a meaning that is empty; fields that names tell serve as what they are.
+    unlabelled : columns with a meaning that is empty; fields that names tell serve as what they are.
     """
-    order = sorted(_choices(fields, nameless), key=lambda c: (-c.score, -abs(c.turning.correlation)))
+    order = sorted(_choices(fields, unlabelled), key=lambda c: (-c.score, -abs(c.turning.correlation)))
     best = next((c for c in order if c.is_strict), None)
     # What is behind v r is no a_y, where there is one ahead of it.
     others = [c for c in order if best is not None and c.x is not None and c.ahead_s > 0.0 and not _same(best, c)]
     rivals = [c for c in others if best is not None and c.score > best.score - CLEARER]
     if best is not None and not rivals:
-        found = _as_chosen(fields, nameless, best, best.evidence, sure=True)
-        return found, next(f.topic.name for f in best.columns if _open(f)), best.evidence
+        results = _as_chosen(fields, unlabelled, best, best.evidence, sure=True)
+        return results, next(f.topic.name for f in best.columns if _open(f)), best.evidence
     likely = sorted(order, key=lambda c: (not c.is_plausible, c.conversions, -abs(c.turning.correlation)))
     likely = likely if best is None else [best, *rivals]
-    found = []
+    results = []
     for choice in likely[:MOST_DOUBTFUL]:
-        for one in _as_chosen(fields, nameless, choice, choice.evidence, sure=False):
-            known = ((f.meaning.quantity, f.meaning.part, f.path) for f in found)
-            if (one.meaning.quantity, one.meaning.part, one.path) not in known:
-                found.append(one)
-    return found, "", ""
+        for item in _as_chosen(fields, unlabelled, choice, choice.evidence, sure=False):
+            keys = ((f.meaning.quantity, f.meaning.part, f.path) for f in results)
+            if (item.meaning.quantity, item.meaning.part, item.path) not in keys:
+                results.append(item)
+    return results, "", ""
 
 
-def _as_chosen(fields: Fields, nameless: Sequence[Found], choice: _Choice, why: str, *, sure: bool) -> list[Found]:
+def _as_chosen(fields: Fields, unlabelled: Sequence[Field], choice: _Choice, why: str, *, sure: bool) -> list[Field]:
     """Return the columns of a choice as what they are in it, and the one that steers."""
     speed_unit, rate_unit, unit = choice.units
     speed_is_sure = sure and _speed_is_sure(fields, choice.v, speed_unit)
     speed_why = why if speed_is_sure else f"{why}; a wheel that turns in rad/s may look the same"
-    told = [
+    meanings = [
         (choice.v, Meaning("speed", "x", 1.0, *speed_unit, speed_why), 1.0, speed_is_sure),
         (choice.r, Meaning("rate", "z", 1.0, *rate_unit, why), 1.0, sure),
         (choice.y, Meaning("acceleration", "y", 1.0, *unit, why), math.copysign(1.0, choice.turning.slope), sure),
     ]
     if choice.x is not None and choice.speeding is not None:
         sign = math.copysign(1.0, choice.speeding.slope)
-        told.append((choice.x, Meaning("acceleration", "x", 1.0, *unit, why), sign, sure))
-    found = [_named(one, meaning, sign, sure=believed) for one, meaning, sign, believed in told if _open(one)]
-    rest = [f for f in nameless if not any(f is c for c in choice.columns)]
+        meanings.append((choice.x, Meaning("acceleration", "x", 1.0, *unit, why), sign, sure))
+    results = [_named(item, meaning, sign, sure=is_sure) for item, meaning, sign, is_sure in meanings if _open(item)]
+    rest = [f for f in unlabelled if not any(f is c for c in choice.columns)]
     speed, rate = _values(choice.v) * speed_unit[1], _values(choice.r) * rate_unit[1]
-    return found + _steering(fields, rest, speed, rate, sure=sure)
+    return results + _steering(fields, rest, speed, rate, sure=sure)
 
 
-def _choices(fields: Fields, nameless: Sequence[Found]) -> Iterator[_Choice]:
+def _choices(fields: Fields, unlabelled: Sequence[Field]) -> Iterator[_Choice]:
     """Yield the choices that satisfy the relations with slopes that units explain."""
-    signed = [f for f in nameless if is_of_both_signs(f.seen.values)]
-    forward = [f for f in nameless if _is_forward(f)]
-    others = {"speed": forward, "rate": signed, "ay": signed, "ax": list(nameless)}
+    signed = [f for f in unlabelled if is_of_both_signs(f.seen.values)]
+    forward = [f for f in unlabelled if _is_forward(f)]
+    others = {"speed": forward, "rate": signed, "ay": signed, "ax": list(unlabelled)}
     speeds, rates, ays, axs = (_known(fields, n) or columns for n, columns in others.items())
     smooth = {id(f): fields.pieces.smooth(_values(f)) for f in {id(f): f for f in (*ays, *axs)}.values()}
     for v in speeds:
         change = fields.pieces.rate_of(_values(v))
         fits = [(x, fit(change, smooth[id(x)])) for x in axs if x is not v]
         # The slope the way round in which grade and noise of a_x do not make it smaller.
-        ways: list[tuple[Found | None, Fit | None]] = [(None, None)]
+        ways: list[tuple[Field | None, Fit | None]] = [(None, None)]
         ways += [
             (x, replace(relation, slope=relation.correlation**2 / relation.slope))
             for x, relation in fits
@@ -200,7 +196,7 @@ def _choices(fields: Fields, nameless: Sequence[Found]) -> Iterator[_Choice]:
 
 
 def _choices_of(
-    fields: Fields, columns: tuple[Found, Found, Found], ay: FloatArray, ways: Sequence[tuple[Found | None, Fit | None]]
+    fields: Fields, columns: tuple[Field, Field, Field], ay: FloatArray, ways: Sequence[tuple[Field | None, Fit | None]]
 ) -> Iterator[_Choice]:
     """Yield the choices of one speed, yaw rate and a_y."""
     turning, by_speed, ahead_s = _turning(fields, *columns[:2], ay)
@@ -213,7 +209,7 @@ def _choices_of(
             yield _Choice(*columns, x, turning, speeding, units, strict, plausible, ahead_s)
 
 
-def _turning(fields: Fields, v: Found, r: Found, ay: FloatArray) -> tuple[Fit | None, bool, float]:
+def _turning(fields: Fields, v: Field, r: Field, ay: FloatArray) -> tuple[Fit | None, bool, float]:
     """Fit a_y to v r; return whether it is as an a_y, not other powers of the speed, and how far it is ahead, s."""
     smooth, speed = fields.pieces.smooth, _values(v)
     with np.errstate(invalid="ignore"):
@@ -229,7 +225,7 @@ def _turning(fields: Fields, v: Found, r: Found, ay: FloatArray) -> tuple[Fit | 
 
 
 def _explained(
-    columns: tuple[Found, Found, Found, Found | None], turning: Fit, speeding: Fit | None
+    columns: tuple[Field, Field, Field, Field | None], turning: Fit, speeding: Fit | None
 ) -> tuple[tuple[tuple[str, float], tuple[str, float], tuple[str, float]], float] | None:
     """Return the units of speed, yaw rate and accelerations that explain the slopes, and the logarithm of how far off.
 
@@ -246,29 +242,29 @@ def _explained(
     return min(ways)[1:] if ways else None
 
 
-def _units(one: Found, quantity: str) -> tuple[tuple[str, float], ...]:
-    return _UNITS[quantity] if _open(one) else (("", 1.0),)
+def _units(item: Field, quantity: str) -> tuple[tuple[str, float], ...]:
+    return _UNITS[quantity] if _open(item) else (("", 1.0),)
 
 
-def _open(one: Found) -> bool:
+def _open(item: Field) -> bool:
     """Return whether a column is one without a name."""
-    return not one.meaning.quantity
+    return not item.meaning.quantity
 
 
-def _values(one: Found) -> FloatArray:
-    return one.seen.cells if _open(one) else one.si
+def _values(item: Field) -> FloatArray:
+    return item.seen.cells if _open(item) else item.si
 
 
-def _known(fields: Fields, what: str) -> list[Found]:
+def _known(fields: Fields, what: str) -> list[Field]:
     """Return the surest field that a name says to be a quantity and whose unit is known."""
     kind = {"speed": ("speed", None), "rate": ("rate", "z"), "ay": ("acceleration", "y"), "ax": ("acceleration", "x")}
-    every = [f for f in fields.all(*kind[what]) if (f.known or f.fixed) and f.seen.changes]
+    every = [f for f in fields.all(*kind[what]) if (f.unit_known or f.fixed) and f.seen.changes]
     return every[:1]
 
 
-def _is_forward(one: Found) -> bool:
+def _is_forward(item: Field) -> bool:
     """Return whether a column may be a speed: hardly ever negative, and never still for long."""
-    finite = one.seen.values[np.isfinite(one.seen.values)]
+    finite = item.seen.values[np.isfinite(item.seen.values)]
     if finite.shape[0] == 0:
         return False
     low, high = np.quantile(finite, [0.02, 0.98])
@@ -277,67 +273,68 @@ def _is_forward(one: Found) -> bool:
 
 def _same(a: _Choice, b: _Choice) -> bool:
     """Return whether two choices are the same, or take copies of one another's columns."""
-    for one, other in zip(a.columns, b.columns, strict=True):
-        relation = None if one is other else fit(_values(one), _values(other))
-        if one is not other and (relation is None or abs(relation.correlation) < COPY):
+    for item, other in zip(a.columns, b.columns, strict=True):
+        relation = None if item is other else fit(_values(item), _values(other))
+        if item is not other and (relation is None or abs(relation.correlation) < COPY):
             return False
     return True
 
 
-def _speed_is_sure(fields: Fields, speed: Found, unit: tuple[str, float]) -> bool:
+def _speed_is_sure(fields: Fields, speed: Field, unit: tuple[str, float]) -> bool:
     """Return whether no wheel that turns in rad/s can be taken for a speed."""
     path = path_speed(fields)
     times = None if path is None else ratio(path, _values(speed) * unit[1], 1.0)
     return unit[0] == "m/s" if times is None else abs(times - 1.0) < 0.08
 
 
-def _named(one: Found, meaning: Meaning, sign: float, *, sure: bool) -> Found:
-    """Return a column as what it was found to be; with a weak name where it is not believed."""
+def _named(item: Field, meaning: Meaning, sign: float, *, sure: bool) -> Field:
+    """Return a column with its quantity; with a weak name where it is not sure."""
     meaning = replace(meaning, strength=1.0 if sure else WEAK)
     factors = ((meaning.unit, meaning.scale or 1.0),)
-    named = replace(one, meaning=meaning, factors=factors, sign=sign, known=sure, reasons=[], doubts=[])
+    named = replace(item, meaning=meaning, factors=factors, sign=sign, unit_known=sure, reasons=[], doubts=[])
     if not sure:
         named.is_weak = True
-        named.doubts.append("its name says nothing, and its values do not decide")
+        named.doubts.append("its name gives no quantity, and its values do not decide")
     return named
 
 
 def _steering(
-    fields: Fields, columns: Sequence[Found], speed: FloatArray, rate: FloatArray, *, sure: bool
-) -> list[Found]:
+    fields: Fields, columns: Sequence[Field], speed: FloatArray, rate: FloatArray, *, sure: bool
+) -> list[Field]:
     """Return the column that follows the path's curvature far better than others, as a steering angle."""
     with np.errstate(invalid="ignore", divide="ignore"):
         slow = max(1.0, 0.25 * float(np.nanquantile(speed, 0.95)))
         curve = fields.pieces.smooth(np.where(speed > slow, rate / speed, np.nan))
     if not spread(curve * speed**2) > EXCITED_A_M_S2:
         return []
-    ranked: list[tuple[float, Found]] = []
-    for one in columns:
-        relation = fit(fields.pieces.smooth(one.seen.cells), curve)
+    ranked: list[tuple[float, Field]] = []
+    for item in columns:
+        relation = fit(fields.pieces.smooth(item.seen.cells), curve)
         if relation is not None and abs(relation.correlation) > STEERS:
-            ranked.append((abs(relation.correlation), one))
+            ranked.append((abs(relation.correlation), item))
     ranked.sort(key=lambda c: -c[0])
     if not ranked:
         return []
     first, best = ranked[0]
     rivals = [o for c, o in ranked[1:] if c > first - CLEARER and not _is_copy(best, o)]
-    kinds = (("rad", 1.0), ("deg", math.radians(1.0)))
     why = f"it follows the path's curvature (correlation {first:.2f})"
     meaning = Meaning("steering", "", 1.0 if sure and not rivals else WEAK, "", None, why)
-    found = replace(best, meaning=meaning, factors=kinds, reasons=[], doubts=[], is_weak=not sure or bool(rivals))
+    results = replace(best, meaning=meaning, factors=ANGLES, reasons=[], doubts=[], is_weak=not sure or bool(rivals))
     if not sure:
-        found.doubts.append("its name says nothing, and its values do not decide")
+        results.doubts.append("its name gives no quantity, and its values do not decide")
     if rivals:
-        found.doubts.append(f"its name says nothing, and {rivals[0].path} follows the path's curvature as well")
-    return [found]
+        results.doubts.append(
+            f"its name gives no quantity, and {rivals[0].path} follows the path's curvature equally well"
+        )
+    return [results]
 
 
-def _is_copy(a: Found, b: Found) -> bool:
+def _is_copy(a: Field, b: Field) -> bool:
     relation = fit(a.seen.cells, b.seen.cells)
     return relation is not None and abs(relation.correlation) > COPY
 
 
-def wanted_nameless(signals: Mapping[str, object], named: Sequence[Meaning]) -> bool:
+def needs_unlabelled(signals: Mapping[str, object], named: Sequence[Meaning]) -> bool:
     """Return whether neither what is mapped nor a name gives the speed, the yaw rate or an acceleration."""
     kinds = {(m.quantity, m.part) for m in named}
     missing = {

@@ -45,11 +45,11 @@ class _FieldTable(BaseModel):
     @model_validator(mode="after")
     def _is_one_quantity(self) -> _FieldTable:
         if bool(self.signal) == bool(self.truth):
-            raise ValueError("give signal or truth")
+            raise ValueError("give signal or truth, not both")
         if self.signal and self.signal not in SIGNAL_UNITS:
             raise ValueError(f"{self.signal!r} is no signal")
         if self.truth and self.truth not in TRUTH_UNITS:
-            raise ValueError(f"{self.truth!r} is no truth quantity")
+            raise ValueError(f"{self.truth!r} is no ground-truth quantity")
         if 0.0 in (self.scale if isinstance(self.scale, list) else [self.scale]):
             raise ValueError("scale must not be 0")
         if isinstance(self.scale, list) and not isinstance(self.field, list):
@@ -157,13 +157,13 @@ def load_vendors(path: Path | None = None) -> Vendors:
     given = path or (Path(os.environ[USERS_FILE]) if os.environ.get(USERS_FILE) else None)
     if given is None:
         return _shipped()
-    own = _read(given)
-    kept = {name: why for name, why in _shipped().reasons.items() if name not in own.types}
+    users = _read(given)
+    kept = {name: why for name, why in _shipped().reasons.items() if name not in users.types}
     return Vendors(
-        {**_shipped().types, **own.types},
-        {**{n: v for n, v in _shipped().vectors.items() if n not in own.types}, **own.vectors},
-        {**kept, **own.reasons},
-        {**_shipped().exports, **own.exports},
+        {**_shipped().types, **users.types},
+        {**{n: v for n, v in _shipped().vectors.items() if n not in users.types}, **users.vectors},
+        {**kept, **users.reasons},
+        {**_shipped().exports, **users.exports},
     )
 
 
@@ -175,7 +175,7 @@ def _shipped() -> Vendors:
 def _read(path: Path) -> Vendors:
     raw = read_toml(path, "a TOML file of vendors' types", MappingFileError)
     problems = [f"{key}: not known, expected [[types]]" for key in raw if key != "types"]
-    found: dict[str, dict[str, VendorField]] = {}
+    by_name: dict[str, dict[str, VendorField]] = {}
     reasons: dict[str, str] = {}
     vectors: dict[str, tuple[SignalSource, ...]] = {}
     exports: dict[str, frozenset[str]] = {}
@@ -191,7 +191,7 @@ def _read(path: Path) -> Vendors:
             for f in model.fields
             if isinstance(f.field, str) and isinstance(f.scale, float)
         }
-        found.update({_plain(name): fields for name in model.type})
+        by_name.update({_plain(name): fields for name in model.type})
         several = tuple(_vector(f) for f in model.fields if isinstance(f.field, list))
         vectors.update({_plain(name): several for name in model.type if several})
         reasons.update({_plain(name): model.leave_out for name in model.type if model.leave_out})
@@ -202,7 +202,7 @@ def _read(path: Path) -> Vendors:
             where=str(path),
             remedy="see docs/vendors.md for every entry",
         )
-    return Vendors(found, vectors, reasons, exports)
+    return Vendors(by_name, vectors, reasons, exports)
 
 
 def _field(table: _FieldTable, scale: float, page: str) -> VendorField:

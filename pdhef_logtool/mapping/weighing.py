@@ -1,7 +1,7 @@
-"""Choosing among candidates by physics: gravity, a_y ≈ v r, a_x ≈ v̇, steering against curvature, wheels against yaw.
+"""Choice among candidates by physics: gravity, a_y ≈ v r, a_x ≈ v̇, steering against curvature, wheels against yaw.
 
-What a recognised type already gives is an anchor: it is held against the candidates and never changed. What decides a
-unit or a sign is said; what stays open becomes a check that is undecided, with what to do about it.
+Signals of recognised types are anchors: candidates are compared with them, and they are never changed. Reports give
+the evidence for a unit or a sign; an open point becomes an undecided check with a remedy.
 """
 
 from __future__ import annotations
@@ -15,14 +15,15 @@ import numpy as np
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.candidates import (
     LEAST_SCORE,
+    SPEEDS,
     Candidate,
-    Found,
+    Field,
     Role,
+    anchor_of,
     leaf_group,
     look,
     named_fields,
     names_of,
-    source_found,
     triad_of,
 )
 from pdhef_logtool.mapping.checking import has_path
@@ -31,7 +32,7 @@ from pdhef_logtool.mapping.fields import CLEAR, Fields, mean_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.signs import SLOW_M_S, WITNESSES, WORDS, judge_signs
 from pdhef_logtool.mapping.units import RADII_M, decide_units
-from pdhef_logtool.mapping.unlabelled_fields import identified, nameless_columns, wanted_nameless
+from pdhef_logtool.mapping.unlabelled_fields import identified, needs_unlabelled, unlabelled_columns
 from pdhef_logtool.mapping.vendors import Vendors
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, FloatArray
@@ -52,15 +53,14 @@ FOLLOWS = 0.5
 WHEEL_UNIT = 0.04
 #: Metres by which curvature becomes an angle: wheelbases of model cars to lorries, and those times a steering ratio.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
-#: Units of wheel speeds, and the usual radius of wheels that turn.
-SPEEDS = (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704))
+#: Unit of rotational speeds, and the usual radius of a wheel.
 RPM = 2.0 * math.pi / 60.0
 USUAL_RADIUS_M = 0.3
 
 
 @dataclass(frozen=True, slots=True)
 class Weighed:
-    """What the candidates give: sources to take, all candidates, notes, and checks that are undecided."""
+    """Result of weighing: sources to take, all candidates, notes, and undecided checks."""
 
     signals: dict[str, SignalSource] = field(default_factory=dict)
     truth: dict[str, SignalSource] = field(default_factory=dict)
@@ -77,7 +77,7 @@ def weigh(
     truth: Mapping[str, SignalSource],
     vendors: Vendors,
 ) -> Weighed:
-    """Look for the signals that are not mapped, and for truth if there is none.
+    """Choose fields for the signals that are not mapped, and for ground truth if there is none.
 
     Parameters
     ----------
@@ -87,26 +87,26 @@ def weigh(
     wanted = [
         n for n in named_fields(log, topics, vendors) if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)
     ]
-    without_names = wanted_nameless(signals, [n[3] for n in wanted])
+    without_names = needs_unlabelled(signals, [n[3] for n in wanted])
     if not (wanted or without_names) or log.end_ns <= log.start_ns:
         return Weighed()
     positions = [s for n, s in truth.items() if n in _POSITIONS]
-    known = {**signals, **_upward(log, signals)}
-    pieces, found = look(log, wanted, vendors, [*known.values(), *positions])
-    anchors = {n: f for n, s in known.items() if (f := source_found(s, found)) is not None}
-    places = [f for f in found if f.meaning.quantity in ("latitude", "longitude", "position")]
-    fields = Fields(pieces, anchors, [f for f in found if not f.anchor], places)
+    mapped = {**signals, **_upward(log, signals)}
+    pieces, weighable = look(log, wanted, vendors, [*mapped.values(), *positions])
+    anchors = {n: f for n, s in mapped.items() if (f := anchor_of(s, weighable)) is not None}
+    places = [f for f in weighable if f.meaning.quantity in ("latitude", "longitude", "position")]
+    fields = Fields(pieces, anchors, [f for f in weighable if not f.anchor], places)
     decide_units(fields)
-    nameless = nameless_columns(log, topics, pieces) if without_names else []
-    meant, named, evidence = identified(fields, nameless) if nameless else ([], "", "")
-    fields.found += meant
-    at_work = _Weighing(fields, "" if truth else truth_topic(fields.found))
+    unlabelled = unlabelled_columns(log, topics, pieces) if without_names else []
+    meant, named, evidence = identified(fields, unlabelled) if unlabelled else ([], "", "")
+    fields.candidates += meant
+    weighing = _Weighing(fields, "" if truth else truth_topic(fields.candidates))
     if named:
-        at_work.say_nameless(named, evidence)
-    at_work.choose_signals(set(signals))
+        weighing.note_unlabelled(named, evidence)
+    weighing.choose_signals(set(signals))
     if not truth:
-        at_work.choose_truth()
-    return at_work.result()
+        weighing.choose_truth()
+    return weighing.result()
 
 
 def _upward(log: DriveLog, signals: Mapping[str, SignalSource]) -> dict[str, SignalSource]:
@@ -139,8 +139,8 @@ def _is_wanted(
 class _Weighing:
     fields: Fields
     truth_from: str
-    taken: dict[str, Found] = field(default_factory=dict)
-    truth: dict[str, Found] = field(default_factory=dict)
+    taken: dict[str, Field] = field(default_factory=dict)
+    truth: dict[str, Field] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     rivals: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
     checks: list[Check] = field(default_factory=list)
@@ -149,11 +149,11 @@ class _Weighing:
 
     def choose_signals(self, have: set[str]) -> None:
         """Take the best candidate of each signal that is missing."""
-        usable = [f for f in self.fields.found if f.role in ("sensor", "navigation", "device")]
+        usable = [f for f in self.fields.candidates if f.role in ("sensor", "navigation", "device")]
         usable = [f for f in usable if (f.seen.changes or f.fixed) and f.section != "truth"]
-        for one in usable:
+        for item in usable:
             # A message that holds the answer gives the sensors too only where no other one does.
-            one.bonus -= 0.2 if one.topic.name == self.truth_from else 0.0
+            item.bonus -= 0.2 if item.topic.name == self.truth_from else 0.0
         wheels = any(n.startswith("wheel_speed") for n in have)
         for name, quantity, part in _SENSORS:
             if name not in have and not (wheels and quantity == "speed"):
@@ -165,27 +165,29 @@ class _Weighing:
             self._steering([f for f in usable if f.meaning.quantity == "steering"])
         self._signs()
         self._follow()
-        for name, one in self.taken.items():
-            self._tell(name, one)
+        for name, item in self.taken.items():
+            self._tell(name, item)
 
-    def say_nameless(self, topic: str, evidence: str) -> None:
-        """Say that values alone told what the fields of a topic are."""
-        self.notes.append(f"values alone tell what {topic} holds: left and right may be exchanged in all of it")
-        evidence = f"the names of {topic} say nothing; {evidence}; nothing tells left from right"
+    def note_unlabelled(self, topic: str, evidence: str) -> None:
+        """Note that the fields of a topic are identified by values alone."""
+        self.notes.append(
+            f"quantities of {topic} are identified by values alone: left and right may be exchanged in all of it"
+        )
+        evidence = f"the names of {topic} give no quantities; {evidence}; left and right are not observable"
         remedy = 'look at them (pdhef inspect --fields), name them in a mapping file, or --waive "mapping.names"'
         self.checks.append(Check("mapping.names", "mapping", "undecided", evidence, remedy))
 
-    def _take(self, name: str, candidates: Sequence[Found]) -> None:
+    def _take(self, name: str, candidates: Sequence[Field]) -> None:
         if name == "speed_m_s":
-            for one in candidates:
-                self._follows_ax(one)
+            for item in candidates:
+                self._follows_ax(item)
         ordered = sorted(candidates, key=lambda f: (-f.score, -f.topic.messages, f.topic.name, f.path))
         good = [f for f in ordered if f.score >= LEAST_SCORE]
         if not good:
             return
         best = good[0]
         if best.meaning.strength < 0.6:
-            best.doubts.append("which number of its array it is was told by values alone")
+            best.doubts.append("its element of the array is identified by values alone")
         near = [f for f in good[1:] if f.score > best.score - 0.1 and not self.fields.agree(best, f)]
         if near:
             best = self._better([best, *near])
@@ -197,38 +199,38 @@ class _Weighing:
             )
         self.taken[name] = best
 
-    def _follows_ax(self, one: Found) -> None:
-        """Believe a speed with a weak name more where its rate of change is a_x."""
-        if one.score >= LEAST_SCORE or one.meaning.strength >= 0.7:
+    def _follows_ax(self, item: Field) -> None:
+        """Raise the score of a speed with a weak name where its rate of change follows a_x."""
+        if item.score >= LEAST_SCORE or item.meaning.strength >= 0.7:
             return
         for ax in self.fields.all("acceleration", "x")[:2]:
-            relation = fit(self.fields.pieces.smooth(ax.si), self.fields.pieces.rate_of(one.seen.cells))
+            relation = fit(self.fields.pieces.smooth(ax.si), self.fields.pieces.rate_of(item.seen.cells))
             if relation is not None and relation.correlation > 0.6:
-                one.bonus += 0.3
-                one.reasons.append(f"its rate of change follows a_x (correlation {relation.correlation:.2f})")
-                self.fields.settle(one, relation.slope, "its rate of change against a_x", 0.4)
+                item.bonus += 0.3
+                item.reasons.append(f"its rate of change follows a_x (correlation {relation.correlation:.2f})")
+                self.fields.settle(item, relation.slope, "its rate of change against a_x", 0.4)
                 return
 
-    def _better(self, rivals: Sequence[Found]) -> Found:
+    def _better(self, rivals: Sequence[Field]) -> Field:
         """Return the one that follows the others' physics best; the first where nothing tells."""
         speed = self._speed()
         if speed is None:
             return rivals[0]
         kind = rivals[0].meaning
-        best: tuple[float, Found] = (0.0, rivals[0])
-        for one in rivals:
+        best: tuple[float, Field] = (0.0, rivals[0])
+        for item in rivals:
             if kind.quantity == "rate":
                 others = self.fields.all("acceleration", "y")
-                relations = [self.fields.turning(a.si, one.si, speed.si) for a in others[:3]]
+                relations = [self.fields.turning(a.si, item.si, speed.si) for a in others[:3]]
             elif kind.quantity == "acceleration" and kind.part == "y":
-                relations = [self.fields.turning(one.si, r.si, speed.si) for r in self.fields.all("rate", "z")[:3]]
+                relations = [self.fields.turning(item.si, r.si, speed.si) for r in self.fields.all("rate", "z")[:3]]
             elif kind.quantity == "acceleration":
-                relations = [fit(self.fields.pieces.rate_of(speed.si), self.fields.pieces.smooth(one.si))]
+                relations = [fit(self.fields.pieces.rate_of(speed.si), self.fields.pieces.smooth(item.si))]
             else:
                 continue
             value = max((abs(r.correlation) for r in relations if r is not None), default=0.0)
             if value > best[0] + 0.1:
-                best = (value, one)
+                best = (value, item)
         return best[1]
 
     def _one_imu(self) -> None:
@@ -238,12 +240,14 @@ class _Weighing:
             return
         for name, part in (("ax_m_s2", "x"), ("ay_m_s2", "y")):
             if name in self.taken and leaf_group(self.taken[name]) != leaf_group(rate):
-                same = [f for f in self.fields.found if f.meaning.quantity == "acceleration" and f.meaning.part == part]
+                same = [
+                    f for f in self.fields.candidates if f.meaning.quantity == "acceleration" and f.meaning.part == part
+                ]
                 same = [f for f in same if leaf_group(f) == leaf_group(rate) and f.score > self.taken[name].score - 0.2]
                 if same:
                     self.taken[name] = max(same, key=lambda f: f.score)
 
-    def _wheels(self, usable: Sequence[Found]) -> None:
+    def _wheels(self, usable: Sequence[Field]) -> None:
         wheels = _wheel_set(usable)
         if len(wheels) < 2:
             return
@@ -251,19 +255,19 @@ class _Weighing:
         mean = mean_of([f.seen.cells for f in wheels.values()])
         first = next(iter(wheels.values()))
         kind, doubt, reason = first.meaning.quantity, "", ""
-        if not (first.known or first.fixed):
+        if not (first.unit_known or first.fixed):
             times = None if reference is None else ratio(mean, reference.si, SLOW_M_S)
             if times is None and reference is None:
                 kind, unit, reason, doubt = self._wheel_unit_by_turning(mean)
             else:
                 kind, unit, reason, doubt = _wheel_unit(times, reference)
-            for one in wheels.values():
-                one.factors = ((unit[0], unit[1]),)
-                one.known = not doubt
-        for corner, one in wheels.items():
-            one.reasons += [reason] if reason else []
-            one.doubts += [doubt] if doubt else []
-            self.taken[f"wheel_speed_{corner}_{'rad_s' if kind == 'wheel rate' else 'm_s'}"] = one
+            for item in wheels.values():
+                item.factors = ((unit[0], unit[1]),)
+                item.unit_known = not doubt
+        for corner, item in wheels.items():
+            item.reasons += [reason] if reason else []
+            item.doubts += [doubt] if doubt else []
+            self.taken[f"wheel_speed_{corner}_{'rad_s' if kind == 'wheel rate' else 'm_s'}"] = item
 
     def _wheel_unit_by_turning(self, mean: FloatArray) -> tuple[str, tuple[str, float], str, str]:
         """Return what :func:`_wheel_unit` does, by a_y ≈ v r, which tells less: roll is in a_y."""
@@ -278,27 +282,27 @@ class _Weighing:
             ways.append((1.0 + off, "wheel rate", turning))
         (_, kind, taken), (_, _, other) = sorted(ways)[:2]
         said = f"{1.0 / metres:.4g} of it is 1 m/s by a_y ≈ v r"
-        doubt = f"the unit of the wheel speeds is not said: by a_y ≈ v r {taken[0]} is likeliest, then {other[0]}"
+        doubt = f"the unit of the wheel speeds is not given: by a_y ≈ v r {taken[0]} is likeliest, then {other[0]}"
         return kind, taken, said, doubt
 
     # --------------------------------------------------------------------------------------------- steering
 
-    def _steering(self, candidates: Sequence[Found]) -> None:
+    def _steering(self, candidates: Sequence[Field]) -> None:
         speed = self._speed()
         rate = self._chosen("yaw_rate_rad_s")
         ay = self._chosen("ay_m_s2")
         curvature = _curvature(speed, rate, ay)
-        judged: list[tuple[float, str, Found]] = []
-        for one in candidates:
+        judged: list[tuple[float, str, Field]] = []
+        for item in candidates:
             relation = None
             if curvature is not None:
-                relation = fit(self.fields.pieces.smooth(one.seen.cells), self.fields.pieces.smooth(curvature))
-            name, follows = self._steering_kind(one, relation)
+                relation = fit(self.fields.pieces.smooth(item.seen.cells), self.fields.pieces.smooth(curvature))
+            name, follows = self._steering_kind(item, relation)
             if follows is False:
-                one.doubts.append("it does not follow the car's turning")
+                item.doubts.append("it does not follow the car's turning")
                 continue
-            if one.score + (0.3 if follows else 0.0) >= LEAST_SCORE:
-                judged.append((one.score + (0.3 if follows else 0.0), name, one))
+            if item.score + (0.3 if follows else 0.0) >= LEAST_SCORE:
+                judged.append((item.score + (0.3 if follows else 0.0), name, item))
         if not judged:
             return
         judged.sort(key=lambda j: (-j[0], -j[2].topic.messages, j[2].topic.name, j[2].path))
@@ -310,24 +314,24 @@ class _Weighing:
             self.rivals.append((name, tuple(f"{f.topic.name}.{f.path}" for f in [best, *rivals])))
         self.taken[name] = best
 
-    def _steering_kind(self, one: Found, relation: Fit | None) -> tuple[str, bool | None]:
+    def _steering_kind(self, item: Field, relation: Fit | None) -> tuple[str, bool | None]:
         """Return the signal that a steering angle is, and whether it follows the car's turning (None: cannot tell)."""
-        kinds = {"road": ("steer_rad",), "wheel": ("steering_wheel_rad",)}.get(one.meaning.part, tuple(_STEERING_M))
+        kinds = {"road": ("steer_rad",), "wheel": ("steering_wheel_rad",)}.get(item.meaning.part, tuple(_STEERING_M))
         if relation is None or abs(relation.correlation) < CLEAR:
-            return _steering_by_range(one, kinds, relation)
+            return _steering_by_range(item, kinds, relation)
         length = abs(relation.slope)
-        units = one.factors[:1] if one.known or one.fixed else one.factors
+        units = item.factors[:1] if item.unit_known or item.fixed else item.factors
         fits = [(k, u) for k in kinds for u in units if _STEERING_M[k][0] <= length * u[1] <= _STEERING_M[k][1]]
         if not fits:
-            metres = length * one.factors[0][1]
-            one.doubts.append(f"its ratio to the path's curvature is {metres:.3g} m, which no car has in this unit")
+            metres = length * item.factors[0][1]
+            item.doubts.append(f"its ratio to the path's curvature is {metres:.3g} m, which no car has in this unit")
             return kinds[0], None
         name, (unit, factor) = min(fits, key=lambda f: _unlikely(f[0], length * f[1][1]))
-        one.use(unit)
-        one.reasons.append(f"ratio to the path's curvature {length * factor:.3g} m: {name} in {unit}")
+        item.use(unit)
+        item.reasons.append(f"ratio to the path's curvature {length * factor:.3g} m: {name} in {unit}")
         rest = [f for f in fits if f != (name, (unit, factor)) and _unlikely(f[0], length * f[1][1]) < 1.0]
-        if rest and not one.fixed:
-            one.doubts.append(f"it could be {rest[0][0]} in {rest[0][1][0]} as well")
+        if rest and not item.fixed:
+            item.doubts.append(f"it could be {rest[0][0]} in {rest[0][1][0]} as well")
         return name, True
 
     # ------------------------------------------------------------------------------------------------ signs
@@ -344,14 +348,14 @@ class _Weighing:
         if rate is not None and relation is not None and abs(relation.correlation) > CLEAR:
             _rate_by_track(rate, abs(relation.slope))
         signs = judge_signs(self.fields, trio, self._speed() or self.fields.wheel_turns(), wheels)
-        for one in (trio[n] for n in signs.turned):
-            if one is not None:
-                one.sign = -one.sign
-                one.reasons.append(f"sign turned: {signs.contradiction} contradict one another")
+        for item in (trio[n] for n in signs.turned):
+            if item is not None:
+                item.sign = -item.sign
+                item.reasons.append(f"sign turned: {signs.contradiction} contradict one another")
         hangs = signs.contradiction == f"{WORDS['rate']} and {WITNESSES['gravity']}"  # imu.mounting says so
         if signs.contradiction and not hangs and not (signs.decided and signs.absolute):
             turned = ", ".join(WORDS[n] for n in signs.turned)
-            taken = f"{turned} was turned as the odd one" if turned else "nothing tells which of them is wrong"
+            taken = f"{turned} was turned as the odd one" if turned else "the wrong one is not observable"
             self.checks.append(
                 Check(
                     "mapping.sign",
@@ -364,10 +368,10 @@ class _Weighing:
 
     def _is_of_ours(self, check: Check) -> bool:
         """Return whether a check is of an accelerometer that is taken."""
-        one = self.taken.get(check.subject)
-        return one is not None and f" of {triad_of(one)}, " in check.evidence
+        item = self.taken.get(check.subject)
+        return item is not None and f" of {triad_of(item)}, " in check.evidence
 
-    def _speed(self) -> Found | None:
+    def _speed(self) -> Field | None:
         """Return what tells others best how fast the car was, taken or not."""
         return self._chosen("speed_m_s") or self.fields.wheel_mean() or self.fields.best("speed")
 
@@ -382,10 +386,10 @@ class _Weighing:
         if rate is not None:
             expected["ay_m_s2"] = (smooth(rate.si * speed.si), "v r")
         for name, (motion, words) in expected.items():
-            one = self.taken.get(name)
-            relation = None if one is None or spread(motion) < MOVING_M_S2 else fit(smooth(one.si), motion)
-            if one is not None and relation is not None and abs(relation.correlation) < FOLLOWS:
-                one.doubts.append(f"its correlation with {words} is only {relation.correlation:.2f}")
+            item = self.taken.get(name)
+            relation = None if item is None or spread(motion) < MOVING_M_S2 else fit(smooth(item.si), motion)
+            if item is not None and relation is not None and abs(relation.correlation) < FOLLOWS:
+                item.doubts.append(f"its correlation with {words} is only {relation.correlation:.2f}")
 
     def _both_signs(self) -> None:
         """Say what is never negative although the car turns both ways: its sign stands in another field."""
@@ -393,13 +397,15 @@ class _Weighing:
         there = {n: f for n in names if (f := self._chosen(n)) is not None and f.seen.changes}
         if not any(is_of_both_signs(f.seen.values) for f in there.values()):
             return
-        for one in there.values():
-            if is_of_one_sign(one.seen.values) and not one.anchor:
-                one.doubts.append("it is never negative although the car turns both ways: its sign may stand elsewhere")
+        for item in there.values():
+            if is_of_one_sign(item.seen.values) and not item.anchor:
+                item.doubts.append(
+                    "it is never negative although the car turns both ways: its sign may be in another field"
+                )
 
-    def _chosen(self, *names: str) -> Found | None:
+    def _chosen(self, *names: str) -> Field | None:
         """Return what is taken for the first of these signals that there is, or mapped already."""
-        return next((f for n in names if (f := self.taken.get(n) or self.fields.anchor(n)) is not None), None)
+        return next((f for n in names if (f := self.taken.get(n) or self.fields.anchors.get(n)) is not None), None)
 
     def _wheels_turn(self) -> FloatArray | None:
         """Return right minus left wheel speed, positive in a turn to the left; None without two of an axle."""
@@ -417,7 +423,7 @@ class _Weighing:
         """Take truth from the one topic that has sideslip or a lateral velocity, and calls itself truth if any does."""
         if not self.truth_from:
             return
-        its = [f for f in self.fields.found if f.topic.name == self.truth_from and f.section != "signals"]
+        its = [f for f in self.fields.candidates if f.topic.name == self.truth_from and f.section != "signals"]
         its = [f for f in its if f.fixed] or its  # documented fields before names
         self.truth = _truth_of(its)
         if not self.truth:
@@ -435,13 +441,13 @@ class _Weighing:
                     "truth.source",
                     "truth",
                     "undecided",
-                    f"{first.topic.name} holds a sideslip and does not say whether it was measured or estimated",
+                    f"{first.topic.name} contains a sideslip, measured or estimated: its name does not give which",
                     'name it under [truth] in a mapping file, or --waive "truth.source"',
                 )
             )
-        self.notes.append(f"truth is taken from {first.topic.name}, by the names of its fields")
-        for name, one in self.truth.items():
-            self._tell(f"truth.{name}", one)
+        self.notes.append(f"ground truth is taken from {first.topic.name}, by the names of its fields")
+        for name, item in self.truth.items():
+            self._tell(f"truth.{name}", item)
 
     def _truth_turns(self) -> bool:
         """Give the truth's yaw rate the sign of the sensor's; return whether the two are one motion."""
@@ -457,22 +463,22 @@ class _Weighing:
 
     # ------------------------------------------------------------------------------------------- what is said
 
-    def _tell(self, name: str, one: Found) -> None:
+    def _tell(self, name: str, item: Field) -> None:
         """Note what stays unsure of what is taken, and mark what stands in for a sensor."""
-        one.doubts = [d for d in one.doubts if d]
-        if name == "speed_m_s" and one.role == "navigation":
+        item.doubts = [d for d in item.doubts if d]
+        if name == "speed_m_s" and item.role == "navigation":
             self.notes.append(
-                f"speed_m_s comes from the navigation system's {one.topic.name}.{one.path}: "
-                "where that is the truth too, an estimator is told the true speed"
+                f"speed_m_s comes from the navigation system's {item.topic.name}.{item.path}: "
+                "if it is the ground truth too, the estimator's input is the true speed"
             )
-        one.doubts += one.unit_doubt
-        if one.doubts:
+        item.doubts += item.unit_doubt
+        if item.doubts:
             self.checks.append(
                 Check(
                     f"{name}.candidate",
                     name,
                     "undecided",
-                    f"{one.topic.name}.{one.path} is taken, but {'; '.join(one.doubts)}",
+                    f"{item.topic.name}.{item.path} is taken, but {'; '.join(item.doubts)}",
                     f'look at it (pdhef inspect --fields), name it in a mapping file, or --waive "{name}.candidate"',
                 )
             )
@@ -482,14 +488,14 @@ class _Weighing:
         candidates = [f.candidate(n, "signals", taken=True) for n, f in self.taken.items()]
         candidates += [f.candidate(n, "truth", taken=True) for n, f in self.truth.items()]
         used = {(c.section, c.source.label) for c in candidates}
-        for one in self.fields.found:
-            for name in names_of(one.meaning.quantity, one.meaning.part)[:1]:
-                record = one.candidate(name, "signals", taken=False)
-                if (record.section, record.source.label) not in used and (one.role != "truth"):
+        for item in self.fields.candidates:
+            for name in names_of(item.meaning.quantity, item.meaning.part)[:1]:
+                record = item.candidate(name, "signals", taken=False)
+                if (record.section, record.source.label) not in used and (item.role != "truth"):
                     candidates.append(record)
-            name = _truth_name(one)
-            if name and one.role in ("truth", "navigation") and not self.truth:
-                candidates.append(one.candidate(name, "truth", taken=False))
+            name = _truth_name(item)
+            if name and item.role in ("truth", "navigation") and not self.truth:
+                candidates.append(item.candidate(name, "truth", taken=False))
         return Weighed(
             signals={n: f.candidate(n, "signals", taken=True).source for n, f in self.taken.items()},
             truth={n: f.candidate(n, "truth", taken=True).source for n, f in self.truth.items()},
@@ -500,13 +506,13 @@ class _Weighing:
         )
 
 
-def _truth_of(candidates: Sequence[Found]) -> dict[str, Found]:
+def _truth_of(candidates: Sequence[Field]) -> dict[str, Field]:
     """Return truth quantities of one topic's fields; empty without sideslip, lateral velocity or a position."""
-    truth: dict[str, Found] = {}
-    for one in sorted(candidates, key=lambda f: -f.score):
-        name = _truth_name(one)
-        if name and one.seen.changes:
-            truth.setdefault(name, one)
+    truth: dict[str, Field] = {}
+    for item in sorted(candidates, key=lambda f: -f.score):
+        name = _truth_name(item)
+        if name and item.seen.changes:
+            truth.setdefault(name, item)
     if not {"vy_m_s", "sideslip_rad", "lat_deg"} & set(truth):
         return {}
     if not {"vy_m_s", "sideslip_rad"} & set(truth):
@@ -516,14 +522,14 @@ def _truth_of(candidates: Sequence[Found]) -> dict[str, Found]:
     return truth
 
 
-def _wheel_set(usable: Sequence[Found]) -> dict[str, Found]:
+def _wheel_set(usable: Sequence[Field]) -> dict[str, Field]:
     """Return the wheels of the struct with most of them, or else wheels of a struct each."""
-    sets: dict[tuple[str, str, str], dict[str, Found]] = {}
-    for one in usable:
-        if one.meaning.quantity in ("wheel speed", "wheel rate") and one.meaning.part in WHEELS:
-            key = (one.topic.name, one.path.rpartition(".")[0], one.meaning.quantity)
-            sets.setdefault(key, {}).setdefault(one.meaning.part, one)
-    apart: dict[str, Found] = {}
+    sets: dict[tuple[str, str, str], dict[str, Field]] = {}
+    for item in usable:
+        if item.meaning.quantity in ("wheel speed", "wheel rate") and item.meaning.part in WHEELS:
+            key = (item.topic.name, item.path.rpartition(".")[0], item.meaning.quantity)
+            sets.setdefault(key, {}).setdefault(item.meaning.part, item)
+    apart: dict[str, Field] = {}
     for group in sets.values():
         if len(group) == 1:
             apart = group | apart
@@ -531,25 +537,25 @@ def _wheel_set(usable: Sequence[Found]) -> dict[str, Found]:
     return max(complete, key=lambda g: (len(g), sum(f.score for f in g.values())), default=apart)
 
 
-def _steering_by_range(one: Found, kinds: tuple[str, ...], relation: Fit | None) -> tuple[str, bool | None]:
+def _steering_by_range(item: Field, kinds: tuple[str, ...], relation: Fit | None) -> tuple[str, bool | None]:
     """Return what :meth:`_Weighing._steering_kind` does, where the path's curvature does not decide."""
-    name = kinds[-1] if one.seen.largest * one.factors[0][1] > 0.9 else kinds[0]
-    if one.fixed:
+    name = kinds[-1] if item.seen.largest * item.factors[0][1] > 0.9 else kinds[0]
+    if item.fixed:
         return name, None
     if len(kinds) == 2:
-        one.doubts.append(f"its name gives neither steering wheel nor road wheels; taken as {name}")
+        item.doubts.append(f"its name gives neither steering wheel nor road wheels; taken as {name}")
     if relation is None:
         return name, None
-    one.doubts.append(f"its correlation with the path's curvature is only {relation.correlation:.2f}")
-    return name, False if abs(relation.correlation) < 0.25 and one.meaning.strength < 0.9 else None
+    item.doubts.append(f"its correlation with the path's curvature is only {relation.correlation:.2f}")
+    return name, False if abs(relation.correlation) < 0.25 and item.meaning.strength < 0.9 else None
 
 
-def truth_topic(found: Sequence[Found]) -> str:
+def truth_topic(weighable: Sequence[Field]) -> str:
     """Return the topic with sideslip or a lateral velocity, reference topics first; empty without one."""
-    topics: dict[str, list[Found]] = {}
-    for one in found:
-        if one.role in ("truth", "navigation", "sensor"):
-            topics.setdefault(one.topic.name, []).append(one)
+    topics: dict[str, list[Field]] = {}
+    for item in weighable:
+        if item.role in ("truth", "navigation", "sensor"):
+            topics.setdefault(item.topic.name, []).append(item)
     best = (0.0, "")
     for name, fields in topics.items():
         kinds = {f.meaning.quantity for f in fields if f.seen.changes}
@@ -562,9 +568,9 @@ def truth_topic(found: Sequence[Found]) -> str:
     return best[1]
 
 
-def _rate_by_track(rate: Found, slope_m: float) -> None:
+def _rate_by_track(rate: Field, slope_m: float) -> None:
     """Tell the unit of a yaw rate by the track that it gives with the wheels' difference: model cars to lorries."""
-    if rate.known or rate.fixed:
+    if rate.unit_known or rate.fixed:
         return
     for unit, factor in rate.factors:
         track_m = slope_m * rate.factors[0][1] / factor
@@ -574,7 +580,7 @@ def _rate_by_track(rate: Found, slope_m: float) -> None:
             return
 
 
-def _curvature(speed: Found | None, rate: Found | None, ay: Found | None) -> FloatArray | None:
+def _curvature(speed: Field | None, rate: Field | None, ay: Field | None) -> FloatArray | None:
     """Return the path's curvature in 1/m where the car drives, by yaw rate, else a_y; None if it goes straight."""
     if speed is None or (rate is None and ay is None):
         return None
@@ -592,7 +598,7 @@ def _unlikely(name: str, metres: float) -> float:
     return abs(math.log(metres / (2.7 if name == "steer_rad" else 43.0)))
 
 
-def _wheel_unit(times: float | None, reference: Found | None) -> tuple[str, tuple[str, float], str, str]:
+def _wheel_unit(times: float | None, reference: Field | None) -> tuple[str, tuple[str, float], str, str]:
     """Return quantity, unit, reason and doubt of wheel speeds whose name has no unit.
 
     Parameters
@@ -600,9 +606,9 @@ def _wheel_unit(times: float | None, reference: Found | None) -> tuple[str, tupl
     times : how many of them are 1 m/s by the reference, a speed; None where there is none, or no one number.
     """
     if times is None or reference is None:
-        doubt = "the unit of the wheel speeds is not said, and no speed tells it; taken as m/s"
+        doubt = "the unit of the wheel speeds is not given, and no speed to compare with; taken as m/s"
         return "wheel speed", ("m/s", 1.0), "", doubt
-    unsure = "" if reference.known else "the unit of the speed that tells theirs is unsure itself"
+    unsure = "" if reference.unit_known else "the unit of the speed that they are compared with is unsure"
     said = f"{times:.4g} of it is 1 m/s of speed"
     for unit, factor in SPEEDS:
         off = abs(times * factor - 1.0)
@@ -618,8 +624,8 @@ def _wheel_unit(times: float | None, reference: Found | None) -> tuple[str, tupl
     return "wheel speed", ("m/s", 1.0), "", f"{said}, which is no unit of wheel speeds; taken as m/s"
 
 
-def _truth_name(one: Found) -> str:
-    kind, part = one.meaning.quantity, one.meaning.part
+def _truth_name(item: Field) -> str:
+    kind, part = item.meaning.quantity, item.meaning.part
     names = {
         ("speed", "x"): "vx_m_s",
         ("speed", ""): "vx_m_s",
@@ -630,5 +636,5 @@ def _truth_name(one: Found) -> str:
         ("longitude", ""): "lon_deg",
     }
     if kind in ("course", "heading"):
-        return {"course": "course_rad", "heading": "yaw_rad"}[kind] if one.fixed else ""
+        return {"course": "course_rad", "heading": "yaw_rad"}[kind] if item.fixed else ""
     return names.get((kind, part), "")

@@ -57,11 +57,16 @@ def test_all_topics_are_listed_and_a_wrong_one_is_refused(sample_logs_dir: Path)
 @pytest.mark.parametrize(
     ("signals", "truth", "can", "needs"),
     [
-        ((), (), "look at its topics", "a steering angle, a lateral acceleration, a yaw rate, a speed or wheel speeds"),
+        ((), (), "list its topics", "a steering angle, a lateral acceleration, a yaw rate, a speed or wheel speeds"),
         (("ay_m_s2", "yaw_rate_rad_s", "speed_m_s"), (), "run zero", "a steering angle"),
-        (("steering_wheel_rad", "ay_m_s2", "yaw_rate_rad_s", "wheel_speed_rl_rad_s"), (), "no truth to score", ""),
+        (
+            ("steering_wheel_rad", "ay_m_s2", "yaw_rate_rad_s", "wheel_speed_rl_rad_s"),
+            (),
+            "without ground truth it has no score",
+            "",
+        ),
         (("steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"), ("vx_m_s", "vy_m_s"), "and score it", ""),
-        (("steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"), ("lat_deg", "lon_deg"), "holds no sideslip", ""),
+        (("steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"), ("lat_deg", "lon_deg"), "contains no sideslip", ""),
     ],
 )
 def test_what_a_log_is_good_for(signals: tuple[str, ...], truth: tuple[str, ...], can: str, needs: str) -> None:
@@ -72,12 +77,12 @@ def test_what_a_log_is_good_for(signals: tuple[str, ...], truth: tuple[str, ...]
 
 @pytest.mark.slow
 def test_inspect_ends_with_what_can_be_done(sample_logs_dir: Path, shared_dir: Path) -> None:
-    assert "What you can do with this log: estimate sideslip" in text_of(
+    assert "Possible uses of this log: estimate sideslip" in text_of(
         render_inspection, inspect_log(sample_logs_dir / "dlc.mcap"), 200
     )
     dart = inspect_log(shared_dir / "reader_corpus" / "dart_ros1" / "4_sept_random_driving_fast.bag")
     text = text_of(render_inspection, dart, 200)
-    assert "to get sideslip you still need: a lateral acceleration, a yaw rate" in text
+    assert "sideslip estimation still needs: a lateral acceleration, a yaw rate" in text
     assert "pdhef map LOG" in text
 
 
@@ -103,5 +108,5 @@ def test_a_mapping_by_question_and_answer(shared_dir: Path) -> None:
     assert mapping.signals["yaw_rate_rad_s"].field == "yaw_rate_gnss_deg_s"
     assert mapping.signals["ay_m_s2"] == SignalSource("ay_m_s2", "/vbox/sample", "y_accel_g", scale=-9.81)
     assert "ax_m_s2" not in mapping.signals
-    assert said[-1] == "this is all that sideslip needs"
+    assert said[-1] == "sideslip estimation needs no further signal"
     assert any("*" in line and "steer_ang_deg" in line for line in said)

@@ -403,4 +403,4 @@ def test_frames_without_their_description_are_said_to_need_one(tmp_path: Path) -
     _write_json(tmp_path / "json.mcap", frames, list)
     for name in ("ros", "json"):
         notes = inspect_log(tmp_path / f"{name}.mcap").notes
-        assert any("/can/raw holds raw CAN frames" in n and "dbc" in n for n in notes), notes
+        assert any("/can/raw contains raw CAN frames" in n and "dbc" in n for n in notes), notes

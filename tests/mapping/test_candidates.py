@@ -336,7 +336,7 @@ def test_odometry_stands_in_for_a_gyro_and_a_navigation_system_for_a_speed() -> 
     assert any("no IMU gives it" in n for n in auto.mapping.notes)
     ins = found(ins__odometry=odometry, imu__data=topic("sensor_msgs/msg/Imu", **imu_fields()))
     assert taken(ins)["speed_m_s"] == ("/ins/odometry.twist.twist.linear.x", 1.0)
-    assert any("is told the true speed" in n for n in ins.mapping.notes)
+    assert any("input is the true speed" in n for n in ins.mapping.notes)
 
 
 def test_documented_types_say_unit_sign_and_page() -> None:

@@ -63,7 +63,7 @@ def test_the_truths_velocity_stands_in_with_a_mark() -> None:
     place = {"latitude": FIX["latitude"], "longitude": FIX["longitude"], "height": 0.0 * S}
     auto = found(ins=topic("novatel_oem7_msgs/msg/INSPVA", pva | place))
     np.testing.assert_allclose(speed_of(auto), V)
-    assert any("is the truth too" in n for n in auto.mapping.notes)
+    assert any("is also the ground truth" in n for n in auto.mapping.notes)
 
 
 def test_a_vector_of_unknown_frame_needs_evidence() -> None:
@@ -106,7 +106,7 @@ def test_joints_by_the_names_in_the_messages() -> None:
 def test_joints_that_change_their_order_are_not_used_and_said() -> None:
     auto = found(joint_states=joints({"name": list(NAMES)}, {"name": list(reversed(NAMES))}))
     assert not {"steer_rad", "wheel_speed_rl_rad_s"} & set(auto.mapping.signals)
-    assert any("/joint_states" in n and "another order" in n for n in auto.mapping.notes)
+    assert any("/joint_states" in n and "their order differ" in n for n in auto.mapping.notes)
 
 
 def test_joints_of_a_command_are_no_sensor() -> None:

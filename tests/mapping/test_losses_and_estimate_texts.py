@@ -57,7 +57,7 @@ def _log() -> FakeLog:
         (["sideslip_rad=/esc.beta", "sideslip_rad=/imu/raw.beta"], UsageError, "expected each signal once"),
         (["sideslip_rad=/ecs.beta"], MappingError, "did you mean /esc?"),
         (["sideslip_rad=/nowhere/near.beta"], MappingError, "pdhef inspect lists the topics"),
-        (["/esc.beta"], UsageError, "the type does not tell which signal this is"),
+        (["/esc.beta"], UsageError, "the type does not give the signal"),
     ],
 )
 def test_a_text_that_names_no_signal_of_the_log_is_refused(texts: list[str], error: type[Exception], said: str) -> None:

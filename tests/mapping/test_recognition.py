@@ -198,10 +198,10 @@ def test_what_a_message_disowns_is_not_mapped() -> None:
     auto = found({"/imu": imu(angular_velocity_covariance=minus)})
     assert set(auto.mapping.signals) == {"ax_m_s2", "ay_m_s2"}
     assert "yaw_rate_rad_s" in auto.missing
-    assert auto.mapping.notes == ("/imu says that it gives no angular rate (covariance -1)",)
+    assert auto.mapping.notes == ("/imu provides no angular rate (covariance -1)",)
     auto = found({"/imu": imu(linear_acceleration_covariance=minus)})
     assert set(auto.mapping.signals) == {"yaw_rate_rad_s"}
-    assert auto.mapping.notes == ("/imu says that it gives no acceleration (covariance -1)",)
+    assert auto.mapping.notes == ("/imu provides no acceleration (covariance -1)",)
     hidden_pose = odometry(pose=True)
     hidden_pose.fields["pose.covariance"] = np.full((N, 36), -1.0)
     auto = found({"/ins/odometry": hidden_pose})
@@ -303,7 +303,7 @@ def test_a_fix_is_gated_by_the_best_that_its_receiver_can_say(name: str, status:
     auto = found({name: fix(status)})
     gate = auto.mapping.quality
     assert gate is not None and (gate.topic, gate.minimum, gate.stamp) == (name, lowest, "header.stamp")
-    assert auto.mapping.notes == (f"truth is kept where {name}.status.status is at least {lowest:g}",)
+    assert auto.mapping.notes == (f"ground truth is used where {name}.status.status is at least {lowest:g}",)
 
 
 def test_an_orientation_that_is_none_and_a_pose_that_stays_at_the_origin_are_fillers() -> None:
