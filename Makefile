@@ -15,7 +15,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 # Tests run in random order. The head of their output has the seed: make test ORDER_SEED=17 repeats an order.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(if $(ORDER_SEED),--randomly-seed=$(ORDER_SEED))
 
-.PHONY: help demo test quick fleet pages mutants mutants-fixed check lint format bench train-default samples conditions real switches torture \
+.PHONY: help demo test quick fleet pages mutants mutants-fixed check lint format bench train-default samples conditions real torture \
   retrain docs docs-truthsim paper strangers wheel release lock clean
 
 help:
@@ -28,7 +28,7 @@ help:
 	@echo "make mutants-fixed  faults that the tests are known to notice: all must still be noticed (three minutes)"
 	@echo "make check    formatting, lint, types, import contracts, tests"
 	@echo "make torture  damaged, hostile and odd input, counted: docs/reliability.md (two hours or less on two cores; resumable)"
-	@echo "make strangers  docs/strangers.md: logs that the tool has not met, and what it gets right (under two minutes)"
+	@echo "make strangers  docs/third_party_logs.md: logs that the tool has not met, and what it gets right (under two minutes)"
 	@echo "make bench    speed against peers"
 	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, 20 minutes or so)"
 	@echo "make retrain  a retraining on simulated drives: sound ones are accepted, spoilt ones are not (docs/retrain.md);"
@@ -36,7 +36,6 @@ help:
 	@echo "make samples  write sample_logs/ anew with the simulator"
 	@echo "make conditions CAR=car NETWORK=folder  docs/conditions.md: every estimator on the condition table"
 	@echo "make real NETWORK=folder  docs/real.md: every estimator on the recorded drives in ../shared"
-	@echo "make switches  docs/switches.md: bias states, roll, standstill, slip gate, latency of the filters, on and off"
 	@echo "make docs     the documentation as a site: out/site/index.html (a broken link is an error)"
 	@echo "make docs-truthsim  figures and tables of docs/truthsim.md anew"
 	@echo "make paper    the paper's experiment: docs/paper.md, its figures and results"
@@ -164,9 +163,6 @@ torture: $(VENV)/installed-dev $(VENV)/compiled
 # With the layouts that were built last.
 strangers: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.strangers --held-out
-
-switches: $(VENV)/installed-dev $(VENV)/compiled
-	OMP_NUM_THREADS=1 $(BIN)/python -m studies.switches
 
 # Of what is committed, in a clone: nothing else that lies about here gets in.
 wheel: $(VENV)/installed-release

@@ -6,6 +6,10 @@ has measured his car would have it; ``physics`` of it is identified by the tool 
 an INS that is mounted a little askew: the network is trained for filters as it will meet them. Residuals are taken from
 the other drives, with perfect truth: from those of the INS the network learnt its noise (the validation loss rose from
 the second epoch on). Drives are split by car.
+
+    python -m studies.many_cars
+
+Simulates the cars, extracts their residuals and trains the shipped network ``many-cars``: 25 minutes on two cores.
 """
 
 from __future__ import annotations
@@ -25,11 +29,17 @@ from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.learning.car.fit_data import load_fit_drive
 from pdhef_logtool.learning.car.physics_fit import fit_physics
+from pdhef_logtool.learning.network.fit import Recipe
+from pdhef_logtool.learning.network.train_command import dataset_for, train_on
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping.mapping_file import load_mapping
 from pdhef_logtool.records.errors import SimulationError
+from pdhef_logtool.residual_model.bundle import MANY_CARS, PHYSICS_MODEL, SHIPPED_FOLDERS
+from pdhef_logtool.residual_model.features import FEATURES
 from studies.defaults.train_default import MAPPING as TRAINING_MAPPING
+from studies.defaults.train_default import pdhef
 from studies.error_budget import fit_vehicle
+from studies.pages import ROOT, options
 from truthsim.batch import DriveSpec, Job, run_jobs
 from truthsim.linear_theory import understeer_gradient_rad_per_m_s2
 from truthsim.sensors import SensorNoise
@@ -37,7 +47,8 @@ from truthsim.suite import draw_spec
 from truthsim.vehicle import GRAVITY_M_S2
 from truthsim.vehicle_choice import choose_vehicle
 
-SEED = 4000
+DATA, CARS_FOLDER = ROOT / "out" / "many-cars-data", ROOT / "out" / "many-cars"
+SEED, EPOCHS = 4000, 48
 CARS = 300
 DRIVES_PER_CAR = 6
 #: Of these, the drives that a car is identified on; no residual is taken from them. Steps of the fit, some 5 s a car.
@@ -164,7 +175,7 @@ def write_cars(
 ) -> dict[str, Any]:
     """Write a set of many cars and its manifest; drives that are there as they should be are kept."""
     planned = plan_cars(cars, drives, seed, folder, load_vehicle(BASE), kinds)
-    head = {"command": "python -m studies.many_cars_table", "seed": seed, "cars": cars, "drives_per_car": drives}
+    head = {"command": "python -m studies.many_cars", "seed": seed, "cars": cars, "drives_per_car": drives}
     return run_jobs(planned, folder, head, processes=jobs)
 
 
@@ -207,3 +218,20 @@ def identified(file: Path, logs: Sequence[Path], mapping: Path) -> str:
     physics = FittedPhysics(values=values, noise=noise).model_dump(mode="json", exclude_none=True)
     text = file.read_text(encoding="utf-8")
     return flat_toml(text, own, own, {PHYSICS: noise}, None, {PHYSICS: physics})
+
+
+def main() -> None:
+    """Simulate, extract and train. Drives and residuals that exist already are kept."""
+    options("many_cars", __doc__).parse_args()
+    write_cars(CARS_FOLDER, cars=CARS, drives=DRIVES_PER_CAR, seed=SEED, jobs=2)
+    logs = identify_cars(CARS_FOLDER)
+    mapping = CARS_FOLDER / "extract.toml"
+    mapping.write_text(TRAINING_MAPPING, encoding="utf-8")
+    pdhef("extract", *logs, "-o", DATA, "--mapping", mapping, "--jobs", 2, "--resume")
+    recipe = Recipe(seed=0, epochs=EPOCHS, feature_names=FEATURES)
+    folder = SHIPPED_FOLDERS[MANY_CARS]
+    train_on(dataset_for(DATA, PHYSICS_MODEL), folder, recipe, progress=lambda text, _share: print(text, flush=True))
+
+
+if __name__ == "__main__":
+    main()

@@ -71,7 +71,7 @@ YARDSTICKS = ("phy-ukf-tuned, identified", "phy-ukf, catalogue")
 FREE = ("zero", "kinematic")
 PHYSICAL = tuple(s.name for s in SPECS if not s.network and s.name not in (*FREE, "gyro", OPEN_LOOP))
 NETWORKS = tuple(s.name for s in SPECS if s.network)
-#: Versions of this page, and of the published files on docs/self_calibration.md, before looks were counted.
+#: Versions of this page, and of the published files on docs/calibration.md, before looks were counted.
 LOOKS_BEFORE = 6
 LOOKS_BEFORE_PUBLISHED = {"250lm": 9, "gti": 8, "tts": 8, "v40": 8}
 LOOKS_FILE = "looks.json"

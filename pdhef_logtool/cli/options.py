@@ -87,7 +87,7 @@ _OPTIONS: dict[str, Any] = {
         _Text, Option(help="arrival: samples count when they arrived, as in a car; stamp: by their stamps, not causal.")
     ],
     "friction": Annotated[
-        _Text, Option(help="auto (log's, else car's, else estimated), file, estimate, or a number; docs/friction.md")
+        _Text, Option(help="auto (log's, else car's, else estimated), file, estimate, or a number; docs/own_car.md")
     ],
     "prefer_truth": Annotated[_Text, Option(help="perfect or rtk: which truth of a simulated log counts.")],
     "msgs": Annotated[_File, Option(metavar="DIR", help="Folder, zip or wheel of .msg files: types a log lacks.")],

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 GUARDED = "pd-hef"
 SIMPLE = ("zero", "open-loop", "open-loop-calibrated", "phy-ukf", "physics")
 #: On simulated drives with right and wrong files every estimate beyond 1.05 times the least d2 had at least 1.7 times
-#: its sideslip error (docs/self_calibration.md).
+#: its sideslip error (docs/calibration.md).
 FACTOR = 1.2
 #: What an estimate must beat to be worth anything: no estimator at all. It needs the least and cannot drift; the
 #: other naive one, ``kinematic``, follows the accelerometer's bias and is worse on half of the recorded drives.

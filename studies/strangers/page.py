@@ -1,4 +1,4 @@
-"""``docs/strangers.md``: the score, every log, and what is wrong by name."""
+"""``docs/third_party_logs.md``: the score, every log, and what is wrong by name."""
 
 from __future__ import annotations
 
