@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from pdhef_logtool.records.files import write_bytes
@@ -52,14 +52,3 @@ def options(name: str, text: str | None) -> argparse.ArgumentParser:
     """Return the parser of ``python -m studies.NAME``; ``text`` is its module's."""
     shape = argparse.RawDescriptionHelpFormatter
     return argparse.ArgumentParser(prog=f"python -m studies.{name}", description=text, formatter_class=shape)
-
-
-def measured(name: str, text: str | None, document: Path, measure: Callable[[], str]) -> None:
-    """Be ``python -m studies.NAME`` of a page with one block: measure, print, and write it if asked for."""
-    parser = options(name, text)
-    parser.add_argument("--write-docs", action="store_true", help=f"put the tables into {document.name}")
-    write_docs = parser.parse_args().write_docs
-    tables = measure()
-    print(tables)
-    if write_docs:
-        write(document, fill(document.read_text(encoding="utf-8"), {"measured": tables}, document.name))

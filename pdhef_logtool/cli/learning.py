@@ -149,7 +149,7 @@ def train(
     "pdhef tune logs/ --split validation --car mycar -o mycar --jobs 2",
     "pdhef tune logs/ --split validation --car mycar -o mycar --trials 256",
     notes="Every estimator gets the same search space, drives and number of trials. All trials and a plot of them "
-    "are kept with the car. Drives that a set's manifest marks test or extrapolation are refused (docs/tune.md).",
+    "are kept with the car. Drives that a set's manifest marks test or extrapolation are refused (docs/learn.md).",
     shared="cache sensors friction network model signal_map",
     car="The car whose filter noise is tuned",
 )
@@ -191,7 +191,7 @@ def tune(
     "pdhef trust logs/ --split test --car mycar -o mycar",
     notes="Give driving that neither the network nor the car was fitted to; drives that a manifest marks train or "
     "validation are refused. The filter runs at trust 0, 0.25, 0.5, 0.75 and 1. The cap is 1 only if a bootstrap of "
-    "blocks confirms the gain, at most 0.5 on a mean gain, else 0 (docs/trust.md). All figures are kept with the car.",
+    "blocks confirms the gain, at most 0.5 on a mean gain, else 0 (docs/learn.md). All figures are kept with the car.",
     shared="cache sensors friction network model",
     car="The car of the drives",
 )
@@ -219,7 +219,7 @@ def trust(
     "pdhef calibrate logs/ --split validation --car mycar -o mycar",
     "pdhef calibrate logs/ --car mycar --vary 0 -o mycar",
     notes="Give drives of many kinds that neither network nor filter noise was fitted to; drives that a set's "
-    "manifest marks test or extrapolation are refused (docs/calibrate.md).",
+    "manifest marks test or extrapolation are refused (docs/learn.md).",
     shared="estimators cache sensors friction network model",
     car="The car that the estimators run with",
 )

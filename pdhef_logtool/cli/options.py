@@ -76,7 +76,9 @@ _OPTIONS: dict[str, Any] = {
     ],
     "cache": Annotated[
         _Text,
-        Option(metavar="DIR|URL", help="Keep a slim log of each log there and read that the next time: docs/slim.md."),
+        Option(
+            metavar="DIR|URL", help="Keep a slim log of each log there and read that the next time: docs/remote.md."
+        ),
     ],
     "cache_max_gb": Annotated[
         float | None,
@@ -87,7 +89,7 @@ _OPTIONS: dict[str, Any] = {
         _Text, Option(help="arrival: samples count when they arrived, as in a car; stamp: by their stamps, not causal.")
     ],
     "friction": Annotated[
-        _Text, Option(help="auto (log's, else car's, else estimated), file, estimate, or a number; docs/own_car.md")
+        _Text, Option(help="auto (log's, else car's, else estimated), file, estimate, or a number; docs/learn.md")
     ],
     "prefer_truth": Annotated[_Text, Option(help="perfect or rtk: which truth of a simulated log counts.")],
     "msgs": Annotated[_File, Option(metavar="DIR", help="Folder, zip or wheel of .msg files: types a log lacks.")],
