@@ -12,6 +12,7 @@ from pdhef_logtool.records.files import write_bytes
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
+RESULTS = ROOT / "studies" / "results"
 SAMPLE_VEHICLE = ROOT / "sample_logs" / "vehicle.toml"
 #: Recorded drives and runs of another simulator, which may not be redistributed: beside the repository, or nowhere.
 DRIVES = ROOT.parent / "shared" / "data" / "drives"
