@@ -172,7 +172,7 @@ def _head(facts: Facts) -> str:
             f"{'none' if network is None else network[:12]}; 95 % intervals "
             f"{'as the estimators return them' if calibrated is None else calibrated[:12]}; "
             f"pdhef-logtool {facts.version}.",
-            "The vehicle file is the same in all rows. All estimators get the true friction, unless the row changes it.",
+            "The vehicle file is the same in all rows. Estimators get the true friction, unless the row changes it.",
             "The ground truth is the state of the simulator.",
             "",
         ]
