@@ -31,8 +31,7 @@ help:
 	@echo "make strangers  docs/third_party_logs.md: logs that the tool has not met, and what it gets right (under two minutes)"
 	@echo "make bench    speed against peers"
 	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, 20 minutes or so)"
-	@echo "make retrain  a retraining on simulated drives: sound ones are accepted, spoilt ones are not (docs/retrain.md);"
-	@echo "              LOGS=drives/ CAR=mycar OUT=folder: on your own"
+	@echo "make retrain LOGS=drives/ CAR=mycar OUT=folder  train the network of a car again, behind a gate (docs/retrain.md)"
 	@echo "make samples  write sample_logs/ anew with the simulator"
 	@echo "make conditions CAR=car NETWORK=folder  docs/conditions.md: every estimator on the condition table"
 	@echo "make real NETWORK=folder  docs/real.md: every estimator on the recorded drives in ../shared"
@@ -128,10 +127,8 @@ train-default: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.defaults.train_default
 	$(BIN)/python -m studies.model_card
 
-# Without LOGS the check of the whole chain, 15 minutes or so on two cores.
 retrain: $(VENV)/installed-dev $(VENV)/compiled
-	$(if $(LOGS),$(BIN)/pdhef retrain $(LOGS) -o $(if $(filter out/demo,$(OUT)),out/retrain,$(OUT)) --car $(CAR) --jobs $(JOBS),\
-	  OMP_NUM_THREADS=1 $(BIN)/python -m studies.retrain --jobs $(JOBS))
+	$(BIN)/pdhef retrain $(LOGS) -o $(if $(filter out/demo,$(OUT)),out/retrain,$(OUT)) --car $(CAR) --jobs $(JOBS)
 
 # Without --quiet, which would hide the warnings that make it fail.
 docs: $(VENV)/installed-docs

@@ -95,7 +95,8 @@ This page shows the sideslip error on recorded drives of real cars and a scale m
 Sideslip RMSE in degrees with the 95 % CI of a bootstrap of 10 s blocks. *datasheet*: published vehicle file.
 *self-calibrated*: calibrated on the scored part without ground truth, not causal. *identified*: stage `identify` of
 `pdhef learn` on the training part. *learn*: all stages. A dash: not possible with the data of this drive.
-*evaluations*: how often the scored part was evaluated during development, at least; many evaluations make the figures optimistic.
+*evaluations*: how often the scored part was evaluated during development, at least; many evaluations make the
+figures optimistic.
 
 {summary}
 
