@@ -28,7 +28,7 @@ help:
 	@echo "make mutants-fixed  faults that the tests are known to notice: all must still be noticed (three minutes)"
 	@echo "make check    formatting, lint, types, import contracts, tests"
 	@echo "make torture  damaged, hostile and odd input, counted: docs/reliability.md (two hours or less on two cores; resumable)"
-	@echo "make strangers  docs/third_party_logs.md: logs that the tool has not met, and what it gets right (under two minutes)"
+	@echo "make strangers  docs/third_party_logs.md: signals recognised in logs with unknown layouts (under two minutes)"
 	@echo "make bench    speed against peers"
 	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, 20 minutes or so)"
 	@echo "make retrain LOGS=drives/ CAR=mycar OUT=folder  train the network of a car again, behind a gate (docs/retrain.md)"

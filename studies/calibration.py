@@ -22,7 +22,8 @@ SELF_SEED, SELF_CARS, IDENTIFIED_SEED, IDENTIFIED_CARS = 77_002, 50, 88_003, 12
 
 PAGE = """# Calibration and confidence intervals
 
-Written by `python -m studies.calibration`. Sideslip RMSE in degrees. Method: [method.md](method.md).
+This page shows the accuracy of calibrated and identified cars and the coverage of their confidence intervals.
+Command: `python -m studies.calibration`. Sideslip RMSE in degrees. Method: [method.md](method.md).
 
 ## Self-calibration on simulated cars with wrong vehicle files
 

@@ -1,4 +1,4 @@
-"""Logs of strangers, scored: ``docs/third_party_logs.md``.
+"""Third-party logs, scored: ``docs/third_party_logs.md``.
 
     python -m studies.strangers [--only NAME ...] [--held-out] [--work out/strangers] [--out docs/third_party_logs.md]
 
