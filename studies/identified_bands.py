@@ -131,5 +131,5 @@ def bands_table(found: Sequence[Judged]) -> str:
             rmse = number(float(np.degrees(np.median([j.rmse for j in some]))))
             row = [name, str(len(some)), rmse, which, f"{np.mean(shares):.0%}", low, middle, high, within]
             body.append([*row, number(float(np.median(widths)), 2)])
-    head = ["driving", "drives", "RMSE, deg: median", "band", "coverage: mean", "10 %", "median", "90 %"]
-    return table([*head, "bands at 90 to 98 %", "width / RMSE: median"], body, right_from=4)
+    head = ["driving", "drives", "RMSE, deg: median", "interval", "coverage: mean", "10 %", "median", "90 %"]
+    return table([*head, "intervals at 90 to 98 %", "width / RMSE: median"], body, right_from=4)
