@@ -234,8 +234,8 @@ def band_table(outcomes: Sequence[Outcome]) -> str:
         inside = np.mean((found[:, 0] >= 0.90) & (found[:, 0] <= 0.98))
         mean, width = f"{np.mean(found[:, 0]):.0%}", number(float(np.median(found[:, 1])), 2)
         body.append([name, str(len(found)), mean, low, middle, high, f"{inside:.0%}", width])
-    head = ["drive", "intervals", "coverage: mean", "10 %", "median", "90 %", "intervals at 90 to 98 %", "width / RMSE: median"]
-    return table(head, body, right_from=1)
+    head = ["drive", "intervals", "coverage: mean", "10 %", "median", "90 %", "intervals at 90 to 98 %"]
+    return table([*head, "width / RMSE: median"], body, right_from=1)
 
 
 def d2_table(outcomes: Sequence[Outcome]) -> str:
