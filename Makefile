@@ -15,7 +15,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 # Tests run in random order. The head of their output has the seed: make test ORDER_SEED=17 repeats an order.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(if $(ORDER_SEED),--randomly-seed=$(ORDER_SEED))
 
-.PHONY: help demo test quick fleet pages mutants mutants-fixed check lint format bench train-default samples conditions real switches torture \
+.PHONY: help demo test quick fleet pages mutants mutants-fixed check lint format bench train-default samples conditions real torture \
   retrain docs docs-truthsim paper strangers wheel release lock clean
 
 help:
@@ -28,15 +28,13 @@ help:
 	@echo "make mutants-fixed  faults that the tests are known to notice: all must still be noticed (three minutes)"
 	@echo "make check    formatting, lint, types, import contracts, tests"
 	@echo "make torture  damaged, hostile and odd input, counted: docs/reliability.md (two hours or less on two cores; resumable)"
-	@echo "make strangers  docs/strangers.md: logs that the tool has not met, and what it gets right (under two minutes)"
+	@echo "make strangers  docs/third_party_logs.md: signals recognised in logs with unknown layouts (under two minutes)"
 	@echo "make bench    speed against peers"
 	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, 20 minutes or so)"
-	@echo "make retrain  a retraining on simulated drives: sound ones are accepted, spoilt ones are not (docs/retrain.md);"
-	@echo "              LOGS=drives/ CAR=mycar OUT=folder: on your own"
+	@echo "make retrain LOGS=drives/ CAR=mycar OUT=folder  train the network of a car again, behind a gate (docs/retrain.md)"
 	@echo "make samples  write sample_logs/ anew with the simulator"
 	@echo "make conditions CAR=car NETWORK=folder  docs/conditions.md: every estimator on the condition table"
 	@echo "make real NETWORK=folder  docs/real.md: every estimator on the recorded drives in ../shared"
-	@echo "make switches  docs/switches.md: bias states, roll, standstill, slip gate, latency of the filters, on and off"
 	@echo "make docs     the documentation as a site: out/site/index.html (a broken link is an error)"
 	@echo "make docs-truthsim  figures and tables of docs/truthsim.md anew"
 	@echo "make paper    the paper's experiment: docs/paper.md, its figures and results"
@@ -129,10 +127,8 @@ train-default: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.defaults.train_default
 	$(BIN)/python -m studies.model_card
 
-# Without LOGS the check of the whole chain, 15 minutes or so on two cores.
 retrain: $(VENV)/installed-dev $(VENV)/compiled
-	$(if $(LOGS),$(BIN)/pdhef retrain $(LOGS) -o $(if $(filter out/demo,$(OUT)),out/retrain,$(OUT)) --car $(CAR) --jobs $(JOBS),\
-	  OMP_NUM_THREADS=1 $(BIN)/python -m studies.retrain --jobs $(JOBS))
+	$(BIN)/pdhef retrain $(LOGS) -o $(if $(filter out/demo,$(OUT)),out/retrain,$(OUT)) --car $(CAR) --jobs $(JOBS)
 
 # Without --quiet, which would hide the warnings that make it fail.
 docs: $(VENV)/installed-docs
@@ -164,9 +160,6 @@ torture: $(VENV)/installed-dev $(VENV)/compiled
 # With the layouts that were built last.
 strangers: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.strangers --held-out
-
-switches: $(VENV)/installed-dev $(VENV)/compiled
-	OMP_NUM_THREADS=1 $(BIN)/python -m studies.switches
 
 # Of what is committed, in a clone: nothing else that lies about here gets in.
 wheel: $(VENV)/installed-release

@@ -22,10 +22,9 @@ _HEADINGS = ("work", "figure", "target", "", "against peers")
 _SECTION = "\n## "
 _INTRODUCTION = """# Performance
 
-Written by `python -m benchmarks.performance --write-docs`; `make bench` prints the same tables. Seconds are processor
-seconds (user and system, with those of child processes), the best of several interleaved rounds unless a section says
-otherwise; a ratio to a peer is measured in the same run. A section that is named on the command line is measured anew
-alone.
+This page shows processor time and memory, also against peers. Command: `python -m benchmarks.performance
+--write-docs`; `make bench` prints the tables. Seconds are processor seconds (user and system, with child processes),
+the best of several interleaved rounds unless a section says otherwise. A ratio to a peer is measured in the same run.
 """
 
 

@@ -140,9 +140,10 @@ def page(times: int, planted: int, drives: int) -> str:
         found.append([str(count), *(f"{x:.1%}" for x in hits)])
     return "\n".join(
         (
-            "# How surely `pdhef compare` finds a regression",
+            "# Comparison of runs",
             "",
-            "`python -m studies.comparing` writes this page. What the command does: [compare.md](compare.md).",
+            "This page shows how often [`pdhef compare`](compare.md) reports a regression, with and without one. "
+            "Command: `python -m studies.comparing`.",
             "",
             f"## Nothing changed: how often the gate closes, of {times:,} relabellings",
             "",

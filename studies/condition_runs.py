@@ -10,8 +10,8 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import cache, lru_cache, partial
+from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +19,16 @@ import polars as pl
 import pyarrow.parquet as pq
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.table import FILTERS, Options, make_estimator, runnable
+from pdhef_logtool.estimators.table import FILTERS, Options, runnable
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.records.supervisor import Crew, Tell
 from pdhef_logtool.runs.estimating import calibrator
-from studies import error_budget, fixed_grid
-from studies.condition_drives import read_drive, rmse_row, score, sideslip_error, told
+from studies.condition_drives import read_drive, score, told
 from studies.pages import ROOT
-from truthsim.vehicle_choice import choose_vehicle
 
 COLUMNS = ("row", "drive", "estimator", "signal", "segment", "metric", "value", "unit", "n")
 _KEY, _NOTES = b"key", b"notes"
@@ -69,15 +65,13 @@ class Setup:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One drive of one row. ``kind``: ``score``, ``grid`` (fixed settings alone) or ``budget``."""
+    """One drive of one row."""
 
-    kind: str
     row: str
     log: Path
     sha256: str
     assume: dict[str, Any]
     friction: float | None = None
-    entry: dict[str, Any] = field(default_factory=dict)
 
     @property
     def use_speed(self) -> bool:
@@ -107,7 +101,6 @@ def source_digest() -> str:
 def row_key(setup: Setup, tasks: Sequence[Task]) -> str:
     """Return the hash of all that the row's figures depend on."""
     document = {
-        "kind": tasks[0].kind,
         "setup": setup.identity,
         "assume": tasks[0].assume,
         "drives": [[t.log.name, t.sha256, t.friction] for t in tasks],
@@ -173,7 +166,7 @@ def _told(setup: Setup, task: Task, _tell: Tell) -> _Done:
 
 
 def _run(setup: Setup, task: Task) -> _Done:
-    rows, notes = (_budget if task.kind == "budget" else _score)(setup, task)
+    rows, notes = _score(setup, task)
     return task, [(r.log, r.estimator, r.signal, r.segment, r.metric, r.value, r.unit, r.n) for r in rows], notes
 
 
@@ -189,51 +182,19 @@ def _estimators(setup: Setup, available: frozenset[str], use_speed: bool) -> tup
     return tuple(ready), [f"{s.name} does not run: {s.reason}" for s in skipped]
 
 
-@cache
-def _grid_base(setup: Setup, use_speed: bool) -> AdaptivePhysics | None:
-    if setup.loaded.residual_network is None:
-        return None
-    base = make_estimator(fixed_grid.BASE, setup.loaded, Options(use_speed))
-    return base if isinstance(base, AdaptivePhysics) else None
-
-
 def _score(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
     drive = read_drive(task.log, setup.loaded, friction=task.friction)
     signals = told(drive, task.assume)
     estimators, skipped = _estimators(setup, signals.available, task.use_speed)
     notes, intervals = list(skipped), calibrator(setup.loaded, estimators)
     rows: list[MetricRow] = []
-    for estimator in estimators if task.kind == "score" else ():
+    for estimator in estimators:
         try:
             track, _ = run_window(estimator, signals)
             rows += score(intervals.add(track, signals), drive)
         except Exception as error:  # noqa: BLE001 (one estimator's failure on one drive is a result, not an end)
             notes.append(f"{estimator.name} failed on {task.row}/{drive.name}: {type(error).__name__}: {error}")
-    base = _grid_base(setup, task.use_speed)
-    if base is not None:
-        rows += fixed_grid.run_grid(base, signals, drive)
     return rows, notes
-
-
-@lru_cache(maxsize=256)
-def _fitted(car: str, friction: float, setup: Setup) -> VehicleParameters:
-    return error_budget.fit_vehicle(choose_vehicle(car), friction, setup.loaded.vehicle)
-
-
-def _budget(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
-    """Sideslip RMSE with nothing and with each cause taken away; the cause stands in ``segment``."""
-    car = setup.loaded
-    run = error_budget.drive_again(task.entry)
-    fitted = _fitted(run.spec.vehicle, run.spec.friction, setup)
-    rows: list[MetricRow] = []
-    for cause in (None, *error_budget.causes_of(run.spec, task.assume)):
-        case = error_budget.without(run, cause, car.vehicle, task.assume, fitted)
-        options = Options(case.use_speed)
-        ready, _ = runnable(setup.estimators, car.with_vehicle(case.vehicle), case.signals.available, options)
-        for estimator in ready:
-            error = sideslip_error(estimator, case.drive, case.signals)
-            rows += rmse_row(task.log.stem, estimator.name, cause or "base", error)
-    return rows, []
 
 
 def as_frame(results: dict[str, RowResult]) -> pl.DataFrame:

@@ -1,11 +1,11 @@
-"""The condition table (docs/method.md#evaluation): every estimator on the same drives with one thing wrong in each row.
+"""The condition table (docs/method.md#evaluation): every estimator on the same drives with one error in each row.
 
-    python -m studies.conditions [--car CAR] [--network FOLDER] [--drives 30] [--jobs 2] [--rows NAME,...]
+    python -m studies.conditions [--car CAR] [--network FOLDER] [--drives 30] [--jobs 2] [--rows NAME,...] [--render]
 
-Simulates the drives (``pdhef simulate conditions``; kept once made), runs all registered estimators that can run, and
-writes ``conditions.md`` with ``conditions/`` (tables as Parquet, plots) to ``--out``. Logs and the rows' results lie in
-``--work`` and are kept: a repeated call computes only rows whose drives, car, network, settings or sources changed.
-The independent simulator's runs join as a row where ``../shared`` lies beside the repository.
+Simulates the drives (``pdhef simulate conditions``), runs all estimators that can run, and writes the page
+``conditions.md`` with two figures to ``--out``, and all tables to ``--results``. ``--work`` keeps logs and rows: a
+repeated call computes the rows whose drives, car, network, settings or sources have changed. ``--render`` renders the
+page from ``--results``. The runs of the independent simulator are a row if ``../shared`` is beside the repository.
 """
 
 from __future__ import annotations
@@ -14,25 +14,20 @@ import argparse
 import hashlib
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from pdhef_logtool.estimators.table import SPECS, check_names
 from pdhef_logtool.records.errors import PdhefError
-from studies import fixed_grid
 from studies.condition_drives import independent_runs
 from studies.condition_runs import Setup, Task, as_frame, progress, run_rows
-from studies.conditions_page import Facts, Tables, write_page
-from studies.pages import DOCS, ROOT, options
+from studies.conditions_page import Facts, write_page, write_results
+from studies.pages import DOCS, RESULTS, ROOT, options
 from truthsim.conditions import ROW_NAMES, ROWS, write_conditions
 
 INDEPENDENT_ROW = "independent-simulator"
-#: The drives on which the best fixed setting is chosen have the table's seed plus this.
-CALIBRATION_SEED_OFFSET = 1000
-#: What the table's claims are about, the first of these that ran, and what it is held against.
-SUBJECTS = ("pd-hef", fixed_grid.BASE)
-REFERENCES = ("physics", "pd-hef:fixed-r", "phy-ukf:tuned", "pd-hef-paper", fixed_grid.BEST)
-BUDGET = ("phy-ukf:tuned", "phy-ukf")
+#: The estimator of interest, and the references of its RMSE ratios.
+SUBJECT = "pd-hef"
+REFERENCES = ("physics", "phy-ukf", "pd-hef-paper")
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -43,12 +38,12 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--estimators", default=",".join(s.name for s in SPECS), help="names, default all")
     parser.add_argument("--rows", default=",".join((*ROW_NAMES, INDEPENDENT_ROW)))
     parser.add_argument("--drives", type=int, default=30, help="drives a row")
-    parser.add_argument("--calibration-drives", type=int, default=10, help="drives a row for the best fixed setting")
-    parser.add_argument("--budget-drives", type=int, default=10, help="drives a row in the error budget; 0: none")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "conditions")
     parser.add_argument("--out", type=Path, default=DOCS)
+    parser.add_argument("--results", type=Path, default=RESULTS / "conditions")
+    parser.add_argument("--render", action="store_true", help="render the page from the stored results")
     given = parser.parse_args(arguments)
     given.estimators = tuple(given.estimators.split(","))
     given.rows = given.rows.split(",")
@@ -59,7 +54,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return given
 
 
-def simulated(given: argparse.Namespace, kind: str, drives: int, seed: int) -> dict[str, list[Task]]:
+def simulated(given: argparse.Namespace, drives: int, seed: int) -> dict[str, list[Task]]:
     """Simulate the rows asked for and return their drives as tasks."""
     rows = [r for r in given.rows if r != INDEPENDENT_ROW]
     if not rows:
@@ -71,10 +66,7 @@ def simulated(given: argparse.Namespace, kind: str, drives: int, seed: int) -> d
     progress(f"simulated (seed {seed}): {len(manifest['drives'])} drives")
     entries = {e["file"]: e for e in manifest["drives"]}
     return {
-        row["name"]: [
-            Task(kind, row["name"], folder / file, entries[file]["sha256"], row["assume"], entry=entries[file])
-            for file in row["files"]
-        ]
+        row["name"]: [Task(row["name"], folder / file, entries[file]["sha256"], row["assume"]) for file in row["files"]]
         for row in manifest["rows"]
     }
 
@@ -84,7 +76,7 @@ def independent(work: Path) -> list[Task]:
     folder = work / INDEPENDENT_ROW
     folder.mkdir(parents=True, exist_ok=True)
     return [
-        Task("score", INDEPENDENT_ROW, log, hashlib.sha256(source.read_bytes()).hexdigest(), {}, friction=friction)
+        Task(INDEPENDENT_ROW, log, hashlib.sha256(source.read_bytes()).hexdigest(), {}, friction=friction)
         for source, log, friction in independent_runs(folder)
     ]
 
@@ -92,7 +84,7 @@ def independent(work: Path) -> list[Task]:
 def run(given: argparse.Namespace) -> None:
     """Do everything."""
     setup = Setup(given.car, given.network, given.estimators)
-    tasks = simulated(given, "score", given.drives, given.seed)
+    tasks = simulated(given, given.drives, given.seed)
     absent = ""
     if INDEPENDENT_ROW in given.rows:
         tasks[INDEPENDENT_ROW] = independent(given.work)
@@ -102,47 +94,37 @@ def run(given: argparse.Namespace) -> None:
     scored = run_rows(setup, tasks, given.work / "rows", jobs=given.jobs, title="estimators")
     if not scored:
         raise SystemExit("no drives to score")
-    calibration = {}
-    if setup.loaded.network is not None and given.calibration_drives > 0:
-        grid = simulated(given, "grid", given.calibration_drives, given.seed + CALIBRATION_SEED_OFFSET)
-        calibration = run_rows(setup, grid, given.work / "calibration", jobs=given.jobs, title="fixed settings")
     metrics = as_frame(scored)
     ran = set(metrics["estimator"].unique())
-    budget = {}
-    if given.budget_drives > 0:
-        names = tuple(dict.fromkeys([*[n for n in BUDGET if n in ran][:1], *[n for n in SUBJECTS if n in ran][:1]]))
-        tasks.pop(INDEPENDENT_ROW, None)
-        some = {n: [replace(t, kind="budget") for t in row[: given.budget_drives]] for n, row in tasks.items()}
-        narrow = replace(setup, estimators=names)
-        budget = run_rows(narrow, some, given.work / "budget", jobs=given.jobs, title="error budget")
     facts = Facts(
         command=_command(given),
         car=setup.loaded.vehicle.name,
         setup=setup.identity,
         rows={r.name: r.description for r in ROWS}
         | {INDEPENDENT_ROW: "runs of another simulator, friction as it says"},
-        subject=next((n for n in SUBJECTS if n in ran), None),
+        subject=SUBJECT if SUBJECT in ran else None,
         references=REFERENCES,
         order=given.estimators,
         notes=tuple(dict.fromkeys([*([absent] if absent else []), *(n for r in scored.values() for n in r.notes)])),
-        calibration_seed=given.seed + CALIBRATION_SEED_OFFSET,
     )
-    write_page(given.out, facts, Tables(metrics, as_frame(calibration), as_frame(budget)))
+    write_results(given.results, facts, metrics)
+    write_page(given.out, given.results)
 
 
 def _command(given: argparse.Namespace) -> str:
     """Return the command line that makes the page again; files by name only."""
     network = "" if given.network is None else f" --network {given.network.name}"
-    return (
-        f"python -m studies.conditions --car {given.car.name}{network} --drives {given.drives}"
-        f" --seed {given.seed} --calibration-drives {given.calibration_drives} --budget-drives {given.budget_drives}"
-    )
+    return f"python -m studies.conditions --car {given.car.name}{network} --drives {given.drives} --seed {given.seed}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make the table; 1 with one line where an input is wrong."""
     try:
-        run(parse(arguments))
+        given = parse(arguments)
+        if given.render:
+            write_page(given.out, given.results)
+        else:
+            run(given)
     except PdhefError as error:
         print(error, file=sys.stderr)
         return 1

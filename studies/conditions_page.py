@@ -1,11 +1,11 @@
-"""The condition table as a page: ``conditions.md`` and, beside it, its Parquet tables and plots. No figure by hand."""
+"""The page of the condition table: summary and figures in ``conditions.md``, all tables in ``studies/results``."""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
 
@@ -16,9 +16,7 @@ from pdhef_logtool import __version__
 from pdhef_logtool.estimators.table import SPECS
 from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.records.signals import FloatArray
-from studies import fixed_grid
 from studies.condition_drives import BIN_LEAST_S, BINS, NONLINEAR, SIDESLIP
-from studies.error_budget import CAUSES
 from studies.pages import number, table, write
 from studies.pictures import save, subplots
 from studies.table_maths import (
@@ -52,7 +50,7 @@ _MARKS = {"better": "**<**", "not worse": "=", "worse": "**>**", "open": "?", "�
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What the page says besides the figures. ``rows``: description by name, in order; ``order``: of the estimators."""
+    """What the page contains besides figures. ``rows``: description by name; ``order``: of the estimators."""
 
     command: str
     car: str
@@ -62,21 +60,7 @@ class Facts:
     references: Sequence[str]
     order: Sequence[str]
     notes: Sequence[str]
-    calibration_seed: int
-
-
-@dataclass(frozen=True)
-class Tables:
-    """Long tables in the columns of ``condition_runs.COLUMNS``; the latter two may be empty."""
-
-    metrics: pl.DataFrame
-    calibration: pl.DataFrame
-    budget: pl.DataFrame
-
-    @cached_property
-    def figures(self) -> Figures:
-        """Figures of the table's drives."""
-        return Figures(self.metrics)
+    version: str = __version__
 
 
 class Figures:
@@ -113,65 +97,52 @@ class Figures:
         return {k[0] for k in self._by}
 
 
-@dataclass(frozen=True, slots=True)
-class Chosen:
-    """The fixed setting that is best on the calibration drives; ``ranking``: settings and scores in rad, best first."""
-
-    name: str
-    ranking: tuple[tuple[str, float], ...]
-
-
-def choose_fixed(calibration: pl.DataFrame) -> Chosen | None:
-    """Return the setting with the least geometric mean over rows of the median sideslip RMSE; None without any."""
-    if calibration.is_empty():
-        return None
-    figures = Figures(calibration)
-    rows = sorted(figures.rows())
-    scores = {
-        s: geometric_mean(np.array([median(figures.get(r, s)[0]) for r in rows])) for s in sorted(figures.estimators())
-    }
-    ranking = tuple(sorted(scores.items(), key=lambda item: (math.isnan(item[1]), item[1])))
-    return Chosen(ranking[0][0], ranking) if ranking else None
+def write_results(folder: Path, facts: Facts, metrics: pl.DataFrame) -> None:
+    """Write the results from which the page is rendered: ``facts.json`` and ``metrics.parquet``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    texts = ("row", "drive", "estimator", "signal", "segment", "metric", "unit")
+    compact = [
+        *(pl.col(t).cast(pl.Categorical) for t in texts),
+        pl.col("value").cast(pl.Float32),
+        pl.col("n").cast(pl.Int32),
+    ]
+    with PendingFile(folder / "metrics.parquet") as pending:
+        metrics.select(compact).write_parquet(pending.path, compression="zstd", compression_level=19)
+    write(folder / "facts.json", json.dumps(asdict(facts), indent=1) + "\n")
 
 
-def with_best(metrics: pl.DataFrame, chosen: Chosen | None) -> pl.DataFrame:
-    """Return the metrics with the chosen setting's rows once more, under the name that the tables use."""
-    if chosen is None:
-        return metrics
-    rows = metrics.filter(pl.col("estimator") == chosen.name)
-    return pl.concat([metrics, rows.with_columns(estimator=pl.lit(fixed_grid.BEST))])
-
-
-def write_page(out: Path, facts: Facts, given: Tables) -> None:
-    """Write page, Parquet tables and plots."""
-    chosen = choose_fixed(given.calibration)
-    tables = Tables(with_best(given.metrics, chosen), given.calibration, given.budget)
-    figures = tables.figures
+def write_page(out: Path, folder: Path) -> None:
+    """Render the page, its two figures, and all tables (``tables.md``) from the results in a folder."""
+    facts = Facts(**json.loads((folder / "facts.json").read_text(encoding="utf-8")))
+    figures = Figures(pl.read_parquet(folder / "metrics.parquet"))
     ran = figures.estimators()
-    names = sorted((n for n in (*facts.order, fixed_grid.BEST) if n in ran), key=lambda n: n in NOT_CAUSAL)
+    names = sorted((n for n in facts.order if n in ran), key=lambda n: n in NOT_CAUSAL)
     rows = [r for r in facts.rows if r in figures.rows()]
     references = [r for r in facts.references if r in ran and r != facts.subject]
-    folder = out / "conditions"
-    parts = [
-        _head(facts, figures, rows, [n for n in names if n in NOT_CAUSAL]),
+    compared = [n for n in names if n in {facts.subject, *references}]
+    tables = [
+        "# Tables of the simulated conditions\n",
         _sideslip(figures, rows, names),
         _means(figures, rows, names),
         _against(figures, rows, facts.subject, references),
-        _fixed(figures, rows, chosen, facts),
         _nonlinear(figures, rows, names),
-        _consistency(figures, rows, [n for n in names if n in {facts.subject, *references}]),
+        _consistency(figures, rows, compared),
         _coverage(figures, rows, names, facts.subject),
-        _lags(figures, rows, [n for n in names if n in {facts.subject, "zero", *references}]),
-        _budget(tables.budget, rows),
+        _lags(figures, rows, [n for n in names if n in {"zero", *compared}]),
     ]
-    folder.mkdir(parents=True, exist_ok=True)
-    _write_parquet(folder, tables, rows, names)
-    _plot_rows(folder / "sideslip.png", figures, rows, names)
+    write(folder / "tables.md", "\n".join(t for t in tables if t))
+    pictures = out / "conditions"
+    pictures.mkdir(parents=True, exist_ok=True)
+    _plot_rows(pictures / "sideslip.png", figures, rows, names)
+    parts = [_head(facts), _summary(facts, figures, rows, [n for n in DRAWN if n in names])]
+    parts.append("![Sideslip RMSE by row](conditions/sideslip.png)\n")
     if facts.subject is not None and references:
-        _plot_ratios(folder / "ratios.png", figures, rows, facts.subject, references)
-        parts.append(f"![{facts.subject} against its references](conditions/ratios.png)\n")
-    parts.insert(2, "![Sideslip RMSE by row](conditions/sideslip.png)\n")
-    write(out / "conditions.md", "\n".join(p for p in parts if p))
+        _plot_ratios(pictures / "ratios.png", figures, rows, facts.subject, references)
+        parts += [_counts(figures, rows, facts.subject, references)]
+        parts.append(f"![Ratio of {facts.subject} to its references](conditions/ratios.png)\n")
+    if facts.notes:
+        parts.append("\n".join(["Estimators that did not run:", "", *(f"- {note}" for note in facts.notes), ""]))
+    write(out / "conditions.md", "\n".join(parts))
 
 
 def _deg(value: float, digits: int = 3) -> str:
@@ -187,31 +158,69 @@ def _table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
     return table(head, body) + "\n"
 
 
-def _head(facts: Facts, figures: Figures, rows: Sequence[str], not_causal: Sequence[str]) -> str:
+def _head(facts: Facts) -> str:
     network, calibrated = facts.setup["network"], facts.setup["intervals"]
     physics, noise = (str(facts.setup[k])[:12] for k in ("physics", "noise"))
-    used = f"{facts.car} (physics {physics}, noise {noise})"
-    ran = "none: no hybrid filter ran" if network is None else f"sha256 {network[:12]}"
-    intervals = "as the estimators give them" if calibrated is None else f"calibrated, sha256 {calibrated[:12]}"
+    return "\n".join(
+        [
+            "# Simulated conditions",
+            "",
+            "This page shows the sideslip error of all estimators on simulated drives. Each row changes one condition.",
+            f"Command: `{facts.command}`.",
+            "",
+            f"Car: {facts.car} (physics {physics}, noise {noise}); network "
+            f"{'none' if network is None else network[:12]}; 95 % intervals "
+            f"{'as the estimators return them' if calibrated is None else calibrated[:12]}; "
+            f"pdhef-logtool {facts.version}.",
+            "The vehicle file is the same in all rows. Estimators get the true friction, unless the row changes it.",
+            "The ground truth is the state of the simulator.",
+            "",
+        ]
+    )
+
+
+def _summary(facts: Facts, figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
+    """Return the median RMSE of the main estimators, and the coverage of the subject, by row."""
     drives = {r: max(figures.get(r, n)[0].size for n in figures.estimators(r)) for r in rows}
+    subject = facts.subject
+    head = ["row", "condition", "drives", *names, *([] if subject is None else [f"coverage of {subject}"])]
+    body = []
+    for row in rows:
+        cells = [_deg(median(figures.get(row, n)[0])) for n in names]
+        if subject is not None:
+            covered = [figures.get(row, subject, "coverage95", segment=b) for b in BINS]
+            values, samples = (np.concatenate([c[i] for c in covered]) for i in (0, 1))
+            cells.append(f"{100 * pooled_mean(values, samples):.0f} %" if values.size else "–")
+        body.append([row, facts.rows[row], str(drives[row]), *cells])
     lines = [
-        "# Condition table",
+        "Sideslip RMSE in degrees, median over drives. `pd-hef-smoothed` is not causal: it uses later measurements.",
+        "Coverage: share of samples in the 95 % confidence interval.",
         "",
-        f"Written by `{facts.command}`; every figure comes from that command.",
+        _table(head, body),
+        "All estimators, percentiles, pooled errors, NEES, NIS, coverage by use of grip, and lag:",
+        "`studies/results/conditions/tables.md`. All figures by drive: `metrics.parquet` in the same folder.",
         "",
-        f"Car: {used}; network {ran}; pdhef-logtool {__version__}.",
-        f"95 % intervals {intervals}.",
-        "The vehicle file stays the same in all rows, whatever car is driven. Friction is told to every estimator from",
-        "the drive, times the factor of the row, or not at all where the row says so. Truth is the simulator's state.",
-        "",
-        _table(["row", "drives", "what is different"], [[r, str(drives[r]), facts.rows[r]] for r in rows]),
     ]
-    if not_causal:
-        knows = ", ".join(f"`{n}`" for n in not_causal)
-        lines += [f"Not causal, and so last and to be ranked apart: {knows} (it uses what is measured later).", ""]
-    if facts.notes:
-        lines += ["What did not run:", "", *(f"- {note}" for note in facts.notes), ""]
     return "\n".join(lines)
+
+
+def _counts(figures: Figures, rows: Sequence[str], subject: str, references: Sequence[str]) -> str:
+    """Return in how many rows the ratio of medians is better, not worse, open or worse."""
+    body = []
+    for reference in references:
+        bounds = {r: b for r in rows if math.isfinite((b := ratios(figures, r, subject, reference)[0]).value)}
+        words = [verdict(b) for b in bounds.values()]
+        above = [f"{r} ({b.value:.2f})" for r, b in bounds.items() if b.value > MARGIN]
+        counts = [str(words.count(w)) for w in ("better", "not worse", "open", "worse")]
+        body.append([reference, *counts, ", ".join(above) or "none"])
+    return "\n".join(
+        [
+            f"Rows by the ratio of the median RMSE of `{subject}` to a reference, with 95 % CI of a paired bootstrap",
+            f"over drives. Better: the CI is below 1; not worse: below {MARGIN}; worse: above {MARGIN}; open: else.",
+            "",
+            _table(["reference", "better", "not worse", "open", "worse", f"ratio above {MARGIN}"], body),
+        ]
+    )
 
 
 def _sideslip(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
@@ -301,46 +310,7 @@ def _against(figures: Figures, rows: Sequence[str], subject: str | None, referen
         "",
         _grid(rows, references, cell(1)),
     ]
-    body = []
-    for reference in references:
-        for which, what in enumerate(("medians", "pooled")):
-            bounds = {r: found[r, reference][which] for r in rows if math.isfinite(found[r, reference][which].value)}
-            words = [verdict(b) for b in bounds.values()]
-            over = [f"{r} ({b.value:.2f})" for r, b in bounds.items() if b.value > MARGIN]
-            counts = [str(words.count(w)) for w in ("better", "not worse", "open", "worse")]
-            body.append([reference, what, *counts, ", ".join(over) or "none"])
-    head = ["reference", "of", "better", "not worse", "open", "worse", f"rows with a ratio above {MARGIN}"]
-    return "\n".join([*lines, _table(head, body)])
-
-
-def _fixed(figures: Figures, rows: Sequence[str], chosen: Chosen | None, facts: Facts) -> str:
-    settings = sorted(n for n in figures.estimators() if fixed_grid.is_setting(n))
-    if chosen is None or not settings:
-        return ""
-    body = []
-    subject = facts.subject or fixed_grid.BEST
-    for row in rows:
-        medians = {s: median(figures.get(row, s)[0]) for s in settings if figures.get(row, s)[0].size}
-        pooled = {s: pooled_rmse(*figures.get(row, s)) for s in medians}
-        if medians:
-            m, p = (min(d, key=d.__getitem__) for d in (medians, pooled))
-            own = median(figures.get(row, subject)[0]), pooled_rmse(*figures.get(row, subject))
-            body.append([row, m, _deg(medians[m]), _deg(own[0]), p, _deg(pooled[p]), _deg(own[1])])
-    return "\n".join(
-        [
-            "## The best single fixed setting",
-            "",
-            f"Of {len(chosen.ranking)} settings of the hybrid filter (trust; factors on σ of a_y and on Q of "
-            f"`{fixed_grid.BASE}`), `{fixed_grid.BEST}`",
-            f"is the one with the least geometric mean over rows of the median on other drives (seed "
-            f"{facts.calibration_seed}): **{chosen.name}**.",
-            "",
-            _table(["setting", "on the calibration drives, deg"], [[s, _deg(v)] for s, v in chosen.ranking[:5]]),
-            "What nobody could have known beforehand, the best setting of each row on its own drives:",
-            "",
-            _table(["row", "best by median", "deg", f"`{subject}`", "best pooled", "deg", f"`{subject}`"], body),
-        ]
-    )
+    return "\n".join(lines)
 
 
 def _nonlinear(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
@@ -408,69 +378,6 @@ def _lags(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
         return ""
     what = "By cross-correlation with the truth, median over drives; + is late."
     return f"## Lag of sideslip / yaw rate in ms\n\n{what}\n\n{_grid(rows, names, cell)}"
-
-
-def _budget(budget: pl.DataFrame, rows: Sequence[str]) -> str:
-    if budget.is_empty():
-        return ""
-    rmse: dict[tuple[str, str, str], float] = {}
-    for key, part in budget.group_by("row", "estimator", "segment"):
-        row, estimator, cause = map(str, key)
-        rmse[row, estimator, cause] = pooled_rmse(part["value"].to_numpy(), part["n"].to_numpy())
-    drives = max(part["drive"].n_unique() for _, part in budget.group_by("row"))
-    lines = [
-        "## Error budget",
-        "",
-        f"The same drives again ({drives} a row) with one cause taken away: by how much of itself the mean square of",
-        "the sideslip error goes down (negative: up). Causes act together, so that shares need not add up to 100 %; a",
-        "dash: nothing to take away. `told`: friction and sensors that the row withholds; `vehicle`: a vehicle file of",
-        "that very car and road; `tilt`: roll, pitch, bank and grade in the accelerometers; `fault`: what is injected.",
-        "The simulator cannot switch off what stays when all are gone: tyre relaxation, load transfer, combined slip,",
-        "the shape of real tyre curves, quantisation, wheel slip, and the pull of a banked road on the car. A network",
-        "was trained against one vehicle file and knows no other: for hybrid filters `vehicle` and `all` say little.",
-        "",
-    ]
-    for estimator in sorted({e for _, e, _ in rmse}, reverse=True):
-        body = []
-        for row in rows:
-            base = rmse.get((row, estimator, "base"))
-            if base is None:
-                continue
-            shares = []
-            for cause in CAUSES:
-                left = rmse.get((row, estimator, cause))
-                shares.append("–" if left is None else f"{100 * (1 - (left / base) ** 2):.0f} %")
-            body.append([row, _deg(base), *shares, _deg(rmse.get((row, estimator, "all"), math.nan))])
-        head = ["row", "pooled RMSE, deg", *CAUSES, "RMSE without all, deg"]
-        lines += [f"`{estimator}`:", "", _table(head, body)]
-    return "\n".join(lines)
-
-
-def _write_parquet(folder: Path, tables: Tables, rows: Sequence[str], names: Sequence[str]) -> None:
-    texts = ("row", "drive", "estimator", "signal", "segment", "metric", "unit")
-    is_grid = pl.col("estimator").str.starts_with(f"{fixed_grid.PREFIX}(")
-    compact = [
-        *(pl.col(t).cast(pl.Categorical) for t in texts),
-        pl.col("value").cast(pl.Float32),
-        pl.col("n").cast(pl.Int32),
-    ]
-    files = {"metrics": tables.metrics.filter(~is_grid).select(compact)}
-    if not tables.budget.is_empty():
-        files["budget"] = tables.budget.select(compact)
-    summary = []
-    settings = sorted(n for n in tables.figures.estimators() if fixed_grid.is_setting(n))
-    for row in rows:
-        for name in (*names, *settings):
-            values, samples = tables.figures.get(row, name)
-            if values.size:
-                low, middle, high = percentiles(values)
-                pooled = pooled_rmse(values, samples)
-                summary.append((row, name, int(values.size), *map(math.degrees, (middle, low, high, pooled))))
-    columns = ("row", "estimator", "drives", "median_deg", "p10_deg", "p90_deg", "pooled_deg")
-    files["sideslip"] = pl.DataFrame(summary, schema=columns, orient="row")
-    for name, frame in files.items():
-        with PendingFile(folder / f"{name}.parquet") as pending:
-            frame.write_parquet(pending.path, compression="zstd", compression_level=19)
 
 
 def _plot_rows(path: Path, figures: Figures, rows: Sequence[str], names: Sequence[str]) -> None:

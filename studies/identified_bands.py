@@ -1,18 +1,14 @@
-"""Identified cars on driving that took no part, 95 % bands and smoothing: simulated, identified by the tool on a drive.
+"""Identified cars on driving that took no part, 95 % confidence intervals.
 
-    python -m studies.identified_bands [--cars 12] [--seed 88003] [--out docs]
-
-Writes ``docs/identified_bands.md``. Each car is identified on a wide sine sweep and, as another car, on a road, from a
+Each car is identified on a wide sine sweep and, as another car, on a road, from a
 vehicle file whose stiffness is wrong; each is then judged on drives of its own: of that kind with another speed and
-seed, and of other kinds.
+seed, and of other kinds. ``studies.calibration`` writes the page.
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -20,21 +16,17 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import PHYSICS, FittedPhysics, FittedValues
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.posterior_band import OWN_SHARE
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import NORMAL_95
 from pdhef_logtool.learning.car.fit_data import FitDrive
 from pdhef_logtool.learning.car.physics_fit import fit_physics, varied_vehicles
 from pdhef_logtool.learning.car.smoothing_fit import fit_smoothing
-from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.runs.estimating import calibrator
-from pdhef_logtool.self_calibration.calibration import VARIED
 from studies.condition_drives import root_mean_square
 from studies.many_cars import FIT_ITERATIONS, PARTS
-from studies.pages import DOCS, number, options, table, write
+from studies.pages import number, table
 from studies.self_calibration import Simulated, make_wrong, say, simulate
 
-SEED, CARS = 88_003, 12
 #: Manoeuvre, km/h, seconds (None: its own). The first of each kind is identified on where it is one of ``FIT_ON``.
 DRIVEN = (
     ("sine-sweep-wide", 90.0, None),
@@ -45,7 +37,6 @@ DRIVEN = (
     ("sine-sweep-wide", 70.0, None),
 )
 FIT_ON = ("sine-sweep-wide", "road")
-SMOOTHED = "pd-hef-smoothed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +45,6 @@ class Judged:
 
     ``own``, ``band`` : of the filter alone, and with the posterior: share of the errors inside, and the whole mean
     width over the RMSE.
-    smoothed : RMSE over that of the filter, smoothed with the filter's noise and with the smoother's own.
     """
 
     fit: str
@@ -62,7 +52,6 @@ class Judged:
     rmse: float
     own: tuple[float, float]
     band: tuple[float, float]
-    smoothed: tuple[float, float]
 
 
 def identified(one: Simulated) -> Car:
@@ -97,16 +86,8 @@ def judged(car: Car, fit: Simulated, one: Simulated) -> Judged:
         half = NORMAL_95 * std[known]
         return float(np.mean(error <= half)), float(2.0 * np.mean(half) / rmse)
 
-    assert car.fitted_physics is not None
-    as_filtered = replace(car, fitted_physics=car.fitted_physics.model_copy(update={"smoothing": (1.0, 1.0)}))
-    smoothed = tuple(_smoothed_rmse(c, one, known) / rmse for c in (as_filtered, car))
     own, band = stands(plain.sideslip_std_rad), stands(wide.sideslip_std_rad)
-    return Judged(fit.manoeuvre, one.manoeuvre, rmse, own, band, (smoothed[0], smoothed[1]))
-
-
-def _smoothed_rmse(car: Car, one: Simulated, known: BoolArray) -> float:
-    track, _ = run_window(make_estimator(SMOOTHED, car), one.drive.signals)
-    return root_mean_square(one.error(track)[known])
+    return Judged(fit.manoeuvre, one.manoeuvre, rmse, own, band)
 
 
 def judge(cars: int, seed: int) -> list[Judged]:
@@ -139,18 +120,6 @@ def _groups(found: Sequence[Judged]) -> dict[str, list[Judged]]:
     }
 
 
-def smoothing_table(found: Sequence[Judged]) -> str:
-    """Return how the smoothed error stands to the filter's."""
-    body = []
-    for name, some in _groups(found).items():
-        for which, ratios in zip(("the filter's", "its own"), np.array([j.smoothed for j in some]).T, strict=True):
-            low, middle, high = (number(float(x), 2) for x in np.percentile(ratios, [10, 50, 90]))
-            row = [name, str(len(some)), which, number(float(np.exp(np.mean(np.log(ratios)))), 2), low, middle, high]
-            body.append([*row, f"{np.mean(ratios > 1.05):.0%}"])
-    head = ["driving", "drives", "process noise", "smoothed / filter: geometric mean", "10 %", "median", "90 %"]
-    return table([*head, "more than 5 % worse"], body, right_from=3)
-
-
 def bands_table(found: Sequence[Judged]) -> str:
     """Return shares and widths, driving like that of the identification apart."""
     body = []
@@ -162,54 +131,5 @@ def bands_table(found: Sequence[Judged]) -> str:
             rmse = number(float(np.degrees(np.median([j.rmse for j in some]))))
             row = [name, str(len(some)), rmse, which, f"{np.mean(shares):.0%}", low, middle, high, within]
             body.append([*row, number(float(np.median(widths)), 2)])
-    head = ["driving", "drives", "RMSE, deg: median", "band", "coverage: mean", "10 %", "median", "90 %"]
-    return table([*head, "bands at 90 to 98 %", "width / RMSE: median"], body, right_from=4)
-
-
-PAGE = """# Bands of identified cars
-
-Written by `{command}`; every figure comes from it.
-
-{cars} simulated cars (`studies.many_cars`), seed {seed}, on which nothing was chosen, with files whose stiffness is
-wrong by up to 1.4 at each axle. `physics` of each is identified on one drive, a wide sine sweep or a road of 120 s, and
-judged on others of the same car. The variance of sideslip is ({own:g} s)² with the filter's own s, what the
-posterior's {varied} strongest directions do to the filter, and what accelerometer and gyro contradict
-([calibrate.md](calibrate.md)). The shares were chosen on 8 other cars. The width is the whole one, mean over a drive:
-with errors of one normal distribution a band that covers 95 % is 3.92 times the RMSE wide.
-
-{bands}
-
-An identification believes no error below 0.05° (`FLOOR_RAD`). On driving like that of the fit, where a simulated car
-has less, its band is far too wide: that is what a posterior can say of a model that may be wrong elsewhere.
-
-## Smoothing
-
-`pd-hef-smoothed` of the same cars on the same drives, with the noise of the filter and with that which `identify`
-finds through the smoother, on the drive of the fit. Not causal.
-
-{smoothing}
-"""
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the page."""
-    parser = options("identified_bands", __doc__)
-    parser.add_argument("--cars", type=int, default=CARS)
-    parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--out", type=Path, default=DOCS)
-    given = parser.parse_args(arguments)
-    command = "python -m studies.identified_bands"
-    command += "".join(
-        f" --{n} {v}" for n, v, usual in (("cars", given.cars, CARS), ("seed", given.seed, SEED)) if v != usual
-    )
-    found = judge(given.cars, given.seed)
-    told = {"command": command, "cars": given.cars, "seed": given.seed, "own": OWN_SHARE, "varied": VARIED}
-    write(
-        given.out / "identified_bands.md",
-        PAGE.format(**told, bands=bands_table(found), smoothing=smoothing_table(found)),
-    )
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    head = ["driving", "drives", "RMSE, deg: median", "interval", "coverage: mean", "10 %", "median", "90 %"]
+    return table([*head, "intervals at 90 to 98 %", "width / RMSE: median"], body, right_from=4)

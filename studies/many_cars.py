@@ -1,11 +1,15 @@
 """Short drives of many simulated cars, each with a vehicle file of its own: what one network for many cars learns from.
 
 Saloons and SUVs of all loads, heights, tyres and wear, with sensors of all qualities; the hatchback is kept for cars
-that no network ever saw. A car's file is fitted to a ramp steer of it (``error_budget.fit_vehicle``), as somebody who
+that no network ever saw. A car's file is fitted to a ramp steer of it (``fit_vehicle``), as somebody who
 has measured his car would have it; ``physics`` of it is identified by the tool on its first drives, with the truth of
 an INS that is mounted a little askew: the network is trained for filters as it will meet them. Residuals are taken from
 the other drives, with perfect truth: from those of the INS the network learnt its noise (the validation loss rose from
 the second epoch on). Drives are split by car.
+
+    python -m studies.many_cars
+
+Simulates the cars, extracts their residuals and trains the shipped network ``many-cars``: 25 minutes on two cores.
 """
 
 from __future__ import annotations
@@ -22,23 +26,37 @@ import numpy as np
 from pdhef_logtool.car.car import FIT_FILE, VEHICLE_FILE, Car
 from pdhef_logtool.car.parts import Fit, FittedPhysics, FittedValues, physics_sha256
 from pdhef_logtool.car.toml_files import load_vehicle, part_toml, vehicle_toml
-from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters
+from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.learning.car.fit_data import load_fit_drive
 from pdhef_logtool.learning.car.physics_fit import fit_physics
+from pdhef_logtool.learning.network.fit import Recipe
+from pdhef_logtool.learning.network.train_command import dataset_for, train_on
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping.mapping_file import load_mapping
 from pdhef_logtool.records.errors import SimulationError
+from pdhef_logtool.residual_model.bundle import MANY_CARS, PHYSICS_MODEL, SHIPPED_FOLDERS
+from pdhef_logtool.residual_model.features import FEATURES
+from studies.defaults.fit_nominal_tyres import (
+    LINEAR_A_Y_M_S2,
+    axle_curves,
+    axle_loads_n,
+    fit_axle,
+    ramp,
+    roll_gradient_rad_per_m_s2,
+)
 from studies.defaults.train_default import MAPPING as TRAINING_MAPPING
-from studies.error_budget import fit_vehicle
+from studies.defaults.train_default import pdhef
+from studies.pages import ROOT, options
 from truthsim.batch import DriveSpec, Job, run_jobs
 from truthsim.linear_theory import understeer_gradient_rad_per_m_s2
 from truthsim.sensors import SensorNoise
 from truthsim.suite import draw_spec
-from truthsim.vehicle import GRAVITY_M_S2
+from truthsim.vehicle import GRAVITY_M_S2, Vehicle
 from truthsim.vehicle_choice import choose_vehicle
 
-SEED = 4000
+DATA, CARS_FOLDER = ROOT / "out" / "many-cars-data", ROOT / "out" / "many-cars"
+SEED, EPOCHS = 4000, 48
 CARS = 300
 DRIVES_PER_CAR = 6
 #: Of these, the drives that a car is identified on; no residual is taken from them. Steps of the fit, some 5 s a car.
@@ -134,6 +152,38 @@ def _sensors(rng: np.random.Generator) -> tuple[tuple[str, float], ...]:
     return tuple((name, round(value, 6)) for name, value in sorted(values.items()))
 
 
+def fit_vehicle(car: Vehicle, friction: float, vehicle: VehicleParameters) -> VehicleParameters:
+    """Return the vehicle file with mass, geometry, axle tyres and roll gradient of a simulated car on a road.
+
+    Raises
+    ------
+    SimulationError
+        The car cannot be driven through the ramp.
+    """
+    motion = ramp(friction, car)
+    if not np.isfinite(motion.column("ay_m_s2")).all():
+        raise SimulationError(expected="a finite ramp steer", got="NaN or infinity", where="fit of a vehicle file")
+    tyres, loads_n = {}, axle_loads_n(car)
+    for axle, (alpha, force) in axle_curves(motion, car).items():
+        # Beyond the peak the car slides in ever other ways; the curve is fitted up to it.
+        whole = slice(0, int(np.argmax(force)) + 1)
+        fit = fit_axle(alpha[whole] / friction, force[whole] / friction, loads_n[axle])
+        tyres[axle] = AxleTyre(B=fit.B, C=fit.C, D_n=fit.D_n, E=fit.E, reference_friction=1.0)
+    linear_m_s2 = min(LINEAR_A_Y_M_S2, 0.5 * friction * GRAVITY_M_S2)
+    return vehicle.model_copy(
+        update={
+            "mass_kg": car.mass_kg,
+            "yaw_inertia_kg_m2": car.yaw_inertia_kg_m2,
+            "cg_to_front_axle_m": car.cg_to_front_axle_m,
+            "cg_to_rear_axle_m": car.cg_to_rear_axle_m,
+            "track_m": car.track_m,
+            "cg_height_m": car.cg_height_m,
+            "roll_gradient_rad_per_m_s2": roll_gradient_rad_per_m_s2(motion, linear_m_s2),
+            "tyres": Tyres(front=tyres["front"], rear=tyres["rear"]),
+        }
+    )
+
+
 def plan_cars(
     cars: int, drives: int, seed: int, folder: Path, base: VehicleParameters, kinds: tuple[str, ...] = KINDS
 ) -> list[Job]:
@@ -165,7 +215,7 @@ def write_cars(
 ) -> dict[str, Any]:
     """Write a set of many cars and its manifest; drives that are there as they should be are kept."""
     planned = plan_cars(cars, drives, seed, folder, load_vehicle(BASE), kinds)
-    head = {"command": "python -m studies.many_cars_table", "seed": seed, "cars": cars, "drives_per_car": drives}
+    head = {"command": "python -m studies.many_cars", "seed": seed, "cars": cars, "drives_per_car": drives}
     return run_jobs(planned, folder, head, processes=jobs)
 
 
@@ -209,3 +259,20 @@ def identified(file: Path, logs: Sequence[Path], mapping: Path) -> str:
     noise = found.noise.model_copy(update={"physics_sha256": physics_sha256(values.applied_to(own))})
     fit = Fit(physics_sha256=physics_sha256(own), physics=FittedPhysics(values=values, noise=noise))
     return part_toml(fit, "Written by python -m studies.many_cars.")
+
+
+def main() -> None:
+    """Simulate, extract and train. Drives and residuals that exist already are kept."""
+    options("many_cars", __doc__).parse_args()
+    write_cars(CARS_FOLDER, cars=CARS, drives=DRIVES_PER_CAR, seed=SEED, jobs=2)
+    logs = identify_cars(CARS_FOLDER)
+    mapping = CARS_FOLDER / "extract.toml"
+    mapping.write_text(TRAINING_MAPPING, encoding="utf-8")
+    pdhef("extract", *logs, "-o", DATA, "--mapping", mapping, "--jobs", 2, "--resume")
+    recipe = Recipe(seed=0, epochs=EPOCHS, feature_names=FEATURES)
+    folder = SHIPPED_FOLDERS[MANY_CARS]
+    train_on(dataset_for(DATA, PHYSICS_MODEL), folder, recipe, progress=lambda text, _share: print(text, flush=True))
+
+
+if __name__ == "__main__":
+    main()

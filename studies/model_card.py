@@ -92,7 +92,7 @@ def page(work: Path, car: Car) -> str:
     ]
     return f"""# Model card of the shipped model
 
-Written by `python -m studies.model_card`; the model by `make train-default`.
+This page describes the shipped network. Command: `python -m studies.model_card`; training: `make train-default`.
 
 - Place: `pdhef_logtool/models/default`, {size / 2**20:.2f} MB, sha256 `{model.sha256[:16]}…`.
 - What it is for: what `physics` of the simulated saloon lacks (`vehicle.toml` and `fit.toml` beside it). On another car

@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from pdhef_logtool.records.files import write_bytes
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
+RESULTS = ROOT / "studies" / "results"
 SAMPLE_VEHICLE = ROOT / "sample_logs" / "vehicle.toml"
 #: Recorded drives and runs of another simulator, which may not be redistributed: beside the repository, or nowhere.
 DRIVES = ROOT.parent / "shared" / "data" / "drives"
@@ -23,6 +24,20 @@ def table(head: Iterable[str], body: Iterable[Iterable[str]], *, right_from: int
     names = list(head)
     rule = ["---" if right_from is None or i < right_from else "---:" for i in range(len(names))]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (names, rule, *body))
+
+
+def table_rows(text: str) -> dict[str, list[list[str]]]:
+    """Return the cells of the first table below each heading of a Markdown text, without head and rule."""
+    tables: dict[str, list[list[str]]] = {}
+    heading, rows, ended = "", list[list[str]](), False
+    for line in text.splitlines():
+        if line.startswith("#"):
+            heading, rows, ended = line.lstrip("# "), tables.setdefault(line.lstrip("# "), []), False
+        elif line.startswith("|") and heading and not ended:
+            rows.append([cell.strip() for cell in line.strip("|").split("|")])
+        else:
+            ended = bool(rows)
+    return {name: rows[2:] for name, rows in tables.items() if rows}
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -52,14 +67,3 @@ def options(name: str, text: str | None) -> argparse.ArgumentParser:
     """Return the parser of ``python -m studies.NAME``; ``text`` is its module's."""
     shape = argparse.RawDescriptionHelpFormatter
     return argparse.ArgumentParser(prog=f"python -m studies.{name}", description=text, formatter_class=shape)
-
-
-def measured(name: str, text: str | None, document: Path, measure: Callable[[], str]) -> None:
-    """Be ``python -m studies.NAME`` of a page with one block: measure, print, and write it if asked for."""
-    parser = options(name, text)
-    parser.add_argument("--write-docs", action="store_true", help=f"put the tables into {document.name}")
-    write_docs = parser.parse_args().write_docs
-    tables = measure()
-    print(tables)
-    if write_docs:
-        write(document, fill(document.read_text(encoding="utf-8"), {"measured": tables}, document.name))

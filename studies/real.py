@@ -11,13 +11,15 @@ other cases are scored with their catalogue vehicle and ``--network`` as they ar
 may not be redistributed: where they are absent it says so and ends with 0, and the page holds figures only.
 
 Rows that are finished stay in ``--work`` and are taken as long as nothing that they rest on has changed. How often a
-part was scored stands in ``real/looks.json`` and on the page: figures that were looked at choose sooner or later.
+part was scored is in ``studies/results/real/looks.json`` and on the page: repeated
+evaluation makes figures optimistic.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import re
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -57,7 +59,7 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, self_calibrated
 from studies.condition_drives import SIDESLIP
-from studies.pages import DOCS, DRIVES, ROOT, number, options, table, write
+from studies.pages import DOCS, DRIVES, RESULTS, ROOT, number, options, table, table_rows, write
 
 REFERENCE = ROOT / "tests" / "reference"
 #: Share of the fit part that the network learns from; the rest, behind a guard, stops its training.
@@ -70,10 +72,36 @@ YARDSTICKS = ("phy-ukf:tuned, identified", "phy-ukf, catalogue")
 FREE = ("zero", "kinematic")
 PHYSICAL = tuple(s.name for s in SPECS if not s.network and s.name not in (*FREE, "zero:no-lateral", OPEN_LOOP))
 NETWORKS = tuple(s.name for s in SPECS if s.network)
-#: Versions of this page, and of the published files on docs/self_calibration.md, before looks were counted.
+#: Versions of this page, and of the published files on docs/calibration.md, before looks were counted.
 LOOKS_BEFORE = 6
 LOOKS_BEFORE_PUBLISHED = {"250lm": 9, "gti": 8, "tts": 8, "v40": 8}
 LOOKS_FILE = "looks.json"
+#: Columns of the page, with patterns of the names in the tables.
+SUMMARY = {
+    "zero": "zero",
+    "open-loop, datasheet": "open-loop, catalogue",
+    "phy-ukf, datasheet": "phy-ukf, catalogue",
+    "physics, datasheet": "physics, catalogue",
+    "physics, self-calibrated": "physics .*self-calibrated",
+    "physics, identified": "physics, identified",
+    "pd-hef, learn": "pd-hef( at trust .*)?, learnt",
+}
+EVALUATED = "Number of evaluations on this part, at least:"
+PAGE = """# Recorded drives
+
+This page shows the sideslip error on recorded drives of real cars and a scale model. {command}
+
+Sideslip RMSE in degrees with the 95 % CI of a bootstrap of 10 s blocks. *datasheet*: published vehicle file.
+*self-calibrated*: calibrated on the scored part without ground truth, not causal. *identified*: stage `identify` of
+`pdhef learn` on the training part. *learn*: all stages. A dash: not possible with the data of this drive.
+*evaluations*: how often the scored part was evaluated during development, at least; many evaluations make the
+figures optimistic.
+
+{summary}
+
+`studies/results/real/tables.md` contains all estimators, networks and 95 % intervals; `blocks.parquet` contains the
+errors of each block. The drives may not be redistributed.
+"""
 
 
 def say(text: str) -> None:
@@ -485,6 +513,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--trials", type=int, default=64)
     parser.add_argument("--cases", default=",".join(c.name for c in CASES))
     parser.add_argument("--out", type=Path, default=DOCS)
+    parser.add_argument("--results", type=Path, default=RESULTS / "real")
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "real", help="rows that are finished; kept")
     given = parser.parse_args(arguments)
     if not DRIVES.is_dir():
@@ -498,14 +527,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     used = "none" if network is None else f"sha256 {network.sha256[:12]}"
     command = "python -m studies.real" + ("" if network is None else f" --network {given.network.name}")
     lines = [
-        "# Recorded drives",
+        "# Tables of the recorded drives",
         "",
-        f"Written by `{command} --trials {given.trials}`; every figure comes from that command. Given network: {used}.",
-        "Sideslip RMSE with the 95 % interval of a bootstrap of 10 s blocks. The drives may not be redistributed.",
-        "*catalogue*: the published file. *self-calibrated*: by the scored part itself, without truth; not causal.",
-        "*identified*: by stage identify of `pdhef learn` on the fit part. *learnt*: by all stages there.",
-        "The last columns are of the 95 % bands of `pdhef run`; one that fits is about 4 times the RMSE wide.",
-        "The blocks one by one, for comparisons in pairs: [real/blocks.parquet](real/blocks.parquet).",
+        f"Command: `{command} --trials {given.trials}`. Given network: {used}.",
         "",
     ]
     stored: list[tuple[str, str, int, int, float]] = []
@@ -514,15 +538,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
         lines += [f"## {case.title}", "", f"Scored above {case.min_speed_m_s:g} m/s. {case.remark}", ""]
         basis = digest([case.name, repr(case), used, given.trials, source])
         results, remarks = run_case(case, given.network, given.trials, Finished(given.work / case.name, basis))
-        looks = count_look(given.out / "real" / LOOKS_FILE, case, basis)
-        remarks.append(f"This part has been looked at at least {looks} times.")
+        looks = count_look(given.results / LOOKS_FILE, case, basis)
+        remarks.append(f"{EVALUATED} {looks}.")
         lines += [case_table(results), "", *(line for remark in remarks for line in (remark, ""))]
         stored += blocks(case, results)
     columns = ("case", "estimator", "block", "stamps", "sideslip_rmse_deg")
-    with PendingFile(given.out / "real" / "blocks.parquet") as pending:
+    with PendingFile(given.results / "blocks.parquet") as pending:
         pl.DataFrame(stored, schema=columns, orient="row").write_parquet(pending.path, compression="zstd")
-    write(given.out / "real.md", "\n".join(lines))
+    tables = "\n".join(lines)
+    write(given.results / "tables.md", tables)
+    write(given.out / "real.md", page(tables))
     return 0
+
+
+def page(tables: str) -> str:
+    """Return the page: command, one summary table, and where the tables are."""
+    rows, body = table_rows(tables), []
+    counts = re.findall(rf"{EVALUATED} (\d+)\.", tables)
+    for (title, lines), count in zip(rows.items(), counts, strict=True):
+        errors = {line[0]: line[1].replace(" [", "<br>[") for line in lines}
+        cells = [next((e for n, e in errors.items() if re.fullmatch(pattern, n)), "–") for pattern in SUMMARY.values()]
+        body.append([title, *cells, count])
+    head = ["drive", *SUMMARY, "evaluations"]
+    return PAGE.format(command=tables.splitlines()[2], summary=table(head, body))
 
 
 if __name__ == "__main__":

@@ -1,13 +1,12 @@
 """Cars that calibrate themselves without truth: simulated ones with wrong files, and published files of real cars.
 
-Writes ``docs/self_calibration.md``. Each simulated car drives a wide sine sweep and a road; its vehicle file, which was
-fitted to a ramp steer of it, is made wrong by a factor of 0.5 to 2 at each axle. Each drive calibrates the car for
-itself, as ``pdhef run`` does.
+Each simulated car drives a wide sine sweep and a road. Its vehicle file, fitted to a ramp steer, gets a stiffness error
+of a factor 0.5 to 2 at each axle. Each drive calibrates the car for itself, as ``pdhef run`` does.
+``studies.calibration`` writes the page.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -23,7 +22,7 @@ from pdhef_logtool.car.toml_files import load_vehicle
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters
 from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.self_calibrated import D2_SHARE, OPEN_LOOP, OWN_SHARE
+from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, signal_error
 from pdhef_logtool.evaluation.metrics.d2 import d2_rows, driven_d2, driving_products
@@ -33,19 +32,13 @@ from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.selection import FACTOR, SIMPLE
+from pdhef_logtool.runs.selection import FACTOR
 from pdhef_logtool.runs.self_calibrating import log_sensors
-from pdhef_logtool.self_calibration.calibration import (
-    LEAST_KNOWN,
-    LEAST_KNOWN_EXPORTED,
-    VARIED,
-    SelfCalibration,
-    self_calibrate,
-)
+from pdhef_logtool.self_calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.self_calibration.driving import DrivingReader
 from studies.condition_drives import SIDESLIP, as_logged
 from studies.many_cars import BASE, KINDS, draw_car
-from studies.pages import DOCS, DRIVES, ROOT, number, options, table, write
+from studies.pages import DRIVES, ROOT, number, table
 from truthsim.batch import sensor_noise
 from truthsim.drive import simulate_drive
 from truthsim.vehicle_choice import choose_vehicle
@@ -190,7 +183,6 @@ class Outcome:
     calibrated: dict[str, tuple[float, float]]
     from_right: dict[str, tuple[float, float]]
     refused: str
-    stiffness: tuple[tuple[float, float], ...]  # by axle: error of the logarithm against the right file, sd
     bands: tuple[tuple[float, float], ...]  # from the wrong file and the right one, without those refused: band_of
 
 
@@ -201,12 +193,6 @@ def outcome_of(one: Simulated) -> Outcome:
     names, after = ("zero", "open-loop", "phy-ukf", "physics"), (OPEN_LOOP, "physics")
     signals = one.drive.signals
     calibrated, as_right = taken(signals, wrong, found), taken(signals, one.file, from_right)
-    by = {p.name: p for p in found.parameters}
-    stiffness = []
-    for axle, front in (("front", True), ("rear", False)):
-        if parameter := by.get(f"{axle} cornering stiffness"):
-            right = one.file.cornering_stiffness_n_per_rad(front, one.file.assumed_friction)
-            stiffness.append((float(np.log(parameter.value / right)), parameter.sd))
     return Outcome(
         one.manoeuvre,
         errors_of(one.drive, Car.of(one.file), names, found),
@@ -214,7 +200,6 @@ def outcome_of(one: Simulated) -> Outcome:
         errors_of(one.drive, calibrated, after, found),
         errors_of(one.drive, as_right, after, from_right),
         found.refused,
-        tuple(stiffness),
         tuple(band_of(one.drive, car) for car in (calibrated, as_right) if car.self_calibrated is not None),
     )
 
@@ -240,28 +225,6 @@ def simulated_table(outcomes: Sequence[Outcome]) -> str:
     return table(head, body, right_from=1)
 
 
-def stiffness_table(outcomes: Sequence[Outcome]) -> str:
-    """Return how far the stiffness is from the right file's, and whether its sd covers that."""
-    body = []
-    for name in dict.fromkeys(o.manoeuvre for o in outcomes):
-        for i, axle in enumerate(("front", "rear")):
-            pairs = np.array([o.stiffness[i] for o in outcomes if o.manoeuvre == name and o.stiffness])
-            within = np.mean(np.abs(pairs[:, 0]) < 1.96 * pairs[:, 1])
-            spread = float(np.sqrt(np.mean(pairs[:, 0] ** 2)))
-            cells = (float(np.median(pairs[:, 0])), spread, float(np.median(pairs[:, 1])))
-            body.append(
-                [
-                    name,
-                    axle,
-                    *(f"{100 * c:+.0f} %" if k == 0 else f"{100 * c:.0f} %" for k, c in enumerate(cells)),
-                    f"{within:.0%}",
-                ]
-            )
-    return table(
-        ["drive", "axle", "median error", "rms error", "median posterior sd", "within 1.96 sd"], body, right_from=2
-    )
-
-
 def band_table(outcomes: Sequence[Outcome]) -> str:
     """Return coverage and width of the 95 % bands on calibrated cars."""
     body = []
@@ -271,8 +234,8 @@ def band_table(outcomes: Sequence[Outcome]) -> str:
         inside = np.mean((found[:, 0] >= 0.90) & (found[:, 0] <= 0.98))
         mean, width = f"{np.mean(found[:, 0]):.0%}", number(float(np.median(found[:, 1])), 2)
         body.append([name, str(len(found)), mean, low, middle, high, f"{inside:.0%}", width])
-    head = ["drive", "bands", "coverage: mean", "10 %", "median", "90 %", "bands at 90 to 98 %", "width / RMSE: median"]
-    return table(head, body, right_from=1)
+    head = ["drive", "intervals", "coverage: mean", "10 %", "median", "90 %", "intervals at 90 to 98 %"]
+    return table([*head, "width / RMSE: median"], body, right_from=1)
 
 
 def d2_table(outcomes: Sequence[Outcome]) -> str:
@@ -342,111 +305,6 @@ def published_run(name: str, log: str) -> tuple[dict[str, tuple[float, float]], 
     return figures, report
 
 
-PAGE = """# A car that calibrates itself, without truth
-
-Written by `{command}`; every figure comes from it. Sideslip RMSE in degrees.
-
-What is fitted, with which priors, stands at the head of `pdhef_logtool/self_calibration/calibration.py`: an open-loop
-single track with relaxing axle forces, to yaw rate and a_y below 4 Hz, on all driving of a log above 10 m/s. It is not
-causal: the whole log speaks before the first estimate. `pdhef run --calibrate off` is the file as it stands, `pool`
-makes one calibration of all logs of a run, `pdhef learn --without-truth` writes that of a pool to a car.
-
-A log that leaves a cornering stiffness at more than ± {least} is refused, and the file stays as it stands; a pool that
-is to be written to a car is at ± {exported}. So is driving with an implausible understeer gradient, a drift, too little
-of it, and in a run a calibration on which the d2 of `physics` (below) is more than {factor:g} times that on the file.
-
-## Simulated cars with wrong files
-
-{cars} saloons, SUVs and hatchbacks of all loads, heights, tyres and sensors (`studies.many_cars`), seed {seed}. Nothing
-was chosen on them: that was done on 24 others. Each has a file that was fitted to a ramp steer of it, made wrong by a
-factor of {low:g} to {high:g} at each axle, and is calibrated on the drive that is scored. Medians; the last column is
-the median of the ratios, with 10 % and 90 % of the drives. Roads have bank, which carries a part of a bend's force.
-
-{simulated}
-
-Cornering stiffness against that of the file which was fitted to the ramp:
-
-{stiffness}
-
-## 95 % bands on calibrated cars
-
-Of `physics`, calibrated from the wrong file and from the right one. The variance of sideslip is ({own:g} s)² with the
-filter's own s, what the posterior's {varied} strongest directions do to the filter, and ({share:g} d2')² as a velocity,
-where d2' is the part of d2 (below) that goes with v_y, v_x r and a_y, less what chance explains. The shares were
-chosen on 16 other cars with wrong files. The width is the whole one, mean over a drive: with errors of one normal
-distribution a band that covers 95 % is 3.92 times the RMSE wide. The report of a run says `intervals: own, parameters
-and d2`; those of an `intervals.json` were found on other driving, and are not taken.
-
-{bands}
-
-## d2, and the guard
-
-d2 is what the change of v_y over two seconds lets open against the sensors; it needs no truth. Of all estimates above,
-by how much their d2 exceeds the least one of the others of the same drive, and how much worse they are:
-
-{d2}
-
-Beyond {factor:g} times the least d2 of {simple} a run says loudly that `pd-hef` contradicts the sensors, and on a car
-without evidence the best of them stands in its place, unless `--calibrate off` asks for causal estimates.
-
-## Published files of real cars
-
-As they were published, no truth used but for these figures; d2 in brackets. These drives were scored {looked} with a
-calibrated car. The speed of the 250 LM, the GTI and the V40 is the truth's own or nearly so.
-
-{published}
-
-{said}
-"""
-
-
-def page(outcomes: Sequence[Outcome], command: str, cars: int, seed: int) -> str:
-    """Return the page."""
-    published, said = published_table() if DRIVES.is_dir() else ("Not done: needs ../shared beside the repository.", [])
-    return PAGE.format(
-        command=command,
-        least=f"{100 * LEAST_KNOWN:.0f} %",
-        exported=f"{100 * LEAST_KNOWN_EXPORTED:.0f} %",
-        cars=cars,
-        seed=seed,
-        low=WRONG[0],
-        high=WRONG[1],
-        simulated=simulated_table(outcomes),
-        stiffness=stiffness_table(outcomes),
-        own=OWN_SHARE,
-        varied=VARIED,
-        share=D2_SHARE,
-        bands=band_table(outcomes),
-        d2=d2_table(outcomes),
-        factor=FACTOR,
-        simple=", ".join(f"`{n}`" for n in SIMPLE),
-        looked="once" if LOOKED_AT == 1 else f"{LOOKED_AT} times",
-        published=published,
-        said="\n".join(said),
-    )
-
-
 def say(text: str) -> None:
-    """Tell who waits."""
+    """Print progress to standard error."""
     print(text, file=sys.stderr)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run it and write the page."""
-    parser: argparse.ArgumentParser = options("self_calibration", __doc__)
-    parser.add_argument("--cars", type=int, default=CARS)
-    parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--out", type=Path, default=DOCS)
-    given = parser.parse_args(arguments)
-    outcomes = []
-    for one in simulate(given.cars, given.seed):
-        outcomes.append(outcome_of(one))
-        say(f"car {one.car}, {one.manoeuvre}: {outcomes[-1].calibrated['physics'][0]:.3f}")
-    write(
-        given.out / "self_calibration.md", page(outcomes, "python -m studies.self_calibration", given.cars, given.seed)
-    )
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -4,7 +4,7 @@
 
 Figures go to ``docs/truthsim/``, tables into the page between the comments ``<!-- begin NAME -->`` and
 ``<!-- end NAME -->``. The table of the independent simulator's runs is made only where those runs lie beside the
-repository (``../shared/data/independent_sim``); elsewhere the page keeps the one that it has. Their traces stay where
+repository (``../shared/data/independent_sim``), in ``studies/results/truthsim``. Their traces stay where
 they are: the page shows peaks, ratios and lags alone.
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from pdhef_logtool.records.signals import WHEELS, FloatArray
 from studies.defaults.fit_nominal_tyres import axle_loads_n
-from studies.pages import DOCS, INDEPENDENT, fill, options, table, write
+from studies.pages import DOCS, INDEPENDENT, RESULTS, fill, options, table, write
 from studies.pictures import STYLE, save, subplots
 from truthsim.drive import simulate_drive
 from truthsim.linear_theory import (
@@ -388,7 +388,8 @@ def main(docs: Path) -> None:
     for part in (steady_state, responses, relaxation, traces):
         blocks.update(part(folder))
     blocks.update(speed())
-    blocks.update(independent())
+    for name, text in independent().items():
+        write(RESULTS / "truthsim" / f"{name}.md", f"# Runs of Open-Car-Dynamics and of truthsim\n\n{text}\n")
     path = docs / "truthsim.md"
     write(path, fill(path.read_text(encoding="utf-8"), blocks, "docs/truthsim.md"))
     for name, text in blocks.items():

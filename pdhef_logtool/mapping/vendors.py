@@ -197,10 +197,10 @@ def _read(path: Path) -> Vendors:
         reasons.update({_plain(name): model.leave_out for name in model.type if model.leave_out})
     if problems:
         raise MappingFileError(
-            expected="entries as in docs/vendors.md",
+            expected="entries as in docs/formats.md",
             got="; ".join(problems),
             where=str(path),
-            remedy="see docs/vendors.md for every entry",
+            remedy="see docs/formats.md for every entry",
         )
     return Vendors(by_name, vectors, reasons, exports)
 

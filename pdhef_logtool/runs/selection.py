@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 PREFERRED = "pd-hef"
 SIMPLE = ("zero", "open-loop", "open-loop:calibrated", "phy-ukf", "physics")
 #: On simulated drives with right and wrong files every estimate beyond 1.05 times the least d2 had at least 1.7 times
-#: its sideslip error (docs/self_calibration.md).
+#: its sideslip error (docs/calibration.md).
 FACTOR = 1.2
 #: The baseline of every score. It needs the fewest signals and cannot drift; ``kinematic`` follows the accelerometer's
 #: bias and has a higher error on half of the recorded drives.

@@ -80,7 +80,7 @@ SUPERELEVATION_STD = 0.2
 PARTS, AY_STD = ("lag", "bank"), 1.0
 #: A stiffness that is less well known is no calibration (sd of its logarithm): of a log that it serves alone, and of a
 #: pool that is exported. On simulated roads, which leave 0.16 to 0.22, the log's own calibration is better than a file
-#: that may be wrong by two, and hardly worse than the right one (docs/self_calibration.md).
+#: that may be wrong by two, and hardly worse than the right one (docs/calibration.md).
 LEAST_KNOWN, LEAST_KNOWN_EXPORTED = 0.25, 0.15
 #: Understeer gradients that a car may have, rad/(m/s²): a little oversteer, and 7 degrees per g.
 PLAUSIBLE_UNDERSTEER = (-2e-3, 12e-3)

@@ -27,8 +27,6 @@ reaches once in ``HOURS_TO_FALSE_ALARM`` of clean driving:
 * spikes: more of them than a long tail contains, or one far beyond it.
 * stuck, missing: for ``STUCK_REPORTED_AFTER_S``, ``MISSING_REPORTED_AFTER_S``. Dead: within a narrow range for
   ``DEAD_REPORTED_AFTER_S`` of turning.
-
-``docs/false_alarms.md`` contains rates and delays.
 """
 
 from __future__ import annotations

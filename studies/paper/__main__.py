@@ -1,4 +1,4 @@
-"""Run the paper's experiment and write ``docs/paper.md``, its pictures and ``docs/paper/results.json``.
+"""Run the paper's experiment and write ``docs/paper.md`` and its details in ``studies/results/paper``.
 
     python -m studies.paper [--cars CAR ...] [-o DOCS] [--noise-seeds N]
 
@@ -10,16 +10,17 @@ other seeds, and one that never saw a lane change or a sine sweep; what is not t
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 from pdhef_logtool.car.car import NETWORK_FILE, Car
 from pdhef_logtool.records.errors import PdhefError
-from studies.pages import DOCS, ROOT, options, write
+from studies.pages import DOCS, RESULTS, ROOT, options, write
 from studies.paper.experiment import FIRST_NOISE_SEED, NOISE_SEEDS
 from studies.paper.figures import draw
-from studies.paper.page import write_page
+from studies.paper.page import PAGE_FIGURES, write_details, write_page
 from studies.paper.results import document, gather
 from studies.paper.withheld import Withheld, counts, withheld_car
 
@@ -56,6 +57,7 @@ def main() -> int:
     parser = options("paper", __doc__)
     parser.add_argument("--cars", nargs="+", metavar="CAR", help="cars with networks, one a training seed")
     parser.add_argument("-o", "--output", type=Path, default=DOCS, metavar="DOCS", help="folder of paper.md")
+    parser.add_argument("--results", type=Path, default=RESULTS / "paper", help="folder of the details")
     parser.add_argument("--noise-seeds", type=int, default=NOISE_SEEDS, metavar="N", help=f"{NOISE_SEEDS} by default")
     arguments = parser.parse_args()
     if arguments.noise_seeds < 1:
@@ -73,13 +75,18 @@ def main() -> int:
         print(error, file=sys.stderr)
         return 1
     pictures = arguments.output / "paper"
-    pictures.mkdir(parents=True, exist_ok=True)
-    for old in pictures.glob("figure*.png"):  # one that is no longer made must not stay
-        old.unlink()
-    draw(results, pictures)
+    for folder in (arguments.results, pictures):
+        folder.mkdir(parents=True, exist_ok=True)
+        for old in folder.glob("figure*.png"):  # one that is no longer drawn must not stay
+            old.unlink()
+    draw(results, arguments.results)
+    for name in PAGE_FIGURES:
+        shutil.copyfile(arguments.results / name, pictures / name)
     text = json.dumps(document(results), indent=1, allow_nan=False)
-    (pictures / "results.json").write_text(text + "\n", encoding="utf-8")
-    write(arguments.output / "paper.md", write_page(results))
+    details = write_details(results)
+    write(arguments.results / "results.json", text + "\n")
+    write(arguments.results / "details.md", details)
+    write(arguments.output / "paper.md", write_page(details))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""The text of ``docs/paper.md``: every number in it is computed or a constant of :mod:`studies.paper.published`."""
+"""The text of ``docs/paper.md`` and of its details: every number is computed or from :mod:`studies.paper.published`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from studies.pages import table
+from studies.pages import table, table_rows
 from studies.paper import published
 from studies.paper.comparison import BOOTSTRAP_DRAWS, LEVEL, Improvement, Spread, spread
 from studies.paper.experiment import BURST, BURST_S, GRAVITY_M_S2, A, B
@@ -36,6 +36,9 @@ TABLE: tuple[tuple[str, str, str | None], ...] = (
     ("lag of sideslip, ms", "sideslip_lag_ms", None),
     ("lag of yaw rate, ms", "yaw_rate_lag_ms", None),
 )
+
+#: Figures of the page; the details contain all.
+PAGE_FIGURES = ("figure12_sideslip_a.png", "figure16_sideslip_b.png", "figure22_rmse.png")
 
 
 def number(value: float) -> str:
@@ -110,7 +113,7 @@ class Findings:
 
     def part(self, title: str, picture: str | None, facts: str) -> str:
         """Return a figure's section: picture, what we find, what agrees, what does not or cannot."""
-        image = "" if picture is None else f"\n![{title}](paper/{picture}.png)\n"
+        image = "" if picture is None else f"\n![{title}]({picture}.png)\n"
         return (
             f"### {title}\n{image}\n{facts}\n\n"
             f"- *Agrees with the paper:* {'; '.join(self.agrees) or 'nothing that can be compared'}.\n"
@@ -537,8 +540,8 @@ _STATES = (
 )
 
 
-def write_page(r: Results) -> str:
-    """Return the whole page."""
+def write_details(r: Results) -> str:
+    """Return what was run, all tables, and each figure of the paper beside ours."""
     seeds = sorted({run.noise_seed for run in r.experiment.runs})
     latency = max(abs(float(str(f["truth_latency_ms"]))) for f in r.experiment.facts)
     missing = [f"- `{name}`: {reason}." for name, reason in r.experiment.missing.items()]
@@ -556,12 +559,9 @@ def write_page(r: Results) -> str:
     figures += [_figure_19(r), _figure_20(r), _figure_21(r), _figure_22(r), _figure_23(r)]
     what = "\n".join(f"- `{n}`: {SCHEMES[n]}." for n in r.ran)
     left_out = "\nNot in this run:\n\n" + "\n".join(missing) + "\n" if missing else ""
-    return f"""# The paper's experiment, run again
+    return f"""# Details of the paper's experiment
 
-Written by `make paper` (`python -m studies.paper`); do not edit. The numbers are in
-[results.json](paper/results.json) too. The paper: Zhou et al., *Physics-Driven Hybrid Framework for Vehicle State
-Estimation Using Residual Learning and Adaptive UKF*, Appl. Sci. 2026, 16(9), 4230. It has CarSim and MATLAB, we have
-`truthsim` ([what it is](truthsim.md)); levels therefore need not agree, the order of the schemes should.
+Written by `make paper` (`python -m studies.paper`). `results.json` contains the numbers.
 
 ## What was run
 
@@ -616,3 +616,49 @@ Time histories show `phy-ukf`, `pure-lstm` and `{HYBRID}`, where this version ha
 where it lies within {percent(NEAR[0])} and {percent(NEAR[1])} of it; a scheme as better where both bounds say so.
 
 {chr(10).join(figures)}"""
+
+
+def write_page(details: str) -> str:
+    """Return the page: the scenarios and the sideslip errors of the details, and three figures."""
+    tables = table_rows(details)
+    scenarios = [name for name in tables if name.startswith(("A", "B"))]
+    errors = [{row[0]: row[1] for row in tables[name]} for name in scenarios]
+    body = [[scheme, *(column.get(scheme, "–") for column in errors)] for scheme in errors[0]]
+    gains = next(rows for name, rows in tables.items() if name.endswith("against the others"))
+    run = details[details.index("- **A**") : details.index("Sensors:")].rstrip()
+    return PAGE.format(
+        run=run,
+        errors=table(["scheme", *scenarios], body),
+        gains=table(["scenario", "against", "lower sideslip RMSE"], [row[:3] for row in gains]),
+    )
+
+
+PAGE = """# The paper's experiment
+
+This page shows the experiment of the paper, repeated with our estimators on our simulator. Command: `make paper`.
+
+Paper: Zhou et al., *Physics-Driven Hybrid Framework for Vehicle State Estimation Using Residual Learning and Adaptive
+UKF*, Appl. Sci. 2026, 16(9), 4230. The paper uses CarSim and MATLAB, this page uses `truthsim`
+([simulated car](truthsim.md)). Therefore the order of the schemes is comparable, the level of the errors is not.
+
+{run}
+
+Sideslip RMSE in degrees: median (smallest … largest) over noise seeds and training seeds; after the dot, relative to
+the RMS of the true sideslip. All schemes get the true friction.
+
+{errors}
+
+![Sideslip, double lane change](paper/figure12_sideslip_a.png)
+
+![Sideslip, sine sweep](paper/figure16_sideslip_b.png)
+
+Reduction of the sideslip RMSE by `pd-hef`, pooled over seeds, with the 95 % CI of a bootstrap over noise seeds, and the
+range over networks:
+
+{gains}
+
+![RMSE](paper/figure22_rmse.png)
+
+`studies/results/paper/details.md` compares each figure of the paper with ours, and contains yaw rate, lateral
+acceleration, position, lags and step times. `results.json` in the same folder contains all numbers.
+"""

@@ -1,1 +1,1 @@
-"""Logs of strangers, of our own making and with known answers, and how many of their signals the tool gets right."""
+"""Third-party logs and synthetic ones with known signals: how many signals the tool recognises."""

@@ -1,6 +1,6 @@
-"""Logs of strangers, scored: ``docs/strangers.md``.
+"""Third-party logs, scored: ``docs/third_party_logs.md``.
 
-    python -m studies.strangers [--only NAME ...] [--held-out] [--work out/strangers] [--out docs/strangers.md]
+    python -m studies.strangers [--only NAME ...] [--held-out] [--work out/strangers] [--out docs/third_party_logs.md]
 
 ``--only`` takes parts of names, prints what the tool says of these logs, and writes no page. ``--held-out`` adds the
 layouts that were built last. Exit code 1: something is wrong and the tool did not say so.
@@ -159,7 +159,7 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", default=[], help="parts of names of logs")
     parser.add_argument("--held-out", action="store_true", help="with the layouts that were built last")
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "strangers", help="folder for the logs")
-    parser.add_argument("--out", type=Path, default=DOCS / "strangers.md", help="the page")
+    parser.add_argument("--out", type=Path, default=DOCS / "third_party_logs.md", help="the page")
     parser.add_argument("--keep", type=Path, help="write the results as JSON, to compare with later")
     given = parser.parse_args()
     given.work.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""``docs/strangers.md``: the score, every log, and what is wrong by name."""
+"""``docs/third_party_logs.md``: the score, every log, and what is wrong by name."""
 
 from __future__ import annotations
 
@@ -19,19 +19,18 @@ GROUPS = {
 #: Groups whose logs are sound and excited, so that checks may neither fail nor stay undecided.
 SOUND = ("layout", "held-out")
 
-_INTRO = """# Logs of strangers
+_INTRO = """# Third-party logs
 
-What the tool makes, without a mapping and without a word of help, of logs that it has not met: <!-- counts -->.
-`make strangers` makes the logs, scores them and writes this page; `python -m studies.strangers --only NAME` shows one.
+This page shows how many signals the tool recognises without a mapping in logs with unknown layouts: <!-- counts -->.
+Command: `make strangers`; `python -m studies.strangers --only NAME` shows one log.
 
-**How it is scored.** Each log's right answers are series of values: what the sensor reads, in SI units and ISO 8855
-axes. A mapped channel is right when its values are those (means of 0.25 s, 4 % or the floor of its unit, accelerations
-but for a bias of up to 0.3 m/s²); field names play no part. What may be found in a log is counted in items: steering,
-a_x, a_y, yaw rate, speed, wheel speeds, and the truth's velocity and yaw rate. *Told* means that a check that did not
-pass is on the wrong channel, or a doubt names it. Logs of one kind count as one, with the worst of each item: the 24
-mountings in steps of 90 degrees are one log. A cause counts as named when a message holds a word of it. Layouts have
-the fields, units and axes of the definitions that their pages give; parts of messages that only say how a device does
-are left out. The motion is truthsim's: drives of three cars with the noise, bias and delay of its usual sensors.
+**Scoring.** The expected values of each log are series in SI units and ISO 8855 axes. A mapped channel is right if
+its values agree (means of 0.25 s, within 4 % or the floor of the unit; accelerations up to a bias of 0.3 m/s²); field
+names do not count. Items: steering, a_x, a_y, yaw rate, speed, wheel speeds, and velocity and yaw rate of the ground
+truth. *Told* means that a failed or undecided check, or a doubt, names the wrong channel. Logs of one kind count as
+one, with the worst result of each item: the 24 mountings in steps of 90 degrees are one log. A cause counts as named
+if a message contains a word of it. Layouts have the fields, units and axes of their published definitions, without
+device status. The motion is that of truthsim: drives of three cars with noise, bias and delay of its usual sensors.
 """
 
 

@@ -14,7 +14,7 @@ from pdhef_logtool.inspection.report import Inspection
 from pdhef_logtool.logs.byte_source import LocalFile
 from pdhef_logtool.logs.mcap_index import read_index
 from pdhef_logtool.logs.remote_place import RemotePlace
-from studies.counting_server import serving
+from tests.counting_server import serving
 
 S = 1_000_000_000
 #: Chunks of road.mcap (41, of 7.3 s): one that no window holds, and one in the first minute.

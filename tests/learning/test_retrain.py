@@ -11,14 +11,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_network_parts import residual_rows, write_dataset
 
 from pdhef_logtool.learning.drives import DriveRecord
-from pdhef_logtool.learning.network.dataset import read_dataset
 from pdhef_logtool.learning.resume import Stages
 from pdhef_logtool.learning.retrain import retrain_command
 from pdhef_logtool.learning.retrain.assignment import GATE, LEAST, SHARES, STOP, TRAIN, TRUST, Candidate, deal
@@ -246,26 +243,3 @@ def test_a_car_that_took_part_elsewhere_is_not_lost_when_the_stages_are(fleet: F
         roles.write_text(sound)
     shutil.rmtree(fleet.folder / "out/work")
     assert fleet.retrain().document == found.document, "parts are drawn by content and seed"
-
-
-def test_spoilt_labels_are_those_of_usable_rows_and_the_set_still_opens(tmp_path: Path) -> None:
-    from studies.retrain import KINDS, corrupt_labels
-
-    rows = residual_rows(120)
-    for kind, corrupt in KINDS.items():
-        if corrupt is None:
-            continue
-        write_dataset(tmp_path / kind, d=("train", rows))
-        (before,) = (d.load() for d in read_dataset(tmp_path / kind).drives)
-        corrupt_labels(tmp_path / kind, corrupt)
-        (after,) = (d.load() for d in read_dataset(tmp_path / kind).drives)
-        np.testing.assert_array_equal(after.features, before.features)
-        assert not np.array_equal(after.targets, before.targets)
-        np.testing.assert_allclose(np.sort(np.abs(after.targets), axis=0), np.sort(np.abs(before.targets), axis=0))
-
-
-@pytest.mark.fleet
-def test_sound_drives_pass_the_gate_and_spoilt_labels_do_not(tmp_path: Path) -> None:
-    from studies.retrain import main
-
-    assert main(["-o", str(tmp_path), "--jobs", "2"]) == 0

@@ -127,7 +127,7 @@ def test_a_run_reports_the_share(sample_logs_dir: Path, tmp_path: Path, capsys: 
 
 def test_a_log_that_is_read_in_part_from_a_server_says_what_was_not_verified(tmp_path: Path) -> None:
     pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
-    from studies.counting_server import serving
+    from tests.counting_server import serving
 
     path = tmp_path / "log.mcap"
     with path.open("wb") as file:

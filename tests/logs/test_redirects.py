@@ -23,7 +23,7 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.redirect_guard import PrivateRedirectError, RedirectGuard, is_public
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, LogError, PdhefError
-from studies.counting_server import CountingServer, serving
+from tests.counting_server import CountingServer, serving
 
 
 @pytest.fixture(autouse=True)

@@ -25,8 +25,8 @@ from pdhef_logtool.logs.open_log import log_metadata, open_log
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.logs.remote_source import RemoteSource, join_ranges, without
 from pdhef_logtool.records.errors import EXIT_FAILURE, LogError, UsageError
-from studies.counting_server import CountingServer, cutting, serving, slow, stalling, status, trickling
-from studies.remote import with_camera, write_apart
+from tests.camera_log import with_camera, write_apart
+from tests.counting_server import CountingServer, cutting, serving, slow, stalling, status, trickling
 
 pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
 

@@ -14,7 +14,7 @@ from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.drive.slim_cache import SlimCache
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.remote_source import _forget, _spools
-from studies.counting_server import serving
+from tests.counting_server import serving
 
 
 def _read(url: str, cache: SlimCache) -> tuple[object, ...]:

@@ -18,6 +18,6 @@ def test_the_bands_of_calibrated_cars_hold_and_are_no_wider_than_they_must() -> 
         assert not found.refused
         bands.append(study.band_of(one.drive, study.taken(one.drive.signals, wrong, found)))
     coverage, width = np.array(bands).T
-    assert np.mean(coverage) > 0.85  # docs/self_calibration.md: 93 % of a hundred; the mean of six varies by 4 %
+    assert np.mean(coverage) > 0.85  # docs/calibration.md: 93 % of a hundred; the mean of six varies by 4 %
     assert np.min(coverage) > 0.7
     assert np.median(width) < 5.5

@@ -1,10 +1,10 @@
-"""The condition table from simulation to page on a tiny row, and the error budget's drives against the logs."""
+"""The condition table from simulation to page on a tiny row."""
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +15,14 @@ import torch
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.latency_compensation import compensate, run_window
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
-from studies import conditions, fixed_grid
+from studies import conditions
 from studies.condition_drives import bin_masks, read_drive, told
-from studies.conditions_page import choose_fixed
-from studies.error_budget import causes_of, drive_again, fit_vehicle, without
+from studies.many_cars import fit_vehicle
 from truthsim.vehicle_choice import choose_vehicle
 
 pytestmark = pytest.mark.slow
@@ -53,10 +51,12 @@ def _bundle() -> ModelBundle:
 
 
 def _make(work: Path) -> int:
-    arguments = ["--drives", "2", "--rows", ",".join(ROWS), "--jobs", "1", "--calibration-drives", "1"]
-    arguments += ["--budget-drives", "1", "--estimators", NAMES, "--car", "sample_logs/vehicle.toml"]
+    arguments = ["--drives", "2", "--rows", ",".join(ROWS), "--jobs", "1"]
+    arguments += ["--estimators", NAMES, "--car", "sample_logs/vehicle.toml"]
     arguments += ["--network", str(work / "network")]
-    return conditions.main([*arguments, "--work", str(work / "work"), "--out", str(work / "docs")])
+    return conditions.main(
+        [*arguments, "--work", str(work / "work"), "--out", str(work / "docs"), "--results", str(work / "results")]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -86,13 +86,14 @@ def test_the_page_has_every_row_and_its_pooled_figure_is_that_of_the_samples(mad
             scored = track.valid & (np.hypot(truth.vx_m_s, truth.vy_m_s) > vehicle.low_speed_blend_m_s)
             squares += float(np.sum(truth.sideslip_rad[scored] ** 2))  # the error of sideslip 0
             count += int(scored.sum())
-    table = pl.read_parquet(made / "docs" / "conditions" / "sideslip.parquet")
-    row = table.filter((pl.col("row") == "in-domain") & (pl.col("estimator") == "zero"))
-    assert row["pooled_deg"][0] == pytest.approx(math.degrees(math.sqrt(squares / count)), rel=1e-6)
+    tables = (made / "results" / "tables.md").read_text(encoding="utf-8")
+    pooled = tables[tables.index("pooled over all samples") :]
+    line = next(text for text in pooled.splitlines() if text.startswith("| in-domain |"))
+    assert line.split("|")[2].strip() == f"{math.degrees(math.sqrt(squares / count)):.3f}"
 
 
 def test_wrong_friction_reaches_the_model_and_nothing_else(made):
-    metrics = pl.read_parquet(made / "docs" / "conditions" / "metrics.parquet").filter(
+    metrics = pl.read_parquet(made / "results" / "metrics.parquet").filter(
         (pl.col("metric") == "rmse") & (pl.col("signal") == "sideslip_rad") & (pl.col("segment") == "low")
     )
 
@@ -110,54 +111,6 @@ def test_a_second_call_computes_nothing_and_writes_the_same(made, monkeypatch):
     monkeypatch.setattr("studies.condition_runs._run", lambda *_: pytest.fail("a kept row was computed again"))
     assert _make(made) == 0
     assert (made / "docs" / "conditions.md").read_bytes() == page
-
-
-def test_a_drive_made_again_is_that_of_the_log(made, car, vehicle):
-    folder, manifest = _drives(made)
-    for entry in manifest["drives"][::2]:
-        run = drive_again(entry)
-        case = without(run, None, vehicle, {}, vehicle)
-        logged = read_drive(folder / entry["file"], car)
-        for f in fields(Signals):
-            ours, theirs = getattr(case.signals, f.name), getattr(logged.signals, f.name)
-            if f.name == "available":
-                assert ours == theirs
-            else:
-                # The log rounds friction to 2^-24.
-                np.testing.assert_allclose(ours.astype(float), theirs.astype(float), rtol=0, atol=1e-7)
-        np.testing.assert_allclose(case.drive.truth.vy_m_s, logged.truth.vy_m_s, rtol=0, atol=1e-6)
-
-
-def test_each_cause_takes_away_its_own_error_alone(made, vehicle):
-    _, manifest = _drives(made)
-    run = drive_again(manifest["drives"][0])
-    base = without(run, None, vehicle, {}, vehicle)
-    planar = np.interp(
-        (base.signals.stamps_ns - base.signals.stamps_ns[0]) * 1e-9, run.motion.times_s, run.motion.column("ay_m_s2")
-    )
-    error = {}
-    for cause in (None, "bias", "noise", "tilt", "all"):
-        signals = without(run, cause, vehicle, {}, vehicle).signals
-        error[cause] = signals.ay_m_s2 - planar
-    assert error["noise"].std() < error[None].std()
-    smooth = np.ones(100) / 100
-    assert (
-        np.abs(np.convolve(error["tilt"], smooth, "valid")).max()
-        < np.abs(np.convolve(error[None], smooth, "valid")).max()
-    )
-    assert np.abs(error["all"]).max() < 1e-3  # quantisation of the accelerometer
-    # The draws of one error do not move when another is taken away.
-    np.testing.assert_allclose(np.diff(error["bias"] - error[None]), 0.0, atol=2e-3)
-    delay = without(run, "delay", vehicle, {}, vehicle).signals
-    assert (delay.ready_ns - delay.stamps_ns).max() < (base.signals.ready_ns - base.signals.stamps_ns).min()
-
-
-def test_causes_follow_the_row(made):
-    _, manifest = _drives(made)
-    by_row = {e["row"]: drive_again(e).spec for e in manifest["drives"]}
-    assert "fault" in causes_of(by_row["gyro-dropped"], {})
-    assert "fault" not in causes_of(by_row["in-domain"], {})
-    assert "told" in causes_of(by_row["in-domain"], {"friction": "unknown"})
 
 
 def test_a_fitted_file_has_the_mass_and_the_stiffness_of_the_car(made, vehicle):
@@ -178,27 +131,3 @@ def test_told_and_bins(made, car):
         told(drive, {"weather": "rain"})
     masks = bin_masks(drive)
     assert (sum(masks[b].astype(int) for b in ("low", "middle", "high")) == 1).all()
-
-
-def test_a_point_of_the_grid_is_the_estimator_with_that_setting(made, car):
-    folder, manifest = _drives(made)
-    drive = read_drive(folder / manifest["drives"][0]["file"], car)
-    base = make_estimator(fixed_grid.BASE, car)
-    whole, _ = run_window(base, drive.signals)
-    rate = base.inputs(drive.signals, None)[0].rate
-    physics = fixed_grid.at(base, fixed_grid.Setting(1.0, 1.0, 1.0)).physics
-    shared, _ = compensate(physics, drive.signals, physics.run(drive.signals, None, rate)[0])
-    np.testing.assert_array_equal(whole.vy_m_s, shared.vy_m_s)
-
-
-def test_the_best_fixed_setting_is_that_of_the_least_geometric_mean():
-    rows = [("r1", "a", 1.0), ("r2", "a", 4.0), ("r1", "b", 3.0), ("r2", "b", 3.0)]
-    table = pl.DataFrame(
-        [(r, "d", f"fixed({s})", "sideslip_rad", "all", "rmse", v, "rad", 10) for r, s, v in rows],
-        schema=["row", "drive", "estimator", "signal", "segment", "metric", "value", "unit", "n"],
-        orient="row",
-    )
-    chosen = choose_fixed(table)
-    assert chosen is not None
-    assert chosen.name == "fixed(a)"
-    assert dict(chosen.ranking)["fixed(a)"] == pytest.approx(2.0)

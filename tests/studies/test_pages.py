@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from studies import condition_runs, friction
+from studies import condition_runs
 from studies.pages import DOCS, ROOT, fill, number, table
 
 DOCUMENTS = [*DOCS.glob("*.md"), *ROOT.glob("*.md"), ROOT / "Makefile", *ROOT.glob("sample_logs/*.toml")]
@@ -37,11 +37,10 @@ def test_every_source_of_the_condition_table_counts(tmp_path: Path, monkeypatch:
     assert len(digests) == 1 + 2 * len(condition_runs._SOURCES)
 
 
-def test_the_measured_tables_of_friction_have_their_place() -> None:
-    page = friction.DOCUMENT.read_text(encoding="utf-8")
-    filled = fill(page, {"measured": "| new |"}, "friction.md")
-    assert "<!-- begin measured -->\n| new |\n<!-- end measured -->" in filled
-    assert fill(filled, {"measured": "| new |"}, "friction.md") == filled != page
+def test_a_filled_block_replaces_the_former_one() -> None:
+    page = "a\n<!-- begin measured -->\n| old |\n<!-- end measured -->\nb\n"
+    filled = fill(page, {"measured": "| new |"}, "page.md")
+    assert filled == page.replace("old", "new") == fill(filled, {"measured": "| new |"}, "page.md")
 
 
 def test_tables_and_numbers() -> None:

@@ -29,13 +29,12 @@ def command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
 
 
 def test_the_page_is_what_the_command_makes(command: ModuleType, tmp_path: Path) -> None:
-    # Without the runs of the other simulator, as in a clean clone: their table stays.
+    # Without the runs of the other simulator, as in a clean clone.
     shutil.copy(ROOT / "docs" / "truthsim.md", tmp_path / "truthsim.md")
     command.main(tmp_path)
     here, made = blocks(PAGE), blocks((tmp_path / "truthsim.md").read_text(encoding="utf-8"))
-    assert set(here) == {"gradients", "responses", "relaxation", "peaks", "speed", "independent"}
+    assert set(here) == {"gradients", "responses", "relaxation", "peaks", "speed"}
     assert {k: v for k, v in made.items() if k != "speed"} == {k: v for k, v in here.items() if k != "speed"}
-    assert here["independent"].count("|") > 100
     times = re.match(r"more than (\d+) times real time", made["speed"])
     assert times is not None and int(times[1]) >= 50
     wanted = set(re.findall(r"!\[[^\]]*\]\((truthsim/\w+\.png)\)", PAGE))

@@ -1,0 +1,59 @@
+"""MCAP logs whose chunks contain either sensors or camera images."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+_SLICE_NS = 20_000_000_000
+_IMAGE_BYTES, _IMAGE_NS = 20_000, 200_000_000
+_CAMERA = ("sensor_msgs/msg/CompressedImage", "ros2msg", b"uint8[] data")
+
+#: Name, encoding and text of a message's definition.
+Definition = tuple[str, str, bytes]
+#: Topic, definition, log time and CDR bytes.
+Message = tuple[str, Definition, int, bytes]
+
+
+def write_apart(path: Path, chunks: Iterable[list[Message]]) -> None:
+    """Write an MCAP with just these chunks."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=1 << 40)
+        writer.start("ros2")
+        schemas: dict[Definition, int] = {}
+        channels: dict[str, int] = {}
+        for chunk in chunks:
+            for topic, definition, log_time, data in chunk:
+                if topic not in channels:
+                    if definition not in schemas:
+                        schemas[definition] = writer.register_schema(*definition)
+                    channels[topic] = writer.register_channel(topic, "cdr", schemas[definition])
+                writer.add_message(channels[topic], log_time, data, log_time)
+            writer._Writer__finalize_chunk()  # type: ignore[attr-defined]  # the library has no name for it
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def with_camera(source: Path, slice_ns: int = _SLICE_NS) -> Iterator[list[Message]]:
+    """Yield the messages of a log in chunks of 20 s (or other slices), and after each as long a chunk of images."""
+    noise = random.Random(1)
+    sensors: list[Message] = []
+
+    def images(start_ns: int) -> list[Message]:
+        head = b"\0\1\0\0" + _IMAGE_BYTES.to_bytes(4, "little")
+        stamps = range(start_ns, start_ns + slice_ns, _IMAGE_NS)
+        return [("/camera", _CAMERA, at, head + noise.randbytes(_IMAGE_BYTES)) for at in stamps]
+
+    with source.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            assert schema is not None
+            if sensors and message.log_time - sensors[0][2] >= slice_ns:
+                yield sensors
+                yield images(sensors[0][2])
+                sensors = []
+            definition = (schema.name, schema.encoding, schema.data)
+            sensors.append((channel.topic, definition, message.log_time, message.data))
+    yield sensors
