@@ -134,7 +134,7 @@ def command_line_sizes() -> dict[str, int]:
         "commands": len({name.split()[0] for name in commands}),
         "options": sum(map(options, commands.values())),
         "options_of_run": options(commands["run"]),
-        "presets": len(SPECS),
+        "presets": len({spec.name.partition(":")[0] for spec in SPECS}),
     }
 
 
