@@ -73,7 +73,7 @@ _MOST_FAILED = 5
 _TEXTS = {
     "result": "Result",
     "consistency": "Consistency",
-    "band": "95 % band",
+    "band": "95 % CI",
     "hindsight": "In hindsight",
     "assumed": "Assumed",
     "next": "Next",
@@ -394,7 +394,7 @@ def _joint_table(reports: Sequence[_Report]) -> Table:
     mains = list(dict.fromkeys(report["answer"]["main"] for report in reports))
     rivals = [n for n in ("physics", "zero") if [n] != mains and any(n in r["answer"]["shown"] for r in reports)]
     head = f">{mains[0]}\nRMSE °" if len(mains) == 1 else ">sideslip\nRMSE °"
-    joint = table("\nlog", ">\ns", head, *(f">{n}\nRMSE °" for n in rivals), ">in 95 %\nband", "\nlook at", fold=1)
+    joint = table("\nlog", ">\ns", head, *(f">{n}\nRMSE °" for n in rivals), ">CI 95 %\ncovers", "\nlook at", fold=1)
     joint.columns[-1].overflow = "fold"
     for report in reports:
         values, main = _figures(report), report["answer"]["main"]

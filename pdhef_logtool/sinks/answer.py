@@ -1,6 +1,6 @@
-"""The answer of a run in words: how good, whether the band holds, what was assumed, what to do next.
+"""The result of a run in sentences: error, coverage of the interval, assumptions, next steps.
 
-Everything is said from the report's document, so that terminal, report.json, Markdown and recording say the same.
+The report's document is the only source, so that terminal, report.json, Markdown and recording agree.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ Report: TypeAlias = Mapping[str, Any]
 #: Figures of the whole drive by estimator, signal and metric; None where there is none.
 _Figures: TypeAlias = Mapping[tuple[str, str, str], float | None]
 
-#: Share of the truth inside the 95 % band from which on it is said to hold, and nearly, and to be too wide.
+#: Coverage of the 95 % interval from which on it is as stated, nearly, and wider than necessary.
 HOLDS, NEARLY_HOLDS = 0.94, 0.90
 _WIDE = 0.995
-#: Two errors that differ by less than this share are said to be the same.
+#: Two errors that differ by less than this share are reported as equal.
 SAME = 0.03
-#: A ratio below this is told with a decimal.
+#: A ratio below this is printed with a decimal.
 _FEW = 10.0
-#: Rad: a truth whose sideslip stays below this on average was not measured.
+#: rad; ground truth whose RMS sideslip is below this does not measure it.
 NO_SIDESLIP_RAD = 1e-5
-#: An estimate whose d2 is not less than this share of that of sideslip 0 has nothing to show for itself.
+#: Ratio of the lateral consistency residual to that of zero sideslip above which it shows nothing.
 _LESS = 0.8
-#: NIS over its degrees of freedom beyond which sensors are said to surprise a filter less or more than it expects.
+#: Range of the NIS per degree of freedom (expected value 1) that is reported as consistent.
 _NIS_RANGE = (0.5, 2.0)
-#: Share of the drive that must show its friction for an estimate of it to be called known.
+#: Share of the drive in which friction must be observable for its estimate to count.
 _FRICTION_SHOWN = 0.1
 _MOST_STEPS = 2
 
@@ -96,39 +96,39 @@ def _error(figures: _Figures, name: str | None) -> float | None:
 def _result(report: Report, main: MainFacts, figures: _Figures) -> str:
     truth, own = report["truth"], _error(figures, main.name)
     if not truth["available"]:
-        return f"sideslip is by {main.name}; how good it is cannot be told, for the log has no truth"
+        return f"Sideslip estimate: {main.name}; its error is unknown, because the log contains no ground truth"
     if own is None:
-        return f"sideslip by {main.name} is not scored: {_why_not_scored(report, main)}{_scored_instead(main, figures)}"
-    said = [f"sideslip by {main.name} is {degrees(own)} RMSE off {_truth_of(report, 'sideslip_rad')}"]
-    rivals = [
-        (name, text) for name, text in (("physics", "physics alone"), ("zero", "sideslip 0")) if name != main.name
-    ]
+        return f"Sideslip of {main.name} is not scored: {_why_not_scored(report, main)}{_scored_instead(main, figures)}"
+    said = [f"Sideslip RMSE of {main.name}: {degrees(own)} ({_truth_of(report, 'sideslip_rad')})"]
+    rivals = [(name, text) for name, text in (("physics", "physics"), ("zero", "zero sideslip")) if name != main.name]
     others = [(text, other) for name, text in rivals if (other := _error(figures, name)) is not None]
     said += [_against(own, other, text) for text, other in others]
     if "sideslip_rad" in truth["not_independent"]:
-        said.append("that truth is an input or the estimate itself: no independent check")
+        said.append("the ground truth is an input of the estimator or the estimate itself: not an independent check")
     if (measured := figures.get(("zero", "sideslip_rad", "rmse"))) is not None and measured < NO_SIDESLIP_RAD:
-        said.append("but that truth's sideslip is 0 throughout, as of one that does not measure it")
+        said.append("the sideslip of the ground truth is 0 throughout: it is probably not measured")
     naive = None if main.name == main.naive else _error(figures, main.naive)
-    useless = ". It is of no use here" if naive is not None and own > (1.0 + SAME) * naive else ""
+    useless = (
+        ". On this drive the estimate is worse than a constant"
+        if naive is not None and own > (1.0 + SAME) * naive
+        else ""
+    )
     return ", ".join(said) + useless
 
 
 def _against(own: float, other: float, text: str) -> str:
     beside = f"{text} ({degrees(other)})"
     if other == own:
-        return f"the same as {beside}"
+        return f"equal to {beside}"
     if abs(own - other) <= SAME * other:
-        return f"as good as {beside}"
+        return f"equal within {SAME:.0%} to {beside}"
     if own == 0.0 or other == 0.0:
-        return f"{'nearer' if own < other else 'farther off'} than {beside}"
+        return f"{'lower' if own < other else 'higher'} than {beside}"
     times = max(own, other) / min(own, other)
     shown = f"{times:.1f}" if times < _FEW else f"{times:.0f}"
     if own > other:
-        return (
-            f"{shown} times as far off as {beside}" if times > 2.0 else f"{times - 1.0:.0%} farther off than {beside}"
-        )
-    return f"{shown} times nearer than {beside}" if times > 2.0 else f"{1.0 - own / other:.0%} nearer than {beside}"
+        return f"{shown} times {beside}" if times > 2.0 else f"{times - 1.0:.0%} higher than {beside}"
+    return f"1/{shown} of {beside}" if times > 2.0 else f"{1.0 - own / other:.0%} lower than {beside}"
 
 
 def _truth_of(report: Report, name: str) -> str:
@@ -137,19 +137,19 @@ def _truth_of(report: Report, name: str) -> str:
     parts = [by_name[n] for n in (name, "vx_m_s", "vy_m_s") if n in by_name]
     words = " ".join(f"{q['source']} {q['derivation']}" for q in parts).replace(",", " ").split()
     topics = dict.fromkeys(w.partition(".")[0] for w in words if w.startswith("/"))
-    return f"the truth of {' and '.join(topics)}" if topics else "the truth"
+    return f"ground truth: {' and '.join(topics)}" if topics else "ground truth"
 
 
 def _why_not_scored(report: Report, main: MainFacts) -> str:
     quantities = {q["name"]: q for q in report["truth"]["quantities"]}
     if "sideslip_rad" in quantities:
-        return f"nowhere is its truth known where {main.name} is valid and the car fast enough"
+        return f"there is no ground truth at times where {main.name} is valid and the car is fast enough"
     if "no heading known" in quantities.get("vx_m_s", {}).get("derivation", ""):
         return (
-            "the truth knows where the car moves (GNSS), not where it points; sideslip is the difference of the two "
-            "and needs two antennas or an INS"
+            "the ground truth (GNSS) has the course but not the heading; sideslip is their difference and needs two "
+            "antennas or an INS"
         )
-    return f"the truth has only {', '.join(quantities) or 'no quantity'}"
+    return f"the ground truth contains only {', '.join(quantities) or 'no quantity'}"
 
 
 def _scored_instead(main: MainFacts, figures: _Figures) -> str:
@@ -159,51 +159,51 @@ def _scored_instead(main: MainFacts, figures: _Figures) -> str:
         for signal, text, factor, unit in shown
         if (value := figures.get((main.name, signal, "rmse"))) is not None
     ]
-    return f". RMSE of what is: {', '.join(found)}" if found else ""
+    return f". RMSE of the other signals: {', '.join(found)}" if found else ""
 
 
 def _consistency(main: MainFacts, figures: _Figures) -> str:
-    """Return what the figures that need no truth say of the main estimator, in words."""
+    """Return the results that need no ground truth, in sentences."""
     said = []
     d2, naive = (figures.get((n, "vy_m_s", "d2")) for n in (main.name, main.naive or ""))
     if main.name == "kinematic":
-        said.append("it integrates the very sensors that it could be held against, so that nothing checks it")
+        said.append("it integrates the sensors that could check it: no independent check")
     elif d2 is not None:
-        follows = f"over 2 s its lateral velocity follows accelerometer and gyro to {d2:.2f} m/s (d2)"
+        follows = f"lateral kinematic consistency with accelerometer and gyro: {d2:.2f} m/s over 2 s"
         if naive is None or main.name == main.naive:
             said.append(follows)
         elif d2 < _LESS * naive:
-            said.append(f"{follows}, sideslip 0 to {naive:.2f}: nothing contradicts it, which is no proof")
+            said.append(f"{follows} (zero sideslip: {naive:.2f}): no contradiction, which is not a proof")
         else:
             said.append(
-                f"{follows}, which sideslip 0 does too ({naive:.2f}): little sideslip, a biased accelerometer, a "
-                "banked road or a wrong model, so that it tells nothing"
+                f"{follows}, no better than zero sideslip ({naive:.2f}): little sideslip, a biased accelerometer, a "
+                "banked road or a wrong model; inconclusive"
             )
     nis, dof = (figures.get((main.name, "state", metric)) for metric in ("nis", "nis_dof"))
     if nis is not None and dof:
         low, high = _NIS_RANGE
-        how = "less than" if nis < low * dof else "more than" if nis > high * dof else "about as much as"
-        hence = {
-            "less than": ", so that its own 1-sigma is rather too wide",
-            "more than": ": model or noise are wrong, its own 1-sigma is too narrow",
-        }
-        said.append(f"its sensors surprise it {how} it expects (NIS/dof {nis / dof:.2f}){hence.get(how, '')}")
+        hence = ""
+        if nis < low * dof:
+            hence = ": the standard deviation of the filter is rather too large"
+        elif nis > high * dof:
+            hence = ": model or noise are wrong, the standard deviation of the filter is too small"
+        said.append(f"NIS per degree of freedom {nis / dof:.2f} (expected value 1){hence}")
     return "; ".join(said)
 
 
 def _band(report: Report, main: MainFacts, figures: _Figures) -> str:
     notes: Sequence[str] = next((e["intervals"] for e in report["estimators"] if e["name"] == main.name), [])
     if not notes:
-        return f"none: {main.name} gives no interval"
+        return f"none: {main.name} states no interval"
     made = f" ({'; '.join(notes)})"
     share = figures.get((main.name, "sideslip_rad", "coverage95"))
     if share is None:
-        return f"not checked, for want of a truth of sideslip{made}"
+        return f"coverage unknown without ground truth of sideslip{made}"
     if share >= HOLDS:
-        wide = ", and is wider than it need be" if share > _WIDE else ""
-        return f"holds{wide}: the truth is inside {share:.0%} of the time{made}"
-    verdict = "nearly holds" if share >= NEARLY_HOLDS else "does not hold, it is too narrow"
-    return f"{verdict}: the truth is inside only {share:.0%} of the time{made}"
+        wide = ", wider than necessary" if share > _WIDE else ""
+        return f"coverage {share:.0%} (nominal 95 %){wide}{made}"
+    verdict = "slightly too narrow" if share >= NEARLY_HOLDS else "too narrow"
+    return f"coverage {share:.0%} (nominal 95 %), {verdict}{made}"
 
 
 def _assumed(report: Report, main: MainFacts) -> list[str]:
@@ -213,20 +213,22 @@ def _assumed(report: Report, main: MainFacts) -> list[str]:
     calibration = report["self_calibration"]
     calibrated = calibration is not None and modelled and not calibration["refused"] and not own["causal"]
     if not modelled:
-        said = [f"no model of the car: {main.name} needs none"]
+        said = [f"no vehicle model ({main.name} needs none)"]
     elif calibrated:
         where = "this log" if calibration["logs"] == 1 else f"{calibration['logs']} logs"
-        said = [_car(vehicle), f"calibrated on {where} without truth and so not causal"]
+        said = [_car(vehicle), f"calibrated on {where} without ground truth, therefore not causal"]
     elif vehicle["file"] is None:
         said = [_car(vehicle)]
     else:
-        proven = "proven by driving with truth" if vehicle["proven"] else "as its file has it, which no driving proved"
+        proven = (
+            "validated on drives with ground truth" if vehicle["proven"] else "parameters of its file, not validated"
+        )
         said = [f"{_car(vehicle)}, {proven}"]
     if calibration is not None and modelled:
         if calibration["refused"]:
             said.append(f"not calibrated on this log: {calibration['refused']}")
         if calibration["understeer"] is not None and calibration["understeer"]["contradicts"]:
-            said.append("the drive understeers otherwise than the file")
+            said.append("the understeer gradient of the drive contradicts the file")
     if friction is not None and modelled:
         said.append(f"friction {_friction(friction)}")
     if main.distrusted:
@@ -234,8 +236,8 @@ def _assumed(report: Report, main: MainFacts) -> list[str]:
     algorithm = own["algorithm"] or {"options": {}}
     trust = algorithm["options"].get("trust", 0.0 if algorithm.get("algorithm") == "adaptive-physics" else None)
     if trust is not None:
-        found = f"network trusted at {trust:g} by the car's evidence"
-        said.append(found if trust else "no network, for want of evidence that it helps")
+        found = f"residual gain of the network {trust:g}, from the car's validation data"
+        said.append(found if trust else "network not used: no validation data show that it helps")
     return said
 
 
@@ -243,37 +245,37 @@ def _friction(friction: Mapping[str, Any]) -> str:
     source: str = friction["source"]
     if friction["estimated"]:
         return f"estimated ({friction['summary']})"
-    return source if source.startswith("assumed") else f"told ({source})"
+    return source if source.startswith("assumed") else f"given ({source})"
 
 
 def _car(vehicle: Mapping[str, Any]) -> str:
-    return "the default sedan, for no car was given" if vehicle["file"] is None else f"car {vehicle['file']}"
+    return "default sedan (no car given)" if vehicle["file"] is None else f"car {vehicle['file']}"
 
 
 def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]:
     """Return what would help, the most important first."""
     vehicle, steps = report["vehicle"], []
     if any(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks", ())):
-        steps.append("mend what failed above, or waive it by name")
+        steps.append("correct the failed checks above, or waive them by name")
     lacks = {e["reason"] for e in report["estimators"] if e["name"] == "physics" and e["outcome"] == "skipped"}
-    steps += [f"map what is missing, for {reason} (pdhef map LOG)" for reason in lacks]
+    steps += [f"map the missing signals ({reason}): pdhef map LOG" for reason in lacks]
     if vehicle["file"] is None:
-        steps.append("name your car: --car vehicle.toml with mass, geometry and tyres (docs/car.md)")
+        steps.append("give your car: --car vehicle.toml with mass, geometry and tyres (docs/car.md)")
     elif main.distrusted:
-        steps.append("look over the vehicle file: mass, wheelbase, tyres, steering ratio")
+        steps.append("check the vehicle file: mass, wheelbase, tyres, steering ratio")
     share = figures.get((main.name, "sideslip_rad", "coverage95"))
     if vehicle["file"] is not None and not vehicle["proven"]:
         given = f"--car {vehicle['file']} -o mycar"
         steps.append(
-            f"let this truth teach and prove the car: pdhef learn LOG {given}"
+            f"identify and validate the car with this ground truth: pdhef learn LOG {given}"
             if _error(figures, main.name) is not None
-            else f"let several logs of the car teach it: pdhef learn LOGS {given} --without-truth"
+            else f"identify the car from several logs: pdhef learn LOGS {given} --without-truth"
         )
     if vehicle["proven"] and share is not None and share < NEARLY_HOLDS:
-        steps.append("make the band anew from drives like this one: pdhef learn --stages intervals")
+        steps.append("recalibrate the intervals with drives like this one: pdhef learn --stages intervals")
     friction = report["friction"]
     if friction is not None and friction["estimated"] and (friction["observable_share"] or 0.0) < _FRICTION_SHOWN:
-        steps.append("tell the friction if you know the road: --friction 0.8")
+        steps.append("give the friction if you know it: --friction 0.8")
     return steps
 
 

@@ -69,16 +69,16 @@ def _figures(found: Interval | None) -> dict[str, Any] | None:
 def _why_none(report: Mapping[str, Any], main: str, signal: str, found: Standing | None) -> str:
     truth = report["truth"]
     if not truth["available"]:
-        return "the log has no truth"
+        return "the log contains no ground truth"
     if signal in truth["not_independent"]:
-        return "its truth is an input or the estimate itself, which is no independent check"
+        return "its ground truth is an input of the estimator or the estimate itself"
     if found is None or found.rmse is None:
         known = {q["name"] for q in truth["quantities"]}
         if signal not in known:
-            return "the truth does not have it"
-        return f"nowhere are its truth and {main} known together"
+            return "the ground truth does not contain it"
+        return f"its ground truth and {main} are never valid at the same time"
     if signal in ("sideslip_rad", "vy_m_s") and _without_sideslip(report):
-        return "that truth's sideslip is 0 throughout, as of one that does not measure it"
+        return "the sideslip of the ground truth is 0 throughout: it is probably not measured"
     return ""
 
 
@@ -116,29 +116,29 @@ def _error(found: Standing) -> str:
     shown = _number(found.rmse.value * factor)
     if math.isfinite(found.rmse.low):
         low, high = _number(found.rmse.low * factor), _number(found.rmse.high * factor)
-        between = f" (95 % between {low} and {high}{unit})"
+        between = f" (95 % CI {low} to {high}{unit})"
     else:
-        between = f" (too short for an interval: that takes {LEAST_BLOCKS} blocks of {found.block_s:g} s)"
-    return f"{found.estimator} is {shown}{unit} RMSE off{between}"
+        between = f" (no CI: it needs {LEAST_BLOCKS} blocks of {found.block_s:g} s)"
+    return f"RMSE of {found.estimator}: {shown}{unit}{between}"
 
 
 def _against(found: Standing, outcome: Outcome) -> str:
     if outcome == "alone":
-        return "no other filter on physics alone ran beside it"
+        return "no filter without a network ran for comparison"
     unit, factor = _unit(found.signal)
     assert found.rival_rmse is not None and found.difference is not None and found.rmse is not None
     beside = f"{found.rival} ({_number(found.rival_rmse * factor)}{unit})"
     if outcome == "same":
-        return f"{'the same as' if found.difference.value == 0.0 else 'as good as'} {beside}"
+        return f"{'equal to' if found.difference.value == 0.0 else 'no relevant difference to'} {beside}"
     difference = found.difference
     share = abs(difference.value) / found.rival_rmse if found.rival_rmse else math.inf
     by = f"{share:.0%} " if share < 10.0 else ""
-    how = f"{by}{'nearer' if difference.value < 0.0 else 'farther off'} than {beside}"
+    how = f"{by}{'lower' if difference.value < 0.0 else 'higher'} than {beside}"
     if not math.isfinite(difference.low):
-        return f"{how}, which may be chance"
+        return f"{how}, difference not tested"
     low, high = (_number(x * factor, sign="+") for x in (difference.low, difference.high))
-    between = f"difference between {low} and {high}{unit}"
-    return f"{how}, which may be chance: {between}" if outcome == "undecided" else f"{how}: {between}"
+    between = f"95 % CI of the difference {low} to {high}{unit}"
+    return f"{how}, difference not significant: {between}" if outcome == "undecided" else f"{how}: {between}"
 
 
 def _limits(found: Standing, limits: Sequence[Verdict]) -> list[str]:
@@ -146,7 +146,7 @@ def _limits(found: Standing, limits: Sequence[Verdict]) -> list[str]:
     said = []
     for verdict in limits:
         limit = verdict.threshold
-        text = f"{'keeps' if verdict.outcome == 'pass' else 'breaks'} the limit {limit.label}"
+        text = f"{'within' if verdict.outcome == 'pass' else 'exceeds'} the limit {limit.label}"
         rmse = found.rmse
         if (limit.metric, limit.segment) == ("rmse", "all") and limit.maximum is not None and rmse is not None:
             at = limit.maximum * limit.factor

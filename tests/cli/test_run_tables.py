@@ -75,9 +75,10 @@ def test_every_estimator_fits_and_keeps_its_whole_name(width: int) -> None:
 
 def test_the_answer_stands_first_then_three_rows() -> None:
     text = shown(named("drive"))
-    order = [text.index(word) for word in ("drive", "Result", "95 % band", "Assumed", "Next", "estimator")]
+    order = [text.index(word) for word in ("drive", "Result", "95 % CI", "Assumed", "Next", "estimator")]
     assert order == sorted(order)
-    assert [line.split()[0] for line in rows(text, "pd-hef ", "physics ", "zero ")] == ["pd-hef", "physics", "zero"]
+    scores = rows(text[text.index("estimator") :], "pd-hef ", "physics ", "zero ")
+    assert [line.split()[0] for line in scores] == ["pd-hef", "physics", "zero"]
 
 
 def test_hindsight_is_one_line_and_only_where_another_was_better() -> None:
@@ -145,8 +146,8 @@ def test_the_joint_table_says_who_answers_and_what_to_look_at() -> None:
 def test_what_is_assumed_of_all_logs_is_said_once_and_the_rest_with_each() -> None:
     told = named("tuesday", friction=FrictionFacts("estimate", estimated=True, observable_share=1.0, summary="seen"))
     text = shown(named("monday"), told)
-    assert text.count("car golf") == text.count("network trusted") == 1
-    assert text.index("car golf") < text.index("friction told (option, 0.9)") < text.index("friction estimated (seen)")
+    assert text.count("car golf") == text.count("residual gain") == 1
+    assert text.index("car golf") < text.index("friction given (option, 0.9)") < text.index("friction estimated (seen)")
 
 
 def test_named_estimators_keep_their_table_a_log() -> None:

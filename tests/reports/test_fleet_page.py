@@ -75,7 +75,7 @@ def test_a_run_with_everything_says_everything(tmp_path: Path) -> None:
 
 def test_one_log_has_a_short_page(tmp_path: Path) -> None:
     page = words(run_of(tmp_path, {"only": {"errors": (0.001, 0.0015)}}))
-    assert "The answer is 0.057° RMSE off." in page
+    assert "RMSE of the selected estimate: 0.057°." in page
     assert "Ranking" not in page and "Breakdown" not in page and "data-figure" not in page.split("<script")[0]
     assert 'href="logs/only/report.html"' in page
 

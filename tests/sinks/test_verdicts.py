@@ -36,7 +36,7 @@ def standing(difference: Interval | None, rival: str | None = "physics", own: In
 
 
 def details(*standings: Standing, **changes: Any) -> DriveDetails:
-    return replace(DriveDetails([], [], standings, [], no_budget("the log has no truth"), [], {}), **changes)
+    return replace(DriveDetails([], [], standings, [], no_budget("the log contains no ground truth"), [], {}), **changes)
 
 
 def verdicts(found: DriveDetails, **changes: Any) -> list[dict[str, Any]]:
@@ -53,25 +53,25 @@ def valid(**facts: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("difference", "outcome", "said"),
     [
-        (interval(-0.02, -0.03, -0.01), "better", "17% nearer than physics (0.120°): difference between -0.030"),
-        (interval(0.02, 0.01, 0.03), "worse", "17% farther off than physics (0.120°): difference between"),
-        (interval(-0.02, -0.05, 0.01), "undecided", "17% nearer than physics (0.120°), which may be chance: "),
-        (interval(-0.02), "undecided", "17% nearer than physics (0.120°), which may be chance"),
-        (interval(0.001, 0.0005, 0.002), "same", "as good as physics (0.120°)"),
+        (interval(-0.02, -0.03, -0.01), "better", "17% lower than physics (0.120°): 95 % CI of the difference -0.030"),
+        (interval(0.02, 0.01, 0.03), "worse", "17% higher than physics (0.120°): 95 % CI of the difference"),
+        (interval(-0.02, -0.05, 0.01), "undecided", "17% lower than physics (0.120°), difference not significant: "),
+        (interval(-0.02), "undecided", "17% lower than physics (0.120°), difference not tested"),
+        (interval(0.001, 0.0005, 0.002), "same", "no relevant difference to physics (0.120°)"),
         (interval(0.0, 0.0, 0.0), "same", "the same as physics (0.120°)"),
     ],
 )  # fmt: skip
 def test_the_sentence_claims_what_the_interval_holds(difference: Interval, outcome: str, said: str) -> None:
     first = verdicts(details(standing(difference)))[0]
     assert (first["signal"], first["outcome"]) == ("sideslip_rad", outcome)
-    assert first["text"].startswith("pd-hef is 0.100° RMSE off (95 % between 0.090 and 0.110°); " + said)
+    assert first["text"].startswith("RMSE of pd-hef: 0.100° (95 % CI 0.090 to 0.110°); " + said)
 
 
 def test_without_a_rival_or_an_interval_that_is_said() -> None:
     first = verdicts(details(standing(None, None, interval(0.1))))[0]
     assert first["outcome"] == "alone"
-    assert "too short for an interval: that takes 6 blocks of 10 s" in first["text"]
-    assert first["text"].endswith("no other filter on physics alone ran beside it")
+    assert "no CI: it needs 6 blocks of 10 s" in first["text"]
+    assert first["text"].endswith("no filter without a network ran for comparison")
     assert first["rmse"]["low"] is None
 
 
@@ -79,8 +79,8 @@ def test_without_a_rival_or_an_interval_that_is_said() -> None:
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"truth": TruthFacts()}, "the log has no truth"),
-        ({"truth": replace(TRUTH, not_independent=["sideslip_rad"])}, "no independent check"),
+        ({"truth": TruthFacts()}, "the log contains no ground truth"),
+        ({"truth": replace(TRUTH, not_independent=["sideslip_rad"])}, "is an input of the estimator"),
         ({"truth": replace(TRUTH, quantities=TRUTH.quantities[:2])}, "the truth does not have it"),
         ({}, "nowhere are its truth and pd-hef known together"),
     ],
@@ -104,8 +104,8 @@ def test_thresholds_of_the_answer_are_named_and_those_of_others_are_not() -> Non
     rows = [*METRICS, *(replace(r, metric="max_abs") for r in METRICS)]
     judged = check_thresholds(limits, rows, log="drive")
     first = verdicts(details(standing(interval(-0.02, -0.03, -0.01)), limits=judged))[0]
-    assert "keeps the limit sideslip_rad rmse (all) <= 0.105 deg, which lies within the interval" in first["text"]
-    assert "breaks the limit sideslip_rad max_abs (all) <= 0.05 deg" in first["text"]
+    assert "within the limit sideslip_rad rmse (all) <= 0.105 deg, which lies within the interval" in first["text"]
+    assert "exceeds the limit sideslip_rad max_abs (all) <= 0.05 deg" in first["text"]
     assert [x["outcome"] for x in first["limits"]] == ["pass", "fail"]
 
 
