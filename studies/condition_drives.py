@@ -169,12 +169,6 @@ def root_mean_square(error: FloatArray) -> float:
     return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
 
 
-def rmse_row(drive: str, estimator: str, segment: str, error: FloatArray) -> list[MetricRow]:
-    """Return the sideslip RMSE over an error [N] in rad as a row; none where nothing is known."""
-    n = int(np.count_nonzero(np.isfinite(error)))
-    return [MetricRow(drive, estimator, SIDESLIP, segment, "rmse", root_mean_square(error), "rad", n)] if n else []
-
-
 def drives_of(folder: Path, split: str | None = None) -> list[dict[str, Any]]:
     """Return the entries of a set's manifest, of one split or all, whose drives could be made."""
     entries = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["drives"]

@@ -48,13 +48,3 @@ def _settings() -> Iterator[str]:
 
 
 _TABLES: dict[str, Callable[[], Iterator[str]]] = {"metrics": _metrics, "checks": _checks, "settings": _settings}
-
-
-def on_post_page(output: str, **_: object) -> str:
-    """Take the web worker of the search from the site, not from the network, so that pages opened from disk have it."""
-    return output.replace("https://unpkg.com/iframe-worker/shim", "iframe-worker.js")
-
-
-def on_post_template(output_content: str, **_: object) -> str:
-    """Do the same for pages without a source, such as 404.html."""
-    return on_post_page(output_content)

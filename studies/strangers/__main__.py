@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
-from studies.pages import DOCS, ROOT, options, write
+from studies.pages import DOCS, RESULTS, ROOT, options, write
 from studies.strangers.answers import SHARED, answered_files, load_answers
 from studies.strangers.containers import write as write_log
 from studies.strangers.faults import faults
@@ -26,10 +26,9 @@ from studies.strangers.recordings import ITEMS, Recording
 from studies.strangers.scoring import Score, look, score_log
 from studies.strangers.vehicles import vehicle_layouts
 
-BEFORE = ROOT / "studies" / "before" / "strangers.json"
 #: What layouts held out gave when they were run for the first time: those now held out, and those that were before.
-FIRST_RUN = ROOT / "studies" / "before" / "strangers_held_out.json"
-FIRST_RUN_BEFORE = ROOT / "studies" / "before" / "strangers_vehicles.json"
+FIRST_RUN = RESULTS / "third_party_logs" / "held_out_first_run.json"
+FIRST_RUN_BEFORE = RESULTS / "third_party_logs" / "vehicles_first_run.json"
 
 
 def result_of(score: Score, name: str, group: str, what: str, page_url: str = "") -> Result:
@@ -173,9 +172,8 @@ def main() -> int:
         for result in chain.from_iterable(kinds.values()):
             _show(result)
     else:
-        before = json.loads(BEFORE.read_text(encoding="utf-8")) if BEFORE.is_file() else None
         remark = first_run() + ("" if given.held_out else "The layouts held out were not run now.\n\n")
-        write(given.out, page(results, before, remark + others_without_answers()))
+        write(given.out, page(results, remark + others_without_answers()))
     if given.keep:
         write(given.keep, json.dumps({r.name: r.as_json() for r in results}, indent=1, sort_keys=True) + "\n")
     return 1 if any(r.count("wrong, not told") for r in results) else 0

@@ -94,12 +94,12 @@ def merged(results: Sequence[Result]) -> Result:
     )
 
 
-def page(results: Sequence[Result], before: Mapping[str, Any] | None, remark: str) -> str:
+def page(results: Sequence[Result], remark: str) -> str:
     """Return the page.
 
     Parameters
     ----------
-    results : one a kind. before : ``as_json`` of earlier results by name. remark : what else to say below the score.
+    results : one a kind. remark : text below the score.
     """
     own = [r for r in results if r.group in ("fault", "layout", "held-out")]
     others = [r for r in results if r.group == "recording"]
@@ -107,7 +107,7 @@ def page(results: Sequence[Result], before: Mapping[str, Any] | None, remark: st
     parts = [
         _INTRO.replace("<!-- counts -->", counts),
         "## Score\n",
-        _score(results, before),
+        _score(results),
         _remarks(results),
         remark,
     ]
@@ -119,41 +119,33 @@ def page(results: Sequence[Result], before: Mapping[str, Any] | None, remark: st
     return "\n".join(parts).rstrip() + "\n"
 
 
-def _score(results: Sequence[Result], before: Mapping[str, Any] | None) -> str:
+def _score(results: Sequence[Result]) -> str:
     rows = []
     for group, title in GROUPS.items():
         here = [r for r in results if r.group == group]
         if here:
-            rows.append(_score_row(title, here, before))
+            rows.append(_score_row(title, here))
     total = [r for r in results if r.group != "held-out"]
-    rows.append(_score_row("all but those held out", total, before))
-    head = ["logs", "count", "items", "right", "right before", "missing", "wrong, told", "wrong, not told"]
-    head += ["not told before", "causes named"]
+    rows.append(_score_row("all but those held out", total))
+    head = ["logs", "count", "items", "right", "missing", "wrong, told", "wrong, not told", "causes named"]
     return table(head, rows, right_from=1) + "\n"
 
 
-def _score_row(title: str, rows: Sequence[Result], before: Mapping[str, Any] | None) -> list[str]:
+def _score_row(title: str, rows: Sequence[Result]) -> list[str]:
     items = sum(r.present for r in rows)
-    earlier = [before[r.name]["items"].values() for r in rows if before and r.name in before]
     planted = [r.named for r in rows if r.named is not None]
 
     def share(count: int, of: int) -> str:
         return f"{count} ({100.0 * count / of:.0f} %)" if of else "–"
 
-    def past(outcome: str) -> int:
-        return sum(1 for log in earlier for o in log if o == outcome)
-
-    known = sum(len(log) for log in earlier)
     return [
         title,
         str(len(rows)),
         str(items),
         share(_sum(rows, "right"), items),
-        share(past("right"), known),
         str(_sum(rows, "missing")),
         str(_sum(rows, "wrong, told")),
         str(_sum(rows, "wrong, not told")),
-        str(past("wrong, not told")) if known else "–",
         f"{sum(planted)} of {len(planted)}" if planted else "–",
     ]
 
@@ -170,8 +162,7 @@ def _remarks(results: Sequence[Result]) -> str:
     return (
         f"On sound and excited logs (the layouts) {len(right)} items are right. Of their checks all passed on "
         f"{counts['passed']}, some stayed undecided on {counts['undecided']}, some failed on {counts['failed']}; "
-        f"{counts['none']} have no check. A sentence doubts {doubted} of the right ones. "
-        "“Before” is the state of 2026-11-22, ahead of candidates and mountings.\n"
+        f"{counts['none']} have no check. A sentence doubts {doubted} of the right ones.\n"
     )
 
 

@@ -172,7 +172,7 @@ def test_the_page_says_what_is_wrong() -> None:
         Result("a", "fault", "w", "", {"ay": "wrong, not told"}, silent=("ay (ay_m_s2 = /x.y)",), named=False),
         Result("b", "layout", "w", "https://x", {"ax": "right"}, verdicts={"ax": "passed"}),
     ]
-    text = page(rows, None, "")
+    text = page(rows, "")
     assert "- a: wrong, not told: ay (ay_m_s2 = /x.y)" in text
     assert "- a: cause not named" in text
     assert "[w](https://x)" in text
