@@ -27,8 +27,7 @@ SetOutput = Annotated[Path, Option("--output", "-o", help="Output folder. Existi
     "pdhef simulate dlc --vehicle suv --fault burst20:yaw_rate:3:5 \\",
     "  --fault dropout:wheels:6:end -o faulty.mcap",
     panel=panels.TOOLS,
-    notes="""Sets of drives: pdhef simulate suite writes a training set,
-pdhef simulate conditions writes the drives of the condition table.
+    notes="""A training set: pdhef simulate suite. The drives of the condition table: pdhef simulate conditions.
 
 Faults: KIND:WHAT:START:END in seconds (END may be end). Kinds: burst<FACTOR>, stuck, dead, flip, bias<SI>, dropout,
 delay<MS>, jump<S> (of the stamps), float, lost (the RTK's fix). What: imu, steering, wheels, rtk, all (sensors), or one

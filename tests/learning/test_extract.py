@@ -25,7 +25,7 @@ from pdhef_logtool.drive import reading
 from pdhef_logtool.learning.network.dataset import MANIFEST, SPLITS, read_dataset
 from pdhef_logtool.learning.network.extract_command import ExtractResult, ExtractSettings, choose_split, extract
 from pdhef_logtool.logs.discovery import hash_log
-from pdhef_logtool.records.documents import is_sealed
+from pdhef_logtool.records.documents import is_sealed, seal
 from pdhef_logtool.records.errors import LogError, OutputError, UsageError
 from pdhef_logtool.records.outputs import OutputFolder
 from pdhef_logtool.residual_model.features import FEATURES
@@ -283,7 +283,7 @@ def test_damaged_dataset_is_told(dataset: ExtractResult, tmp_path: Path) -> None
     with pytest.raises(OutputError, match="not as it was written"):
         read_dataset(copy)
     del document["digest"]
-    (copy / MANIFEST).write_text(json.dumps({**document, "version": 99}))
+    (copy / MANIFEST).write_text(json.dumps(seal({**document, "version": 99})))
     with pytest.raises(OutputError, match="makes it anew"):
         read_dataset(copy)
     (copy / MANIFEST).unlink()
@@ -403,7 +403,8 @@ def test_calls_add_up_by_log_and_slice(sample_logs_dir: Path, tmp_path: Path) ->
 def test_a_dataset_of_an_older_version_is_refused_in_one_line(tmp_path: Path) -> None:
     out = tmp_path / "old"
     out.mkdir()
-    (out / MANIFEST).write_text(json.dumps({"format": "pdhef.residual-dataset", "version": 2, "features": ["x"]}))
+    old = seal({"format": "pdhef.residual-dataset", "version": 2, "features": ["x"]})
+    (out / MANIFEST).write_text(json.dumps(old))
     with pytest.raises(OutputError, match="pdhef extract") as refused:
         read_dataset(out)
     assert "\n" not in str(refused.value)

@@ -12,6 +12,7 @@ import pytest
 from pdhef_logtool.car.toml_files import load_vehicle
 from pdhef_logtool.learning.network.dataset import read_dataset
 from pdhef_logtool.learning.network.train_command import run_training
+from pdhef_logtool.records.documents import seal
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.residual_model.bundle import load_bundle
 from pdhef_logtool.residual_model.features import NOMINAL_FEATURES
@@ -106,7 +107,7 @@ def test_wrong_calls_are_one_line(dataset: Path, tmp_path: Path) -> None:
     document = json.loads((alone / "manifest.json").read_text())
     del document["digest"]
     document["drives"] = [d for d in document["drives"] if d["split"] == "train"]
-    (alone / "manifest.json").write_text(json.dumps(document))
+    (alone / "manifest.json").write_text(json.dumps(seal(document)))
     done = called("train", str(alone), "-o", str(tmp_path / "m"), "--epochs", "1")
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1

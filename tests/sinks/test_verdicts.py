@@ -36,7 +36,8 @@ def standing(difference: Interval | None, rival: str | None = "physics", own: In
 
 
 def details(*standings: Standing, **changes: Any) -> DriveDetails:
-    return replace(DriveDetails([], [], standings, [], no_budget("the log contains no ground truth"), [], {}), **changes)
+    empty = DriveDetails([], [], standings, [], no_budget("the log contains no ground truth"), [], {})
+    return replace(empty, **changes)
 
 
 def verdicts(found: DriveDetails, **changes: Any) -> list[dict[str, Any]]:
