@@ -59,7 +59,7 @@ def valid(**facts: Any) -> dict[str, Any]:
         (interval(-0.02, -0.05, 0.01), "undecided", "17% lower than physics (0.120°), difference not significant: "),
         (interval(-0.02), "undecided", "17% lower than physics (0.120°), difference not tested"),
         (interval(0.001, 0.0005, 0.002), "same", "no relevant difference to physics (0.120°)"),
-        (interval(0.0, 0.0, 0.0), "same", "the same as physics (0.120°)"),
+        (interval(0.0, 0.0, 0.0), "same", "equal to physics (0.120°)"),
     ],
 )  # fmt: skip
 def test_the_sentence_claims_what_the_interval_holds(difference: Interval, outcome: str, said: str) -> None:
@@ -82,8 +82,8 @@ def test_without_a_rival_or_an_interval_that_is_said() -> None:
     [
         ({"truth": TruthFacts()}, "the log contains no ground truth"),
         ({"truth": replace(TRUTH, not_independent=["sideslip_rad"])}, "is an input of the estimator"),
-        ({"truth": replace(TRUTH, quantities=TRUTH.quantities[:2])}, "the truth does not have it"),
-        ({}, "nowhere are its truth and pd-hef known together"),
+        ({"truth": replace(TRUTH, quantities=TRUTH.quantities[:2])}, "the ground truth does not contain it"),
+        ({}, "its ground truth and pd-hef are never valid at the same time"),
     ],
 )
 def test_no_verdict_without_independent_truth_and_why(changes: dict[str, Any], why: str) -> None:
