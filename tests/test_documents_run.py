@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -53,3 +54,20 @@ def test_examples_of_the_api_give_what_they_show(module: str, monkeypatch: pytes
     monkeypatch.chdir(ROOT)
     done = doctest.testmod(importlib.import_module(f"pdhef_logtool.{module}"))
     assert done.attempted and not done.failed
+
+
+def test_every_option_of_the_pages_exists() -> None:
+    import typer
+
+    from pdhef_logtool.cli.app import app
+
+    group = typer.main.get_command(app)
+    commands: Any = [group, *group.commands.values()]  # type: ignore[attr-defined]
+    options = {o for c in commands for p in c.params for o in (*p.opts, *p.secondary_opts)} | {"--help"}
+    unknown = []
+    for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
+        text = page.read_text(encoding="utf-8")
+        words = " ".join(line for line in text.splitlines() if line.strip().startswith("pdhef ")).split()
+        words += " ".join(re.findall(r"`((?:pdhef |--)[^`]*)`", text)).split()
+        unknown += [f"{page.name}: {w}" for w in words if w.startswith("--") and w.partition("=")[0] not in options]
+    assert unknown == []

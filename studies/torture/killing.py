@@ -77,11 +77,11 @@ def _notice_interrupts() -> None:
 
 def _prepared(output: Path) -> set[int]:
     """Return what identifies the folders in which logs' outputs are prepared."""
-    found = set()
-    for folder in (output / "logs" / ".pdhef").glob("*/new"):
-        with contextlib.suppress(FileNotFoundError):
-            found.add(folder.stat().st_ino)
-    return found
+    prepared = set()
+    with contextlib.suppress(FileNotFoundError):  # also of the search, while a run removes its folder
+        for folder in (output / "logs" / ".pdhef").glob("*/new"):
+            prepared.add(folder.stat().st_ino)
+    return prepared
 
 
 def kill_many(

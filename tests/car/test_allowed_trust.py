@@ -127,7 +127,8 @@ def test_the_report_says_the_cap_and_why(
         assert why in note
         assert note in report_markdown(report)
         render_run(result, Console(width=400))
-        said = f"network trusted at {cap:g} by the car's evidence" if cap else "no network, for want of evidence"
+        used = f"residual gain of the network {cap:g}, from the car's validation data"
+        said = used if cap else "network not used"
         assert said in capsys.readouterr().out
         folder = tmp_path / f"out{cap}" / "logs" / "dlc"
         track = read_track(folder / "estimates.parquet", "pd-hef")

@@ -32,7 +32,7 @@ def test_a_drive_with_truth_has_all_of_it(sample_logs_dir: Path, tmp_path: Path)
     first = report["verdicts"][0]
     figure = {(m["estimator"], m["signal"], m["metric"], m["segment"]): m["value"] for m in report["metrics"]}
     assert first["rmse"]["value"] == pytest.approx(figure["pd-hef", "sideslip_rad", "rmse", "all"])
-    assert first["rival"] == "physics" and "keeps the limit" in first["text"]
+    assert first["rival"] == "physics" and "within the limit" in first["text"]
     assert {i["estimator"] for i in report["innovations"]} == {"pd-hef", "physics"}
     assert {i["channel"] for i in report["innovations"]} == {"ay_m_s2", "yaw_rate_rad_s", "speed_m_s"}
     assert report["error_budget"]["reason"] == "" and len(report["error_budget"]["causes"]) == 5

@@ -71,8 +71,8 @@ def test_calibrated_estimators_are_not_causal_and_say_so_and_the_others_keep_the
     assert told["phy-ukf"]["algorithm"]["physics_sha256"] == report["vehicle"]["sha256"]
     assert told["physics"]["algorithm"]["physics_sha256"] != report["vehicle"]["sha256"]
     assert report["self_calibration"]["understeer"]["contradicts"]
-    assert "calibrated on this log without truth" in report["answer"]["texts"]["assumed"]
-    assert "the drive understeers otherwise" in report["answer"]["texts"]["assumed"]
+    assert "calibrated on this log without ground truth" in report["answer"]["texts"]["assumed"]
+    assert "the understeer gradient of the drive contradicts" in report["answer"]["texts"]["assumed"]
     assert told["physics"]["intervals"] == ["intervals: own, parameters and d2"]
     assert told["open-loop:calibrated"]["intervals"] == []
 
