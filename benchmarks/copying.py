@@ -16,7 +16,7 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.source_copy import iterate_copy, iterate_raw, register_channels
 from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.tracks import StateTrack, make_track
-from pdhef_logtool.sinks.mcap import AnnotatedMcapSink
+from pdhef_logtool.results.mcap_sink import AnnotatedMcapSink
 
 _SLICE = 10
 _SLICE_END_NS = START_NS + HOUR_S // _SLICE * 10**9

@@ -121,8 +121,10 @@ def _parts_of_a_run() -> None:
 
     from pdhef_logtool.cli.app import main
     from pdhef_logtool.drive import windows
+    from pdhef_logtool.results import mcap_sink as mcap
+    from pdhef_logtool.results import parquet_sink as parquet
+    from pdhef_logtool.results import rerun_sink as rerun
     from pdhef_logtool.runs import drive_details, estimating, pipeline
-    from pdhef_logtool.sinks import mcap, parquet, rerun
 
     timed(windows.DriveReader, "windows", "reading and aligning", lazy=True)
     timed(estimating, "run_window", None)

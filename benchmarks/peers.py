@@ -18,7 +18,7 @@ from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.filter_base import INITIAL_STD
 from pdhef_logtool.estimators.phy_ukf import PHY_UKF_Q_STD
 from pdhef_logtool.logs.schema_files import message_definition
-from pdhef_logtool.sinks.mcap import STATE_TYPE, topic_of
+from pdhef_logtool.results.mcap_sink import STATE_TYPE, topic_of
 
 _IMU, _STEER, _WHEELS = "/imu/data", "/vehicle/status/steering_status", "/vehicle/wheel_speeds"
 

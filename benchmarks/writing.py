@@ -16,7 +16,7 @@ from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.geometry import quat_from_yaw
 from pdhef_logtool.records.signals import FloatArray, IntArray
-from pdhef_logtool.sinks.mcap import BODY_FRAME, MAP_FRAME, ODOMETRY_TYPE, STATE_TYPE, topic_of
+from pdhef_logtool.results.mcap_sink import BODY_FRAME, MAP_FRAME, ODOMETRY_TYPE, STATE_TYPE, topic_of
 
 START_NS = 1_700_000_000_000_000_000
 STAMPS = 360_000

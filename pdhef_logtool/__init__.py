@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from pdhef_logtool.drive.options import ReadOptions as ReadOptions
     from pdhef_logtool.drive.reading import Drive as Drive
     from pdhef_logtool.drive.reading import read_drive as read_drive
-    from pdhef_logtool.inspection import inspect_log as inspect_log
     from pdhef_logtool.learning.drives import LearnSettings as LearnSettings
     from pdhef_logtool.learning.engine import learn as learn
     from pdhef_logtool.learning.network.extract_command import ExtractSettings as ExtractSettings
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.runs.frames import choose as choose
     from pdhef_logtool.runs.frames import estimate as estimate
     from pdhef_logtool.runs.frames import score as score
+    from pdhef_logtool.runs.inspection import inspect_log as inspect_log
 
 #: Where each name stands, ``module`` or ``module:name there``; it is imported when it is first asked for.
 _HOMES = {
@@ -33,7 +33,7 @@ _HOMES = {
     "ReadOptions": "drive.options",
     "Drive": "drive.reading",
     "read_drive": "drive.reading",
-    "inspect_log": "inspection",
+    "inspect_log": "runs.inspection",
     "LearnSettings": "learning.drives",
     "learn": "learning.engine",
     "ExtractSettings": "learning.network.extract_command",

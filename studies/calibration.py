@@ -9,10 +9,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from pdhef_logtool.estimators.calibration.calibration import LEAST_KNOWN, LEAST_KNOWN_EXPORTED, VARIED
 from pdhef_logtool.estimators.posterior_band import OWN_SHARE as IDENTIFIED_SHARE
 from pdhef_logtool.estimators.self_calibrated import D2_SHARE, OWN_SHARE
 from pdhef_logtool.runs.selection import FACTOR, SIMPLE
-from pdhef_logtool.self_calibration.calibration import LEAST_KNOWN, LEAST_KNOWN_EXPORTED, VARIED
 from studies import identified_bands, self_calibration
 from studies.pages import DOCS, DRIVES, options, write
 from studies.self_calibration import outcome_of, say, simulate

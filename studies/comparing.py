@@ -23,7 +23,7 @@ import numpy as np
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.results.paired_change import paired_change
-from pdhef_logtool.sinks.parquet import write_metrics
+from pdhef_logtool.results.parquet_sink import write_metrics
 from studies.pages import DOCS, options, table, write
 
 LIMIT, PLANTED, SPREAD = 0.05, 0.10, 0.2

@@ -23,10 +23,10 @@ from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import FILTERS, Options, runnable
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.records.documents import digest
-from pdhef_logtool.records.files import PendingFile
-from pdhef_logtool.records.supervisor import Crew, Tell
 from pdhef_logtool.runs.estimating import calibrator
+from pdhef_logtool.storage.documents import digest
+from pdhef_logtool.storage.files import PendingFile
+from pdhef_logtool.workers.supervisor import Crew, Tell
 from studies.condition_drives import read_drive, score, told
 from studies.pages import ROOT
 

@@ -14,8 +14,8 @@ import polars as pl
 
 from pdhef_logtool import __version__
 from pdhef_logtool.estimators.table import SPECS
-from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.storage.files import PendingFile
 from studies.condition_drives import BIN_LEAST_S, BINS, NONLINEAR, SIDESLIP
 from studies.pages import number, table, write
 from studies.pictures import save, subplots

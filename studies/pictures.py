@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pdhef_logtool.records.files import PendingFile
+from pdhef_logtool.storage.files import PendingFile
 
 #: Of the pages with their own look; the condition table has matplotlib's.
 STYLE = {"font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "legend.fontsize": 8}

@@ -49,15 +49,15 @@ from pdhef_logtool.learning.stages.gain import errors_by_trust
 from pdhef_logtool.learning.stages.network import train_on_parts
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import load_mapping
-from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.errors import PdhefError
-from pdhef_logtool.records.files import PendingFile, write_bytes
-from pdhef_logtool.records.release import released_steps
 from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.steps import released_steps
 from pdhef_logtool.residual_model.bundle import NO_MODEL, ModelBundle
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, self_calibrated
+from pdhef_logtool.storage.documents import digest
+from pdhef_logtool.storage.files import PendingFile, write_bytes
 from studies.condition_drives import SIDESLIP
 from studies.pages import DOCS, DRIVES, RESULTS, ROOT, number, options, table, table_rows, write
 

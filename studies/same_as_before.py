@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from pdhef_logtool.sinks.mcap import topic_of
+from pdhef_logtool.results.mcap_sink import topic_of
 from studies.pages import DRIVES, ROOT, options
 
 _REFERENCE = ["--car", "tests/reference/vehicles/revs_250lm.toml"]

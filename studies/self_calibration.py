@@ -21,6 +21,8 @@ from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.toml_files import load_vehicle
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters
 from pdhef_logtool.drive.reading import WholeDrive
+from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
+from pdhef_logtool.estimators.calibration.driving import DrivingReader
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
 from pdhef_logtool.estimators.table import make_estimator
@@ -34,8 +36,6 @@ from pdhef_logtool.runs.estimating import calibrator
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.selection import FACTOR
 from pdhef_logtool.runs.self_calibrating import log_sensors
-from pdhef_logtool.self_calibration.calibration import SelfCalibration, self_calibrate
-from pdhef_logtool.self_calibration.driving import DrivingReader
 from studies.condition_drives import SIDESLIP, as_logged
 from studies.many_cars import BASE, KINDS, draw_car
 from studies.pages import DRIVES, ROOT, number, table

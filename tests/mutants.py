@@ -30,17 +30,17 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from pdhef_logtool.records.compiled_sources import sources_digest
+from pdhef_logtool.compiled.sources import sources_digest
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = "pdhef_logtool"
 #: By package that is mutated, the folders of the tests that know it best.
 FOLDERS = {
-    "estimators": ("estimators", "watches", "runs"),
+    "estimators": ("estimators", "runs"),
     "evaluation": ("evaluation", "runs"),
-    "mapping": ("mapping", "drive", "inspection"),
+    "mapping": ("mapping", "drive", "runs"),
     "learning": ("learning", "studies"),
-    "sinks": ("sinks", "runs", "cli"),
+    "results": ("results", "runs", "cli"),
 }
 NOT_COPIED = (".git", ".venv", "out", "build", "dist", "*.egg-info", ".hypothesis", ".*_cache", "*.tmp")
 #: A mutant that loops for ever is stopped, and was noticed.

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.sinks.answer import MainFacts
-from pdhef_logtool.sinks.report import (
+from pdhef_logtool.results.run_report import (
     EstimatorFacts,
     FrictionFacts,
     LogFacts,
@@ -18,6 +17,7 @@ from pdhef_logtool.sinks.report import (
     TruthFacts,
     build_report,
 )
+from pdhef_logtool.results.selected_estimate import MainFacts
 
 SHA = "ab" * 32
 MODEL = {"physics_sha256": SHA, "options": {"trust": 0.5}}

@@ -11,7 +11,7 @@ import mutants
 import pytest
 from mutants import FOLDERS, ROOT, Mutant
 
-from pdhef_logtool.records.compiled_sources import sources_digest
+from pdhef_logtool.compiled.sources import sources_digest
 
 pytestmark = pytest.mark.slow
 
@@ -81,7 +81,7 @@ def act(a: int, b: int) -> int:
 
 def test_a_fault_in_a_compiled_function_forgets_all_that_may_hold_it(tmp_path: Path) -> None:
     code = {
-        "low.py": '"""Low level, made for the test."""\nfrom pdhef_logtool.records.compiled import njit\n\n\n'
+        "low.py": '"""Low level, made for the test."""\nfrom pdhef_logtool.compiled.cache import njit\n\n\n'
         "@njit(cache=True)\ndef half(x):\n    return x / 2.0\n\n\ndef plain(x):\n    return x - 1.0\n",
         "high.py": '"""High."""\nfrom pdhef_logtool.made.low import half\n',
         "top.py": '"""Top."""\nfrom pdhef_logtool.made import high\n',

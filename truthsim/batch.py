@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.records.errors import PdhefError, SimulationError, UsageError
-from pdhef_logtool.records.files import write_bytes, writing
-from pdhef_logtool.records.supervisor import Tell, supervise
 from pdhef_logtool.records.version import __version__
+from pdhef_logtool.storage.files import write_bytes, writing
+from pdhef_logtool.workers.supervisor import Tell, supervise
 from truthsim.drive import DEFAULT_VEHICLE, Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
 from truthsim.manoeuvres import GRAVITY_M_S2

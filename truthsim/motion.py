@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pdhef_logtool.records.compiled import njit
+from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.records.signals import FloatArray
 from truthsim.driver import (
     MEMORY_SIZE,

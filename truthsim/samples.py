@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.files import write_bytes
+from pdhef_logtool.storage.files import write_bytes
 from truthsim.drive import Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
 

@@ -13,8 +13,8 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 
-from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import VehicleError
+from pdhef_logtool.storage.documents import read_toml, validated
 from truthsim.tyres import Tyre
 from truthsim.vehicle import GRAVITY_M_S2, Vehicle
 

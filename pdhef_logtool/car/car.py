@@ -30,7 +30,6 @@ from pdhef_logtool.car.parts import (
 )
 from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.car.vehicle import Record, VehicleParameters, default_vehicle
-from pdhef_logtool.records.documents import read_json, read_text, read_toml, validated
 from pdhef_logtool.records.errors import UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
@@ -41,6 +40,7 @@ from pdhef_logtool.residual_model.bundle import (
     ModelBundle,
     load_bundle,
 )
+from pdhef_logtool.storage.documents import read_json, read_text, read_toml, validated
 
 VEHICLE_FILE, FIT_FILE, NOISE_FILE, NETWORK_FILE = "vehicle.toml", "fit.toml", "noise.toml", "network.toml"
 INTERVALS_FILE, UNSURE_FILE, HISTORY_FILE = "intervals.json", "intervals-unsure.json", "history.jsonl"

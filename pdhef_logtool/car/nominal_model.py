@@ -11,7 +11,7 @@ import math
 from typing import NamedTuple
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.records.compiled import njit
+from pdhef_logtool.compiled.cache import njit
 
 #: Time constant of the approach to the kinematic model, s: short for driving, long for a 10 ms step.
 KINEMATIC_TIME_CONSTANT_S = 0.1

@@ -12,7 +12,7 @@ import math
 from typing import NamedTuple
 
 from pdhef_logtool.car.nominal_model import KINEMATIC_TIME_CONSTANT_S
-from pdhef_logtool.records.compiled import njit
+from pdhef_logtool.compiled.cache import njit
 
 #: Points of one inner loop: a constant, so that no remainder is left and every point is computed alike.
 WIDTH = 16

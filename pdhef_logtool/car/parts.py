@@ -22,7 +22,7 @@ from pdhef_logtool.car.vehicle import (
     Tyres,
     VehicleParameters,
 )
-from pdhef_logtool.records.documents import digest, one_of
+from pdhef_logtool.storage.documents import digest, one_of
 
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
@@ -260,7 +260,7 @@ class SideslipCoefficients(YawRateCoefficients):
 
 
 class Inflation(Record):
-    """Coefficients of the calibrated 1-sigmas of one algorithm (:mod:`pdhef_logtool.watches.intervals`).
+    """Coefficients of the calibrated 1-sigmas of one algorithm (:mod:`pdhef_logtool.estimators.intervals`).
 
     ``grip_factors`` : on that of the sideslip, where little, some and much of the grip is used.
     """

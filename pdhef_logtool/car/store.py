@@ -25,11 +25,11 @@ from pdhef_logtool.car.car import (
 )
 from pdhef_logtool.car.parts import HistoryLine, LearntOn
 from pdhef_logtool.car.toml_files import vehicle_toml
-from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.files import write_bytes, writing
-from pdhef_logtool.records.outputs import LOCK_FILE, FolderLock, FolderTransaction
 from pdhef_logtool.records.version import __version__
+from pdhef_logtool.storage.documents import digest
+from pdhef_logtool.storage.files import write_bytes, writing
+from pdhef_logtool.storage.outputs import LOCK_FILE, FolderLock, FolderTransaction
 
 #: How long a change waits for another command that is changing the same car: such a change takes a moment.
 LONGEST_WAIT_S = 60.0

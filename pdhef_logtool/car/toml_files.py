@@ -10,8 +10,8 @@ from pydantic import Field
 
 from pdhef_logtool.car.parts import Trust
 from pdhef_logtool.car.vehicle import REMEDY, Record, VehicleParameters
-from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import VehicleError
+from pdhef_logtool.storage.documents import read_toml, validated
 
 
 class _Network(Record):

@@ -9,10 +9,10 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from pdhef_logtool.records.documents import validated
 from pdhef_logtool.records.errors import VehicleError
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.storage.documents import validated
 
 #: A car is at a standstill below this share of its low-speed blend.
 STANDSTILL_SHARE = 0.1

@@ -25,7 +25,7 @@ from pdhef_logtool.cli import (
 )
 from pdhef_logtool.cli.removed_commands import replacement
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, PdhefError, UsageError
-from pdhef_logtool.records.files import OF_WRITING, cannot_write
+from pdhef_logtool.storage.files import OF_WRITING, cannot_write
 
 #: The error of a word that no command takes; it belongs to click, or to the copy of it that newer typers carry.
 _WrongWord: type[Any] = typer.BadParameter.__bases__[0]

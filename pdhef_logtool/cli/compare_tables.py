@@ -12,7 +12,6 @@ from rich.text import Text
 
 from pdhef_logtool.cli.console import table
 from pdhef_logtool.evaluation.units import read_unit
-from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison
 from pdhef_logtool.results.comparison_words import (
     interval_text,
@@ -23,7 +22,8 @@ from pdhef_logtool.results.comparison_words import (
     percent,
     verdict_text,
 )
-from pdhef_logtool.sinks.junit import Case, cases_bytes
+from pdhef_logtool.results.junit import Case, cases_bytes
+from pdhef_logtool.storage.files import write_bytes
 
 if TYPE_CHECKING:
     from rich.console import Console

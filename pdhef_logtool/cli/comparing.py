@@ -57,10 +57,10 @@ def compare(
 ) -> None:
     """Compare two runs drive by drive: better, worse, or no significant difference."""
     from pdhef_logtool.cli.compare_tables import render_comparison, write_comparison_junit
-    from pdhef_logtool.records.object_store import is_url
-    from pdhef_logtool.records.outputs import check_no_input
     from pdhef_logtool.results.comparing import compare_runs
     from pdhef_logtool.results.opened_run import open_run
+    from pdhef_logtool.storage.object_store import is_url
+    from pdhef_logtool.storage.outputs import check_no_input
 
     check_no_input(
         [*(Path(x) for x in (a, b) if not is_url(x)), gate], [file for file in (html, junit) if file is not None]
@@ -72,8 +72,8 @@ def compare(
     if junit is not None:
         write_comparison_junit(junit, found)
     if html is not None:
-        from pdhef_logtool.records.files import write_bytes
         from pdhef_logtool.reports.comparison import comparison_page
+        from pdhef_logtool.storage.files import write_bytes
 
         write_bytes(html, comparison_page(found))
     console.finish(found, render_comparison, as_json)
@@ -140,11 +140,11 @@ def events(
 ) -> None:
     """Find the times at which a condition is true, and cut clips there."""
     from pdhef_logtool.cli.event_tables import render_events
-    from pdhef_logtool.records.object_store import is_url
-    from pdhef_logtool.records.outputs import check_no_input
     from pdhef_logtool.results.events import find_events, write_events
     from pdhef_logtool.results.expression import parse_condition
     from pdhef_logtool.results.opened_run import open_run
+    from pdhef_logtool.storage.object_store import is_url
+    from pdhef_logtool.storage.outputs import check_no_input
 
     condition = parse_condition(where)
     pad_s = (_CLIP_PAD_S if clip else _PAD_S) if pad is None else _seconds(pad)

@@ -9,7 +9,7 @@ import typer
 from pdhef_logtool.cli import console, options, panels
 
 if TYPE_CHECKING:
-    from pdhef_logtool.records.supervisor import Tell
+    from pdhef_logtool.workers.supervisor import Tell
 
 commands = typer.Typer()
 #: Parts beside those of the estimators: a simulated drive, and a run of one with a car of which nothing is known.
@@ -29,7 +29,7 @@ def compile_(as_json: options.JsonFlag = False) -> None:
     """Compile the filters in advance, so that the first run starts at once."""
     import time
 
-    from pdhef_logtool.records.compiled_sources import compiled_digest
+    from pdhef_logtool.compiled.sources import compiled_digest
     from pdhef_logtool.runs.compiling import all_parts, compile_parts
 
     began_s = time.perf_counter()

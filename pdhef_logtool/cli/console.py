@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn, Protocol, TypeVar
 import typer
 
 from pdhef_logtool.cli import stopping
-from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.errors import EXIT_OK
-from pdhef_logtool.records.shown import all_shown, shown
+from pdhef_logtool.records.printable import all_shown, shown
+from pdhef_logtool.storage.documents import jsonable
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -46,9 +46,9 @@ def inspect(
 
     Of an MCAP file above 32 MB with an intact index, only a part of the chunks is read; the output states how many.
     """
-    from pdhef_logtool.inspection import fields_of_log, inspect_log, render_fields, render_inspection
-    from pdhef_logtool.inspection import write_mapping as write_mapping_file
     from pdhef_logtool.logs.discovery import one_place
+    from pdhef_logtool.runs.inspection import fields_of_log, inspect_log, render_fields, render_inspection
+    from pdhef_logtool.runs.inspection import write_mapping as write_mapping_file
 
     reading = config.read_options
     if topic is not None and not fields:
@@ -92,8 +92,8 @@ def map_(
     """
     import sys
 
-    from pdhef_logtool.inspection import ask_mapping, inspect_log, write_mapping
     from pdhef_logtool.logs.discovery import one_place
+    from pdhef_logtool.runs.inspection import ask_mapping, inspect_log, write_mapping
 
     reading = config.read_options
     place = one_place(log, private_redirects=config.allow_private_redirects)

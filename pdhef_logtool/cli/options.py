@@ -46,7 +46,7 @@ Jobs = Annotated[
 
 def local_folder(argument: str) -> Path:
     """Return the folder that an argument names; raises UsageError for a URL, as the command writes there."""
-    from pdhef_logtool.records.object_store import ObjectFolder, is_url
+    from pdhef_logtool.storage.object_store import ObjectFolder, is_url
 
     if is_url(argument):
         shown = ObjectFolder(argument).shown
@@ -195,7 +195,7 @@ def command(
         @functools.wraps(function)
         def run_command(**values: Any) -> None:
             if isinstance(output := values.get("output"), Path):
-                from pdhef_logtool.records.outputs import local_path
+                from pdhef_logtool.storage.outputs import local_path
 
                 values["output"] = local_path(output)
             if "config" in given:

@@ -39,9 +39,9 @@ def report(
     as_json: options.JsonFlag = False,
 ) -> None:
     """Write the HTML reports of a finished run again."""
-    from pdhef_logtool.records.outputs import OutputFolder
     from pdhef_logtool.reports.pages import write_pages
     from pdhef_logtool.results.opened_run import LOGS, open_run
+    from pdhef_logtool.storage.outputs import OutputFolder
 
     open_run(output)  # before the folder is held, which would make it where it is missing
     with OutputFolder(output, (LOGS,)), console.progress() as bar:

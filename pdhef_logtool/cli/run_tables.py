@@ -16,19 +16,19 @@ from pdhef_logtool.cli.console import cell, table
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.geometry import DEGREES
-from pdhef_logtool.records.shown import all_shown
+from pdhef_logtool.records.printable import all_shown
 from pdhef_logtool.results.opened_run import PAGE_FILE
-from pdhef_logtool.sinks.answer import NEARLY_HOLDS, degrees
-from pdhef_logtool.sinks.report import diverged_line, reasons_line
+from pdhef_logtool.results.run_report import diverged_line, reasons_line
+from pdhef_logtool.results.selected_estimate import NEARLY_HOLDS, degrees
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from pdhef_logtool.evaluation.metrics.metric import Metric
     from pdhef_logtool.evaluation.thresholds import Verdict
+    from pdhef_logtool.results.run_report import LogOutcome
     from pdhef_logtool.results.summary import RunSummary
     from pdhef_logtool.runs.pipeline import RunResult
-    from pdhef_logtool.sinks.report import LogOutcome
 
 _Report: TypeAlias = Mapping[str, Any]
 #: Signal, segment and metric.

@@ -204,7 +204,7 @@ def view(
     web: Annotated[bool, Option("--web", help="Open in the browser, for machines without a display.")] = False,
 ) -> None:
     """Open the recordings of a run in the Rerun viewer."""
-    from pdhef_logtool.sinks.base import is_finished_recording
+    from pdhef_logtool.results.sink import is_finished_recording
 
     named = find_recordings(output, log or ())
     recordings = [path for path in named if path == output or is_finished_recording(path)]

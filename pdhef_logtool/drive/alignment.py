@@ -24,10 +24,10 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.errors import MappingError
-from pdhef_logtool.records.release import MAX_PREDICTION_S
 from pdhef_logtool.records.signals import WHEELS, BoolArray, Channel, FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import MAX_PREDICTION_S
+from pdhef_logtool.storage.documents import jsonable
 
 Method: TypeAlias = Literal["exact", "interpolate", "hold", "next"]
 #: Which time makes a sample known: when it arrived at the recorder, or its own stamp (offline, not causal).

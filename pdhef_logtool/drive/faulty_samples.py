@@ -1,7 +1,7 @@
 """Samples of an IMU that a sensor fault has spoilt: relations between signals are looked at without them.
 
-The detector is that of the filters (:mod:`pdhef_logtool.watches.sensor_faults`). It cannot know whether a channel that
-reads next to nothing is dead or in another unit; here the whole drive is known.
+The detector is that of the filters (:mod:`pdhef_logtool.estimators.sensor_faults`). It cannot tell a dead
+channel from one in another unit; here the whole drive is available.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def without_faulty_samples(
     -------
     channels, and by name of those that lost samples the share of the drive's motion that the silent ones held.
     """
-    from pdhef_logtool.watches.sensor_faults import find_faults  # loads the compiler
+    from pdhef_logtool.estimators.sensor_faults import find_faults  # loads the compiler
 
     found = dict(signals)
     if any(n not in signals or not len(signals[n]) for n in _OTHER):

@@ -31,8 +31,8 @@ from pdhef_logtool.mapping import (
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.ledger import SampleCount, damage
-from pdhef_logtool.records.release import MAX_PREDICTION_S
 from pdhef_logtool.records.signals import Loss, Signals, join_signals
+from pdhef_logtool.records.steps import MAX_PREDICTION_S
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
 Tell = Callable[[str], None]

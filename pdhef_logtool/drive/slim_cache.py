@@ -21,11 +21,11 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.slim_log import FORMAT, is_whole
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.mapping.vendors import load_vendors
-from pdhef_logtool.records.documents import digest, jsonable
 from pdhef_logtool.records.errors import OutputError, PdhefError
-from pdhef_logtool.records.files import scratch_folder
-from pdhef_logtool.records.object_store import ObjectFolder, is_url
 from pdhef_logtool.records.version import __version__
+from pdhef_logtool.storage.documents import digest, jsonable
+from pdhef_logtool.storage.files import scratch_folder
+from pdhef_logtool.storage.object_store import ObjectFolder, is_url
 
 #: A process looks at what a cache holds each time that it has added this share of what it may hold.
 _LOOK_SHARE = 0.05

@@ -28,15 +28,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputState, check_inputs, r_scale, residual_rate
 from pdhef_logtool.estimators.filter_base import VX, FilterState, PosteriorSteps, sideslip_std
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter, of_car
-from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.release import RESTART_GAP_S, Extrapolation, StepColumns, step_durations_s
+from pdhef_logtool.estimators.sensor_faults import no_faults
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns, step_durations_s
 from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, StateTrack
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.watches.sensor_faults import no_faults
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car

@@ -12,8 +12,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from pdhef_logtool.records.release import Extrapolation, StepColumns
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import Extrapolation, StepColumns
 from pdhef_logtool.records.tracks import StateTrack, make_track
 
 # Entries of a step's values and of their time derivatives.

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.records.release import StepColumns
 from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.steps import StepColumns
 
 #: A window is checked at two stamps: one anywhere, one among its first samples, which costs little.
 SHORT_CUT = 256

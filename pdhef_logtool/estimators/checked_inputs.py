@@ -14,9 +14,9 @@ import numpy as np
 from pdhef_logtool.estimators.filter_base import FilterState
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter
+from pdhef_logtool.estimators.sensor_faults import FaultState, SensorFaults, find_faults
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
-from pdhef_logtool.watches.sensor_faults import FaultState, SensorFaults, find_faults
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from pdhef_logtool.estimators.base import Estimator, look_ahead_of, notes_of, predict_track, run_steps
-from pdhef_logtool.records.release import Extrapolation
 from pdhef_logtool.records.signals import IntArray, Signals
+from pdhef_logtool.records.steps import Extrapolation
 from pdhef_logtool.records.tracks import StateTrack
 
 

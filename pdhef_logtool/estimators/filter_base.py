@@ -25,18 +25,18 @@ from typing import NamedTuple
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.estimators.speed_slip import SlipState, believable
 from pdhef_logtool.estimators.unscented import unscented_weights
-from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.release import (
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import (
     RESTART_GAP_S,
     Extrapolation,
     StepColumns,
     last_stamp_ns,
     step_durations_s,
 )
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
-from pdhef_logtool.watches.speed_slip import SlipState, believable
 
 # State entries and measurement entries, by name.
 VX, VY, YAW_RATE, AX_BIAS = 0, 1, 2, 3

@@ -29,12 +29,12 @@ from pdhef_logtool.car.nominal_model import (
     substeps,
 )
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.filter_base import U_STEER, VX, FilterState
 from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
-from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
-from pdhef_logtool.records.release import last_stamp_ns, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.steps import last_stamp_ns, step_durations_s
 
 #: Aligned signals without which nothing can be estimated.
 NEEDS = frozenset({"steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})

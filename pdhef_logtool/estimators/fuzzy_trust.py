@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from pdhef_logtool.records.compiled import njit
+from pdhef_logtool.compiled.cache import njit
 
 #: Tops of the sets small, medium and large of E_ay in m/s².
 DEVIATION_TOPS_M_S2 = (0.3, 1.0, 2.5)

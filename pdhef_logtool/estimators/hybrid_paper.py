@@ -33,24 +33,24 @@ from pdhef_logtool.car.nominal_model import (
 )
 from pdhef_logtool.car.nominal_points import AT_VX, AT_VY, AT_YAW_RATE, advance_points, place, work_size
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators import filter_base as base
 from pdhef_logtool.estimators.filter_base import FilterState
 from pdhef_logtool.estimators.fuzzy_trust import NOMINAL_TRUST, fuzzy_trust
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.phy_ukf import PHY_UKF_Q_STD, measure_sigma_points, set_points
+from pdhef_logtool.estimators.speed_slip import believable
 from pdhef_logtool.estimators.unscented import (
     draw_sigma_points,
     innovation_moments,
     kalman_update,
     mean_and_covariance,
 )
-from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.release import Extrapolation
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import Extrapolation
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.features import PAPER_FEATURES
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
-from pdhef_logtool.watches.speed_slip import believable
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car

@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.base import AY, VX, VY, YAW_RATE, Steps
 from pdhef_logtool.estimators.stepwise import StepState, advance_speed, run_stepwise
-from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.release import RESTART_GAP_S
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.steps import RESTART_GAP_S
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car

@@ -15,8 +15,8 @@ from typing import Any
 from pdhef_logtool.estimators.base import Estimator, look_ahead_of, predict_track, run_steps
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.records.errors import EstimatorError
-from pdhef_logtool.records.release import StepColumns, extrapolation, release
 from pdhef_logtool.records.signals import IntArray, Signals
+from pdhef_logtool.records.steps import StepColumns, extrapolation, release
 from pdhef_logtool.records.tracks import StateTrack
 
 

@@ -12,8 +12,8 @@ from pdhef_logtool.estimators.base import Steps
 from pdhef_logtool.estimators.direct_network import direct_steps
 from pdhef_logtool.estimators.filter_base import VX, FilterState
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
-from pdhef_logtool.records.release import last_stamp_ns, step_durations_s
 from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.steps import last_stamp_ns, step_durations_s
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.low_pass import low_pass
 

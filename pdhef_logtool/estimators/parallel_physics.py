@@ -13,6 +13,7 @@ import numpy as np
 
 from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model_parameters
 from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.filter_base import (
     U_FRICTION,
     U_SPEED,
@@ -25,7 +26,6 @@ from pdhef_logtool.estimators.filter_base import (
 from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter, of_car
 from pdhef_logtool.estimators.physics_model import FRONT, REAR, Layout, PhysicsParameters, sensed_ay
-from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.bundle import PHYSICS_MODEL

@@ -36,6 +36,7 @@ from pdhef_logtool.car.nominal_points import (
 )
 from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators import filter_base as base
 from pdhef_logtool.estimators.unscented import (
     draw_sigma_points,
@@ -43,7 +44,6 @@ from pdhef_logtool.estimators.unscented import (
     kalman_update,
     mean_and_covariance,
 )
-from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.signals import Signals
 
 if TYPE_CHECKING:

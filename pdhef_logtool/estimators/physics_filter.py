@@ -23,6 +23,18 @@ import numpy as np
 from pdhef_logtool.car.nominal_model import ModelParameters, dynamic_share, model_parameters
 from pdhef_logtool.car.parts import PHYSICS, FilterNoise
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, corrected_anew
+from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.compiled.vectors import (
+    LANES,
+    ROOM,
+    aligned,
+    first_half_twice,
+    inner_products,
+    load,
+    spread,
+    store,
+    total,
+)
 from pdhef_logtool.estimators import filter_base as base
 from pdhef_logtool.estimators.filter_base import LINK_WHOLE
 from pdhef_logtool.estimators.physics_model import (
@@ -54,19 +66,7 @@ from pdhef_logtool.estimators.physics_model import (
     step_count,
 )
 from pdhef_logtool.estimators.unscented import whiten, wide_root
-from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.signals import FloatArray, Signals
-from pdhef_logtool.records.vectors import (
-    LANES,
-    ROOM,
-    aligned,
-    first_half_twice,
-    inner_products,
-    load,
-    spread,
-    store,
-    total,
-)
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car

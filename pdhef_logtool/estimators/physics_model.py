@@ -37,7 +37,7 @@ import numpy as np
 from pdhef_logtool.car.nominal_model import KINEMATIC_TIME_CONSTANT_S, MAX_SUBSTEPS, dynamic_share, substeps
 from pdhef_logtool.car.nominal_points import arctangent, sine
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.records.compiled import njit
+from pdhef_logtool.compiled.cache import njit
 
 #: Entries of the state that every car has, and how many of the others its parts add.
 VX, VY, YAW_RATE, AX_BIAS, FRONT, REAR = range(6)

@@ -4,9 +4,9 @@
 
 v_y,i is that of the physics filter on the vehicle one posterior 1-sigma away in direction i, without the states that
 cure what a car lacks. w is what accelerometer and gyro say against the estimate's own changes, ``kinematic`` of
-:mod:`~pdhef_logtool.watches.error_features`: driving unlike that of the identification shows there. Both are known on
-line, so that the band is causal. The own one counts less, for the noise of an identified car takes in what its model
-leaves of a_y.
+:mod:`~pdhef_logtool.estimators.error_features`: driving unlike that of the identification shows there. Both are
+available online, so that the band is causal. The own one counts less, for the
+noise of an identified car includes what its model leaves of a_y.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import numpy as np
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.adaptive_physics import CURES
+from pdhef_logtool.estimators.error_features import TERMS, FeatureState, error_terms
 from pdhef_logtool.estimators.latency_compensation import WindowState, run_window
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter, of_car
 from pdhef_logtool.estimators.self_calibrated import widened
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.watches.error_features import TERMS, FeatureState, error_terms
 
 #: k_o above, chosen on 8 simulated cars, identified on one drive and judged on drives of other manoeuvres. The other
 #: two count as they are.

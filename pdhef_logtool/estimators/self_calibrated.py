@@ -25,11 +25,11 @@ import numpy as np
 from pdhef_logtool.car.car import WithoutTruth
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
 from pdhef_logtool.estimators.base import Estimator, look_ahead_of, notes_of, predict_track, run_steps
+from pdhef_logtool.estimators.intervals import MAX_SIDESLIP_STD_RAD
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.records.release import Extrapolation
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import Extrapolation
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.watches.intervals import MAX_SIDESLIP_STD_RAD
 
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.physics_filter import PhysicsFilter

@@ -33,6 +33,8 @@ from typing import TypeAlias
 
 import numpy as np
 
+from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.compiled.vectors import LANES, ROOM, aligned, load, spread, store
 from pdhef_logtool.estimators.adaptive_physics import (
     FORGET_S,
     AdaptivePhysics,
@@ -52,11 +54,9 @@ from pdhef_logtool.estimators.filter_base import (
 )
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.estimators.unscented import wide_root
-from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.release import RESTART_GAP_S, Extrapolation, StepColumns, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals, join_signals
+from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns, step_durations_s
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.records.vectors import LANES, ROOM, aligned, load, spread, store
 
 #: A step sees at least this much ahead and at most twice as much. Sensor biases remember for minutes: against a
 #: smoother that sees all of a drive of 300 s this changed v_y by less than 5e-5 m/s (60 s: 5e-4 m/s).

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.base import VX, Steps
-from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.release import last_stamp_ns, step_durations_s
+from pdhef_logtool.estimators.speed_slip import ASSUMED_STD_M_S, SlipState, believable
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
-from pdhef_logtool.watches.speed_slip import ASSUMED_STD_M_S, SlipState, believable
+from pdhef_logtool.records.steps import last_stamp_ns, step_durations_s
 
 #: A speed sample is carried on by a_x for this long.
 SPEED_HOLD_S = 0.5

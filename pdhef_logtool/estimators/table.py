@@ -19,7 +19,7 @@ from pdhef_logtool.estimators.presets import Options as Options
 from pdhef_logtool.estimators.presets import check_options, options_of, preset_of
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED, SelfCalibrated
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.shown import shown
+from pdhef_logtool.records.printable import shown
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 
 _ESP = frozenset({"steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
@@ -100,7 +100,7 @@ class Spec:
 #: Estimators of other packages: each entry point names a :class:`Spec`.
 ENTRY_POINTS = "pdhef.estimators"
 #: What the fork server of workers that filter has loaded.
-FILTERS = ("pdhef_logtool.estimators.*", "pdhef_logtool.records.compiled:load_kept")
+FILTERS = ("pdhef_logtool.estimators.*", "pdhef_logtool.compiled.cache:load_kept")
 #: In place of names: every estimator that the car suits.
 ALL_ESTIMATORS = "all"
 #: Those of this package, in the order of the tables.

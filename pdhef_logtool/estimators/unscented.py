@@ -11,9 +11,9 @@ import math
 
 import numpy as np
 
-from pdhef_logtool.records.compiled import njit
+from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.compiled.vectors import factor
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.records.vectors import factor
 
 #: Smallest variance that a repaired covariance keeps on its diagonal.
 COVARIANCE_FLOOR = 1e-12
@@ -74,7 +74,7 @@ def repair_covariance(P):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def wide_root(P, places, there, L):  # type: ignore[no-untyped-def]
-    """Write the factor of P (see :func:`~pdhef_logtool.records.vectors.factor`); P is repaired if needed.
+    """Write the factor of P (see :func:`~pdhef_logtool.compiled.vectors.factor`); P is repaired if needed.
 
     ``places`` are the entries that are ``there``.
     """

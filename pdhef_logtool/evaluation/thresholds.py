@@ -20,8 +20,8 @@ from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.metrics.sensor_residuals import SENSORS
 from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.units import SIGNALS, typed_unit
-from pdhef_logtool.records.documents import checked, read_toml, unknown
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.storage.documents import checked, read_toml, unknown
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1)]

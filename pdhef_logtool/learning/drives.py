@@ -26,8 +26,8 @@ from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
 from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.sinks.report import tool_versions
 
 #: Stages of ``pdhef learn`` in the order in which they run.
 IDENTIFY, NOISE, GAIN, NETWORK, INTERVALS = STAGES = ("identify", "noise", "gain", "network", "intervals")

@@ -59,14 +59,14 @@ from pdhef_logtool.learning.stages.noise import tune
 from pdhef_logtool.learning.stages.task import Progress, StageOutput, Task
 from pdhef_logtool.logs.discovery import LogInput, Logs, hash_log
 from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.records.documents import digest, seal
 from pdhef_logtool.records.errors import EstimatorError, ModelError, UsageError
-from pdhef_logtool.records.files import write_bytes
-from pdhef_logtool.records.outputs import LOCK_FILE, OutputFolder, check_no_input, local_path
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import MANY_CARS, NO_MODEL
 from pdhef_logtool.residual_model.torch_extra import check_torch
-from pdhef_logtool.sinks.report import json_bytes
+from pdhef_logtool.results.run_report import json_bytes
+from pdhef_logtool.storage.documents import digest, seal
+from pdhef_logtool.storage.files import write_bytes
+from pdhef_logtool.storage.outputs import LOCK_FILE, OutputFolder, check_no_input, local_path
 
 FORMAT, FORMAT_VERSION = "pdhef-learn", 2
 #: In the car's folder: the stages' results, and the record, page and plot of the whole.

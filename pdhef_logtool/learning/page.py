@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from pdhef_logtool.learning.plots import new_figure, png_bytes
-from pdhef_logtool.records.shown import shown
+from pdhef_logtool.records.printable import shown
 
 _COLOURS = {"kept": "#009E73", "undone": "#D55E00", "not done": "0.6"}
 #: Use of each part of the drives.

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.drive.reading import Tell
-from pdhef_logtool.records.documents import digest, read_sealed, seal
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.files import write_bytes, writing
-from pdhef_logtool.records.outputs import FolderTransaction
 from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES
-from pdhef_logtool.sinks.report import json_bytes
+from pdhef_logtool.results.run_report import json_bytes
+from pdhef_logtool.storage.documents import digest, read_sealed, seal
+from pdhef_logtool.storage.files import write_bytes, writing
+from pdhef_logtool.storage.outputs import FolderTransaction
 
 STAGE_FILE = "step.json"
 

@@ -11,8 +11,8 @@ from functools import cache
 from pathlib import Path
 
 from pdhef_logtool.logs.schema_files import shipped_definition
-from pdhef_logtool.records.documents import read_text
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.storage.documents import read_text
 
 #: A workspace with more files is more than messages, and a longer text is no message.
 MOST_FILES = 50_000

@@ -39,10 +39,10 @@ from pdhef_logtool.logs.formats import (
 from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.logs.slim_log import SlimLog, slim_record
-from pdhef_logtool.records.documents import read_text
 from pdhef_logtool.records.errors import LogError, PdhefError
-from pdhef_logtool.records.files import scratch_folder
 from pdhef_logtool.records.signals import IntArray, Loss
+from pdhef_logtool.storage.documents import read_text
+from pdhef_logtool.storage.files import scratch_folder
 
 _REMEDY = "give the recording itself"
 #: What a log of a container is called in reports, as a file and as a folder.

@@ -29,7 +29,7 @@ from pdhef_logtool.logs.remote_objects import (
     try_in_turn,
 )
 from pdhef_logtool.logs.remote_place import RemotePlace
-from pdhef_logtool.records.files import scratch_folder
+from pdhef_logtool.storage.files import scratch_folder
 
 Extent: TypeAlias = tuple[int, int]
 

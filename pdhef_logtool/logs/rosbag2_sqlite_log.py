@@ -27,8 +27,8 @@ from pdhef_logtool.logs.container import (
 )
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.type_names import ros2_type_name
-from pdhef_logtool.records.files import scratch_folder
 from pdhef_logtool.records.signals import IntArray
+from pdhef_logtool.storage.files import scratch_folder
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.log_file import LogFile

@@ -25,9 +25,9 @@ from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.occupied_time import OccupiedTime
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import LogError
-from pdhef_logtool.records.files import scratch_folder, write_bytes
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.records.version import LIBRARY
+from pdhef_logtool.storage.files import scratch_folder, write_bytes
 
 #: Of the record's content; another one is not read.
 FORMAT = 1

@@ -40,9 +40,9 @@ from pdhef_logtool.logs.encoding import CdrEncoder
 from pdhef_logtool.logs.mcap_log import MESSAGE_HEAD
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.records.errors import MappingError, OutputError
-from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.records.version import LIBRARY
+from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
 if TYPE_CHECKING:
     from zstandard import ZstdCompressor

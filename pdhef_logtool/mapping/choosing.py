@@ -10,9 +10,9 @@ from pdhef_logtool.logs.slim_log import SlimLog
 from pdhef_logtool.mapping.checking import check_mapping
 from pdhef_logtool.mapping.recognition import Ambiguity, AutoMapping, auto_map
 from pdhef_logtool.mapping.records import Mapping
-from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.errors import LogError, MappingError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS
+from pdhef_logtool.storage.documents import jsonable
 
 
 @dataclass(frozen=True, slots=True)

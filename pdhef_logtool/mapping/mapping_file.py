@@ -26,9 +26,9 @@ from pdhef_logtool.mapping.records import (
     SignalSource,
     StampUnit,
 )
-from pdhef_logtool.records.documents import checked, read_toml, unknown
 from pdhef_logtool.records.errors import MappingError, MappingFileError
 from pdhef_logtool.records.signals import ESTIMATE_UNITS, SIGNAL_UNITS, TRUTH_UNITS, WHEELS
+from pdhef_logtool.storage.documents import checked, read_toml, unknown
 
 if TYPE_CHECKING:
     from pdhef_logtool.mapping.candidates import Candidate

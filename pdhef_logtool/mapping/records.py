@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 from pdhef_logtool.records.checks import Check
-from pdhef_logtool.records.documents import digest, jsonable
+from pdhef_logtool.storage.documents import digest, jsonable
 
 #: Number of columns of the truth channels that are vectors; all other signals are scalars.
 VECTOR_COLUMNS: dict[str, int] = {"ecef_position_m": 3, "ecef_velocity_m_s": 3, "enu_velocity_m_s": 3, "quat_wxyz": 4}

@@ -16,9 +16,9 @@ from pdhef_logtool.logs.drive_log import TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.naming import Meaning
 from pdhef_logtool.mapping.records import VECTOR_COLUMNS, SignalSource
-from pdhef_logtool.records.documents import checked, read_toml
 from pdhef_logtool.records.errors import MappingFileError
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS
+from pdhef_logtool.storage.documents import checked, read_toml
 
 #: Names a file like ``vendors.toml`` whose entries come before those that are shipped.
 USERS_FILE = "PDHEF_VENDORS"

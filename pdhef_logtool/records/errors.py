@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from pdhef_logtool.records.shown import shown
+from pdhef_logtool.records.printable import shown
 
 EXIT_OK = 0
 EXIT_FAILURE = 1

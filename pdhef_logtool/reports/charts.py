@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.records.shown import all_shown
+from pdhef_logtool.records.printable import all_shown
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.reports.encoding import Grid, encode
 

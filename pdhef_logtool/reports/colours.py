@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from pdhef_logtool.estimators.table import all_specs
-from pdhef_logtool.sinks.base import TRUTH
-from pdhef_logtool.sinks.palette import colour_rgb
+from pdhef_logtool.results.palette import colour_rgb
+from pdhef_logtool.results.sink import TRUTH
 
 INK = "#1a1a1a"
 #: Of what is wrong, of what is only told, and of what goes on; safe beside each other for the colour-blind.

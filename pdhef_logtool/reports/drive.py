@@ -13,7 +13,7 @@ from pdhef_logtool.reports.drive_figures import DriveFigures, Roles, drive_figur
 from pdhef_logtool.reports.drive_tables import by_segment, consistency, definitions, disagreements, residuals, scores
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
-from pdhef_logtool.sinks.report import reasons_line
+from pdhef_logtool.results.run_report import reasons_line
 
 #: What reports of earlier versions do not say: the default of a vehicle file.
 _LOW_SPEED_M_S = 3.0

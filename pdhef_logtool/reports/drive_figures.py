@@ -16,7 +16,7 @@ from pdhef_logtool.reports.charts import Band, Charts, Cloud, Mark, Row, Series,
 from pdhef_logtool.reports.colours import FAULT, NOTE, PLAIN, colour
 from pdhef_logtool.reports.drive_series import DriveSeries, Points, Reference, SideslipTrack, Tracks, gather
 from pdhef_logtool.reports.encoding import grid_of
-from pdhef_logtool.sinks.base import TRUTH
+from pdhef_logtool.results.sink import TRUTH
 
 #: What nobody sees on a page, in degrees, as a share, and in m/s or m/s².
 _DEGREES_SEEN, _SHARE_SEEN, _SEEN = 0.001, 0.001, 0.002

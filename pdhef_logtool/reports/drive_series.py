@@ -16,8 +16,8 @@ from pdhef_logtool.records.geometry import DEGREES, wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.reports.encoding import Envelope, FirstKnown, Grid, Means
-from pdhef_logtool.sinks.base import TRUTH
-from pdhef_logtool.sinks.parquet import list_estimators, read_blocks
+from pdhef_logtool.results.parquet_sink import list_estimators, read_blocks
+from pdhef_logtool.results.sink import TRUTH
 
 #: NIS is shown as its mean over so long.
 _NIS_S = 1.0

@@ -1,6 +1,6 @@
 """A whole HTML file from a template and figures: nothing in it is fetched, and nothing of a log in it can run.
 
-Texts go through jinja's escaping and :func:`~pdhef_logtool.records.shown.shown`, series are base64; the page's
+Texts go through jinja's escaping and :func:`~pdhef_logtool.records.printable.shown`, series are base64; the page's
 Content-Security-Policy allows its own scripts and its own style by their digests and forbids everything else.
 """
 
@@ -18,7 +18,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from pdhef_logtool.records.shown import shown
+from pdhef_logtool.records.printable import shown
 from pdhef_logtool.records.version import __version__
 from pdhef_logtool.reports.charts import Charts
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, OutputError
-from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedLog, OpenedRun
+from pdhef_logtool.storage.files import write_bytes
 
 if TYPE_CHECKING:
     from pdhef_logtool.reports.drive import DrivePage

@@ -9,8 +9,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.records.files import write_bytes
-from pdhef_logtool.records.shown import shown
+from pdhef_logtool.records.printable import shown
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.reports.charts import (
     BarsFigure,
@@ -22,6 +21,7 @@ from pdhef_logtool.reports.charts import (
     TimeFigure,
 )
 from pdhef_logtool.reports.encoding import Grid
+from pdhef_logtool.storage.files import write_bytes
 
 _Axes: TypeAlias = Any
 #: Inches, at _DPI a slide's width of 1600 points.

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.records.documents import read_json
 from pdhef_logtool.records.errors import ModelError
-from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel, load_linear_model
+from pdhef_logtool.storage.documents import read_json
+from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
 FORMAT = "pdhef.residual-model"
 FORMAT_VERSION = 2

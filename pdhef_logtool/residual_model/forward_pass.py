@@ -18,7 +18,7 @@ from numba.core import cgutils
 from numba.core.errors import TypingError
 from numba.extending import intrinsic
 
-from pdhef_logtool.records.compiled import njit
+from pdhef_logtool.compiled.cache import njit
 
 Float32Array: TypeAlias = np.ndarray[Any, np.dtype[np.float32]]
 

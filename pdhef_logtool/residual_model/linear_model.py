@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.records.documents import digest, read_json
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.storage.documents import digest, read_json
 
 FORMAT = "pdhef.linear-regression"
 FORMAT_VERSION = 1

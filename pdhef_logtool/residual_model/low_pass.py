@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from pdhef_logtool.records.compiled import njit
+from pdhef_logtool.compiled.cache import njit
 
 
 @njit(cache=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.results.pairing import Pair
-from pdhef_logtool.sinks.base import TRUTH, resolution
+from pdhef_logtool.results.sink import TRUTH, resolution
 
 if TYPE_CHECKING:
     import polars as pl

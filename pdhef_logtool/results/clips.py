@@ -11,12 +11,12 @@ from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import OutputError, PdhefError
-from pdhef_logtool.records.outputs import FolderTransaction, OutputFolder
 from pdhef_logtool.results.events import FoundEvent, FoundEvents
+from pdhef_logtool.results.mcap_sink import NAMESPACE, AnnotatedMcapSink
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
-from pdhef_logtool.sinks.base import TRUTH
-from pdhef_logtool.sinks.mcap import NAMESPACE, AnnotatedMcapSink
-from pdhef_logtool.sinks.parquet import list_estimators, read_track
+from pdhef_logtool.results.parquet_sink import list_estimators, read_track
+from pdhef_logtool.results.sink import TRUTH
+from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder
 
 #: Folder of the clips within those of a run; it holds those of the last search alone.
 CLIPS = "clips"

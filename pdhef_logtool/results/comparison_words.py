@@ -8,7 +8,7 @@ from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.results.changed_signals import ChangedSignal
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison
 from pdhef_logtool.results.paired_change import LEAST_CLUSTERS
-from pdhef_logtool.sinks.base import TRUTH
+from pdhef_logtool.results.sink import TRUTH
 
 _COLUMN_UNITS = {"rad": "rad", "rad_s": "rad/s", "m_s": "m/s", "m_s2": "m/s^2"}
 _BY = {"signals": "what their signals held", "content": "their files", "name": "their names alone"}

@@ -12,11 +12,11 @@ import numpy as np
 
 from pdhef_logtool.evaluation.segments import RUN_GAP_S
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
-from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.results.expression import ERRORS, FLAGS, OPERATIONS, SPEED, Column, Condition, Node, Number
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
-from pdhef_logtool.sinks.base import TRUTH
+from pdhef_logtool.results.sink import TRUTH
+from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
 if TYPE_CHECKING:
     import polars as pl

@@ -14,8 +14,8 @@ from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.thresholds import unit_of
 from pdhef_logtool.evaluation.units import LABELS, SIGNALS
-from pdhef_logtool.records.documents import checked, read_toml, unknown
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.storage.documents import checked, read_toml, unknown
 
 #: What stands for A's main estimator of each drive.
 MAIN = "main"

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel, ConfigDict
 
 from pdhef_logtool.logs.discovery import RUN_FILE
-from pdhef_logtool.records.documents import file_sha256, read_json, read_sealed, validated
 from pdhef_logtool.records.errors import OutputError, PdhefError
-from pdhef_logtool.records.object_store import Mirror, is_url
+from pdhef_logtool.storage.documents import file_sha256, read_json, read_sealed, validated
+from pdhef_logtool.storage.object_store import Mirror, is_url
 
 if TYPE_CHECKING:
     import polars as pl
@@ -184,7 +184,7 @@ def _check(path: Path, sha256: str | None, remedy: str) -> None:
     try:
         if sha256 is None:
             if path.suffix == ".parquet":
-                from pdhef_logtool.sinks.parquet import check_parquet
+                from pdhef_logtool.results.parquet_sink import check_parquet
 
                 check_parquet(path, path.name)
         elif file_sha256(path) != sha256:

@@ -18,10 +18,10 @@ from pdhef_logtool.drive.cached import cached
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.open_log import log_metadata
 from pdhef_logtool.mapping import mapping_of
-from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.journal import digest_of
+from pdhef_logtool.storage.documents import read_toml, validated
 
 _Name = Annotated[str, Field(min_length=1)]
 

@@ -17,7 +17,7 @@ from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.presets import preset_of
 from pdhef_logtool.estimators.table import Options, all_names, make_estimator
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
-from pdhef_logtool.records.supervisor import Tell, supervise
+from pdhef_logtool.workers.supervisor import Tell, supervise
 
 #: Parts that are no estimators: the filter of ``physics``, and what runs beside it over every drive.
 _FILTER, _CHECKS = "filter", "checks"
@@ -36,11 +36,11 @@ _STEP_NS, _STEPS = 10_000_000, 100
 
 def compile_for(names: Sequence[str]) -> None:
     """Compile what estimators need most time for, in several processes, if it is not kept already."""
-    from pdhef_logtool.records import compiled
+    from pdhef_logtool.compiled import cache
 
     wanted = {*names, _CHECKS, *([_FILTER] if set(map(preset_of, names)) & set(_FILTERED) else [])}
-    parts = [part for part, last in _LAST.items() if part in wanted and not compiled.is_kept(last)]
-    if min(len(parts), _processors()) > 1 and compiled.kept_in() is not None and hasattr(os, "fork"):
+    parts = [part for part, last in _LAST.items() if part in wanted and not cache.is_kept(last)]
+    if min(len(parts), _processors()) > 1 and cache.kept_in() is not None and hasattr(os, "fork"):
         with suppress(OSError, RuntimeError):  # the run compiles in its own process where no others can be started
             compile_parts(parts)
 
@@ -65,11 +65,11 @@ def compile_part(part: str, tell: Tell) -> None:
 
 def compile_parts(parts: Sequence[str], work: Callable[[str, Tell], None] = compile_part) -> None:
     """Compile parts in as many processes as there are processors; an error shows where the part is used."""
-    from pdhef_logtool.records import compiled
+    from pdhef_logtool.compiled import cache
 
-    compiled.announce()
+    cache.announce()
     jobs = min(_processors(), len(parts)) if hasattr(os, "fork") else 1
-    preload = ("pdhef_logtool.estimators.*", "pdhef_logtool.records.compiled:be_silent", work.__module__)
+    preload = ("pdhef_logtool.estimators.*", "pdhef_logtool.compiled.cache:be_silent", work.__module__)
     for _ in supervise(work, parts, jobs=jobs, preload=preload):
         pass
 
@@ -82,11 +82,11 @@ def _compile_filter() -> None:
 
 
 def _compile_checks() -> None:
+    from pdhef_logtool.estimators.divergence import wrong_branch
+    from pdhef_logtool.estimators.error_features import error_terms
+    from pdhef_logtool.estimators.sensor_faults import find_faults
+    from pdhef_logtool.estimators.speed_slip import without_slip
     from pdhef_logtool.residual_model.features import FEATURES
-    from pdhef_logtool.watches.divergence import wrong_branch
-    from pdhef_logtool.watches.error_features import error_terms
-    from pdhef_logtool.watches.sensor_faults import find_faults
-    from pdhef_logtool.watches.speed_slip import without_slip
 
     car, signals = Car.load("saloon"), _windows()[0]
     _compile_algebra()

@@ -17,11 +17,11 @@ from pdhef_logtool.car.car import NO_INTERVALS, SHIPPED_CARS, UNSURE
 from pdhef_logtool.drive.friction import parse_friction
 from pdhef_logtool.drive.options import WINDOW_S, ReadOptions, parse_time
 from pdhef_logtool.estimators.presets import split_names
-from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.object_store import is_url
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED_FOLDERS
+from pdhef_logtool.storage.documents import read_toml, validated
+from pdhef_logtool.storage.object_store import is_url
 
 _FILES = ("car", "cars", "mapping", "msgs", "thresholds", "network", "intervals")
 #: Settings that change no result.

@@ -17,14 +17,14 @@ from pdhef_logtool.evaluation.reasons import SensorFault, sensor_faults
 from pdhef_logtool.evaluation.segments import moving_mask
 from pdhef_logtool.evaluation.standing import standings
 from pdhef_logtool.evaluation.thresholds import Verdict
-from pdhef_logtool.records.shown import shown
+from pdhef_logtool.records.printable import shown
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.results.run_report import DriveDetails
+from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.runs.drive_sample import sample_drive
 from pdhef_logtool.runs.error_budget import ErrorBudget, error_budget, no_budget
 from pdhef_logtool.runs.innovations import channel_innovations
-from pdhef_logtool.sinks.base import TRUTH
-from pdhef_logtool.sinks.report import DriveDetails
 
 #: Entries of a log's metadata that a report keeps, and signs of each.
 _MOST_METADATA, _MOST_SIGNS = 64, 200

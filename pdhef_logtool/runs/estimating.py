@@ -14,13 +14,13 @@ from pdhef_logtool.drive.windows import with_look_ahead
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, look_ahead_of
 from pdhef_logtool.estimators.causality_check import CausalityCheck
+from pdhef_logtool.estimators.intervals import TrackCalibrator
 from pdhef_logtool.estimators.latency_compensation import WindowState, run_window
 from pdhef_logtool.estimators.presets import preset_of
 from pdhef_logtool.estimators.self_calibrated import SELF_CALIBRATED, CalibratedBand
 from pdhef_logtool.records.geometry import DeadReckoner
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.watches.intervals import TrackCalibrator
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +60,7 @@ def estimate_windows(
     EstimatorError
         The drive holds no stamp.
     """
-    from pdhef_logtool.watches.divergence import DivergenceWatch
+    from pdhef_logtool.estimators.divergence import DivergenceWatch
 
     watch = DivergenceWatch(drive.plan.vehicle) if watched else None
     states: dict[str, WindowState] = {}

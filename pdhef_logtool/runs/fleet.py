@@ -35,14 +35,8 @@ from pdhef_logtool.logs.discovery import (
     with_free_stem,
 )
 from pdhef_logtool.mapping import Mapping, mapping_of
-from pdhef_logtool.records.documents import file_sha256
 from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, WorkerError
-from pdhef_logtool.records.files import writing
-from pdhef_logtool.records.object_store import is_url
-from pdhef_logtool.records.outputs import OutputFolder
 from pdhef_logtool.records.processes import own_name
-from pdhef_logtool.records.ray_supervisor import supervise_on_ray
-from pdhef_logtool.records.supervisor import Ended, Limits, Tell, supervise
 from pdhef_logtool.results.opened_run import (
     JOURNAL_FILE,
     LOGS,
@@ -53,6 +47,7 @@ from pdhef_logtool.results.opened_run import (
     OpenedLog,
     open_run,
 )
+from pdhef_logtool.results.run_report import LogOutcome, build_run, run_versions, tool_versions, write_json
 from pdhef_logtool.runs.cars import RunCars, car_record
 from pdhef_logtool.runs.config import Keep, RunConfig
 from pdhef_logtool.runs.journal import Entry, Journal, Place, changes, digest_of, outputs_digest
@@ -71,12 +66,17 @@ from pdhef_logtool.runs.pipeline import (
 )
 from pdhef_logtool.runs.self_calibrating import calibrate_pool
 from pdhef_logtool.runs.stored_output import StoredEnd, StoredOutput, stored_drive
-from pdhef_logtool.sinks.report import LogOutcome, build_run, run_versions, tool_versions, write_json
+from pdhef_logtool.storage.documents import file_sha256
+from pdhef_logtool.storage.files import writing
+from pdhef_logtool.storage.object_store import is_url
+from pdhef_logtool.storage.outputs import OutputFolder
+from pdhef_logtool.workers.ray_supervisor import supervise_on_ray
+from pdhef_logtool.workers.supervisor import Ended, Limits, Tell, supervise
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
     from pdhef_logtool.evaluation.thresholds import Threshold
-    from pdhef_logtool.self_calibration.calibration import SelfCalibration
 
 #: Drives with the largest errors that are kept in full where the run itself chose to keep metrics alone.
 FULL_WORST = 5
@@ -85,7 +85,7 @@ SILENCE_S = 600.0
 #: What each choice keeps includes what those before it keep.
 _KEPT = ("metrics", "estimates", "full")
 #: What the workers have loaded; polars starts threads at its first query, and none of these makes one.
-_PRELOAD = ("pdhef_logtool.runs.*", "pdhef_logtool.logs.*", "pdhef_logtool.sinks.parquet", *FILTERS)
+_PRELOAD = ("pdhef_logtool.runs.*", "pdhef_logtool.logs.*", "pdhef_logtool.results.parquet_sink", *FILTERS)
 #: Entries of the configuration that change no figure and no file that is kept, or are told apart by themselves.
 _NO_SETTING = frozenset(
     {
@@ -322,7 +322,7 @@ def _on_node(work: Callable[[DriveTask, Tell], Any], here: Path, mark: Path | No
 
 
 def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
-    from pdhef_logtool.sinks.parquet import write_metrics
+    from pdhef_logtool.results.parquet_sink import write_metrics
 
     cars, mapping = _opened(task)
     cars = replace(cars, warn=warned.append)
@@ -771,7 +771,7 @@ class _Fleet:
 
     def collect(self) -> list[LogResult]:
         """Write metrics.parquet and run.json of all that is done, and return it in the order of the plan."""
-        from pdhef_logtool.sinks.parquet import join_metrics
+        from pdhef_logtool.results.parquet_sink import join_metrics
 
         folders = folders_of([p.log for p in self.planned])
         entries = [(e, f) for p, f in zip(self.planned, folders, strict=True) if (e := self._entry(p)) is not None]

@@ -13,9 +13,9 @@ from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.table import Options, Skipped, runnable
 from pdhef_logtool.records.signals import Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 from pdhef_logtool.runs.selection import default_names
-from pdhef_logtool.sinks.base import TRUTH
 
 if TYPE_CHECKING:
     import polars as pl
@@ -41,7 +41,7 @@ class Estimates:
         """Return the tracks as rows of estimates.parquet, in SI units."""
         import polars as pl
 
-        from pdhef_logtool.sinks.parquet import track_table
+        from pdhef_logtool.results.parquet_sink import track_table
 
         frames = (pl.DataFrame(track_table(track)) for track in self.tracks.values())
         return pl.concat(f.with_columns(pl.col("estimator").cast(pl.String)) for f in frames)

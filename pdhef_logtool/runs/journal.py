@@ -19,11 +19,11 @@ from typing import Any
 
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.remote_place import RemotePlace
-from pdhef_logtool.records.documents import digest, jsonable
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.results.opened_run import JOURNAL_FILE
-from pdhef_logtool.sinks.report import CarFacts, LogOutcome
+from pdhef_logtool.results.run_report import CarFacts, LogOutcome
+from pdhef_logtool.storage.documents import digest, jsonable
+from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
 _FORMAT = {"format": "pdhef.journal", "version": 2}
 #: Part of what a checksum is of, so that lines of another version of the format are left out as damaged ones are.

@@ -19,10 +19,10 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.fallback import Fallback
+from pdhef_logtool.estimators.intervals import TrackCalibrator
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, Skipped, all_specs, runnable
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
 from pdhef_logtool.mapping import Mapping, merge_losses
-from pdhef_logtool.records.documents import file_sha256
 from pdhef_logtool.records.errors import (
     EXIT_FAILURE,
     EXIT_GATE,
@@ -32,7 +32,6 @@ from pdhef_logtool.records.errors import (
     UsageError,
 )
 from pdhef_logtool.records.ledger import SampleCount
-from pdhef_logtool.records.outputs import OutputFolder, Transaction, check_no_input
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
 from pdhef_logtool.results.opened_run import (
     ESTIMATES_FILE,
@@ -43,14 +42,7 @@ from pdhef_logtool.results.opened_run import (
     REPORT_FILE,
     OpenedLog,
 )
-from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.estimating import calibrator, estimate_windows
-from pdhef_logtool.runs.scoring import evaluate, in_time
-from pdhef_logtool.runs.selection import PREFERRED, Contradiction, choose_main, contradiction, default_names
-from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
-from pdhef_logtool.runs.track_store import TrackStore
-from pdhef_logtool.sinks.base import LONGEST_WHOLE_NS, TRUTH, Event, Shown, Sink
-from pdhef_logtool.sinks.report import (
+from pdhef_logtool.results.run_report import (
     CarFacts,
     EstimatorFacts,
     FrictionFacts,
@@ -67,14 +59,22 @@ from pdhef_logtool.sinks.report import (
     tool_versions,
     write_json,
 )
-from pdhef_logtool.watches.intervals import TrackCalibrator
+from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, Shown, Sink
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.estimating import calibrator, estimate_windows
+from pdhef_logtool.runs.scoring import evaluate, in_time
+from pdhef_logtool.runs.selection import PREFERRED, Contradiction, choose_main, contradiction, default_names
+from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
+from pdhef_logtool.runs.track_store import TrackStore
+from pdhef_logtool.storage.documents import file_sha256
+from pdhef_logtool.storage.outputs import OutputFolder, Transaction, check_no_input
 
 if TYPE_CHECKING:
+    from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
     from pdhef_logtool.evaluation.metrics import MetricRow
     from pdhef_logtool.evaluation.thresholds import Threshold, Verdict
-    from pdhef_logtool.records.object_store import Mirror
-    from pdhef_logtool.self_calibration.calibration import SelfCalibration
-    from pdhef_logtool.sinks.answer import MainFacts
+    from pdhef_logtool.results.selected_estimate import MainFacts
+    from pdhef_logtool.storage.object_store import Mirror
 
 #: ``update(text, share)`` with share in [0, 1].
 Progress = Callable[[str, float], None]
@@ -134,7 +134,7 @@ class LogResult:
     @property
     def rows(self) -> tuple[MetricRow, ...]:
         """The figures; raises OutputError for a damaged file of them."""
-        from pdhef_logtool.sinks.parquet import read_metrics
+        from pdhef_logtool.results.parquet_sink import read_metrics
 
         if self.figures is not None:
             return self.figures
@@ -228,7 +228,7 @@ def judge(result: LogResult, thresholds: Sequence[Threshold] | None) -> LogResul
 
 def write_verdicts(junit: Path | None, results: Sequence[LogResult]) -> None:
     """Write JUnit XML if a file is asked for; raises OutputError."""
-    from pdhef_logtool.sinks.junit import write_junit
+    from pdhef_logtool.results.junit import write_junit
 
     if junit is not None:
         checks = {r.outcome.log: (r.report or {}).get("checks", ()) for r in results}
@@ -370,7 +370,7 @@ def _run_estimators(
         if config.kept == "metrics":
             report = brief_report(report)
         else:
-            from pdhef_logtool.sinks.parquet import write_metrics
+            from pdhef_logtool.results.parquet_sink import write_metrics
 
             write_metrics(change.file(METRICS_FILE), rows)
         write_json(change.file(REPORT_FILE), report, brief=config.kept == "metrics")
@@ -436,9 +436,9 @@ def _open_sinks(
     change: Transaction, drive: Drive, config: RunConfig, car: Car, shown: Shown, output: Path
 ) -> Iterator[list[Sink]]:
     """Yield the outputs of a run that are fed window by window; on an exception they are aborted."""
-    from pdhef_logtool.sinks.layouts import LayoutsSink
-    from pdhef_logtool.sinks.mcap import AnnotatedMcapSink
-    from pdhef_logtool.sinks.parquet import EstimatesSink
+    from pdhef_logtool.results.layouts import LayoutsSink
+    from pdhef_logtool.results.mcap_sink import AnnotatedMcapSink
+    from pdhef_logtool.results.parquet_sink import EstimatesSink
 
     sinks: list[Sink] = []
     colours = {s.name: s.colour for s in all_specs()}
@@ -474,7 +474,7 @@ def _recording(  # positional: what `_open_sinks` takes
     output: Path,
     colours: dict[str, int],
 ) -> Sink:
-    from pdhef_logtool.sinks.rerun import RerunSink
+    from pdhef_logtool.results.rerun_sink import RerunSink
 
     application_id = _application_id(output, config)
     return RerunSink(
@@ -663,7 +663,7 @@ def check_places(
 
 def write_run(output: Path, config: dict[str, Any], result: LogResult, car: Car | None = None) -> None:
     """Write metrics.parquet and run.json of a run of one log, with the configuration as JSON-able values."""
-    from pdhef_logtool.sinks.parquet import write_metrics
+    from pdhef_logtool.results.parquet_sink import write_metrics
 
     known = None if car is None else car.network
     network = None if known is None or car is None else {"name": Path(car.network_name).name, "sha256": known.sha256}

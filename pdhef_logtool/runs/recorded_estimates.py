@@ -35,7 +35,6 @@ from pdhef_logtool.mapping import check_mapping, join_channels, mapping_of, merg
 from pdhef_logtool.mapping.estimates import EstimateSource, choose_estimates, sources_of
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.ledger import Role, damage
-from pdhef_logtool.records.outputs import OutputFolder, Transaction
 from pdhef_logtool.records.signals import (
     ALIGNED_SIGNALS,
     TRUTH_UNITS,
@@ -50,6 +49,8 @@ from pdhef_logtool.records.signals import (
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
+from pdhef_logtool.results.run_report import EstimatorFacts, build_report, write_json
+from pdhef_logtool.results.sink import TRUTH, Event
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimate_channels import RecordedEstimate, gap_ns, read_estimate
 from pdhef_logtool.runs.estimating import DeadReckoning, first_pose
@@ -68,8 +69,7 @@ from pdhef_logtool.runs.pipeline import (
     write_verdicts,
 )
 from pdhef_logtool.runs.scoring import diverged_events, in_time, segment_events
-from pdhef_logtool.sinks.base import TRUTH, Event
-from pdhef_logtool.sinks.report import EstimatorFacts, build_report, write_json
+from pdhef_logtool.storage.outputs import OutputFolder, Transaction
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
@@ -318,7 +318,7 @@ def _write(
     tracks: Sequence[StateTrack],
     plan: DrivePlan,
 ) -> None:
-    from pdhef_logtool.sinks.parquet import EstimatesSink, write_metrics
+    from pdhef_logtool.results.parquet_sink import EstimatesSink, write_metrics
 
     start = first_pose(tracks[0])
     sink = EstimatesSink(change.file("estimates.parquet"))

@@ -10,8 +10,8 @@ from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.evaluation.blocks import row_blocks
 from pdhef_logtool.records.signals import BoolArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.results.sink import TRUTH, Event
 from pdhef_logtool.runs.self_calibrating import log_sensors
-from pdhef_logtool.sinks.base import TRUTH, Event
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow

@@ -14,7 +14,7 @@ from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.fallback import Fallback
 from pdhef_logtool.estimators.table import all_names, spec_of
-from pdhef_logtool.sinks.answer import MainFacts
+from pdhef_logtool.results.selected_estimate import MainFacts
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow

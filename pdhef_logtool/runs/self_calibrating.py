@@ -28,9 +28,9 @@ from pdhef_logtool.runs import selection
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
+    from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
+    from pdhef_logtool.estimators.calibration.driving import Driving
     from pdhef_logtool.evaluation.metrics.metric import SensorErrors
-    from pdhef_logtool.self_calibration.calibration import SelfCalibration
-    from pdhef_logtool.self_calibration.driving import Driving
 
 #: Squares are summed window by window, over spans that no window cuts: another length would be another figure.
 _WINDOW_S = 600.0
@@ -41,7 +41,7 @@ def calibrate_drive(drive: Drive, config: RunConfig) -> SelfCalibration | None:
     """Return what a drive says of its car; None where nobody asks or the log lacks a sensor for it."""
     if config.calibrate == "off" or not _asked(config, drive.car) or lacking(drive):
         return None
-    from pdhef_logtool.self_calibration.calibration import self_calibrate
+    from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 
     return self_calibrate([read_driving(drive)], drive.car.vehicle)
 
@@ -52,7 +52,7 @@ def calibrate_pool(
     """Return what all logs of a run together say of its car; None where nobody asks. A log that fails is left out."""
     if not _asked(config, car):
         return None
-    from pdhef_logtool.self_calibration.calibration import self_calibrate
+    from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 
     found = []
     for log_input in inputs:
@@ -72,7 +72,7 @@ def lacking(drive: Drive) -> list[str]:
 
 def read_driving(drive: Drive) -> Driving:
     """Return the driving of a drive that can be calibrated on; its truth is not looked at."""
-    from pdhef_logtool.self_calibration.driving import DrivingReader
+    from pdhef_logtool.estimators.calibration.driving import DrivingReader
 
     reader = DrivingReader(drive.car.vehicle)
     for window in drive.windows(fill_friction=_told(drive)):

@@ -16,9 +16,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from pdhef_logtool.records.files import open_new, writing
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.storage.files import open_new, writing
 
 _SIGNALS = "signals"
 #: A column up to this length stays in memory: nearly three minutes at 100 Hz, of which a track takes 5 MB.

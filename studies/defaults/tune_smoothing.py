@@ -22,7 +22,7 @@ from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_filter import of_car
 from pdhef_logtool.estimators.smoothed import SmoothedPhysics, for_smoothing
-from pdhef_logtool.records.files import write_bytes
+from pdhef_logtool.storage.files import write_bytes
 from studies.condition_drives import root_mean_square
 from studies.identified_bands import DRIVEN, fit_drives, identified
 from studies.pages import options

@@ -10,7 +10,7 @@ from typing import Any
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.table import spec_of
 from pdhef_logtool.residual_model.bundle import ModelBundle
-from pdhef_logtool.sinks.report import tool_versions
+from pdhef_logtool.results.run_report import tool_versions
 from studies.paper.comparison import Improvement, Spread, improvement, spread
 from studies.paper.experiment import (
     BURST,

@@ -13,7 +13,6 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.inspection.report import inspect_drive_log
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping as SignalMapping
@@ -21,6 +20,7 @@ from pdhef_logtool.mapping import fit_clocks, read_signals
 from pdhef_logtool.mapping.choosing import choose_mapping
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.signals import Channel, FloatArray
+from pdhef_logtool.runs.inspection.report import inspect_drive_log
 from studies.strangers.cars import Series
 from studies.strangers.recordings import ITEMS
 

@@ -17,10 +17,10 @@ from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.results.parquet_sink import read_track
+from pdhef_logtool.results.run_report import report_markdown
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.sinks.parquet import read_track
-from pdhef_logtool.sinks.report import report_markdown
 
 EVIDENCE = "a gain on one drive: 0.41° at trust 0, 0.33° at 0.5"
 

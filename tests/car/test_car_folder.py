@@ -45,10 +45,10 @@ from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.physics_filter import of_car
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.records import outputs
-from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS
+from pdhef_logtool.storage import outputs
+from pdhef_logtool.storage.documents import digest
 
 #: A person's file: with comments, an order of its own, and a line that is set apart.
 PERSONS = """# My car, weighed on 3 May.

@@ -15,7 +15,7 @@ from pdhef_logtool.car.car import SHIPPED_CARS
 from pdhef_logtool.car.parts import FilterNoise, Fit, FittedSensors, FittedValues, Intervals, LearntOn, Noise, Trust
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.car.vehicle import Record, VehicleParameters, default_vehicle
-from pdhef_logtool.sinks.schema import load_schema
+from pdhef_logtool.results.arrow_schema import load_schema
 
 FOLDER = Path(__file__).parents[2] / "schemas"
 #: By the name of the part.

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from pdhef_logtool.cli.removed_commands import REMOVED
-from pdhef_logtool.records.documents import seal
+from pdhef_logtool.storage.documents import seal
 from tests.command_line import called
 
 ROOT = Path(__file__).parents[2]

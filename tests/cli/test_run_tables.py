@@ -15,10 +15,10 @@ from pdhef_logtool.cli.run_tables import render_fleet, render_run
 from pdhef_logtool.estimators.table import SPECS
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.results.fleet import Failures
+from pdhef_logtool.results.run_report import EstimatorFacts, FrictionFacts, LogFacts, LogOutcome, TruthFacts
+from pdhef_logtool.results.sink import Event
 from pdhef_logtool.results.summary import ErrorsOf, RunSummary, WorstDrive
 from pdhef_logtool.runs.pipeline import LogResult, RunResult
-from pdhef_logtool.sinks.base import Event
-from pdhef_logtool.sinks.report import EstimatorFacts, FrictionFacts, LogFacts, LogOutcome, TruthFacts
 
 NAMES = [s.name for s in SPECS]
 GOOD = [

@@ -17,9 +17,9 @@ from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.drive import checks
 from pdhef_logtool.drive.checks import registry
 from pdhef_logtool.drive.checks.registry import registered
-from pdhef_logtool.inspection import inspect_log
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
+from pdhef_logtool.runs.inspection import inspect_log
 from studies.documentation_tables import on_page_markdown
 
 NAME = "speed_m_s.range"

@@ -14,11 +14,11 @@ from pdhef_logtool.drive.frames import angles_deg
 from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.mounting import Mounting, find_mounting, survey_log
 from pdhef_logtool.drive.windows import DrivePlan, DriveReader, plan_drive
-from pdhef_logtool.inspection.report import inspect_drive_log, write_mapping
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map, fit_clocks, load_mapping, read_signals, resolve_mapping
 from pdhef_logtool.mapping.triads import ACCELERATIONS, RATES, find_triads
 from pdhef_logtool.records.signals import Signals, join_signals
+from pdhef_logtool.runs.inspection.report import inspect_drive_log, write_mapping
 from tests.turned_log import TurnedLog, rotation
 
 ANGLES = [(r, p, y) for r, p, y in product((0, 90, 180, 270), (0, 90, 270), (0, 90, 180, 270)) if p == 0 or r == 0]

@@ -11,8 +11,8 @@ from odd_clocks import S, Shift, rewrite
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Drive, WholeDrive, read_drive
-from pdhef_logtool.inspection import inspect_log
 from pdhef_logtool.records.ledger import DAMAGE, DAMAGED_SHARE, SampleCount, damage
+from pdhef_logtool.runs.inspection import inspect_log
 
 YEARS = 10 * 365 * 86_400 * S
 START = 1_767_225_600 * S

@@ -13,10 +13,10 @@ from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.mounting import Survey, survey_log
 from pdhef_logtool.drive.proposals import Proposal, apply_proposals, car_proposals, mapping_proposals, surest
 from pdhef_logtool.drive.windows import DriveReader, plan_drive, with_gyro_delay
-from pdhef_logtool.inspection.report import inspect_drive_log, write_mapping
 from pdhef_logtool.learning.car.fit_data import FitDrive, sensors_of
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, auto_map, fit_clocks, load_mapping
+from pdhef_logtool.runs.inspection.report import inspect_drive_log, write_mapping
 from tests.turned_log import TurnedLog, rotation
 
 DELAY_S, LEVER_M, GAIN = 0.040, -1.45, 1.06

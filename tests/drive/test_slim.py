@@ -23,7 +23,6 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.drive.slim import slim_log
-from pdhef_logtool.inspection import inspect_log
 from pdhef_logtool.logs.discovery import LogInput, hash_log
 from pdhef_logtool.logs.open_log import log_metadata, open_log
 from pdhef_logtool.logs.slim_copy import write_record
@@ -31,6 +30,7 @@ from pdhef_logtool.logs.slim_log import SlimLog
 from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.mapping import Mapping, load_mapping
 from pdhef_logtool.records.errors import LogError, MappingError
+from pdhef_logtool.runs.inspection import inspect_log
 
 AS_IT_IS = ReadOptions()
 CAR = Car.load(None)

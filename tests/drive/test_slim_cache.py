@@ -19,7 +19,7 @@ from pdhef_logtool.logs.discovery import LogInput, identity_of
 from pdhef_logtool.logs.slim_log import is_whole
 from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.supervisor import Tell, supervise
+from pdhef_logtool.workers.supervisor import Tell, supervise
 
 DLC = Path(__file__).resolve().parents[2] / "sample_logs/dlc.mcap"
 AS_IT_IS = ReadOptions()

@@ -20,8 +20,8 @@ from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import Options, all_specs, check_names, make_estimator, runnable, spec_of
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import without_impossible
-from pdhef_logtool.records.release import MAX_PREDICTION_S, released_steps
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, TRUTH_UNITS, Signals
+from pdhef_logtool.records.steps import MAX_PREDICTION_S, released_steps
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
 pytestmark = pytest.mark.slow

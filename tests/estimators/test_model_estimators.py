@@ -19,8 +19,8 @@ from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import make_estimator, runnable, spec_of
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.release import MAX_PREDICTION_S
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
+from pdhef_logtool.records.steps import MAX_PREDICTION_S
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.bundle import (
     LATERAL_VELOCITY,

@@ -23,6 +23,8 @@ from pdhef_logtool.car.parts import (
 from pdhef_logtool.car.toml_files import part_toml, vehicle_toml
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.error_features import TERMS, error_terms
+from pdhef_logtool.estimators.intervals import POSTERIOR_NOTE, make_inflation
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_filter import physics_filter
 from pdhef_logtool.estimators.posterior_band import OWN_SHARE
@@ -30,8 +32,6 @@ from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.estimating import calibrator
-from pdhef_logtool.watches.error_features import TERMS, error_terms
-from pdhef_logtool.watches.intervals import POSTERIOR_NOTE, make_inflation
 
 OWN = default_vehicle()
 PARTS = PhysicsParts(lag=True, force_scale=True)

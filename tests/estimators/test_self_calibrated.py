@@ -14,6 +14,7 @@ from pdhef_logtool.car.parts import FilterNoise, IntervalEntry, Intervals
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.fallback import Fallback
+from pdhef_logtool.estimators.intervals import make_inflation
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter, physics_filter
 from pdhef_logtool.estimators.self_calibrated import D2_SHARE, OPEN_LOOP, OWN_SHARE, SELF_CALIBRATED, SelfCalibrated
@@ -22,7 +23,6 @@ from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.estimating import calibrator
-from pdhef_logtool.watches.intervals import make_inflation
 
 OWN = default_vehicle()
 FOUND = OWN.model_copy(

@@ -25,6 +25,7 @@ from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import LookingAhead
+from pdhef_logtool.estimators.intervals import SIDESLIP_TERMS, make_inflation
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_filter import PHYSICS_Q_STD
 from pdhef_logtool.estimators.presets import OPTIONS, options_of, preset_of, split_names
@@ -54,7 +55,6 @@ from pdhef_logtool.residual_model.features import ONE_CAR_FEATURES, PAPER_FEATUR
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.runs.estimating import calibrator
-from pdhef_logtool.watches.intervals import SIDESLIP_TERMS, make_inflation
 
 pytestmark = pytest.mark.slow
 

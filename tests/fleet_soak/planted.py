@@ -9,8 +9,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from pdhef_logtool.records.supervisor import Tell
 from pdhef_logtool.runs.fleet import DriveEnd, DriveTask, run_drive
+from pdhef_logtool.workers.supervisor import Tell
 from tests.runs.stub_drives import stub_drive
 
 #: Where workers write what a drive cost; they have it from the process that started them.

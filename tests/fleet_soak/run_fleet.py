@@ -13,9 +13,9 @@ import sys
 import time
 from pathlib import Path
 
-from pdhef_logtool.records.supervisor import Limits
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
+from pdhef_logtool.workers.supervisor import Limits
 from tests.fleet_soak.planted import MEASURES, measured_drive, measured_stub, rss_bytes
 
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from pdhef_logtool.records.outputs import LOCK_FILE
 from pdhef_logtool.results.opened_run import JOURNAL_FILE, open_run
+from pdhef_logtool.storage.outputs import LOCK_FILE
 from tests.conftest import ROOT
 from tests.s3_store import S3Store, s3_store
 

@@ -13,6 +13,8 @@ import pytest
 
 from pdhef_logtool.car.car import Car, load_intervals
 from pdhef_logtool.car.parts import Inflation
+from pdhef_logtool.estimators.error_features import grip_share
+from pdhef_logtool.estimators.intervals import SIDESLIP_TERMS, YAW_RATE_TERMS, combined, grip_factor
 from pdhef_logtool.learning.drives import LearnSettings, choose_drives
 from pdhef_logtool.learning.engine import learn
 from pdhef_logtool.learning.evidence.calibrate import (
@@ -33,8 +35,6 @@ from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.watches.error_features import grip_share
-from pdhef_logtool.watches.intervals import SIDESLIP_TERMS, YAW_RATE_TERMS, combined, grip_factor
 
 pytestmark = pytest.mark.slow
 

@@ -27,10 +27,10 @@ from pdhef_logtool.learning.network.cells import (
 from pdhef_logtool.learning.network.dataset import MANIFEST, read_dataset
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
 from pdhef_logtool.learning.network.train_command import LEAD_STEPS, gap_free_runs, weights_of
-from pdhef_logtool.records.documents import seal
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.storage.documents import seal
 
 
 def test_every_row_lies_in_the_cell_of_its_speed_acceleration_and_friction() -> None:

@@ -25,11 +25,11 @@ from pdhef_logtool.drive import reading
 from pdhef_logtool.learning.network.dataset import MANIFEST, SPLITS, read_dataset
 from pdhef_logtool.learning.network.extract_command import ExtractResult, ExtractSettings, choose_split, extract
 from pdhef_logtool.logs.discovery import hash_log
-from pdhef_logtool.records.documents import is_sealed, seal
 from pdhef_logtool.records.errors import LogError, OutputError, UsageError
-from pdhef_logtool.records.outputs import OutputFolder
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.storage.documents import is_sealed, seal
+from pdhef_logtool.storage.outputs import OutputFolder
 from tests.command_line import called
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "schemas/dataset.schema.json").read_text(encoding="utf-8"))

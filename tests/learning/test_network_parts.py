@@ -44,13 +44,13 @@ from pdhef_logtool.learning.network.residuals import (
 from pdhef_logtool.learning.network.train_command import gap_free_runs, make_recipe, mean_square, train_on
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
-from pdhef_logtool.records.documents import seal
 from pdhef_logtool.records.errors import EstimatorError, ModelError, OutputError, UsageError
-from pdhef_logtool.records.supervisor import Ended, Failure
 from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES, NOMINAL_FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.storage.documents import seal
+from pdhef_logtool.workers.supervisor import Ended, Failure
 
 TINY = Recipe(FEATURES[:2], hidden=3, layers=1, head=(2,), epochs=9, batch=2, patience=3, learning_rate=1e-2)
 

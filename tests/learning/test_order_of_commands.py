@@ -12,12 +12,12 @@ import torch
 
 from pdhef_logtool.car.car import Car, read_history
 from pdhef_logtool.learning.stages import identify
-from pdhef_logtool.records.documents import digest
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
+from pdhef_logtool.storage.documents import digest
 from tests.learning.stage_run import run_stage
 
 pytestmark = pytest.mark.slow

@@ -13,6 +13,7 @@ from reference_car import FRONT_TYRE, MASS_KG, REAR_TYRE, Drive, drive, keep, wi
 
 from pdhef_logtool.car.parts import FittedPhysics
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.estimators.calibration.calibration import VARIED
 from pdhef_logtool.estimators.physics_filter import PHYSICS_Q_STD
 from pdhef_logtool.learning.car import physics_fit
 from pdhef_logtool.learning.car.axle_forces import axle_samples
@@ -31,7 +32,6 @@ from pdhef_logtool.learning.car.physics_fit import (
     varied_vehicles,
 )
 from pdhef_logtool.records.tracks import make_track
-from pdhef_logtool.self_calibration.calibration import VARIED
 
 STATIC = PhysicsParts()
 #: Slope of the true tyres at no slip, N/rad at friction 0.85.

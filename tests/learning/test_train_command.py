@@ -12,12 +12,12 @@ import pytest
 from pdhef_logtool.car.toml_files import load_vehicle
 from pdhef_logtool.learning.network.dataset import read_dataset
 from pdhef_logtool.learning.network.train_command import run_training
-from pdhef_logtool.records.documents import seal
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.residual_model.bundle import load_bundle
 from pdhef_logtool.residual_model.features import NOMINAL_FEATURES
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
+from pdhef_logtool.storage.documents import seal
 from tests.command_line import called, pdhef, said
 
 pytestmark = pytest.mark.slow

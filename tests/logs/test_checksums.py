@@ -15,12 +15,12 @@ from mcap.writer import CompressionType, Writer
 from rich.console import Console
 
 from pdhef_logtool.cli.app import app
-from pdhef_logtool.inspection import inspect_log, render_inspection
 from pdhef_logtool.logs.byte_account import ByteAccount, ByteLedger, checksummed_share
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
+from pdhef_logtool.runs.inspection import inspect_log, render_inspection
 
 T0 = 1_700_000_000_000_000_000
 N = 400

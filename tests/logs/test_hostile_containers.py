@@ -15,7 +15,6 @@ import pytest
 import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
 
-from pdhef_logtool.inspection import inspect_log
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget, BudgetError, Meter
 from pdhef_logtool.logs.compression import decompress, decompress_message
 from pdhef_logtool.logs.container import SpanDamageError
@@ -23,6 +22,7 @@ from pdhef_logtool.logs.discovery import find_logs, hash_log
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.runs.inspection import inspect_log
 
 T0 = 1_700_000_000_000_000_000
 N = 300

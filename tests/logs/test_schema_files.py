@@ -42,7 +42,7 @@ def test_a_built_wheel_ships_every_schema_file(tmp_path: Path) -> None:
     installed = tmp_path / "installed"
     zipfile.ZipFile(wheel).extractall(installed)
     code = (
-        "import pdhef_logtool; from pdhef_logtool.sinks.schema import arrow_schema, load_schema;"
+        "import pdhef_logtool; from pdhef_logtool.results.arrow_schema import arrow_schema, load_schema;"
         "print(pdhef_logtool.__file__); print(load_schema('report.schema.json')['$schema']);"
         "print(arrow_schema('metrics.parquet.json').names[0])"
     )

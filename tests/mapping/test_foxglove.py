@@ -222,7 +222,7 @@ def test_a_name_without_the_fields_is_said_and_spoils_nothing(tmp_path: Path) ->
 
 
 def test_recordings_of_other_tools_are_inspected(shared_dir: Path) -> None:
-    from pdhef_logtool.inspection.report import inspect_log
+    from pdhef_logtool.runs.inspection.report import inspect_log
 
     root = shared_dir / "reader_corpus"
     files = sorted([*root.glob("lichtblick/*.mcap"), *root.glob("plotjuggler*/*.mcap"), *root.glob("rerun/*.mcap")])

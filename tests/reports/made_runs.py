@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.records.documents import seal
 from pdhef_logtool.records.tracks import StateTrack, make_track
-from pdhef_logtool.sinks.parquet import EstimatesSink, write_metrics
-from pdhef_logtool.sinks.report import write_json
+from pdhef_logtool.results.parquet_sink import EstimatesSink, write_metrics
+from pdhef_logtool.results.run_report import write_json
+from pdhef_logtool.storage.documents import seal
 
 START_NS = 1_700_000_000_000_000_000
 #: Those of `pdhef run --estimators all` with a network that has its baselines.

@@ -15,13 +15,13 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 from made_runs import START_NS, drive_tracks, write_run
 
-from pdhef_logtool.records.documents import seal
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.reports.colours import colour, contrast
 from pdhef_logtool.reports.drive import drive_page, roles_of
 from pdhef_logtool.reports.page import number
 from pdhef_logtool.reports.pages import remove_pages, write_pages
 from pdhef_logtool.results.opened_run import open_run
+from pdhef_logtool.storage.documents import seal
 from tests.command_line import called
 
 

@@ -15,11 +15,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 from browser import CHROMIUM, WHY_NOT, Browser
 
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.records.documents import seal
 from pdhef_logtool.reports.fleet import fleet_page
 from pdhef_logtool.reports.pages import remove_pages, write_pages
 from pdhef_logtool.results.opened_run import open_run
-from pdhef_logtool.sinks.parquet import write_metrics
+from pdhef_logtool.results.parquet_sink import write_metrics
+from pdhef_logtool.storage.documents import seal
 
 HOSTILE = "</script><script>alert(1)</script>\"'><img src=x onerror=alert(1)>\u202egnp"
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.records.documents import seal
 from pdhef_logtool.records.tracks import make_track
-from pdhef_logtool.sinks.parquet import EstimatesSink, write_metrics
+from pdhef_logtool.results.parquet_sink import EstimatesSink, write_metrics
+from pdhef_logtool.storage.documents import seal
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -11,11 +11,11 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.results.comparing import Comparison, compare_runs
 from pdhef_logtool.results.gate import Figure, Gate, gate_from_dict
 from pdhef_logtool.results.opened_run import open_run
+from pdhef_logtool.storage.documents import jsonable
 from tests.results.made_run import digest, entry, row, write_estimates, write_run
 
 ASKED = Gate((Figure(),))

@@ -17,9 +17,9 @@ from pdhef_logtool.results.clips import write_clips
 from pdhef_logtool.results.events import FoundEvents, find_events, write_events
 from pdhef_logtool.results.expression import parse_condition
 from pdhef_logtool.results.opened_run import open_run
+from tests.results import source_log
 from tests.results.made_run import START_NS, entry, write_estimates, write_run
 from tests.run_report import report
-from tests.sinks import source_log
 
 N = 600
 

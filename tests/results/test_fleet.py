@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.records.documents import seal
 from pdhef_logtool.results.fleet import ANSWER, Fleet, exact_median, read_fleet
 from pdhef_logtool.results.opened_run import open_run
-from pdhef_logtool.sinks.parquet import write_metrics
+from pdhef_logtool.results.parquet_sink import write_metrics
+from pdhef_logtool.storage.documents import seal
 
 LOST = {"what": "ends at byte 3; what follows is gone (a.mcap)", "severity": "lost"}
 NO_TRUTH = {"available": False, "not_independent": []}

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from pdhef_logtool.records.documents import seal
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.results.opened_run import open_run
+from pdhef_logtool.storage.documents import seal
 
 
 def _run(folder: Path, logs: list[object], **changed: object) -> Path:

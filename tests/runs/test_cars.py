@@ -13,10 +13,10 @@ import pytest
 from pdhef_logtool.logs.discovery import LogInput, find_logs
 from pdhef_logtool.logs.open_log import log_metadata
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.runs.cars import RunCars
 from pdhef_logtool.runs.config import RunConfig, load_config
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.sinks.schema import load_schema
 
 
 @pytest.fixture

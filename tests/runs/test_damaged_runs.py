@@ -12,12 +12,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from pdhef_logtool.cli import running
-from pdhef_logtool.records.documents import seal
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.results.opened_run import open_run
+from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.runs.fleet import DriveEnd
 from pdhef_logtool.runs.journal import Journal
-from pdhef_logtool.sinks.report import LogOutcome
+from pdhef_logtool.storage.documents import seal
 from studies.torture.workers import Ended, command
 from tests.runs.stub_drives import stub_drive
 from tests.runs.test_fleet_runs import Counted, contents, named_logs, run

@@ -9,9 +9,9 @@ from typing import Any
 import jsonschema
 import pytest
 
+from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.sinks.schema import load_schema
 
 pytestmark = pytest.mark.slow
 

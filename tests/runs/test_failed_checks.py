@@ -11,12 +11,12 @@ import pytest
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.inspection import inspect_log
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map, load_mapping, mapping_to_toml
+from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.runs.config import RunConfig, load_config
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.sinks.schema import load_schema
+from pdhef_logtool.runs.inspection import inspect_log
 
 
 @pytest.fixture

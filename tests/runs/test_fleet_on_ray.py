@@ -13,14 +13,14 @@ from typing import Any
 import pytest
 
 from pdhef_logtool.records.errors import OutputError, UsageError
-from pdhef_logtool.records.supervisor import Limits
 from pdhef_logtool.results.opened_run import METRICS_FILE, open_run
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import _on_node, run_logs
-from tests.records.ray_nodes import START_S, cluster_of_one, grow, processes_of
+from pdhef_logtool.workers.supervisor import Limits
 from tests.runs.stub_drives import stub_drive, waiting_drive
 from tests.runs.test_fleet_runs import named_logs
 from tests.s3_store import s3_store
+from tests.workers.ray_nodes import START_S, cluster_of_one, grow, processes_of
 
 
 def files_of(output: Path) -> dict[str, bytes]:

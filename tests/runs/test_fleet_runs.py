@@ -14,13 +14,13 @@ import polars as pl
 import pytest
 
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.supervisor import Limits, Tell
 from pdhef_logtool.results.opened_run import JOURNAL_FILE, open_run
+from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.results.summary import summarise
 from pdhef_logtool.runs import fleet
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import DriveEnd, DriveTask, run_logs
-from pdhef_logtool.sinks.report import LogOutcome
+from pdhef_logtool.workers.supervisor import Limits, Tell
 from tests.fleet_soak.planted import planted_stub
 from tests.runs.stub_drives import stub_drive
 
@@ -253,7 +253,7 @@ def test_two_jobs_that_are_killed_and_go_on_leave_what_one_job_leaves(
 def test_metrics_alone_leave_a_short_report_by_the_schema(sample_logs_dir: Path, tmp_path: Path) -> None:
     import jsonschema
 
-    from pdhef_logtool.sinks.schema import load_schema
+    from pdhef_logtool.results.arrow_schema import load_schema
 
     logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")]
     config = RunConfig(car=Path("saloon"), keep="metrics", end="4")

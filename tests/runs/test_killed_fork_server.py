@@ -13,14 +13,14 @@ from pathlib import Path
 import pytest
 
 from pdhef_logtool.records.errors import WorkerError
-from pdhef_logtool.records.files import PendingFile
-from pdhef_logtool.records.supervisor import Limits, Tell
 from pdhef_logtool.runs import fleet
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import DriveEnd, DriveTask, run_logs
-from tests.records.planted_work import DEATHS, MOST_DEATHS
+from pdhef_logtool.storage.files import PendingFile
+from pdhef_logtool.workers.supervisor import Limits, Tell
 from tests.runs.stub_drives import stub_drive
 from tests.runs.test_fleet_runs import contents, named_logs, run
+from tests.workers.planted_work import DEATHS, MOST_DEATHS
 
 RESTARTS = [f"the fork server died (signal 9): restart {n} of 3, no item is lost" for n in (1, 2, 3)]
 
@@ -43,7 +43,7 @@ def dies_at_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The file with a letter for each time that the fork server was killed while it loaded."""
     (tmp_path / "deaths").touch()
     monkeypatch.setenv(DEATHS, str(tmp_path / "deaths"))
-    monkeypatch.setattr(fleet, "_PRELOAD", ("tests.records.planted_work:die_at_start", "tests.runs.stub_drives"))
+    monkeypatch.setattr(fleet, "_PRELOAD", ("tests.workers.planted_work:die_at_start", "tests.runs.stub_drives"))
     return tmp_path / "deaths"
 
 

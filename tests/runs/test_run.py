@@ -15,10 +15,10 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
 from pdhef_logtool.estimators.table import SPECS, all_names
 from pdhef_logtool.records.errors import EstimatorError, LogError, MappingError, UsageError, VehicleError
+from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.runs import pipeline
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.sinks.schema import load_schema
 
 pytestmark = pytest.mark.slow
 

@@ -19,10 +19,10 @@ from pdhef_logtool.learning.network.dataset import read_dataset
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.runs.config import RunConfig, load_config
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.pipeline import RunResult
-from pdhef_logtool.sinks.schema import load_schema
 
 pytestmark = pytest.mark.slow
 

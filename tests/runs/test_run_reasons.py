@@ -20,12 +20,12 @@ from pdhef_logtool.records.reasons import STUCK_YAW_RATE
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.results.arrow_schema import load_schema
+from pdhef_logtool.results.parquet_sink import read_track
+from pdhef_logtool.results.run_report import report_markdown
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.pipeline import RunResult
-from pdhef_logtool.sinks.parquet import read_track
-from pdhef_logtool.sinks.report import report_markdown
-from pdhef_logtool.sinks.schema import load_schema
 from truthsim.drive import simulate_drive, write_drive
 from truthsim.faults import parse_fault
 

@@ -15,15 +15,15 @@ import pytest
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Tell, read_drive
+from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.runs import selection
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, checked, read_driving, self_calibrated
-from pdhef_logtool.self_calibration.calibration import self_calibrate
-from pdhef_logtool.sinks.schema import load_schema
 
 pytestmark = pytest.mark.slow
 

@@ -17,10 +17,10 @@ from mcap.writer import Writer
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import MappingError, UsageError
+from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.recorded_estimates import score_log
-from pdhef_logtool.sinks.schema import load_schema
 
 REFERENCE = Path(__file__).resolve().parents[1] / "reference"
 ERRORS = ("rmse", "rmse_relative", "mae", "bias", "p95_abs", "max_abs", "coverage95", "lag_s", "availability", "nees")

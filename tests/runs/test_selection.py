@@ -15,11 +15,11 @@ from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.fallback import Fallback
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS
+from pdhef_logtool.results.selected_estimate import MainFacts
 from pdhef_logtool.runs import frames, selection
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.selection import choose_main, default_names
-from pdhef_logtool.sinks.answer import MainFacts
 
 EVERY = frozenset(ALIGNED_SIGNALS)
 #: Truth as it is, and the same shuffled: the sideslip of something else at another speed.

@@ -12,14 +12,14 @@ from typing import Any
 import polars as pl
 import pytest
 
-from pdhef_logtool.records import object_store
 from pdhef_logtool.records.errors import OutputError, UsageError
-from pdhef_logtool.records.object_store import LEFT_OVER_S, HeldError, ObjectFolder
-from pdhef_logtool.records.outputs import LOCK_FILE
-from pdhef_logtool.records.supervisor import Tell
 from pdhef_logtool.results.opened_run import JOURNAL_FILE, METRICS_FILE, open_run
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import DriveEnd, DriveTask
+from pdhef_logtool.storage import object_store
+from pdhef_logtool.storage.object_store import LEFT_OVER_S, HeldError, ObjectFolder
+from pdhef_logtool.storage.outputs import LOCK_FILE
+from pdhef_logtool.workers.supervisor import Tell
 from tests.runs.stub_drives import stub_drive
 from tests.runs.test_fleet_runs import Counted, named_logs, run
 from tests.s3_store import S3Store, forget_file_systems, s3_store

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.records.errors import OutputError, SimulationError, UsageError, VehicleError
-from pdhef_logtool.records.supervisor import Ended, Failure
+from pdhef_logtool.workers.supervisor import Ended, Failure
 from truthsim import batch
 from truthsim.batch import BINS, DriveSpec, Job, make_drive, run_jobs, sensor_noise, time_in_bins_s
 from truthsim.conditions import ROW_NAMES, plan_conditions, write_conditions

@@ -26,6 +26,7 @@ from pdhef_logtool.car.descent import descend
 from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, TriedParts
 from pdhef_logtool.car.prior import Prior
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
+from pdhef_logtool.estimators.calibration.calibration import varied_parameters
 from pdhef_logtool.estimators.filter_base import PosteriorSteps
 from pdhef_logtool.estimators.physics_filter import PHYSICS_Q_STD, physics_filter
 from pdhef_logtool.learning.car.axle_forces import (
@@ -43,7 +44,6 @@ from pdhef_logtool.learning.car.axle_forces import (
 )
 from pdhef_logtool.learning.car.fit_data import FitDrive, part_of, period_s, signals_of
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.self_calibration.calibration import varied_parameters
 
 #: Errors stay alike for this long, s; what the filter needs before its error counts, s.
 CORRELATION_S, SETTLE_S = 1.0, 2.0

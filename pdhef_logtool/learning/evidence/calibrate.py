@@ -22,9 +22,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from pdhef_logtool.car.parts import Inflation
+from pdhef_logtool.estimators.error_features import grip_share
+from pdhef_logtool.estimators.intervals import combined, grip_factor, make_inflation
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
-from pdhef_logtool.watches.error_features import grip_share
-from pdhef_logtool.watches.intervals import combined, grip_factor, make_inflation
 
 #: Share inside.
 COVERED = 0.95

@@ -24,8 +24,6 @@ from pdhef_logtool.learning.network.train_command import (
     weights_of,
 )
 from pdhef_logtool.records.errors import ModelError
-from pdhef_logtool.records.files import write_bytes
-from pdhef_logtool.records.outputs import OutputFolder
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import (
     LATERAL_VELOCITY,
@@ -36,6 +34,8 @@ from pdhef_logtool.residual_model.bundle import (
 from pdhef_logtool.residual_model.features import FEATURES, NOMINAL_FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.low_pass import low_pass
+from pdhef_logtool.storage.files import write_bytes
+from pdhef_logtool.storage.outputs import OutputFolder
 
 LOW_PASS_HZ = 2.0
 #: A feature that varies by less than this share of its size is a constant, which the intercept already is.

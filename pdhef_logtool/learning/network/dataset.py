@@ -29,14 +29,14 @@ from pdhef_logtool.car.parts import car_folder
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.learning.network.cells import COUNT, EVERYTHING, Picked, Picking, draw_limits, is_chosen, table_of
 from pdhef_logtool.learning.network.residuals import ResidualRows
-from pdhef_logtool.records.documents import DIGEST, digest, is_sealed, read_sealed, seal, validated
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.results.arrow_schema import arrow_schema
 from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES
-from pdhef_logtool.sinks.parquet import RowGroups
-from pdhef_logtool.sinks.report import tool_versions, write_json
-from pdhef_logtool.sinks.schema import arrow_schema
+from pdhef_logtool.results.parquet_sink import RowGroups
+from pdhef_logtool.results.run_report import tool_versions, write_json
+from pdhef_logtool.storage.documents import DIGEST, digest, is_sealed, read_sealed, seal, validated
 
 FORMAT = "pdhef.residual-dataset"
 FORMAT_VERSION = 4

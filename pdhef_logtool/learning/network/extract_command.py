@@ -62,15 +62,15 @@ from pdhef_logtool.learning.variation import MAX_VARIATION, vary
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
-from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
-from pdhef_logtool.records.files import writing
-from pdhef_logtool.records.outputs import OutputFolder, check_no_input, local_path
 from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.records.supervisor import supervise
 from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, NOMINAL_MODEL, PHYSICS_MODEL
+from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.sinks.report import tool_versions
+from pdhef_logtool.storage.documents import digest
+from pdhef_logtool.storage.files import writing
+from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_path
+from pdhef_logtool.workers.supervisor import supervise
 
 #: Upper ends of the shares of train and validation in [0, 1); the rest is test.
 SPLIT_ENDS = (0.70, 0.85)

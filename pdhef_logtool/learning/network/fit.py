@@ -23,13 +23,13 @@ from typing import Any, Self
 
 import numpy as np
 
-from pdhef_logtool.records.documents import is_sealed, seal
 from pdhef_logtool.records.errors import ModelError
-from pdhef_logtool.records.files import write_bytes, writing
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import OUTPUT_COUNT, RESIDUAL, ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES, ONE_CAR_FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork, State
+from pdhef_logtool.storage.documents import is_sealed, seal
+from pdhef_logtool.storage.files import write_bytes, writing
 
 # isort: split
 # Behind the network, which checks that PyTorch is installed.

@@ -27,6 +27,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters, state_derivative
+from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.drive.windows import DriveWindow
 from pdhef_logtool.estimators.filter_base import U_AX, U_FRICTION, U_STEER, FilterState, HeldInputs
 from pdhef_logtool.estimators.parallel_physics import run_features
@@ -43,10 +44,9 @@ from pdhef_logtool.estimators.physics_model import (
     settle_forces,
     step_count,
 )
-from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
-from pdhef_logtool.records.release import StepColumns
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.steps import StepColumns
 
 #: A step of more than this many periods is a gap: no increment is taken across it.
 GAP_PERIODS = 1.5

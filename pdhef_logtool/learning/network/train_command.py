@@ -15,8 +15,6 @@ from pdhef_logtool.learning.network.dataset import SPLITS, Dataset, DatasetDrive
 from pdhef_logtool.learning.network.fit import CHECKPOINT, PAPER_RECIPE, Epoch, FeatureSequence, Recipe, train
 from pdhef_logtool.learning.plots import new_figure, png_bytes
 from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
-from pdhef_logtool.records.files import write_bytes
-from pdhef_logtool.records.outputs import OutputFolder, check_no_input, local_path
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
@@ -29,6 +27,8 @@ from pdhef_logtool.residual_model.bundle import (
     open_model,
 )
 from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.storage.files import write_bytes
+from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_path
 
 HISTORY_FILE = "history.parquet"
 PLOT_FILE = "history.png"

@@ -55,19 +55,19 @@ from pdhef_logtool.learning.stages.network import GENTLY
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.records.documents import digest, read_sealed, seal
 from pdhef_logtool.records.errors import EXIT_GATE, EstimatorError, OutputError, PdhefError
-from pdhef_logtool.records.files import write_bytes, writing
-from pdhef_logtool.records.outputs import FolderTransaction, OutputFolder, check_no_input
-from pdhef_logtool.records.supervisor import supervise
 from pdhef_logtool.residual_model.bundle import MANY_CARS, NO_MODEL, open_model
 from pdhef_logtool.residual_model.torch_extra import check_torch
 from pdhef_logtool.results.comparing import compare_runs
 from pdhef_logtool.results.gate import Figure, Gate
 from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES, open_run
+from pdhef_logtool.results.run_report import json_bytes
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.sinks.report import json_bytes
+from pdhef_logtool.storage.documents import digest, read_sealed, seal
+from pdhef_logtool.storage.files import write_bytes, writing
+from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder, check_no_input
+from pdhef_logtool.workers.supervisor import supervise
 
 FORMAT, FORMAT_VERSION = "pdhef-retrain", 1
 #: In the output: stages, candidates that may take the car's place, and those that may not.

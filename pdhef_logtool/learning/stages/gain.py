@@ -41,7 +41,7 @@ from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS
 from pdhef_logtool.residual_model.service import RememberingNetwork
-from pdhef_logtool.sinks.report import json_bytes
+from pdhef_logtool.results.run_report import json_bytes
 
 FORMAT = "pdhef-trust"
 FORMAT_VERSION = 2

@@ -14,6 +14,8 @@ from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.drive.reading import friction_of
 from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.error_features import error_terms
+from pdhef_logtool.estimators.intervals import yaw_rate_terms
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, runnable
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, smooth
@@ -35,10 +37,8 @@ from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.results.run_report import json_bytes, tool_versions
 from pdhef_logtool.runs.estimating import estimate_windows
-from pdhef_logtool.sinks.report import json_bytes, tool_versions
-from pdhef_logtool.watches.error_features import error_terms
-from pdhef_logtool.watches.intervals import yaw_rate_terms
 
 #: Neighbouring errors are correlated: one sample in this time is kept.
 SAMPLE_EVERY_S = 0.05

@@ -33,7 +33,7 @@ from pdhef_logtool.learning.noise.search import (
 )
 from pdhef_logtool.learning.split import TRAINING
 from pdhef_logtool.learning.stages.task import StageOutput, Task
-from pdhef_logtool.sinks.report import json_bytes
+from pdhef_logtool.results.run_report import json_bytes
 
 FORMAT = "pdhef-tuning"
 FORMAT_VERSION = 2

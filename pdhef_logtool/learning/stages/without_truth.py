@@ -14,14 +14,14 @@ from pdhef_logtool.car.parts import Fit, FittedPhysics, FittedValues, LearntOn, 
 from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.drive.cached import read_cached
+from pdhef_logtool.estimators.calibration.calibration import LEAST_KNOWN_EXPORTED, SelfCalibration, self_calibrate
+from pdhef_logtool.estimators.calibration.driving import Driving
 from pdhef_logtool.learning.drives import IDENTIFY, DriveRecord, record_of
 from pdhef_logtool.learning.split import TRAINING
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.runs.self_calibrating import lacking, read_driving
-from pdhef_logtool.self_calibration.calibration import LEAST_KNOWN_EXPORTED, SelfCalibration, self_calibrate
-from pdhef_logtool.self_calibration.driving import Driving
 
 #: Least number of logs.
 LEAST_LOGS = 2

@@ -1,0 +1,146 @@
+"""What a log gives to its calibration: sensors on an even grid, in stretches of driving; no truth.
+
+A log of any length is taken window by window and thinned at once: of ten hours 72 MB remain. Windows change no bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.estimators.calibration.single_track import AY, FRICTION, SLOW_TURN, SPEED, STEER, YAW_RATE
+from pdhef_logtool.estimators.speed_slip import SlipState, believable
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, join_signals
+
+#: Step of the grid. The model follows 4 Hz, and the lag of a tyre at 40 m/s is 12 ms, which its step takes exactly.
+STEP_S = 0.02
+#: Below this speed bends are narrow, and what they say of the rear axle is wrong (docs/method.md#self-calibration).
+LEAST_SPEED_M_S = 10.0
+#: A shorter stretch has hardly settled. Missing samples are bridged for so long; of the speed, which is slow, longer.
+LEAST_STRETCH_S, BRIDGED_S, SPEED_BRIDGED_S = 6.0, 0.15, 0.6
+
+_COLUMNS = 6
+#: A road is banked for its bends, over more than this of them.
+SLOW_S = 2.0
+_PAUSE_CELLS = 100
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Driving:
+    """The driving of one log that can be calibrated on.
+
+    Attributes
+    ----------
+    columns : float64 [6, N], steering, speed, yaw rate, a_y and friction on the grid, as ``read_with`` reads them, and
+        v_x r without what is fast.
+    stretches : int64 [k, 2], [first, last) of each stretch without a gap, above :data:`LEAST_SPEED_M_S`.
+    """
+
+    columns: FloatArray
+    stretches: IntArray
+    read_with: VehicleParameters
+
+    @property
+    def seconds(self) -> float:
+        """Driving in all stretches."""
+        return float(np.sum(np.diff(self.stretches, axis=1))) * STEP_S
+
+
+class DrivingReader:
+    """Thins the windows of one drive to :class:`Driving`; a cell of the grid has the mean of its samples."""
+
+    def __init__(self, vehicle: VehicleParameters) -> None:
+        self._vehicle = vehicle
+        self._slip: SlipState | None = None
+        self._start_ns: int | None = None
+        self._open: Signals | None = None  # samples of a cell that the next window may add to
+        self._cells: list[NDArray[np.int64]] = []
+        self._means: list[FloatArray] = []
+
+    def add(self, signals: Signals) -> None:
+        """Take the next window."""
+        if not len(signals):
+            return
+        signals, self._slip = believable(signals, self._vehicle.sensors.speed_std_m_s, self._slip, gate=True)
+        if self._open is not None:
+            signals = join_signals([self._open, signals])
+        if self._start_ns is None:
+            self._start_ns = int(signals.stamps_ns[0])
+        cell = (signals.stamps_ns - self._start_ns) // round(STEP_S * 1e9)
+        done = int(np.searchsorted(cell, cell[-1]))
+        self._open = signals.rows(done, len(signals))
+        self._take(signals.rows(0, done), cell[:done])
+
+    def finish(self) -> Driving:
+        """Return all of it."""
+        if self._open is not None and self._start_ns is not None:
+            self._take(self._open, (self._open.stamps_ns - self._start_ns) // round(STEP_S * 1e9))
+            self._open = None
+        if not self._cells:
+            return Driving(np.empty((_COLUMNS, 0)), np.empty((0, 2), dtype=np.int64), self._vehicle)
+        cells, means = np.concatenate(self._cells), np.concatenate(self._means, axis=1)
+        # A pause, however long, is a gap: it takes no more room than that.
+        cells = np.concatenate([[0], np.cumsum(np.minimum(np.diff(cells), _PAUSE_CELLS))])
+        columns = np.full((_COLUMNS, int(cells[-1]) + 1), np.nan)
+        columns[:, cells] = means
+        columns[FRICTION] = np.where(np.isfinite(columns[FRICTION]), columns[FRICTION], self._vehicle.assumed_friction)
+        for row, bridged_s in ((STEER, BRIDGED_S), (YAW_RATE, BRIDGED_S), (AY, BRIDGED_S), (SPEED, SPEED_BRIDGED_S)):
+            columns[row] = _bridged(columns[row], round(bridged_s / STEP_S))
+        stretches = _stretches(columns[:SLOW_TURN])
+        columns[SLOW_TURN] = smoothed(columns[SPEED] * columns[YAW_RATE], stretches, SLOW_S)
+        return Driving(columns, stretches, self._vehicle)
+
+    def _take(self, signals: Signals, cell: NDArray[np.int64]) -> None:
+        if not len(signals):
+            return
+        cells, place = np.unique(cell, return_inverse=True)
+        means = np.full((_COLUMNS, cells.size), np.nan)
+        sources = {
+            STEER: signals.steer_rad,
+            SPEED: signals.speed_m_s,
+            YAW_RATE: signals.yaw_rate_rad_s,
+            AY: signals.ay_m_s2,
+            FRICTION: signals.friction,
+        }
+        for row, values in sources.items():
+            known = np.isfinite(values)
+            count = np.bincount(place, known, cells.size)
+            total = np.bincount(place, np.where(known, values, 0.0), cells.size)
+            means[row] = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
+        self._cells.append(cells)
+        self._means.append(means)
+
+
+def _bridged(values: FloatArray, most: int) -> FloatArray:
+    """Return values [N] with gaps of at most so many steps filled in, linear; longer ones stay NaN."""
+    at = np.flatnonzero(np.isfinite(values))
+    if at.size < 2:
+        return values
+    grid = np.arange(values.size)
+    filled = np.interp(grid, at, values[at], left=np.nan, right=np.nan)
+    after = np.searchsorted(at, grid)
+    gap = at[np.minimum(after, at.size - 1)] - at[np.maximum(after - 1, 0)]
+    return np.where(np.isfinite(values) | (gap <= most), filled, np.nan)
+
+
+def _stretches(columns: FloatArray) -> IntArray:
+    """Return [first, last) of each stretch that is known, fast and long enough."""
+    good = np.isfinite(columns).all(axis=0) & (columns[SPEED] > LEAST_SPEED_M_S)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]])))
+    spans = edges.reshape(-1, 2).astype(np.int64)
+    return spans[spans[:, 1] - spans[:, 0] >= round(LEAST_STRETCH_S / STEP_S)]
+
+
+def smoothed(column: FloatArray, stretches: IntArray, over_s: float) -> FloatArray:
+    """Return the mean of a column [N] around each sample of a stretch, NaN outside."""
+    half = round(0.5 * over_s / STEP_S)
+    out = np.full(column.size, np.nan)
+    for a, b in stretches:
+        total = np.concatenate([[0.0], np.cumsum(column[a:b])])
+        at = np.arange(b - a)
+        low, high = np.maximum(at - half, 0), np.minimum(at + half + 1, b - a)
+        out[a:b] = (total[high] - total[low]) / (high - low)
+    return out

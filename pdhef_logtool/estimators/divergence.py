@@ -1,0 +1,181 @@
+"""Divergence that no innovation shows: the estimate's changes of v_y against accelerometer and gyro.
+
+Beyond the peak of the tyre force two sideslip angles give the same a_y and nearly the same yaw rate. A filter that
+converges to the wrong one agrees with all its sensors, so that its normalized innovation stays small
+(docs/method.md#divergence). The way there is visible: at the IMU, for any tyre forces,
+
+    v̇_y,i = a_y / (1 + g K_φ) − v_x,i r,    v_x,i = v_x − y_i r,  v_y,i = v_y + x_i r.
+
+D, the leaky sum of the changes of v̂_y,i beyond that, is the error that the estimate accumulated recently. The leak is
+fast (``LINEAR_S``) in the linear range of the tyres, where only one solution exists and D would accumulate bank, bias
+and noise. It is slow (``LIMIT_S``) near the limit of grip, and while the flag is set, so that a return to the right
+solution clears the flag. The flag is set while abs D exceeds v̂_x times ``ON_RAD``, and cleared below v̂_x times
+``OFF_RAD``. Both limits are increased by ``NOISE_SIGMAS`` of the sensors' white noise (vehicle file) in D.
+
+Not detected: an estimate that is wrong from its start, or drifts more slowly than the leak forgets. Errors of
+accelerometer or gyro are attributed to the estimate, except for missing and stuck samples, which are not judged.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.records.readings import without_impossible
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import RESTART_GAP_S, StepColumns, last_stamp_ns, release, step_durations_s
+from pdhef_logtool.records.tracks import StateTrack
+
+ON_RAD, OFF_RAD = math.radians(5.0), math.radians(3.0)
+LINEAR_S, LIMIT_S = 0.5, 3.0
+#: Shares of the grip, abs a_y / (μ g), between which the leak goes from quick to slow.
+GRIP_LOW, GRIP_HIGH = 0.5, 0.7
+GRIP_SMOOTHING_S, GRIP_HOLD_S = 0.1, 1.0
+#: Tolerance for the noise in D, in standard deviations.
+NOISE_SIGMAS = 3.0
+#: Smallest speed in the limit of D, as a multiple of the low-speed blend.
+LEAST_SPEED_BLENDS = 3.0
+#: Zero-order hold of a sample; without a newer sample the monitor is suspended.
+SAMPLE_HOLD_S = 0.1
+#: Consecutive identical samples that indicate a stuck sensor, or one whose resolution is too coarse to judge.
+STUCK_SAMPLES = 5
+
+# Entries of the memory.
+D, FLAG, HAS_LAST, VY, VX, AY, GYRO, AY_AGE, GYRO_AGE, AY_RUN, GYRO_RUN, AY_SLOW, GRIP, FRICTION, VAR = range(15)
+MEMORY_SIZE = 15
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlagSteps(StepColumns):
+    """When steps arrived and whether the flag is set at them, [K]."""
+
+    ready_ns: IntArray
+    flags: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DivergenceState:
+    """State between windows: the sum, and the flags of steps that later stamps need."""
+
+    memory: FloatArray
+    last_stamp_ns: int | None
+    waiting: FlagSteps
+
+
+@dataclass(slots=True)
+class DivergenceWatch:
+    """Monitor of the tracks of a drive, window by window and by name.
+
+    Estimates without a covariance are not monitored: they make no claim about their accuracy.
+    """
+
+    vehicle: VehicleParameters
+    _carries: dict[str, DivergenceState] = field(default_factory=dict)
+
+    def add(self, track: StateTrack, signals: Signals) -> StateTrack:
+        """Return the next window of a track with ``diverged`` updated."""
+        if track.covariance.shape[0] == 0:
+            return track
+        flags, self._carries[track.name] = wrong_branch(track, signals, self.vehicle, self._carries.get(track.name))
+        return replace(track, diverged=track.diverged | (flags & track.valid))
+
+
+def wrong_branch(
+    track: StateTrack, signals: Signals, vehicle: VehicleParameters, state: DivergenceState | None = None
+) -> tuple[BoolArray, DivergenceState]:
+    """Return where a track departs from the sensors' motion, [N]; joined windows equal the whole bit for bit.
+
+    Computed on measurement time; a scored stamp has the flag of the newest step that had arrived.
+
+    Parameters
+    ----------
+    track, signals : [N] at the same stamps. state : of the previous window, None at the start of a log.
+    """
+    signals = without_impossible(signals)
+    count = len(signals)
+    before_ns = state.last_stamp_ns if state else None
+    memory = np.zeros(MEMORY_SIZE) if state is None else state.memory.copy()
+    friction = np.where(np.isfinite(track.friction), track.friction, signals.friction)
+    steps = FlagSteps(signals.ready_ns, np.empty(count, dtype=np.bool_))
+    dt_s = step_durations_s(signals.stamps_ns, before_ns)
+    motion = (
+        dt_s, signals.ay_m_s2, signals.yaw_rate_rad_s, friction, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s,
+        track.valid,
+    )  # fmt: skip
+    sensors = vehicle.sensors
+    car = (
+        vehicle.assumed_friction, 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2, sensors.ay_std_m_s2,
+        sensors.yaw_rate_std_rad_s, *vehicle.imu_position_m[:2], LEAST_SPEED_BLENDS * vehicle.low_speed_blend_m_s,
+    )  # fmt: skip
+    _watch(motion, car, memory, steps.flags)
+    if state is not None:
+        steps = state.waiting.joined(steps)
+    released = release(steps.ready_ns, signals.stamps_ns)
+    flags: BoolArray = steps.flags[released.at] & released.arrived
+    last = last_stamp_ns(signals.stamps_ns, before_ns)
+    return flags, DivergenceState(memory, last, steps.since(released.needed))
+
+
+@njit(cache=True)
+def _hold(sample, dt, value, age, run, memory):  # type: ignore[no-untyped-def]
+    """Store a sensor's newest sample, its age and its number of consecutive repetitions."""
+    if math.isfinite(sample):
+        memory[run] = memory[run] + 1.0 if sample == memory[value] else 1.0
+        memory[value] = sample
+        memory[age] = 0.0
+    else:
+        memory[age] += dt
+
+
+@njit(cache=True)
+def _watch(motion, car, memory, flags):  # type: ignore[no-untyped-def]
+    """Advance the memory over the steps [N] and write the flags [N] in place; ``dt[k]`` ends at step k."""
+    dt, ay, gyro, friction, vx, vy, rate, valid = motion
+    default_friction, tilt, ay_std, gyro_std, imu_x, imu_y, least_speed = car
+    for k in range(dt.shape[0]):
+        step = dt[k]
+        if not step <= RESTART_GAP_S:
+            memory[:] = 0.0
+            memory[AY_AGE] = memory[GYRO_AGE] = math.inf
+            step = 0.0
+        before_ay, before_gyro = memory[AY], memory[GYRO]
+        could = memory[AY_AGE] <= SAMPLE_HOLD_S and memory[GYRO_AGE] <= SAMPLE_HOLD_S
+        _hold(ay[k], step, AY, AY_AGE, AY_RUN, memory)
+        _hold(gyro[k], step, GYRO, GYRO_AGE, GYRO_RUN, memory)
+        can = memory[AY_AGE] <= SAMPLE_HOLD_S and memory[GYRO_AGE] <= SAMPLE_HOLD_S
+        stuck = memory[AY_RUN] >= STUCK_SAMPLES or memory[GYRO_RUN] >= STUCK_SAMPLES
+        if math.isfinite(friction[k]):
+            memory[FRICTION] = friction[k]
+        mu = memory[FRICTION] if memory[FRICTION] > 0.0 else default_friction
+        if memory[AY_AGE] <= SAMPLE_HOLD_S:
+            memory[AY_SLOW] += (1.0 - math.exp(-step / GRIP_SMOOTHING_S)) * (memory[AY] - memory[AY_SLOW])
+        share = abs(memory[AY_SLOW]) / (mu * GRAVITY_M_S2)
+        memory[GRIP] = max(share, memory[GRIP] * math.exp(-step / GRIP_HOLD_S))
+
+        r = rate[k] if math.isfinite(rate[k]) else memory[GYRO]
+        if not valid[k] or not math.isfinite(vx[k]) or not math.isfinite(vy[k]):
+            memory[D] = memory[VAR] = memory[FLAG] = memory[HAS_LAST] = 0.0
+            flags[k] = False
+            continue
+        vx_imu, vy_imu = vx[k] - imu_y * r, vy[k] + imu_x * r
+        if memory[HAS_LAST] > 0.0:
+            if could and can and not stuck:
+                turned = 0.5 * (memory[VX] * before_gyro + vx_imu * memory[GYRO])
+                sensed = 0.5 * (before_ay + memory[AY]) / tilt - turned
+                memory[D] += (vy_imu - memory[VY]) - sensed * step
+                memory[VAR] += ((ay_std / tilt) ** 2 + (vx_imu * gyro_std) ** 2) * step * step
+            near = min(max((memory[GRIP] - GRIP_LOW) / (GRIP_HIGH - GRIP_LOW), 0.0), 1.0)
+            if memory[FLAG] > 0.0:
+                near = 1.0
+            keep = math.exp(-step * ((1.0 - near) / LINEAR_S + near / LIMIT_S))
+            memory[D] *= keep
+            memory[VAR] *= keep * keep
+        memory[VX], memory[VY], memory[HAS_LAST] = vx_imu, vy_imu, 1.0
+        angle = OFF_RAD if memory[FLAG] > 0.0 else ON_RAD
+        limit = angle * max(vx[k], least_speed) + NOISE_SIGMAS * math.sqrt(memory[VAR])
+        memory[FLAG] = 1.0 if abs(memory[D]) > limit else 0.0
+        flags[k] = memory[FLAG] > 0.0

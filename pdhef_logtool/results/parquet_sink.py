@@ -1,0 +1,387 @@
+"""estimates.parquet (wide, a row a stamp and estimator) and metrics.parquet (long, a row a figure)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.tracks import OPTIONAL_COLUMNS, TRACK_COLUMNS, StateTrack, diagonal_covariance, make_track
+from pdhef_logtool.results.arrow_schema import arrow_schema
+from pdhef_logtool.results.sink import Event, Sink, rounded
+from pdhef_logtool.storage.files import PendingFile, open_new, writing
+
+#: Rows that are gathered of one estimator before a row group is written: 10 h at 100 Hz make 110 row groups an
+#: estimator, and what waits of six estimators stays below 30 MB.
+ROWS_A_GROUP = 32768
+
+#: Of zstd, of estimates: less work than the lowest level, and 4 % fewer bytes.
+_LEVEL = 3
+#: Files of figures that are read before a row group of theirs is written.
+_PARTS_AT_ONCE = 256
+#: Columns that files of earlier versions have not.
+_LATER_COLUMNS = ("diverged", *OPTIONAL_COLUMNS)
+_LATER_METRIC_COLUMNS = ("algorithm",)
+_ESTIMATES, _METRICS = "estimates.parquet", "metrics.parquet"
+_AGAIN = "run the log again"
+_FLAGS = ("valid", "diverged")
+_STD_COLUMNS = ("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s")
+
+
+class RowGroups:
+    """A Parquet file that is written in row groups under a temporary name; a row group holds the rows of one key.
+
+    Parameters
+    ----------
+    path : where the finished file stands. rows_a_group : rows of one row group.
+    dictionaries : columns of few values.
+    joined : every row group is written from one piece, so that the same rows give the same bytes.
+    encodings : Parquet's, by column. level : of zstd; None: Parquet's own, which is the lowest.
+
+    Raises
+    ------
+    OutputError
+        When the file cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        schema: pa.Schema,
+        rows_a_group: int,
+        dictionaries: list[str],
+        *,
+        joined: bool = False,
+        encodings: Mapping[str, str] | None = None,
+        level: int | None = None,
+    ) -> None:
+        self._path, self._rows_a_group, self._joined = path, rows_a_group, joined
+        self._waiting: dict[str, list[pa.Table]] = {}
+        self._pending = PendingFile(path)
+        with writing(path):
+            self._file = open_new(self._pending.path)
+        try:
+            with writing(path):
+                self._writer = pq.ParquetWriter(
+                    self._file,
+                    schema,
+                    compression="zstd",
+                    compression_level=level,
+                    use_dictionary=dictionaries,
+                    column_encoding=encodings,
+                    write_page_checksum=True,
+                )
+        except BaseException:
+            self._drop()
+            raise
+
+    def append(self, key: str, table: pa.Table) -> None:
+        """Take the next rows of a key."""
+        waiting = self._waiting.setdefault(key, [])
+        waiting.append(table)
+        if sum(t.num_rows for t in waiting) < self._rows_a_group:
+            return
+        joined = pa.concat_tables(waiting)
+        whole = joined.num_rows - joined.num_rows % self._rows_a_group
+        self._write(joined.slice(0, whole))
+        waiting[:] = [joined.slice(whole)]
+
+    def finish(self, metadata: Mapping[str, str] | None = None) -> None:
+        """Write what waits and the file's metadata, and give the file its name."""
+        try:
+            for tables in self._waiting.values():
+                self._write(pa.concat_tables(tables))
+            if metadata:
+                self._writer.add_key_value_metadata(dict(metadata))
+            with writing(self._path):
+                self._writer.close()
+                self._file.close()
+        except BaseException:
+            self.abort()
+            raise
+        self._pending.commit()
+
+    def abort(self) -> None:
+        """Remove what was written."""
+        with suppress(OSError, ValueError):  # its last words may not fit the disk either, or come after the file's end
+            self._writer.close()
+        self._drop()
+
+    def _drop(self) -> None:
+        with suppress(OSError):
+            self._file.close()
+        self._pending.discard()
+
+    def _write(self, table: pa.Table) -> None:
+        with writing(self._path):
+            if self._joined:
+                self._writer.write_table(table.combine_chunks(), row_group_size=self._rows_a_group)
+            elif table.num_rows:
+                self._writer.write_table(table, row_group_size=self._rows_a_group)
+
+
+class EstimatesSink(Sink):
+    """Writes estimates.parquet; a row group holds one estimator, so that one can be read without the others.
+
+    Numbers are :func:`~pdhef_logtool.results.sink.rounded` and stored byte by byte: a sixth of the file.
+
+    Parameters
+    ----------
+    path : where the finished file stands.
+    rows_a_group : rows of one row group.
+
+    Raises
+    ------
+    OutputError : When the file cannot be written.
+    """
+
+    def __init__(self, path: Path, rows_a_group: int = ROWS_A_GROUP) -> None:
+        schema = arrow_schema("estimates.parquet.json")
+        split = {f.name: "BYTE_STREAM_SPLIT" for f in schema if pa.types.is_floating(f.type)}
+        encodings = {**split, "stamp_ns": "DELTA_BINARY_PACKED"}
+        self._file = RowGroups(path, schema, rows_a_group, ["estimator"], encodings=encodings, level=_LEVEL)
+
+    def append(self, track: StateTrack) -> None:
+        """Take one track of this window; [N] rows."""
+        self._file.append(track.name, track_table(track, as_written=True))
+
+    def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:  # noqa: ARG002
+        """Write what waits and give the file its name; the report is not part of this file."""
+        self._file.finish()
+
+    def abort(self) -> None:
+        """Remove what was written."""
+        self._file.abort()
+
+
+def track_table(track: StateTrack, *, as_written: bool = False) -> pa.Table:
+    """Return a track [N] as rows of estimates.parquet, rounded as they stand in the file if ``as_written``."""
+    schema = arrow_schema("estimates.parquet.json")
+    columns: dict[str, Any] = dict(track.columns())
+    if as_written:
+        columns = {n: rounded(n, values) if values.dtype == np.float64 else values for n, values in columns.items()}
+    columns["estimator"] = pa.DictionaryArray.from_arrays(np.zeros(len(track), dtype=np.int32), [track.name])
+    arrays = [
+        pa.array(columns[f.name], type=f.type, from_pandas=True) if f.name in columns else pa.nulls(len(track), f.type)
+        for f in schema
+    ]
+    return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def list_estimators(path: Path) -> tuple[str, ...]:
+    """Return the names of the tracks in an estimates.parquet, in order of their first row group."""
+    names: dict[str, None] = {}
+    with _open(path, _ESTIMATES) as file:
+        for group in range(file.num_row_groups):
+            names.update(dict.fromkeys(_estimators_of(file, group)))
+    return tuple(names)
+
+
+def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None) -> StateTrack:
+    """Read one track of an estimates.parquet; the row groups of other estimators are not touched.
+
+    Parameters
+    ----------
+    path : an estimates.parquet.
+    estimator : name of the track.
+    columns : of :data:`pdhef_logtool.records.tracks.TRACK_COLUMNS`; the others stay NaN (``valid`` True,
+        ``diverged`` False). All when None.
+
+    Returns
+    -------
+    StateTrack
+        In order of time. The file holds standard deviations only: ``covariance`` has them on its diagonal, NaN
+        elsewhere, and length 0 if none was read or known. ``nis_dof`` is NaN. Optional columns that were not read, or
+        that are null throughout, have length 0.
+
+    Raises
+    ------
+    OutputError : When the file is no estimates.parquet or holds no such track.
+    """
+    tables = list(_tables(path, estimator, None if columns is None else set(columns)))
+    if not tables:
+        raise OutputError(expected=f"one of {', '.join(list_estimators(path))}", got=estimator, where=str(path))
+    return _track_from_table(estimator, pa.concat_tables(tables))
+
+
+def read_blocks(path: Path, estimator: str, columns: Iterable[str]) -> Iterator[StateTrack]:
+    """Yield one track of an estimates.parquet in order of time, a row group at once; none where it is not in the file.
+
+    As :func:`read_track` says; a column that an earlier version did not write stays NaN.
+
+    Raises
+    ------
+    OutputError : When the file is no estimates.parquet or damaged.
+    """
+    with _open(path, _ESTIMATES) as file:
+        later = set(_LATER_COLUMNS) - set(file.schema_arrow.names)
+    for table in _tables(path, estimator, set(columns) - later):
+        yield _track_from_table(estimator, table)
+
+
+def _tables(path: Path, estimator: str, columns: set[str] | None) -> Iterator[pa.Table]:
+    """Yield the row groups of an estimator with the columns asked for, all that there are when None."""
+    wanted = [c for c in TRACK_COLUMNS if c == "stamp_ns" or columns is None or c in columns]
+    unknown = (columns or set()) - set(TRACK_COLUMNS)
+    if unknown:
+        raise OutputError(
+            expected=f"columns of {', '.join(TRACK_COLUMNS)}", got=", ".join(sorted(unknown)), where=str(path)
+        )
+    with _open(path, _ESTIMATES) as file:
+        absent = set(wanted) - set(file.schema_arrow.names)
+        if columns is None:  # a file from before these columns is whole without them
+            wanted = [c for c in wanted if c not in absent]
+        elif absent:
+            raise _without(path, _ESTIMATES, absent)
+        for group in range(file.num_row_groups):
+            with _reading(path):
+                names = _estimators_of(file, group)
+                if estimator not in names:
+                    continue
+                if len(names) == 1:
+                    table = file.read_row_group(group, columns=wanted)
+                else:
+                    table = file.read_row_group(group, columns=[*wanted, "estimator"])
+                    table = table.filter(pc.field("estimator") == estimator).select(wanted)
+            yield table
+
+
+def _track_from_table(name: str, table: pa.Table) -> StateTrack:
+    def numbers(column: str) -> FloatArray:
+        if column not in table.column_names:
+            return np.full(table.num_rows, np.nan)
+        return np.asarray(table[column].to_numpy(), dtype=np.float64)
+
+    floats = {c: numbers(c) for c in TRACK_COLUMNS if c not in ("stamp_ns", *_FLAGS, *_STD_COLUMNS, *OPTIONAL_COLUMNS)}
+    optional = {c: table[c] for c in OPTIONAL_COLUMNS if c in table.column_names}
+    known: dict[str, Any] = {c: v for c, v in optional.items() if v.null_count < table.num_rows}
+    known |= {c: numbers(c) for c in known if c != "reason"}
+    if "reason" in known:
+        known["reason"] = np.asarray(pc.fill_null(known["reason"], 0).to_numpy(), dtype=np.int64)
+    flags = {c: np.asarray(table[c].to_numpy(), dtype=np.bool_) for c in _FLAGS if c in table.column_names}
+    return make_track(
+        name,
+        np.asarray(table["stamp_ns"].to_numpy(), dtype=np.int64),
+        covariance=diagonal_covariance([numbers(c) for c in _STD_COLUMNS]),
+        **floats,
+        **flags,
+        **known,
+    )
+
+
+def _estimators_of(file: pq.ParquetFile, group: int) -> tuple[str, ...]:
+    """Return the names in one row group, from its statistics when they leave no doubt."""
+    index = file.schema_arrow.get_field_index("estimator")
+    statistics = file.metadata.row_group(group).column(index).statistics
+    if statistics is not None and statistics.has_min_max and statistics.min == statistics.max:
+        return (str(statistics.min),)
+    column = file.read_row_group(group, columns=["estimator"])["estimator"]
+    return tuple(str(v) for v in pc.unique(column).to_pylist())
+
+
+def _open(path: Path, kind: str) -> pq.ParquetFile:
+    """Open a file that has the columns of its kind, but for those that earlier versions did not write."""
+    with _reading(path):
+        file = pq.ParquetFile(path)
+        types = {f.name: _class_of(f.type) for f in file.schema_arrow}
+    wanted = {f.name: _class_of(f.type) for f in arrow_schema(f"{kind}.json")}
+    if absent := wanted.keys() - types.keys() - {*_LATER_COLUMNS, *_LATER_METRIC_COLUMNS}:
+        file.close()
+        raise _without(path, kind, absent)
+    if other := sorted(name for name in wanted.keys() & types.keys() if types[name] != wanted[name]):
+        file.close()
+        raise OutputError(
+            expected=f"the columns of {kind}",
+            got=", ".join(f"{name} of {types[name]}" for name in other),
+            where=str(path),
+            remedy=_AGAIN,
+        )
+    return file
+
+
+def _class_of(kind: pa.DataType) -> str:
+    """Return what the values of a column are, however many bits they have; texts may stand in a dictionary."""
+    if pa.types.is_dictionary(kind):
+        kind = kind.value_type
+    if pa.types.is_string(kind) or pa.types.is_large_string(kind):
+        return "texts"
+    if pa.types.is_integer(kind):
+        return "whole numbers"
+    return "numbers" if pa.types.is_floating(kind) else str(kind)
+
+
+def _without(path: Path, kind: str, absent: Iterable[str]) -> OutputError:
+    got = f"a Parquet file without {', '.join(sorted(absent))}"
+    return OutputError(expected=f"the columns of {kind}", got=got, where=str(path), remedy=_AGAIN)
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn what Arrow says of a damaged file into an OutputError."""
+    try:
+        yield
+    except (OSError, ValueError, LookupError, pa.ArrowException) as error:
+        got = f"one that cannot be read: {' '.join(str(error).split())[:200]}"
+        raise OutputError(expected="a readable Parquet file", got=got, where=str(path), remedy=_AGAIN) from error
+
+
+def check_parquet(path: Path, kind: str) -> None:
+    """Read all of a file and raise OutputError where it is damaged or has not the columns of ``kind``.
+
+    ``kind`` : ``estimates.parquet`` or ``metrics.parquet``.
+    """
+    with _open(path, kind) as file, _reading(path):
+        for group in range(file.num_row_groups):
+            file.read_row_group(group).validate(full=True)
+
+
+def write_metrics(path: Path, rows: Sequence[MetricRow]) -> None:
+    """Write metrics.parquet, rows in the order given; NaN becomes null; raises OutputError."""
+    schema = arrow_schema("metrics.parquet.json")
+    arrays = [pa.array([getattr(r, f.name) for r in rows], type=f.type, from_pandas=True) for f in schema]
+    with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
+        pq.write_table(pa.Table.from_arrays(arrays, schema=schema), file, compression="zstd")
+
+
+def join_metrics(path: Path, parts: Sequence[Path]) -> None:
+    """Write metrics.parquet from those of drives, in their order, a few at a time; raises OutputError."""
+    schema = arrow_schema("metrics.parquet.json")
+    with (
+        PendingFile(path) as pending,
+        writing(path),
+        open_new(pending.path) as file,
+        pq.ParquetWriter(file, schema, compression="zstd") as writer,
+    ):
+        for first in range(0, len(parts), _PARTS_AT_ONCE):
+            tables = [_metrics_table(part, schema) for part in parts[first : first + _PARTS_AT_ONCE]]
+            writer.write_table(pa.concat_tables(tables).combine_chunks())
+
+
+def _metrics_table(path: Path, schema: pa.Schema) -> pa.Table:
+    with _open(path, _METRICS) as file, _reading(path):
+        return file.read().select(schema.names).cast(schema)
+
+
+def read_metrics(path: Path) -> list[MetricRow]:
+    """Read a metrics.parquet; null becomes NaN, rows marked ``not_independent`` are so again; raises OutputError."""
+    schema = arrow_schema("metrics.parquet.json")
+    with _open(path, _METRICS) as file, _reading(path):
+        names = [n for n in schema.names if n in file.schema_arrow.names]
+        records = file.read(columns=names).to_pylist()
+    dependent = {(r["log"], r["estimator"], r["signal"]) for r in records if r["metric"] == "not_independent"}
+    return [
+        MetricRow(
+            **{**r, "value": float("nan") if r["value"] is None else r["value"]},
+            independent=(r["log"], r["estimator"], r["signal"]) not in dependent,
+        )
+        for r in records
+    ]

@@ -1,0 +1,147 @@
+"""All numeric fields of a log: type, rate, and minimum, mean and maximum."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.text import Text
+
+from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
+from pdhef_logtool.logs.container import Wanted
+from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.mapping.evidence import PIECE_NS, Pieces, Seen
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.runs.inspection.rendering import empty_table, number_text
+from pdhef_logtool.runs.inspection.report import COVARIANCE, INDEX, collapsed
+from pdhef_logtool.storage.documents import jsonable
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+#: Arrays inside of arrays, or of structs.
+INNER_ARRAY = re.compile(r"\[\].")
+#: Fields of one topic that are read.
+MOST_FIELDS = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class FieldReport:
+    """One field: float64 statistics in raw units over what was read, NaN without a finite value."""
+
+    path: str
+    type: str
+    minimum: float
+    mean: float
+    maximum: float
+
+
+@dataclass(frozen=True, slots=True)
+class TopicFields:
+    """The fields of a topic; ``reason`` is given where there are none."""
+
+    name: str
+    type: str
+    messages: int
+    rate_hz: float
+    fields: tuple[FieldReport, ...]
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FieldsOfLog:
+    """Fields by topic over ``seconds`` of the log; ``whole`` if that is all of it."""
+
+    path: str
+    topics: tuple[TopicFields, ...]
+    seconds: float
+    whole: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``pdhef inspect --fields --json`` prints."""
+        return {"path": self.path, "seconds": self.seconds, "whole": self.whole, "topics": jsonable(self.topics)}
+
+
+def fields_of_log(
+    path: LogPlace | str, topic: str | None = None, *, budget: Budget = DEFAULT_BUDGET, msgs: Path | str | None = None
+) -> FieldsOfLog:
+    """Return the numeric fields of a topic, or of all, over a few pieces of the log.
+
+    Raises
+    ------
+    LogError : The file is no log.
+    UsageError : The log has no such topic.
+    """
+    with closing(open_log(path, budget, msgs, Wanted(frozenset()))) as log:
+        topics = [t for t in log.topics if topic in (None, t.name)]
+        if topic is not None and not topics:
+            names = ", ".join(t.name for t in log.topics) or "none"
+            raise UsageError(expected="a topic of the log", got=repr(topic), where=str(path), remedy=f"topics: {names}")
+        pieces = Pieces(log)
+        seconds = min(log.end_ns - log.start_ns, len(pieces.starts) * PIECE_NS) * 1e-9
+        reports = tuple(_topic_fields(log, pieces, t) for t in topics)
+        return FieldsOfLog(str(path), reports, seconds, log.end_ns - log.start_ns <= seconds * 1e9 + 1)
+
+
+def _topic_fields(log: DriveLog, pieces: Pieces, topic: TopicInfo) -> TopicFields:
+    lines = [line for line in collapsed(log.fields(topic.name)) if not any(map(INNER_ARRAY.search, line[2]))]
+    lines = lines[:MOST_FIELDS]
+    paths = {p.removesuffix("[]") for _, _, every in lines for p in every}
+    samples = pieces.read({topic.name: [*paths]}) if paths and topic.messages else {}
+    values = _values_by_path(samples, paths)
+    reports = []
+    for line, kind, every in lines:
+        parts = [v for p in every for v in values.get(p.removesuffix("[]"), [])]
+        reports.append(_report(line, kind, parts))
+        if line.endswith("[]") and len(parts) > 1 and not COVARIANCE.search(line):
+            columns = [p for p in values if INDEX.sub("", p) == line.removesuffix("[]") and p not in paths]
+            reports += [_report(p, kind, values[p]) for p in columns]
+    reason = ""
+    if not (reports and topic.messages):
+        reason = log.unreadable(topic.name) or "no numeric fields" if topic.messages else "no messages"
+    rate_hz = max((sample.rate_hz for sample in samples.values()), default=float("nan"))
+    name = topic.type_name.replace("/msg/", "/")
+    return TopicFields(topic.name, name, topic.messages, rate_hz, tuple(reports), reason)
+
+
+def _values_by_path(samples: Mapping[tuple[str, str], Seen], paths: set[str]) -> dict[str, list[FloatArray]]:
+    """Return values by path; those of an array's elements by the array's path as well."""
+    values: dict[str, list[FloatArray]] = {}
+    for (_, path), sample in samples.items():
+        for name in {path} if path in paths else {path, INDEX.sub("", path)}:
+            values.setdefault(name, []).append(sample.values)
+    return values
+
+
+def _report(path: str, kind: str, values: Sequence[FloatArray]) -> FieldReport:
+    every = np.concatenate([np.empty(0), *values])
+    every = every[np.isfinite(every)]
+    if every.shape[0] == 0:
+        return FieldReport(path, kind, float("nan"), float("nan"), float("nan"))
+    with np.errstate(over="ignore"):
+        return FieldReport(path, kind, float(every.min()), float(every.mean()), float(every.max()))
+
+
+def render_fields(report: FieldsOfLog, console: Console) -> None:
+    """Print a table a topic, for a terminal of 80 columns or more."""
+    console.print(Text(report.path, "bold"), soft_wrap=True)
+    part = "all" if report.whole else "pieces"
+    console.print(f"Values over {part} of the log, {report.seconds:.0f} s, in recorded units.")
+    for topic in report.topics:
+        title = f"{topic.name} ({topic.type}), {number_text(topic.rate_hz)} Hz"
+        table = empty_table(title, "field", "type", "min", "mean", "max", words=2)
+        for row in topic.fields:
+            numbers = (number_text(v) for v in (row.minimum, row.mean, row.maximum))
+            table.add_row(Text(row.path), row.type, *numbers)
+        if topic.fields and not topic.reason:
+            console.print(table)
+        else:
+            console.print(Text(f"{topic.name} ({topic.type}): {topic.reason}"))

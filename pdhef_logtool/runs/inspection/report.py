@@ -1,0 +1,557 @@
+"""Look a log through: topics, rates, gaps, clocks, what maps to which signal, what is missing, what is implausible."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Mapping as MappingABC
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.drive.mounting import survey_log
+from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_proposals
+from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
+from pdhef_logtool.logs.byte_account import checksummed_share
+from pdhef_logtool.logs.container import Wanted
+from pdhef_logtool.logs.drive_log import DriveLog, LogIndex, TopicInfo, windows
+from pdhef_logtool.logs.message_schema import FieldInfo
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.mapping import (
+    Ambiguity,
+    ClockModel,
+    MappedChannels,
+    Mapping,
+    QualityGate,
+    SignalSource,
+    check_mapping,
+    clock_key,
+    fit_clocks,
+    mapping_of,
+    mapping_to_toml,
+    merge_losses,
+    read_signals,
+    recognise,
+    resolve_mapping,
+)
+from pdhef_logtool.mapping.candidates import Candidate
+from pdhef_logtool.mapping.clocks import sources_by_clock, survey_windows
+from pdhef_logtool.mapping.mapping_file import missing_signals
+from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss
+from pdhef_logtool.runs.inspection.step_statistics import DelayStatistics, StepStatistics, ValueStatistics
+from pdhef_logtool.runs.inspection.uses import uses_of
+from pdhef_logtool.storage.documents import jsonable
+from pdhef_logtool.storage.files import write_bytes
+
+WINDOW_NS = 600_000_000_000
+#: Of a larger log with a sound index values are looked at in a part: its first ten minutes, and windows over the rest.
+WHOLE_BYTES = 32 << 20
+#: Where that is a larger share of the chunks, the rest is read too.
+MOST_SAMPLED = 0.75
+#: Kinds of loss that are counted by topic and concern all its signals.
+TOPIC_DROPS = frozenset({"bad-stamp", "duplicate-stamp"})
+#: Topics with more number fields than this are listed in part.
+MAX_LISTED_FIELDS = 40
+#: Arrays that no signal comes from stand in one line.
+COVARIANCE = re.compile(r"cov(ariance)?(\[\d*\])?$", re.IGNORECASE)
+INDEX = re.compile(r"\[\d+\]$")
+#: A device clock whose envelope leaves the fitted line by more has stepped or bent.
+CLOCK_RESIDUAL_S = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class TopicReport:
+    """One topic. Times in s; ``largest_gap_at_s`` is since the log's start; NaN where nothing can be said.
+
+    ``rate_hz`` is by the median step; of a topic of which no time was looked at, by its messages and the log's length.
+    ``delay_*`` are of log time − publish time, which equals zero where a recorder knows one time only.
+    """
+
+    name: str
+    type: str
+    encoding: str
+    messages: int
+    rate_hz: float
+    jitter_p95_s: float
+    largest_gap_s: float
+    largest_gap_at_s: float
+    delay_median_s: float
+    delay_p95_s: float
+    delay_drift_ppm: float
+    delay_negative_share: float
+    fields: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ClockReport:
+    """The stamps that mapped signals use, against log time."""
+
+    topic: str
+    stamp: str
+    clock: str
+    delay_median_s: float
+    delay_p95_s: float
+    delay_min_s: float
+    drift_ppm: float
+    residual_s: float
+    delay_known: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SignalReport:
+    """One mapped signal in SI units, cleaned. Vectors have NaN statistics.
+
+    ``gaps`` counts steps of more than 5 median steps and 0.1 s; ``dropped`` samples by kind.
+    """
+
+    name: str
+    unit: str
+    topic: str
+    field: str
+    samples: int
+    rate_hz: float
+    latency_s: float
+    mean: float
+    std: float
+    minimum: float
+    maximum: float
+    gaps: int
+    largest_gap_s: float
+    largest_gap_at_s: float
+    dropped: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """What was looked at of a log that was not read whole.
+
+    ``times`` says what rates, jitter and gaps of topics come from: the ``index``, or the chunks that were read
+    (``sample``), as do delays, signals and truth in any case. Counts are the index's.
+    """
+
+    chunks: int
+    of_chunks: int
+    times: Literal["index", "sample"]
+
+    def __str__(self) -> str:
+        """Say it in a line."""
+        what, index = ("values", "counts and rates") if self.times == "index" else ("values and rates", "counts")
+        return (
+            f"{what} from {self.chunks} of {self.of_chunks} chunks, {index} from the index; "
+            "--all reads everything and finds damage within chunks"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Inspection:
+    """All that :func:`inspect_log` found.
+
+    Attributes
+    ----------
+    kind : of log. start_ns, end_ns : log time, [start, end).
+    signals, truth : reports by name. missing : signals an estimator looks for and no topic provides.
+    ambiguities, notes : of the mapping. candidates : fields that were weighed for it.
+    checks : what physics says of signals and truth. proposals : corrections of the mapping that are certain.
+    lost : every loss and note of reading. sample : what was looked at; None: everything.
+    checksummed_share : which share of the bytes that were read a verified checksum covers; None where none was read.
+    """
+
+    path: str
+    kind: str
+    start_ns: int
+    end_ns: int
+    topics: tuple[TopicReport, ...]
+    clocks: tuple[ClockReport, ...]
+    mapping: Mapping
+    signals: dict[str, SignalReport]
+    truth: dict[str, SignalReport]
+    missing: tuple[str, ...]
+    ambiguities: tuple[Ambiguity, ...]
+    notes: tuple[str, ...]
+    checks: tuple[Check, ...]
+    proposals: tuple[Proposal, ...]
+    lost: tuple[Loss, ...]
+    candidates: tuple[Candidate, ...] = ()
+    sample: Sample | None = None
+    checksummed_share: float | None = None
+
+    @property
+    def uses(self) -> MappingABC[str, str]:
+        """What the log is good for (``can``), and what it lacks for sideslip (``sideslip_needs``, may be empty)."""
+        return uses_of(self.mapping)
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the log."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+    @property
+    def is_partial(self) -> bool:
+        """Return whether data that the log should have held is gone (exit code 3)."""
+        return any(loss.severity == "lost" for loss in self.lost)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``pdhef inspect --json`` prints; NaN and infinities become None."""
+        document = {
+            "path": self.path,
+            "kind": self.kind,
+            "start_ns": self.start_ns,
+            "end_ns": self.end_ns,
+            "duration_s": self.duration_s,
+            "sample": self.sample,
+            "topics": self.topics,
+            "clocks": self.clocks,
+            "mapping_origin": self.mapping.origin,
+            "signals": self.signals,
+            "truth": self.truth,
+            "truth_quality": None if self.mapping.quality is None else self.mapping.quality.describe(),
+            "missing": self.missing,
+            "ambiguities": self.ambiguities,
+            "notes": self.notes,
+            "checks": self.checks,
+            "proposals": [{"subject": p.subject, "home": p.home, "evidence": p.evidence} for p in self.proposals],
+            "lost": self.lost,
+            "checksummed_share": self.checksummed_share,
+            "candidates": self.candidates,
+            **self.uses,
+        }
+        return {key: jsonable(value) for key, value in document.items()}
+
+
+def inspect_log(
+    path: LogPlace | str,
+    mapping: Mapping | Path | str | None = None,
+    *,
+    prefer_truth: Literal["perfect", "rtk"] = "perfect",
+    budget: Budget = DEFAULT_BUDGET,
+    msgs: Path | str | None = None,
+    whole: bool = False,
+) -> Inspection:
+    """Look a log through and report on it; without a mapping (or its file) the well-known types are recognised.
+
+    Of a large MCAP whose index agrees with itself values are looked at in a part of the chunks (``sample``), unless
+    ``whole``; if anything is wrong in them, or little is left, all of it is read. Memory is bounded by windows of ten
+    minutes, whatever the log's length. ``prefer_truth`` is the choice of :func:`pdhef_logtool.mapping.recognise`;
+    ``budget`` is what reading may cost, ``msgs`` a folder with definitions of types that the log does not define.
+
+    Raises
+    ------
+    LogError : The file is no log.
+    MappingError : The mapping names what the log does not hold.
+    """
+    mapping = mapping_of(mapping)
+    if not whole:
+        with closing(open_log(path, budget, msgs, Wanted(frozenset(), above_bytes=WHOLE_BYTES))) as log:
+            index = log.index
+            # Most of a shorter one is read anyway.
+            long = index is not None and (index.far or log.end_ns - log.start_ns > 2 * WINDOW_NS)
+            if index is not None and not (long and index.size > WHOLE_BYTES):
+                index = None
+            partial = inspect_drive_log(log, mapping, prefer_truth=prefer_truth, index=index)
+            damaged = any(loss.severity == "lost" for loss in log.lost)
+            if partial.sample is None or not (
+                damaged or partial.sample.chunks > MOST_SAMPLED * partial.sample.of_chunks
+            ):
+                return partial
+    with closing(open_log(path, budget, msgs)) as log:
+        return inspect_drive_log(log, mapping, prefer_truth=prefer_truth)
+
+
+def inspect_drive_log(
+    log: DriveLog,
+    given: Mapping | None = None,
+    *,
+    prefer_truth: Literal["perfect", "rtk"] = "perfect",
+    index: LogIndex | None = None,
+) -> Inspection:
+    """Do what :func:`inspect_log` does with a log that is open already; with its ``index`` a sample of it is read."""
+    ambiguities: tuple[Ambiguity, ...] = ()
+    candidates: tuple[Candidate, ...] = ()
+    if given is None:
+        auto = recognise(log, prefer_truth=prefer_truth)
+        mapping, ambiguities, candidates = auto.mapping, auto.ambiguities, auto.candidates
+    else:
+        check_mapping(given, log)
+        mapping = given
+    mapping = resolve_mapping(log, mapping)
+    head = (log.start_ns, min(log.end_ns, log.start_ns + WINDOW_NS))
+    look = _whole_look(log) if index is None else _sample_look(log, index, mapping, head)
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    looked_at = survey_log(log, mapping, clocks, head)
+    mapping = looked_at.mapping
+    steps, delays, gathered, reading = _read_windows(log, mapping, clocks, look)
+    signals, truth = (
+        {n: _signal_report(s, section, gathered, clocks, reading, log, mapping.quality) for n, s in sources.items()}
+        for section, sources in (("signals", mapping.signals), ("truth", mapping.truth))
+    )
+    return Inspection(
+        path=str(log.path),
+        kind=log.kind,
+        start_ns=log.start_ns,
+        end_ns=log.end_ns,
+        topics=tuple(_topic_report(t, steps[t.name], delays[t.name], log) for t in log.topics),
+        clocks=tuple(_clock_report(s, clocks[key]) for key, s in sources_by_clock(mapping).items()),
+        mapping=mapping,
+        signals=signals,
+        truth=truth,
+        missing=missing_signals(mapping),
+        ambiguities=ambiguities,
+        notes=(*mapping.notes, *_clock_notes(mapping, clocks)),
+        checks=looked_at.checks,
+        proposals=mapping_proposals(looked_at),
+        # Last, since a log knows all its losses only after it was read through.
+        lost=merge_losses([log.lost, reading]),
+        candidates=candidates,
+        sample=None if look.sample is None else look.sample(),
+        checksummed_share=checksummed_share(log.byte_ledgers),
+    )
+
+
+def _read_windows(
+    log: DriveLog, mapping: Mapping, clocks: dict[str, ClockModel], look: _Look
+) -> tuple[dict[str, StepStatistics], dict[str, DelayStatistics], dict[tuple[str, str], _Gathered], tuple[Loss, ...]]:
+    """Return steps and delays by topic, statistics by section and signal, and losses."""
+    steps = {t.name: StepStatistics() for t in log.topics}
+    delays = {t.name: DelayStatistics() for t in log.topics}
+    gathered: dict[tuple[str, str], _Gathered] = {}
+    losses: list[tuple[Loss, ...]] = []
+    if look.by_index is not None:
+        for start, end in windows(log.start_ns, log.end_ns, WINDOW_NS, log.occupied):
+            for name, times in look.by_index.index_times(start, end).items():
+                steps[name].add(times)
+    for start, end in look.windows:
+        if look.sample is not None:  # windows of a sample are not contiguous
+            for stream in (*(steps.values() if look.by_index is None else ()), *(g.steps for g in gathered.values())):
+                stream.last_ns = None
+        channels = read_signals(log, mapping, clocks, start, end, stamps=look.stamps)
+        for name, columns in channels.stamps.items():
+            if look.by_index is None:
+                steps[name].add(columns.log_time_ns)
+            delays[name].add(columns.log_time_ns, columns.publish_time_ns)
+        losses.append(channels.losses)
+        _gather(channels, gathered)
+    return steps, delays, gathered, merge_losses(losses)
+
+
+# ------------------------------------------------------------------------------------------------ what is read
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """What of a log is read.
+
+    Attributes
+    ----------
+    windows : [start, end) that are read. stamps : topics whose times are read there.
+    by_index : the index that tells the times of all topics; None: what is read tells them.
+    sample : says what was looked at in the end; None: all of the log is.
+    """
+
+    windows: Iterable[tuple[int, int]]
+    stamps: tuple[str, ...]
+    by_index: LogIndex | None = None
+    sample: Callable[[], Sample] | None = None
+
+
+def _whole_look(log: DriveLog) -> _Look:
+    return _Look(windows(log.start_ns, log.end_ns, WINDOW_NS, log.occupied), tuple(t.name for t in log.topics))
+
+
+def _sample_look(log: DriveLog, index: LogIndex, mapping: Mapping, head: tuple[int, int]) -> _Look:
+    """Look at what the clocks are fitted to, evenly over the log. With the head, which is checked, it is expected."""
+    mapped = {source.topic for source in mapping.sources()}
+    spread = survey_windows(log.start_ns, log.end_ns) if log.end_ns > head[1] else [head]
+    index.expect(mapped, [head, *spread])
+
+    def sample() -> Sample:
+        return Sample(*index.looked_at, times="sample" if index.far else "index")
+
+    return _Look(spread, tuple(sorted(index.beside(mapped))), None if index.far else index, sample)
+
+
+# ---------------------------------------------------------------------------------------------- gathering
+
+
+@dataclass(slots=True)
+class _Gathered:
+    steps: StepStatistics
+    values: ValueStatistics
+
+
+def _gather(channels: MappedChannels, gathered: dict[tuple[str, str], _Gathered]) -> None:
+    for section, partial in (("signals", channels.signals), ("truth", channels.truth)):
+        for name, channel in partial.items():
+            entry = gathered.setdefault((section, name), _Gathered(StepStatistics(), ValueStatistics()))
+            stamps = channel.stamps_ns
+            if entry.steps.last_ns is not None:
+                # Stamps at the seam of two windows may be out of order by the jitter of their delays.
+                stamps = stamps[stamps > entry.steps.last_ns]
+            entry.steps.add(stamps)
+            if channel.values.ndim == 1:
+                entry.values.add(channel.values)
+
+
+# ------------------------------------------------------------------------------------------------ reports
+
+
+def collapsed(fields: Sequence[FieldInfo]) -> list[tuple[str, str, list[str]]]:
+    """Return name, type and paths of what stands in a line each: covariances are one, with all their elements."""
+    lines: dict[str, tuple[str, list[str]]] = {}
+    for info in fields:
+        if info.kind not in ("number", "bool"):
+            continue
+        name = INDEX.sub("[]", info.path) if COVARIANCE.search(info.path) else info.path
+        kind = np.dtype(info.code).name if info.code and info.kind == "number" else info.kind
+        lines.setdefault(name, (kind, []))[1].append(info.path)
+    return [(name, kind, paths) for name, (kind, paths) in lines.items()]
+
+
+def _topic_report(topic: TopicInfo, steps: StepStatistics, delays: DelayStatistics, log: DriveLog) -> TopicReport:
+    largest = steps.largest
+    log_s = (log.end_ns - log.start_ns) * 1e-9
+    numbers = tuple(name for name, _, _ in collapsed(log.fields(topic.name)))
+    return TopicReport(
+        name=topic.name,
+        type=topic.type_name,
+        encoding=topic.encoding,
+        messages=topic.messages,
+        rate_hz=_inverse(steps.median_s) if steps.count else topic.messages / log_s if log_s > 0.0 else float("nan"),
+        jitter_p95_s=steps.jitter_p95_s,
+        largest_gap_s=largest[0] if largest else float("nan"),
+        largest_gap_at_s=(largest[1] - log.start_ns) * 1e-9 if largest else float("nan"),
+        delay_median_s=delays.quantile(0.5),
+        delay_p95_s=delays.quantile(0.95),
+        delay_drift_ppm=delays.drift_ppm,
+        delay_negative_share=delays.negative / delays.count if delays.count else float("nan"),
+        fields=numbers[:MAX_LISTED_FIELDS],
+    )
+
+
+def _signal_report(
+    source: SignalSource,
+    section: str,
+    gathered: dict[tuple[str, str], _Gathered],
+    clocks: dict[str, ClockModel],
+    losses: Iterable[Loss],
+    log: DriveLog,
+    quality: QualityGate | None,
+) -> SignalReport:
+    entry = gathered.get((section, source.name), _Gathered(StepStatistics(), ValueStatistics()))
+    gaps = entry.steps.gaps()
+    largest = max(gaps, key=lambda g: g[0]) if gaps else None
+    has_values = entry.values.count > 0
+    places = {f"{source.name} ({source.label})"}
+    if section == "truth" and quality is not None:
+        places.add(f"{source.name} ({quality.describe()})")
+    dropped = {x.kind: x.count or 0 for x in losses if x.where in places}
+    # Messages that were sorted back are used.
+    dropped |= {x.kind: x.count or 0 for x in losses if x.where == source.read_topic and x.kind in TOPIC_DROPS}
+    clock = clocks[clock_key(source)]
+    return SignalReport(
+        name=source.name,
+        unit=(SIGNAL_UNITS if section == "signals" else TRUTH_UNITS)[source.name],
+        topic=source.topic,
+        field=source.field if isinstance(source.field, str) else ", ".join(source.field),
+        samples=entry.steps.count,
+        rate_hz=_inverse(entry.steps.median_s),
+        latency_s=clock.median_delay_s + source.latency_s,
+        mean=entry.values.mean if has_values else float("nan"),
+        std=entry.values.std,
+        minimum=entry.values.low if has_values else float("nan"),
+        maximum=entry.values.high if has_values else float("nan"),
+        gaps=len(gaps),
+        largest_gap_s=largest[0] if largest else float("nan"),
+        largest_gap_at_s=(largest[1] - log.start_ns) * 1e-9 if largest else float("nan"),
+        dropped=dropped,
+    )
+
+
+def _clock_report(source: SignalSource, clock: ClockModel) -> ClockReport:
+    return ClockReport(
+        topic=source.topic,
+        stamp=source.stamp,
+        clock=source.clock,
+        delay_median_s=clock.median_delay_s,
+        delay_p95_s=clock.p95_delay_s,
+        delay_min_s=clock.min_delay_s,
+        drift_ppm=clock.drift * 1e6,
+        residual_s=clock.residual_s,
+        delay_known=clock.delay_known,
+    )
+
+
+def _clock_notes(mapping: Mapping, clocks: dict[str, ClockModel]) -> list[str]:
+    notes = []
+    for key, source in sources_by_clock(mapping).items():
+        residual_s = clocks[key].residual_s
+        if source.clock == "device" and residual_s > CLOCK_RESIDUAL_S:
+            notes.append(
+                f"the clock of {key} leaves its fitted line by {residual_s * 1e3:.0f} ms: "
+                "it stepped, or its drift changed"
+            )
+    return notes
+
+
+def _inverse(seconds: float) -> float:
+    return 1.0 / seconds if math.isfinite(seconds) and seconds > 0.0 else float("nan")
+
+
+# ------------------------------------------------------------------------------------------------ mapping
+
+
+def mapping_comments(inspection: Inspection) -> dict[str, str]:
+    """Return comments for :func:`pdhef_logtool.mapping.mapping_to_toml` that help to edit the mapping."""
+    types = {t.name: t.type for t in inspection.topics}
+    comments: dict[str, str] = {}
+    for section, reports in (("signals", inspection.signals), ("truth", inspection.truth)):
+        for name, report in reports.items():
+            text = f"{types.get(report.topic, '')}, {_number(report.rate_hz)} Hz"
+            if math.isfinite(report.minimum):
+                text += f", {_number(report.minimum)} to {_number(report.maximum)} {report.unit}"
+            subject = name if section == "signals" else f"truth.{name}"
+            doubts = [
+                c
+                for c in inspection.checks
+                if c.verdict != "passed" and subject in (c.subject, c.name.removesuffix(".candidate"))
+            ]
+            done = any(p.subject == subject for p in inspection.proposals)
+            lines = [] if done else [f"CHECK {c.name} {c.verdict}: {c.evidence}; {c.remedy}" for c in doubts]
+            comments[f"{section}.{name}"] = "\n".join([text, *lines])
+    head = [f"Written from {Path(inspection.path).name}."]
+    head += [f"Ambiguous: {a}" for a in inspection.ambiguities]
+    mapped = set(inspection.mapping.topics)
+    unmapped = [t for t in inspection.topics if t.name not in mapped and t.fields and t.messages]
+    if unmapped and (inspection.missing or not inspection.truth):
+        head.append("Topics with numbers that no signal uses:")
+        head += [f"  {t.name} ({t.type}): {', '.join(t.fields[:12])}" for t in unmapped[:50]]
+    comments[""] = "\n".join(head)
+    return comments
+
+
+def write_mapping(inspection: Inspection, path: Path) -> None:
+    """Write the inspection's mapping, with the corrections that it proposes, as a TOML file that is ready to edit.
+
+    Raises
+    ------
+    OutputError : The file exists already (somebody may have edited it) or cannot be written.
+    """
+    if path.exists():
+        raise OutputError(
+            expected="a new file", got="one that exists", where=str(path), remedy="give another name or remove it"
+        )
+    mapping, _ = apply_proposals(inspection.proposals, inspection.mapping, default_vehicle())
+    comments = mapping_comments(inspection)
+    text = mapping_to_toml(mapping, comments=comments, alternatives=inspection.candidates)
+    write_bytes(path, text.encode())
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if math.isfinite(value) else "?"

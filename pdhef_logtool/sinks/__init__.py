@@ -1,1 +1,0 @@
-"""What a run leaves: Parquet tables, annotated MCAP, Rerun recording, reports."""

@@ -1,0 +1,1 @@
+"""Files, folders, object stores and documents: complete or absent."""

@@ -1,0 +1,295 @@
+"""Documents that people write: read as TOML or JSON, checked by a pydantic model, or refused in one line; and ours.
+
+A document of our own contains the digest of its other entries (:func:`seal`), by which its reader notices any change.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import tomllib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from difflib import get_close_matches
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
+
+from pdhef_logtool.records.errors import PdhefError
+from pdhef_logtool.records.printable import utf8
+
+if TYPE_CHECKING:
+    from pydantic import AfterValidator, ValidationError
+
+ModelT = TypeVar("ModelT")
+
+#: Tables and lists inside one another: far more than any of our files has, far less than Python's stack.
+MAX_DEPTH = 32
+#: Twenty times the largest that is read.
+MAX_BYTES = 4 << 20
+#: The entry of a sealed document that is the digest of all others.
+DIGEST = "digest"
+#: TOML's whole numbers have 64 bits.
+_WHOLE = range(-(2**63), 2**64)
+
+
+def read_toml(path: Path, what: str, error: type[PdhefError], remedy: str = "") -> dict[str, Any]:
+    """Return the table of a TOML file; ``what`` names it in the error.
+
+    Raises
+    ------
+    PdhefError
+        Of class ``error``: the file is missing, no UTF-8, no TOML, or nested beyond :data:`MAX_DEPTH`.
+    """
+    return _read(path, tomllib.loads, what, error, remedy)
+
+
+def read_json(
+    path: Path, what: str, error: type[PdhefError], remedy: str = "", max_bytes: int = MAX_BYTES
+) -> dict[str, Any]:
+    """Return the object of a JSON file; otherwise as :func:`read_toml`, and a list or a number is refused as well."""
+    return _read(path, json.loads, what, error, remedy, max_bytes)
+
+
+def read_sealed(
+    path: Path,
+    what: str,
+    error: type[PdhefError],
+    remedy: str = "",
+    max_bytes: int = MAX_BYTES,
+) -> dict[str, Any]:
+    """Return a document that :func:`seal` made, without its digest; otherwise as :func:`read_json`.
+
+    Raises
+    ------
+    PdhefError
+        Of class ``error``: also a document that is not as it was written.
+    """
+    document = read_json(path, what, error, remedy, max_bytes)
+    if not is_sealed(document):
+        raise error(expected=what, got="one that is not as it was written", where=str(path), remedy=remedy)
+    return {key: value for key, value in document.items() if key != DIGEST}
+
+
+def seal(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a JSON-able document with the digest of its entries."""
+    plain = jsonable(document)
+    return {**plain, DIGEST: digest(plain)}
+
+
+def is_sealed(document: Mapping[str, Any]) -> bool:
+    """Return whether a document is as :func:`seal` made it."""
+    return document.get(DIGEST) == digest({key: value for key, value in document.items() if key != DIGEST})
+
+
+def file_sha256(path: Path) -> str:
+    """Return the sha256 of a file's content; raises OSError."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _read(
+    path: Path,
+    parse: Callable[[str], Any],
+    what: str,
+    error: type[PdhefError],
+    remedy: str,
+    max_bytes: int = MAX_BYTES,
+) -> dict[str, Any]:
+    try:
+        document = parse(read_text(path, max_bytes))
+        got = _oddity(document)
+    except FileNotFoundError:
+        got = "no such file"
+    except OSError as problem:
+        got = problem.strerror or str(problem)
+    except RecursionError:
+        got = "tables or lists that are nested too deeply"
+    except ValueError as problem:  # of the decoder, either parser, or a number of thousands of digits
+        got = str(problem)
+    if got:
+        raise error(expected=what, got=got, where=str(path), remedy=remedy)
+    return dict(document)
+
+
+def read_text(path: Path, max_bytes: int = MAX_BYTES) -> str:
+    """Return the text of a document; raises OSError, or ValueError if it is no UTF-8 or longer than any document."""
+    with path.open("rb") as file:
+        data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise ValueError(f"more than {max_bytes >> 20} MiB")
+    return data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _oddity(document: object) -> str:
+    """Return what no document of ours has and what would break its reader, empty if nothing."""
+    if not isinstance(document, dict):
+        return f"a {type(document).__name__} instead of named entries"
+    level: list[object] = [document]
+    for _ in range(MAX_DEPTH):
+        if any(isinstance(value, int) and value not in _WHOLE for value in level):
+            return "a whole number of more than 64 bits"
+        parts = (v.values() if isinstance(v, dict) else v for v in level if isinstance(v, dict | list))
+        level = [value for part in parts for value in part]
+        if not level:
+            return ""
+    return "tables or lists that are nested too deeply"
+
+
+def validated(
+    model: type[ModelT], raw: object, where: str, error: type[PdhefError], *, expected: str, remedy: str = ""
+) -> ModelT:
+    """Return the record of a parsed document.
+
+    Parameters
+    ----------
+    model : pydantic model or dataclass that forbids extra entries.
+
+    Raises
+    ------
+    PdhefError
+        Of class ``error``: entries are wrong, missing, unknown or contradict one another; all are named.
+    """
+    problems: list[str] = []
+    record = checked(model, raw, "", problems)
+    if record is None:
+        raise error(expected=expected, got="; ".join(problems), where=where, remedy=remedy)
+    return record
+
+
+def checked(model: type[ModelT], raw: object, table: str, problems: list[str]) -> ModelT | None:
+    """Return the record of a parsed table that stands at ``table`` in its document; None adds to ``problems``."""
+    from pydantic import BaseModel, ValidationError
+    from pydantic_core import ArgsKwargs
+
+    validate = model.__pydantic_validator__.validate_python  # type: ignore[attr-defined]
+    try:
+        if isinstance(raw, dict) and not issubclass(model, BaseModel):
+            # A strict dataclass takes its entries as arguments of a new one only.
+            record: ModelT = validate(ArgsKwargs((), raw), self_instance=object.__new__(model))
+        else:
+            record = validate(raw)
+    except ValidationError as error:
+        problems += _problems(error, model, raw, table)
+        return None
+    return record
+
+
+def unknown(name: str, known: Iterable[str], table: str = "") -> str:
+    """Return the problem of an entry that a table does not know, with the nearest that it knows."""
+    return f"{_at(table, name)}: {_unknown(name, known, table)}"
+
+
+def _unknown(name: str, known: Iterable[str], table: str) -> str:
+    known = tuple(known)
+    # The start of a name, such as "ay" of "ay_m_s2", is nearer than what happens to share its letters.
+    near = [k for k in known if name and k.startswith(name)] or get_close_matches(name, known, n=1, cutoff=0.4)
+    if near:
+        return f"unknown, did you mean {_at(table, near[0])}?"
+    return "unknown" + (f", known are {', '.join(known)}" if 0 < len(known) <= 12 else "")
+
+
+def one_of(names: Iterable[str]) -> AfterValidator:
+    """Return the check that a text, a dict's key for instance, is one of ``names``; the nearest is told."""
+    from pydantic import AfterValidator
+    from pydantic_core import PydanticCustomError
+
+    known = tuple(names)
+
+    def check(name: str) -> str:
+        if name not in known:
+            raise PydanticCustomError("unknown_name", "should be one of {names}", {"names": known})
+        return name
+
+    return AfterValidator(check)
+
+
+def _at(table: str, name: str) -> str:
+    return f"{table}.{name}" if table and name else table or name or "file"
+
+
+def _problems(error: ValidationError, model: type, raw: object, table: str) -> list[str]:
+    found: dict[str, list[str]] = {}
+    for e in error.errors(include_url=False, include_input=False):
+        place, value = _place(e["loc"], raw, missing=e["type"].startswith("missing"))
+        at = _at(table, ".".join(place))
+        if e["type"] in ("extra_forbidden", "unexpected_keyword_argument", "unknown_name"):
+            known = e["ctx"]["names"] if e["type"] == "unknown_name" else _entries(model, place[:-1])
+            text = _unknown(place[-1], known, ".".join(p for p in (table, *place[:-1]) if p))
+        elif e["type"].startswith("missing"):
+            text = "is missing"
+        else:
+            text = e["msg"].removeprefix("Value error, ")
+            text = text.replace("Input should", "should").replace("an instance of Path", "a path")
+            text = text.replace("a valid tuple", "a list")
+            # A table's problem says itself which entries it is about.
+            text += f", got {value!r:.60}" if isinstance(value, str | int | float) else ""
+        found.setdefault(at, []).append(text)
+    # A union reports one message an alternative; together they are one problem.
+    return [f"{at}: {' or '.join(dict.fromkeys(texts))}" for at, texts in found.items()]
+
+
+def _place(loc: tuple[int | str, ...], raw: object, *, missing: bool) -> tuple[list[str], object]:
+    """Return the keys of pydantic's ``loc`` that are the document's, without a union's alternatives, and the value."""
+    place = []
+    for part in loc:
+        if isinstance(raw, Mapping) and (part in raw or (missing and part == loc[-1])):
+            raw = raw.get(part)
+        elif isinstance(raw, list | tuple) and isinstance(part, int) and part < len(raw):
+            raw = raw[part]
+        else:
+            continue
+        place.append(str(part))
+    return place, raw
+
+
+def _entries(annotation: Any, place: Sequence[str]) -> tuple[str, ...]:
+    """Return the names that a model's table at a place knows."""
+    fields = getattr(annotation, "__pydantic_fields__", None)
+    if fields is not None:
+        if not place:
+            return tuple(fields)
+        return _entries(fields[place[0]].annotation, place[1:]) if place[0] in fields else ()
+    # The items of a container stand one place deeper, the alternatives of a union at the same.
+    inner = place[1:] if get_origin(annotation) in (dict, list, tuple) else place
+    return next((names for member in get_args(annotation) if (names := _entries(member, inner))), ())
+
+
+def jsonable(value: Any) -> Any:
+    """Turn records, mappings, sequences, numpy values and paths into what JSON holds; NaN and infinity become None.
+
+    Raises
+    ------
+    TypeError
+        For anything else.
+    """
+    if isinstance(value, str):  # in order of how many there are in a report
+        return utf8(value)
+    if value is None or isinstance(value, int):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {utf8(str(k)): jsonable(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [jsonable(v) for v in value]
+    if isinstance(value, PurePath):
+        return utf8(str(value))
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: jsonable(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {utf8(str(k)): jsonable(v) for k, v in value.items()}
+    if isinstance(value, set | frozenset):
+        return [jsonable(v) for v in sorted(value)]
+    if isinstance(value, Sequence):
+        return [jsonable(v) for v in value]
+    import numpy as np
+
+    if isinstance(value, np.generic | np.ndarray):
+        return jsonable(value.tolist())
+    raise TypeError(f"no JSON form of {type(value).__name__}")
+
+
+def digest(document: Any) -> str:
+    """Return the sha256 of a JSON-able value, whatever the order of its keys."""
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,272 @@
+"""A folder of an object store, by fsspec: what is written to it appears whole or not at all.
+
+Credentials are the environment's. What a store refuses or fails at is an OutputError, which names the URL without what
+gives access to it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import weakref
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from pdhef_logtool.records.errors import OutputError, UsageError
+from pdhef_logtool.records.processes import is_alive, own_name
+from pdhef_logtool.storage.files import scratch_folder
+from pdhef_logtool.storage.outputs import LOCK_FILE
+
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://.")
+#: Stores whose objects appear when they are complete; elsewhere a temporary name is used.
+_WHOLE = frozenset({"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "memory"})
+#: A lock that nobody has renewed for so long is left over. Stores refuse clocks that differ by more than 15 minutes.
+LEFT_OVER_S = 1800.0
+#: How S3 is asked again, by botocore with growing waits; a request that is not answered is given up.
+S3_CLIENT: dict[str, Any] = {
+    "connect_timeout": 15.0,
+    "read_timeout": 60.0,
+    "retries": {"mode": "standard", "total_max_attempts": 5},
+}
+_AT_ONCE = 16
+_REFUSED = "give credentials that may write, by the environment: docs/remote.md"
+_EXISTING = "make the bucket first, or check the URL"
+
+
+class HeldError(OutputError):
+    """Another command holds the folder."""
+
+
+def is_url(place: Path | str) -> bool:
+    """Tell whether an output is a URL, and no folder of this machine."""
+    return isinstance(place, str) and _URL.match(place) is not None
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectFolder:
+    """The objects below a URL of what fsspec can write to, by their names there: ``logs/drive/report.json``."""
+
+    url: str
+
+    @property
+    def shown(self) -> str:
+        """The URL as people and files are told of it: without user, password and query."""
+        parts = urlsplit(self.url)
+        return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}".rstrip("/")
+
+    @property
+    def name(self) -> str:
+        """The last part of the URL."""
+        return self.shown.rpartition("/")[2]
+
+    def names(self) -> list[str]:
+        """Return the names of all objects, ascending."""
+        with self._asking():
+            store, root = self._store()
+            store.invalidate_cache()
+            found = store.find(root)
+        # Some stores give paths a slash more than they take.
+        return sorted(path.lstrip("/").removeprefix(f"{root.lstrip('/')}/") for path in found)
+
+    def get(self, name: str, to: Path) -> bool:
+        """Copy an object to a file; False where there is none."""
+        with self._asking(name):
+            store, root = self._store()
+            try:
+                store.get_file(f"{root}/{name}", str(to))
+            except BaseException as error:
+                with suppress(OSError):
+                    to.unlink(missing_ok=True)  # or who looks for it finds a part of it
+                if isinstance(error, FileNotFoundError):
+                    return False
+                raise
+        return True
+
+    def get_all(self, names: Sequence[str], folder: Path) -> None:
+        """Copy objects to a folder, under their names, many at once."""
+        for parent in {(folder / name).parent for name in names}:
+            parent.mkdir(parents=True, exist_ok=True)
+        with self._asking():
+            store, root = self._store()
+            if names:
+                store.get([f"{root}/{name}" for name in names], [str(folder / name) for name in names])
+
+    def put(self, name: str, path: Path) -> None:
+        """Copy a file to an object, in place of what it was."""
+        with self._asking(name):
+            store, root = self._store()
+            if self._is_whole:
+                store.put_file(str(path), f"{root}/{name}")
+                return
+            partial = f"{root}/{name}.{own_name()}.partial"
+            store.makedirs(partial.rpartition("/")[0], exist_ok=True)
+            store.put_file(str(path), partial)
+            store.mv(partial, f"{root}/{name}")
+
+    def remove(self, names: Iterable[str]) -> None:
+        """Remove objects, whether they are there or not."""
+
+        def remove_one(name: str) -> None:  # not `rm`, which takes a name for a pattern
+            with suppress(FileNotFoundError):
+                store.rm_file(f"{root}/{name}")
+
+        if gone := list(names):
+            with self._asking(), ThreadPoolExecutor(_AT_ONCE) as several:
+                store, root = self._store()
+                list(several.map(remove_one, gone))
+
+    def acquire(self) -> None:
+        """Hold the folder by an object that is made only where there is none; raises OutputError if another does.
+
+        That of a command that has ended here, or has not renewed it for long, is replaced.
+        """
+        with self._asking():
+            store, root = self._store()
+            for _ in range(2):
+                try:
+                    if not self._is_whole:
+                        store.makedirs(root, exist_ok=True)
+                    store.pipe_file(f"{root}/{LOCK_FILE}", own_name().encode(), mode="create")
+                except Exception:
+                    holder = self._holder()
+                    if holder is None:
+                        raise
+                    if not self._is_left_over(holder):
+                        raise self._held(holder) from None
+                    self.remove([LOCK_FILE])
+                else:
+                    return
+        raise self._held(self._holder() or "")
+
+    def renew(self) -> None:
+        """Say that the folder is still held; raises OutputError if it is not any more."""
+        with self._asking():
+            store, root = self._store()
+            holder = self._holder()
+            if holder != own_name():
+                raise self._held(holder or "")
+            store.pipe_file(f"{root}/{LOCK_FILE}", own_name().encode())
+
+    def release(self) -> None:
+        """Let go of the folder; harmless when it is not held."""
+        with suppress(OutputError), self._asking():
+            if self._holder() == own_name():
+                self.remove([LOCK_FILE])
+
+    def _holder(self) -> str | None:
+        store, root = self._store()
+        try:
+            return bytes(store.cat_file(f"{root}/{LOCK_FILE}")).decode("ascii", "replace")
+        except FileNotFoundError:
+            return None
+
+    def _is_left_over(self, holder: str) -> bool:
+        with suppress(ValueError):
+            if is_alive(holder) is not None:
+                return not is_alive(holder)
+        store, root = self._store()
+        store.invalidate_cache()
+        renewed = store.modified(f"{root}/{LOCK_FILE}")
+        return bool((datetime.now(UTC) - renewed.astimezone(UTC)).total_seconds() > LEFT_OVER_S)
+
+    def _held(self, holder: str) -> HeldError:
+        who = ""
+        with suppress(ValueError, IndexError):
+            who = f"it is process {holder.split('-')[1]}: " if is_alive(holder) else ""
+        ended = "" if who else f", or remove {LOCK_FILE} there if that command has ended"
+        return HeldError(
+            expected="an output folder that no other command is writing to",
+            got="one that another command is writing to",
+            where=self.shown,
+            remedy=f"{who}wait for it or choose another one{ended}",
+        )
+
+    @property
+    def _is_whole(self) -> bool:
+        return self.url.partition("://")[0].lower() in _WHOLE
+
+    def _store(self) -> tuple[Any, str]:
+        return _opened(self.url, os.getpid())
+
+    @contextmanager
+    def _asking(self, name: str = "") -> Iterator[None]:
+        """Turn what goes wrong with the store into one line."""
+        try:
+            yield
+        except (OutputError, UsageError):
+            raise
+        except Exception as error:
+            where = f"{self.shown}/{name}".rstrip("/")
+            got, remedy = _told(error)
+            raise OutputError(expected="an object store that can be used", got=got, where=where, remedy=remedy) from (
+                error
+            )
+
+
+def _told(error: Exception) -> tuple[str, str]:
+    """Return what went wrong, and what helps."""
+    kind = type(error).__name__
+    if isinstance(error, PermissionError):
+        return f"a refusal ({_first_line(error)})", _REFUSED
+    if "Credentials" in kind or "Unauthorized" in kind:
+        return "no credentials", _REFUSED
+    if isinstance(error, FileNotFoundError):
+        return f"no such place ({_first_line(error)})", _EXISTING
+    if "Connect" in kind or "Timeout" in kind:
+        return f"no answer ({kind})", "check the network, the URL and AWS_ENDPOINT_URL, or try again later"
+    return f"{kind}: {_first_line(error)}", "check the URL, or try again later"
+
+
+def _first_line(error: Exception) -> str:
+    """Return what an error says, without what may give access."""
+    text = getattr(error, "strerror", None) or (error.args[0] if error.args else "") or type(error).__name__
+    return str(text).partition("\n")[0].partition("?")[0][:200]
+
+
+@cache
+def _opened(url: str, _pid: int) -> tuple[Any, str]:
+    """Return the file system of a URL and the path there; once a process."""
+    import fsspec
+
+    scheme = url.partition("://")[0].lower()
+    options: dict[str, Any] = {"config_kwargs": S3_CLIENT} if scheme in ("s3", "s3a") else {}
+    try:
+        if scheme in ("http", "https"):
+            raise ValueError(f"{scheme}://, which is for reading")
+        store, root = fsspec.core.url_to_fs(url, use_listings_cache=False, **options)
+    except (ImportError, ValueError) as error:
+        raise UsageError(
+            expected="a folder, or a URL that fsspec can write to",
+            got=" ".join(str(error).split()),
+            where=ObjectFolder(url).shown,
+            remedy="pip install 'pdhef-logtool[s3]' for s3://",
+        ) from error
+    return store, root.rstrip("/")
+
+
+class Mirror:
+    """A folder of this machine with what was asked for of an object folder; it goes with who holds it."""
+
+    def __init__(self, url: str) -> None:
+        self.objects = ObjectFolder(url)
+        scratch = scratch_folder()
+        weakref.finalize(self, scratch.cleanup)
+        # The name of an output's folder stands in what is written there.
+        self.folder = Path(scratch.name) / (self.objects.name or "out")
+        self.folder.mkdir()
+
+    def fetch(self, name: str) -> Path | None:
+        """Return the file of an object, None where there is none; it is asked for once."""
+        path = self.folder / name
+        if not path.is_file():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if not self.objects.get(name, path):
+                return None
+        return path

@@ -1,0 +1,444 @@
+"""Where outputs go: a folder that one command at a time holds, and changes to it that happen whole or not at all.
+
+A change is written into a hidden folder beside what it replaces and takes its place by exchange: killed at any point,
+the old or the new stands whole under the name. What a killed command left is removed by the next one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import os
+import re
+import shutil
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Container, Iterable, Iterator
+from pathlib import Path
+from typing import Self
+
+from pdhef_logtool.records.errors import OutputError, UsageError
+from pdhef_logtool.records.processes import is_alive, own_name
+from pdhef_logtool.storage.files import OF_WRITING, cannot_write, open_new, sweep_files, sync, writing
+
+#: The hidden folder beside outputs in which changes are prepared: ``.pdhef/NAME/{new,old,scratch}``.
+WORK = ".pdhef"
+#: Stands for the kernel's lock where the file system has none.
+LOCK_FILE = ".pdhef.lock"
+_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+:)/.")
+_NO_LOCK = (errno.EBADF, errno.EINVAL, errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EISDIR)
+_POLL_S = 0.05
+#: To make a folder that a command beside this one may remove while it is empty.
+_TRIES = 100
+
+
+class Transaction(ABC):
+    """A named set of files that replaces the set of that name whole, or not at all.
+
+    Files are written to the paths that :meth:`file` returns. Then either :meth:`commit` makes them the outputs, or
+    :meth:`discard` leaves what was there. As a context it commits at its end and discards on an exception.
+    """
+
+    #: A local folder for what is needed until then; gone afterwards.
+    scratch: Path
+    #: What a person is told of as the place of the outputs.
+    target: Path
+
+    @abstractmethod
+    def file(self, name: str) -> Path:
+        """Return where to write the file of a name."""
+
+    @abstractmethod
+    def commit(self) -> None:
+        """Make the files the outputs; raises OutputError, and what was there then stands as it was."""
+
+    @abstractmethod
+    def discard(self) -> None:
+        """Remove what was written; harmless after :meth:`commit` and when called twice."""
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        """Commit on success, discard on an exception; a full disk is an OutputError wherever it was noticed."""
+        if kind is None:
+            self.commit()
+            return
+        self.discard()
+        if isinstance(error, OutputError):
+            error.where = self._shown(error.where)
+        if isinstance(error, OSError) and error.errno in OF_WRITING:
+            raise cannot_write(self.target, error) from error
+
+    def _shown(self, where: str) -> str:
+        """Return the final name of a place that an error names."""
+        return where
+
+
+class FolderTransaction(Transaction):
+    """A folder that is replaced; files in the old one that the new one has not are kept by a second name (hard link).
+
+    Parameters
+    ----------
+    target : the folder, which the process must hold. keep : whether what the new one has not is kept.
+    stale : names of files that are not, as they tell of what is replaced.
+
+    Raises
+    ------
+    OutputError
+        The folder cannot be made.
+    """
+
+    def __init__(self, target: Path, *, keep: bool = True, stale: Container[str] = ()) -> None:
+        self.target = target
+        self._stale = stale
+        self._place = Path(os.path.realpath(target))
+        self._keep = keep
+        self._work = self._place.parent / WORK / self._place.name
+        self._new, self._old, self.scratch = (self._work / name for name in ("new", "old", "scratch"))
+        try:
+            with writing(target):
+                if self._place.exists() and not self._place.is_dir():
+                    raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
+                _repair(self._work, self._place)
+                self._make()
+        except BaseException:
+            self.discard()
+            raise
+
+    def _make(self) -> None:
+        for left in reversed(range(_TRIES)):
+            try:
+                self._new.mkdir(parents=True)
+                break
+            except FileNotFoundError:  # a command beside this one has removed the folder of both while it was empty
+                if not left:
+                    raise
+        self.scratch.mkdir()
+
+    def file(self, name: str) -> Path:
+        """Return where to write the file of a name."""
+        return self._new / name
+
+    def _shown(self, where: str) -> str:
+        for folder in (self._new, self.scratch):
+            where = where.replace(str(folder), str(self.target))
+        return where
+
+    def commit(self) -> None:
+        """Put everything on the disk, take over what is kept, and exchange the folders."""
+        try:
+            with writing(self.target):
+                shutil.rmtree(self.scratch)
+                if self._place.is_dir():
+                    shutil.copymode(self._place, self._new)
+                    if self._keep:
+                        _take_over(self._place, self._new, self._stale)
+                _sync_all(self._new)
+                _take_place(self._new, self._place, self._old)
+                sync(self._place.parent)
+        finally:
+            self.discard()
+
+    def discard(self) -> None:
+        """Remove what was written, or what was replaced."""
+        with contextlib.suppress(OSError):
+            _repair(self._work, self._place)
+        with contextlib.suppress(OSError):
+            self._work.parent.rmdir()
+
+
+class OutputFolder:
+    """A folder that this process holds, so that no other of ours writes to it; made when it is missing.
+
+    Parameters
+    ----------
+    path : the folder. parts : names of folders in it that hold outputs of their own.
+
+    Raises
+    ------
+    OutputError
+        It cannot be made or is held by another command.
+    """
+
+    def __init__(self, path: Path, parts: Iterable[str] = ()) -> None:
+        self.path = path
+        self._parts = tuple(parts)
+        self._lock = FolderLock(path)
+
+    def begin(self, name: str, stale: Container[str] = ()) -> Transaction:
+        """Begin to replace a folder, such as ``logs/drive``, without its stale files; raises OutputError."""
+        return FolderTransaction(self.path / name, stale=stale)
+
+    def sweep(self) -> None:
+        """Remove what killed commands left here, and finish an exchange that one was killed in."""
+        sweep_files(self.path, held=True)
+        for part in (self.path / name for name in self._parts):
+            with contextlib.suppress(OSError):
+                for work in list((part / WORK).iterdir()):
+                    _repair(work, part / work.name)
+                (part / WORK).rmdir()
+            sweep_files(part, held=True)
+            with contextlib.suppress(OSError):
+                for folder in [p for p in part.iterdir() if p.is_dir() and not p.is_symlink()]:
+                    sweep_files(folder, held=True)
+
+    def __enter__(self) -> Self:
+        """Take hold of the folder and sweep it."""
+        self._lock.acquire()
+        self.sweep()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Let go of it; what a request to end has kept from being cleaned up is swept."""
+        if kind is not None:
+            self.sweep()
+        self._lock.release()
+
+
+class FolderLock:
+    """Holds a folder until it is released or this process ends, however it ends; the folder is made when missing.
+
+    The kernel's lock on the folder itself, which no child process inherits. Where the file system has none, a file in
+    the folder names the process, and counts for nothing once that is dead.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._descriptors: list[int] = []
+        self._file: Path | None = None
+
+    def acquire(self, wait_s: float = 0.0) -> None:
+        """Take hold of the folder, after at most ``wait_s``; raises OutputError when another command holds it."""
+        end = time.monotonic() + wait_s
+        while True:
+            with writing(self._folder):
+                self._folder.mkdir(parents=True, exist_ok=True)
+                if self._try():
+                    return
+            if time.monotonic() >= end:
+                raise OutputError(
+                    expected="an output folder that no other command is writing to",
+                    got="one that another command is writing to",
+                    where=str(self._folder),
+                    remedy=f"{self._who()}wait for it or choose another folder",
+                )
+            time.sleep(_POLL_S)
+
+    def hold_next(self, folder: Path) -> None:
+        """Hold a folder of ours as well that is about to take the place of the one that is held.
+
+        Else whoever waits would take hold of it before this command has swept what it leaves.
+        """
+        with writing(folder):
+            if self._file is not None:
+                shutil.copyfile(self._file, folder / LOCK_FILE)
+                return
+            descriptor = os.open(folder, os.O_RDONLY)
+            self._descriptors.append(descriptor)
+            _locked(descriptor)
+
+    def release(self) -> None:
+        """Let go; harmless when it is not held."""
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                self._file.unlink(missing_ok=True)
+        for descriptor in self._descriptors:
+            os.close(descriptor)
+        self._file, self._descriptors = None, []
+
+    def _try(self) -> bool:
+        descriptor = os.open(self._folder, os.O_RDONLY)
+        try:
+            if not _locked(descriptor):
+                os.close(descriptor)
+                return False
+            if not os.path.samestat(os.fstat(descriptor), self._folder.stat()):
+                os.close(descriptor)  # exchanged since it was opened: the lock is on the old one
+                return False
+        except OSError as error:
+            os.close(descriptor)
+            if error.errno not in _NO_LOCK:
+                raise
+            return self._try_file()
+        self._descriptors.append(descriptor)
+        return True
+
+    def _try_file(self) -> bool:
+        """Take the lock file, which appears with its content; one of a dead process is removed first."""
+        file, own = self._folder / LOCK_FILE, self._folder / f"{LOCK_FILE}.{own_name()}"
+        if (holder := _holder(file)) is not None and is_alive(holder) is False:
+            stale = self._folder / f"{LOCK_FILE}.{own_name()}.stale"
+            with contextlib.suppress(FileNotFoundError):
+                file.rename(stale)
+                if _holder(stale) != holder:  # another took it in the meantime: it is theirs
+                    stale.rename(file)
+                    return False
+                stale.unlink()
+        try:
+            with open_new(own) as made:
+                made.write(own_name().encode())
+            os.link(own, file)
+        except FileExistsError:
+            return False
+        finally:
+            own.unlink(missing_ok=True)
+        self._file = file
+        return True
+
+    def _who(self) -> str:
+        holder = _holder(self._folder / LOCK_FILE)
+        if holder is None:
+            return ""
+        if is_alive(holder) is None:
+            return f"if no command runs on any machine, remove {LOCK_FILE} in it, else "
+        return f"it is process {holder.split('-')[1]}: "
+
+
+def local_path(place: Path | str) -> Path:
+    """Return an output's place on this machine; raises UsageError for a URL, which as a path has lost a slash."""
+    if (found := _URL.match(str(place))) and not Path(found[1]).exists():
+        raise UsageError(
+            expected="a place on this machine",
+            got=re.sub(":/+", "://", str(place), count=1),
+            where="--output",
+            remedy="pdhef run alone writes to a URL",
+        )
+    return Path(place)
+
+
+def check_no_input(inputs: Iterable[Path | None], files: Iterable[Path], folders: Iterable[Path] = ()) -> None:
+    """Refuse outputs that would replace an input, before anything is written.
+
+    Parameters
+    ----------
+    inputs : files and folders that the command reads; those that are not there do not count.
+    files : that would be written. folders : that would be replaced, with all that is in them.
+
+    Raises
+    ------
+    UsageError
+        One is the other, by whatever name or link, or an input lies in a folder that would be replaced.
+    """
+    read = {identity: path for given in inputs if given is not None for identity, path in _identities(given)}
+    within = {i: path for path in read.values() for parent in _lineage(path) if (i := _identity(parent)) is not None}
+    for output, known in [*((f, read) for f in files), *((f, within) for f in folders)]:
+        identity = _identity(output)
+        if identity is not None and identity in known:
+            raise UsageError(
+                expected="an output that is no input of the same command",
+                got=f"{output}, which would replace the input {known[identity]}",
+                where="output",
+                remedy="choose another output folder, or move the input first",
+            )
+
+
+def _identities(path: Path) -> Iterator[tuple[tuple[int, int], Path]]:
+    """Yield what identifies a file, or a folder and the files in it."""
+    for one in [path, *(p for p in path.iterdir() if p.is_file())] if path.is_dir() else [path]:
+        if (identity := _identity(one)) is not None:
+            yield identity, one
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    try:
+        found = path.stat()
+    except (OSError, ValueError):
+        return None
+    return found.st_dev, found.st_ino
+
+
+def _lineage(path: Path) -> Iterator[Path]:
+    real = Path(os.path.realpath(path))
+    yield from (real, *real.parents)
+
+
+def _locked(descriptor: int) -> bool:
+    """Take the kernel's lock; False if another has it. Raises OSError where there is none."""
+    try:
+        import fcntl
+    except ImportError:
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS)) from None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _holder(file: Path) -> str | None:
+    """Return whose lock file this is, None if it is none."""
+    try:
+        name = file.read_text(encoding="ascii")
+        is_alive(name)
+    except (OSError, ValueError):
+        return None
+    return name
+
+
+def _repair(work: Path, place: Path) -> None:
+    """Finish an exchange that was cut off between its two renames, then remove the working folder."""
+    old = work / "old"
+    if old.is_dir() and not os.path.lexists(place):
+        old.rename(place)
+    if work.is_dir():
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _remove(path: Path) -> None:
+    with contextlib.suppress(OSError):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink()
+
+
+def _sync_all(folder: Path) -> None:
+    for path in [*(p for p in folder.rglob("*") if not p.is_symlink() and (p.is_file() or p.is_dir())), folder]:
+        sync(path)
+
+
+def _take_over(old: Path, new: Path, stale: Container[str]) -> None:
+    """Give everything of the old folder that the new one has not, but for stale files, a second name there."""
+    for path in old.iterdir():
+        to = new / path.name
+        if path.name in stale or os.path.lexists(to):
+            continue
+        if path.is_symlink():
+            to.symlink_to(path.readlink())
+        elif path.is_dir():
+            shutil.copytree(path, to, symlinks=True, copy_function=_link)
+        else:
+            _link(path, to)
+
+
+def _link(source: str | Path, target: str | Path) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # a file system without hard links, or somebody else's file
+        shutil.copy2(source, target)
+
+
+def _take_place(new: Path, place: Path, old: Path) -> None:
+    """Give ``new`` the name of ``place``; what stood there is at ``new`` or gone to ``old`` afterwards."""
+    if not os.path.lexists(place):
+        new.rename(place)
+    elif not _exchanged(new, place):
+        # A file system without exchange: for a moment nothing stands under the name; a kill then is repaired.
+        place.rename(old)
+        new.rename(place)
+
+
+def _exchanged(one: Path, other: Path) -> bool:
+    """Exchange two names at once where system and file system can (Linux renameat2); False where they cannot."""
+    at_cwd, exchange = -100, 2
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if rename is None:
+        return False
+    if rename(at_cwd, os.fsencode(one), at_cwd, os.fsencode(other), exchange) == 0:
+        return True
+    if ctypes.get_errno() in (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP):
+        return False
+    raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(other))

@@ -1,0 +1,235 @@
+"""The process that workers are forked from, and what a worker does: the other side of ``supervisor.py``.
+
+The server imports what the workers need and stays otherwise as it is: it has one thread and no open query, so that
+every fork of it is a whole process at the price of a fork.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import importlib
+import os
+import pickle
+import pkgutil
+import signal
+import socket
+import struct
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pdhef_logtool.records import processes
+from pdhef_logtool.records.printable import shown
+
+#: One thread a worker: what libraries read when they are loaded.
+ONE_THREAD = dict.fromkeys(
+    (
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "VECLIB_MAXIMUM_THREADS",
+        "NUMBA_NUM_THREADS",
+        "POLARS_MAX_THREADS",
+        "RAYON_NUM_THREADS",
+        "ARROW_IO_THREADS",
+    ),
+    "1",
+)
+#: What the server is asked: a new worker (its socket comes along), or how the worker of a process id ended.
+FORK, STATUS = b"fork", b"stat"
+_REQUEST = struct.Struct("<4sq")
+_HEAD = struct.Struct("<q")
+#: The same progress is told again after this many seconds at the earliest.
+_TELL_EVERY_S = 0.1
+_LONGEST = 500
+
+
+def send(channel: socket.socket, message: Any) -> None:
+    """Write a message as its length and a pickle."""
+    data = pickle.dumps(message)
+    channel.sendall(_HEAD.pack(len(data)) + data)
+
+
+def receive(channel: socket.socket) -> Any:
+    """Wait for a message.
+
+    Raises
+    ------
+    EOFError : the other side is gone.
+    """
+    return pickle.loads(_exactly(channel, _HEAD.unpack(_exactly(channel, _HEAD.size))[0]))  # noqa: S301 (from our own process)
+
+
+def split(buffer: bytearray) -> Iterator[Any]:
+    """Take the whole messages off the front of what came; what is not yet whole stays."""
+    while len(buffer) >= _HEAD.size:
+        end = _HEAD.size + _HEAD.unpack_from(buffer)[0]
+        if len(buffer) < end:
+            return
+        message = pickle.loads(bytes(buffer[_HEAD.size : end]))  # noqa: S301 (from our own process)
+        del buffer[:end]
+        yield message
+
+
+def ask(control: socket.socket, what: bytes, number: int, descriptors: Sequence[int] = ()) -> None:
+    """Send the server a request: the process id of a worker, or the number of a new one and its socket."""
+    socket.send_fds(control, [_REQUEST.pack(what, number)], list(descriptors))
+
+
+def serve(descriptor: int) -> None:
+    """Be the server, on the socket of this descriptor, until its other side closes; no worker outlives it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends
+    control = socket.socket(fileno=descriptor)
+    workers: set[int] = set()
+    try:
+        send(control, _prepare(receive(control)))
+        while True:
+            data, descriptors, _, _ = socket.recv_fds(control, _REQUEST.size, 1)
+            if not data:
+                return
+            what, number = _REQUEST.unpack(data)
+            if what == FORK:
+                workers |= _fork(control, socket.socket(fileno=descriptors[0]), number)
+            else:
+                _, status = os.waitpid(number, 0)
+                workers.discard(number)
+                send(control, os.waitstatus_to_exitcode(status))
+    except (EOFError, ConnectionError):
+        return
+    finally:
+        for pid in workers:
+            os.kill(pid, signal.SIGKILL)  # not yet waited for: no other process can have its number
+        for pid in workers:
+            os.waitpid(pid, 0)  # so that what they took counts as the command's
+
+
+def _prepare(preload: Sequence[str]) -> tuple[str, bool]:
+    """Import modules, with ``.*`` all of a package, and call what stands after a colon.
+
+    Returns what went wrong, and whether all is warm: nothing that was called has returned False.
+    """
+    warm = True
+    for name in preload:
+        module, _, function = name.partition(":")
+        try:
+            loaded = importlib.import_module(module.removesuffix(".*"))
+            if module.endswith(".*"):
+                for inner in pkgutil.iter_modules(loaded.__path__, f"{loaded.__name__}."):
+                    importlib.import_module(inner.name)
+            if function:
+                warm &= getattr(loaded, function)() is not False
+        except Exception as error:  # noqa: BLE001 (told by the parent, whatever it is)
+            return f"{name}: {told_error(error)}", warm
+    gc.collect()
+    gc.freeze()  # so that collecting in a worker does not copy what all share
+    return "", warm
+
+
+def _fork(control: socket.socket, channel: socket.socket, number: int) -> set[int]:
+    """Begin a worker on its channel; where the system has no process for it, the parent sees the channel close."""
+    with channel:
+        try:
+            pid = os.fork()
+        except OSError:
+            return set()
+        if pid:
+            return {pid}
+        try:
+            processes.worker_number = number
+            control.close()
+            _work(channel)
+        finally:
+            with contextlib.suppress(OSError, ValueError):
+                sys.stdout.flush()
+                sys.stderr.flush()
+            os._exit(0)
+
+
+class _Gone(BaseException):
+    """The parent is; no handler of errors in the work takes it on its way up."""
+
+
+def _say(channel: socket.socket, *message: Any) -> None:
+    try:
+        send(channel, message)
+    except OSError:
+        raise _Gone from None
+
+
+def _work(channel: socket.socket) -> None:
+    """Be a worker: take the function and its bound, then items; answer each with its result or what it raised."""
+    with contextlib.suppress(OSError):
+        # When the machine runs out of memory, a worker is to go and not who watches it.
+        Path("/proc/self/oom_score_adj").write_text("500")
+    with contextlib.suppress(_Gone, EOFError, OSError):
+        _say(channel, "ready", os.getpid())
+        work, more_bytes = receive(channel)
+        _bound(more_bytes)
+        while True:
+            _say(channel, *_answer(channel, work, receive(channel)))
+
+
+def _answer(channel: socket.socket, work: bytes, item: bytes) -> tuple[str, ...] | tuple[str, bytes]:
+    told: tuple[str, float] = ("", 0.0)
+
+    def tell(text: str, share: float) -> None:
+        nonlocal told
+        now = time.monotonic()
+        if text != told[0] or now - told[1] > _TELL_EVERY_S:
+            told = (text, now)
+            _say(channel, "tell", text, share)
+
+    try:
+        result = _function(work)(pickle.loads(item), tell)  # noqa: S301 (from our own process)
+    except MemoryError:
+        return ("memory",)
+    except _Gone:
+        raise
+    except BaseException as error:  # noqa: BLE001 (a worker outlives whatever an item raises)
+        return "failed", f"raised {told_error(error)}"
+    try:
+        return "done", pickle.dumps(result)
+    except Exception as error:  # noqa: BLE001 (whatever a pickler may raise)
+        return "failed", f"its result cannot be sent: {told_error(error)}"
+
+
+@cache
+def _function(packed: bytes) -> Callable[..., Any]:
+    return pickle.loads(packed)  # type: ignore[no-any-return]  # noqa: S301 (from our own process)
+
+
+def _bound(more_bytes: int | None) -> None:
+    """Let no allocation take this process that much beyond what it has, however fast it comes; Linux keeps to it."""
+    if more_bytes is None:
+        return
+    with contextlib.suppress(ImportError, OSError, ValueError, IndexError):
+        import resource
+
+        # All that is writable and private, whether touched or not: the sixth number, in pages.
+        now = int(Path("/proc/self/statm").read_bytes().split()[5]) * resource.getpagesize()
+        _, most = resource.getrlimit(resource.RLIMIT_DATA)
+        bound = now + more_bytes if most == resource.RLIM_INFINITY else min(now + more_bytes, most)
+        resource.setrlimit(resource.RLIMIT_DATA, (bound, bound))
+
+
+def told_error(error: BaseException) -> str:
+    """Return an exception as one line."""
+    try:
+        text = " ".join(str(error).split())
+    except Exception:  # noqa: BLE001 (an exception that cannot even be told)
+        text = ""
+    return shown(f"{type(error).__name__}: {text}", _LONGEST) if text else type(error).__name__
+
+
+def _exactly(channel: socket.socket, count: int) -> bytes:
+    parts = bytearray()
+    while len(parts) < count:
+        part = channel.recv(min(count - len(parts), 1 << 20))
+        if not part:
+            raise EOFError
+        parts += part
+    return bytes(parts)

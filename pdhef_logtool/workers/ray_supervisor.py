@@ -1,0 +1,167 @@
+"""The same as ``supervisor.py`` on the machines of a Ray cluster.
+
+A task is a worker under watch on whatever node Ray has chosen: what dies, falls silent or grows there is an outcome
+like any other, so that Ray has to repeat a task only where its node is lost, and does so as often as it takes.
+"""
+
+from __future__ import annotations
+
+import atexit
+import itertools
+import logging
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.processes import own_name
+from pdhef_logtool.workers.fork_server import told_error
+from pdhef_logtool.workers.supervisor import Crew, Ended, Failure, Limits, Tell
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+#: Nodes that an item may lose: machines that are taken away at any time count as such.
+MAX_RETRIES = 1000
+#: Items that are with Ray for each of its processors: so many that none waits for the next.
+_AHEAD = 2
+_LOOK_S = 5.0
+_CONNECT_S = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Orders:
+    """What a node is to do with items; ``run`` tells the orders of one run from those of others."""
+
+    run: str
+    work: Callable[[Any, Tell], Any]
+    limits: Limits
+    preload: tuple[str, ...]
+
+
+def supervise_on_ray(
+    work: Callable[[T, Tell], R],
+    items: Iterable[T],
+    *,
+    address: str,
+    limits: Limits,
+    preload: Sequence[str] = (),
+) -> Generator[Ended[T, R], None, None]:
+    """Do the work on every item, one for each processor of a cluster at a time, and yield how each ended.
+
+    Arguments and results are those of :func:`~.supervisor.supervise`; the nodes have this package and the work's module
+    installed. An item that is lost is tried once more alone in its place, beside what other places do.
+
+    Parameters
+    ----------
+    address : of the cluster as ``ray.init`` takes it: ``auto``, ``HOST:PORT`` or ``ray://HOST:PORT``.
+
+    Raises
+    ------
+    UsageError : Ray is not installed, or there is no cluster.
+    """
+    orders = _Orders(f"{own_name()}-{next(_RUNS)}", work, limits, tuple(preload))
+    with _connected(address) as ray:
+        task = ray.remote(num_cpus=1, max_retries=MAX_RETRIES, retry_exceptions=False)(_end_on_node)
+        waiting = enumerate(items)
+        under_way: dict[Any, tuple[int, T]] = {}
+        room, looked = 0, -_LOOK_S
+        while True:
+            if time.monotonic() - looked > _LOOK_S:
+                looked = time.monotonic()
+                room = _AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
+            for number, item in itertools.islice(waiting, max(0, room - len(under_way))):
+                under_way[task.remote(orders, item)] = number, item
+            if not under_way:
+                return
+            done, _ = ray.wait(list(under_way), num_returns=1, timeout=_LOOK_S)
+            for reference in done:
+                number, item = under_way.pop(reference)
+                yield _ended(ray, reference, number, item)
+            del done
+
+
+_RUNS = itertools.count()
+
+
+def _ended(ray: Any, reference: Any, number: int, item: T) -> Ended[T, Any]:
+    try:
+        result, failure = ray.get(reference)
+    except ray.exceptions.RayError as error:
+        reason = f"Ray lost it: {type(error).__name__}"
+        return Ended(number, item, failure=Failure(reason, tries=MAX_RETRIES + 1))
+    return Ended(number, item, result, failure)
+
+
+@contextmanager
+def _connected(address: str) -> Iterator[Any]:
+    """Connect to a cluster, and leave it unless this process was connected before."""
+    try:
+        import ray
+    except ImportError:
+        raise UsageError(
+            expected="Ray", got="none installed", where="--ray", remedy="pip install 'pdhef-logtool[ray]'"
+        ) from None
+    if ray.is_initialized():
+        yield ray
+        return
+    main = threading.current_thread() is threading.main_thread()
+    was = signal.getsignal(signal.SIGTERM)
+    try:
+        _check_reachable(address)
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+    except (ConnectionError, ValueError, RuntimeError, OSError) as error:
+        raise UsageError(
+            expected="the address of a Ray cluster",
+            got=f"{address} ({told_error(error).partition('. ')[0]})",
+            where="--ray",
+            remedy="ray status tells whether it is up",
+        ) from None
+    if main:
+        signal.signal(signal.SIGTERM, was)  # Ray has put its own in its place
+    with suppress(AttributeError):
+        # It prints on stdout, where results go, that a node was lost and that it goes on.
+        ray._private.worker.print_to_stdstream = lambda *_, **__: None
+    try:
+        yield ray
+    finally:
+        ray.shutdown()
+
+
+def _check_reachable(address: str) -> None:
+    """Raise OSError where nobody listens: Ray itself would try for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdigit():
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT_S).close()
+
+
+#: The worker of this node's process, by the run that it works for.
+_crews: dict[str, Crew[Any, Any]] = {}
+
+
+def _end_on_node(orders: _Orders, item: Any) -> tuple[Any, Failure | None]:
+    """Do the work on an item in a worker beside this process, which lives as long as this one does its run's tasks."""
+    try:
+        for ended in _crew(orders).each([item]):
+            return ended.result, ended.failure
+    except Exception as error:  # noqa: BLE001 (what a task raises, Ray would take for its own)
+        return None, Failure(f"raised {told_error(error)}")
+    raise AssertionError("an item ends")
+
+
+def _crew(orders: _Orders) -> Crew[Any, Any]:
+    if orders.run not in _crews:
+        _dismiss()
+        _crews[orders.run] = Crew(orders.work, jobs=1, limits=orders.limits, preload=orders.preload)
+        atexit.register(_dismiss)
+    return _crews[orders.run]
+
+
+def _dismiss() -> None:
+    while _crews:
+        _crews.popitem()[1].__exit__(None, None, None)

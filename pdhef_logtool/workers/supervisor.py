@@ -1,0 +1,511 @@
+"""Work on many items in processes of their own, under watch.
+
+A worker lives as long as the run and has one thread. What dies, falls silent or takes too much memory costs the item
+in flight only: that is tried once more when nothing else runs, in a new process, and then given up and told. Workers
+come from a fork server (``fork_server.py``), a pipe each; they end when their parent does, however that ends. A fork
+server that dies is restarted, a bounded number of times; its workers finish their items without it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pickle
+import selectors
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Generic, Self, TypeVar
+
+from pdhef_logtool.records.errors import UsageError, WorkerError
+from pdhef_logtool.records.printable import shown
+from pdhef_logtool.records.processes import wait_for_end
+from pdhef_logtool.workers.fork_server import FORK, ONE_THREAD, STATUS, ask, receive, send, split, told_error
+
+T = TypeVar("T")
+R = TypeVar("R")
+#: Tells what an item is at, and its share from 0 to 1.
+Tell = Callable[[str, float], None]
+#: Hears the same, with the number of the item.
+Progress = Callable[[int, str, float], None]
+
+_TICK_S = 0.05
+#: The most that one look at the workers counts as silence: more means that the parent itself was stopped or busy.
+_LONGEST_TICK_S = 5.0
+#: No allocation brings a worker further beyond its bound than this, however fast; allocators reserve more than needed.
+_RESERVED_BYTES = 2 << 30
+_TRIES = 2
+#: How often a fork server that died is replaced while the items of one list are worked on.
+_RESTARTS = 3
+#: A worker that does not take an item within this time does not listen.
+_SEND_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What an item may take; None: as much as it likes.
+
+    Parameters
+    ----------
+    silence_s : between two words of progress.
+    memory_bytes : of a worker's resident set.
+    """
+
+    silence_s: float | None = None
+    memory_bytes: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """Why there is no result: a line for people, the last progress that was told, and how often it was tried."""
+
+    reason: str
+    last: str = ""
+    tries: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Ended(Generic[T, R]):
+    """How an item ended, with its number in the order of the items; with no ``failure`` it has a result."""
+
+    number: int
+    item: T
+    result: R | None = None
+    failure: Failure | None = None
+
+
+def supervise(
+    work: Callable[[T, Tell], R],
+    items: Iterable[T],
+    *,
+    jobs: int,
+    limits: Limits = Limits(),
+    preload: Sequence[str] = (),
+    progress: Progress = lambda _number, _text, _share: None,
+    warn: Callable[[str], None] = lambda _text: None,
+) -> Generator[Ended[T, R], None, None]:
+    """Do the work on every item and yield how each ended, in the order of ending.
+
+    Items are pulled as workers become free, and nothing of an item is kept once it has ended. With one job and no
+    limits all is done in this process.
+
+    Parameters
+    ----------
+    work : a function of a module; takes an item and what tells its progress, and returns something small.
+    jobs : processes at once.
+    preload : modules that the fork server imports: ``package.module``, ``package.*`` for all of a package, or
+        ``package.module:function`` to call that too. ``pdhef_logtool.compiled.cache:load_kept`` behind others
+        loads their compiled code. They must leave no thread behind that is needed, and run no query (polars) or tensor.
+    warn : called with a line for people whenever the fork server is restarted.
+
+    Raises
+    ------
+    UsageError : fewer jobs than one, or more on a system that cannot fork.
+    WorkerError : the fork server died more often than it is restarted.
+    """
+    if jobs < 1:
+        raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
+    if jobs == 1 and limits == Limits():
+        return _in_this_process(work, items, progress)
+    return _in_processes(work, items, jobs, limits, preload, progress, warn)
+
+
+def _in_this_process(
+    work: Callable[[T, Tell], R], items: Iterable[T], progress: Progress
+) -> Generator[Ended[T, R], None, None]:
+    for number, item in enumerate(items):
+        last = ""
+
+        def tell(text: str, share: float, number: int = number) -> None:
+            nonlocal last
+            last = text
+            progress(number, text, share)
+
+        try:
+            result = work(item, tell)
+        except Exception as error:  # noqa: BLE001 (one item never stops the others)
+            yield Ended(number, item, failure=Failure(f"raised {told_error(error)}", last))
+        else:
+            yield Ended(number, item, result)
+            del result
+        del item
+
+
+def _in_processes(  # positional: the arguments of `supervise`, which checked them
+    work: Callable[[T, Tell], R],
+    items: Iterable[T],
+    jobs: int,
+    limits: Limits,
+    preload: Sequence[str],
+    progress: Progress,
+    warn: Callable[[str], None],
+) -> Generator[Ended[T, R], None, None]:
+    with Crew[T, R](work, jobs=jobs, limits=limits, preload=preload, warn=warn) as crew:
+        yield from crew.each(items, progress)
+
+
+@dataclass(slots=True)
+class _Attempt(Generic[T]):
+    number: int
+    item: T
+    place: int | None
+    tries: int = 0
+    last: str = ""
+
+
+@dataclass(slots=True)
+class _Worker(Generic[T]):
+    """A process as the parent knows it; ``pid`` is None until it has said that it is ready."""
+
+    channel: socket.socket
+    server: _Server
+    attempt: _Attempt[T] | None
+    place: int | None
+    pid: int | None = None
+    silent_s: float = 0.0
+    buffer: bytearray = field(default_factory=bytearray)
+
+    def resident_bytes(self) -> int:
+        try:
+            return int(Path(f"/proc/{self.pid}/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        except (OSError, IndexError, ValueError):
+            return 0
+
+    def end(self) -> str:
+        """End the process if it lives, and return how it ended."""
+        self.channel.close()
+        if self.pid is None:
+            return "no process could be started for it"
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGKILL)
+        code = self.server.status(self.pid)
+        if code is None:
+            wait_for_end(self.pid)
+            return "the worker died"
+        return f"the worker was killed (signal {-code})" if code < 0 else f"the worker ended with exit code {code}"
+
+
+class _Server:
+    """A fork server of our own."""
+
+    def __init__(self, preload: Sequence[str]) -> None:
+        self._control, theirs = socket.socketpair()
+        start = (
+            "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
+            "from pdhef_logtool.workers.fork_server import serve; serve(int(sys.argv[2]))"
+        )
+        with theirs:
+            self._process = subprocess.Popen(  # noqa: S603 (ourselves)
+                [sys.executable, "-c", start, json.dumps(sys.path), str(theirs.fileno())],
+                stdin=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                env={**os.environ, **ONE_THREAD},
+            )
+        self._preload = list(preload)
+
+    def start(self) -> bool | None:
+        """Wait until it has loaded what it is to load; return False if workers have something to compile.
+
+        Returns None if it died.
+
+        Raises
+        ------
+        RuntimeError : a module cannot be loaded.
+        """
+        try:
+            send(self._control, self._preload)
+            problem, warm = receive(self._control)
+        except (EOFError, OSError):
+            return None
+        if problem:
+            raise RuntimeError(problem)
+        return bool(warm)
+
+    def is_dead(self) -> bool:
+        """Return whether its side of the socket is closed, which precedes the end of whatever it has in hand."""
+        try:
+            return not self._control.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+
+    def fork(self, number: int, channel: socket.socket) -> bool:
+        """Begin a worker on its channel; return False if the server is dead."""
+        try:
+            ask(self._control, FORK, number, [channel.fileno()])
+        except OSError:
+            if not self.is_dead():
+                raise
+            return False
+        return True
+
+    def status(self, pid: int) -> int | None:
+        """Wait for a worker that ended and return its exit code, below zero a signal; None if the server is dead."""
+        try:
+            ask(self._control, STATUS, pid)
+            return int(receive(self._control))
+        except (EOFError, OSError):
+            return None
+
+    def end(self) -> int:
+        """End it and return its exit code, below zero a signal; with 0 its workers have ended too."""
+        self._control.close()
+        return self._process.wait()
+
+
+class Crew(Generic[T, R]):
+    """Workers for several lists of items; arguments and errors as those of :func:`supervise`."""
+
+    def __init__(
+        self,
+        work: Callable[[T, Tell], R],
+        *,
+        jobs: int,
+        limits: Limits = Limits(),
+        preload: Sequence[str] = (),
+        warn: Callable[[str], None] = lambda _text: None,
+    ) -> None:
+        if not hasattr(os, "fork"):
+            raise UsageError(
+                expected="a system with fork", got=sys.platform, where="--jobs", remedy="--jobs 1, and no limits"
+            )
+        most = limits.memory_bytes
+        self._orders = (pickle.dumps(work), None if most is None else most + _RESERVED_BYTES)
+        self._jobs, self._limits, self._preload = jobs, limits, preload
+        self._progress: Progress = lambda _number, _text, _share: None
+        self._warn = warn
+        self._server: _Server | None = None
+        self._deaths = 0
+        self._returned: list[_Attempt[T]] = []
+        self._workers: list[_Worker[T]] = []
+        self._started = 0
+        self._warm = True
+        self._selector = selectors.DefaultSelector()
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        """End all processes."""
+        self._selector.close()
+        for worker in self._workers:
+            worker.channel.close()
+        if self._server is not None:
+            code = self._server.end()
+            for worker in self._workers:
+                if code or worker.server is not self._server:  # it is dead and has not ended it
+                    worker.end()
+        self._workers.clear()
+
+    def each(
+        self,
+        items: Iterable[T],
+        progress: Progress = lambda _number, _text, _share: None,
+        *,
+        place: Callable[[T], int] | None = None,
+    ) -> Generator[Ended[T, R], None, None]:
+        """Do the work on every item, as :func:`supervise` does.
+
+        Parameters
+        ----------
+        place : which worker an item is for, by a number below ``jobs``, for work that goes on from what an earlier
+            item has left in its process; that is gone when the process is lost.
+        """
+        self._progress = progress
+        self._deaths = 0
+        self._returned.clear()
+        lost: list[_Attempt[T]] = []
+        attempts = (_Attempt(n, item, place and place(item)) for n, item in enumerate(items))
+        try:
+            for attempt, ended in self._run(attempts, self._jobs):
+                if ended is None:
+                    lost.append(attempt)
+                else:
+                    yield ended
+                del attempt, ended
+            while lost:
+                self._dismiss(self._workers)
+                for _, ended in self._run(iter([lost.pop(0)]), 1):
+                    assert ended is not None
+                    yield ended
+                    del ended
+        finally:
+            self._dismiss([w for w in self._workers if w.attempt is not None])
+
+    def _dismiss(self, workers: Sequence[_Worker[T]]) -> None:
+        for worker in tuple(workers):
+            self._end(worker)
+
+    def _run(self, attempts: Iterator[_Attempt[T]], jobs: int) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
+        """Try items, so many at once; yield how each ended, None if it was lost and may be tried again."""
+        since = time.monotonic()
+        coming: _Attempt[T] | None = None
+        while True:
+            # What the first item has compiled, the others find.
+            while self._busy() < (jobs if self._warm else 1):
+                coming = coming or (self._returned.pop() if self._returned else next(attempts, None))
+                if coming is None or self._is_taken(coming):
+                    break
+                attempt, coming = coming, None
+                yield from self._give(attempt)
+                del attempt
+            if not self._busy():
+                return
+            heard = [key.data for key, _ in self._selector.select(_TICK_S)]
+            now = time.monotonic()
+            for worker in self._workers:
+                worker.silent_s += min(now - since, _LONGEST_TICK_S)
+            since = now
+            for worker in heard:
+                yield from self._hear(worker)
+            yield from self._watch()
+
+    def _is_taken(self, attempt: _Attempt[T]) -> bool:
+        """Tell whether the worker that an item is for is at work."""
+        return attempt.place is not None and any(w.attempt and w.place == attempt.place for w in self._workers)
+
+    def _busy(self) -> int:
+        return sum(w.attempt is not None for w in self._workers)
+
+    def _give(self, attempt: _Attempt[T]) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
+        """Hand an item to a worker that is free, or to a new one; an item that cannot be sent ends here."""
+        attempt.tries, attempt.last = attempt.tries + 1, ""
+        free = next((w for w in self._workers if w.attempt is None and w.place == attempt.place), None)
+        if free is None:
+            self._start(attempt)
+        else:
+            free.attempt = attempt
+            yield from self._send(free)
+
+    def _start(self, attempt: _Attempt[T]) -> None:
+        ours, theirs = socket.socketpair()
+        self._started += 1
+        with theirs:
+            while not (server := self._live_server()).fork(self._started, theirs):
+                pass
+        ours.settimeout(_SEND_S)
+        worker = _Worker(ours, server, attempt, attempt.place)
+        self._workers.append(worker)
+        self._selector.register(ours, selectors.EVENT_READ, worker)
+
+    def _live_server(self) -> _Server:
+        """Return the fork server, started or restarted where it is necessary.
+
+        Raises
+        ------
+        WorkerError : it died more often than it is restarted.
+        """
+        while self._server is None or self._server.is_dead():
+            if self._server is not None:
+                self._note_death(self._server.end())
+            self._server = _Server(self._preload)
+            if (warm := self._server.start()) is not None:
+                self._warm = warm
+        return self._server
+
+    def _note_death(self, code: int) -> None:
+        self._deaths += 1
+        how = f"exit code {code}" if code >= 0 else f"signal {-code}"
+        if self._deaths > _RESTARTS:
+            raise WorkerError(
+                expected="a fork server that keeps running",
+                got=f"{self._deaths} that died, the last one by {how}",
+                where="worker processes",
+                remedy="find what kills them, for example the system for lack of memory",
+            )
+        self._warn(f"the fork server died ({how}): restart {self._deaths} of {_RESTARTS}, no item is lost")
+
+    def _send(self, worker: _Worker[T]) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
+        attempt = worker.attempt
+        assert attempt is not None
+        try:
+            packed = pickle.dumps(attempt.item)
+        except Exception as error:  # noqa: BLE001 (whatever a pickler may raise)
+            worker.attempt = None
+            yield attempt, _failed(attempt, f"it cannot be sent to a worker: {told_error(error)}")
+            return
+        worker.silent_s = 0.0
+        with contextlib.suppress(OSError):  # a worker that is dead or does not listen is found by the watch
+            send(worker.channel, packed)
+
+    def _hear(self, worker: _Worker[T]) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
+        """Take what a worker says."""
+        try:
+            data = worker.channel.recv(1 << 16)
+        except OSError:
+            data = b""
+        if not data:
+            yield from self._lose(worker)
+            return
+        worker.silent_s = 0.0
+        worker.buffer += data
+        for kind, *said in split(worker.buffer):
+            attempt = worker.attempt
+            if kind == "ready":
+                worker.pid = said[0]
+                with contextlib.suppress(OSError):
+                    send(worker.channel, self._orders)
+                yield from self._send(worker)
+            elif attempt is None:
+                continue
+            elif kind == "tell":
+                attempt.last = said[0]
+                self._progress(attempt.number, said[0], said[1])
+            elif kind == "memory":
+                yield from self._lose(worker, self._too_big())
+                return
+            else:
+                worker.attempt, self._warm = None, True
+                yield attempt, _opened(attempt, said[0]) if kind == "done" else _failed(attempt, said[0])
+
+    def _watch(self) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
+        """End the workers that have been silent for too long or have grown too big."""
+        for worker in [w for w in self._workers if w.attempt is not None and w.pid is not None]:
+            silence_s, memory_bytes = self._limits.silence_s, self._limits.memory_bytes
+            if memory_bytes is not None and worker.resident_bytes() > memory_bytes:
+                yield from self._lose(worker, self._too_big())
+            elif silence_s is not None and worker.silent_s > silence_s:
+                yield from self._lose(worker, f"nothing heard for {silence_s:g} s")
+
+    def _too_big(self) -> str:
+        most = self._limits.memory_bytes
+        return "there was no more memory" if most is None else f"took more than {most / 1e6:.0f} MB"
+
+    def _lose(self, worker: _Worker[T], reason: str = "") -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
+        """End a worker; its item, if it has one, is lost for a reason, or for how the process ended.
+
+        An item of a worker that never started because the fork server died has not been tried: it is the next one.
+        """
+        attempt, self._warm = worker.attempt, True
+        untried = worker.pid is None and worker.server.is_dead()
+        how = self._end(worker)
+        if attempt is not None and untried:
+            attempt.tries -= 1
+            self._returned.append(attempt)
+        elif attempt is not None:
+            yield attempt, _failed(attempt, reason or how) if attempt.tries >= _TRIES else None
+
+    def _end(self, worker: _Worker[T]) -> str:
+        self._workers.remove(worker)
+        self._selector.unregister(worker.channel)
+        return worker.end()
+
+
+def _failed(attempt: _Attempt[T], reason: str) -> Ended[T, R]:
+    return Ended(attempt.number, attempt.item, failure=Failure(shown(reason), shown(attempt.last), attempt.tries))
+
+
+def _opened(attempt: _Attempt[T], answer: bytes) -> Ended[T, R]:
+    try:
+        return Ended(attempt.number, attempt.item, pickle.loads(answer))  # noqa: S301 (from our own process)
+    except Exception as error:  # noqa: BLE001 (whatever a pickle may raise)
+        return _failed(attempt, f"its result cannot be read: {told_error(error)}")

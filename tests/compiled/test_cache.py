@@ -1,0 +1,386 @@
+"""Where machine code is kept, and what no cache may do."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import stat
+import subprocess
+import sys
+import tempfile
+import venv
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from pdhef_logtool.compiled import cache, sources
+from pdhef_logtool.records import processes
+
+_ROOT = Path(__file__).parents[2]
+_CODE = "from pdhef_logtool.compiled.cache import njit\n\n\n@njit(cache=True)\ndef more(x):\n    return x + 1\n"
+
+
+@pytest.fixture
+def module_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A module with one compiled function, and an installation, a user and temporary folders of its own."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr(cache, "announced", False)
+    (tmp_path / "tmp").mkdir()
+    file = tmp_path / "installed" / "pdhef_logtool" / "module.py"
+    file.parent.mkdir(parents=True)
+    file.write_text(_CODE)
+    sources.compiled_digest()  # that of the real sources
+    monkeypatch.setattr(sources, "ROOT", tmp_path / "installed")
+    cache.kept_in.cache_clear()
+    yield file
+    cache.kept_in.cache_clear()
+
+
+def _load(file: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("module", file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _close(monkeypatch: pytest.MonkeyPatch, *folders: Path) -> None:
+    """Let nothing be written below these folders: permissions do not hold back root."""
+    monkeypatch.setattr(
+        cache, "_writable", lambda f, was=cache._writable: not any(map(f.is_relative_to, folders)) and was(f)
+    )
+    cache.kept_in.cache_clear()
+
+
+def _code_files(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.rglob("*") if p.suffix in (".nbi", ".nbc"))
+
+
+def test_the_first_folder_that_can_be_written_keeps_the_code(
+    module_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    installed, home, tmp = tmp_path / "installed", tmp_path / "home", tmp_path / "tmp"
+    writable = cache._writable
+    for closed, keeps in [((), installed), ((installed,), home), ((installed, home), tmp)]:
+        _close(monkeypatch, *closed)
+        assert _load(module_file).more(1) == 2
+        assert _code_files(keeps), keeps
+        assert "compiling, once, about" in capsys.readouterr().err
+        assert _load(module_file).more(1) == 2
+        assert capsys.readouterr().err == ""  # warm: nothing is compiled
+        monkeypatch.setattr(cache, "_writable", writable)
+        monkeypatch.setattr(cache, "announced", False)
+        shutil.rmtree(module_file.parent / "__pycache__", ignore_errors=True)
+    assert stat.S_IMODE(next(tmp.glob("pdhef-compiled*")).stat().st_mode) == 0o700
+
+
+def test_without_any_folder_it_runs_and_says_so(
+    module_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _close(monkeypatch, tmp_path)
+    assert _load(module_file).more(1) == 2
+    assert not _code_files(tmp_path)
+    assert "in every run" in capsys.readouterr().err
+
+
+def test_what_an_installation_brings_along_serves_where_nobody_can_write_it(
+    module_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _load(module_file).more(1)
+    capsys.readouterr()
+    _close(monkeypatch, tmp_path)
+    monkeypatch.setattr(cache, "announced", False)
+    assert _load(module_file).more(1) == 2
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length", [0, 1, 40])
+def test_a_file_that_was_cut_short_is_compiled_anew(module_file: Path, length: int) -> None:
+    _load(module_file).more(1)
+    files = _code_files(module_file.parent)
+    assert {p.parent.name for p in files} == {sources.compiled_digest()}
+    assert {p.suffix for p in files} == {".nbi", ".nbc"}
+    for damaged in files:
+        with damaged.open("r+b") as file:
+            file.truncate(length)
+        assert _load(module_file).more(1) == 2
+        assert all(p.stat().st_size > 1000 for p in files)
+
+
+def test_a_full_disk_ends_no_call(module_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("numba.core.caching.IndexDataCacheFile._save_data", full)
+    assert _load(module_file).more(1) == 2
+
+
+def test_two_processes_that_save_at_once_never_take_each_others_code(
+    module_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            "numba.core.caching.IndexDataCacheFile._load_index", lambda _: {}
+        )  # of neither has the other read
+        function = _load(module_file).more
+        assert (function(1), function(1.5)) == (2, 2.5)
+    assert [p.suffix for p in _code_files(module_file.parent)].count(".nbc") == 2
+    again = _load(module_file).more
+    assert (again(1), again(1.5)) == (2, 2.5)
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="users and permissions of POSIX")
+def test_a_temporary_folder_of_somebody_else_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    folder = tmp_path / f"pdhef-compiled-{os.getuid()}"
+    folder.mkdir()
+    folder.chmod(0o777)  # anybody could put code there
+    assert cache._private_folder() is None
+    folder.rmdir()
+    (tmp_path / "elsewhere").mkdir(mode=0o700)
+    folder.symlink_to(tmp_path / "elsewhere")
+    assert cache._private_folder() is None
+    folder.unlink()
+    assert cache._private_folder() == folder
+    monkeypatch.setattr(os, "getuid", lambda: folder.stat().st_uid + 1)
+    (tmp_path / f"pdhef-compiled-{os.getuid()}").mkdir(mode=0o700)
+    assert cache._private_folder() is None
+
+
+def _as_nobody(python: str, *arguments: str) -> list[str]:
+    """Return a command that runs as nobody, or, where nobody reaches this interpreter, as root without its powers."""
+    setpriv = shutil.which("setpriv")
+    if setpriv is None or os.geteuid() != 0:
+        pytest.skip("only root, with setpriv, can become another user")
+    for user in (
+        ("--reuid=65534", "--regid=65534", "--clear-groups"),
+        ("--bounding-set=-all", "--inh-caps=-all", "--clear-groups"),
+    ):
+        command = [setpriv, *user, python]
+        if subprocess.run([*command, "-c", "import numba"], capture_output=True, cwd="/").returncode == 0:
+            return [*command, *arguments]
+    pytest.skip("no other user can run this interpreter")
+
+
+@pytest.mark.slow
+def test_a_run_works_as_nobody_with_a_read_only_installation_and_no_home(tmp_path: Path) -> None:
+    # Outside of pytest's own folder, which is this user's alone.
+    with tempfile.TemporaryDirectory(prefix="pdhef-nobody-") as folder:
+        installed, output, tmp = (Path(folder) / name for name in ("installed", "out", "tmp"))
+        ignored = shutil.ignore_patterns("__pycache__")
+        for part in ("pdhef_logtool", "truthsim", "schemas"):
+            shutil.copytree(_ROOT / part, installed / part, ignore=ignored)
+        shutil.copy(_ROOT / "sample_logs" / "dlc.mcap", installed)
+        Path(folder).chmod(0o755)
+        for place in (output, tmp):
+            place.mkdir()
+            place.chmod(0o777)
+        subprocess.run(["chmod", "-R", "a-w,a+rX", str(installed)], check=True)
+        arguments = ("-m", "pdhef_logtool", "run", str(installed / "dlc.mcap"), "--car", "saloon", "-o")
+        command = _as_nobody(sys.executable, *arguments, str(output / "run"), "--estimators", "zero,kinematic")
+        environment = {"PATH": os.environ["PATH"], "HOME": "/proc/nonexistent", "TMPDIR": str(tmp)}
+        environment["PYTHONPATH"] = os.pathsep.join([str(installed), *filter(None, sys.path)])
+        first = subprocess.run(command, capture_output=True, text=True, cwd="/", env=environment)
+        assert first.returncode == 0, first.stderr
+        assert "compiling, once" in first.stderr
+        assert str(tmp) in first.stderr
+        assert (output / "run" / "run.json").is_file()
+        command[-3] = str(output / "again")
+        again = subprocess.run(command, capture_output=True, text=True, cwd="/", env=environment)
+        assert again.returncode == 0, again.stderr
+        assert "compiling" not in again.stderr
+
+
+def test_kept_code_is_loaded_before_it_is_called(
+    module_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = _load(module_file)
+    assert first.more(1) == 2
+    assert first.more(1.5) == 2.5
+    capsys.readouterr()
+    monkeypatch.setattr(cache, "announced", False)
+    monkeypatch.setattr(cache, "_kept", [])
+    again = _load(module_file)
+    assert cache.load_kept()
+    assert set(again.more.signatures) == set(first.more.signatures)
+    assert capsys.readouterr().err == ""
+    for file in _code_files(module_file.parent):
+        file.write_bytes(b"cut")
+    cut = _load(module_file)
+    monkeypatch.setattr(cache, "_kept", [cut.more])
+    assert not cache.load_kept()
+    assert cut.more.signatures == []
+
+
+def test_of_the_workers_only_the_first_says_that_it_compiles(
+    module_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(processes, "worker_number", 2)
+    assert _load(module_file).more(1) == 2
+    assert capsys.readouterr().err == ""
+
+
+def test_the_code_of_other_sources_of_this_installation_is_removed_and_no_other(
+    module_file: Path, tmp_path: Path
+) -> None:
+    digest, places = sources.compiled_digest(), list(cache._places())
+    of_sources, of_processor = digest.split("-")
+    former = module_file.parent / "compiled/__pycache__/cache.f-5.py311.nbi"
+    stale = [module_file.parent / "__pycache__/compiled" / f"{'0' * 16}-{of_processor}" / "a.nbi", former]
+    others = [
+        places[0] / f"{of_sources}-{'0' * 8}" / "a.nbi",  # another processor
+        places[1].with_name(f"pdhef_logtool_{'0' * 16}")
+        / f"{'0' * 16}-{of_processor}"
+        / "a.nbi",  # installed elsewhere
+        places[0] / "notes" / "a.nbi",
+    ]
+    for file in (*stale, *others):
+        file.parent.mkdir(parents=True)
+        file.touch()
+    assert _load(module_file).more(1) == 2
+    assert [f.exists() for f in stale] == [False, False]
+    assert all(f.exists() for f in others)
+
+
+def test_what_compiled_code_is_made_of() -> None:
+    names = {p.relative_to(_ROOT).as_posix() for p in sources.compiled_sources()}
+    assert {
+        "pdhef_logtool/estimators/physics_filter.py",
+        "truthsim/motion.py",
+        "pdhef_logtool/compiled/vectors.py",
+    } <= names
+    assert "pdhef_logtool/records/signals.py" in names  # constants
+    assert "pdhef_logtool/compiled/cache.py" in names
+    assert not names & {"pdhef_logtool/cli/app.py", "pdhef_logtool/workers/supervisor.py"}
+    assert all(
+        p.relative_to(_ROOT).as_posix() in names
+        for package in sources.PACKAGES
+        for p in (_ROOT / package).rglob("*.py")
+        if "njit" in p.read_text() and p.name != "sources.py"
+    )
+
+
+def test_another_compiler_or_processor_is_another_digest(monkeypatch: pytest.MonkeyPatch) -> None:
+    def digest() -> str:
+        sources.compiled_digest.cache_clear()
+        return sources.compiled_digest()
+
+    usual = digest()
+    monkeypatch.setenv("NUMBA_CPU_NAME", "generic")
+    assert digest().split("-")[0] == usual.split("-")[0] and digest() != usual
+    monkeypatch.delenv("NUMBA_CPU_NAME")
+    for changed in ("numba", "llvmlite"):
+        monkeypatch.setattr(sources, "version", lambda name, c=changed: "0" if name == c else "1")
+        assert digest().split("-")[0] != usual.split("-")[0]
+    monkeypatch.undo()
+    assert digest() == usual
+
+
+#: Calls a compiled function whose compiled callee lies in another file; prints where it is from and what it returns.
+_USE = """
+import numpy as np
+from pdhef_logtool.car.nominal_model import model_parameters
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.estimators.parallel_physics import __file__, _nominal_ay
+ay = np.zeros(1)
+_nominal_ay(np.array([[20.0, 0.1, 0.2, 0.0]]), np.full((1, 5), 0.05), model_parameters(default_vehicle()), ay)
+print(__file__, ay[0])
+"""
+_CALLEE, _LINE = "pdhef_logtool/car/nominal_model.py", "    return (1.0 + p.ay_roll_gain) * ay"
+
+
+def _used(python: str | Path, **environment: str) -> tuple[Path, float]:
+    """Return the file of the module in use and what its function returns."""
+    done = subprocess.run(
+        [python, "-c", _USE], capture_output=True, text=True, cwd="/", env={"PATH": os.environ["PATH"], **environment}
+    )
+    assert done.returncode == 0, done.stderr
+    file, value = done.stdout.split()
+    return Path(file), float(value)
+
+
+def _copied(folder: Path) -> Path:
+    """Return a copy of the sources."""
+    for package in sources.PACKAGES:
+        shutil.copytree(_ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__", "models"))
+    return folder
+
+
+def _change_the_callee(folder: Path) -> None:
+    text = (folder / _CALLEE).read_text()
+    assert text.count(_LINE) == 1
+    (folder / _CALLEE).write_text(text.replace(_LINE, f"{_LINE} + 1.0"))
+
+
+def _folders(place: Path) -> list[str]:
+    return sorted({p.parent.name for p in _code_files(place)})
+
+
+@pytest.mark.slow
+def test_an_edit_of_a_callee_in_another_file_counts(tmp_path: Path) -> None:
+    sources = _copied(tmp_path / "sources")
+    environment = {"PYTHONPATH": os.pathsep.join([str(sources), *filter(None, sys.path)])}
+    environment["NUMBA_CACHE_DIR"] = str(tmp_path / "cache")
+    file, before = _used(sys.executable, **environment)
+    assert file.is_relative_to(sources)
+    folders = _folders(tmp_path / "cache")
+    _change_the_callee(sources)
+    assert _used(sys.executable, **environment)[1] == pytest.approx(before + 1.0)
+    assert len(_folders(tmp_path / "cache")) == 1 and _folders(tmp_path / "cache") != folders
+
+
+def _wheel(sources: Path, version: str) -> Path:
+    """Return a wheel of sources, with no more than pip needs."""
+    about = f"pdhef_logtool-{version}.dist-info"
+    files = {f.relative_to(sources).as_posix(): f.read_text() for p in ("*.py", "*.toml") for f in sources.rglob(p)}
+    files[f"{about}/METADATA"] = f"Metadata-Version: 2.1\nName: pdhef-logtool\nVersion: {version}\n"
+    files[f"{about}/WHEEL"] = "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
+    files[f"{about}/RECORD"] = "".join(f"{name},,\n" for name in [*files, f"{about}/RECORD"])
+    path = sources.parent / f"pdhef_logtool-{version}-py3-none-any.whl"
+    with zipfile.ZipFile(path, "w") as wheel:
+        for name, text in files.items():
+            wheel.writestr(name, text)
+    return path
+
+
+@pytest.mark.slow
+def test_an_upgrade_by_pip_runs_the_new_code_and_leaves_none_of_the_old(tmp_path: Path) -> None:
+    venv.create(tmp_path / "venv", with_pip=False)
+    python = tmp_path / "venv" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+    packages = subprocess.check_output(
+        [python, "-c", "import site; print(site.getsitepackages()[0])"], text=True
+    ).strip()
+    (Path(packages) / "dependencies.pth").write_text("\n".join(p for p in sys.path if p.endswith("site-packages")))
+    sources = _copied(tmp_path / "sources")
+
+    def installed(version: str) -> tuple[Path, float]:
+        pip = [
+            sys.executable,
+            "-m",
+            "pip",
+            "--python",
+            str(python),
+            "install",
+            "--no-deps",
+            "--no-index",
+            "--no-compile",
+        ]
+        wheel = _wheel(sources, version)
+        done = subprocess.run([*pip, "--upgrade", str(wheel)], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return _used(python)
+
+    file, before = installed("0.1.0")
+    assert file.is_relative_to(packages)
+    folders = _folders(Path(packages) / "pdhef_logtool")
+    _change_the_callee(sources)
+    assert installed("0.2.0")[1] == pytest.approx(before + 1.0)
+    assert len(_folders(Path(packages) / "pdhef_logtool")) == 1
+    assert _folders(Path(packages) / "pdhef_logtool") != folders

@@ -1,0 +1,291 @@
+"""The watch for divergence: exact kinematics with and without an error of the estimate, and the wrong branch itself."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from contextlib import closing
+from dataclasses import fields, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference_car import cut, make_signals
+from rich.console import Console
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.toml_files import load_vehicle
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_vehicle
+from pdhef_logtool.cli.run_tables import render_run
+from pdhef_logtool.drive.windows import DriveReader, plan_drive
+from pdhef_logtool.estimators.divergence import DivergenceState, DivergenceWatch, wrong_branch
+from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.table import make_estimator
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import auto_map
+from pdhef_logtool.records.signals import Signals, join_signals
+from pdhef_logtool.records.tracks import StateTrack, concatenate, make_track
+from pdhef_logtool.results.run_report import diverged_line, report_markdown
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.fleet import run_logs
+from truthsim.drive import simulate_drive, write_drive
+
+pytestmark = pytest.mark.slow
+
+IMU_X_M, IMU_Y_M = 0.8, -0.3
+VEHICLE = default_vehicle().model_copy(update={"imu_position_m": (IMU_X_M, IMU_Y_M, 0.0)})
+TILT = 1.0 + GRAVITY_M_S2 * VEHICLE.roll_gradient_rad_per_m_s2
+SPEED_M_S = 25.0
+FRICTION = 0.85
+
+
+def motion(
+    share: float = 0.9, duration_s: float = 12.0, hz: float = 0.4, seed: int = 0, delay_ns: int = 10_000_000
+) -> tuple[Signals, StateTrack]:
+    """Return what the sensors read of a slalom up to a share of the grip, and its true state; irregular 100 Hz."""
+    rng = np.random.default_rng(seed)
+    dt = rng.uniform(0.008, 0.012, round(duration_s * 100))
+    t = np.concatenate([[0.0], np.cumsum(np.round(dt * 1e9) * 1e-9)])
+    w = 2.0 * math.pi * hz
+    peak = share * FRICTION * GRAVITY_M_S2 / SPEED_M_S
+    r, r_dot, r_dot2 = peak * np.sin(w * t), peak * w * np.cos(w * t), -peak * w * w * np.sin(w * t)
+    vy, vy_dot = -0.8 * r_dot, -0.8 * r_dot2
+    ay = vy_dot + SPEED_M_S * r
+    signals = make_signals(
+        dt,
+        delay_ns,
+        ay_m_s2=TILT * ay + IMU_X_M * r_dot - IMU_Y_M * r * r,
+        yaw_rate_rad_s=r,
+        speed_m_s=np.full(len(t), SPEED_M_S),
+        friction=np.full(len(t), FRICTION),
+    )
+    covariance = np.tile(np.diag([0.01, 0.01, 1e-5]), (len(t), 1, 1))
+    track = make_track(
+        "f", signals.stamps_ns, vx_m_s=np.full(len(t), SPEED_M_S), vy_m_s=vy, yaw_rate_rad_s=r, covariance=covariance
+    )
+    return signals, track
+
+
+def off_by(track: StateTrack, degrees: float, from_s: float, to_s: float, rise_s: float = 0.3) -> StateTrack:
+    """Return the track with its sideslip off by an angle between two times, up and down within ``rise_s``."""
+    t = (track.stamps_ns - track.stamps_ns[0]) * 1e-9
+    shape = np.clip((t - from_s) / rise_s, 0.0, 1.0) - np.clip((t - to_s) / rise_s, 0.0, 1.0)
+    return replace(track, vy_m_s=track.vy_m_s + SPEED_M_S * math.tan(math.radians(degrees)) * shape)
+
+
+def seconds(signals: Signals) -> np.ndarray:
+    return (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
+
+
+def flags(track: StateTrack, signals: Signals, vehicle: VehicleParameters = VEHICLE) -> np.ndarray:
+    return wrong_branch(track, signals, vehicle)[0]
+
+
+@settings(deadline=None, max_examples=20)
+@given(share=st.floats(0.0, 1.0), hz=st.floats(0.1, 1.5), seed=st.integers(0, 99))
+def test_the_true_motion_is_never_flagged(share: float, hz: float, seed: int) -> None:
+    signals, truth = motion(share, hz=hz, seed=seed)
+    noise = np.random.default_rng(seed)
+    noisy = replace(
+        signals,
+        ay_m_s2=signals.ay_m_s2 + noise.normal(0.0, VEHICLE.sensors.ay_std_m_s2, len(signals)),
+        yaw_rate_rad_s=signals.yaw_rate_rad_s + noise.normal(0.0, VEHICLE.sensors.yaw_rate_std_rad_s, len(signals)),
+    )
+    assert not flags(truth, noisy).any()
+
+
+@settings(deadline=None, max_examples=20)
+@given(degrees=st.floats(8.0, 40.0), rise_s=st.floats(0.02, 1.0), sign=st.sampled_from([-1, 1]))
+def test_an_error_is_flagged_while_it_grows_and_taken_back_with_it(degrees: float, rise_s: float, sign: int) -> None:
+    signals, truth = motion()
+    found, t = flags(off_by(truth, sign * degrees, 5.0, 7.0, rise_s), signals), seconds(signals)
+    assert not found[t < 5.0].any()
+    grown = 5.0 + rise_s
+    assert found[(t > grown + 0.1) & (t < grown + 0.5)].all()
+    # What the leak forgot of the error stands on the other side when it goes: at most 1 − e^(−2/3) of it.
+    left = degrees * (1.0 - math.exp(-(2.0 + rise_s) / 3.0))
+    assert left > 2.9 or not found[t > 7.0 + rise_s + 0.1].any()
+
+
+def test_a_small_error_is_not_flagged() -> None:
+    signals, truth = motion()
+    assert not flags(off_by(truth, 4.0, 5.0, 7.0), signals).any()
+
+
+def test_the_lever_arm_and_the_roll_count() -> None:
+    """The truth at the CG against the IMU's reading: without its position or the roll it looks like divergence."""
+    signals, truth = motion(share=1.0, hz=1.0)
+    assert not flags(truth, signals).any()
+    wrong = VEHICLE.model_copy(update={"imu_position_m": (-10.0, 0.0, 0.0)})
+    assert flags(truth, signals, wrong).any()
+    signals, truth = motion(share=1.0, hz=0.1)
+    assert not flags(truth, signals).any()
+    assert flags(truth, signals, VEHICLE.model_copy(update={"roll_gradient_rad_per_m_s2": 0.06})).any()
+
+
+def test_in_the_linear_range_bank_and_bias_are_no_divergence() -> None:
+    signals, truth = motion(share=0.3)
+    banked = replace(signals, ay_m_s2=signals.ay_m_s2 + 1.0)  # 10 % of bank
+    assert not flags(truth, banked).any()
+
+
+def test_stuck_and_missing_sensors_are_not_judged() -> None:
+    signals, truth = motion()
+    t = seconds(signals)
+    for column in ("yaw_rate_rad_s", "ay_m_s2"):
+        at = int(np.searchsorted(t, 5.0))
+        stuck = np.where(t >= 5.0, getattr(signals, column)[at], getattr(signals, column))
+        assert not flags(truth, replace(signals, **{column: stuck})).any()
+        missing = np.where(t >= 5.0, np.nan, getattr(signals, column))
+        assert not flags(truth, replace(signals, **{column: missing})).any()
+    moving = np.where(t >= 5.0, 1e-5 * np.arange(len(t)), signals.yaw_rate_rad_s)
+    assert flags(truth, replace(signals, yaw_rate_rad_s=moving)).any()  # only the repetition excuses it
+
+
+def test_sensors_at_half_the_rate_are_held() -> None:
+    signals, truth = motion()
+    even = np.arange(len(signals)) % 2 == 0
+    half = replace(signals, yaw_rate_rad_s=np.where(even, signals.yaw_rate_rad_s, np.nan))
+    assert not flags(truth, half).any()
+    assert flags(off_by(truth, 12.0, 5.0, 7.0), half).any()
+
+
+def test_sensors_too_noisy_to_judge_do_not_judge() -> None:
+    signals, truth = motion()
+    wrong = off_by(truth, 12.0, 5.0, 7.0)
+    rough = VEHICLE.sensors.model_copy(update={"ay_std_m_s2": 40.0})
+    assert flags(wrong, signals).any()
+    assert not flags(wrong, signals, VEHICLE.model_copy(update={"sensors": rough})).any()
+
+
+def test_the_flag_waits_for_the_samples_to_arrive() -> None:
+    late_ns = 200_000_000
+    signals, truth = motion(delay_ns=0)
+    wrong = off_by(truth, 20.0, 5.0, 7.0)
+    late = replace(signals, ready_ns=signals.stamps_ns + late_ns)
+    at, at_late = (int(np.flatnonzero(flags(wrong, s))[0]) for s in (signals, late))
+    assert 0.185 <= seconds(signals)[at_late] - seconds(signals)[at] <= 0.215
+
+
+def test_what_comes_later_changes_no_flag() -> None:
+    signals, truth = motion()
+    wrong = off_by(truth, 20.0, 5.0, 7.0)
+    whole = flags(wrong, signals)
+    end = 600
+    part, _ = wrong_branch(_cut_track(wrong, 0, end), cut(signals, 0, end), VEHICLE)
+    assert whole[:end].any()
+    np.testing.assert_array_equal(part, whole[:end])
+
+
+@settings(deadline=None, max_examples=20)
+@given(borders=st.lists(st.integers(0, 1200), max_size=6), delay_ms=st.integers(0, 300))
+def test_windows_change_no_bit(borders: list[int], delay_ms: int) -> None:
+    signals, truth = motion(delay_ns=delay_ms * 1_000_000)
+    wrong = off_by(truth, 9.0, 5.0, 8.0)
+    whole, last = wrong_branch(wrong, signals, VEHICLE)
+    parts: list[np.ndarray] = []
+    carry: DivergenceState | None = None
+    for a, b in pairwise([0, *sorted(borders), len(signals)]):
+        found, carry = wrong_branch(_cut_track(wrong, a, b), cut(signals, a, b), VEHICLE, carry)
+        parts.append(found)
+    assert whole.any()
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
+    assert carry is not None
+    np.testing.assert_array_equal(carry.memory, last.memory)
+
+
+def test_the_watch_adds_to_what_an_estimator_says_itself_and_leaves_those_without_a_covariance() -> None:
+    signals, truth = motion()
+    own = np.zeros(len(signals), dtype=np.bool_)
+    own[:10] = True
+    wrong = replace(off_by(truth, 20.0, 5.0, 7.0), diverged=own)
+    watch = DivergenceWatch(VEHICLE)
+    parts = [watch.add(_cut_track(wrong, a, b), cut(signals, a, b)) for a, b in ((0, 555), (555, len(signals)))]
+    np.testing.assert_array_equal(concatenate(parts).diverged, own | flags(wrong, signals))
+    plain = replace(wrong, covariance=np.empty((0, 3, 3)))
+    assert DivergenceWatch(VEHICLE).add(plain, signals) is plain
+
+
+def test_an_estimate_that_is_not_valid_is_not_flagged() -> None:
+    signals, truth = motion()
+    wrong = off_by(truth, 20.0, 5.0, 7.0)
+    assert not DivergenceWatch(VEHICLE).add(replace(wrong, valid=~wrong.valid), signals).diverged.any()
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A growing sine on a slippery road: beyond the peak of the tyres, the true sideslip still moderate."""
+    drive = simulate_drive(
+        "sine-sweep", speed_km_h=100.0, friction=0.3, amplitude=1.08, seed=7302, keep_spins=True, tolerance=0.01
+    )
+    path = tmp_path_factory.mktemp("sweep") / "sweep.mcap"
+    write_drive(drive, path)
+    return path
+
+
+def test_a_filter_on_the_wrong_branch_is_flagged_at_once_in_every_output(
+    sweep: Path, sample_logs_dir: Path, tmp_path: Path
+) -> None:
+    names = ("phy-ukf", "physics", "zero")
+    config = RunConfig(car=sample_logs_dir / "vehicle_mu03.toml", estimators=names, annotate="none")
+    result = run_logs([str(sweep)], tmp_path, config)
+    folder = tmp_path / "logs" / "sweep"
+    table = pl.read_parquet(folder / "estimates.parquet")
+    true = table.filter(pl.col("estimator") == "truth").select("stamp_ns", true="sideslip_rad")
+    report = json.loads((folder / "report.json").read_text())
+    text, markdown = io.StringIO(), report_markdown(report)
+    render_run(result, Console(file=text, width=160))
+    for name in names[:2]:
+        of = table.filter(pl.col("estimator") == name).join(true, on="stamp_ns").sort("stamp_ns")
+        beta, truth = np.degrees(of["sideslip_rad"].to_numpy()), np.degrees(of["true"].to_numpy())
+        t = (of["stamp_ns"].to_numpy() - of["stamp_ns"][0]) * 1e-9
+        wrong = abs(beta - truth) > 8.0
+        start = float(t[int(np.flatnonzero(wrong)[0])])
+        # It is the wrong branch: within two seconds the estimate is far beyond the truth.
+        soon = (t >= start) & (t <= start + 2.0)
+        assert (abs(beta)[soon] > 2.5 * abs(truth)[soon]).any()
+        assert abs(beta)[soon].max() > 25.0
+        said = of["diverged"].to_numpy()
+        assert not said[t < start - 1.0].any()
+        first = float(t[int(np.flatnonzero(said)[0])])
+        assert first < start + 0.1
+        assert said[wrong].mean() > 0.7
+        spans = [s for s in report["segments"] if s["name"] == f"{name} diverged"]
+        assert (spans[0]["start_ns"] - int(of["stamp_ns"][0])) * 1e-9 == pytest.approx(first, abs=1e-6)
+        share = [
+            m for m in report["metrics"] if (m["estimator"], m["metric"], m["segment"]) == (name, "diverged", "all")
+        ]
+        assert share[0]["value"] == pytest.approx(said.mean(), abs=0.01)
+        line = diverged_line(report, name)
+        assert line.startswith("diverged for ")
+        of_log = (spans[0]["start_ns"] - report["log"]["start_ns"]) * 1e-9
+        assert f"first at {of_log:.2f} s" in line
+        assert line in text.getvalue()
+        assert line in markdown
+    assert not table.filter(pl.col("estimator") == "zero")["diverged"].any()
+    assert diverged_line(report, "zero") == ""
+
+
+def test_the_filter_itself_sees_it_later(sweep: Path, sample_logs_dir: Path) -> None:
+    """What the watch adds: its flag stands before that of the filter's own innovations."""
+    vehicle = load_vehicle(sample_logs_dir / "vehicle_mu03.toml")
+    signals = read_signals(sweep, vehicle)
+    track, _ = run_window(make_estimator("phy-ukf", Car.of(vehicle)), signals)
+    own, seen = (int(np.flatnonzero(f)[0]) for f in (track.diverged, flags(track, signals, vehicle)))
+    assert (signals.stamps_ns[own] - signals.stamps_ns[seen]) * 1e-9 > 0.3
+
+
+def read_signals(path: Path, vehicle: VehicleParameters) -> Signals:
+    with closing(open_log(path)) as log:
+        plan = plan_drive(log, auto_map(log).mapping, vehicle, log.start_ns, log.end_ns)
+        return join_signals([w.signals for w in DriveReader(log, plan, 600.0).windows()])
+
+
+def _cut_track(track: StateTrack, first: int, end: int) -> StateTrack:
+    whole = {f.name: getattr(track, f.name) for f in fields(track) if f.name != "name"}
+    return replace(track, **{n: c[first:end] if len(c) == len(track) else c for n, c in whole.items()})

@@ -1,0 +1,385 @@
+"""Calibrated intervals: exact over windows, causal, monotone, and only from a file that says what it is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.car.car import INTERVALS_FILE, UNSURE_FILE, Car, load_intervals
+from pdhef_logtool.car.parts import Algorithm, Inflation, IntervalEntry, Intervals
+from pdhef_logtool.car.toml_files import vehicle_toml
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.estimators.error_features import FLOOR_RAD, TERMS, error_terms
+from pdhef_logtool.estimators.intervals import (
+    SIDESLIP_TERMS,
+    YAW_RATE_TERMS,
+    TrackCalibrator,
+    calibrated,
+    inflated,
+    make_inflation,
+)
+from pdhef_logtool.records.errors import PdhefError, VehicleError
+from pdhef_logtool.records.reasons import STUCK_AY, STUCK_YAW_RATE
+from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
+from pdhef_logtool.records.tracks import StateTrack, concatenate, make_track
+
+STEP_NS = 10_000_000
+SIDESLIP_FACTORS = (1.0, 1.5, 0.3, 0.8, 0.5, 0.9, 0.2, 0.6, 0.4)
+INFLATION = make_inflation(SIDESLIP_FACTORS, (0.5, 1.2, 0.7), 1.1, (1.0, 1.3, 2.0))
+ROLL = 0.009
+ALGORITHM = Algorithm(
+    algorithm="physics-ukf",
+    options={"roll_correction": True},
+    noise={"q_std": [0.1, 0.1, 0.1]},
+    physics_sha256="ab" * 32,
+    network_sha256="12" * 32,
+)
+
+
+def _intervals(algorithm: Algorithm = ALGORITHM, inflation: Inflation = INFLATION, **changes: Any) -> Intervals:
+    values = {
+        "car": "car",
+        "physics_sha256": "ab" * 32,
+        "roll_gradient_rad_per_m_s2": ROLL,
+        "entries": (IntervalEntry(estimator="e", algorithm=algorithm, inflation=inflation),),
+    }
+    return Intervals(**{**values, **changes})
+
+
+def _calibrator(intervals: Intervals | None, *algorithms: Algorithm, name: str = "e") -> TrackCalibrator:
+    return TrackCalibrator(intervals, {name: algorithms})
+
+
+def _drive(count: int = 900, seed: int = 0) -> tuple[Signals, StateTrack]:
+    """A slalom with noise, gaps, missing samples and irregular arrival; the estimate is not quite right."""
+    rng = np.random.default_rng(seed)
+    stamps = 10**18 + np.cumsum(rng.integers(9_000_000, 11_000_000, count)).astype(np.int64)
+    stamps[count // 2 :] += 700_000_000
+    t = (stamps - stamps[0]) * 1e-9
+    vy, rate, vx = 0.3 * np.sin(3.0 * t), 0.25 * np.sin(3.0 * t + 0.4), np.full(count, 22.0)
+    ay = np.gradient(vy, t) + vx * rate + rng.normal(0.0, 0.12, count)
+    ay[rng.random(count) < 0.05] = np.nan
+    signals = Signals(
+        stamps_ns=stamps,
+        ready_ns=np.maximum.accumulate(stamps + rng.integers(1_000_000, 35_000_000, count)),
+        steer_rad=np.zeros(count),
+        ax_m_s2=np.zeros(count),
+        ay_m_s2=ay,
+        yaw_rate_rad_s=rate + rng.normal(0.0, 0.004, count),
+        speed_m_s=vx,
+        friction=np.full(count, 0.8),
+        wheel_speed_m_s=np.full((count, 4), np.nan),
+        available=frozenset(ALIGNED_SIGNALS),
+    )
+    covariance = np.tile(np.diag([0.01, 0.02, 1e-5]), (count, 1, 1))
+    covariance[:, 0, 1] = covariance[:, 1, 0] = 0.004
+    covariance[:, 1, 2] = covariance[:, 2, 1] = 1e-4
+    std = np.full(count, np.sqrt(0.02) / 22.0)
+    std[:3] = np.nan
+    track = make_track(
+        "e",
+        stamps,
+        vx_m_s=vx,
+        vy_m_s=0.8 * vy,
+        yaw_rate_rad_s=rate + 0.002 * np.sin(t),
+        ay_m_s2=ay,
+        covariance=covariance,
+        sideslip_std_rad=std,
+    )
+    return signals, track
+
+
+def _cut(record: Any, a: int, b: int) -> Any:
+    """Return stamps a to b of signals or of a track."""
+    changed = {f.name: getattr(record, f.name) for f in fields(record)}
+    return replace(record, **{k: v[a:b] for k, v in changed.items() if isinstance(v, np.ndarray) and len(v)})
+
+
+@pytest.mark.parametrize("cuts", [(0, 1, 2, 450, 900), (0, 7, 449, 451, 452, 899, 900), (0, 300, 300, 900)])
+def test_joined_windows_equal_the_whole(cuts: tuple[int, ...]) -> None:
+    signals, track = _drive()
+    track = replace(track, reason=np.where(np.arange(900) % 250 < 40, STUCK_AY, 0))
+    whole, _ = calibrated(track, signals, INFLATION, ROLL)
+    carry, parts = None, []
+    for a, b in pairwise(cuts):
+        part, carry = calibrated(_cut(track, a, b), _cut(signals, a, b), INFLATION, ROLL, carry)
+        if len(part):
+            parts.append(part)
+    joined = concatenate(parts)
+    assert np.array_equal(joined.sideslip_std_rad, whole.sideslip_std_rad, equal_nan=True)
+    assert np.array_equal(joined.covariance, whole.covariance)
+
+
+@pytest.mark.parametrize("at", [100, 460, 700])
+def test_what_has_not_arrived_changes_nothing(at: int) -> None:
+    signals, track = _drive()
+    late = signals.ready_ns > signals.stamps_ns[at]
+    changed = replace(
+        signals,
+        ay_m_s2=np.where(late, 30.0, signals.ay_m_s2),
+        yaw_rate_rad_s=np.where(late, 3.0, signals.yaw_rate_rad_s),
+    )
+    before, _ = error_terms(track, signals, 0.009, None)
+    after, _ = error_terms(track, changed, 0.009, None)
+    assert np.array_equal(before[: at + 1], after[: at + 1])
+    assert not np.array_equal(before, after)
+
+
+def test_the_estimate_stays_and_the_covariance_is_scaled_as_one() -> None:
+    signals, track = _drive()
+    out, _ = calibrated(track, signals, INFLATION, ROLL)
+    for name in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad"):
+        assert getattr(out, name) is getattr(track, name)
+    assert np.array_equal(np.isnan(out.sideslip_std_rad), np.isnan(track.sideslip_std_rad))
+    k = out.sideslip_std_rad[3:] / track.sideslip_std_rad[3:]
+    np.testing.assert_allclose(out.vy_std_m_s[3:] / track.vy_std_m_s[3:], 1.1 * k)
+    np.testing.assert_array_equal(out.vx_std_m_s, track.vx_std_m_s)
+    before, after = track.covariance, out.covariance
+    for i, j in ((0, 1), (1, 2)):
+        correlation = [c[:, i, j] / np.sqrt(c[:, i, i] * c[:, j, j]) for c in (before, after)]
+        np.testing.assert_allclose(correlation[0], correlation[1])
+    assert np.all(np.linalg.eigvalsh(after) > 0.0)
+
+
+def test_the_filters_own_term_alone_changes_nothing_but_the_scale() -> None:
+    signals, track = _drive()
+    terms, _ = error_terms(track, signals, 0.009, None)
+    only = make_inflation(
+        tuple(2.0 * (t == "filter") for t in SIDESLIP_TERMS), tuple(3.0 * (t == "filter") for t in YAW_RATE_TERMS)
+    )
+    out = inflated(track, terms, only)
+    np.testing.assert_allclose(out.sideslip_std_rad, 2.0 * track.sideslip_std_rad)
+    np.testing.assert_allclose(out.yaw_rate_std_rad_s, 3.0 * track.yaw_rate_std_rad_s)
+
+
+def test_the_interval_widens_with_every_term() -> None:
+    _, track = _drive(50)
+    track = replace(track, sideslip_std_rad=np.full(50, 0.001))
+    terms = np.full((50, len(TERMS)), 0.001)
+    plain = make_inflation(SIDESLIP_FACTORS, (0.5, 1.2, 0.7))
+    base = inflated(track, terms, plain).sideslip_std_rad
+    np.testing.assert_allclose(base, 0.001 * np.sqrt(np.sum(np.square(SIDESLIP_FACTORS))))
+    for i in range(len(TERMS)):
+        more = terms.copy()
+        more[:, i] = 0.002
+        assert np.all(inflated(track, more, plain).sideslip_std_rad > base)
+
+
+def test_terms_see_a_wrong_sideslip_and_a_wrong_yaw_rate() -> None:
+    signals, track = _drive()
+    right = replace(track, vy_m_s=track.vy_m_s / 0.8, yaw_rate_rad_s=signals.yaw_rate_rad_s)
+    untilted = error_terms(right, signals, 0.0, None)[0]
+    wrong = error_terms(replace(right, vy_m_s=0.5 * right.vy_m_s), signals, 0.0, None)[0]
+    late = slice(200, 440)
+    kinematic, rate = TERMS.index("kinematic"), TERMS.index("yaw_rate")
+    # Half of a swing of 0.3 m/s at 3 rad/s is lost; the high-pass of 0.3 s passes ωτ / √(1 + ω²τ²) = 0.67 of it.
+    expected = 0.15 / np.sqrt(2.0) * 0.67 / 22.0
+    assert np.all(untilted[late, kinematic] < 0.3 * expected)
+    assert np.median(wrong[late, kinematic]) == pytest.approx(expected, rel=0.25)
+    assert np.all(untilted[late, rate] == 0.0)
+    off = error_terms(replace(right, yaw_rate_rad_s=right.yaw_rate_rad_s - 0.01), signals, 0.0, None)[0]
+    assert off[400, rate] == pytest.approx(0.01, rel=0.05)
+    assert np.all(untilted[:, 0] == FLOOR_RAD)
+
+
+def test_grip_follows_the_friction_that_is_told() -> None:
+    signals, track = _drive()
+    grip = TERMS.index("grip")
+    high = error_terms(track, signals, 0.0, None)[0][:, grip]
+    low = error_terms(track, replace(signals, friction=signals.friction / 2.0), 0.0, None)[0][:, grip]
+    np.testing.assert_allclose(low, 2.0 * high)
+
+
+def test_terms_tell_that_an_estimator_cures_its_car_and_sees_a_bank() -> None:
+    signals, track = _drive()
+    weight = np.linspace(0.0, 1.0, 900)
+    weight[5] = np.nan
+    curing = replace(track, mixture_weight=weight, bank_rad=np.full(900, -0.03))
+    plain, told = (error_terms(t, signals, 0.0, None)[0] for t in (track, curing))
+    cure, bank = TERMS.index("cure"), TERMS.index("bank")
+    np.testing.assert_allclose(told[:, cure], np.nan_to_num(weight) * np.abs(track.sideslip_rad))
+    np.testing.assert_array_equal(told[:, bank], 0.03)
+    np.testing.assert_array_equal(plain[:, [cure, bank]], 0.0)
+    np.testing.assert_array_equal(np.delete(told, [cure, bank], axis=1), np.delete(plain, [cure, bank], axis=1))
+
+
+def test_a_factor_holds_where_its_share_of_the_grip_is_used() -> None:
+    _, track = _drive(5)
+    track = replace(track, sideslip_std_rad=np.full(5, 0.001))
+    terms = np.full((5, len(TERMS)), 0.001)
+    terms[:, TERMS.index("grip")] = 0.003 * np.array([0.0, 0.2, 0.45, 0.575, 1.2])
+    free = [k * (t != "grip") for t, k in zip(SIDESLIP_TERMS, SIDESLIP_FACTORS, strict=True)]
+    std = [
+        inflated(track, terms, make_inflation(free, (1.0, 1.0, 1.0), 1.0, factors)).sideslip_std_rad
+        for factors in ((1.0, 1.0, 1.0), (0.5, 1.0, 2.0))
+    ]
+    np.testing.assert_allclose(std[1] / std[0], [0.5, 0.5, 1.0, 1.5, 2.0])
+
+
+def test_nothing_is_made_of_missing_samples() -> None:
+    signals, track = _drive(60)
+    nothing = np.full(60, np.nan)
+    blind = replace(signals, ay_m_s2=nothing, yaw_rate_rad_s=nothing, friction=nothing)
+    terms, _ = error_terms(track, blind, 0.009, None)
+    assert np.all(np.isfinite(terms))
+    assert np.all(terms[:, 3:] == 0.0)
+
+
+def test_a_sensor_that_the_estimator_has_found_faulty_widens_nothing() -> None:
+    signals, track = _drive()
+    stuck = np.arange(900) >= 200
+    signals = replace(signals, yaw_rate_rad_s=np.where(stuck, 0.4, signals.yaw_rate_rad_s))
+    told = replace(track, reason=np.where(stuck, STUCK_YAW_RATE, 0))
+    blind, seeing = (error_terms(t, signals, 0.009, None)[0][300:440, 5:7] for t in (track, told))
+    assert np.all(seeing < 0.1 * blind)
+    # A faulty accelerometer leaves the yaw rate's term alone.
+    other = replace(track, reason=np.where(stuck, STUCK_AY, 0))
+    assert np.array_equal(error_terms(other, signals, 0.009, None)[0][300:440, 6], blind[:, 1])
+
+
+def test_without_an_entry_a_track_stays_as_it_is() -> None:
+    signals, track = _drive(60)
+    other = ALGORITHM.model_copy(update={"algorithm": "physics-filter"})
+    for intervals, ran in ((None, ALGORITHM), (_intervals(entries=()), ALGORITHM), (_intervals(), other)):
+        calibrator = _calibrator(intervals, ran)
+        assert calibrator.add(track, signals) is track
+        assert calibrator.notes("e")[0] == "intervals not calibrated"
+        assert calibrator.notes("e")[1:] == ((calibrator.mismatch("e"),) if ran is other else ())
+    assert calibrator.mismatch("e") == (
+        "the calibrated intervals of e are not applied: expected physics-ukf 1 (roll_correction=True), "
+        "got physics-filter 1 (roll_correction=True); run pdhef learn --stages intervals"
+    )
+    assert calibrator.warning == calibrator.mismatch("e")
+    # Those of the shipped car were never this car's.
+    assert TrackCalibrator(_intervals(), {"e": [other]}, of_car=False).mismatch("e") == ""
+    assert _calibrator(_intervals(), ALGORITHM).mismatch("e") == ""
+    assert _calibrator(None).notes("zero") == ()
+
+
+def test_the_notes_say_for_what_intervals_were_made() -> None:
+    signals, track = _drive(60)
+
+    def notes(intervals: Intervals, ran: Algorithm = ALGORITHM) -> str:
+        calibrator = _calibrator(intervals, ran)
+        assert calibrator.add(track, signals) is not track
+        return "; ".join(calibrator.notes("e"))
+
+    made = "intervals calibrated on car for friction and vehicle"
+    assert notes(_intervals()) == f"{made} as told"
+    assert notes(_intervals(spread=0.2)) == f"{made} wrong by 0.2"
+    for changes, said in (
+        ({"physics_sha256": "cd" * 32}, "physics"),
+        ({"noise": {"q_std": [0.1, 0.1, 0.2]}}, "filter noise"),
+        ({"network_sha256": "34" * 32}, "network"),
+        ({"use_speed": False}, "sensors (with or without the speed)"),
+    ):
+        assert notes(_intervals(), ALGORITHM.model_copy(update=changes)).endswith(f"as told, but with other {said}")
+    # The physics that the whole car has now are no matter: those of what ran are.
+    assert notes(_intervals(physics_sha256="cd" * 32)) == f"{made} as told"
+
+
+# ---- the file ----
+
+
+def _document() -> dict[str, Any]:
+    return _intervals().model_dump(mode="json")
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    (tmp_path / INTERVALS_FILE).write_text(json.dumps(_document()))
+    for path in (tmp_path, tmp_path / INTERVALS_FILE):
+        assert load_intervals(path) == _intervals()
+
+
+def _with_entry(**changes: Any) -> dict[str, Any]:
+    return {"entries": [_document()["entries"][0] | changes]}
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"format": "pdhef-tuning"}, "format: should be 'pdhef-intervals'"),
+        ({"version": 2}, "version: should be 1"),
+        ({"physics_sha256": "ab"}, "physics_sha256"),
+        (_with_entry(inflation={"sideslip": {}, "yaw_rate": {}, "vy_factor": 1.0}), "inflation.sideslip.floor"),
+        (_with_entry(inflation=_document()["entries"][0]["inflation"] | {"vy_factor": -1.0}), "inflation.vy_factor"),
+        (
+            _with_entry(inflation=_document()["entries"][0]["inflation"] | {"vy_factor": float("nan")}),
+            "inflation.vy_factor",
+        ),
+        ({"entries": {}}, "entries: should be a list"),
+        ({"roll_gradient_rad_per_m_s2": None}, "roll_gradient_rad_per_m_s2"),
+        ({"estimators": {}}, "estimators: unknown"),
+    ],
+)
+def test_a_wrong_file_is_one_clear_error(tmp_path: Path, change: dict[str, Any], said: str) -> None:
+    path = tmp_path / "c.json"
+    path.write_text(json.dumps(_document() | change))
+    with pytest.raises(VehicleError) as caught:
+        load_intervals(path)
+    assert said in str(caught.value)
+    assert "c.json" in str(caught.value)
+    assert "pdhef learn --stages intervals" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [None, "{", "[]"])
+def test_no_file_and_no_json(tmp_path: Path, content: str | None) -> None:
+    path = tmp_path / "c.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(VehicleError):
+        load_intervals(path)
+
+
+def test_which_intervals_a_run_takes(tmp_path: Path) -> None:
+    folder = tmp_path / "car"
+    folder.mkdir()
+    (folder / "vehicle.toml").write_text(vehicle_toml(default_vehicle()))
+
+    def taken(chosen: Path | str | None, car: Path | None = folder, network: str | None = None) -> str | None:
+        intervals = Car.load(car, network=network, intervals=chosen).intervals
+        return None if intervals is None else intervals.car
+
+    shipped = Car.load("saloon").intervals
+    assert shipped is not None
+    assert taken(None) == shipped.car
+    for name, file in (("mine", INTERVALS_FILE), ("mine, unsure", UNSURE_FILE)):
+        (folder / file).write_text(json.dumps(_document() | {"car": name}))
+    assert taken(None) == "mine"
+    assert taken("none") is None
+    assert taken("unsure") == taken(Path("unsure")) == "mine, unsure"
+    assert taken(folder, None) == taken(folder / INTERVALS_FILE, None) == "mine"
+    assert taken(None, None) == shipped.car
+    assert taken(None, network="none") == "mine"
+    for other in ("none", "many-cars"):
+        assert taken(None, None, network=other) is None, "the shipped car's were made with the shipped network"
+    with pytest.raises(PdhefError, match="elsewhere"):
+        taken(tmp_path / "elsewhere")
+
+
+def test_an_estimator_that_is_another_one_has_its_intervals() -> None:
+    signals, track = _drive()
+    renamed = replace(track, name="hybrid")
+    cautious = ALGORITHM.model_copy(update={"algorithm": "cautious-physics"})
+
+    def with_intervals(algorithms: Sequence[Algorithm], intervals: Intervals | None = None) -> StateTrack:
+        return _calibrator(intervals or _intervals(), *algorithms, name="hybrid").add(renamed, signals)
+
+    np.testing.assert_array_equal(with_intervals([cautious]).sideslip_std_rad, track.sideslip_std_rad)
+    own = _calibrator(_intervals(), ALGORITHM).add(track, signals)
+    as_another = with_intervals([cautious, ALGORITHM])
+    np.testing.assert_array_equal(as_another.sideslip_std_rad, own.sideslip_std_rad)
+    assert as_another.name == "hybrid"
+    # Its own come first, wherever they stand in the file.
+    wide = make_inflation([3.0 * k for k in SIDESLIP_FACTORS], (0.5, 1.2, 0.7), 1.0, INFLATION.grip_factors)
+    both = _intervals(entries=(*_intervals().entries, *_intervals(cautious, wide).entries))
+    ratio = with_intervals([cautious, ALGORITHM], both).sideslip_std_rad[3:] / own.sideslip_std_rad[3:]
+    np.testing.assert_allclose(ratio, 3.0)

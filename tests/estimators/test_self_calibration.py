@@ -1,0 +1,194 @@
+"""A car that calibrates itself: what it recovers of a car that is known, and when it refuses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference_car import FRICTION, Drive, cut, drive, keep, with_noise
+
+from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, drift_share, self_calibrate
+from pdhef_logtool.estimators.calibration.driving import LEAST_SPEED_M_S, STEP_S, Driving, DrivingReader
+from pdhef_logtool.records.signals import Signals
+
+RIGHT = default_vehicle()
+
+
+def wrong(front: float, rear: float, vehicle: VehicleParameters = RIGHT) -> VehicleParameters:
+    """Return a vehicle whose axles are stiffer by factors; peaks stay."""
+
+    def of(tyre: AxleTyre, factor: float) -> AxleTyre:
+        assert tyre.B is not None
+        return tyre.model_copy(update={"B": tyre.B * factor})
+
+    tyres = Tyres(front=of(vehicle.tyres.front, front), rear=of(vehicle.tyres.rear, rear))
+    return vehicle.model_copy(update={"tyres": tyres})
+
+
+def sweep(amplitude: float) -> Callable[[float], float]:
+    """Return steering that sweeps from 0.2 to 1.2 Hz in 20 s, again and again."""
+    return lambda t: amplitude * math.sin(2.0 * math.pi * (0.2 * (t % 20.0) + 0.025 * (t % 20.0) ** 2))
+
+
+@cache
+def wide() -> Drive:
+    return drive(sweep(0.02), 60.0)
+
+
+def driving(signals: Signals, vehicle: VehicleParameters) -> Driving:
+    reader = DrivingReader(vehicle)
+    reader.add(signals)
+    return reader.finish()
+
+
+def found(signals: Signals, vehicle: VehicleParameters) -> SelfCalibration:
+    return self_calibrate([driving(signals, vehicle)], vehicle)
+
+
+def stiffness_errors(calibration: SelfCalibration) -> list[tuple[float, float]]:
+    """Return, by axle, the error of the logarithm of the cornering stiffness, and its sd."""
+    by = {p.name: p for p in calibration.parameters}
+    pairs = []
+    for axle, front in (("front", True), ("rear", False)):
+        parameter = by[f"{axle} cornering stiffness"]
+        true = RIGHT.cornering_stiffness_n_per_rad(front, FRICTION)
+        pairs.append((math.log(parameter.value / true), parameter.sd))
+    return pairs
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("front", "rear"), [(1.0, 1.0), (2.0, 0.5), (0.5, 0.7)])
+def test_a_sweep_finds_the_stiffness_within_its_own_posterior_whatever_the_file_says(front: float, rear: float) -> None:
+    calibration = found(with_noise(wide().signals, 3), wrong(front, rear))
+    assert not calibration.refused
+    for error, sd in stiffness_errors(calibration):
+        assert abs(error) < min(3.0 * sd, 0.1)
+        assert sd < 0.15
+
+
+def test_biases_offset_and_gain_of_the_sensors_are_found() -> None:
+    signals = with_noise(wide().signals, 4)
+    signals = replace(signals, ay_m_s2=1.05 * signals.ay_m_s2 + 0.1, steer_rad=signals.steer_rad + 0.005)
+    file = RIGHT.model_copy(update={"roll_gradient_rad_per_m_s2": 0.0})
+    by = {p.name: p for p in found(signals, file).parameters}
+    for name, true in (("roll gain", 1.05), ("a_y bias", 0.1), ("steering offset", 0.005)):
+        assert abs(by[name].value - true) < 3.0 * by[name].sd, name
+
+
+def test_the_calibrated_vehicle_reads_its_signals_with_what_was_found() -> None:
+    signals = wide().signals
+    calibration = found(replace(signals, steer_rad=signals.steer_rad + 0.005), RIGHT)
+    assert calibration.vehicle.steer_offset_rad == pytest.approx(0.005, abs=1e-3)
+    assert calibration.vehicle.physics.names == ("lag", "bank")
+    assert calibration.vehicle.mass_kg == RIGHT.mass_kg
+    assert calibration.own is RIGHT
+
+
+@pytest.mark.slow
+def test_a_file_that_contradicts_the_drive_is_told() -> None:
+    slow = drive(sweep(0.01), 40.0).signals
+    agrees, contradicts = (self_calibrate([driving(slow, v)], v).understeer for v in (RIGHT, wrong(2.0, 0.6)))
+    assert agrees is not None and agrees.known and not agrees.contradicts
+    assert contradicts is not None and contradicts.contradicts
+    assert "contradicts" in contradicts.text
+
+
+def test_too_little_or_too_slow_driving_is_refused() -> None:
+    short = found(drive(sweep(0.02), 8.0).signals, RIGHT)
+    assert "are needed" in short.refused
+    assert short.vehicle is RIGHT
+    slow = found(drive(sweep(0.02), 20.0, speed=LEAST_SPEED_M_S - 1.0).signals, RIGHT)
+    assert "0 s above" in slow.refused
+
+
+@pytest.mark.slow
+def test_straight_driving_leaves_the_file_as_it_stands() -> None:
+    straight = found(with_noise(drive(lambda _t: 0.0, 60.0).signals, 5), RIGHT)
+    assert "cornering stiffness" in straight.refused
+    assert "not calibrated" in straight.text
+
+
+def test_a_drift_is_refused() -> None:
+    signals = wide().signals
+    against = replace(signals, steer_rad=-2.0 * signals.steer_rad)
+    assert found(against, RIGHT).refused
+
+
+def test_windows_change_no_bit() -> None:
+    signals = with_noise(wide().signals, 6)
+    whole = driving(signals, RIGHT)
+    reader = DrivingReader(RIGHT)
+    for a, b in ((0, 1), (1, 1), (1, 777), (777, 778), (778, 4003), (4003, len(signals))):
+        reader.add(cut(signals, a, b))
+    parts = reader.finish()
+    np.testing.assert_array_equal(parts.columns, whole.columns)
+    np.testing.assert_array_equal(parts.stretches, whole.stretches)
+
+
+def test_a_pause_of_a_day_costs_no_memory() -> None:
+    signals = wide().signals
+    day = np.where(np.arange(len(signals)) < 3000, 0, 86_400 * 10**9)
+    paused = driving(replace(signals, stamps_ns=signals.stamps_ns + day, ready_ns=signals.ready_ns + day), RIGHT)
+    assert paused.columns.shape[1] < 60 / STEP_S + 200
+    assert len(paused.stretches) == 2
+
+
+def test_a_pool_knows_more_than_each_of_its_logs() -> None:
+    logs = [driving(with_noise(cut(wide().signals, a, a + 2000), a), RIGHT) for a in (0, 2000, 4000)]
+    alone, pool = self_calibrate(logs[:1], RIGHT), self_calibrate(logs, RIGHT)
+    assert pool.logs == 3
+    assert pool.stiffness_sd < alone.stiffness_sd
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**31), share=st.floats(0.05, 0.98))
+def test_any_losses_give_a_grid_whose_stretches_are_whole(seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    signals = keep(wide().signals, rng.uniform(size=len(wide().signals)) < share)
+    lost = np.where(rng.uniform(size=len(signals)) < 0.1, np.nan, signals.ay_m_s2)
+    d = driving(replace(signals, ay_m_s2=lost), RIGHT)
+    for a, b in d.stretches:
+        assert np.isfinite(d.columns[:, a:b]).all()
+        assert (d.columns[1, a:b] > LEAST_SPEED_M_S).all()
+    assert (np.diff(d.stretches.ravel()) > 0).all()
+
+
+def test_a_fast_slalom_is_no_drift_and_a_held_counter_steer_is() -> None:
+    """In a fast slalom the yaw rate follows late, so that the steering is often against it."""
+    late = drive(lambda t: 0.02 * math.sin(2.0 * math.pi * t), 20.0).signals
+    late = replace(late, steer_rad=np.roll(late.steer_rad, -25))
+    assert drift_share([driving(late, RIGHT)], RIGHT) == 0.0
+    held = drive(lambda _t: 0.02, 20.0).signals
+    assert drift_share([driving(held, RIGHT)], RIGHT) == 0.0
+    assert drift_share([driving(replace(held, steer_rad=-2.0 * held.steer_rad), RIGHT)], RIGHT) > 0.9
+
+
+def test_the_vehicles_of_the_band_spread_as_the_posterior_does() -> None:
+    """Together no more than the posterior of each parameter, and most of that of a stiffness, which moves the car."""
+    calibration = found(with_noise(wide().signals, 3), wrong(2.0, 0.5))
+    assert len(calibration.varied) == 5
+    by = {p.name: p for p in calibration.parameters}
+    middle = calibration.vehicle
+    for axle, front in (("front", True), ("rear", False)):
+        at = math.log(middle.cornering_stiffness_n_per_rad(front, middle.assumed_friction))
+        away = [math.log(v.cornering_stiffness_n_per_rad(front, v.assumed_friction)) - at for v in calibration.varied]
+        sd = by[f"{axle} cornering stiffness"].sd
+        assert 0.7 * sd < math.sqrt(sum(x**2 for x in away)) < 1.05 * sd
+
+
+@pytest.mark.slow
+def test_less_driving_spreads_them_wider() -> None:
+    def spread(signals: Signals) -> float:
+        of = found(signals, RIGHT)
+        at = of.vehicle.cornering_stiffness_n_per_rad(False, of.vehicle.assumed_friction)
+        return sum(math.log(v.cornering_stiffness_n_per_rad(False, v.assumed_friction) / at) ** 2 for v in of.varied)
+
+    signals = with_noise(wide().signals, 3)
+    assert spread(cut(signals, 0, 2000)) > 1.5 * spread(signals)

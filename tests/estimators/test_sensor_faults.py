@@ -1,0 +1,338 @@
+"""The fault detector: what it must see, how fast, and above all what it must not take for a fault."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference_car import cut, drive, make_signals, slalom, tanh_tyre, with_noise
+
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.estimators import sensor_faults as sf
+from pdhef_logtool.estimators.sensor_faults import SensorFaults, find_faults
+from pdhef_logtool.evaluation.reasons import ReasonIntervals
+from pdhef_logtool.records import reasons
+from pdhef_logtool.records.signals import Signals
+
+VEHICLE = default_vehicle()
+S0 = np.array([VEHICLE.sensors.ay_std_m_s2, VEHICLE.sensors.yaw_rate_std_rad_s])
+COLUMNS = ("ay_m_s2", "yaw_rate_rad_s")
+CHANNELS = (sf.AY, sf.YAW_RATE)
+
+
+def found(signals: Signals) -> SensorFaults:
+    return find_faults(signals, VEHICLE, None)[0]
+
+
+def times(signals: Signals) -> np.ndarray:
+    return (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
+
+
+def unused(result: SensorFaults, channel: int) -> np.ndarray:
+    """Where the filters do not get the channel."""
+    return np.isnan(getattr(result.filtered, COLUMNS[channel]))
+
+
+def reported(result: SensorFaults, bit: int, channel: int) -> np.ndarray:
+    return result.reason & (bit << channel) > 0
+
+
+def with_column(signals: Signals, channel: int, mask: np.ndarray, values) -> Signals:
+    return replace(signals, **{COLUMNS[channel]: np.where(mask, values, getattr(signals, COLUMNS[channel]))})
+
+
+@pytest.fixture(scope="module")
+def clean() -> Signals:
+    s = with_noise(drive(slalom(0.035, 0.5), 12.0, speed=22.0).signals, seed=9)
+    s.friction[:] = 0.85
+    return s
+
+
+def test_the_noise_is_that_of_third_differences_on_an_even_clock(clean):
+    """The general form on any clock is (z_k − 3 z_k−1 + 3 z_k−2 − z_k−3)²/20 on an even one."""
+    z = clean.ay_m_s2
+    e = np.full(len(z), 0.0)
+    e[3:] = (z[3:] - 3 * z[2:-1] + 3 * z[1:-2] - z[:-3]) ** 2 / 20
+    recent = np.array([e[max(0, k - 3) : k + 1].sum() / 4 for k in range(len(z))])
+    variance, want = S0[0] ** 2, []
+    for value in recent:
+        variance = max(value, S0[0] ** 2 + math.exp(-1 / 8) * (variance - S0[0] ** 2))
+        want.append(variance)
+    np.testing.assert_allclose(found(clean).noise_std[:, 0] ** 2, want, rtol=1e-3)
+
+
+@settings(derandomize=True, deadline=None, max_examples=20)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_parabola_on_an_uneven_clock_is_no_noise(seed):
+    dt = np.random.default_rng(seed).uniform(0.005, 0.02, 300)
+    t = np.concatenate([[0.0], np.cumsum(np.round(dt * 1e9) * 1e-9)])
+    s = make_signals(dt, ay_m_s2=3.0 - 4.0 * t + 2.0 * t**2, yaw_rate_rad_s=0.2 * t**2, speed_m_s=np.full(301, 20.0))
+    result = found(s)
+    assert not (result.reason & ~(reasons.DEAD_AY | reasons.DEAD_YAW_RATE)).any()
+    np.testing.assert_allclose(result.noise_std, np.broadcast_to(S0, (301, 2)), rtol=1e-9)
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+def test_a_burst_raises_r_within_50_ms_and_returns(channel, clean):
+    t, factor = times(clean), 20.0
+    late = []
+    for seed in range(20):
+        noise = factor * S0[channel] * np.random.default_rng(seed).standard_normal(len(t))
+        burst = (t >= 4.0) & (t < 6.0)
+        result = found(with_column(clean, channel, burst, getattr(clean, COLUMNS[channel]) + noise))
+        spiked = unused(result, channel)
+        raised = (result.extra_r[:, channel] > 0) | spiked
+        late.append(t[np.flatnonzero(raised & (t >= 4.0))[0]] - 4.0)
+        inside = burst & (t > 4.05)
+        assert np.mean(raised[inside]) > 0.97
+        level = np.sqrt(np.median(result.extra_r[inside & raised, channel]))
+        assert 0.7 * factor * S0[channel] < level < 1.6 * factor * S0[channel]
+        assert not raised[(t > 6.6)].any()
+        assert not result.extra_r[:, 1 - channel].any()
+        assert np.isnan(getattr(result.network, COLUMNS[channel])[raised]).all()
+        told = reported(result, reasons.BURST_AY, channel)
+        assert told[(t > 4.8) & burst].all()
+        assert not told[(t < 4.1) | (t > 6.6)].any()
+        assert not reported(result, reasons.BURST_AY, 1 - channel).any()
+    assert np.quantile(late, 0.9) < 0.051
+    assert max(late) < 0.1
+
+
+@cache
+def without_noise() -> Signals:
+    return drive(lambda t: 0.02 * math.sin(0.4 * t) * math.sin(0.07 * t), 120.0, speed=20.0).signals
+
+
+def road(seed: int, *, degrees: float = 4.0, factor: float = 1.0) -> Signals:
+    """Two healthy minutes: Student's t, its level swinging between the file's noise and twice that within seconds."""
+    s = without_noise()
+    rng, t = np.random.default_rng(seed), times(s)
+    level = factor * (1.5 + 0.5 * np.sin(1.3 * t))
+    noise = rng.standard_t(degrees, (2, len(s))) / math.sqrt(degrees / (degrees - 2.0))
+    s.friction[:] = 0.85
+    return replace(
+        s,
+        ay_m_s2=s.ay_m_s2 + level * S0[0] * noise[0],
+        yaw_rate_rad_s=s.yaw_rate_rad_s + level * S0[1] * noise[1],
+    )
+
+
+@pytest.mark.slow
+def test_an_hour_of_healthy_driving_reports_one_fault_at_most():
+    """With the very noise of which the filters weight down hundreds of samples."""
+    told, raised = 0, 0
+    for seed in range(30):
+        s = road(seed)
+        result = found(s)
+        gathered = ReasonIntervals()
+        gathered.append(s.stamps_ns, result.reason)
+        told += sum(len(i) for i in gathered.intervals().values())
+        raised += int((result.extra_r > 0).sum())
+    assert told <= 1
+    assert raised > 1000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [5.0, 15.0])
+def test_a_car_rougher_than_its_file_is_healthy_from_the_start(factor):
+    assert not found(road(8, factor=factor)).reason.any()
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+def test_a_short_burst_is_weighted_down_and_not_reported(channel, clean):
+    """A kerb; what is reported has to last."""
+    t = times(clean)
+    noise = 8.0 * S0[channel] * np.random.default_rng(0).standard_normal(len(t))
+    result = found(with_column(clean, channel, (t > 5.0) & (t < 5.15), getattr(clean, COLUMNS[channel]) + noise))
+    assert (result.extra_r[:, channel] > 0).sum() > 5
+    assert not result.reason.any()
+
+
+@pytest.mark.parametrize("amplitude", [0.02, 0.06])
+@pytest.mark.parametrize("frequency", [0.2, 0.7, 2.0])
+def test_a_slow_model_error_does_not_raise_r(amplitude, frequency):
+    """Another car than the file's, to its grip limit: the innovations are large, and nothing is wrong with a sensor."""
+    s = with_noise(drive(slalom(amplitude, frequency), 12.0, speed=24.0, tyre=tanh_tyre, mu=0.7).signals, seed=3)
+    s.friction[:] = 1.0
+    result = found(s)
+    assert np.mean(result.extra_r > 0) < 0.005
+    assert np.mean(result.reason > 0) < 0.005
+
+
+def test_a_biased_channel_is_not_noisy(clean):
+    result = found(replace(clean, ay_m_s2=clean.ay_m_s2 + 3.0, yaw_rate_rad_s=clean.yaw_rate_rad_s - 0.05))
+    assert np.mean(result.reason & (reasons.BURST_AY | reasons.BURST_YAW_RATE) > 0) < 0.005
+
+
+@pytest.mark.slow
+def test_a_rough_car_becomes_usual():
+    """Five times the file's noise from 10 s on: a burst at first, what this car is like in the end."""
+    s = with_noise(drive(slalom(0.02, 0.3), 100.0, speed=20.0).signals, seed=1)
+    t = times(s)
+    more = np.where(t > 10, 5 * S0[0], 0.0) * np.random.default_rng(0).standard_normal(len(s))
+    burst = found(replace(s, ay_m_s2=s.ay_m_s2 + more)).reason & reasons.BURST_AY > 0
+    assert burst[(t > 11) & (t < 13.5)].mean() > 0.9
+    assert burst[t > 80].mean() < 0.02
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+def test_a_single_spike_is_one_missing_sample_and_no_burst(channel, clean):
+    at = np.zeros(len(clean), dtype=bool)
+    at[300::97] = True
+    result = found(with_column(clean, channel, at, getattr(clean, COLUMNS[channel]) + 40 * S0[channel]))
+    np.testing.assert_array_equal(unused(result, channel), at)
+    assert not result.extra_r[~at].any()
+    # One alone may be chance; once a second is not.
+    told = reported(result, reasons.SPIKE_AY, channel)
+    np.testing.assert_array_equal(told[590:], at[590:])
+    assert not told[:390].any()
+    assert not reported(result, reasons.BURST_AY, channel).any()
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+@pytest.mark.parametrize(("sigmas", "is_reported"), [(40.0, False), (700.0, True)])
+def test_one_spike_is_reported_only_far_beyond_any_tail(channel, sigmas, is_reported, clean):
+    at = np.arange(len(clean)) == 1100
+    result = found(with_column(clean, channel, at, getattr(clean, COLUMNS[channel]) + sigmas * S0[channel]))
+    assert unused(result, channel)[1100]
+    np.testing.assert_array_equal(result.reason != 0, at & is_reported)
+
+
+def test_a_jump_is_followed_after_two_samples(clean):
+    jumped = times(clean) >= 5.0
+    result = found(with_column(clean, sf.AY, jumped, clean.ay_m_s2 + 8.0))
+    spiked = np.flatnonzero(unused(result, sf.AY))
+    assert 1 <= len(spiked) <= sf.MAX_SPIKES
+    assert (spiked < np.argmax(jumped) + sf.MAX_SPIKES).all()
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+@pytest.mark.parametrize("value", [None, 0.0])
+def test_five_identical_samples_are_stuck_and_reported_a_little_later(channel, value, clean):
+    t = times(clean)
+    bad = (t >= 4.0) & (t < 7.0)
+    first = int(np.argmax(bad))
+    held = getattr(clean, COLUMNS[channel])[first] if value is None else value
+    result = found(with_column(clean, channel, bad, held))
+    stuck = unused(result, channel)
+    assert not stuck[~bad].any()
+    assert stuck[first + sf.STUCK_SAMPLES - 1 : first + bad.sum()].all()
+    told = reported(result, reasons.STUCK_AY, channel)
+    np.testing.assert_array_equal(told, bad & (t - t[first] > sf.STUCK_REPORTED_AFTER_S - 0.005))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("quantum", [0.002, 0.01, 0.02])
+def test_a_quantised_gyro_is_not_stuck(quantum):
+    """Quiet and coarse: on straights it repeats for seconds."""
+    made = drive(lambda t: 0.02 * math.sin(3 * t) * (math.sin(0.2 * t) > 0), 60.0, speed=20.0)
+    r = made.r + 0.0002 * np.random.default_rng(0).standard_normal(len(made.r))
+    s = replace(made.signals, yaw_rate_rad_s=np.round(r / quantum) * quantum)
+    s.friction[:] = 0.85
+    assert (np.diff(s.yaw_rate_rad_s) == 0).mean() > 0.4
+    assert not (found(s).reason & reasons.STUCK_YAW_RATE).any()
+
+
+def test_a_quantised_gyro_that_is_stuck_is_found_once_the_car_turns():
+    made = drive(slalom(0.03, 0.3), 30.0, speed=20.0)
+    r = np.round(made.r / 0.005) * 0.005
+    t = made.time_s
+    r[(t > 20) & (t < 24)] = r[np.argmax(t > 20)]
+    s = replace(made.signals, yaw_rate_rad_s=r)
+    s.friction[:] = 0.85
+    stuck = found(s).reason & reasons.STUCK_YAW_RATE > 0
+    assert not stuck[(t < 20) | (t > 24)].any()
+    assert stuck[(t > 22) & (t < 23.9)].mean() > 0.9
+
+
+def test_a_gyro_at_rest_may_repeat(clean):
+    still = replace(
+        clean,
+        speed_m_s=np.zeros(len(clean)),
+        yaw_rate_rad_s=np.zeros(len(clean)),
+        ay_m_s2=np.full(len(clean), 0.03),
+        steer_rad=np.zeros(len(clean)),
+    )
+    assert not found(still).reason.any()
+
+
+@pytest.mark.parametrize(("channel", "bit"), [(sf.AY, reasons.DEAD_AY), (sf.YAW_RATE, reasons.DEAD_YAW_RATE)])
+def test_a_dead_and_noisy_channel_is_missing_while_the_car_turns(channel, bit, clean):
+    t = times(clean)
+    bad = (t >= 4.0) & (t < 8.0)
+    noise = S0[channel] * np.random.default_rng(1).standard_normal(len(t))
+    result = found(with_column(clean, channel, bad, noise))
+    dead, told = unused(result, channel), result.reason & bit > 0
+    assert not dead[t < 4.0].any()
+    assert dead[bad].mean() > 0.6
+    assert not dead[t > 9.5].any()
+    assert not told[~dead].any()
+    assert told[(t > 6.5) & bad].all()
+    assert not (found(clean).reason & (reasons.DEAD_AY | reasons.DEAD_YAW_RATE)).any()
+
+
+def test_missing_samples_are_said_and_harm_nothing(clean):
+    t = times(clean)
+    gone = (t >= 4.0) & (t < 6.0)
+    result = found(with_column(clean, sf.YAW_RATE, gone, np.nan))
+    np.testing.assert_array_equal(unused(result, sf.YAW_RATE), gone)
+    told = result.reason & reasons.MISSING_YAW_RATE > 0
+    np.testing.assert_array_equal(told, gone & (t > 3.995 + sf.MISSING_REPORTED_AFTER_S))
+    assert not (result.reason & ~reasons.MISSING_YAW_RATE).any()
+
+
+def test_a_channel_at_a_lower_rate_than_the_stamps_is_not_missing(clean):
+    result = found(with_column(clean, sf.AY, np.arange(len(clean)) % 5 > 0, np.nan))
+    assert not result.reason.any()
+
+
+@pytest.fixture(scope="module")
+def rough() -> Signals:
+    rng = np.random.default_rng(4)
+    s = with_noise(drive(slalom(0.04, 0.5), speed=22.0, step_s=rng.uniform(0.004, 0.022, 700)).signals, seed=5)
+    t = times(s)
+    s.yaw_rate_rad_s[(t > 2) & (t < 3)] = 0.01
+    s.ay_m_s2[(t > 4) & (t < 5)] += 2.0 * rng.standard_normal(int(((t > 4) & (t < 5)).sum()))
+    s.ay_m_s2[rng.random(len(t)) < 0.05] = np.nan
+    return s
+
+
+@settings(derandomize=True, deadline=None, max_examples=25)
+@given(st.lists(st.integers(0, 701), max_size=10))
+def test_windows_of_any_cut_join_bit_for_bit(rough, inner):
+    whole = found(rough)
+    assert whole.reason.any()
+    parts, carry = [], None
+    for first, end in pairwise([0, *sorted(inner), len(rough)]):
+        part, carry = find_faults(cut(rough, first, end), VEHICLE, carry)
+        parts.append(part)
+    for name in ("extra_r", "noise_std", "reason"):
+        np.testing.assert_array_equal(np.concatenate([getattr(p, name) for p in parts]), getattr(whole, name))
+    for name in COLUMNS:
+        got = np.concatenate([getattr(p.network, name) for p in parts])
+        np.testing.assert_array_equal(got, getattr(whole.network, name))
+
+
+@settings(derandomize=True, deadline=None, max_examples=15)
+@given(j=st.integers(1, 600), seed=st.integers(0, 2**32 - 1))
+def test_later_samples_change_nothing(rough, j, seed):
+    rng = np.random.default_rng(seed)
+    later = {c: np.where(np.arange(len(rough)) >= j, rng.normal(0, 5, len(rough)), getattr(rough, c)) for c in COLUMNS}
+    a, b = found(rough), found(replace(rough, **later))
+    np.testing.assert_array_equal(a.extra_r[:j], b.extra_r[:j])
+    np.testing.assert_array_equal(a.reason[:j], b.reason[:j])
+
+
+def test_nothing_of_the_input_is_changed_and_the_rest_passes_through(clean):
+    before = clean.ay_m_s2.copy()
+    result = found(clean)
+    np.testing.assert_array_equal(clean.ay_m_s2, before)
+    assert result.filtered.steer_rad is clean.steer_rad
+    assert result.network.stamps_ns is clean.stamps_ns
+    assert found(cut(clean, 0, 0)).reason.shape == (0,)

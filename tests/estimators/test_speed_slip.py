@@ -1,0 +1,210 @@
+"""The speed of wheels that spin or lock is kept from the filters; nothing else is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference_car import cut, drive, rolling_drive, slalom, with_noise
+
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.estimators.filter_base import U_SPEED
+from pdhef_logtool.estimators.kinematic import Kinematic
+from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.open_loop import OpenLoop
+from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
+from pdhef_logtool.estimators.speed_slip import TIMEOUT_S, without_slip
+from pdhef_logtool.records.readings import without_impossible
+from pdhef_logtool.records.signals import Signals
+
+VEHICLE = default_vehicle()
+STD = 0.08
+ESTIMATORS = (Kinematic(), OpenLoop(VEHICLE), PhysicsUkf(VEHICLE), PhysicsFilter(VEHICLE))
+
+
+def start_and_stop(t: np.ndarray) -> np.ndarray:
+    """Stand for 1 s, start with 1.5 m/s² up to 9 m/s, brake with 2 m/s² to a standstill."""
+    return np.clip(np.minimum(1.5 * (t - 1.0), 9.0 - 2.0 * (t - 10.0)), 0.0, 9.0)
+
+
+def spin(t: np.ndarray, at: float = 2.0, length: float = 2.5, size: float = 10.0) -> np.ndarray:
+    """What spinning wheels turn too fast, m/s: up, and down again."""
+    return size * np.sin(np.pi * np.clip((t - at) / length, 0.0, 1.0)) ** 2
+
+
+def with_wheels(signals: Signals, front: np.ndarray, rear: np.ndarray) -> Signals:
+    """Give the axles' wheels their speeds and, as in the alignment, the mean of the middle two as speed."""
+    wheels = np.stack([front, front, rear, rear], axis=1)
+    return replace(signals, wheel_speed_m_s=wheels, speed_m_s=0.5 * (front + rear))
+
+
+@pytest.fixture(scope="module")
+def good():
+    made = rolling_drive(start_and_stop, lambda t: 0.004 * np.sin(t), 20.0)
+    return replace(made, signals=with_noise(made.signals, 3))
+
+
+def believed(signals: Signals, **options) -> np.ndarray:
+    return without_slip(signals, STD, None, **options)[0].speed_m_s
+
+
+def test_a_drive_without_slip_is_left_alone(good):
+    assert without_slip(good.signals, STD, None)[0] is good.signals
+    made = drive(slalom(0.06, 0.7), 12.0, acceleration=lambda t: -6.0 if 4.0 < t < 6.0 else 0.0)
+    noisy = with_noise(made.signals, 5)
+    assert without_slip(noisy, STD, None)[0] is noisy
+
+
+@pytest.mark.parametrize("slope", [-2.0, 2.0])
+def test_a_steep_hill_is_no_slip(good, slope):
+    hill = replace(good.signals, ax_m_s2=good.signals.ax_m_s2 + slope)
+    assert without_slip(hill, STD, None)[0] is hill
+
+
+@pytest.mark.parametrize("size", [10.0, 20.0])
+def test_spinning_wheels_are_not_believed(good, size):
+    slipping = replace(good.signals, speed_m_s=good.signals.speed_m_s + spin(good.time_s, size=size))
+    out = believed(slipping)
+    error = np.abs(out - good.vx)
+    assert np.nanmax(error) < 2.0  # the bound, and what the tolerance has grown
+    lasts = (good.time_s > 2.8) & (good.time_s < 3.8)
+    assert np.isnan(out[lasts & np.isfinite(slipping.speed_m_s)]).all()
+    away = (good.time_s < 2.0) | (good.time_s > 5.5)
+    np.testing.assert_array_equal(out[away], slipping.speed_m_s[away])
+    dead_reckoned = believed(slipping, reckoned=True)
+    np.testing.assert_array_equal(np.isfinite(dead_reckoned), np.isfinite(slipping.speed_m_s))
+    assert np.nanmax(np.abs(dead_reckoned - good.vx)) < 2.0
+
+
+@pytest.mark.parametrize("name", range(len(ESTIMATORS)))
+@pytest.mark.slow
+def test_all_estimators_heed_it_and_can_do_without(good, name):
+    slipping = replace(good.signals, speed_m_s=good.signals.speed_m_s + spin(good.time_s))
+    gated = run_window(ESTIMATORS[name], slipping)[0]
+    plain = run_window(replace(ESTIMATORS[name], slip_gate=False), slipping)[0]
+
+    def worst(track):
+        return np.nanmax(np.abs(track.vx_m_s - good.vx)[good.time_s > 0.5])
+
+    assert worst(gated) < 1.5
+    assert worst(plain) > 5.0
+    assert gated.valid.sum() >= plain.valid.sum()
+    same = run_window(ESTIMATORS[name], good.signals)[0]
+    np.testing.assert_array_equal(
+        same.vy_m_s, run_window(replace(ESTIMATORS[name], slip_gate=False), good.signals)[0].vy_m_s
+    )
+
+
+def test_locked_wheels_are_not_believed_however_long_it_takes():
+    """All wheels stand while the car slides from 20 m/s at 2 m/s²; then it stands, and that is believed."""
+    made = rolling_drive(lambda t: np.clip(20.0 - 2.0 * np.clip(t - 2.0, 0, None), 0.0, None), np.zeros_like, 16.0)
+    signals = with_noise(made.signals, 7)
+    lock = np.clip((made.time_s - 2.0) / 0.3, 0.0, 1.0)
+    locked = replace(signals, speed_m_s=np.maximum(signals.speed_m_s * (1.0 - lock), 0.0))
+    out = believed(locked)
+    sliding = (made.time_s > 2.5) & (made.vx > 4.0)
+    assert made.time_s[sliding][-1] - 2.0 > TIMEOUT_S + 2.0
+    assert np.isnan(out[sliding & np.isfinite(locked.speed_m_s)]).all()
+    stands = made.time_s > 14.0
+    np.testing.assert_array_equal(out[stands], locked.speed_m_s[stands])
+    track = run_window(PhysicsUkf(VEHICLE), locked)[0]
+    assert np.abs(track.vx_m_s - made.vx)[sliding].max() < 1.0
+    assert np.abs(track.vx_m_s[-100:]).max() < 0.02
+
+
+def test_a_standstill_and_the_floor_of_the_pulses_are_no_slip(good):
+    """No pulses below 0.8 m/s, with a start of 5 m/s²: the speed jumps, and stops dead."""
+    made = rolling_drive(
+        lambda t: np.clip(np.minimum(5.0 * (t - 1.0), 5.0 * (8.0 - t)), 0.0, 10.0), np.zeros_like, 12.0
+    )
+    signals = with_noise(made.signals, 8)
+    read = np.where(signals.speed_m_s < 0.8, np.where(np.isfinite(signals.speed_m_s), 0.0, np.nan), signals.speed_m_s)
+    floor = replace(signals, speed_m_s=read)
+    assert without_slip(floor, STD, None)[0] is floor
+
+
+def test_the_axle_that_does_not_slip_is_believed(good):
+    slip = spin(good.time_s, size=20.0)
+    for front, rear in ((slip, 0.0 * slip), (0.0 * slip, slip)):
+        signals = with_wheels(good.signals, good.signals.speed_m_s + front, good.signals.speed_m_s + rear)
+        out = believed(signals)
+        given = np.isfinite(signals.speed_m_s)
+        assert np.isfinite(out[given]).mean() > 0.97
+        assert np.nanmax(np.abs(out - good.vx)) < 1.5
+        late = (good.time_s > 2.6) & (good.time_s < 4.0)
+        assert np.nanmax(np.abs(out - good.vx)[late]) < 0.5
+
+
+def test_a_single_sample_that_is_off_is_left_to_the_filter(good):
+    at = np.flatnonzero(np.isfinite(good.signals.speed_m_s))[300]
+    for size in (5.0, -5.0):
+        speed = good.signals.speed_m_s.copy()
+        speed[at] += size
+        spiked = replace(good.signals, speed_m_s=speed)
+        assert without_slip(spiked, STD, None)[0] is spiked
+
+
+def test_a_speed_that_lasts_is_believed_in_the_end(good):
+    jumped = replace(good.signals, speed_m_s=good.signals.speed_m_s + np.where(good.time_s > 4.0, 6.0, 0.0))
+    out = believed(jumped)
+    assert np.isnan(out[(good.time_s > 5.0) & (good.time_s < 8.0) & np.isfinite(jumped.speed_m_s)]).all()
+    late = good.time_s > 4.0 + TIMEOUT_S + 0.5
+    np.testing.assert_array_equal(out[late], jumped.speed_m_s[late])
+
+
+def test_without_an_accelerometer_nothing_is_gated(good):
+    blind = replace(good.signals, ax_m_s2=np.full(len(good.signals), np.nan))
+    blind = replace(blind, speed_m_s=blind.speed_m_s + spin(good.time_s))
+    assert without_slip(blind, STD, None)[0] is blind
+
+
+@settings(max_examples=25, deadline=None)
+@given(data=st.data())
+def test_windows_change_no_bit_and_nothing_is_seen_ahead(good, data):
+    slip = spin(good.time_s, size=12.0)
+    rough = with_wheels(good.signals, good.signals.speed_m_s + slip, good.signals.speed_m_s + 0.7 * slip)
+    gaps = np.arange(len(rough)) % 97 < 4
+    rough = replace(rough, ax_m_s2=np.where(gaps, np.nan, rough.ax_m_s2))
+    whole = believed(rough)
+    assert np.isnan(whole).sum() > np.isnan(rough.speed_m_s).sum()
+    cuts = sorted(data.draw(st.sets(st.integers(1, len(rough) - 1), min_size=1, max_size=5)))
+    parts, carry = [], None
+    for first, end in zip([0, *cuts], [*cuts, len(rough)], strict=True):
+        out, carry = without_slip(cut(rough, first, end), STD, carry)
+        parts.append(out.speed_m_s)
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
+    later = replace(rough, speed_m_s=np.where(np.arange(len(rough)) >= cuts[0], 3.0, rough.speed_m_s))
+    np.testing.assert_array_equal(believed(later)[: cuts[0]], whole[: cuts[0]])
+
+
+@pytest.mark.parametrize("maker", [PhysicsUkf, PhysicsFilter])
+@pytest.mark.slow
+def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(maker, good):
+    """The accelerometer says braking, the speed sensor falls silent: v_x runs below zero."""
+    silent = good.time_s > 9.0
+    signals = without_impossible(good.signals)
+    signals = replace(
+        signals,
+        speed_m_s=np.where(silent, np.nan, signals.speed_m_s),
+        ax_m_s2=np.where(silent, -4.0, signals.ax_m_s2),
+    )
+    estimator = maker(VEHICLE)
+    steps, _ = estimator.run(signals, None)
+    back = steps.x[:, 0] < 0.0
+    assert back[-500:].all()
+    assert (steps.inputs[back & silent, U_SPEED] > 0.5).all()
+    track = run_window(estimator, signals)[0]
+    assert not track.valid[back & silent].any()
+    assert track.valid[~back & (good.time_s > 0.5)].all()
+
+
+def test_slip_that_is_seen_only_as_it_ends_is_no_lock(good):
+    """Wheels come to spin slowly and grip at once: the fall of their speed is no reason to believe what was before."""
+    t = good.time_s
+    slow = np.clip(2.0 * (t - 2.0), 0.0, 4.0) * (t < 4.2)
+    recovering = replace(good.signals, speed_m_s=good.signals.speed_m_s + slow)
+    assert without_slip(recovering, STD, None)[0] is recovering

@@ -1,0 +1,107 @@
+"""What comes from outside on its way to a person."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.writer import Writer
+
+from pdhef_logtool.cli import console
+from pdhef_logtool.records.errors import LogError, PdhefError
+from pdhef_logtool.records.printable import all_shown, shown, utf8
+from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.runs.inspection import inspect_log, render_inspection
+from pdhef_logtool.storage.documents import jsonable
+
+_ANY = st.text(st.characters(exclude_categories=()), max_size=60)  # surrogates, too
+_HOSTILE = "\x1b[31m\nwarning: forged\r\x9b2J\u202e\u2066\u200f\x00\x7f\u2028\udcff [red][/]"
+
+
+@given(_ANY, st.integers(10, 60))
+def test_what_is_shown_is_one_printable_line_of_limited_length(text: str, most: int) -> None:
+    line = shown(text, most)
+    assert line.isprintable()
+    assert len(line) <= most
+    line.encode()
+    if text.isprintable() and len(text) <= most:
+        assert line == text
+
+
+@given(_ANY)
+def test_every_document_of_ours_is_utf8(text: str) -> None:
+    utf8(text).encode()
+    json.dumps(jsonable({text: [text, Path("a") / text.replace("\0", "")]}), ensure_ascii=False).encode()
+
+
+@given(_ANY, _ANY)
+def test_an_error_is_one_line(got: str, where: str) -> None:
+    assert str(PdhefError(expected="x", got=got, where=where)).isprintable()
+
+
+def test_the_parts_of_an_error_stay_as_they_came() -> None:
+    error = LogError(expected="x", got=_HOSTILE, where="w")
+    assert error.got == _HOSTILE
+    assert "\\x1b[31m warning: forged" in str(error)
+
+
+def test_records_are_shown_whole() -> None:
+    @dataclass(frozen=True, slots=True)
+    class Record:
+        losses: tuple[Loss, ...]
+        facts: dict[str, object]
+        path: Path
+
+    seen = all_shown(Record((Loss("a", _HOSTILE, "\n"),), {"\x1b": [_HOSTILE, 1, None]}, Path("a\nb")))
+    assert seen.losses[0].what == shown(_HOSTILE)
+    assert seen.losses[0].where == "\\n"
+    assert seen.facts == {"\\x1b": [shown(_HOSTILE), 1, None]}
+    assert seen.path == Path("a\\nb")
+
+
+def test_the_console_obeys_nothing_and_forges_no_line(capsys: pytest.CaptureFixture[str]) -> None:
+    console.warn(f"topic {_HOSTILE}")
+    console.print_json({"topic": _HOSTILE})
+    console.print_facts({"topic": _HOSTILE})
+    out, err = capsys.readouterr()
+    assert err.count("\n") == 1
+    assert (out + err).replace("\n", "").isprintable()
+    document, _ = json.JSONDecoder().raw_decode(out)
+    assert document["topic"] == utf8(_HOSTILE)  # a program still has the name
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_an_inspection_of_hostile_names_is_plain(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], as_json: bool
+) -> None:
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start(profile="", library="test")
+    topic = _HOSTILE.replace("\udcff", "")
+    schema = writer.register_schema(topic, "jsonschema", b'{"properties": {"x": {"type": "number"}}}')
+    writer.add_message(writer.register_channel(topic, "json", schema), 5, b'{"x": 1}', 5)
+    writer.finish()
+    # A file name that is no UTF-8, with what would be a colour in a table.
+    path = tmp_path / "a\n\x1b[31m[/red]\udcff.mcap"
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(stream.getvalue())
+    console.show(inspect_log(path), render_inspection, as_json)
+    out = capsys.readouterr().out
+    assert out.replace("\n", "").isprintable()
+    assert "warning: forged" not in out.splitlines()
+    if as_json:
+        assert json.loads(out)["topics"][0]["name"] == topic
+    else:
+        assert "[red][/]" in out.replace("\n", "").replace(" ", "")
+
+
+def test_numbers_and_nothing_stay_what_they_are() -> None:
+    given = {"a": [1, 2.5, None, True, float("inf")], "b": ({"c\x1b": "d\n"},)}
+    found = all_shown(given)
+    assert repr(found) == repr({"a": [1, 2.5, None, True, float("inf")], "b": ({"c\\x1b": "d\\n"},)})
+    assert found["a"] is not given["a"]

@@ -1,0 +1,546 @@
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.writer import Writer
+from rerun.chunk import McapReader
+from rosbags.highlevel import AnyReader
+from source_log import write_source
+from written import as_written
+
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.reasons import REASONS
+from pdhef_logtool.records.tracks import concatenate, make_track
+from pdhef_logtool.results.mcap_sink import AnnotatedMcapSink, _twist_covariance, metrics_record, topic_of
+
+STATE = "pdhef_msgs/msg/VehicleStateEstimate"
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+#: Every topic of the annotated log: type, encoding, messages. 600 stamps, 12 of them not valid.
+SOURCE_TOPICS = {
+    "/imu": ("sensor_msgs/msg/Imu", "cdr", 600),
+    "/can/speed": ("can.Speed", "json", 120),
+    "/blob": (None, "octets", 6),
+}
+OUR_TOPICS = {
+    "/pdhef/phy_ukf/state": (STATE, "cdr", 600),
+    "/pdhef/phy_ukf/odometry": (ODOMETRY, "cdr", 588),
+    "/pdhef/zero/state": (STATE, "cdr", 600),
+    "/pdhef/zero/odometry": (ODOMETRY, "cdr", 588),
+    "/pdhef/truth/state": (STATE, "cdr", 600),
+    "/pdhef/truth/odometry": (ODOMETRY, "cdr", 588),
+}
+TOPICS = SOURCE_TOPICS | OUR_TOPICS
+NAMES = {"phy_ukf": "phy-ukf", "zero": "zero", "truth": "truth"}
+
+ALGORITHM = {"algorithm": "physics-ukf", "sha256": "ab" * 32, "options": {"slip_gate": True}}
+REPORT = {
+    "format": "pdhef.report",
+    "log": {"name": "drive", "end_ns": 1_700_000_006_000_000_123},
+    "truth": {"available": True},
+    "estimators": [{"name": "phy-ukf", "algorithm": ALGORITHM}, {"name": "zero", "algorithm": None}],
+    "metrics": [
+        {
+            "estimator": "phy-ukf",
+            "signal": "sideslip_rad",
+            "segment": "all",
+            "metric": "rmse",
+            "value": 0.0125,
+            "unit": "rad",
+            "n": 588,
+        },
+        {
+            "estimator": "zero",
+            "signal": "sideslip_rad",
+            "segment": "nonlinear",
+            "metric": "rmse",
+            "value": None,
+            "unit": "rad",
+            "n": 0,
+        },
+    ],
+}
+METRICS = {
+    "log": "drive",
+    "truth": "available",
+    "phy-ukf/algorithm": json.dumps(ALGORITHM, sort_keys=True),
+    "phy-ukf/sideslip_rad/all/rmse": "0.0125 rad n=588",
+    "zero/sideslip_rad/nonlinear/rmse": "null rad n=0",
+}
+
+
+def annotate(path: Path, source: Path | None, circle, windows: int = 2) -> None:
+    log = None if source is None else open_log(source)
+    sink = AnnotatedMcapSink(path, log)
+    n = 600 // windows
+    for k in range(windows):
+        for name in NAMES.values():
+            sink.append(circle(name, n * k, n))
+    sink.finish(REPORT)
+    assert sink.lost == ()
+    if log is not None:
+        log.close()
+
+
+@pytest.fixture
+def source(tmp_path) -> Path:
+    path = tmp_path / "drive.mcap"
+    write_source(path)
+    return path
+
+
+@pytest.fixture
+def annotated(tmp_path, source, circle) -> Path:
+    path = tmp_path / "annotated.mcap"
+    annotate(path, source, circle)
+    return path
+
+
+def messages(path: Path, topic: str | None = None):
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        return [
+            (c.topic, m.log_time, m.publish_time, m.sequence, m.data)
+            for _, c, m in reader.iter_messages(topics=None if topic is None else [topic])
+        ]
+
+
+def decoded(path: Path, topic: str) -> list:
+    with AnyReader([path]) as reader:
+        connections = [c for c in reader.connections if c.topic == topic]
+        return [(t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages(connections)]
+
+
+def test_every_topic_is_there_with_all_messages(annotated):
+    with annotated.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    counts = {
+        c.topic: (
+            summary.schemas[c.schema_id].name if c.schema_id else None,
+            c.message_encoding,
+            summary.statistics.channel_message_counts[c.id],
+        )
+        for c in summary.channels.values()
+    }
+    assert counts == TOPICS
+    assert len(summary.channels) == len(TOPICS)
+    read: dict[str, int] = {}
+    for topic, *_ in messages(annotated):
+        read[topic] = read.get(topic, 0) + 1
+    assert read == {topic: n for topic, (_, _, n) in TOPICS.items()}
+
+
+def test_summary_statistics_and_indexes_are_there(annotated):
+    with annotated.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    statistics = summary.statistics
+    total = sum(n for _, _, n in TOPICS.values())
+    assert statistics.message_count == total
+    assert statistics.channel_count == 9
+    assert statistics.schema_count == 4
+    assert statistics.attachment_count == 3
+    assert statistics.metadata_count == 2
+    assert statistics.chunk_count == len(summary.chunk_indexes) > 0
+    assert statistics.message_start_time == 1_700_000_000_000_000_123
+    assert statistics.message_end_time == 1_700_000_005_992_000_123
+    assert all(c.message_index_length > 0 for c in summary.chunk_indexes)
+    # Chunks of the source stay as they are; ours are zstd.
+    source_ids = {c.id for c in summary.channels.values() if c.topic in SOURCE_TOPICS}
+    for chunk in summary.chunk_indexes:
+        held = set(chunk.message_index_offsets)
+        assert chunk.compression == ("lz4" if held & source_ids else "zstd")
+        assert held <= source_ids or not held & source_ids
+    indexed = set().union(*(c.message_index_offsets for c in summary.chunk_indexes))
+    assert indexed == set(summary.channels)
+    assert [a.name for a in summary.attachment_indexes] == ["calibration.txt", "report.json", "report.json"]
+    assert [m.name for m in summary.metadata_indexes] == ["recorder", "pdhef.metrics"]
+
+
+def test_source_is_kept_bit_for_bit(annotated, source):
+    for topic in SOURCE_TOPICS:
+        assert messages(annotated, topic) == messages(source, topic)
+        assert len(messages(source, topic)) == SOURCE_TOPICS[topic][2]
+
+    def channels(path):
+        with path.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+        schemas = {id_: (s.name, s.encoding, s.data) for id_, s in summary.schemas.items()}
+        return {
+            c.topic: (c.message_encoding, c.metadata, schemas.get(c.schema_id))
+            for c in summary.channels.values()
+            if c.topic in SOURCE_TOPICS
+        }
+
+    assert channels(annotated) == channels(source)
+    with source.open("rb") as a, annotated.open("rb") as b:
+        before, after = make_reader(a), make_reader(b)
+        assert before.get_header().profile == after.get_header().profile == "ros2"
+        kept = list(after.iter_attachments())
+        assert kept[:-1] == list(before.iter_attachments())
+        assert list(after.iter_metadata())[:-1] == list(before.iter_metadata())
+
+
+def test_messages_are_merged_by_log_time(annotated):
+    times = [t for _, t, *_ in messages(annotated)]
+    assert len(times) == sum(n for _, _, n in TOPICS.values())
+    assert times == sorted(times)
+    with annotated.open("rb") as stream:
+        starts = [c.message_start_time for c in make_reader(stream).get_summary().chunk_indexes]
+        stream.seek(0)
+        sequential = [m.log_time for _, _, m in NonSeekingReader(stream).iter_messages(log_time_order=False)]
+    assert starts == sorted(starts)
+    assert sorted(sequential) == times
+
+
+def test_metrics_record_and_report_attachment(annotated):
+    with annotated.open("rb") as stream:
+        reader = make_reader(stream)
+        (metrics,) = [m.metadata for m in reader.iter_metadata() if m.name == "pdhef.metrics"]
+        report = list(reader.iter_attachments())[-1]
+    assert metrics == METRICS
+    assert (report.name, report.media_type, report.log_time) == (
+        "report.json",
+        "application/json",
+        1_700_000_006_000_000_123,
+    )
+    assert json.loads(report.data) == REPORT
+
+
+def cdr_only(path: Path, source: Path) -> None:
+    """Copy the CDR topics, as rosbags opens no file with other encodings."""
+    with source.open("rb") as stream, path.open("wb") as out:
+        reader = make_reader(stream)
+        writer = Writer(out)
+        writer.start(profile="ros2", library="test")
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            if channel.message_encoding != "cdr":
+                continue
+            if channel.id not in channels:
+                id_ = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, "cdr", id_)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+
+
+@pytest.fixture
+def ros_only(tmp_path, source, circle) -> Path:
+    drive, path = tmp_path / "ros.mcap", tmp_path / "ros_annotated.mcap"
+    cdr_only(drive, source)
+    annotate(path, drive, circle)
+    return path
+
+
+def test_weights_reasons_and_their_names_are_in_the_message(tmp_path, circle):
+    path = tmp_path / "sidecar.mcap"
+    sink = AnnotatedMcapSink(path, None)
+    for k in range(2):
+        sink.append(circle("pd-hef", 300 * k, 300, adaptive=True))
+    sink.finish(REPORT)
+    track = circle("pd-hef", 0, 600, adaptive=True)
+    rows = [m for _, m in decoded(path, "/pdhef/pd_hef/state")]
+    np.testing.assert_array_equal([m.mixture_weight for m in rows], as_written(track.mixture_weight))
+    np.testing.assert_array_equal([m.reason for m in rows], track.reason)
+    assert {r.name: getattr(rows[0], f"REASON_{r.name.upper()}") for r in REASONS} == {r.name: r.bit for r in REASONS}
+
+
+@pytest.mark.parametrize("token", NAMES)
+def test_rosbags_reads_every_state(ros_only, circle, token):
+    track = circle(NAMES[token], 0, 600)
+    rows = decoded(ros_only, f"/pdhef/{token}/state")
+    assert [t for t, _ in rows] == track.stamps_ns.tolist()
+    assert [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for _, m in rows] == track.stamps_ns.tolist()
+    assert {m.header.frame_id for _, m in rows} == {"base_link"}
+    for field in (
+        "vx_m_s",
+        "vy_m_s",
+        "yaw_rate_rad_s",
+        "sideslip_rad",
+        "ay_m_s2",
+        "sideslip_std_rad",
+        "network_trust",
+        "r_scale",
+        "nis",
+        "friction",
+        "valid",
+        "diverged",
+    ):
+        np.testing.assert_array_equal(
+            [getattr(m, field) for _, m in rows], as_written(getattr(track, field), field), err_msg=field
+        )
+    assert np.isnan([m.mixture_weight for _, m in rows]).all() and not any(m.reason for _, m in rows)
+    covariance = np.array([m.covariance for _, m in rows])
+    if token == "truth":
+        assert np.isnan(covariance).all()
+    else:
+        np.testing.assert_array_equal(covariance, as_written(track.covariance.reshape(600, 9)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("token", NAMES)
+def test_rosbags_reads_every_odometry(ros_only, circle, token):
+    track = circle(NAMES[token], 0, 600)
+    use = track.valid
+    rows = decoded(ros_only, f"/pdhef/{token}/odometry")
+    assert [t for t, _ in rows] == track.stamps_ns[use].tolist()
+    assert {(m.header.frame_id, m.child_frame_id) for _, m in rows} == {("map", "base_link")}
+    poses = [m.pose.pose for _, m in rows]
+    np.testing.assert_array_equal([p.position.x for p in poses], as_written(track.x_m[use], "x_m"))
+    np.testing.assert_array_equal([p.position.y for p in poses], as_written(track.y_m[use], "y_m"))
+    yaw = [2 * np.arctan2(p.orientation.z, p.orientation.w) for p in poses]
+    np.testing.assert_allclose(yaw, track.yaw_rad[use], atol=6e-6)
+    twists = [m.twist.twist for _, m in rows]
+    np.testing.assert_array_equal([t.linear.x for t in twists], as_written(track.vx_m_s[use], "vx_m_s"))
+    np.testing.assert_array_equal([t.linear.y for t in twists], as_written(track.vy_m_s[use], "vy_m_s"))
+    yaw_rate = as_written(track.yaw_rate_rad_s[use], "yaw_rate_rad_s")
+    np.testing.assert_array_equal([t.angular.z for t in twists], yaw_rate)
+    covariance = rows[0][1].twist.covariance
+    expected = np.zeros(36)
+    if token != "truth":
+        # x, y and the rotation about z of a row-major 6 x 6 matrix
+        expected[[0, 1, 6, 7, 11, 31, 35]] = [0.04, 0.001, 0.001, 0.09, 0.002, 0.002, 0.0004]
+    np.testing.assert_array_equal(covariance, as_written(expected))
+
+
+def test_rerun_shows_every_topic(annotated):
+    reader = McapReader(annotated)
+    rows: dict[str, int] = {}
+    for chunk in reader.stream():
+        if not chunk.is_static:
+            rows[chunk.entity_path] = max(rows.get(chunk.entity_path, 0), chunk.num_rows)
+    for topic in TOPICS:
+        assert rows.get(topic, 0) > 0, topic
+    info = reader.info()
+    assert info.statistics_present
+    assert info.summary_source == "embedded"
+    assert info.message_count == sum(n for _, _, n in TOPICS.values())
+
+
+def test_our_own_reader_takes_the_estimates_as_signals(annotated, circle):
+    log = open_log(annotated)
+    columns = log.read({"/pdhef/phy_ukf/state": ["header.stamp", "sideslip_rad"]})["/pdhef/phy_ukf/state"]
+    track = circle("phy-ukf", 0, 600)
+    np.testing.assert_array_equal(columns.fields["header.stamp"], track.stamps_ns)
+    np.testing.assert_array_equal(columns.fields["sideslip_rad"], as_written(track.sideslip_rad, "sideslip_rad"))
+    assert log.lost == ()
+    log.close()
+
+
+def test_annotating_twice_is_annotating_once(tmp_path, annotated, circle):
+    again = tmp_path / "again.mcap"
+    annotate(again, annotated, circle)
+    assert messages(again) == messages(annotated)
+    with again.open("rb") as a, annotated.open("rb") as b:
+        first, second = make_reader(a), make_reader(b)
+        assert list(first.iter_attachments()) == list(second.iter_attachments())
+        assert list(first.iter_metadata()) == list(second.iter_metadata())
+        assert len(first.get_summary().channels) == len(TOPICS)
+
+
+def test_topics_of_an_earlier_run_go(tmp_path, annotated, circle):
+    path = tmp_path / "other.mcap"
+    log = open_log(annotated)
+    sink = AnnotatedMcapSink(path, log)
+    sink.append(circle("zero:no-lateral", 0, 600))
+    sink.finish({**REPORT, "metrics": []})
+    log.close()
+    assert {topic for topic, *_ in messages(path)} == {
+        *SOURCE_TOPICS,
+        "/pdhef/zero_no_lateral/state",
+        "/pdhef/zero_no_lateral/odometry",
+    }
+
+
+def test_in_place(source, circle):
+    annotate(source, source, circle)
+    annotate(source, source, circle)
+    assert {topic for topic, *_ in messages(source)} == set(TOPICS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("windows", [1, 3, 10])
+def test_content_does_not_depend_on_windows(tmp_path, source, circle, windows):
+    annotate(tmp_path / "a.mcap", source, circle, windows)
+    annotate(tmp_path / "b.mcap", source, circle, 2)
+    assert messages(tmp_path / "a.mcap") == messages(tmp_path / "b.mcap")
+
+
+def test_same_input_gives_the_same_bytes(tmp_path, source, circle):
+    annotate(tmp_path / "a.mcap", source, circle)
+    annotate(tmp_path / "b.mcap", source, circle)
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+def test_sidecar_holds_our_topics_alone(tmp_path, circle):
+    path = tmp_path / "sidecar.mcap"
+    annotate(path, None, circle)
+    assert {topic for topic, *_ in messages(path)} == set(OUR_TOPICS)
+    assert len(decoded(path, "/pdhef/phy_ukf/odometry")) == 588
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        assert [a.name for a in reader.iter_attachments()] == ["report.json"]
+        assert [m.name for m in reader.iter_metadata()] == ["pdhef.metrics"]
+    rows = {c.entity_path for c in McapReader(path).stream() if c.num_rows and not c.is_static}
+    assert set(OUR_TOPICS) <= rows
+
+
+@pytest.mark.slow
+def test_bags_become_ros2(tmp_path, shared_dir, circle):
+    log = open_log(shared_dir / "data" / "drives" / "f1tenth_hoons_run2.bag")
+    path = tmp_path / "annotated.mcap"
+    sink = AnnotatedMcapSink(path, log)
+    track = circle("phy-ukf", 0, 100)
+    inside = make_track("phy-ukf", track.stamps_ns - track.stamps_ns[0] + log.start_ns, vx_m_s=track.vx_m_s)
+    sink.append(inside)
+    sink.finish(REPORT)
+    log.close()
+    with AnyReader([path]) as reader:
+        counts = {c.topic: c.msgcount for c in reader.connections}
+        first = next(reader.messages([c for c in reader.connections if c.topic == "/imu"]))
+        imu = reader.deserialize(first[2], first[0].msgtype)
+    assert counts["/imu"] == counts["/drive"] == counts["/optitrack/twist"] == 4655
+    assert counts["/pdhef/phy_ukf/state"] == 100
+    assert counts["/pdhef/phy_ukf/odometry"] == 0  # no pose was given
+    assert imu.linear_acceleration.z == 9.81
+
+
+def test_odometry_holds_no_pose_that_is_not_known(tmp_path, circle):
+    path = tmp_path / "sidecar.mcap"
+    track = circle("zero", 0, 10)
+    x = track.x_m.copy()
+    x[3:5] = np.nan
+    sink = AnnotatedMcapSink(path, None)
+    sink.append(track.with_pose(x, track.y_m, track.yaw_rad))
+    sink.finish(REPORT)
+    stamps = [t for t, _ in decoded(path, "/pdhef/zero/odometry")]
+    assert stamps == np.delete(track.stamps_ns, [3, 4]).tolist()
+    assert len(decoded(path, "/pdhef/zero/state")) == 10
+
+
+def test_a_log_without_truth_says_so_in_its_record():
+    report = {**REPORT, "truth": {"available": False}, "metrics": [], "estimators": []}
+    assert metrics_record(report) == {"log": "drive", "truth": "no truth"}
+
+
+def test_a_covariance_that_is_not_known_is_zero_as_ros_wants_it():
+    covariance = np.arange(18.0).reshape(2, 3, 3)
+    covariance[1, 0, 2] = np.nan
+    full = _twist_covariance(covariance, 2).reshape(2, 6, 6)
+    places = np.ix_([0, 1, 5], [0, 1, 5])
+    np.testing.assert_array_equal(full[0][places], covariance[0])
+    assert np.count_nonzero(full) == 8  # the first entry is 0 itself
+    assert not _twist_covariance(np.empty((0, 3, 3)), 2).any()
+
+
+def test_positions_far_from_the_origin_keep_their_millimetres(tmp_path, circle):
+    path = tmp_path / "sidecar.mcap"
+    track = circle("zero", 0, 10)
+    sink = AnnotatedMcapSink(path, None)
+    sink.append(track.with_pose(track.x_m + 4_500_000.0, track.y_m, track.yaw_rad))
+    sink.finish(REPORT)
+    x = [m.pose.pose.position.x for _, m in decoded(path, "/pdhef/zero/odometry")]
+    np.testing.assert_allclose(x, track.x_m + 4_500_000.0, rtol=0, atol=5e-4)
+
+
+def test_only_the_named_tracks_are_written(tmp_path, circle):
+    path = tmp_path / "sidecar.mcap"
+    sink = AnnotatedMcapSink(path, None, {"zero", "truth"})
+    for first in (0, 300):
+        for name in NAMES.values():
+            sink.append(circle(name, first, 300))
+    sink.finish(REPORT)
+    assert {topic.split("/")[2] for topic, *_ in messages(path)} == {"zero", "truth"}
+    assert len(messages(path, "/pdhef/zero/state")) == 600
+
+
+def test_topic_names_are_legal():
+    assert topic_of("pd-hef", "state") == "/pdhef/pd_hef/state"
+    assert topic_of("2nd try", "odometry") == "/pdhef/_2nd_try/odometry"
+
+
+def test_two_estimators_never_share_a_topic(tmp_path, circle):
+    sink = AnnotatedMcapSink(tmp_path / "a.mcap", None)
+    sink.append(circle("pd-hef"))
+    with pytest.raises(OutputError, match="different topics"):
+        sink.append(circle("pd_hef"))
+    sink.abort()
+
+
+def test_nothing_stands_under_the_final_name_before_finish(tmp_path, source, circle):
+    path = tmp_path / "out" / "annotated.mcap"
+    log = open_log(source)
+    sink = AnnotatedMcapSink(path, log)
+    sink.append(circle("zero"))
+    sink.append(circle("zero", 200))
+    assert not path.exists()
+    sink.abort()
+    sink.abort()
+    assert list(path.parent.iterdir()) == []
+    sink = AnnotatedMcapSink(path, log)
+    sink.append(circle("zero"))
+    with pytest.raises(KeyError):
+        sink.finish({})
+    assert list(path.parent.iterdir()) == []
+    sink = AnnotatedMcapSink(path, log)
+    sink.finish(REPORT)
+    sink.abort()
+    log.close()
+    assert [p.name for p in path.parent.iterdir()] == ["annotated.mcap"]
+
+
+def test_unwritable_place_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="expected a place to write to"):
+        AnnotatedMcapSink(tmp_path / "file" / "annotated.mcap", None)
+
+
+def test_a_track_of_all_windows_equals_the_joined_one(circle):
+    joined = concatenate([circle("zero", 0, 300), circle("zero", 300, 300)])
+    np.testing.assert_array_equal(joined.sideslip_rad, circle("zero", 0, 600).sideslip_rad)
+
+
+def test_the_pose_of_what_is_not_shown_first_stands_20_times_a_second_however_windows_fall(tmp_path, circle):
+    def poses(cuts: list[int]) -> dict[str, list[int]]:
+        path = tmp_path / "annotated.mcap"
+        sink = AnnotatedMcapSink(path, None, shown={"phy-ukf"})
+        for a, b in pairwise(cuts):
+            for name in ("phy-ukf", "zero"):
+                sink.append(circle(name, a, b - a))
+        sink.finish(REPORT)
+        return {t: [s for s, _ in decoded(path, f"/pdhef/{t}/odometry")] for t in ("phy_ukf", "zero")}
+
+    found = poses([0, 300, 600])
+    assert found == poses([0, 7, 333, 600])
+    assert len(found["phy_ukf"]) > 4 * len(found["zero"]) > 0
+    assert np.median(np.diff(found["zero"])) == 50_000_000
+
+
+def test_of_a_long_drive_what_nobody_asked_for_stands_five_times_a_second_however_windows_fall(tmp_path, circle):
+    def written(cuts: list[int]) -> dict[str, list[int]]:
+        path = tmp_path / "annotated.mcap"
+        sink = AnnotatedMcapSink(path, None, shown={"phy-ukf"}, thin=True)
+        for a, b in pairwise(cuts):
+            for name in ("phy-ukf", "zero"):
+                sink.append(circle(name, a, b - a, adaptive=True))
+        sink.finish(REPORT)
+        return {topic: [t for c, t, *_ in messages(path) if c == topic] for topic in OUR_TOPICS}
+
+    found = written([0, 300, 600])
+    assert found == written([0, 7, 333, 600])
+    assert (len(found["/pdhef/phy_ukf/state"]), len(found["/pdhef/phy_ukf/odometry"])) == (600, 588)
+    stated = np.array(found["/pdhef/zero/state"])
+    assert len(stated) == pytest.approx(30, abs=1)
+    assert set(np.diff(stated // 200_000_000)) == {1}
+    rows = dict(decoded(tmp_path / "annotated.mcap", "/pdhef/zero/state"))
+    whole = circle("zero", 0, 600, adaptive=True)
+    at = np.searchsorted(whole.stamps_ns, stated)
+    assert found["/pdhef/zero/odometry"] == stated[whole.valid[at]].tolist()
+    for field in ("sideslip_rad", "nis", "mixture_weight", "reason", "valid"):
+        expected = as_written(getattr(whole, field)[at], field)
+        np.testing.assert_array_equal([getattr(rows[t], field) for t in stated], expected, err_msg=field)

@@ -1,0 +1,356 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pyarrow.parquet as pq
+import pytest
+from numpy.testing import assert_array_equal
+from written import as_written
+
+from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, concatenate, make_track
+from pdhef_logtool.results.parquet_sink import EstimatesSink, list_estimators, read_metrics, read_track, write_metrics
+
+ESTIMATE_COLUMNS = {
+    "stamp_ns": pl.Int64,
+    "estimator": pl.Categorical,
+    "vx_m_s": pl.Float64,
+    "vy_m_s": pl.Float64,
+    "yaw_rate_rad_s": pl.Float64,
+    "sideslip_rad": pl.Float64,
+    "ay_m_s2": pl.Float64,
+    "x_m": pl.Float64,
+    "y_m": pl.Float64,
+    "yaw_rad": pl.Float64,
+    "vx_std_m_s": pl.Float64,
+    "vy_std_m_s": pl.Float64,
+    "yaw_rate_std_rad_s": pl.Float64,
+    "sideslip_std_rad": pl.Float64,
+    "network_trust": pl.Float64,
+    "r_scale": pl.Float64,
+    "nis": pl.Float64,
+    "friction": pl.Float64,
+    "valid": pl.Boolean,
+    "diverged": pl.Boolean,
+    "mixture_weight": pl.Float64,
+    "reason": pl.Int32,
+    "roll_rad": pl.Float64,
+    "bank_rad": pl.Float64,
+    "force_scale": pl.Float64,
+    "steer_bias_rad": pl.Float64,
+    "ay_bias_m_s2": pl.Float64,
+    "yaw_rate_bias_rad_s": pl.Float64,
+}
+#: Those that none of these tracks has.
+OPTIONAL = {"mixture_weight", "reason", *ESTIMATED_COLUMNS}
+UNITS = {
+    "stamp_ns": "ns",
+    "estimator": "",
+    "vx_m_s": "m/s",
+    "vy_m_s": "m/s",
+    "yaw_rate_rad_s": "rad/s",
+    "sideslip_rad": "rad",
+    "ay_m_s2": "m/s^2",
+    "x_m": "m",
+    "y_m": "m",
+    "yaw_rad": "rad",
+    "vx_std_m_s": "m/s",
+    "vy_std_m_s": "m/s",
+    "yaw_rate_std_rad_s": "rad/s",
+    "sideslip_std_rad": "rad",
+    "network_trust": "1",
+    "r_scale": "1",
+    "nis": "1",
+    "friction": "1",
+    "valid": "",
+    "diverged": "",
+    "mixture_weight": "1",
+    "reason": "",
+    "roll_rad": "rad",
+    "bank_rad": "rad",
+    "force_scale": "1",
+    "steer_bias_rad": "rad",
+    "ay_bias_m_s2": "m/s^2",
+    "yaw_rate_bias_rad_s": "rad/s",
+}
+METRIC_COLUMNS = {
+    "log": pl.String,
+    "estimator": pl.String,
+    "signal": pl.String,
+    "segment": pl.String,
+    "metric": pl.String,
+    "value": pl.Float64,
+    "unit": pl.String,
+    "n": pl.Int64,
+    "algorithm": pl.String,
+}
+NAMES = ("phy-ukf", "zero", "truth")
+
+
+def write(path: Path, circle, windows: int = 3, n: int = 200, rows_a_group: int = 256) -> None:
+    sink = EstimatesSink(path, rows_a_group)
+    for k in range(windows):
+        for name in NAMES:
+            sink.append(circle(name, k * n, n))
+    sink.finish({})
+
+
+def test_polars_reads_every_column_with_its_type(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    frame = pl.read_parquet(path)
+    assert list(frame.schema.items()) == list(ESTIMATE_COLUMNS.items())
+    assert frame.height == 3 * 3 * 200
+    for name in NAMES:
+        rows = frame.filter(pl.col("estimator") == name)
+        whole = circle(name, 0, 600)
+        assert_array_equal(rows["stamp_ns"].to_numpy(), whole.stamps_ns)
+        for column in set(ESTIMATE_COLUMNS) - {"stamp_ns", "estimator"} - OPTIONAL:
+            assert_array_equal(rows[column].to_numpy(), as_written(getattr(whole, column), column), err_msg=column)
+        assert all(rows[column].null_count() == rows.height for column in OPTIONAL)
+
+
+def test_unknown_is_null_for_polars(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    frame = pl.read_parquet(path)
+    assert frame.filter(pl.col("estimator") == "truth")["nis"].null_count() == 600
+    nis = circle("phy-ukf", 0, 600).nis
+    mean = frame.filter(pl.col("estimator") == "phy-ukf")["nis"].mean()
+    assert mean == pytest.approx(nis[np.isfinite(nis)].mean())
+
+
+def test_units_stand_in_the_file(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    metadata = pl.read_parquet_metadata(path)
+    assert metadata["format"] == "pdhef.estimates"
+    assert metadata["version"] == "1"
+    assert json.loads(metadata["units"]) == UNITS
+    assert {f.name: f.metadata[b"unit"].decode() for f in pq.read_schema(path)} == UNITS
+
+
+def test_file_is_zstd_with_dictionary_and_one_estimator_a_row_group(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    metadata = pq.ParquetFile(path).metadata
+    assert metadata.num_row_groups == 9
+    for g in range(metadata.num_row_groups):
+        group = metadata.row_group(g)
+        assert group.num_rows <= 256
+        assert {group.column(c).compression for c in range(group.num_columns)} == {"ZSTD"}
+        estimator = group.column(1)
+        assert estimator.path_in_schema == "estimator"
+        assert "RLE_DICTIONARY" in estimator.encodings
+        assert estimator.statistics.min == estimator.statistics.max
+
+
+def test_bytes_do_not_depend_on_chance(tmp_path, circle):
+    write(tmp_path / "a", circle)
+    write(tmp_path / "b", circle)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_track_comes_back(tmp_path, circle, name):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    assert list_estimators(path) == NAMES
+    track = read_track(path, name)
+    whole = concatenate([circle(name, 0, 600)])
+    for column, values in whole.columns().items():
+        got = track.columns()[column]
+        assert got.dtype == values.dtype
+        np.testing.assert_allclose(got, as_written(values, column), rtol=1e-15, err_msg=column)
+    assert track.name == name
+    if name == "truth":
+        assert track.covariance.shape == (0, 3, 3)
+    else:
+        assert np.isnan(track.covariance[:, 0, 1]).all()
+
+
+def test_weights_and_reasons_come_back_where_there_are_some(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    sink = EstimatesSink(path, 256)
+    for k in range(3):
+        sink.append(circle("zero", 200 * k, 200))
+        sink.append(circle("pd-hef", 200 * k, 200, adaptive=True))
+    sink.finish({})
+    whole = circle("pd-hef", 0, 600, adaptive=True)
+    track = read_track(path, "pd-hef")
+    assert_array_equal(track.mixture_weight, as_written(whole.mixture_weight))
+    assert_array_equal(track.reason, whole.reason)
+    assert track.reason.dtype == np.int64 and set(track.reason.tolist()) == {0, 4, 32}
+    assert_array_equal(read_track(path, "pd-hef", ["reason"]).reason, whole.reason)
+    other = read_track(path, "zero")
+    assert (len(other), len(other.mixture_weight), len(other.reason)) == (600, 0, 0)
+    rows = pl.read_parquet(path).filter(pl.col("estimator") == "zero")
+    assert rows["mixture_weight"].null_count() == rows["reason"].null_count() == 600
+
+
+def test_a_file_from_before_the_later_columns_is_read(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    old = tmp_path / "old.parquet"
+    pl.read_parquet(path).drop("mixture_weight", "reason", "diverged").write_parquet(old)
+    track = read_track(old, "phy-ukf")
+    assert_array_equal(track.sideslip_rad, as_written(circle("phy-ukf", 0, 600).sideslip_rad, "sideslip_rad"))
+    assert len(track.reason) == len(track.mixture_weight) == 0
+    assert circle("phy-ukf", 0, 600).diverged.any()
+    assert not track.diverged.any()
+    with pytest.raises(OutputError, match="reason"):
+        read_track(old, "phy-ukf", ["reason"])
+
+
+def test_only_the_row_groups_of_the_estimator_are_read(tmp_path, circle, monkeypatch):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    metadata = pq.ParquetFile(path).metadata
+    own = [g for g in range(metadata.num_row_groups) if metadata.row_group(g).column(1).statistics.min == "zero"]
+    read: list[tuple[int, tuple[str, ...]]] = []
+    original = pq.ParquetFile.read_row_group
+
+    def spy(self, i, columns=None, **kwargs):
+        read.append((i, tuple(columns)))
+        return original(self, i, columns=columns, **kwargs)
+
+    monkeypatch.setattr(pq.ParquetFile, "read_row_group", spy)
+    track = read_track(path, "zero", ["sideslip_rad"])
+    assert read == [(g, ("stamp_ns", "sideslip_rad")) for g in own]
+    assert len(own) == 3
+    assert_array_equal(track.sideslip_rad, as_written(circle("zero", 0, 600).sideslip_rad, "sideslip_rad"))
+    assert np.isnan(track.vx_m_s).all()
+    assert np.isnan(read_track(path, "zero", ["vx_m_s", "vy_m_s"]).sideslip_rad).all()
+
+
+def test_mixed_row_groups_of_other_writers_are_read(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    shuffled = tmp_path / "by_stamp.parquet"
+    pl.read_parquet(path).sort("stamp_ns", "estimator").write_parquet(shuffled)
+    track = read_track(shuffled, "phy-ukf")
+    assert_array_equal(track.sideslip_rad, as_written(circle("phy-ukf", 0, 600).sideslip_rad, "sideslip_rad"))
+    assert set(list_estimators(shuffled)) == set(NAMES)
+
+
+def test_windows_with_and_without_covariance_stay_aligned(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    sink = EstimatesSink(path, 300)
+    sink.append(circle("phy-ukf", 0, 200, covariance=False))
+    sink.append(circle("phy-ukf", 200, 200))
+    sink.finish({})
+    std = read_track(path, "phy-ukf").vx_std_m_s
+    assert np.isnan(std[:200]).all()
+    np.testing.assert_allclose(std[200:], 0.2, rtol=1.3e-4)
+
+
+def test_what_is_not_there_is_said(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    with pytest.raises(OutputError, match=r"expected one of phy-ukf, zero, truth, got pd-hef"):
+        read_track(path, "pd-hef")
+    with pytest.raises(OutputError, match="no_such_column"):
+        read_track(path, "zero", ["no_such_column"])
+    with pytest.raises(OutputError, match=r"readable Parquet"):
+        read_track(tmp_path / "absent.parquet", "zero")
+    (tmp_path / "text.parquet").write_text("no parquet")
+    with pytest.raises(OutputError, match=r"readable Parquet"):
+        read_track(tmp_path / "text.parquet", "zero")
+    pl.DataFrame({"stamp_ns": [1]}).write_parquet(tmp_path / "other.parquet")
+    with pytest.raises(OutputError, match=r"estimates\.parquet"):
+        read_track(tmp_path / "other.parquet", "zero")
+
+
+def test_nothing_stands_under_the_final_name_before_finish(tmp_path, circle):
+    path = tmp_path / "out" / "estimates.parquet"
+    sink = EstimatesSink(path, 100)
+    sink.append(circle("zero"))
+    assert not path.exists()
+    sink.abort()
+    sink.abort()
+    assert list(path.parent.iterdir()) == []
+    sink = EstimatesSink(path)
+    sink.append(circle("zero"))
+    sink.finish({})
+    sink.abort()
+    assert [p.name for p in path.parent.iterdir()] == ["estimates.parquet"]
+
+
+def test_failure_while_finishing_leaves_the_old_file(tmp_path, circle, monkeypatch):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    before = path.read_bytes()
+    sink = EstimatesSink(path)
+    sink.append(circle("zero"))
+
+    def full_disk(self, table, row_group_size=None):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pq.ParquetWriter, "write_table", full_disk)
+    with pytest.raises(OutputError, match="No space left"):
+        sink.finish({})
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["estimates.parquet"]
+
+
+def test_unwritable_place_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="expected a place to write to"):
+        EstimatesSink(tmp_path / "file" / "estimates.parquet")
+
+
+def test_empty_log_gives_an_empty_table(tmp_path):
+    path = tmp_path / "estimates.parquet"
+    EstimatesSink(path).finish({})
+    assert pl.read_parquet(path).schema.names() == list(ESTIMATE_COLUMNS)
+
+
+ROWS = [
+    MetricRow("drive", "phy-ukf", "sideslip_rad", "all", "rmse", 0.0123, "rad", 600, algorithm="0123456789ab"),
+    MetricRow("drive", "phy-ukf", "sideslip_rad", "nonlinear", "rmse", float("nan"), "rad", 0),
+]
+
+
+def test_polars_reads_the_metrics(tmp_path):
+    path = tmp_path / "metrics.parquet"
+    write_metrics(path, ROWS)
+    frame = pl.read_parquet(path)
+    assert list(frame.schema.items()) == list(METRIC_COLUMNS.items())
+    assert frame.rows() == [
+        ("drive", "phy-ukf", "sideslip_rad", "all", "rmse", 0.0123, "rad", 600, "0123456789ab"),
+        ("drive", "phy-ukf", "sideslip_rad", "nonlinear", "rmse", None, "rad", 0, ""),
+    ]
+    assert [p.name for p in tmp_path.iterdir()] == ["metrics.parquet"]
+
+
+def test_metrics_of_an_older_version_name_no_algorithm(tmp_path):
+    path = tmp_path / "metrics.parquet"
+    write_metrics(path, ROWS)
+    pl.read_parquet(path).drop("algorithm").write_parquet(path)
+    assert [r.algorithm for r in read_metrics(path)] == ["", ""]
+    pl.read_parquet(path).drop("unit").write_parquet(path)
+    with pytest.raises(OutputError, match="without unit"):
+        read_metrics(path)
+
+
+def test_metrics_come_back(tmp_path):
+    path = tmp_path / "metrics.parquet"
+    marked = [
+        MetricRow("drive", "phy-ukf", "vx_m_s", "all", "rmse", 0.1, "m/s", 600, independent=False),
+        MetricRow("drive", "phy-ukf", "vx_m_s", "all", "not_independent", 1.0, "1", 600, independent=False),
+    ]
+    write_metrics(path, ROWS + marked)
+    rows = read_metrics(path)
+    assert np.isnan(rows[1].value)
+    assert [replace(r, value=0.0) for r in rows] == [replace(r, value=0.0) for r in ROWS + marked]
+    assert [r.value for r in rows if r.n] == [0.0123, 0.1, 1.0]
+    write_metrics(path, [])
+    assert read_metrics(path) == []
+    with pytest.raises(OutputError, match=r"expected the columns of metrics\.parquet"):
+        write(tmp_path / "estimates.parquet", lambda *a: make_track("zero", np.arange(2)))
+        read_metrics(tmp_path / "estimates.parquet")

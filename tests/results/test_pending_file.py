@@ -1,0 +1,146 @@
+"""The file that appears only when it is complete: what stays in the folder after every way that writing can end."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.storage.files import PendingFile, write_bytes
+
+DONE = {"out.bin": b"new"}
+
+
+def folder(path: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in path.iterdir()}
+
+
+def test_the_file_takes_its_name_when_it_is_complete_and_leaves_nothing_else(tmp_path: Path) -> None:
+    with PendingFile(tmp_path / "out.bin") as pending:
+        pending.path.write_bytes(b"new")
+        assert not (tmp_path / "out.bin").exists()
+    assert folder(tmp_path) == DONE
+
+
+def test_what_was_there_stays_until_the_new_file_is_complete(tmp_path: Path) -> None:
+    (tmp_path / "out.bin").write_bytes(b"old")
+    with PendingFile(tmp_path / "out.bin") as pending:
+        pending.path.write_bytes(b"new")
+        assert (tmp_path / "out.bin").read_bytes() == b"old"
+    assert folder(tmp_path) == DONE
+
+
+@pytest.mark.parametrize("failure", [ValueError, KeyboardInterrupt])
+def test_a_failure_while_writing_goes_through_and_leaves_the_folder_as_it_was(
+    tmp_path: Path, failure: type[BaseException]
+) -> None:
+    (tmp_path / "out.bin").write_bytes(b"old")
+    with pytest.raises(failure), PendingFile(tmp_path / "out.bin") as pending:
+        pending.path.write_bytes(b"half")
+        raise failure
+    assert folder(tmp_path) == {"out.bin": b"old"}
+
+
+def test_a_failure_before_anything_was_written_is_not_hidden(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="mine"), PendingFile(tmp_path / "out.bin"):
+        raise ValueError("mine")
+    assert folder(tmp_path) == {}
+
+
+def test_what_a_killed_run_left_is_gone_from_the_start(tmp_path: Path) -> None:
+    script = "import sys, pathlib; from pdhef_logtool.storage.files import PendingFile as P\n"
+    script += "P(pathlib.Path(sys.argv[1])).path.write_bytes(b'half of an old one')"
+    subprocess.run([sys.executable, "-c", script, str(tmp_path / "out.bin")], check=True)
+    assert len(folder(tmp_path)) == 1
+    pending = PendingFile(tmp_path / "out.bin")
+    assert folder(tmp_path) == {}
+    with pending, pending.path.open("ab") as file:  # a writer that appends must not continue the old one
+        file.write(b"new")
+    assert folder(tmp_path) == DONE
+
+
+def test_two_targets_in_a_folder_do_not_share_a_temporary_name(tmp_path: Path) -> None:
+    with PendingFile(tmp_path / "a.bin") as a, PendingFile(tmp_path / "b.bin") as b:
+        a.path.write_bytes(b"a")
+        b.path.write_bytes(b"b")
+    assert folder(tmp_path) == {"a.bin": b"a", "b.bin": b"b"}
+
+
+def test_the_content_is_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    events: list[str] = []
+    partial = PendingFile(tmp_path / "out.bin").path
+    fsync, rename = os.fsync, Path.replace
+
+    def note_fsync(descriptor: int) -> None:
+        if partial.exists() and os.path.samestat(os.fstat(descriptor), partial.stat()):
+            events.append("fsync")
+        elif os.path.samestat(os.fstat(descriptor), tmp_path.stat()):
+            events.append("fsync of the folder")
+        fsync(descriptor)
+
+    def note_rename(self: Path, target: Path) -> Path:
+        events.append(f"{self.name} -> {target.name}")
+        return rename(self, target)
+
+    monkeypatch.setattr(os, "fsync", note_fsync)
+    monkeypatch.setattr(Path, "replace", note_rename)
+    write_bytes(tmp_path / "out.bin", b"new")
+    assert events == ["fsync", f"{partial.name} -> out.bin", "fsync of the folder"]
+    assert folder(tmp_path) == DONE
+
+
+@pytest.mark.parametrize("broken", ["fsync", "replace"])
+def test_a_commit_that_fails_says_where_and_removes_what_was_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    (tmp_path / "out.bin").write_bytes(b"old")
+    pending = PendingFile(tmp_path / "out.bin")
+    pending.path.write_bytes(b"new")
+    monkeypatch.setattr(*((os, "fsync", full) if broken == "fsync" else (Path, "replace", full)))
+    with pytest.raises(OutputError, match=r"out\.bin.*No space left on device"):
+        pending.commit()
+    assert folder(tmp_path) == {"out.bin": b"old"}
+
+
+def test_a_commit_of_nothing_is_an_output_error(tmp_path: Path) -> None:
+    with pytest.raises(OutputError):
+        PendingFile(tmp_path / "out.bin").commit()
+    assert folder(tmp_path) == {}
+
+
+def test_discard_is_harmless_after_commit_and_twice(tmp_path: Path) -> None:
+    pending = PendingFile(tmp_path / "out.bin")
+    pending.path.write_bytes(b"new")
+    pending.commit()
+    pending.discard()
+    pending.discard()
+    assert folder(tmp_path) == DONE
+
+
+def test_a_temporary_file_that_cannot_be_removed_does_not_hide_the_failure(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="mine"), PendingFile(tmp_path / "out.bin") as pending:
+        pending.path.mkdir()  # no file: unlink refuses
+        raise ValueError("mine")
+
+
+def test_the_longest_name_is_written(tmp_path: Path) -> None:
+    write_bytes(tmp_path / ("n" * 255), b"new")
+    assert folder(tmp_path) == {"n" * 255: b"new"}
+
+
+def test_missing_folders_are_made(tmp_path: Path) -> None:
+    write_bytes(tmp_path / "a" / "b" / "out.bin", b"new")
+    assert folder(tmp_path / "a" / "b") == DONE
+
+
+def test_a_file_in_the_way_of_the_folder_is_an_output_error_at_once(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"")
+    with pytest.raises(OutputError, match=r"a/out\.bin"):
+        PendingFile(tmp_path / "a" / "out.bin")

@@ -1,0 +1,539 @@
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rerun.chunk import RrdReader
+
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.tracks import make_track
+from pdhef_logtool.results import rerun_sink as rerun
+from pdhef_logtool.results.palette import colour_rgb
+from pdhef_logtool.results.rerun_sink import LONGEST_BRIDGE_NS, MOST_OTHERS, RerunSink, _Rows, _Trajectory
+from pdhef_logtool.results.sink import Event, Shown
+
+HASH = "0123456789abcdef" * 4
+#: Of one track only: the others have those of the palette.
+COLOURS = {"phy-ukf": 0x123456}
+#: The third track that is written, zero, is neither.
+SHOWN = Shown("phy-ukf")
+START_NS = 1_700_000_000_000_000_123
+REPORT = {
+    "log": {"name": "drive", "file": "drive.mcap", "kind": "mcap", "duration_s": 6.0, "sha256": HASH},
+    "vehicle": {"name": "sedan"},
+    "warnings": ["a warning"],
+    "losses": [],
+    "truth": {"available": False, "quantities": [], "latency_s": None, "not_independent": [], "notes": []},
+    "metrics": [],
+    "estimators": [],
+    "mapping": {"signals": [], "missing": []},
+    "versions": {"python": "3"},
+}
+EVENTS = (
+    Event("nonlinear", START_NS + 10**9, START_NS + 3 * 10**9, "|ay| above 0.5 g"),
+    Event("start", START_NS, START_NS + 1, ""),
+)
+
+STATES = ("sideslip_deg", "yaw_rate_deg_s", "vx_m_s", "vy_m_s", "ay_m_s2")
+HEALTH = ("nis", "network_trust", "r_scale", "mixture_weight", "friction")
+ERRORS = ("error_sideslip_deg", "error_yaw_rate_deg_s", "error_vy_m_s")
+#: Every entity of the recording of two windows of 300 stamps of phy-ukf, truth and zero: rows and components.
+HELD = {
+    "/truth": (600, STATES),
+    "/main": (600, STATES + HEALTH + ERRORS),
+    "/other/1": (600, STATES),
+    "/inputs": (600, ("speed_m_s", "steer_deg", "ax_m_s2", "ay_m_s2", "yaw_rate_deg_s")),
+    "/plan/truth/now": (120, ()),
+    "/plan/main/now": (120, ()),
+    "/plan/other/1/now": (120, ()),
+    "/events": (2, ()),
+}
+STATIC = {
+    *("/__properties", "/report", "/truth", "/main", "/other/1"),
+    *(f"/plan/{place}{now}" for place in ("truth", "main", "other/1") for now in ("", "/now")),
+}
+
+
+def write(path: Path, circle, circle_signals, events=EVENTS) -> None:
+    sink = RerunSink(
+        path,
+        application_id="pdhef-x",
+        shown=SHOWN,
+        log_name="drive",
+        input_hash=HASH,
+        start_ns=START_NS,
+        colours=COLOURS,
+    )
+    for k in range(2):
+        sink.append_signals(circle_signals(300 * k, 300))
+        for name in ("phy-ukf", "truth", "zero"):
+            sink.append(circle(name, 300 * k, 300, bias=0.0 if name == "truth" else 0.02))
+    sink.finish(REPORT, events)
+
+
+@pytest.fixture
+def recording(tmp_path, circle, circle_signals) -> Path:
+    path = tmp_path / "recording.rrd"
+    write(path, circle, circle_signals)
+    return path
+
+
+def tables(path: Path) -> tuple[dict[str, pa.Table], dict[str, list[pa.RecordBatch]]]:
+    """Return by entity what stands on the timelines and what is static."""
+    reader = RrdReader(path)
+    store = reader.recordings()[0]
+    timed: dict[str, list[pa.RecordBatch]] = defaultdict(list)
+    static: dict[str, list[pa.RecordBatch]] = defaultdict(list)
+    for chunk in reader.stream(store=store):
+        (static if chunk.is_static else timed)[chunk.entity_path].append(chunk.to_record_batch())
+    return {e: pa.concat_tables([pa.Table.from_batches([b]) for b in bs]) for e, bs in timed.items()}, dict(static)
+
+
+def plain(table: pa.Table | pa.RecordBatch) -> dict[str, list]:
+    """Return the columns as lists, times as integers; row ids hold the time of writing and are left out."""
+    columns = {}
+    for name in table.schema.names:
+        column = table[name]
+        if pa.types.is_timestamp(column.type) or pa.types.is_duration(column.type):
+            column = column.cast(pa.int64())
+        if name != "rerun.controls.RowId":
+            columns[name] = column.to_pylist()
+    return columns
+
+
+def series(table: pa.Table, component: str) -> tuple[np.ndarray, list[list[float]]]:
+    """Return stamps and values of the rows of a component that hold something."""
+    (name,) = [n for n in table.column_names if n.endswith(f":{component}")]
+    order = np.argsort(table["time"].to_numpy().astype(np.int64), kind="stable")
+    values = table[name].to_pylist()
+    held = [i for i in order if values[i] is not None]
+    return table["time"].to_numpy().astype(np.int64)[held], [values[i] for i in held]
+
+
+def test_every_entity_has_its_rows_and_each_track_is_there_once(recording):
+    timed, static = tables(recording)
+    assert {e: t.num_rows for e, t in timed.items()} == {e: rows for e, (rows, _) in HELD.items()}
+    assert set(static) == STATIC
+    for entity, (_, components) in HELD.items():
+        names = timed[entity].column_names
+        assert {"time", "elapsed"} <= set(names)
+        if components:
+            assert {n.split(":")[1] for n in names if ":" in n} == set(components)
+
+
+def test_identity_and_footer(recording):
+    reader = RrdReader(recording)
+    (entry,) = reader.recordings()
+    assert (entry.application_id, entry.recording_id) == ("pdhef-x", HASH[:32])
+    assert reader.store() is not None
+    _, static = tables(recording)
+    properties = {k: v for b in static["/__properties"] for k, v in b.to_pydict().items()}
+    assert properties["RecordingInfo:name"] == [["drive"]]
+    assert properties["RecordingInfo:start_time"] == [[START_NS]]
+
+
+def blueprint_of(path: Path) -> dict[str, list]:
+    """Return all values of the blueprint by component."""
+    found: dict[str, list] = defaultdict(list)
+    reader = RrdReader(path)
+    for chunk in reader.stream(store=reader.blueprints()[0]):
+        for name, values in plain(chunk.to_record_batch()).items():
+            found[name] += [v for row in values if isinstance(row, list) for v in row]
+    return found
+
+
+def test_the_blueprint_opens_on_truth_main_and_baseline_and_names_no_estimator(recording):
+    assert len(RrdReader(recording).blueprints()) == 1
+    blueprint = blueprint_of(recording)
+    titles = blueprint["ViewBlueprint:display_name"]
+    assert {"Sideslip [deg]", "Speed [m/s]", "Road-wheel angle [deg]", "Plan, north up [m]", "Report"} <= set(titles)
+    assert blueprint["TimePanelBlueprint:timeline"] == ["elapsed"]
+    entities = {line.strip("+ ") for query in blueprint["ViewContents:query"] for line in query.splitlines()}
+    drawn = {e for e in entities if not e.startswith(("/plan", "/events", "/reasons", "/report", "$"))}
+    others = {f"/other/{number}" for number in range(1, MOST_OTHERS + 1)}
+    assert drawn == {"/truth", "/baseline", "/main", "/inputs"} | others
+    assert not {"phy-ukf", "zero"} & {word for text in titles for word in text.split()}
+    sources = {m["source_component"] for m in blueprint["VisualizerInstruction:component_map"]}
+    timed, _ = tables(recording)
+    held = {n for e in ("/main", "/inputs") for n in timed[e].column_names}
+    assert sources <= held and len(sources) == 14
+
+
+def test_values_stamps_bands_and_errors(recording, circle):
+    timed, _ = tables(recording)
+    truth = circle("truth", 0, 600)
+    track = circle("phy-ukf", 0, 600, bias=0.02)
+    stamps, values = series(timed["/main"], "sideslip_deg")
+    np.testing.assert_array_equal(stamps, track.stamps_ns)
+    middle = np.where(track.valid, np.degrees(track.sideslip_rad), np.nan)
+    half = np.degrees(1.959963985 * 0.03)
+    np.testing.assert_allclose(values, np.stack([middle, middle - half, middle + half], axis=1), rtol=1e-6)
+    _, error = series(timed["/main"], "error_sideslip_deg")
+    expected = np.where(track.valid, np.degrees(track.sideslip_rad - truth.sideslip_rad), np.nan)
+    np.testing.assert_allclose([e[0] for e in error], expected, rtol=1e-6)
+    elapsed = timed["/inputs"]["elapsed"].to_numpy().astype(np.int64)
+    np.testing.assert_array_equal(np.sort(elapsed), np.arange(600) * 10_000_000)
+    speed_stamps, speed = series(timed["/inputs"], "speed_m_s")  # every second one: no value and no gap between
+    assert speed_stamps.tolist() == track.stamps_ns[::2].tolist() and {v[0] for v in speed} == {10.0}
+
+
+def test_lines_carry_names_and_colours_of_estimators(recording):
+    _, static = tables(recording)
+    for place, name in (("main", "phy-ukf"), ("other/1", "zero"), ("truth", "truth")):
+        r, g, b = colour_rgb(name, COLOURS)
+        assert name not in COLOURS or (r << 16) | (g << 8) | b == COLOURS[name]
+        packed = (r << 24) | (g << 16) | (b << 8)
+        (batch,) = static[f"/{place}"]
+        band = [] if name == "truth" else [packed | 110] * 2
+        assert batch["SeriesLines:colors"].to_pylist() == [[packed | 0xFF, *band]]
+        assert batch["SeriesLines:names"].to_pylist() == [[name, *[f"{name} 95 %"] * len(band)]]
+        assert batch["SeriesLines:widths"].to_pylist() == [[2.0] if name == "truth" else [1.5, 0.75, 0.75]]
+        (strips,) = static[f"/plan/{place}"]
+        assert strips["LineStrips2D:colors"].to_pylist() == [[packed | 0xFF]]
+
+
+def test_the_plan_has_north_up_and_parts_where_the_track_is_not_valid(recording, circle):
+    _, static = tables(recording)
+    (batch,) = static["/plan/truth"]
+    strips = batch["LineStrips2D:strips"].to_pylist()[0]
+    assert len(strips) == 12
+    truth = circle("truth", 0, 600)
+    expected = np.stack([truth.x_m, -truth.y_m], axis=1)[:49]
+    np.testing.assert_allclose(np.array(strips[0]), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_events_and_report_are_text(recording):
+    timed, static = tables(recording)
+    order = np.argsort(timed["/events"]["time"].to_numpy())
+    texts = [timed["/events"]["TextLog:text"].to_pylist()[i][0] for i in order]
+    assert texts == ["start, 0.00 s", "nonlinear, 2.00 s: |ay| above 0.5 g"]
+    (batch,) = static["/report"]
+    assert batch["TextDocument:media_type"].to_pylist() == [["text/markdown"]]
+    assert batch["TextDocument:text"].to_pylist()[0][0].startswith("# drive\n")
+
+
+def test_weights_and_reasons_are_drawn_over_windows(tmp_path, circle):
+    path = tmp_path / "recording.rrd"
+    sink = RerunSink(
+        path,
+        application_id="pdhef-x",
+        shown=Shown("pd-hef", "zero"),
+        log_name="drive",
+        input_hash=HASH,
+        start_ns=START_NS,
+    )
+    for k in range(5):
+        sink.append(circle("pd-hef", 120 * k, 120, adaptive=True))  # the gyro is stuck over the first cut
+        sink.append(circle("zero", 120 * k, 120))
+    sink.finish(REPORT)
+    timed, _ = tables(path)
+    track = circle("pd-hef", 0, 600, adaptive=True)
+    _, weights = series(timed["/main"], "mixture_weight")
+    expected = np.where(track.valid, track.mixture_weight, np.nan)
+    np.testing.assert_allclose([w[0] for w in weights], expected, rtol=1e-6)
+    assert {e for e in timed if e.startswith("/reasons")} == {
+        *("/reasons/pd-hef/stuck_yaw_rate", "/reasons/pd-hef/spike_ay")
+    }
+    stuck = timed["/reasons/pd-hef/stuck_yaw_rate"]
+    assert stuck["StateChange:state"].to_pylist() == [["gyro stuck"], [""]]
+    assert plain(stuck)["time"] == [int(track.stamps_ns[100]), int(track.stamps_ns[149]) + 1]
+    spikes = plain(timed["/reasons/pd-hef/spike_ay"])
+    assert spikes["time"][::2] == [int(track.stamps_ns[30]), int(track.stamps_ns[400])]
+    texts = [t[0] for t in timed["/events"]["TextLog:text"].to_pylist()]
+    assert texts == ["pd-hef: a_y spike, 0.00 s", "pd-hef: gyro stuck, 0.49 s", "pd-hef: a_y spike, 0.00 s"]
+
+
+@pytest.mark.slow
+def test_same_input_gives_the_same_content(tmp_path, circle, circle_signals):
+    contents = []
+    for name in ("a.rrd", "b.rrd"):
+        write(tmp_path / name, circle, circle_signals)
+        timed, static = tables(tmp_path / name)
+        contents.append(({e: plain(t) for e, t in timed.items()}, {e: [*map(plain, bs)] for e, bs in static.items()}))
+    assert repr(contents[0]) == repr(contents[1])  # NaN equals itself in words
+
+
+def test_slow_sideslip_is_not_drawn(tmp_path, circle):
+    path = tmp_path / "recording.rrd"
+    shown = Shown("phy-ukf", "zero")
+    sink = RerunSink(
+        path, application_id="x", shown=shown, log_name="drive", input_hash=HASH, start_ns=START_NS, min_speed_m_s=11.0
+    )
+    sink.append(circle("zero"))
+    sink.append(circle("truth"))
+    sink.finish(REPORT)
+    timed, _ = tables(path)
+    assert np.isfinite(series(timed["/baseline"], "vx_m_s")[1]).any()
+    for component in ("sideslip_deg", "error_sideslip_deg"):
+        assert np.isnan(series(timed["/baseline"], component)[1]).all()
+    assert "/events" not in timed
+
+
+def test_errors_stand_where_both_are_valid_and_share_a_stamp(tmp_path, circle):
+    path = tmp_path / "recording.rrd"
+    track, truth = circle("phy-ukf", 0, 40), circle("truth", 5, 40)
+    track.valid[20] = False
+    truth.valid[25] = False  # stamp 30 of the track
+    sink = RerunSink(path, application_id="x", shown=SHOWN, log_name="drive", input_hash=HASH, start_ns=START_NS)
+    sink.append(track)
+    sink.append(truth)
+    sink.finish(REPORT)
+    timed, _ = tables(path)
+    stamps, values = series(timed["/main"], "error_sideslip_deg")
+    shown = [int(t) for t, v in zip(stamps, values, strict=True) if np.isfinite(v[0])]
+    assert shown == track.stamps_ns[[i for i in range(5, 40) if i not in (20, 30)]].tolist()
+
+
+def test_nothing_stands_under_the_final_name_before_finish(tmp_path, circle):
+    path = tmp_path / "out" / "recording.rrd"
+    sink = RerunSink(
+        path,
+        application_id="pdhef-x",
+        shown=SHOWN,
+        log_name="drive",
+        input_hash=HASH,
+        start_ns=START_NS,
+        colours=COLOURS,
+    )
+    sink.append(circle("zero"))
+    assert not path.exists()
+    sink.abort()
+    sink.abort()
+    assert list(path.parent.iterdir()) == []
+    sink = RerunSink(
+        path,
+        application_id="pdhef-x",
+        shown=SHOWN,
+        log_name="drive",
+        input_hash=HASH,
+        start_ns=START_NS,
+        colours=COLOURS,
+    )
+    sink.append(circle("zero"))
+    with pytest.raises(KeyError):
+        sink.finish({})
+    assert list(path.parent.iterdir()) == []
+    sink = RerunSink(
+        path,
+        application_id="pdhef-x",
+        shown=SHOWN,
+        log_name="drive",
+        input_hash=HASH,
+        start_ns=START_NS,
+        colours=COLOURS,
+    )
+    sink.finish(REPORT)
+    sink.abort()
+    assert [p.name for p in path.parent.iterdir()] == ["recording.rrd"]
+
+
+def test_unwritable_place_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="expected a place to write to"):
+        RerunSink(
+            tmp_path / "file" / "recording.rrd",
+            application_id="pdhef-x",
+            shown=SHOWN,
+            log_name="drive",
+            input_hash=HASH,
+            start_ns=START_NS,
+        )
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.results.sink import Shown
+from pdhef_logtool.results.rerun_sink import RerunSink
+try:
+    RerunSink(
+        Path(sys.argv[1]), application_id="x", shown=Shown("zero"), log_name="d", input_hash="ab" * 32, start_ns=0
+    ).abort()
+except OutputError as error:
+    print(error)
+"""
+
+
+def run_script(tmp_path: Path, **env: str) -> str:
+    home = tmp_path / "home"
+    home.mkdir()
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, str(tmp_path / "recording.rrd")],
+        env={**os.environ, "HOME": str(home), "XDG_CONFIG_HOME": "", "XDG_DATA_HOME": "", **env},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    assert not [p for p in home.rglob("*") if "rerun" in p.name or "analytics" in p.name]
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_writing_starts_no_analytics_and_a_switched_off_rerun_is_said(tmp_path):
+    assert "unset RERUN" in run_script(tmp_path, RERUN="off")
+
+
+@pytest.mark.parametrize("call", [0, 1, 3, "close"])
+def test_a_disk_that_is_full_is_told_and_leaves_nothing(tmp_path, circle, circle_signals, monkeypatch, call):
+    class Full(io.BytesIO):
+        calls = 0
+
+        def write(self, data):
+            self.calls += 1
+            if call != "close" and self.calls > call:
+                raise OSError(28, "No space left on device")
+            return len(data)
+
+        def close(self):
+            if call == "close":
+                raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(rerun, "open_new", lambda _path: Full())
+    with pytest.raises(OutputError, match=r"recording\.rrd: .*No space left on device; free some space"):
+        write(tmp_path / "recording.rrd", circle, circle_signals)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recording_without_its_end_is_none(tmp_path, circle, circle_signals, monkeypatch):
+    monkeypatch.setattr("pdhef_logtool.results.sink._RECORDING_END", b"something that Rerun does not write")
+    with pytest.raises(OutputError, match="got one without its end"):
+        write(tmp_path / "recording.rrd", circle, circle_signals)
+    assert list(tmp_path.iterdir()) == []
+
+
+HANGING = """
+import sys, threading
+from pathlib import Path
+import numpy as np
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.tracks import make_track
+from pdhef_logtool.records.tracks import make_track
+from pdhef_logtool.results import rerun_sink as rerun
+from pdhef_logtool.results.sink import Shown
+
+class Hangs:
+    left = int(sys.argv[2])
+    def write(self, data):
+        self.left -= 1
+        if self.left < 0:
+            threading.Event().wait()
+    def close(self):
+        threading.Event().wait()
+
+rerun.LONGEST_WAIT_S = 1.0
+rerun.open_new = lambda path: Hangs()
+try:
+    sink = rerun.RerunSink(
+        Path(sys.argv[1]), application_id="x", shown=Shown("zero"), log_name="d", input_hash="ab" * 32, start_ns=0
+    )
+    for k in range(6):
+        stamps_ns = (np.arange(20000) + 20000 * k) * 10_000_000
+        vy = np.sin(stamps_ns * 1.0)
+        sink.append(make_track("zero", stamps_ns, vx_m_s=10 + vy, vy_m_s=vy, valid=np.ones(20000, dtype=bool)))
+    sink._draw_whole = lambda *_: None
+    sink.finish({})
+except OutputError as error:
+    print(error)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("writes", [0, 5, 1000])
+def test_a_disk_that_hangs_is_given_up_and_the_process_ends(tmp_path, writes):
+    done = subprocess.run(
+        [sys.executable, "-c", HANGING, str(tmp_path / "recording.rrd"), str(writes)],
+        capture_output=True, text=True, check=True, timeout=120,
+    )  # fmt: skip
+    assert "recording.rrd: expected a place to write to, got nothing could be written for 1 s" in done.stdout
+
+
+@pytest.mark.slow
+@settings(max_examples=200, derandomize=True, deadline=None)
+@given(
+    st.lists(st.booleans(), min_size=1, max_size=40),
+    st.lists(st.integers(1, 3 * LONGEST_BRIDGE_NS // 2), min_size=40, max_size=40),
+    st.integers(1, 40),
+)
+def test_line_breaks_do_not_depend_on_windows(known, steps, cut):
+    known_array, cut = np.array(known), min(cut, len(known))
+    stamps = np.cumsum(np.array(steps[: len(known)], dtype=np.int64))
+    whole = _Rows()
+    gaps, bridged = whole.gaps(stamps), whole.bridged("nis", stamps, known_array)
+    parted, found, absent = _Rows(), [], []
+    for part in (slice(0, cut), slice(cut, len(known))):
+        if len(stamps[part]):
+            found += (parted.gaps(stamps[part]) + part.start).tolist()
+            absent += parted.bridged("nis", stamps[part], known_array[part]).tolist()
+            parted.last_ns = int(stamps[part][-1])
+    assert found == gaps.tolist() == (np.flatnonzero(np.diff(stamps) > LONGEST_BRIDGE_NS) + 1).tolist()
+    assert absent == bridged.tolist()
+    for i in np.flatnonzero(~known_array):
+        before = stamps[:i][known_array[:i]]
+        assert bridged[i] == (len(before) == 0 or stamps[i] - before[-1] <= LONGEST_BRIDGE_NS)
+
+
+def test_a_line_breaks_where_nothing_was_recorded(tmp_path, circle):
+    path = tmp_path / "recording.rrd"
+    sink = RerunSink(path, application_id="x", shown=SHOWN, log_name="drive", input_hash=HASH, start_ns=START_NS)
+    sink.append(circle("phy-ukf", 0, 40))
+    sink.append(circle("phy-ukf", 400, 40))
+    sink.finish(REPORT)
+    stamps, values = series(tables(path)[0]["/main"], "vx_m_s")
+    assert stamps[40] == circle("phy-ukf", 0, 40).stamps_ns[-1] + 1 and np.isnan(values[40]).all() and len(stamps) == 81
+
+
+@settings(max_examples=50, derandomize=True, deadline=None)
+@given(st.lists(st.integers(0, 60), min_size=1, max_size=20))
+def test_a_trajectory_stays_small_and_evenly_spaced(lengths):
+    path = _Trajectory(50)
+    total = sum(lengths)
+    points = np.stack([np.arange(total), np.zeros(total)], axis=1).astype(float)
+    for n, end in zip(lengths, np.cumsum(lengths), strict=True):
+        path.append(points[end - n : end])
+    strips = path.strips()
+    if total > 1:
+        (strip,) = strips
+        assert len(strip) <= 50
+        assert strip[0, 0] == 0
+        assert len(set(np.diff(strip[:, 0]))) == 1
+        assert total - strip[-1, 0] <= np.diff(strip[:, 0])[0]
+
+
+def test_of_a_long_drive_ten_rows_a_second_are_drawn_with_the_largest_nis_and_five_of_the_others(tmp_path):
+    n, step_ns = 61_000, 10_000_000
+    stamps = START_NS + np.arange(n) * step_ns
+    nis = np.full(n, np.nan)
+    nis[1::2] = 1.0
+    nis[31_013] = 9.0
+    path = tmp_path / "recording.rrd"
+    sink = RerunSink(
+        path,
+        application_id="x",
+        shown=Shown("zero"),
+        log_name="d",
+        input_hash=HASH,
+        start_ns=START_NS,
+        end_ns=int(stamps[-1]) + 1,
+    )
+    for part in (slice(0, 30_003), slice(30_003, n)):  # a window may end inside of a step
+        speed = np.full(part.stop - part.start, 20.0)
+        for name in ("zero", "zero:no-lateral"):
+            track = make_track(name, stamps[part], vx_m_s=speed, vy_m_s=0 * speed, nis=nis[part])
+            sink.append(track.with_pose(speed, speed, 0 * speed))
+    sink.finish(REPORT)
+    timed, _ = tables(path)
+    assert timed["/main"].num_rows == n // 10
+    assert timed["/other/1"].num_rows == n // 20
+    assert timed["/plan/main/now"].num_rows == pytest.approx(n / 50, abs=1)
+    assert np.nanmax([v[0] for v in series(timed["/main"], "nis")[1]]) == 9.0

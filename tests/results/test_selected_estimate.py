@@ -1,0 +1,150 @@
+"""The answer of a run in words: what it claims, and that it claims nothing that the figures do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from run_report import GNSS, MAIN, MODEL, SHA, TRUTH, errors_deg, figures, report
+
+from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.results.run_report import EstimatorFacts, FrictionFacts, TruthFacts, report_markdown
+from pdhef_logtool.results.selected_estimate import MainFacts
+
+
+def texts(main: MainFacts = MAIN, **changes: Any) -> dict[str, str]:
+    found: dict[str, str] = report(main, **changes)["answer"]["texts"]
+    return found
+
+
+def test_the_result_says_how_good_against_which_truth_and_against_whom() -> None:
+    said = texts(metrics=errors_deg(pd_hef=0.1, physics=0.12, zero=1.0))["result"]
+    assert said == (
+        "Sideslip RMSE of pd-hef: 0.100° (ground truth: /ins), 17% lower than physics (0.120°), "
+        "1/10 of zero sideslip (1.00°)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("own", "said"),
+    [
+        (1.0, "equal to zero sideslip"),
+        (0.99, "equal within 3% to zero sideslip"),
+        (1.5, "50% higher than zero sideslip"),
+        (3.0, "3.0 times zero sideslip"),
+    ],
+)
+def test_an_estimate_that_is_worse_than_none_is_said_to_be_of_no_use(own: float, said: str) -> None:
+    result = texts(metrics=errors_deg(pd_hef=own, zero=1.0))["result"]
+    assert said in result
+    assert ("worse than a constant" in result) == (own > 1.1)
+
+
+@pytest.mark.parametrize(("own", "zero"), [(0.3, 0.0), (0.0, 0.3), (0.0, 0.0)])
+def test_an_error_of_nothing_is_no_division(own: float, zero: float) -> None:
+    result = texts(metrics=errors_deg(pd_hef=own, zero=zero))["result"]
+    assert ("the sideslip of the ground truth is 0 throughout" in result) == (zero == 0.0)
+
+
+def test_a_truth_that_is_an_input_is_no_independent_check() -> None:
+    metrics = errors_deg(pd_hef=0.1)
+    assert (
+        "not an independent check"
+        in texts(metrics=metrics, truth=replace(TRUTH, not_independent=["sideslip_rad"]))["result"]
+    )
+    assert "not an independent check" not in texts(metrics=metrics)["result"]
+
+
+@pytest.mark.parametrize(
+    ("share", "said"),
+    [
+        (1.0, "(nominal 95 %), wider than necessary"),
+        (0.95, "(nominal 95 %) ("),
+        (0.91, "(nominal 95 %), slightly too narrow"),
+        (0.7, "(nominal 95 %), too narrow"),
+    ],
+)
+def test_whether_the_band_holds(share: float, said: str) -> None:
+    band = texts(metrics=[*errors_deg(pd_hef=0.1), *figures(("pd-hef", "sideslip_rad", "coverage95", share))])["band"]
+    assert band.startswith(f"coverage {share:.0%} {said}")
+    assert band.endswith("(intervals calibrated on x)")
+
+
+def test_an_estimator_without_an_interval_has_no_band() -> None:
+    assert texts(replace(MAIN, name="zero"))["band"] == "none: zero states no interval"
+
+
+def test_a_truth_of_gnss_alone_says_why_there_is_no_figure() -> None:
+    said = texts(truth=GNSS, metrics=figures(("pd-hef", "vx_m_s", "rmse", 0.05)))
+    assert "not the heading" in said["result"]
+    assert "v_x 0.05 m/s" in said["result"]
+    assert said["band"].startswith("coverage unknown")
+
+
+@pytest.mark.parametrize(("d2", "proof"), [(0.1, "not a proof"), (0.95, "inconclusive")])
+def test_without_truth_the_consistency_is_put_in_words(d2: float, proof: str) -> None:
+    metrics = figures(
+        ("pd-hef", "vy_m_s", "d2", d2), ("zero", "vy_m_s", "d2", 1.0),
+        ("pd-hef", "state", "nis", 6.0), ("pd-hef", "state", "nis_dof", 2.0),
+    )  # fmt: skip
+    said = texts(truth=TruthFacts(), metrics=metrics)
+    assert "is unknown" in said["result"]
+    assert proof in said["consistency"]
+    assert "NIS per degree of freedom 3.00 (expected value 1): model or noise are wrong" in said["consistency"]
+    assert texts(metrics=metrics)["consistency"] == ""
+
+
+def test_what_was_assumed_of_car_friction_and_network() -> None:
+    assert texts()["assumed"] == (
+        "car golf, validated on drives with ground truth; friction given (option, 0.9); "
+        "residual gain of the network 0.5, from the car's validation data"
+    )
+    unknown = texts(vehicle_file=None, vehicle_proven=False)
+    assert unknown["assumed"].startswith("default sedan (no car given)")
+    assert unknown["next"].startswith("give your car")
+    estimated = FrictionFacts("estimate", estimated=True, observable_share=0.01, summary="observable 1 % of the time")
+    assert "friction estimated (observable 1 %" in texts(friction=estimated)["assumed"]
+    assert "--friction" in texts(friction=estimated)["next"]
+    assert "friction assumed, 1;" in texts(friction=FrictionFacts("assumed, 1"))["assumed"]
+    assert texts(replace(MAIN, name="zero"))["assumed"] == "no vehicle model (zero needs none)"
+
+
+def test_a_calibrated_car_is_said_to_be_and_a_refusal_with_its_reason() -> None:
+    estimators = [EstimatorFacts("pd-hef", causal=False, algorithm={"physics_sha256": SHA, "options": {}})]
+    told = {"refused": None, "logs": 1, "understeer": {"contradicts": True}}
+    said = texts(vehicle_proven=False, estimators=estimators, calibration=told)
+    assert "car golf; calibrated on this log without ground truth, therefore not causal" in said["assumed"]
+    assert "the understeer gradient of the drive contradicts the file" in said["assumed"]
+    said = texts(vehicle_proven=False, calibration={"refused": "too short", "logs": 1, "understeer": None})
+    assert "parameters of its file, not validated; not calibrated on this log: too short" in said["assumed"]
+
+
+def test_the_next_steps_are_few_and_the_most_important_first() -> None:
+    lacking = [
+        EstimatorFacts("physics", causal=True, skipped="the log has no steer_rad"),
+        EstimatorFacts("zero", causal=True),
+    ]
+    said = texts(replace(MAIN, name="zero"), estimators=lacking, vehicle_file=None, vehicle_proven=False)["next"]
+    assert said.startswith("map the missing signals (the log has no steer_rad)")
+    assert said.count("; ") == 1
+    distrusted = replace(MAIN, name="open-loop", chosen_by="d2", why="pd-hef contradicts", distrusted=True)
+    estimators = [EstimatorFacts("open-loop", causal=True, algorithm=MODEL)]
+    said = texts(distrusted, estimators=estimators)
+    assert "pd-hef contradicts" in said["assumed"]
+    assert said["next"].startswith("check the vehicle file")
+    assert texts()["next"] == ""
+
+
+def test_hindsight_is_said_apart_and_chooses_nothing() -> None:
+    answer = report(metrics=errors_deg(pd_hef=0.3, physics=0.2, zero=0.1))["answer"]
+    assert answer["main"] == "pd-hef"
+    assert answer["best_in_hindsight"] == {"name": "zero", "causal": True, "sideslip_rmse_rad": np.deg2rad(0.1)}
+    assert report(truth=TruthFacts())["answer"]["best_in_hindsight"] is None
+
+
+def test_the_words_stand_in_the_markdown() -> None:
+    document = report(metrics=errors_deg(pd_hef=0.1), losses=[Loss("gap", "a gap", "/imu")])
+    text = report_markdown(document)
+    assert all(said in text for said in document["answer"]["texts"].values())

@@ -1,0 +1,122 @@
+"""The verdict of a drive, a sentence a signal: it claims what the interval holds and names why there is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+from run_report import MAIN, TRUTH, errors_deg, report
+
+from pdhef_logtool.evaluation.bootstrap import Interval
+from pdhef_logtool.evaluation.operating_space import Cell
+from pdhef_logtool.evaluation.reasons import Interval as Span
+from pdhef_logtool.evaluation.reasons import SensorFault
+from pdhef_logtool.evaluation.standing import Standing
+from pdhef_logtool.evaluation.thresholds import check_thresholds, thresholds_from_dict
+from pdhef_logtool.results.arrow_schema import load_schema
+from pdhef_logtool.results.run_report import DriveDetails, TruthFacts, tool_versions
+from pdhef_logtool.runs.error_budget import no_budget
+from pdhef_logtool.runs.innovations import ChannelInnovations
+
+NAN = float("nan")
+METRICS = errors_deg(pd_hef=0.1, physics=0.12, zero=1.0)
+
+
+def interval(value: float, low: float = NAN, high: float = NAN) -> Interval:
+    return Interval(*np.deg2rad([value, low, high]).tolist(), blocks=30)
+
+
+def standing(difference: Interval | None, rival: str | None = "physics", own: Interval | None = None) -> Standing:
+    own = own or interval(0.1, 0.09, 0.11)
+    rival_rmse = None if rival is None else float(np.deg2rad(0.12))
+    return Standing("sideslip_rad", "pd-hef", own, rival, rival_rmse, difference, 10.0)
+
+
+def details(*standings: Standing, **changes: Any) -> DriveDetails:
+    empty = DriveDetails([], [], standings, [], no_budget("the log contains no ground truth"), [], {})
+    return replace(empty, **changes)
+
+
+def verdicts(found: DriveDetails, **changes: Any) -> list[dict[str, Any]]:
+    return list(valid(details=found, **{"metrics": METRICS, **changes})["verdicts"])
+
+
+def valid(**facts: Any) -> dict[str, Any]:
+    document = report(MAIN, versions=tool_versions(), **facts)
+    jsonschema.validate({**document, "estimators": []}, load_schema("report.schema.json"))
+    return document
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("difference", "outcome", "said"),
+    [
+        (interval(-0.02, -0.03, -0.01), "better", "17% lower than physics (0.120°): 95 % CI of the difference -0.030"),
+        (interval(0.02, 0.01, 0.03), "worse", "17% higher than physics (0.120°): 95 % CI of the difference"),
+        (interval(-0.02, -0.05, 0.01), "undecided", "17% lower than physics (0.120°), difference not significant: "),
+        (interval(-0.02), "undecided", "17% lower than physics (0.120°), difference not tested"),
+        (interval(0.001, 0.0005, 0.002), "same", "no relevant difference to physics (0.120°)"),
+        (interval(0.0, 0.0, 0.0), "same", "equal to physics (0.120°)"),
+    ],
+)  # fmt: skip
+def test_the_sentence_claims_what_the_interval_holds(difference: Interval, outcome: str, said: str) -> None:
+    first = verdicts(details(standing(difference)))[0]
+    assert (first["signal"], first["outcome"]) == ("sideslip_rad", outcome)
+    assert first["text"].startswith("RMSE of pd-hef: 0.100° (95 % CI 0.090 to 0.110°); " + said)
+
+
+def test_without_a_rival_or_an_interval_that_is_said() -> None:
+    first = verdicts(details(standing(None, None, interval(0.1))))[0]
+    assert first["outcome"] == "alone"
+    assert "no CI: it needs 6 blocks of 10 s" in first["text"]
+    assert first["text"].endswith("no filter without a network ran for comparison")
+    assert first["rmse"]["low"] is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"truth": TruthFacts()}, "the log contains no ground truth"),
+        ({"truth": replace(TRUTH, not_independent=["sideslip_rad"])}, "is an input of the estimator"),
+        ({"truth": replace(TRUTH, quantities=TRUTH.quantities[:2])}, "the ground truth does not contain it"),
+        ({}, "its ground truth and pd-hef are never valid at the same time"),
+    ],
+)
+def test_no_verdict_without_independent_truth_and_why(changes: dict[str, Any], why: str) -> None:
+    first = verdicts(details(), **changes)[0]
+    assert first["outcome"] == "none" and first["rmse"] is None
+    assert first["text"] == f"no verdict: {why}" or why in first["text"]
+
+
+def test_a_truth_that_never_slips_gives_no_verdict() -> None:
+    first = verdicts(details(standing(None)), metrics=errors_deg(pd_hef=0.1, zero=1e-6))[0]
+    assert first["outcome"] == "none" and "0 throughout" in first["text"]
+
+
+def test_thresholds_of_the_answer_are_named_and_those_of_others_are_not() -> None:
+    table = {"signal": "sideslip_rad", "metric": "rmse", "unit": "deg"}
+    limits = thresholds_from_dict(
+        {"threshold": [{**table, "max": 0.105}, {**table, "metric": "max_abs", "max": 0.05}]}, where="x"
+    )
+    rows = [*METRICS, *(replace(r, metric="max_abs") for r in METRICS)]
+    judged = check_thresholds(limits, rows, log="drive")
+    first = verdicts(details(standing(interval(-0.02, -0.03, -0.01)), limits=judged))[0]
+    assert "within the limit sideslip_rad rmse (all) <= 0.105 deg, which lies within the interval" in first["text"]
+    assert "exceeds the limit sideslip_rad max_abs (all) <= 0.05 deg" in first["text"]
+    assert [x["outcome"] for x in first["limits"]] == ["pass", "fail"]
+
+
+def test_the_other_details_follow_the_schema_and_an_older_report_does_without() -> None:
+    fault = SensorFault("ay_m_s2", "spike", 70, 1.0, (Span(1, 2),))
+    channel = ChannelInnovations("physics", "ay_m_s2", "m/s^2", 5, 0.1, 0.2, NAN)
+    cell = Cell(3, 2, 1.5, 0, NAN)
+    found = details(faults=[fault], innovations=[channel], operating_space=[cell], metadata={"vehicle": "a"})
+    document = valid(details=found)
+    assert document["innovations"][0]["autocorrelation"] is None
+    assert document["operating_space"]["cells"][0]["sideslip_mse_rad2"] is None
+    assert valid(details=details(faults=None))["faults"] is None
+    assert "verdicts" not in valid()

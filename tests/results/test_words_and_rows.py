@@ -1,0 +1,189 @@
+"""What the outputs say and hold to the letter, on documents and rows that are written out here."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from pdhef_logtool.evaluation.thresholds import Threshold, Verdict
+from pdhef_logtool.logs.container import Attachment
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.results import run_report as report_module
+from pdhef_logtool.results.junit import junit_bytes
+from pdhef_logtool.results.mcap_sink import _is_our_report
+from pdhef_logtool.results.palette import colour_rgb
+from pdhef_logtool.results.parquet_sink import EstimatesSink, RowGroups
+from pdhef_logtool.results.run_report import diverged_line, json_bytes, report_markdown, tool_versions
+
+SECOND = 10**9
+START_NS = 1_700_000_000 * SECOND
+
+
+@pytest.mark.parametrize("joined", [False, True])
+def test_a_row_group_holds_so_many_rows_of_one_key(tmp_path: Path, joined: bool) -> None:
+    path, schema = tmp_path / "rows.parquet", pa.schema([("key", pa.string()), ("n", pa.int64())])
+    file = RowGroups(path, schema, 50, ["key"], joined=joined)
+    for a in range(0, 120, 30):
+        for key in "ab":
+            file.append(key, pa.table({"key": [key] * 30, "n": range(a, a + 30)}, schema=schema))
+    file.append("a", pa.table({"key": ["a"] * 130, "n": range(120, 250)}, schema=schema))
+    file.finish({"made": "by hand"})
+    whole = pq.ParquetFile(path)
+    groups = [whole.read_row_group(i).to_pydict() for i in range(whole.num_row_groups)]
+    spans = [("".join(sorted(set(g["key"]))), g["n"][0], g["n"][-1]) for g in groups if g["n"]]
+    first = [("a", 0, 49), ("b", 0, 49), ("a", 50, 99), ("b", 50, 99)]
+    assert spans[:4] == first
+    assert spans[4:] == [("a", 100, 149), ("a", 150, 199), ("a", 200, 249), ("b", 100, 119)]
+    assert whole.metadata.metadata[b"made"] == b"by hand"
+
+
+def test_a_place_that_fails_is_told_in_the_callers_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pq, "ParquetWriter", full)
+    with pytest.raises(OutputError, match="No space left"):
+        EstimatesSink(tmp_path / "estimates.parquet")
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "ours"),
+    [
+        ("report.json", b'{"format": "pdhef.report", "version": 1}', True),
+        ("report.json", b'{"format": "theirs"}', False),
+        ("report.json", b'{"by": "someone else"}', False),
+        ("report.json", b'["pdhef.report"]', False),
+        ("report.json", b"no json", False),
+        ("report.json", b"\xff\xfe\x00", False),
+        ("my_report.json", b'{"format": "pdhef.report"}', False),
+    ],
+)
+def test_only_our_own_report_is_replaced(name: str, data: bytes, ours: bool) -> None:
+    assert _is_our_report(Attachment(name, "application/json", data, 0, 0)) is ours
+
+
+def test_colours_are_red_green_blue_and_a_names_own() -> None:
+    assert colour_rgb("phy-ukf", {"phy-ukf": 0x12_34_56}) == (0x12, 0x34, 0x56)
+    assert colour_rgb("truth", {}) == (0x8A, 0x8A, 0x8A)
+    palette = {
+        (0xD5, 0x5E, 0),
+        (0, 0x72, 0xB2),
+        (0xE6, 0x9F, 0),
+        (0, 0x9E, 0x73),
+        (0xCC, 0x79, 0xA7),
+        (0x56, 0xB4, 0xE9),
+    }
+    found = [colour_rgb(f"recorded {i}", {"phy-ukf": 0}) for i in range(40)]
+    assert set(found) == palette
+    assert colour_rgb("recorded 7", {}) == found[7]
+
+
+def test_junit_is_laid_out_for_people_and_a_failure_says_all() -> None:
+    limit = Threshold("sideslip_rad", "rmse", maximum=0.5, unit="deg")
+    verdict = Verdict("a", "zero", limit, "fail", 2.0, -1.5, 10, True, "beyond by 1.5")
+    lines = junit_bytes({"a": [verdict]}).decode().splitlines()
+    assert lines[1].startswith("<testsuites") and lines[3].startswith("    <testcase")
+    said = "a: zero: sideslip_rad rmse (all) &lt;= 0.5 deg: beyond by 1.5"
+    assert lines[4] == f'      <failure message="beyond by 1.5" type="fail">{said}</failure>'
+
+
+def _report(**changes: Any) -> dict[str, Any]:
+    rows = [
+        {"estimator": e, "signal": s, "segment": "all", "metric": m, "value": v, "unit": u, "n": 9}
+        for e in ("smooth", "ukf")
+        for s, m, v, u in (
+            ("vx_m_s", "rmse", 0.25, "m/s"), ("sideslip_rad", "rmse", 0.01, "rad"),
+            ("sideslip_rad", "coverage", 0.9, "1"), ("yaw_rate_rad_s", "rmse", 0.02, "rad/s"),
+        )
+    ]  # fmt: skip
+    base = {
+        "log": {
+            "name": "drive",
+            "file": "d.mcap",
+            "kind": "mcap",
+            "duration_s": 6.04,
+            "sha256": "ab" * 32,
+            "start_ns": START_NS,
+        },
+        "vehicle": {"name": "sedan"},
+        "warnings": ["careful"],
+        "losses": [{"what": "a gap", "where": "/imu"}],
+        "truth": {
+            "available": True,
+            "quantities": [{"name": "vy_m_s", "source": "/ins.v", "samples": 7, "derivation": "moved"}],
+            "latency_s": 0.0125,
+            "not_independent": ["vx_m_s"],
+            "notes": ["smoothed"],
+        },
+        "friction": {"source": "vehicle file, 0.85", "summary": "observable"},
+        "metrics": rows,
+        "segments": [],
+        "estimators": [
+            {"name": "ukf", "causal": True, "reason": None, "notes": ["a", "b"], "reasons": None},
+            {"name": "smooth", "causal": False, "reason": None, "notes": [], "reasons": []},
+        ],
+        "mapping": {
+            "signals": [{"name": "ay_m_s2", "source": "/imu.y", "samples": 600, "derivation": ""}],
+            "missing": ["friction"],
+        },
+        "versions": {"python": "3", "numpy": "2"},
+    }
+    return {**base, **changes}
+
+
+def test_the_report_for_people_is_this() -> None:
+    spans = [
+        {"name": "ukf diverged", "start_ns": START_NS + 5 * SECOND, "end_ns": START_NS + 6 * SECOND, "text": ""},
+        {
+            "name": "ukf diverged",
+            "start_ns": START_NS + 2 * SECOND,
+            "end_ns": START_NS + 2 * SECOND + 250_000_000,
+            "text": "",
+        },
+    ]
+    report = _report(segments=spans)
+    assert report_markdown(report).splitlines() == [
+        "# drive", "", "d.mcap (mcap), 6.0 s, sha256 abababababab; vehicle sedan", "",
+        "## Warnings", "", "- careful", "",
+        "## Losses", "", "- a gap (/imu)", "",
+        "## Truth", "", "- vy_m_s: `/ins.v`, 7 samples; moved", "- latency 12.5 ms",
+        "- not independent of the estimators' inputs: vx_m_s", "- smoothed", "",
+        "Friction: vehicle file, 0.85, observable", "",
+        "## sideslip_rad", "", "| estimator | segment | rmse [deg] | coverage |", "| --- | --- | ---: | ---: |",
+        "| ukf | all | 0.573 | 0.9 |", "| smooth (not causal) | all | 0.573 | 0.9 |", "",
+        "## vx_m_s", "", "| estimator | segment | rmse [m/s] |", "| --- | --- | ---: |",
+        "| ukf | all | 0.25 |", "| smooth (not causal) | all | 0.25 |", "",
+        "## yaw_rate_rad_s", "", "| estimator | segment | rmse [deg/s] |", "| --- | --- | ---: |",
+        "| ukf | all | 1.146 |", "| smooth (not causal) | all | 1.146 |", "",
+        "## Estimators", "",
+        "- **ukf** (causal): a; b; diverged for 1.25 s in 2 intervals, first at 2.00 s",
+        "- **smooth** (not causal)", "",
+        "## Signals", "", "- ay_m_s2: `/imu.y`, 600 samples", "- friction: missing", "",
+        "Versions: numpy 2, python 3",
+    ]  # fmt: skip
+    assert diverged_line({**report, "segments": spans[:1]}, "ukf") == "diverged for 1.00 s, first at 5.00 s"
+    assert diverged_line(report, "smooth") == ""
+    plain = report_markdown(_report(warnings=[], losses=[], friction={"source": "none", "summary": ""}))
+    assert "Friction: none\n" in plain and "Warnings" not in plain and "Losses" not in plain
+    assert "Friction" not in report_markdown(_report(friction=None))
+
+
+def test_versions_are_those_that_are_installed_and_json_is_the_same_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = tool_versions()
+    assert found["numpy"] == importlib.metadata.version("numpy") and "python" in found
+
+    def absent(name: str) -> str:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", absent)
+    report_module._installed.cache_clear()
+    assert list(tool_versions()) == ["python"]
+    report_module._installed.cache_clear()
+    assert json_bytes({"b": "µ", "a": [float("nan")]}) == '{\n  "a": [\n    null\n  ],\n  "b": "µ"\n}\n'.encode()
+    assert json.loads(json_bytes({"a": 1})) == {"a": 1}

@@ -1,0 +1,112 @@
+"""Every number of a log, the way to a mapping by question and answer, and what a log is good for."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from pdhef_logtool.mapping import Mapping, SignalSource, load_mapping
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.runs.inspection import (
+    ask_mapping,
+    fields_of_log,
+    inspect_log,
+    render_fields,
+    render_inspection,
+    write_mapping,
+)
+from pdhef_logtool.runs.inspection.uses import uses_of
+
+
+def text_of(render: object, found: object, width: int = 80) -> str:
+    out = io.StringIO()
+    render(found, Console(file=out, width=width, highlight=False))  # type: ignore[operator]
+    return out.getvalue()
+
+
+def sources(*names: str) -> dict[str, SignalSource]:
+    return {n: SignalSource(n, "/t", n) for n in names}
+
+
+def test_covariances_do_not_hide_the_gyro(sample_logs_dir: Path) -> None:
+    found = fields_of_log(sample_logs_dir / "dlc.mcap", "/imu/data")
+    (topic,) = found.topics
+    paths = [f.path for f in topic.fields]
+    assert "angular_velocity.z" in paths
+    assert sum("covariance" in p for p in paths) == 3
+    gravity = next(f for f in topic.fields if f.path == "linear_acceleration.z")
+    assert gravity.type == "float64"
+    assert gravity.minimum <= gravity.mean <= gravity.maximum
+    assert found.whole
+    text = text_of(render_fields, found)
+    assert max(map(len, text.splitlines()[1:])) <= 80
+    json.dumps(found.to_dict(), allow_nan=False)
+
+
+def test_all_topics_are_listed_and_a_wrong_one_is_refused(sample_logs_dir: Path) -> None:
+    found = fields_of_log(sample_logs_dir / "dlc.mcap")
+    assert len(found.topics) > 5
+    with pytest.raises(UsageError, match="topics: "):
+        fields_of_log(sample_logs_dir / "dlc.mcap", "/imu")
+
+
+@pytest.mark.parametrize(
+    ("signals", "truth", "can", "needs"),
+    [
+        ((), (), "list its topics", "a steering angle, a lateral acceleration, a yaw rate, a speed or wheel speeds"),
+        (("ay_m_s2", "yaw_rate_rad_s", "speed_m_s"), (), "run zero", "a steering angle"),
+        (
+            ("steering_wheel_rad", "ay_m_s2", "yaw_rate_rad_s", "wheel_speed_rl_rad_s"),
+            (),
+            "without ground truth it has no score",
+            "",
+        ),
+        (("steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"), ("vx_m_s", "vy_m_s"), "and score it", ""),
+        (("steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"), ("lat_deg", "lon_deg"), "contains no sideslip", ""),
+    ],
+)
+def test_what_a_log_is_good_for(signals: tuple[str, ...], truth: tuple[str, ...], can: str, needs: str) -> None:
+    uses = uses_of(Mapping(sources(*signals), sources(*truth)))
+    assert can in uses["can"]
+    assert uses["sideslip_needs"] == needs
+
+
+@pytest.mark.slow
+def test_inspect_ends_with_what_can_be_done(sample_logs_dir: Path, shared_dir: Path) -> None:
+    assert "Possible uses of this log: estimate sideslip" in text_of(
+        render_inspection, inspect_log(sample_logs_dir / "dlc.mcap"), 200
+    )
+    dart = inspect_log(shared_dir / "reader_corpus" / "dart_ros1" / "4_sept_random_driving_fast.bag")
+    text = text_of(render_inspection, dart, 200)
+    assert "sideslip estimation still needs: a lateral acceleration, a yaw rate" in text
+    assert "pdhef map LOG" in text
+
+
+@pytest.mark.slow
+def test_doubtful_candidates_stand_in_the_file_as_comments(shared_dir: Path, tmp_path: Path) -> None:
+    found = inspect_log(shared_dir / "reader_corpus" / "dart_ros1" / "4_sept_random_driving_fast.bag")
+    write_mapping(found, tmp_path / "m.toml")
+    text = (tmp_path / "m.toml").read_text()
+    assert "undecided: /steering_angle_1.data is taken" in text
+    assert '# topic = "/steering_1"' in text
+    assert "score 0." in text
+    assert set(load_mapping(tmp_path / "m.toml").signals) == {"steer_rad"}
+
+
+def test_a_mapping_by_question_and_answer(shared_dir: Path) -> None:
+    found = inspect_log(shared_dir / "data" / "drives" / "lunda_v40")
+    said: list[str] = []
+    answers = iter(
+        ["", "1", "nonsense", "/vbox y_accel_g", "/vbox/sample y_accel_g -9.81", "-", "", "", "", "", "", ""]
+    )
+    mapping = ask_mapping(found, lambda _: next(answers), said.append)
+    assert mapping.signals["steering_wheel_rad"] == found.mapping.signals["steering_wheel_rad"]
+    assert mapping.signals["yaw_rate_rad_s"].field == "yaw_rate_gnss_deg_s"
+    assert mapping.signals["ay_m_s2"] == SignalSource("ay_m_s2", "/vbox/sample", "y_accel_g", scale=-9.81)
+    assert "ax_m_s2" not in mapping.signals
+    assert said[-1] == "sideslip estimation needs no further signal"
+    assert any("*" in line and "steer_ang_deg" in line for line in said)

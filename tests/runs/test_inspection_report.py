@@ -1,0 +1,243 @@
+"""The whole inspection: what it reports of a log, as record, as JSON, as tables and as a mapping to edit."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_drive_log import FakeLog, FakeTopic
+from rich.console import Console
+
+from pdhef_logtool.mapping import Mapping, SignalSource, load_mapping
+from pdhef_logtool.records.errors import MappingError, OutputError
+from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.runs.inspection import inspect_drive_log, inspect_log, render_inspection, write_mapping
+from pdhef_logtool.runs.inspection.report import WINDOW_NS
+from pdhef_logtool.runs.inspection.step_statistics import ValueStatistics
+
+T0 = 1_700_000_000_000_000_000
+MAPPINGS = Path(__file__).parents[1] / "reference" / "mappings"
+
+
+def small_log(n: int = 3000, period_ms: int = 10) -> FakeLog:
+    """An IMU with a gap of 1.51 s after 10 s, a late publisher, and a vendor topic that nobody recognises."""
+    stamps = T0 + np.arange(n, dtype=np.int64) * period_ms * 1_000_000
+    stamps[1001:] += 1_500_000_000
+    rng = np.random.default_rng(0)
+    imu = FakeTopic(
+        "sensor_msgs/msg/Imu",
+        stamps + 3_000_000,
+        {
+            "header.stamp": stamps,
+            "linear_acceleration.x": rng.normal(size=n),
+            "linear_acceleration.y": rng.normal(2.0, 3.0, size=n),
+            "angular_velocity.z": rng.normal(size=n),
+        },
+        publish_time_ns=stamps + 1_000_000,
+    )
+    imu.fields["linear_acceleration.y"][5] = np.nan
+    vendor = FakeTopic("vendor_msgs/msg/Box", stamps[::10] + 3_000_000, {"speed_kmh": np.full(len(stamps[::10]), 50.0)})
+    lost = (Loss("truncated", "the file ends early", "memory.mcap", start_ns=int(stamps[-1])),)
+    return FakeLog({"/imu": imu, "/vendor": vendor}, lost=lost)
+
+
+def text_of(inspection: object, width: int) -> str:
+    out = io.StringIO()
+    render_inspection(inspection, Console(file=out, width=width, no_color=True))  # type: ignore[arg-type]
+    return out.getvalue()
+
+
+def test_topics_are_measured() -> None:
+    log = small_log()
+    found = inspect_drive_log(log)
+    imu = next(t for t in found.topics if t.name == "/imu")
+    assert (imu.messages, imu.type, imu.encoding) == (3000, "sensor_msgs/msg/Imu", "cdr")
+    assert imu.rate_hz == pytest.approx(100.0)
+    assert imu.jitter_p95_s == pytest.approx(0.0, abs=1e-9)
+    assert imu.largest_gap_s == pytest.approx(1.51)
+    assert imu.largest_gap_at_s == pytest.approx(10.0)
+    assert imu.delay_median_s == pytest.approx(0.002)
+    assert imu.delay_negative_share == 0.0
+    assert imu.delay_drift_ppm == pytest.approx(0.0, abs=1e-3)
+    assert found.duration_s == pytest.approx(31.49, abs=1e-6)
+
+
+def test_signals_are_measured() -> None:
+    log = small_log()
+    found = inspect_drive_log(log)
+    ay = found.signals["ay_m_s2"]
+    values = log.contents["/imu"].fields["linear_acceleration.y"]
+    good = values[np.isfinite(values)]
+    assert (ay.topic, ay.field, ay.samples, ay.gaps, ay.dropped) == (
+        "/imu",
+        "linear_acceleration.y",
+        2999,
+        1,
+        {"nan": 1},
+    )
+    assert [ay.mean, ay.std, ay.minimum, ay.maximum] == pytest.approx([good.mean(), good.std(), good.min(), good.max()])
+    assert ay.latency_s == pytest.approx(0.003)
+    assert found.signals["ax_m_s2"].dropped == {}
+    assert found.missing == ("steer_rad", "speed_m_s")
+    assert [(x.kind, x.severity) for x in found.lost] == [("truncated", "lost"), ("nan", "lost")]
+    assert found.is_partial
+
+
+def test_windows_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = inspect_drive_log(small_log()).to_dict()
+    monkeypatch.setattr("pdhef_logtool.runs.inspection.report.WINDOW_NS", WINDOW_NS // 200)
+    parts = inspect_drive_log(small_log()).to_dict()
+    assert list(whole) == list(parts)
+    for section in ("topics", "signals", "lost"):
+        a, b = whole[section], parts[section]
+        rows = zip(a.values(), b.values(), strict=True) if isinstance(a, dict) else zip(a, b, strict=True)
+        for mine, theirs in rows:
+            for key, value in mine.items():
+                assert theirs[key] == (pytest.approx(value) if isinstance(value, float) else value), key
+
+
+def test_json_holds_no_nan() -> None:
+    document = inspect_drive_log(small_log()).to_dict()
+    again = json.loads(json.dumps(document, allow_nan=False))
+    assert {"topics", "signals", "lost"} <= set(again)
+    assert {"name", "type", "encoding", "messages"} <= set(again["topics"][0])
+    assert again["topics"][1]["fields"] == ["speed_kmh"]
+
+
+def test_a_mapping_that_does_not_fit_is_an_error() -> None:
+    mapping = Mapping(signals={"speed_m_s": SignalSource("speed_m_s", "/vendor", "speed_kph")})
+    with pytest.raises(MappingError, match="speed_kmh"):
+        inspect_drive_log(small_log(), mapping)
+
+
+def test_an_empty_log_is_reported() -> None:
+    found = inspect_drive_log(FakeLog({}))
+    assert found.topics == ()
+    json.dumps(found.to_dict(), allow_nan=False)
+    assert "missing" in text_of(found, 80)
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_tables_fit_and_say_what_matters(width: int) -> None:
+    text = text_of(inspect_drive_log(small_log()), width)
+    assert max(len(line) for line in text.splitlines()) <= width
+    for part in (
+        "/imu",
+        "sensor_msgs/Imu",
+        "/vendor",
+        "1.51 @ 10.0",
+        "yaw_rate_rad_s",
+        "linear_acceleration.y",
+        "steer_rad",
+    ):
+        assert part in text, part
+    assert "lost" in text
+    assert "the file ends early" in text
+
+
+def test_brackets_in_names_are_no_markup() -> None:
+    log = small_log()
+    log.contents["/odd[red]name[/]"] = log.contents.pop("/vendor")
+    assert "/odd[red]name[/]" in text_of(inspect_drive_log(log), 120)
+
+
+def test_the_written_mapping_loads_and_names_the_candidates(tmp_path: Path) -> None:
+    found = inspect_drive_log(small_log())
+    path = tmp_path / "m.toml"
+    write_mapping(found, path)
+    again = load_mapping(path)
+    assert again.signals == found.mapping.signals
+    text = path.read_text()
+    assert "# [signals.speed_m_s]" in text
+    assert "/vendor (vendor_msgs/msg/Box): speed_kmh" in text
+    assert "# sensor_msgs/msg/Imu, 100 Hz, " in text
+    assert [p.name for p in tmp_path.iterdir()] == ["m.toml"]
+
+
+def test_a_mapping_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError) as caught:
+        write_mapping(inspect_drive_log(small_log()), tmp_path / "file" / "m.toml")
+    assert "\n" not in str(caught.value)
+    write_mapping(inspect_drive_log(small_log()), tmp_path / "none" / "m.toml")
+    assert (tmp_path / "none" / "m.toml").is_file()
+
+
+# --------------------------------------------------------------------------------------------- real drives
+
+
+@pytest.mark.parametrize(
+    ("file", "mapping_name"),
+    [
+        ("revs_250lm_a.mcap", None),
+        ("f1tenth_xray_run24.bag", "f1tenth"),
+        ("comma2k19_segment.mcap", "comma2k19"),
+        ("lunda_v40", "lunda_v40"),
+    ],
+)
+def test_recorded_drives(shared_dir: Path, file: str, mapping_name: str | None) -> None:
+    mapping = load_mapping(MAPPINGS / f"{mapping_name}.toml") if mapping_name else None
+    found = inspect_log(shared_dir / "data" / "drives" / file, mapping)
+    assert found.missing == ()
+    failed = {c.name for c in found.checks if c.verdict == "failed"}
+    assert failed == ({"truth.sideslip_rad.offset"} if mapping_name == "comma2k19" else set())
+    assert not found.is_partial
+    assert found.truth
+    json.dumps(found.to_dict(), allow_nan=False)
+    text = text_of(found, 80)
+    assert max(len(line) for line in text.splitlines()[1:]) <= 80  # The path stands on a line of its own.
+
+
+@pytest.mark.slow
+def test_a_log_with_a_dropout_and_losses(shared_dir: Path) -> None:
+    found = inspect_log(shared_dir / "data" / "drives" / "faulty" / "revs_250lm_a_disorder.mcap")
+    imu = next(t for t in found.topics if t.name == "/imu/data")
+    assert imu.largest_gap_s == pytest.approx(30.01, abs=0.02)
+    assert imu.largest_gap_at_s == pytest.approx(135.0, abs=0.1)
+    assert found.signals["ay_m_s2"].dropped == {"nan": 2, "duplicate-stamp": 20}
+    # The truth of the same name has lost nothing.
+    assert found.truth["yaw_rate_rad_s"].dropped == {}
+    assert found.is_partial
+
+
+def test_fields_of_vendor_messages_are_candidates(shared_dir: Path, tmp_path: Path) -> None:
+    found = inspect_log(shared_dir / "data" / "drives" / "lunda_v40")
+    assert found.missing == ()
+    assert found.signals["steering_wheel_rad"].field == "steer_ang_deg"
+    write_mapping(found, tmp_path / "m.toml")
+    assert "steer_ang_deg" in (tmp_path / "m.toml").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["dlc", "sweep", "road"])
+def test_simulated_drives_need_no_mapping(sample_logs_dir: Path, name: str) -> None:
+    found = inspect_log(sample_logs_dir / f"{name}.mcap")
+    assert found.missing == ()
+    assert found.ambiguities == ()
+    assert not [c for c in found.checks if c.verdict == "failed"]
+    assert found.lost == ()
+    text = text_of(found, 80)
+    assert max(len(line) for line in text.splitlines()[1:]) <= 80
+    assert "wheel_speed_fl_m_s " in text
+    assert "pose.pose.orientation.{w,x,y,z}" in text_of(found, 110)
+
+
+@pytest.mark.slow
+def test_signal_and_truth_of_one_name_keep_their_own_comments(shared_dir: Path, tmp_path: Path) -> None:
+    write_mapping(inspect_log(shared_dir / "data" / "drives" / "f1tenth_hoons_run2.bag"), tmp_path / "m.toml")
+    lines = (tmp_path / "m.toml").read_text().splitlines()
+    above = {line.split("]")[0]: lines[i - 1] for i, line in enumerate(lines) if line.startswith("[")}
+    assert "Imu" in above["[signals.yaw_rate_rad_s"]
+    assert "TwistStamped" in above["[truth.yaw_rate_rad_s"]
+
+
+def test_statistics_of_values_that_are_no_measurements_overflow_in_silence() -> None:
+    statistics = ValueStatistics()
+    for window in ([1.0, 2.0], [1e300, -1e300], [1e308, 1e308]):
+        statistics.add(np.array(window))
+    assert statistics.count == 6
+    assert (statistics.low, statistics.high) == (-1e300, 1e308)
+    assert not np.isfinite(statistics.std)

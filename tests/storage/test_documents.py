@@ -1,0 +1,301 @@
+"""Every document that is read: whatever stands in it, a valid record or one line that says why not."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.car.car import SHIPPED_CARS, Car, load_intervals
+from pdhef_logtool.car.toml_files import load_vehicle
+from pdhef_logtool.evaluation.thresholds import load_thresholds
+from pdhef_logtool.mapping import Mapping, SignalSource, load_mapping
+from pdhef_logtool.records.errors import PdhefError, UsageError, VehicleError
+from pdhef_logtool.residual_model.bundle import DOCUMENT_FILE, SHIPPED_FOLDERS, WEIGHTS_FILE, load_network
+from pdhef_logtool.residual_model.linear_model import LinearModel, load_linear_model
+from pdhef_logtool.runs.config import load_config
+from pdhef_logtool.runs.journal import digest_of
+from pdhef_logtool.storage.documents import MAX_DEPTH, digest, read_json, read_sealed, read_toml, seal, unknown
+
+SHIPPED, CAR = SHIPPED_FOLDERS["default"], SHIPPED_CARS["saloon"]
+VALID_CONFIG = {
+    "estimators": ["zero"],
+    "car": "car.toml",
+    "start": 3,
+    "end": "end-2s",
+    "friction": 0.5,
+    "window_s": 60.0,
+    "network": "none",
+    "annotate": "full",
+}
+VALID_MAPPING = {
+    "signals": {"ax_m_s2": {"topic": "/imu", "field": "x", "scale": 9.81, "stamp": "t", "latency_s": 0.1}},
+    "truth": {"ecef_position_m": {"topic": "/gnss", "field": ["x", "y", "z"], "scale": [1.0, 1.0, 1.0]}},
+    "truth_quality": {"topic": "/gnss", "field": "mode", "values": [4]},
+    "estimates": {"mine": {"vy_m_s": {"topic": "/filter", "field": "vy"}}},
+    "can": {"dbc": ["car.dbc"], "bus": 1, "bus_field": "bus"},
+    "fill_recognised": True,
+}
+VALID_FIT = {
+    "format": "pdhef-fit",
+    "version": 1,
+    "physics_sha256": "ab" * 32,
+    "values": {"friction": 0.9, "sensors": {"ay_bias_m_s2": 0.01, "yaw_rate_bias_rad_s": 0.0}},
+    "filter": {"phy-ukf:tuned": {"q_std": [0.1, 0.1, 0.1], "r_std": {"ay_m_s2": 1.0}}},
+    "drives": [{"name": "lap", "sha256": "cd", "start_s": 0.0, "end_s": 9.5}],
+    "scores": {"lap": {"rmse": 0.2}},
+}
+VALID_THRESHOLDS = {"threshold": [{"signal": "sideslip_rad", "metric": "rmse", "max": 0.5, "unit": "deg"}]}
+
+
+class Loader(NamedTuple):
+    name: str
+    load: Callable[[Path], object]
+    valid: dict[str, Any]
+
+
+def _model(path: Path) -> object:
+    if not (path.parent / WEIGHTS_FILE).is_file():
+        shutil.copy(SHIPPED / WEIGHTS_FILE, path.parent)
+    return load_network(path.parent, "residual_rates")
+
+
+def _part(path: Path) -> object:
+    """Read the car that this part stands in."""
+    shutil.copy(CAR / "vehicle.toml", path.parent)
+    return Car.load(path.parent, network="none", intervals="none")
+
+
+LOADERS = [
+    Loader("pdhef.toml", lambda path: load_config(path, {}), VALID_CONFIG),
+    Loader("mapping.toml", load_mapping, VALID_MAPPING),
+    Loader("thresholds.toml", load_thresholds, VALID_THRESHOLDS),
+    Loader("vehicle.toml", load_vehicle, tomllib.loads((CAR / "vehicle.toml").read_text())),
+    Loader("fit.toml", _part, VALID_FIT),
+    Loader("noise.toml", _part, tomllib.loads((CAR / "noise.toml").read_text())),
+    Loader("network.toml", _part, tomllib.loads((CAR / "network.toml").read_text())),
+    Loader("intervals.json", load_intervals, json.loads((CAR / "intervals.json").read_text())),
+    Loader(DOCUMENT_FILE, _model, json.loads((SHIPPED / DOCUMENT_FILE).read_text())),
+    Loader(
+        "regression.json",
+        load_linear_model,
+        json.loads((SHIPPED / "baselines" / "linear-regression.json").read_text()),
+    ),
+]
+every_loader = pytest.mark.parametrize("loader", LOADERS, ids=lambda loader: loader.name)
+every_toml = pytest.mark.parametrize("loader", LOADERS[:7], ids=lambda loader: loader.name)
+
+
+def to_toml(value: Any, top: bool = False) -> str:
+    if top:
+        return "".join(f"{json.dumps(k, ensure_ascii=False)} = {to_toml(v)}\n" for k, v in value.items())
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(k, ensure_ascii=False)} = {to_toml(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(to_toml(v) for v in value) + "]"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    return str(value).lower()  # true, 1e+300, nan and inf are TOML
+
+
+def write(path: Path, document: Any) -> Path:
+    path.write_text(json.dumps(document) if path.suffix == ".json" else to_toml(document, top=True), encoding="utf-8")
+    return path
+
+
+def outcome(loader: Loader, path: Path) -> str:
+    """Return the line of a refused document, empty for one that is taken; anything else fails the test."""
+    try:
+        loader.load(path)
+    except PdhefError as error:
+        text = str(error)
+        assert len(text.splitlines()) == 1
+        assert path.name in text or "options" in text or "--" in text or path.name == DOCUMENT_FILE
+        return text
+    return ""
+
+
+texts = st.text(st.characters(exclude_categories=["Cs", "Cc"]), max_size=8)
+scalars = st.booleans() | st.integers() | st.floats() | texts | st.sampled_from(["none", "zero", "ay_m_s2", "1.0"])
+
+
+def documents(keys: list[str]) -> st.SearchStrategy[Any]:
+    names = st.sampled_from(keys) | texts
+
+    def deeper(inner: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
+        return st.lists(inner, max_size=4) | st.dictionaries(names, inner, max_size=4)
+
+    return st.recursive(scalars, deeper, max_leaves=8)
+
+
+def keys_of(document: Any) -> list[str]:
+    if isinstance(document, dict):
+        return [*document, *(k for v in document.values() for k in keys_of(v))]
+    return [k for v in document for k in keys_of(v)] if isinstance(document, list) else []
+
+
+def changed(data: st.DataObject, document: Any, anything: st.SearchStrategy[Any]) -> Any:
+    """Return a copy with one place replaced, added or taken away."""
+    if isinstance(document, dict) and document:
+        key = data.draw(st.sampled_from(sorted(document)))
+        match data.draw(st.sampled_from(["deeper", "deeper", "gone", "more"])):
+            case "gone":
+                return {k: v for k, v in document.items() if k != key}
+            case "more":
+                return {**document, data.draw(texts): data.draw(anything)}
+        return {**document, key: changed(data, document[key], anything)}
+    if isinstance(document, list) and document and data.draw(st.booleans()):
+        return [changed(data, document[0], anything), *document[1:]]
+    return data.draw(anything)
+
+
+@every_loader
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(data=st.data())
+@pytest.mark.slow
+def test_any_document_is_a_record_or_one_line(
+    loader: Loader, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    folder = tmp_path_factory.getbasetemp() / loader.name
+    folder.mkdir(exist_ok=True)
+    anything = documents(keys_of(loader.valid))
+    document = changed(data, loader.valid, anything)
+    if loader.name.endswith(".toml") and not isinstance(document, dict):
+        document = {"": document}
+    outcome(loader, write(folder / loader.name, document))
+
+
+@every_loader
+def test_the_document_that_the_others_are_made_of_is_taken(loader: Loader, tmp_path: Path) -> None:
+    assert outcome(loader, write(tmp_path / loader.name, loader.valid)) == ""
+
+
+@every_loader
+def test_what_cannot_be_read_is_one_line(loader: Loader, tmp_path: Path) -> None:
+    path = tmp_path / loader.name
+    # A car needs none of its parts.
+    assert ("no such file" in outcome(loader, path)) == (loader.load is not _part)
+    path.write_bytes(b"\xff\xfe\x00")
+    assert "utf-8" in outcome(loader, path)
+    path.write_text("= ][")
+    assert outcome(loader, path)
+    path.unlink()
+    path.mkdir()
+    assert "directory" in outcome(loader, path) or loader.name == "intervals.json"
+
+
+@every_loader
+@pytest.mark.parametrize("depth", [MAX_DEPTH + 1, 100_000])
+def test_deep_nesting_is_one_line(loader: Loader, tmp_path: Path, depth: int) -> None:
+    path = tmp_path / loader.name
+    nested = "[" * depth + "]" * depth
+    path.write_text(f'{{"a": {nested}}}' if path.suffix == ".json" else f"a = {nested}")
+    assert "too deeply" in outcome(loader, path)
+
+
+@every_toml
+def test_deep_tables_that_the_parser_takes_are_one_line(loader: Loader, tmp_path: Path) -> None:
+    path = tmp_path / loader.name
+    path.write_text(".".join("a" * 1000) + " = 1\n")
+    assert "too deeply" in outcome(loader, path)
+
+
+@every_toml
+@pytest.mark.parametrize("number", ["1" + "0" * 5000, "0x" + "f" * 5000, "1" + "0" * 30])
+def test_numbers_without_end_are_one_line(loader: Loader, tmp_path: Path, number: str) -> None:
+    path = tmp_path / loader.name
+    path.write_text(f"a = {number}\n")
+    assert outcome(loader, path)
+
+
+@pytest.mark.parametrize("loader", LOADERS[7:], ids=lambda loader: loader.name)
+@pytest.mark.parametrize("document", [[], [1], "text", 3, None, True])
+def test_json_that_is_no_object_is_one_line(loader: Loader, tmp_path: Path, document: Any) -> None:
+    assert f"a {type(document).__name__} instead of named entries" in outcome(
+        loader, write(tmp_path / loader.name, document)
+    )
+
+
+def test_nesting_up_to_the_limit_is_read(tmp_path: Path) -> None:
+    depth = MAX_DEPTH - 1
+    nested = "[" * depth + "]" * depth
+    (tmp_path / "a.toml").write_text(f"a = {nested}")
+    (tmp_path / "a.json").write_text(f'{{"a": {nested}, "n": {2**64 - 1}}}')
+    assert list(read_toml(tmp_path / "a.toml", "a file", UsageError)) == ["a"]
+    assert read_json(tmp_path / "a.json", "a file", UsageError)["n"] == 2**64 - 1
+
+
+def test_a_sealed_document_is_read_as_it_was_written_or_not_at_all(tmp_path: Path) -> None:
+    path, document = tmp_path / "own.json", {"a": [1, 0.1, None, "é"], "b": {"c": True}}
+    data = json.dumps(seal(document)).encode()
+    path.write_bytes(data)
+    assert read_sealed(path, "ours", UsageError) == document
+    for at in range(len(data)):
+        for damaged in (data[:at], data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]):
+            path.write_bytes(damaged)
+            with pytest.raises(UsageError, match=r"own\.json: expected ours"):
+                read_sealed(path, "ours", UsageError)
+    path.write_text(json.dumps(document))
+    with pytest.raises(UsageError, match="not as it was written"):
+        read_sealed(path, "ours", UsageError)
+
+
+def test_errors_say_what_was_wanted_where_and_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(VehicleError, match=r"none\.toml: expected a car, got no such file; write one"):
+        read_toml(tmp_path / "none.toml", "a car", VehicleError, "write one")
+
+
+def test_the_nearest_name_is_told() -> None:
+    known = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
+    assert unknown("ay", known, "r_std") == "r_std.ay: unknown, did you mean r_std.ay_m_s2?"
+    assert unknown("yaw_rate_rads", known) == "yaw_rate_rads: unknown, did you mean yaw_rate_rad_s?"
+    assert unknown("", known, "r_std") == "r_std: unknown, known are ay_m_s2, yaw_rate_rad_s, speed_m_s"
+    assert unknown("zzz", known).endswith("known are ay_m_s2, yaw_rate_rad_s, speed_m_s")
+
+
+@pytest.mark.parametrize(
+    ("loader", "line", "said"),
+    [
+        (LOADERS[0], 'estimater = ["zero"]', "estimater: unknown, did you mean estimators?"),
+        (LOADERS[0], "windows_s = 3", "windows_s: unknown, did you mean window_s?"),
+        (LOADERS[1], "fill_recognized = true", "fill_recognized: unknown, did you mean fill_recognised?"),
+        (LOADERS[1], "truth_quallity = {}", "truth_quallity: unknown, did you mean truth_quality?"),
+        (
+            LOADERS[1],
+            "truth_quality = {tropic = 3}",
+            "truth_quality.tropic: unknown, did you mean truth_quality.topic?",
+        ),
+        (LOADERS[1], "can = {dbcs = 'a'}", "can.dbcs: unknown, did you mean can.dbc?"),
+        (
+            LOADERS[1],
+            "[estimates.mine.vy_ms]\ntopic = '/a'",
+            "estimates.mine.vy_ms: unknown, did you mean estimates.mine.vy_m_s?",
+        ),
+        (LOADERS[2], "[[threshold]]\nmaks = 3", "threshold[0].maks: unknown, did you mean threshold[0].max?"),
+        (LOADERS[2], "[[thresholds]]\nmax = 3", "thresholds: unknown, did you mean threshold?"),
+        (LOADERS[3], "mass = 1440.0", "mass: unknown, did you mean mass_kg?"),
+        (LOADERS[3], "[sensors]\nay_std = 1.0", "sensors.ay_std: unknown, did you mean sensors.ay_std_m_s2?"),
+        (LOADERS[3], "[tyres.front]\nD = 1.0", "tyres.front.D: unknown, did you mean tyres.front.D_n?"),
+    ],
+)
+def test_misspelt_entries_are_told_with_the_nearest_name(loader: Loader, line: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / loader.name).write_text(line)
+    assert said in outcome(loader, tmp_path / loader.name)
+
+
+def test_hashes_that_stand_in_files_stay_what_they_were() -> None:
+    """Of version 0.2.0: journals, caches, datasets and cars name by them what they rest on."""
+    document = {"b": [1, 2.5, None, True], "a": {"ü\udc80": "/", "": (1e-9, 1e22)}}
+    assert digest(document) == "67b92e78790c0c9feafdf6c5b26ff7e18525bc442921e21ed792a5d1dbcc28d6"
+    assert digest_of(document) == "67b92e78790c0c9f"
+    mapping = Mapping({"speed_m_s": SignalSource("speed_m_s", "/can", "speed", scale=0.5)})
+    assert mapping.sha256 == "95bc15effd8048a668853de7ce24f1e84c771acd8e1692d120c193d57d689937"
+    linear = LinearModel(("ay_m_s2",), (0.5,), 0.25, 2.0)
+    assert linear.sha256 == "47076088d4172941685a059bf407bb89750dff940ccc307b7ca6278cb1868aed"

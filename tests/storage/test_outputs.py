@@ -1,0 +1,362 @@
+"""A folder that one command holds, changes to it that happen whole or not at all, and outputs that are no inputs."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pdhef_logtool.records.errors import OutputError, UsageError
+from pdhef_logtool.records.processes import is_alive, own_name
+from pdhef_logtool.storage import outputs
+from pdhef_logtool.storage.files import PendingFile, scratch_folder, write_bytes
+from pdhef_logtool.storage.outputs import LOCK_FILE, FolderLock, FolderTransaction, OutputFolder, check_no_input
+
+OLD = {"a.txt": "old a", "b.txt": "old b"}
+
+
+def make(folder: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+
+
+def texts(folder: Path) -> dict[str, str]:
+    return {p.relative_to(folder).as_posix(): p.read_text() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture(params=[True, False], ids=["exchange", "renames"])
+def exchange(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+    if not request.param:
+        monkeypatch.setattr(outputs, "_exchanged", lambda *_: False)
+    return bool(request.param)
+
+
+# ------------------------------------------------------------------------------------------------ transactions
+
+
+def test_a_new_folder_appears_whole(tmp_path: Path) -> None:
+    with FolderTransaction(tmp_path / "out" / "x") as change:
+        write_bytes(change.file("a.txt"), b"a")
+        (change.scratch / "big").write_bytes(b"for a while")
+        assert not (tmp_path / "out" / "x").exists()
+    assert texts(tmp_path) == {"out/x/a.txt": "a"}
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["x"]
+
+
+def test_an_old_folder_is_replaced_at_once(tmp_path: Path, exchange: bool) -> None:
+    make(tmp_path / "x", OLD)
+    with FolderTransaction(tmp_path / "x", keep=False) as change:
+        write_bytes(change.file("a.txt"), b"new a")
+        assert texts(tmp_path / "x") == OLD
+    assert texts(tmp_path) == {"x/a.txt": "new a"}
+
+
+def test_what_the_new_folder_has_not_is_kept_with_its_identity(tmp_path: Path, exchange: bool) -> None:
+    notes = {"notes.txt": "mine", "pictures/1/p.png": "p", ".hidden": "h"}
+    make(tmp_path / "x", {**OLD, **notes})
+    (tmp_path / "x" / "link").symlink_to("../elsewhere")
+    (tmp_path / "x").chmod(0o750)
+    number = (tmp_path / "x" / "notes.txt").stat().st_ino
+    with FolderTransaction(tmp_path / "x") as change:
+        write_bytes(change.file("a.txt"), b"new a")
+    assert texts(tmp_path / "x") == {"a.txt": "new a", "b.txt": "old b", **notes}
+    assert (tmp_path / "x" / "notes.txt").stat().st_ino == number
+    assert (tmp_path / "x" / "link").readlink() == Path("../elsewhere")
+    assert (tmp_path / "x").stat().st_mode & 0o777 == 0o750
+    assert [p.name for p in tmp_path.iterdir()] == ["x"]
+
+
+def test_without_hard_links_what_is_kept_is_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_links(*_: object, **__: object) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    make(tmp_path / "x", {**OLD, "notes.txt": "mine"})
+    monkeypatch.setattr(os, "link", no_links)
+    with FolderTransaction(tmp_path / "x") as change:
+        write_bytes(change.file("a.txt"), b"new a")
+    assert texts(tmp_path / "x") == {"a.txt": "new a", "b.txt": "old b", "notes.txt": "mine"}
+
+
+@pytest.mark.parametrize("failure", [ValueError, KeyboardInterrupt])
+def test_an_exception_leaves_the_old_folder(tmp_path: Path, failure: type[BaseException]) -> None:
+    make(tmp_path / "x", OLD)
+    with pytest.raises(failure), FolderTransaction(tmp_path / "x") as change:
+        write_bytes(change.file("a.txt"), b"new a")
+        raise failure
+    assert texts(tmp_path) == {f"x/{n}": t for n, t in OLD.items()}
+    assert [p.name for p in tmp_path.iterdir()] == ["x"]
+
+
+@pytest.mark.parametrize("act", ["discard", "commit"])
+def test_discard_is_harmless_afterwards(tmp_path: Path, act: str) -> None:
+    change = FolderTransaction(tmp_path / "x")
+    write_bytes(change.file("a.txt"), b"a")
+    getattr(change, act)()
+    change.discard()
+    assert (tmp_path / "x").exists() is (act == "commit")
+
+
+def test_a_folder_behind_a_link_is_replaced_where_it_is(tmp_path: Path) -> None:
+    make(tmp_path / "real" / "x", OLD)
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "x").symlink_to(tmp_path / "real" / "x")
+    with FolderTransaction(tmp_path / "logs" / "x", keep=False) as change:
+        write_bytes(change.file("a.txt"), b"new a")
+    assert (tmp_path / "logs" / "x").is_symlink()
+    assert texts(tmp_path / "real") == {"x/a.txt": "new a"}
+
+
+def test_a_file_in_the_way_is_one_line_and_stays(tmp_path: Path) -> None:
+    (tmp_path / "x").write_text("mine")
+    with pytest.raises(OutputError, match="something else has that name"):
+        FolderTransaction(tmp_path / "x")
+    assert texts(tmp_path) == {"x": "mine"}
+
+
+def test_errors_name_the_final_place(tmp_path: Path) -> None:
+    with pytest.raises(OutputError) as caught, FolderTransaction(tmp_path / "x") as change:
+        write_bytes(change.file("n" * 300), b"")
+    assert str(caught.value).startswith(f"{tmp_path}/x/nnn")
+    said = r"/x: expected a place to write to, got full; free some space"
+    with pytest.raises(OutputError, match=said), FolderTransaction(tmp_path / "x"):
+        raise OSError(errno.ENOSPC, "full")
+
+
+#: Every call to the system that a commit makes and that can fail on a full or broken disk.
+CALLS = ("fsync", "link", "rename", "replace", "mkdir", "chmod", "open")
+
+
+def test_whichever_call_fails_one_of_the_two_is_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchange: bool
+) -> None:
+    done = False
+    number = 0
+    while not done:
+        number += 1
+        folder = tmp_path / f"{number}" / "x"
+        make(folder, {**OLD, "notes.txt": "mine"})
+        left = number
+
+        with monkeypatch.context() as patch:
+
+            def failing(real, *, once=patch):
+                def call(*arguments, **options):
+                    nonlocal left
+                    left -= 1
+                    if left == 0:
+                        raise OSError(errno.EIO, "Input/output error")
+                    return real(*arguments, **options)
+
+                return call
+
+            for name in CALLS:
+                patch.setattr(os, name, failing(getattr(os, name)))
+            try:
+                with FolderTransaction(folder) as change:
+                    write_bytes(change.file("a.txt"), b"new a")
+                done = left > 0
+            except OutputError as error:
+                assert "Input/output error" in str(error)
+            except OSError as error:
+                pytest.fail(f"call {number}: {error!r} is not told as an error of writing")
+        found = texts(folder)
+        new = {**OLD, "a.txt": "new a", "notes.txt": "mine"}
+        assert found in ({**OLD, "notes.txt": "mine"}, new), number
+        assert found == new or not done
+        FolderTransaction(folder).discard()  # the next command sweeps what a failing clean-up has left
+        assert [p.name for p in folder.parent.iterdir()] == ["x"], number
+    assert number > 8
+
+
+def test_a_kill_between_the_two_renames_is_repaired(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make(tmp_path / "logs" / "x", OLD)
+    child = os.fork()
+    if child == 0:  # dies as a killed process does: nothing is cleaned up
+        outputs._exchanged = lambda *_: False
+        rename = Path.rename
+
+        def dies(self: Path, target: Path) -> Path:
+            if self.name == "new":
+                os._exit(9)
+            return rename(self, target)
+
+        Path.rename = dies  # type: ignore[method-assign,assignment]
+        with FolderTransaction(tmp_path / "logs" / "x") as change:
+            write_bytes(change.file("a.txt"), b"new a")
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+    assert not (tmp_path / "logs" / "x").exists()
+    with OutputFolder(tmp_path, ("logs",)):
+        assert texts(tmp_path) == {f"logs/x/{n}": t for n, t in OLD.items()}
+
+
+# --------------------------------------------------------------------------------------------------- holding
+
+
+HOLD = """
+import sys, time, pathlib
+from pdhef_logtool.storage import outputs
+from pdhef_logtool.storage.outputs import OutputFolder
+if sys.argv[2] == "file":
+    def none(_): raise OSError(22, "no lock")
+    outputs._locked = none
+with OutputFolder(pathlib.Path(sys.argv[1]), ("logs",)) as held:
+    change = held.begin("logs/x")
+    change.file("half").write_bytes(b"half")
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def _no_kernel_lock(_: int) -> bool:
+    raise OSError(errno.EINVAL, "no lock")
+
+
+@pytest.fixture(params=["kernel", "file"])
+def kind(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    if request.param == "file":
+        monkeypatch.setattr(outputs, "_locked", _no_kernel_lock)
+    return str(request.param)
+
+
+def test_a_held_folder_is_refused_and_free_again_when_its_holder_is_dead(tmp_path: Path, kind: str) -> None:
+    with subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path), kind], stdout=subprocess.PIPE) as holder:
+        assert holder.stdout is not None
+        holder.stdout.readline()
+        before = texts(tmp_path)
+        with pytest.raises(OutputError, match="got one that another command is writing to") as caught:
+            OutputFolder(tmp_path, ("logs",)).__enter__()
+        assert caught.value.exit_code == 1
+        assert texts(tmp_path) == before
+        assert "logs/.pdhef/x/new/half" in before  # a living run's are not swept
+        holder.kill()
+    with OutputFolder(tmp_path, ("logs",)):
+        assert [p for p in tmp_path.rglob("*") if p.name != LOCK_FILE] == [tmp_path / "logs"]
+    assert [p.name for p in tmp_path.iterdir()] == ["logs"]
+
+
+def test_a_process_that_a_holder_started_holds_nothing(tmp_path: Path) -> None:
+    with OutputFolder(tmp_path), subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as child:
+        held = [p.readlink() for p in Path(f"/proc/{child.pid}/fd").iterdir()] if Path("/proc").is_dir() else []
+        assert tmp_path not in held
+        child.kill()
+
+
+def test_the_same_process_is_refused_too(tmp_path: Path, kind: str) -> None:
+    with OutputFolder(tmp_path), pytest.raises(OutputError):
+        OutputFolder(tmp_path).__enter__()
+    with OutputFolder(tmp_path):
+        pass
+
+
+def test_a_lock_file_of_another_host_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outputs, "_locked", _no_kernel_lock)
+    (tmp_path / LOCK_FILE).write_text("00000000-1-1")
+    with pytest.raises(OutputError, match=f"remove {LOCK_FILE}"):
+        FolderLock(tmp_path).acquire()
+
+
+def test_a_lock_waits_as_long_as_it_is_told(tmp_path: Path) -> None:
+    with OutputFolder(tmp_path):
+        start = time.monotonic()
+        with pytest.raises(OutputError):
+            FolderLock(tmp_path).acquire(wait_s=0.2)
+        assert 0.2 <= time.monotonic() - start < 5.0
+
+
+def test_a_lock_is_on_the_folder_that_has_the_name_now(tmp_path: Path) -> None:
+    folder = tmp_path / "x"
+    one, two = FolderLock(folder), FolderLock(folder)
+    one.acquire()
+    folder.rename(tmp_path / "old")
+    two.acquire()
+    one.release()
+    with pytest.raises(OutputError):
+        FolderLock(folder).acquire()
+    two.release()
+
+
+def test_processes_are_known_by_host_number_and_start() -> None:
+    assert is_alive(own_name()) is True
+    host, pid, start = own_name().split("-")
+    assert is_alive(f"{host}-{pid}-{int(start) + 1}") is False  # the number was given to another one since
+    assert is_alive(f"00000000-{pid}-{start}") is None
+    with subprocess.Popen([sys.executable, "-c", ""]) as child:
+        pass
+    assert is_alive(f"{host}-{child.pid}-5") is False
+
+
+def test_what_killed_processes_left_is_swept_and_what_others_own_is_not(tmp_path: Path) -> None:
+    host, pid, start = own_name().split("-")
+    dead, foreign = f"{host}-{pid}-{int(start) + 1}", "00000000-1-1"
+    mine = {"notes.partial": "mine", ".notes.partial": "mine", "logs/x/.vimrc": "mine", "logs/x/a.part": "mine"}
+    alive = {f".run.json.{own_name()}.partial": "half"}
+    make(tmp_path, mine | alive)
+    make(tmp_path, {f".run.json.{dead}.partial": "", f"logs/x/.report.json.{foreign}.partial": ""})
+    make(tmp_path / "logs" / ".pdhef" / "y" / "new", {"report.json": ""})
+    with OutputFolder(tmp_path, ("logs",)):
+        assert texts(tmp_path) == mine | alive
+    shutil.rmtree(tmp_path / "logs")
+    write_bytes(tmp_path / "other.txt", b"")  # a file alone leaves other hosts' alone
+    assert texts(tmp_path) == {n: t for n, t in (mine | alive).items() if "/" not in n} | {"other.txt": ""}
+
+
+def test_scratch_folders_of_killed_processes_are_swept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import tempfile
+
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    script = "import os, signal; from pdhef_logtool.storage.files import scratch_folder as s\n"
+    script += f"f = s(); open(f.name + '/copy', 'w').close(); os.kill(os.getpid(), {signal.SIGKILL:d})"
+    subprocess.run([sys.executable, "-c", script], env={**os.environ, "TMPDIR": str(tmp_path)}, check=False)
+    (tmp_path / "pdhef-somebody-else").mkdir()
+    assert len(list(tmp_path.iterdir())) == 2
+    with scratch_folder() as folder:
+        assert {p.name for p in tmp_path.iterdir()} == {"pdhef-somebody-else", Path(folder).name}
+
+
+# ----------------------------------------------------------------------------------------- inputs and outputs
+
+
+def test_an_output_that_is_an_input_is_refused_by_whatever_name(tmp_path: Path) -> None:
+    make(tmp_path, {"d/logs/x/x.mcap": "log", "car/vehicle.toml": "car", "free/y.mcap": "log"})
+    log = tmp_path / "d" / "logs" / "x" / "x.mcap"
+    (tmp_path / "symlink").symlink_to(tmp_path / "d")
+    os.link(log, tmp_path / "hard.mcap")
+    folder = tmp_path / "d" / "logs" / "x"
+    refused = [
+        ([log], [log], []),
+        ([log], [tmp_path / "hard.mcap"], []),
+        ([tmp_path / "hard.mcap"], [log], []),
+        ([tmp_path / "symlink" / "logs" / "x" / "x.mcap"], [log], []),
+        ([log], [], [folder]),
+        ([log], [], [tmp_path / "symlink" / "logs" / "x"]),
+        ([folder], [], [folder]),
+        ([folder], [], [tmp_path / "d"]),
+        ([folder], [log], []),  # a storage file of a folder that is read
+        ([tmp_path / "car"], [tmp_path / "car" / "vehicle.toml"], []),
+    ]
+    for inputs, files, folders in refused:
+        with pytest.raises(UsageError, match="which would replace the input"):
+            check_no_input(inputs, files, folders)
+    check_no_input(
+        [log, None, tmp_path / "none"], [tmp_path / "free" / "x.mcap", tmp_path / "none2"], [tmp_path / "car"]
+    )
+    check_no_input([folder], [folder / "out" / "report.json"], [folder / "out"])  # beside the files of a log folder
+    check_no_input([log], [folder / "report.json"], [tmp_path / "d" / "logs" / "xx"])
+
+
+def test_two_processes_never_write_to_one_temporary_file(tmp_path: Path) -> None:
+    script = "import sys, pathlib; from pdhef_logtool.storage.files import PendingFile as P\n"
+    script += "print(P(pathlib.Path(sys.argv[1])).path)"
+    other = subprocess.run(
+        [sys.executable, "-c", script, str(tmp_path / "x")], capture_output=True, text=True, check=True
+    )
+    assert other.stdout.strip() != str(PendingFile(tmp_path / "x").path)

@@ -1,0 +1,180 @@
+"""What goes wrong in a worker, on purpose: a work for the supervisor, whose items say what is to happen."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+from pdhef_logtool.storage.files import PendingFile
+from pdhef_logtool.workers.supervisor import Tell
+
+#: What to do, and the value to return or a path.
+Item = tuple[str, str]
+called: list[int] = []
+
+
+def note_call() -> None:
+    """Be called by the fork server."""
+    called.append(os.getpid())
+
+
+def cold() -> bool:
+    """Tell the fork server that there is no compiled code yet."""
+    return False
+
+
+#: Names the file to which :func:`die_at_start` notes how often it killed the fork server, and how often it does so.
+DEATHS, MOST_DEATHS = "PDHEF_TEST_DEATHS", "PDHEF_TEST_MOST_DEATHS"
+
+
+def die_at_start() -> None:
+    """Kill the fork server while it loads, so often."""
+    file = Path(os.environ[DEATHS])
+    if len(file.read_bytes()) < int(os.environ[MOST_DEATHS]):
+        with file.open("ab") as opened:
+            opened.write(b"x")
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Odd:
+    """A result that does not travel."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        raise TypeError("not me")
+
+
+class Unreadable:
+    """A result, or an item, that travels and cannot be opened."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return (_burst, ())
+
+
+def _burst() -> None:
+    raise ValueError("burst")
+
+
+def planted(item: Item, tell: Tell) -> object:
+    """Do what the item says."""
+    what, value = item
+    tell(f"at {what}", 0.5)
+    if what in _FAULTS:
+        return _FAULTS[what](value, tell)
+    if what == "where":
+        return os.getpid(), called, threading.active_count(), os.environ.get("OMP_NUM_THREADS")
+    return value
+
+
+def _kill(_value: str, _tell: Tell) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _kill_once(value: str, tell: Tell) -> str:
+    if not Path(value).exists():
+        Path(value).touch()
+        _kill(value, tell)
+    return value
+
+
+def _kill_server(_value: str, _tell: Tell) -> None:
+    os.kill(os.getppid(), signal.SIGKILL)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _hang(_value: str, _tell: Tell) -> None:
+    time.sleep(600)
+
+
+def _stop(_value: str, _tell: Tell) -> None:
+    os.kill(os.getpid(), signal.SIGSTOP)
+
+
+def _slowly(value: str, tell: Tell) -> str:
+    for k in range(10):
+        time.sleep(0.1)
+        tell("slowly", k / 10)
+    return value
+
+
+def _burn(value: str, _tell: Tell) -> str:
+    while time.process_time() < 0.2:
+        pass
+    return value
+
+
+def _grow(_value: str, tell: Tell) -> None:
+    held = []
+    while True:
+        tell("at grow", 0.5)
+        held.append(bytearray(os.urandom(1 << 16)) * 160)
+        time.sleep(0.005)
+
+
+def _8_gb(_value: str, _tell: Tell) -> int:
+    return len(bytearray(8 << 30))
+
+
+def _raise(_value: str, _tell: Tell) -> None:
+    raise ValueError("two\nlines")
+
+
+def _cut(_value: str, _tell: Tell) -> None:
+    """Write half a message and then nothing, as when it is stopped while it writes."""
+    files = [f for f in Path("/proc/self/fd").iterdir() if int(f.name) > 2 and f.is_socket()]
+    for file in files:
+        os.write(int(file.name), (1000).to_bytes(8, "little") + b"half")
+    time.sleep(600)
+
+
+def _wait(value: str, tell: Tell) -> str:
+    """Note the process that it begins in, wait for the word to go on, and write a file that appears whole."""
+    path = Path(value)
+    with path.with_suffix(".begun").open("a") as file:
+        file.write(f"{os.getpid()}\n")
+    while not (path.parent / "go").exists():
+        tell("at wait", 0.5)
+        time.sleep(0.01)
+    with PendingFile(path.with_suffix(".done")) as pending:
+        pending.path.write_text(value)
+    return value
+
+
+held: list[str] = []
+
+
+def _hold(value: str, _tell: Tell) -> tuple[int, list[str]]:
+    held.append(value)
+    return os.getpid(), held
+
+
+def _alone(value: str, tell: Tell) -> int:
+    """Be lost the first time; the second time return how many workers there are."""
+    _kill_once(value, tell)
+    parent = os.getppid()
+    return len(Path(f"/proc/{parent}/task/{parent}/children").read_text().split())
+
+
+_FAULTS = {
+    "kill": _kill,
+    "kill once": _kill_once,
+    "kill server": _kill_server,
+    "exit": lambda _value, _tell: os._exit(5),
+    "hang": _hang,
+    "stop": _stop,
+    "cut": _cut,
+    "slowly": _slowly,
+    "burn": _burn,
+    "grow": _grow,
+    "8 GB": _8_gb,
+    "raise": _raise,
+    "quit": lambda _value, _tell: sys.exit(3),
+    "odd": lambda _value, _tell: Odd(),
+    "unreadable": lambda _value, _tell: Unreadable(),
+    "alone": _alone,
+    "hold": _hold,
+    "wait": _wait,
+}

@@ -1,0 +1,322 @@
+"""Workers under watch: what dies, hangs or grows costs its own item only, and is told."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+import tracemalloc
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.records.errors import EXIT_FAILURE, UsageError, WorkerError
+from pdhef_logtool.workers.supervisor import Crew, Ended, Failure, Limits, supervise
+from tests.workers.planted_work import DEATHS, MOST_DEATHS, Item, Unreadable, called, planted
+
+LIMITS = Limits(silence_s=0.5, memory_bytes=400_000_000)
+PRELOAD = ["tests.workers.planted_work:note_call"]
+REASONS = {
+    "kill": "the worker was killed (signal 9)",
+    "exit": "the worker ended with exit code 5",
+    "hang": "nothing heard for 0.5 s",
+    "stop": "nothing heard for 0.5 s",
+    "cut": "nothing heard for 0.5 s",
+    "grow": "took more than 400 MB",
+    "8 GB": "took more than 400 MB",
+    "raise": "raised ValueError: two lines",
+    "quit": "raised SystemExit: 3",
+    "odd": "its result cannot be sent: TypeError: not me",
+    "unreadable": "its result cannot be read: ValueError: burst",
+}
+#: What another try would not change.
+FINAL = {"raise", "quit", "odd", "unreadable"}
+
+
+def outcomes(items: list[Item], jobs: int, limits: Limits = LIMITS) -> list[Ended[Item, object]]:
+    """Return how the items ended, in their order."""
+    ended = sorted(supervise(planted, items, jobs=jobs, limits=limits, preload=PRELOAD), key=lambda e: e.number)
+    assert [e.number for e in ended] == list(range(len(items)))
+    assert [e.item for e in ended] == items
+    return ended
+
+
+def assert_as_planted(ended: list[Ended[Item, object]]) -> None:
+    for e in ended:
+        what, value = e.item
+        if what in REASONS:
+            assert e.failure == Failure(REASONS[what], f"at {what}", 1 if what in FINAL else 2)
+            assert e.result is None
+        else:
+            assert e.failure is None
+            assert e.result == value
+
+
+@pytest.mark.slow
+def test_each_fault_costs_its_own_item_only(tmp_path: Path) -> None:
+    items = [(what, "") for what in REASONS] + [("kill once", str(tmp_path / "once")), ("slowly", "x")]
+    items = [x for i, fault in enumerate(items) for x in (fault, ("well", str(i)))]
+    assert_as_planted(outcomes(items, 2))
+
+
+@settings(max_examples=6, deadline=None)
+@given(
+    items=st.lists(st.tuples(st.sampled_from(["well", "well", "kill", "exit", "raise", "odd"]), st.text(max_size=5))),
+    jobs=st.integers(1, 4),
+)
+def test_every_item_ends_once_whatever_happens_in_any_order(items: list[Item], jobs: int) -> None:
+    assert_as_planted(outcomes(items, jobs, Limits(silence_s=60.0)))
+
+
+def test_a_lost_item_is_tried_again_when_nothing_else_runs(tmp_path: Path) -> None:
+    items = [("alone", str(tmp_path / "mark")), *[("well", "")] * 4]
+    ended = list(supervise(planted, items, jobs=3, preload=PRELOAD))
+    assert [e.number for e in ended[-1:]] == [0]
+    assert ended[-1].result == 1
+
+
+def test_workers_have_one_thread_and_live_as_long_as_the_run() -> None:
+    ended = outcomes([("where", "")] * 20, 2, Limits())
+    pids, calls, threads, omp = zip(*(e.result for e in ended), strict=True)  # type: ignore[misc]
+    assert len(set(pids)) <= 2
+    assert os.getpid() not in pids
+    assert set(threads) == {1}
+    assert set(omp) == {"1"}
+    assert {len(c) for c in calls} == {1}, "the fork server called it, once for all"
+    assert not called
+
+
+def test_what_workers_took_counts_as_the_commands() -> None:
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    outcomes([("burn", "")] * 2, 2, Limits())
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime > 0.35
+
+
+def test_one_job_without_limits_runs_here() -> None:
+    told: list[tuple[int, str, float]] = []
+    items = [("where", ""), ("raise", ""), ("well", "x")]
+    ended = list(supervise(planted, items, jobs=1, progress=lambda *what: told.append(what)))
+    assert ended[0].result[0] == os.getpid()  # type: ignore[index]
+    assert ended[1].failure == Failure(REASONS["raise"], "at raise", 1)
+    assert ended[2].result == "x"
+    assert told == [(0, "at where", 0.5), (1, "at raise", 0.5), (2, "at well", 0.5)]
+
+
+def test_progress_of_workers_is_heard() -> None:
+    told: list[tuple[int, str, float]] = []
+    list(supervise(planted, [("well", ""), ("raise", "")], jobs=2, progress=lambda *what: told.append(what)))
+    assert sorted(told) == [(0, "at well", 0.5), (1, "at raise", 0.5)]
+
+
+def test_items_that_do_not_travel_are_told() -> None:
+    items: list[object] = [lambda: 0, ("well", "x"), Unreadable()]
+    lost, well, burst = sorted(supervise(planted, items, jobs=2), key=lambda e: e.number)  # type: ignore[arg-type]
+    assert lost.failure is not None
+    assert lost.failure.reason.startswith("it cannot be sent to a worker: ")
+    assert well.result == "x"
+    assert burst.failure == Failure("raised ValueError: burst", "", 1)
+
+
+def test_the_fork_server_may_die_too() -> None:
+    ended = outcomes([("kill server", ""), *[("well", "x")] * 3], 2, Limits())
+    assert ended[0].failure == Failure("the worker died", "at kill server", 2)
+    assert [e.result for e in ended[1:]] == ["x"] * 3
+
+
+@pytest.fixture
+def deaths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file with a letter for each time that the fork server was killed while it loaded: at most twice."""
+    file = tmp_path / "deaths"
+    file.touch()
+    monkeypatch.setenv(DEATHS, str(file))
+    monkeypatch.setenv(MOST_DEATHS, "2")
+    return file
+
+
+DYING = ["tests.workers.planted_work:die_at_start"]
+
+
+def test_a_fork_server_that_dies_while_it_loads_is_restarted_and_that_is_said(deaths: Path) -> None:
+    warned: list[str] = []
+    items = [("well", str(i)) for i in range(4)]
+    ended = list(supervise(planted, items, jobs=2, preload=DYING, warn=warned.append))
+    assert sorted((e.result, e.failure) for e in ended) == [(str(i), None) for i in range(4)]
+    assert warned == [f"the fork server died (signal 9): restart {n} of 3, no item is lost" for n in (1, 2)]
+    assert deaths.read_text() == "xx"
+
+
+def test_a_fork_server_that_dies_again_and_again_is_one_error(deaths: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(MOST_DEATHS, "99")
+    with pytest.raises(WorkerError, match="4 that died, the last one by signal 9") as caught:
+        list(supervise(planted, [("well", "")] * 4, jobs=2, preload=DYING))
+    assert caught.value.exit_code == EXIT_FAILURE
+    assert deaths.read_text() == "xxxx"
+
+
+def test_workers_outlive_the_fork_server_until_they_are_dismissed(tmp_path: Path) -> None:
+    files = [tmp_path / name for name in "ab"]
+    warned: list[str] = []
+    begun = [f.with_suffix(".begun") for f in files]
+    pids: list[int] = []
+
+    def heard(*_: object) -> None:
+        if not pids and all(f.is_file() and f.read_text().endswith("\n") for f in begun):
+            os.kill(crew._server._process.pid, signal.SIGKILL)  # type: ignore[union-attr]
+            crew._server._process.wait()  # type: ignore[union-attr]
+            pids.extend(int(f.read_text()) for f in begun)
+            (tmp_path / "go").touch()
+
+    with Crew(planted, jobs=2, preload=PRELOAD, warn=warned.append) as crew:
+        ended = list(crew.each([("wait", str(f)) for f in files] + [("where", "")], heard))
+        assert [e.failure for e in ended] == [None] * 3
+        assert {e.result[0] for e in ended if e.number == 2} <= set(pids)  # type: ignore[index]
+        assert warned == []
+        # One of them dies: now a new one is needed, and a new server.
+        again = list(crew.each([("kill once", str(tmp_path / "once")), ("well", "x")]))
+        assert [(e.result, e.failure) for e in sorted(again, key=lambda e: e.number)] == [
+            (str(tmp_path / "once"), None),
+            ("x", None),
+        ]
+        assert warned == ["the fork server died (signal 9): restart 1 of 3, no item is lost"]
+        os.kill(crew._server._process.pid, signal.SIGKILL)  # type: ignore[union-attr]
+        pids += [w.pid for w in crew._workers if w.pid is not None]
+    for pid in pids:
+        assert not Path(f"/proc/{pid}/exe").exists()
+
+
+def test_an_item_whose_worker_was_never_started_has_not_been_tried() -> None:
+    with Crew(planted, jobs=1, limits=Limits(60.0), preload=PRELOAD) as crew:
+        list(crew.each([("kill", "")]))
+        server = crew._server._process.pid  # type: ignore[union-attr]
+        assert not crew._workers
+        os.kill(server, signal.SIGSTOP)
+
+        def kill_when_asked() -> None:
+            while not crew._workers:
+                time.sleep(0.001)
+            os.kill(server, signal.SIGKILL)
+
+        killer = threading.Thread(target=kill_when_asked)
+        killer.start()
+        (ended,) = crew.each([("kill", "")])
+        killer.join()
+        assert ended.failure == Failure(REASONS["kill"], "at kill", 2)
+
+
+def test_items_of_a_place_go_to_its_worker_as_long_as_it_lives() -> None:
+    items = [("hold", str(i)) for i in range(6)]
+    with Crew(planted, jobs=3, preload=PRELOAD) as crew:
+        for turn in (1, 2):
+            ended = sorted(crew.each(items, place=lambda item: int(item[1]) % 3), key=lambda e: e.number)
+            assert [e.result[1] for e in ended[3:]] == [[str(i), str(i + 3)] * turn for i in range(3)]  # type: ignore[index]
+        next(crew.each([("hang", ""), ("well", "")], place=lambda item: int(item[0] == "well")))
+        # What was left at work is gone with what it held; the others are not.
+        ended = sorted(crew.each(items[:3], place=lambda item: int(item[1])), key=lambda e: e.number)
+        assert [len(e.result[1]) for e in ended] == [1, 5, 5]  # type: ignore[index]
+
+
+@pytest.mark.slow
+def test_the_first_item_compiles_alone() -> None:
+    items = [("slowly", "a"), ("well", "b"), ("well", "c")]
+    told: list[int] = []
+    found = supervise(
+        planted, items, jobs=3, preload=["tests.workers.planted_work:cold"], progress=lambda n, *_: told.append(n)
+    )
+    first = next(found)
+    assert first.number == 0
+    assert set(told) == {0}
+    assert {e.number for e in found} == {1, 2}
+
+
+def test_what_cannot_be_loaded_is_told_at_once() -> None:
+    with pytest.raises(RuntimeError, match="no_such_module: ModuleNotFoundError"):
+        list(supervise(planted, [("well", "")], jobs=2, preload=["no_such_module"]))
+
+
+def test_no_jobs_are_refused_before_anything_is_pulled() -> None:
+    with pytest.raises(UsageError, match="at least one process"):
+        supervise(planted, [], jobs=0)
+
+
+def test_items_are_pulled_as_workers_become_free() -> None:
+    pulled = 0
+
+    def items() -> Iterator[Item]:
+        nonlocal pulled
+        while True:
+            pulled += 1
+            yield "well", ""
+
+    with closing(supervise(planted, items(), jobs=2, preload=PRELOAD)) as ended:
+        for count, _ in zip(range(10), ended, strict=False):
+            assert pulled <= count + 1 + 2
+
+
+@pytest.mark.slow
+def test_a_busy_caller_is_no_silence_of_the_workers() -> None:
+    items = [("well", ""), ("slowly", "")]
+    for ended in supervise(planted, items, jobs=2, limits=Limits(silence_s=0.6), preload=PRELOAD):
+        time.sleep(0.8 if ended.item[0] == "well" else 0.0)
+        assert ended.failure is None
+
+
+@pytest.mark.slow
+def test_3000_items_leave_nothing_in_the_parent() -> None:
+    sizes = []
+    tracemalloc.start()
+    items = (("well", "x" * 10_000 + str(i)) for i in range(3000))
+    for count, ended in enumerate(supervise(planted, items, jobs=2, preload=PRELOAD)):
+        assert ended.failure is None
+        if count in (300, 2900):
+            sizes.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    assert sizes[1] - sizes[0] < 100_000
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+from pdhef_logtool.workers.supervisor import Limits, supervise
+from tests.workers.planted_work import planted
+
+def heard(number, text, share):
+    print("heard", flush=True)
+
+for ended in supervise(planted, [("hang", "")] * 2, jobs=2, limits=Limits(silence_s=60.0), progress=heard):
+    pass
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_all_ends_with_the_parent_without_a_word(number: int) -> None:
+    root = Path(__file__).parents[2]
+    with subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(SCRIPT)],
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": str(root)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "heard\n"
+        assert process.stdout.readline() == "heard\n"
+        if number == signal.SIGKILL:
+            process.kill()
+        else:
+            os.killpg(process.pid, number)
+        # Its pipes close when the last process that holds them is gone.
+        _, err = process.communicate(timeout=10)
+    told = [line for line in err.splitlines() if line and not line.startswith((" ", "Traceback"))]
+    assert told == ([] if number == signal.SIGKILL else ["KeyboardInterrupt"]), "the workers and the server say nothing"
