@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pdhef_logtool.car.assumed_values import AssumedValue
 from pdhef_logtool.car.parts import (
     PHYSICS,
     FilterNoise,
@@ -28,7 +29,7 @@ from pdhef_logtool.car.parts import (
     noise_sha256,
     physics_sha256,
 )
-from pdhef_logtool.car.toml_files import read_vehicle_file
+from pdhef_logtool.car.toml_files import VehicleFile, read_vehicle_file
 from pdhef_logtool.car.vehicle import Record, VehicleParameters, default_vehicle
 from pdhef_logtool.records.errors import UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import (
@@ -100,7 +101,8 @@ class Car:
     intervals : calibrated 95 % intervals, None without.
     learnt_on : drives that ``vehicle`` was identified on.
     self_calibrated : the vehicle as the log that is run calibrated it, None without; for the estimators that take it.
-    source : folder or file, None for the default car. notes : what is stale, and why.
+    assumed : entries that the file left out. source : folder or file, None for the default car.
+    notes : what is stale, and why.
     """
 
     vehicle: VehicleParameters
@@ -114,6 +116,7 @@ class Car:
     learnt_on: tuple[LearntOn, ...] = ()
     fitted_physics: FittedPhysics | None = None
     self_calibrated: WithoutTruth | None = None
+    assumed: tuple[AssumedValue, ...] = ()
     source: Path | None = None
     notes: tuple[str, ...] = ()
 
@@ -153,10 +156,10 @@ class Car:
                     got=f"{what} folder",
                     where=str(folder),
                 )
-            vehicle, trust = read_vehicle_file(folder / VEHICLE_FILE)
+            file = read_vehicle_file(folder / VEHICLE_FILE)
         else:
-            vehicle, trust = (default_vehicle(), None) if source is None else read_vehicle_file(source)
-        car = cls(vehicle, vehicle, trust=trust, source=source)
+            file = VehicleFile(default_vehicle(), None, ()) if source is None else read_vehicle_file(source)
+        car = cls(file.vehicle, file.vehicle, trust=file.trust, assumed=file.assumed, source=source)
         if folder is not None:
             car = _with_parts(car, folder)
         name, home = _network_of(car, folder, network)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field
 
+from pdhef_logtool.car.assumed_values import AssumedValue, completed
 from pdhef_logtool.car.parts import Trust
 from pdhef_logtool.car.vehicle import REMEDY, Record, VehicleParameters
 from pdhef_logtool.records.errors import VehicleError
@@ -25,8 +27,17 @@ class _VehicleFile(VehicleParameters):
     network: _Network | None = None
 
 
-def read_vehicle_file(path: Path) -> tuple[VehicleParameters, Trust | None]:
-    """Read a vehicle.toml: physics and sensors, and the residual gain in its table ``[network]``, None without one.
+@dataclass(frozen=True, slots=True)
+class VehicleFile:
+    """Contents of a vehicle.toml: physics and sensors, what of them it left out, and the table ``[network]``."""
+
+    vehicle: VehicleParameters
+    trust: Trust | None
+    assumed: tuple[AssumedValue, ...]
+
+
+def read_vehicle_file(path: Path) -> VehicleFile:
+    """Read a vehicle.toml; values that it leaves out follow from mass and wheelbase (:mod:`~.assumed_values`).
 
     Raises
     ------
@@ -34,17 +45,19 @@ def read_vehicle_file(path: Path) -> tuple[VehicleParameters, Trust | None]:
         The file is missing or no TOML, or has wrong, unknown or missing entries; the message names all of them.
     """
     raw, where = read_toml(path, "a vehicle TOML file", VehicleError), str(path)
-    file = validated(_VehicleFile, raw, where, VehicleError, expected="the entries of vehicle.toml", remedy=REMEDY)
+    entries, assumed = completed(raw)
+    file = validated(_VehicleFile, entries, where, VehicleError, expected="the entries of vehicle.toml", remedy=REMEDY)
     fields = VehicleParameters.model_fields
     vehicle = VehicleParameters.model_construct(
         file.model_fields_set & fields.keys(), **{name: getattr(file, name) for name in fields}
     )
-    return vehicle, None if file.network is None else Trust(**file.network.model_dump())
+    trust = None if file.network is None else Trust(**file.network.model_dump())
+    return VehicleFile(vehicle, trust, assumed)
 
 
 def load_vehicle(path: Path) -> VehicleParameters:
     """Return physics and sensors of a vehicle.toml; raises VehicleError as :func:`read_vehicle_file`."""
-    return read_vehicle_file(path)[0]
+    return read_vehicle_file(path).vehicle
 
 
 def part_toml(part: Record, head: str, comments: Mapping[str, str] | None = None) -> str:

@@ -1,0 +1,163 @@
+"""Values that a vehicle file leaves out, from rules that scale with mass and wheelbase.
+
+A file needs the mass, and the wheelbase with the front axle's share of the weight (or both axle distances). Lengths
+scale with the wheelbase, times with its square root, and axle stiffness with the axle load. Each rule has a relative
+standard deviation over vehicles: what a calibration may move the value by, and what an interval must cover.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeGuard
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2
+
+#: A passenger car's: the share of the static weight on the front axle, where the file gives none. 0.63 for front-wheel
+#: drive, 0.50 for rear-engined and sports cars.
+FRONT_WEIGHT_SHARE, FRONT_WEIGHT_SHARE_SPREAD = 0.56, 0.08
+
+
+@dataclass(frozen=True, slots=True)
+class AssumedValue:
+    """An entry that was left out: dotted name, value, relative standard deviation over vehicles, and rule."""
+
+    entry: str
+    value: float
+    spread: float
+    rule: str
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """How an entry follows from those before it. ``value`` takes the entries so far, axle loads in N included."""
+
+    entry: str
+    value: Callable[[Mapping[str, float]], float]
+    spread: float
+    text: str
+
+
+def _stiffness_per_load(mass_kg: float) -> float:
+    """Return cornering stiffness over axle load in 1/rad by the class of vehicle.
+
+    14.5 for cars, 6 for heavy trucks and for models below 50 kg; between the classes linear in the logarithm of mass.
+    """
+    return float(np.interp(math.log(mass_kg), np.log([50.0, 400.0, 4000.0, 12_000.0]), [6.0, 14.5, 14.5, 6.0]))
+
+
+#: In the order in which they build on each other.
+RULES: tuple[Rule, ...] = (
+    Rule(
+        "yaw_inertia_kg_m2",
+        lambda v: v["mass_kg"] * v["cg_to_front_axle_m"] * v["cg_to_rear_axle_m"],
+        0.15,
+        "mass times the product of the axle distances (dynamic index 1)",
+    ),
+    Rule("track_m", lambda v: min(0.547 * v["wheelbase_m"], 2.1), 0.07, "0.547 of the wheelbase, 2.1 m at most"),
+    Rule("cg_height_m", lambda v: 0.2 * v["wheelbase_m"], 0.15, "0.2 of the wheelbase"),
+    Rule("wheel_radius_m", lambda v: 0.11 * v["wheelbase_m"], 0.1, "0.11 of the wheelbase"),
+    Rule("relaxation_length_m", lambda v: v["wheel_radius_m"] / 0.6, 0.4, "1.67 wheel radii"),
+    Rule("cg_over_roll_axis_m", lambda v: 0.625 * v["cg_height_m"], 0.2, "0.625 of the height of the CG"),
+    Rule(
+        "roll_frequency_rad_s",
+        lambda v: 11.0 * math.sqrt(2.87 / v["wheelbase_m"]),
+        0.15,
+        "11 rad/s at a wheelbase of 2.87 m, with the inverse square root of the wheelbase",
+    ),
+    Rule(
+        "low_speed_blend_m_s",
+        lambda v: 0.5655 * math.sqrt(GRAVITY_M_S2 * v["wheelbase_m"]),
+        0.3,
+        "0.566 times the square root of g times the wheelbase",
+    ),
+    Rule(
+        "tyres.front.cornering_stiffness_n_per_rad",
+        lambda v: 0.97 * _stiffness_per_load(v["mass_kg"]) * v["front_load_n"],
+        0.4,
+        "14 per rad times the axle load for cars, 5.8 for heavy trucks and small models",
+    ),
+    Rule(
+        "tyres.rear.cornering_stiffness_n_per_rad",
+        lambda v: 1.03 * _stiffness_per_load(v["mass_kg"]) * v["rear_load_n"],
+        0.4,
+        "15 per rad times the axle load for cars, 6.2 for heavy trucks and small models",
+    ),
+)
+
+
+def completed(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[AssumedValue, ...]]:
+    """Return the entries of a vehicle file with what it left out, and what that is.
+
+    ``wheelbase_m`` and ``front_weight_share`` become the axle distances. Entries that are wrong stay as they are, for
+    the validation to name them; nothing is assumed where mass or geometry are missing or no positive numbers.
+    """
+    entries: dict[str, Any] = {k: dict(v) if isinstance(v, Mapping) else v for k, v in raw.items()}
+    assumed: list[AssumedValue] = []
+    _axle_distances(entries, assumed)
+    needed = ("mass_kg", "cg_to_front_axle_m", "cg_to_rear_axle_m")
+    if not all(_is_positive(entries.get(name)) for name in needed):
+        return entries, tuple(assumed)
+    values = {name: float(entries[name]) for name in needed}
+    front, rear = values["cg_to_front_axle_m"], values["cg_to_rear_axle_m"]
+    weight_n = values["mass_kg"] * GRAVITY_M_S2
+    values |= {"wheelbase_m": front + rear}
+    values |= {"front_load_n": weight_n * rear / (front + rear), "rear_load_n": weight_n * front / (front + rear)}
+    for rule in RULES:
+        table, name = entries, rule.entry
+        if rule.entry.startswith("tyres."):
+            _, axle, name = rule.entry.split(".")
+            tyres = entries.setdefault("tyres", {})
+            if not isinstance(tyres, dict):
+                continue
+            table = tyres.setdefault(axle, {})
+            if not isinstance(table, dict) or table:
+                continue  # the axle's tyre is given in one form or another
+        if name in table:
+            if _is_positive(table[name]):
+                values[name] = float(table[name])
+            continue
+        if any(missing not in values for missing in _NEEDS.get(name, ())):
+            continue
+        value = float(f"{rule.value(values):.4g}")
+        table[name] = values[name] = value
+        assumed.append(AssumedValue(rule.entry, value, rule.spread, rule.text))
+    return entries, tuple(assumed)
+
+
+#: Rules that build on an entry which may have been given wrongly.
+_NEEDS = {"relaxation_length_m": ("wheel_radius_m",), "cg_over_roll_axis_m": ("cg_height_m",)}
+
+
+def _axle_distances(entries: dict[str, Any], assumed: list[AssumedValue]) -> None:
+    """Replace wheelbase and weight share by the axle distances, in place; complete the third of the three."""
+    wheelbase, share = entries.get("wheelbase_m"), entries.get("front_weight_share")
+    front, rear = entries.get("cg_to_front_axle_m"), entries.get("cg_to_rear_axle_m")
+    if front is not None and rear is not None:
+        return  # a wheelbase beside them is refused as an unknown entry
+    if not _is_positive(wheelbase):
+        return
+    if front is not None or rear is not None:
+        name, other = ("cg_to_rear_axle_m", front) if rear is None else ("cg_to_front_axle_m", rear)
+        if _is_positive(other) and float(other) < float(wheelbase):
+            entries[name] = float(wheelbase) - float(other)
+            del entries["wheelbase_m"]
+        return
+    if share is None:
+        share = FRONT_WEIGHT_SHARE
+        text = "a passenger car's share of the weight on the front axle"
+        assumed.append(AssumedValue("front_weight_share", share, FRONT_WEIGHT_SHARE_SPREAD, text))
+    if not (_is_positive(share) and float(share) < 1.0):
+        return
+    entries.pop("front_weight_share", None)
+    del entries["wheelbase_m"]
+    entries["cg_to_front_axle_m"] = float(wheelbase) * (1.0 - float(share))
+    entries["cg_to_rear_axle_m"] = float(wheelbase) * float(share)
+
+
+def _is_positive(value: Any) -> TypeGuard[float]:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number and math.isfinite(value) and value > 0
