@@ -1,6 +1,7 @@
 """Tables of the documentation that are made of the code when the site is built: a hook of MkDocs.
 
-In a page, ``<!-- table: metrics -->`` becomes the table of all metrics; ``checks`` and ``settings`` are the others.
+In a page, ``<!-- table: metrics -->`` becomes the table of all metrics; ``checks``, ``settings`` and
+``assumed_values`` are the others.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import fields
 from typing import Any
 
+from pdhef_logtool.car.assumed_values import RULES
 from pdhef_logtool.drive.checks import registry as checks
 from pdhef_logtool.evaluation.metrics import registry as metrics
 from pdhef_logtool.runs.config import RunConfig
@@ -47,4 +49,16 @@ def _settings() -> Iterator[str]:
         yield f"| `{key.name}` | {default} | {text} |"
 
 
-_TABLES: dict[str, Callable[[], Iterator[str]]] = {"metrics": _metrics, "checks": _checks, "settings": _settings}
+def _assumed_values() -> Iterator[str]:
+    yield "| entry left out | rule | spread |"
+    yield "| --- | --- | --- |"
+    for rule in RULES:
+        yield f"| `{rule.entry}` | {rule.text} | {rule.spread:.0%} |"
+
+
+_TABLES: dict[str, Callable[[], Iterator[str]]] = {
+    "metrics": _metrics,
+    "checks": _checks,
+    "settings": _settings,
+    "assumed_values": _assumed_values,
+}

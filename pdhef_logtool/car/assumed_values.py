@@ -107,15 +107,12 @@ def completed(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[AssumedValu
     values |= {"wheelbase_m": front + rear}
     values |= {"front_load_n": weight_n * rear / (front + rear), "rear_load_n": weight_n * front / (front + rear)}
     for rule in RULES:
-        table, name = entries, rule.entry
-        if rule.entry.startswith("tyres."):
-            _, axle, name = rule.entry.split(".")
-            tyres = entries.setdefault("tyres", {})
-            if not isinstance(tyres, dict):
-                continue
-            table = tyres.setdefault(axle, {})
-            if not isinstance(table, dict) or table:
-                continue  # the axle's tyre is given in one form or another
+        *tables, name = rule.entry.split(".")
+        if tables and "tyres" in raw:
+            continue
+        table = entries
+        for inner in tables:
+            table = table.setdefault(inner, {})
         if name in table:
             if _is_positive(table[name]):
                 values[name] = float(table[name])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from pdhef_logtool.car.assumed_values import AssumedValue, completed
 from pdhef_logtool.car.parts import Trust
@@ -21,8 +21,17 @@ class _Network(Record):
     evidence: str
 
 
-class _VehicleFile(VehicleParameters):
+def _what_may_be_left_out(schema: dict[str, Any]) -> None:
+    """Make the JSON Schema that of a file: before :func:`~.assumed_values.completed`, only the mass is required."""
+    schema["required"] = ["mass_kg"]
+    positive = {"exclusiveMinimum": 0, "type": "number"}
+    schema["properties"] |= {"wheelbase_m": positive, "front_weight_share": positive | {"exclusiveMaximum": 1}}
+
+
+class VehicleEntries(VehicleParameters):
     """A vehicle.toml: physics and sensors, and optionally the residual gain that its author allows, with the reason."""
+
+    model_config = ConfigDict(json_schema_extra=_what_may_be_left_out)
 
     network: _Network | None = None
 
@@ -46,7 +55,9 @@ def read_vehicle_file(path: Path) -> VehicleFile:
     """
     raw, where = read_toml(path, "a vehicle TOML file", VehicleError), str(path)
     entries, assumed = completed(raw)
-    file = validated(_VehicleFile, entries, where, VehicleError, expected="the entries of vehicle.toml", remedy=REMEDY)
+    file = validated(
+        VehicleEntries, entries, where, VehicleError, expected="the entries of vehicle.toml", remedy=REMEDY
+    )
     fields = VehicleParameters.model_fields
     vehicle = VehicleParameters.model_construct(
         file.model_fields_set & fields.keys(), **{name: getattr(file, name) for name in fields}

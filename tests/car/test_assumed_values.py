@@ -8,10 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pdhef_logtool.car.assumed_values import completed
+from pdhef_logtool.car.assumed_values import RULES, completed
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.toml_files import read_vehicle_file
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.records.errors import VehicleError
+from studies.documentation_tables import on_page_markdown
 
 #: Mass, wheelbase and front share of a 1:10 car, a 1:5 car, a small car, a saloon, a van, a 40 t truck.
 VEHICLES = [
@@ -49,8 +51,6 @@ def test_mass_wheelbase_and_weight_split_suffice(tmp_path: Path, vehicle: tuple[
 def test_whatever_the_size_the_assumed_values_agree_with_one_another(mass: float, size: float, share: float) -> None:
     wheelbase = size * 0.22 * mass ** (1 / 3) + 0.05  # longer for heavier, over a factor of three
     entries, _ = completed(rough(mass, wheelbase, share))
-    from pdhef_logtool.car.vehicle import VehicleParameters
-
     VehicleParameters(**entries)
 
 
@@ -95,3 +95,8 @@ def test_the_car_names_what_was_assumed(tmp_path: Path) -> None:
     car = Car.load(write(tmp_path, rough(1440.0, 2.87, 0.6)), network="none")
     assert {a.entry for a in car.assumed} == {a.entry for a in completed(rough(1440.0, 2.87, 0.6))[1]}
     assert Car.load(network="none").assumed == ()
+
+
+def test_the_documentation_has_every_rule() -> None:
+    page = on_page_markdown((Path(__file__).parents[2] / "docs" / "formats.md").read_text())
+    assert all(f"| `{rule.entry}` | {rule.text} |" in page for rule in RULES)

@@ -13,14 +13,14 @@ import pytest
 
 from pdhef_logtool.car.car import SHIPPED_CARS
 from pdhef_logtool.car.parts import FilterNoise, Fit, FittedSensors, FittedValues, Intervals, LearntOn, Noise, Trust
-from pdhef_logtool.car.toml_files import part_toml
-from pdhef_logtool.car.vehicle import Record, VehicleParameters, default_vehicle
+from pdhef_logtool.car.toml_files import VehicleEntries, part_toml
+from pdhef_logtool.car.vehicle import Record, default_vehicle
 from pdhef_logtool.results.arrow_schema import load_schema
 
 FOLDER = Path(__file__).parents[2] / "schemas"
 #: By the name of the part.
 MODELS: dict[str, type[Record]] = {
-    "vehicle": VehicleParameters,
+    "vehicle": VehicleEntries,
     "fit": Fit,
     "noise": Noise,
     "network": Trust,
@@ -85,3 +85,5 @@ def test_misspelt_filters_and_measurements_are_seen_by_an_editor() -> None:
     assert not valid("noise", noise | {"filter": {name.replace("-", "_"): one}})
     assert not valid("noise", noise | {"filter": {name: one | {"r_std": {"ay": 1.0}}}})
     assert not valid("vehicle", document("vehicle") | {"mass_kg": 1e6})
+    assert valid("vehicle", {"mass_kg": 1440.0, "wheelbase_m": 2.87, "front_weight_share": 0.6})
+    assert not valid("vehicle", {"mass_kg": 1440.0, "wheelbase_m": 2.87, "front_weight_share": 60})

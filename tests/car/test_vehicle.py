@@ -115,6 +115,7 @@ def test_all_problems_are_reported_together(tmp_path):
     [
         ("E = 0.30", "E = 0.30\ncornering_stiffness_n_per_rad = 9e4", "tyres.front"),
         ("E = 0.30\n", "", "tyres.front"),
+        ("cornering_stiffness_n_per_rad = 108000.0", "", "tyres.rear"),
         ("E = 0.30", "E = 1.5", "tyres.front.E"),
         ("mass_kg = 1440.0", "mass_kg = nan", "mass_kg"),
         ("mass_kg = 1440.0", "mass_kg = inf", "mass_kg"),
