@@ -31,6 +31,8 @@ class ReadOptions:
     clock : ``arrival`` takes samples as known when they arrived, as in a car; ``stamp`` by their stamps (not causal).
     budget : factor on what reading a log may cost.
     waived : names of checks that do not count.
+    setup : file with what is decided once per drive; None decides it on the log. setup_from_s : decided on the first so
+        many seconds of the slice; None = its first ten minutes, and clocks on all of it.
     msgs : folder with definitions of message types that a log does not define.
     cache : folder or URL of slim logs, which stand for logs that were read before; changes no number.
     cache_max_gb : what the cache may hold, in GB, if it is a folder; None = any.
@@ -46,6 +48,8 @@ class ReadOptions:
     clock: Literal["arrival", "stamp"] = "arrival"
     budget: float = 1.0
     waived: tuple[str, ...] = ()
+    setup: Path | None = None
+    setup_from_s: float | None = None
     msgs: Path | None = None
     cache: str | None = None
     cache_max_gb: float | None = None
@@ -53,6 +57,7 @@ class ReadOptions:
 
     def __post_init__(self) -> None:
         """Take places as texts or paths."""
+        object.__setattr__(self, "setup", None if self.setup is None else Path(self.setup))
         object.__setattr__(self, "msgs", None if self.msgs is None else Path(self.msgs))
         object.__setattr__(self, "cache", None if self.cache is None else str(self.cache))
 

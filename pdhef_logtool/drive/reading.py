@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Self
+from typing import Self, cast
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.friction import FrictionSource, friction_source
 from pdhef_logtool.drive.options import ReadOptions, time_slice
-from pdhef_logtool.drive.windows import DrivePlan, DriveReader, DriveWindow, plan_drive
+from pdhef_logtool.drive.setup import LogUntil, Setup, load_setup
+from pdhef_logtool.drive.windows import DrivePlan, DriveReader, DriveWindow, plan_drive, setup_of
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
@@ -299,7 +300,12 @@ def read_drive(
 
     opened = open_log(log_input.path, options.limits, options.msgs, wanted=Wanted(frozenset()))
     try:
-        chosen = choose_mapping(opened, mapping, prefer_truth=options.prefer_truth, require_signals=require_sensors)
+        chosen = choose_mapping(
+            _as_far_as_decided(opened, options),
+            mapping,
+            prefer_truth=options.prefer_truth,
+            require_signals=require_sensors,
+        )
         for ambiguity in chosen.ambiguities:
             told(str(ambiguity))
         remarks += chosen.remarks
@@ -315,7 +321,10 @@ def read_drive(
         if not isinstance(log_input.path, Path):
             opened = _reopened(opened, used, slice_ns, options)
             slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
-        plan = plan_drive(opened, used, car.vehicle, *slice_ns, require_imu=require_sensors, clock=options.clock)
+        setup = _setup_of(opened, used, car.vehicle, slice_ns, options)
+        plan = plan_drive(
+            opened, used, car.vehicle, *slice_ns, require_imu=require_sensors, clock=options.clock, setup=setup
+        )
         for note in plan.mapping.notes[len(used.notes) :]:
             told(note)
         _tell_doubts(plan, options, told)
@@ -326,6 +335,28 @@ def read_drive(
         opened.close()
         raise
     return Drive(log_input.stem, opened, car, options, plan, chosen, notes, friction, tell, remarks)
+
+
+def _setup_of(
+    log: DriveLog, mapping: Mapping, vehicle: VehicleParameters, slice_ns: tuple[int, int], options: ReadOptions
+) -> Setup | None:
+    """Return the frozen set-up that the options ask for: that of a file, or that of the first seconds; else None."""
+    if options.setup is not None:
+        return load_setup(options.setup)
+    if options.setup_from_s is None:
+        return None
+    start_ns, end_ns = slice_ns
+    first = _as_far_as_decided(log, options)
+    until_ns = min(end_ns, first.end_ns)
+    return setup_of(plan_drive(first, mapping, vehicle, start_ns, until_ns, clock=options.clock))
+
+
+def _as_far_as_decided(log: DriveLog, options: ReadOptions) -> DriveLog:
+    """Return the log as far as a set-up from the first seconds may look at it, otherwise all of it."""
+    if options.setup_from_s is None or log.end_ns <= log.start_ns:
+        return log
+    start_ns, _ = time_slice(options, log.start_ns, log.end_ns)
+    return cast(DriveLog, LogUntil(log, start_ns + round(options.setup_from_s * 1e9)))
 
 
 def _reopened(log: DriveLog, mapping: Mapping, slice_ns: tuple[int, int], options: ReadOptions) -> DriveLog:

@@ -22,6 +22,7 @@ from pdhef_logtool.drive.alignment import (
 )
 from pdhef_logtool.drive.channel_hash import ChannelHash
 from pdhef_logtool.drive.mounting import survey_log
+from pdhef_logtool.drive.setup import Setup, clocks_of
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
     TruthPlan,
@@ -69,6 +70,7 @@ class DrivePlan:
     latency : of the truth against the sensors; None without truth yaw rate or gyro.
     dependent : truth quantities that are an input of the estimators, with the reason.
     derivation : by truth quantity, how it is derived.
+    decided_s : seconds of the log, or of that of the set-up, that the sensors' part was decided on.
     checks : of signals, truth and vehicle file. placed : where recorded frames put the IMU.
     """
 
@@ -83,6 +85,7 @@ class DrivePlan:
     survey_truth: dict[str, Channel]
     start_ns: int
     end_ns: int
+    decided_s: float
     checks: tuple[Check, ...] = ()
     placed: Placement | None = None
 
@@ -122,24 +125,31 @@ def plan_drive(
     *,
     require_imu: bool = True,
     clock: Clock = "arrival",
+    setup: Setup | None = None,
 ) -> DrivePlan:
     """Read at most ten minutes of the slice [start_ns, end_ns) and decide clocks, alignment and truth.
 
     Parameters
     ----------
     require_imu : False gives a plan with no alignment (``alignment.channels`` empty) where there is no IMU.
-    clock : as for :func:`~.alignment.plan_alignment`.
+    clock : as for :func:`~.alignment.plan_alignment`. setup : the sensors' part of the plan; None decides it here.
 
     Raises
     ------
     MappingError : The log lacks what is mapped, or there is no IMU to set the stamps.
     """
     mapping = with_gyro_delay(mapping, vehicle)
+    if setup is not None:
+        mapping = setup.applied_to(mapping)
     clocks = fit_clocks(log, mapping, start_ns, end_ns)
+    if setup is not None:
+        clocks |= clocks_of(setup, log, mapping, start_ns)
     span_ns = (start_ns, min(end_ns, start_ns + round(SURVEY_S * 1e9)))
     looked_at = survey_log(log, mapping, clocks, span_ns, vehicle)
     mapping, survey = looked_at.mapping, looked_at.channels
-    if require_imu or has_imu(survey.signals):
+    if setup is not None:
+        alignment = setup.alignment
+    elif require_imu or has_imu(survey.signals):
         alignment = plan_alignment(
             survey.signals,
             steering_ratio=vehicle.steering_ratio,
@@ -164,8 +174,21 @@ def plan_drive(
         survey_truth=survey.truth,
         start_ns=start_ns,
         end_ns=end_ns,
+        decided_s=(end_ns - start_ns) * 1e-9 if setup is None else setup.decided_s,
         checks=looked_at.checks,
         placed=looked_at.placed,
+    )
+
+
+def setup_of(plan: DrivePlan) -> Setup:
+    """Return what of a plan can be frozen: mapping, clocks and alignment of the sensors."""
+    keys = {clock_key(source) for source in plan.mapping.signals.values()}
+    return Setup(
+        signals=plan.mapping.signals,
+        clocks={key: clock for key, clock in plan.clocks.items() if key in keys},
+        alignment=plan.alignment,
+        decided_s=plan.decided_s,
+        can=plan.mapping.can,
     )
 
 
