@@ -96,6 +96,22 @@ _OPTIONS: dict[str, Any] = {
             rich_help_panel=ESTIMATION,
         ),
     ],
+    "setup": Annotated[
+        _File,
+        Option(
+            help="setup.toml of another run of this car and recorder: mounting, delays and clocks are taken from it.",
+            rich_help_panel=ESTIMATION,
+        ),
+    ],
+    "setup_from_s": Annotated[
+        float | None,
+        Option(
+            "--setup-from",
+            metavar="SECONDS",
+            help="Decide mounting, delays and clocks on the first SECONDS only, as in a car.",
+            rich_help_panel=ESTIMATION,
+        ),
+    ],
     "estimators": Annotated[
         _Text,
         Option(

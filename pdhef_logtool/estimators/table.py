@@ -22,7 +22,10 @@ from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.printable import shown
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 
-_ESP = frozenset({"steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
+#: What drives the vehicle model; a filter uses a_y and yaw rate where the log has them.
+_INPUTS = frozenset({"steer_rad", "speed_m_s"})
+#: What the features of a network are made of.
+_FEATURES = _INPUTS | {"ay_m_s2", "yaw_rate_rad_s"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,53 +122,53 @@ SPECS: tuple[Spec, ...] = (
     ),
     Spec(
         "open-loop", "nominal single-track model from steering and speed alone", "open_loop:build",
-        frozenset({"steer_rad", "speed_m_s"}), 0xE69F00,
+        _INPUTS, 0xE69F00,
     ),
     Spec(
         OPEN_LOOP, "open-loop on the car as its log calibrated it, without truth: not causal",
-        "open_loop:build", frozenset({"steer_rad", "speed_m_s"}), 0x661100, causal=False,
+        "open_loop:build", _INPUTS, 0x661100, causal=False,
     ),
     Spec(
         "linear-regression",
         "sideslip linear in the network's features, low-passed at 2 Hz (needs a network with baselines)",
-        "linear_regression:build", _ESP, 0xDDCC77, network="linear_regression",
+        "linear_regression:build", _FEATURES, 0xDDCC77, network="linear_regression",
     ),
     Spec(
         "phy-ukf", "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",
-        "phy_ukf:build", _ESP, 0x0072B2,
+        "phy_ukf:build", _INPUTS, 0x0072B2,
     ),
     Spec(
         "physics", "the strongest filter on physics alone, with the parts that driving of the car gave evidence for",
-        "adaptive_physics:build", _ESP, 0x44AA99, tunable=True,
+        "adaptive_physics:build", _INPUTS, 0x44AA99, tunable=True,
     ),
     Spec(
         "phy-ukf:tuned", "phy-ukf with the noise of an identified car, corrected for body roll",
-        "phy_ukf:build", _ESP, 0x56B4E9, needs_noise=True, tunable=True,
+        "phy_ukf:build", _INPUTS, 0x56B4E9, needs_noise=True, tunable=True,
     ),
     Spec(
         "pure-lstm", "a network that says v_y itself, from the same inputs, no filter (needs a network with baselines)",
-        "direct_network:build", _ESP, 0xAA4499, network="pure_lstm",
+        "direct_network:build", _FEATURES, 0xAA4499, network="pure_lstm",
     ),
     Spec(
         "pd-hef", "physics plus what its network says that it lacks, as far as the car's evidence lets it",
-        "pd_hef:build", _ESP, 0xD55E00, network="optional",
+        "pd_hef:build", _INPUTS, 0xD55E00, network="optional",
     ),
     Spec(
         "pd-hef:fixed-r", "pd-hef at gain 1 without the adaptive mechanism (needs a network)",
-        "pd_hef:build", _ESP, 0x117733, network="residual",
+        "pd_hef:build", _INPUTS, 0x117733, network="residual",
     ),
     Spec(
         "pd-hef-smoothed", "pd-hef smoothed with what came later: not causal, ranked apart",
-        "pd_hef:build_smoothed", _ESP, 0x332288, causal=False, network="optional",
+        "pd_hef:build_smoothed", _INPUTS, 0x332288, causal=False, network="optional",
     ),
     Spec(
         "pd-hef:gain=1",
         "pd-hef at a given residual gain, 0 to 1, with or without evidence (needs a network; not in all)",
-        "pd_hef:build", _ESP, 0x882255, in_all=False, network="residual",
+        "pd_hef:build", _INPUTS, 0x882255, in_all=False, network="residual",
     ),
     Spec(
         "pd-hef-paper", "the paper's hybrid filter with its adaptive mechanism, to the letter (needs its network)",
-        "hybrid_paper:build", _ESP, 0xCC6677, network="paper",
+        "hybrid_paper:build", _FEATURES, 0xCC6677, network="paper",
     ),
 )  # fmt: skip
 

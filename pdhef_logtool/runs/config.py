@@ -23,7 +23,7 @@ from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED_FOLDERS
 from pdhef_logtool.storage.documents import read_toml, validated
 from pdhef_logtool.storage.object_store import is_url
 
-_FILES = ("car", "cars", "mapping", "msgs", "thresholds", "network", "intervals")
+_FILES = ("car", "cars", "mapping", "msgs", "thresholds", "network", "intervals", "setup")
 #: Settings that change no result.
 _NO_RESULT = ("cache", "cache_max_gb", "allow_private_redirects", "log_timeout_s", "max_memory_mb", "full_worst")
 #: What may stand in place of a file.
@@ -82,6 +82,10 @@ class RunConfig:
     calibrate : calibration of a car without validation data, without ground truth: per ``log``, on the ``pool`` of all
         logs, or ``off``.
     waived : names of checks whose failure is ignored.
+    setup : setup.toml of another run of the same car and recorder, from which mounting, units, delays and clocks are
+        taken; None = decided on the log.
+    setup_from_s : decide these on the first so many seconds of the slice; None = on its first ten minutes (clocks on
+        all of it).
     cache : folder or URL of reduced logs, which replace logs that were read before. Results do not depend on it.
     cache_max_gb : maximum cache size in GB; least recently used entries are evicted.
     allow_private_redirects : follow redirects of web servers to hosts of this machine or its network.
@@ -110,6 +114,8 @@ class RunConfig:
     intervals: File | None = None
     calibrate: Literal["off", "log", "pool"] = "log"
     waived: Names = ()
+    setup: File | None = None
+    setup_from_s: Annotated[float, Field(ge=1)] | None = None
     cache: Annotated[str, BeforeValidator(lambda v: str(v) if isinstance(v, Path) else v)] | None = None
     cache_max_gb: Annotated[float, Field(gt=0)] | None = None
     allow_private_redirects: bool = False
@@ -185,6 +191,8 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
         )
     if config.cache_max_gb is not None and (config.cache is None or is_url(config.cache)):
         raise UsageError(expected="--cache DIR", got=config.cache or "none", where="cache_max_gb")
+    if config.setup is not None and config.setup_from_s is not None:
+        raise UsageError(expected="--setup or --setup-from", got="both", where="--setup")
     # Times are understood without a log, so that a typing error is told before the first log is opened.
     for name, text in (("--start", config.start), ("--end", config.end)):
         if text is not None:

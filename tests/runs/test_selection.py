@@ -54,15 +54,17 @@ def test_a_proven_car_runs_three_and_an_unproven_one_what_guards_it_as_well() ->
     assert "linear-regression" not in unproven
 
 
-@pytest.mark.parametrize(
-    ("lacks", "instead"),
-    [({"steer_rad"}, {"kinematic"}), ({"ay_m_s2"}, {"open-loop"}), ({"steer_rad", "ay_m_s2"}, set())],
-)
+@pytest.mark.parametrize(("lacks", "instead"), [({"steer_rad"}, {"kinematic"}), ({"steer_rad", "ay_m_s2"}, set())])
 @pytest.mark.parametrize("car", ["saloon", None])
 def test_a_log_that_lacks_what_physics_needs_runs_what_does_with_less(
     lacks: set[str], instead: set[str], car: str | None
 ) -> None:
     assert set(default_names(Car.load(car), EVERY - lacks)) == {"zero", "physics", "pd-hef", *instead}
+
+
+@pytest.mark.parametrize("lacks", [{"ay_m_s2"}, {"yaw_rate_rad_s"}, {"ay_m_s2", "yaw_rate_rad_s"}])
+def test_physics_runs_without_a_measurement(lacks: set[str]) -> None:
+    assert {"physics", "pd-hef"} <= set(default_names(Car.load("saloon"), EVERY - lacks))
 
 
 def test_the_main_one_is_the_best_of_its_kind_whatever_the_order() -> None:
