@@ -18,7 +18,7 @@ from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, join_si
 #: Step of the grid. The model follows 4 Hz, and the lag of a tyre at 40 m/s is 12 ms, which its step takes exactly.
 STEP_S = 0.02
 #: Below this speed bends are narrow, and what they say of the rear axle is wrong (docs/method.md#self-calibration).
-LEAST_SPEED_M_S = 10.0
+LEAST_SPEED_M_S = 3.0
 #: A shorter stretch has hardly settled. Missing samples are bridged for so long; of the speed, which is slow, longer.
 LEAST_STRETCH_S, BRIDGED_S, SPEED_BRIDGED_S = 6.0, 0.15, 0.6
 

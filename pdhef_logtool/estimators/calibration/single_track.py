@@ -11,11 +11,17 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from pdhef_logtool.car.nominal_points import arctangent, sine
 from pdhef_logtool.compiled.cache import njit
 
 #: Columns of a drive on its grid.
 STEER, SPEED, YAW_RATE, AY, FRICTION, SLOW_TURN = range(6)
+#: What the sensors correct: noise of yaw rate and a_y, rad/s and m/s²; how v_y and yaw rate wander, 1-sigma per √s; and
+#: what is known of them at the start of a stretch. The model wanders little, for parameters show at low frequencies; as
+#: much as keeps it from spinning where the car does not (docs/method.md#self-calibration).
+NOISE_STD, WANDER_STD, START_STD = (0.02, 0.3), (0.05, 0.002), (0.3, 0.05)
 #: Rows of the errors.
 OF_RATE, OF_AY = range(2)
 
@@ -84,6 +90,34 @@ def _slip_of(force, B, peak, shape):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def _slope(slip, B, peak, shape):  # type: ignore[no-untyped-def]
+    """Return the derivative of a force by its slip."""
+    return peak * math.cos(shape * math.atan(B * slip)) * shape * B / (1.0 + (B * slip) ** 2)
+
+
+@njit(cache=True)
+def _predict_covariance(P, A, work):  # type: ignore[no-untyped-def]
+    """Replace P [4, 4] by A P A^T + Q."""
+    for i in range(4):
+        for j in range(4):
+            work[i, j] = A[i, 0] * P[0, j] + A[i, 1] * P[1, j] + A[i, 2] * P[2, j] + A[i, 3] * P[3, j]
+    for i in range(4):
+        for j in range(4):
+            P[i, j] = work[i, 0] * A[j, 0] + work[i, 1] * A[j, 1] + work[i, 2] * A[j, 2] + work[i, 3] * A[j, 3]
+
+
+@njit(cache=True)
+def _update(P, h, variance, innovation, gained):  # type: ignore[no-untyped-def]
+    """Update P by one measurement h [4]; write what the state gains."""
+    gain = P @ h
+    total = variance + h @ gain
+    gained += gain * (innovation / total)
+    for i in range(4):
+        for j in range(4):
+            P[i, j] -= gain[i] * gain[j] / total
+
+
+@njit(cache=True)
 def simulate(columns, stretches, step_s, p, out):  # type: ignore[no-untyped-def]
     """Drive the model through the stretches [k, 2] of a grid, [first, last) each.
 
@@ -91,6 +125,8 @@ def simulate(columns, stretches, step_s, p, out):  # type: ignore[no-untyped-def
     """
     steer, speed, rate, ay = columns[0], columns[1], columns[2], columns[3]
     friction, slow_turn = columns[4], columns[5]
+    P, A, work = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4))
+    h, gained = np.zeros(4), np.zeros(4)
     for s in range(stretches.shape[0]):
         first, last = stretches[s, 0], stretches[s, 1]
         mu = friction[first] / p.friction
@@ -100,6 +136,8 @@ def simulate(columns, stretches, step_s, p, out):  # type: ignore[no-untyped-def
         ff, fr = planar * p.rear_m / length, planar * p.front_m / length
         vy = p.rear_m * r - v * math.tan(_slip_of(fr, p.rear_B / mu, p.rear_peak * mu, p.shape))
         angle = p.steer_gain * _at(steer, first - p.steer_delay, first, last) + p.steer_added
+        P[:, :] = 0.0
+        P[0, 0], P[1, 1] = START_STD[0] ** 2, START_STD[1] ** 2
         for k in range(first, last):
             ffc = ff * math.cos(angle)
             r_dot = p.mass_over_inertia * (p.front_m * ffc - p.rear_m * fr)
@@ -108,6 +146,18 @@ def simulate(columns, stretches, step_s, p, out):  # type: ignore[no-untyped-def
             out[2, k] = vy
             if k + 1 == last:
                 break
+            gained[:] = 0.0
+            h[:] = 0.0
+            h[1] = 1.0
+            _update(P, h, NOISE_STD[0] ** 2, rate[k] - out[0, k], gained)
+            h[1] = 0.0
+            h[2] = p.ay_gain + p.imu_x_m * p.mass_over_inertia * p.front_m
+            h[3] = p.ay_gain - p.imu_x_m * p.mass_over_inertia * p.rear_m
+            measured = _at(ay, k + p.ay_delay, first, last) - out[1, k] - h @ gained
+            _update(P, h, NOISE_STD[1] ** 2, measured, gained)
+            vy, r, ff, fr = vy + gained[0], r + gained[1], ff + gained[2], fr + gained[3]
+            ffc = ff * math.cos(angle)
+            r_dot = p.mass_over_inertia * (p.front_m * ffc - p.rear_m * fr)
             v = speed[k]
             middle = 0.5 * (v + speed[k + 1])
             after = p.steer_gain * _at(steer, k + 1 - p.steer_delay, first, last) + p.steer_added
@@ -120,10 +170,20 @@ def simulate(columns, stretches, step_s, p, out):  # type: ignore[no-untyped-def
             slope = p.superelevation * slow_turn[k]
             sideways = vy + t * (ffc + fr + slope - v * r)
             asked = angle + (after - angle) * t / step_s
-            sf = _force(
-                asked - arctangent(sideways + p.front_m * turning, middle), p.front_B / mu, p.front_peak * mu, p.shape
-            )
-            sr = _force(-arctangent(sideways - p.rear_m * turning, middle), p.rear_B / mu, p.rear_peak * mu, p.shape)
+            front_slip = asked - arctangent(sideways + p.front_m * turning, middle)
+            rear_slip = -arctangent(sideways - p.rear_m * turning, middle)
+            sf = _force(front_slip, p.front_B / mu, p.front_peak * mu, p.shape)
+            sr = _force(rear_slip, p.rear_B / mu, p.rear_peak * mu, p.shape)
+            cf = (1.0 - kept) * _slope(front_slip, p.front_B / mu, p.front_peak * mu, p.shape) / middle
+            cr = (1.0 - kept) * _slope(rear_slip, p.rear_B / mu, p.rear_peak * mu, p.shape) / middle
+            A[0, 0], A[0, 1], A[0, 2], A[0, 3] = 1.0, -step_s * middle, step_s, step_s
+            A[1, 0], A[1, 1] = 0.0, 1.0
+            A[1, 2], A[1, 3] = step_s * p.mass_over_inertia * p.front_m, -step_s * p.mass_over_inertia * p.rear_m
+            A[2, 0], A[2, 1], A[2, 2], A[2, 3] = -cf, -cf * p.front_m, kept, 0.0
+            A[3, 0], A[3, 1], A[3, 2], A[3, 3] = -cr, cr * p.rear_m, 0.0, kept
+            _predict_covariance(P, A, work)
+            P[0, 0] += step_s * WANDER_STD[0] ** 2
+            P[1, 1] += step_s * WANDER_STD[1] ** 2
             ff1, fr1 = sf + (ff - sf) * kept, sr + (fr - sr) * kept
             mf, mr = 0.5 * (ffc + ff1 * math.cos(after)), 0.5 * (fr + fr1)
             r1 = r + step_s * p.mass_over_inertia * (p.front_m * mf - p.rear_m * mr)
