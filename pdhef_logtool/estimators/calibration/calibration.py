@@ -33,7 +33,7 @@ from pdhef_logtool.car.vehicle import (
     Tyres,
     VehicleParameters,
 )
-from pdhef_logtool.estimators.calibration.driving import LEAST_SPEED_M_S, STEP_S, Driving, smoothed
+from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving, smoothed
 from pdhef_logtool.estimators.calibration.single_track import (
     AY,
     FRICTION,
@@ -60,6 +60,8 @@ KEPT_STEPS = 4
 ROBUST = 3.0
 #: No error is believed to be smaller: rad/s and m/s².
 FLOORS = (0.0008, 0.03)
+#: What the model leaves of yaw rate and a_y, rad/s and m/s² (docs/method.md#self-calibration).
+MODEL_STD = (0.02, 0.3)
 #: Share of an error's slow part that is forgotten at each step: of a_y over 5 s, for the road's bank wanders so.
 FORGOTTEN = np.array([0.0, STEP_S / 5.0])
 #: Steps of the search: of each start, then of the best of them.
@@ -260,7 +262,7 @@ def self_calibrate(
     drives = [d for d in drives if len(d.stretches)]
     seconds = sum(d.seconds for d in drives)
     if seconds < LEAST_S:
-        why = f"{seconds:.0f} s above {LEAST_SPEED_M_S:g} m/s, {LEAST_S:g} are needed"
+        why = f"{seconds:.0f} s above {own.low_speed_blend_m_s:g} m/s, {LEAST_S:g} are needed"
         return SelfCalibration(own, own, (), None, why, (math.nan,) * 2, (math.nan,) * 2, seconds, len(drives))
     problem = _Problem(drives, own)
     theta, covariance = problem.solve(progress)
@@ -525,6 +527,8 @@ def _track_of(vehicle: VehicleParameters, own: VehicleParameters, nuisance: Mapp
         superelevation=nuisance.get("superelevation", 0.0),
         steer_delay=nuisance.get("steering delay", 0.0) / STEP_S,
         ay_delay=nuisance.get("a_y delay", 0.0) / STEP_S,
+        rate_std=max(MODEL_STD[OF_RATE], own.sensors.yaw_rate_std_rad_s),
+        ay_std=max(MODEL_STD[OF_AY], own.sensors.ay_std_m_s2),
     )
 
 

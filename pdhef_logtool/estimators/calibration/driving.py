@@ -17,8 +17,6 @@ from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, join_si
 
 #: Step of the grid. The model follows 4 Hz, and the lag of a tyre at 40 m/s is 12 ms, which its step takes exactly.
 STEP_S = 0.02
-#: Below this speed bends are narrow, and what they say of the rear axle is wrong (docs/method.md#self-calibration).
-LEAST_SPEED_M_S = 3.0
 #: A shorter stretch has hardly settled. Missing samples are bridged for so long; of the speed, which is slow, longer.
 LEAST_STRETCH_S, BRIDGED_S, SPEED_BRIDGED_S = 6.0, 0.15, 0.6
 
@@ -36,7 +34,7 @@ class Driving:
     ----------
     columns : float64 [6, N], steering, speed, yaw rate, a_y and friction on the grid, as ``read_with`` reads them, and
         v_x r without what is fast.
-    stretches : int64 [k, 2], [first, last) of each stretch without a gap, above :data:`LEAST_SPEED_M_S`.
+    stretches : int64 [k, 2], [first, last) of each stretch without a gap, above the vehicle's low-speed limit.
     """
 
     columns: FloatArray
@@ -89,7 +87,7 @@ class DrivingReader:
         columns[FRICTION] = np.where(np.isfinite(columns[FRICTION]), columns[FRICTION], self._vehicle.assumed_friction)
         for row, bridged_s in ((STEER, BRIDGED_S), (YAW_RATE, BRIDGED_S), (AY, BRIDGED_S), (SPEED, SPEED_BRIDGED_S)):
             columns[row] = _bridged(columns[row], round(bridged_s / STEP_S))
-        stretches = _stretches(columns[:SLOW_TURN])
+        stretches = _stretches(columns[:SLOW_TURN], self._vehicle.low_speed_blend_m_s)
         columns[SLOW_TURN] = smoothed(columns[SPEED] * columns[YAW_RATE], stretches, SLOW_S)
         return Driving(columns, stretches, self._vehicle)
 
@@ -126,9 +124,9 @@ def _bridged(values: FloatArray, most: int) -> FloatArray:
     return np.where(np.isfinite(values) | (gap <= most), filled, np.nan)
 
 
-def _stretches(columns: FloatArray) -> IntArray:
+def _stretches(columns: FloatArray, least_speed_m_s: float) -> IntArray:
     """Return [first, last) of each stretch that is known, fast and long enough."""
-    good = np.isfinite(columns).all(axis=0) & (columns[SPEED] > LEAST_SPEED_M_S)
+    good = np.isfinite(columns).all(axis=0) & (columns[SPEED] > least_speed_m_s)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]])))
     spans = edges.reshape(-1, 2).astype(np.int64)
     return spans[spans[:, 1] - spans[:, 0] >= round(LEAST_STRETCH_S / STEP_S)]

@@ -18,10 +18,14 @@ from pdhef_logtool.compiled.cache import njit
 
 #: Columns of a drive on its grid.
 STEER, SPEED, YAW_RATE, AY, FRICTION, SLOW_TURN = range(6)
-#: What the sensors correct: noise of yaw rate and a_y, rad/s and m/s²; how v_y and yaw rate wander, 1-sigma per √s; and
-#: what is known of them at the start of a stretch. The model wanders little, for parameters show at low frequencies; as
+#: What the sensors correct: how v_y and yaw rate wander, m/s and rad/s per √s, and their 1-sigma at the start of a
+#: stretch. The model wanders little, for parameters show at low frequencies; as
 #: much as keeps it from spinning where the car does not (docs/method.md#self-calibration).
-NOISE_STD, WANDER_STD, START_STD = (0.02, 0.3), (0.05, 0.002), (0.3, 0.05)
+WANDER_STD, START_STD = (0.05, 0.002), (0.3, 0.05)
+#: Largest phase of the model's oscillation in a step of its integration.
+LARGEST_STEP_RAD = 0.7
+#: From about this sum of normalised squared innovations on the model is taken to be lost, and the sensors lead it back.
+CONTRADICTED = 18.0
 #: Rows of the errors.
 OF_RATE, OF_AY = range(2)
 
@@ -48,6 +52,8 @@ class TrackParameters(NamedTuple):
     superelevation: float  # share of a bend's slow v_x r that the road's bank carries
     steer_delay: float  # in grid steps
     ay_delay: float
+    rate_std: float  # of the innovations
+    ay_std: float
 
 
 class LowPass(NamedTuple):
@@ -91,8 +97,8 @@ def _slip_of(force, B, peak, shape):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _slope(slip, B, peak, shape):  # type: ignore[no-untyped-def]
-    """Return the derivative of a force by its slip."""
-    return peak * math.cos(shape * math.atan(B * slip)) * shape * B / (1.0 + (B * slip) ** 2)
+    """Return the derivative of a force by its slip, 0 beyond the peak, where it is negative."""
+    return max(peak * math.cos(shape * math.atan(B * slip)) * shape * B / (1.0 + (B * slip) ** 2), 0.0)
 
 
 @njit(cache=True)
@@ -108,13 +114,22 @@ def _predict_covariance(P, A, work):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _update(P, h, variance, innovation, gained):  # type: ignore[no-untyped-def]
-    """Update P by one measurement h [4]; write what the state gains."""
+    """Update P by one measurement h [4]; write what the state gains. Return the normalised squared innovation."""
     gain = P @ h
     total = variance + h @ gain
     gained += gain * (innovation / total)
     for i in range(4):
         for j in range(4):
             P[i, j] -= gain[i] * gain[j] / total
+    return innovation * innovation / total
+
+
+@njit(cache=True)
+def _parts(step_s, p):  # type: ignore[no-untyped-def]
+    """Return into how many parts a step of the grid is divided, for the yaw oscillation of a light car."""
+    front, rear = p.front_B * p.front_peak * p.shape, p.rear_B * p.rear_peak * p.shape
+    turning = p.mass_over_inertia * (p.front_m**2 * front + p.rear_m**2 * rear)
+    return 1 + int(step_s * math.sqrt(max(front + rear, turning) / p.relaxation_m) / LARGEST_STEP_RAD)
 
 
 @njit(cache=True)
@@ -127,6 +142,8 @@ def simulate(columns, stretches, step_s, p, out):  # type: ignore[no-untyped-def
     friction, slow_turn = columns[4], columns[5]
     P, A, work = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4))
     h, gained = np.zeros(4), np.zeros(4)
+    parts = _parts(step_s, p)
+    h_s = step_s / parts
     for s in range(stretches.shape[0]):
         first, last = stretches[s, 0], stretches[s, 1]
         mu = friction[first] / p.friction
@@ -149,46 +166,55 @@ def simulate(columns, stretches, step_s, p, out):  # type: ignore[no-untyped-def
             gained[:] = 0.0
             h[:] = 0.0
             h[1] = 1.0
-            _update(P, h, NOISE_STD[0] ** 2, rate[k] - out[0, k], gained)
+            contradicted = _update(P, h, p.rate_std**2, rate[k] - out[0, k], gained)
             h[1] = 0.0
             h[2] = p.ay_gain + p.imu_x_m * p.mass_over_inertia * p.front_m
             h[3] = p.ay_gain - p.imu_x_m * p.mass_over_inertia * p.rear_m
             measured = _at(ay, k + p.ay_delay, first, last) - out[1, k] - h @ gained
-            _update(P, h, NOISE_STD[1] ** 2, measured, gained)
+            contradicted += _update(P, h, p.ay_std**2, measured, gained)
             vy, r, ff, fr = vy + gained[0], r + gained[1], ff + gained[2], fr + gained[3]
             ffc = ff * math.cos(angle)
             r_dot = p.mass_over_inertia * (p.front_m * ffc - p.rear_m * fr)
-            v = speed[k]
-            middle = 0.5 * (v + speed[k + 1])
-            after = p.steer_gain * _at(steer, k + 1 - p.steer_delay, first, last) + p.steer_added
             mu = friction[k] / p.friction
-            x = step_s * middle / p.relaxation_m
-            kept = math.exp(-x)
-            t = step_s * (1.0 - (1.0 - x * kept / (1.0 - kept)) / x) if x > 1e-3 else 0.5 * step_s
-            # the tyres, asked at the instant for which the lag's kernel stands
-            turning = r + t * r_dot
             slope = p.superelevation * slow_turn[k]
-            sideways = vy + t * (ffc + fr + slope - v * r)
-            asked = angle + (after - angle) * t / step_s
-            front_slip = asked - arctangent(sideways + p.front_m * turning, middle)
-            rear_slip = -arctangent(sideways - p.rear_m * turning, middle)
-            sf = _force(front_slip, p.front_B / mu, p.front_peak * mu, p.shape)
-            sr = _force(rear_slip, p.rear_B / mu, p.rear_peak * mu, p.shape)
-            cf = (1.0 - kept) * _slope(front_slip, p.front_B / mu, p.front_peak * mu, p.shape) / middle
-            cr = (1.0 - kept) * _slope(rear_slip, p.rear_B / mu, p.rear_peak * mu, p.shape) / middle
-            A[0, 0], A[0, 1], A[0, 2], A[0, 3] = 1.0, -step_s * middle, step_s, step_s
-            A[1, 0], A[1, 1] = 0.0, 1.0
-            A[1, 2], A[1, 3] = step_s * p.mass_over_inertia * p.front_m, -step_s * p.mass_over_inertia * p.rear_m
-            A[2, 0], A[2, 1], A[2, 2], A[2, 3] = -cf, -cf * p.front_m, kept, 0.0
-            A[3, 0], A[3, 1], A[3, 2], A[3, 3] = -cr, cr * p.rear_m, 0.0, kept
-            _predict_covariance(P, A, work)
-            P[0, 0] += step_s * WANDER_STD[0] ** 2
-            P[1, 1] += step_s * WANDER_STD[1] ** 2
-            ff1, fr1 = sf + (ff - sf) * kept, sr + (fr - sr) * kept
-            mf, mr = 0.5 * (ffc + ff1 * math.cos(after)), 0.5 * (fr + fr1)
-            r1 = r + step_s * p.mass_over_inertia * (p.front_m * mf - p.rear_m * mr)
-            vy += step_s * (mf + mr + slope - middle * 0.5 * (r + r1))
-            r, ff, fr, angle = r1, ff1, fr1, after
+            lost = (1.0 + contradicted / CONTRADICTED) ** 2
+            first_angle = angle
+            last_angle = p.steer_gain * _at(steer, k + 1 - p.steer_delay, first, last) + p.steer_added
+            for i in range(parts):
+                v = speed[k] + (speed[k + 1] - speed[k]) * i / parts
+                middle = v + 0.5 * (speed[k + 1] - speed[k]) / parts
+                after = first_angle + (last_angle - first_angle) * (i + 1) / parts
+                x = h_s * middle / p.relaxation_m
+                kept = math.exp(-x)
+                t = h_s * (1.0 - (1.0 - x * kept / (1.0 - kept)) / x) if x > 1e-3 else 0.5 * h_s
+                # the tyres, asked at the instant for which the lag's kernel stands
+                turning = r + t * r_dot
+                sideways = vy + t * (ffc + fr + slope - v * r)
+                asked = angle + (after - angle) * t / h_s
+                front_slip = asked - arctangent(sideways + p.front_m * turning, middle)
+                rear_slip = -arctangent(sideways - p.rear_m * turning, middle)
+                sf = _force(front_slip, p.front_B / mu, p.front_peak * mu, p.shape)
+                sr = _force(rear_slip, p.rear_B / mu, p.rear_peak * mu, p.shape)
+                cf = (1.0 - kept) * _slope(front_slip, p.front_B / mu, p.front_peak * mu, p.shape) / middle
+                cr = (1.0 - kept) * _slope(rear_slip, p.rear_B / mu, p.rear_peak * mu, p.shape) / middle
+                A[2, 0], A[2, 1], A[2, 2], A[2, 3] = -cf, -cf * p.front_m, kept, 0.0
+                A[3, 0], A[3, 1], A[3, 2], A[3, 3] = -cr, cr * p.rear_m, 0.0, kept
+                for n in range(4):  # the new forces act on the velocities, or the oscillation of a light car would grow
+                    A[0, n] = h_s * (A[2, n] + A[3, n])
+                    A[1, n] = h_s * p.mass_over_inertia * (p.front_m * A[2, n] - p.rear_m * A[3, n])
+                A[0, 0] += 1.0
+                A[0, 1] -= h_s * middle
+                A[1, 1] += 1.0
+                _predict_covariance(P, A, work)
+                P[0, 0] += h_s * lost * WANDER_STD[0] ** 2
+                P[1, 1] += h_s * lost * WANDER_STD[1] ** 2
+                ff1, fr1 = sf + (ff - sf) * kept, sr + (fr - sr) * kept
+                mf, mr = 0.5 * (ffc + ff1 * math.cos(after)), 0.5 * (fr + fr1)
+                r1 = r + h_s * p.mass_over_inertia * (p.front_m * mf - p.rear_m * mr)
+                vy += h_s * (mf + mr + slope - middle * 0.5 * (r + r1))
+                r, ff, fr, angle = r1, ff1, fr1, after
+                ffc = ff * math.cos(angle)
+                r_dot = p.mass_over_inertia * (p.front_m * ffc - p.rear_m * fr)
 
 
 @njit(cache=True)
