@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from pdhef_logtool.estimators.calibration.calibration import LEAST_KNOWN, LEAST_KNOWN_EXPORTED, VARIED
+from pdhef_logtool.estimators.calibration.calibration import LEAST_KNOWN_EXPORTED, VARIED
 from pdhef_logtool.estimators.posterior_band import OWN_SHARE as IDENTIFIED_SHARE
 from pdhef_logtool.estimators.self_calibrated import D2_SHARE, OWN_SHARE
 from pdhef_logtool.runs.selection import FACTOR, SIMPLE
@@ -117,7 +117,6 @@ def settings() -> dict[str, object]:
         "seed": SELF_SEED,
         "low": self_calibration.WRONG[0],
         "high": self_calibration.WRONG[1],
-        "least": f"{100 * LEAST_KNOWN:.0f} %",
         "exported": f"{100 * LEAST_KNOWN_EXPORTED:.0f} %",
         "own": OWN_SHARE,
         "varied": VARIED,

@@ -53,11 +53,14 @@ def read_vehicle_file(path: Path) -> VehicleFile:
     VehicleError
         The file is missing or no TOML, or has wrong, unknown or missing entries; the message names all of them.
     """
-    raw, where = read_toml(path, "a vehicle TOML file", VehicleError), str(path)
+    return vehicle_of_entries(read_toml(path, "a vehicle TOML file", VehicleError), where=str(path))
+
+
+def vehicle_of_entries(raw: Mapping[str, Any], *, where: str) -> VehicleFile:
+    """Return what the entries of a vehicle.toml say; raises VehicleError as :func:`read_vehicle_file`."""
     entries, assumed = completed(raw)
-    file = validated(
-        VehicleEntries, entries, where, VehicleError, expected="the entries of vehicle.toml", remedy=REMEDY
-    )
+    expected = "the entries of vehicle.toml"
+    file = validated(VehicleEntries, entries, where, VehicleError, expected=expected, remedy=REMEDY)
     fields = VehicleParameters.model_fields
     vehicle = VehicleParameters.model_construct(
         file.model_fields_set & fields.keys(), **{name: getattr(file, name) for name in fields}

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from pdhef_logtool.records.errors import VehicleError
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.storage.documents import validated
 
 #: A car is at a standstill below this share of its low-speed blend.
 STANDSTILL_SHARE = 0.1
@@ -314,22 +312,4 @@ def default_vehicle() -> VehicleParameters:
             front=AxleTyre(B=12.3, C=1.41, D_n=7600.0, E=0.30),
             rear=AxleTyre(B=15.4, C=1.17, D_n=6110.0, E=0.20),
         ),
-    )
-
-
-def vehicle_from_dict(raw: dict[str, Any], *, where: str) -> VehicleParameters:
-    """Build parameters from parsed TOML; problems are reported together.
-
-    Raises
-    ------
-    VehicleError
-        Entries are wrong, unknown or missing.
-    """
-    return validated(
-        VehicleParameters,
-        raw,
-        where,
-        VehicleError,
-        expected="the entries of vehicle.toml",
-        remedy=REMEDY,
     )

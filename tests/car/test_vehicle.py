@@ -13,8 +13,8 @@ from pydantic import ValidationError
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import Noise, Trust
-from pdhef_logtool.car.toml_files import load_vehicle, read_vehicle_file
-from pdhef_logtool.car.vehicle import default_vehicle, vehicle_from_dict
+from pdhef_logtool.car.toml_files import load_vehicle, read_vehicle_file, vehicle_of_entries
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.records.errors import VehicleError
 
 FILES = Path(__file__).parents[1] / "reference" / "vehicles"
@@ -80,7 +80,7 @@ def test_every_entry_of_the_example_is_read(tmp_path):
     raw = tomllib.loads(EXAMPLE)
     given = {k: v for k, v in vehicle.model_dump(exclude_unset=True).items() if k in raw}
     assert as_plain(given) == raw
-    assert vehicle_from_dict(as_plain(vehicle.model_dump(exclude_none=True)), where="again") == vehicle
+    assert vehicle_of_entries(as_plain(vehicle.model_dump(exclude_none=True)), where="again").vehicle == vehicle
 
 
 def test_defaults_of_what_the_file_leaves_out(tmp_path):
@@ -190,7 +190,7 @@ def test_relations_find_a_slip_that_the_ranges_let_pass(tmp_path, entry, factor,
     place = next(t for t in (raw, raw["tyres"]["front"], raw["tyres"]["rear"]) if entry in t)
     place[entry] *= factor
     with pytest.raises(VehicleError) as caught:
-        vehicle_from_dict(raw, where="car.toml")
+        vehicle_of_entries(raw, where="car.toml")
     assert named in str(caught.value)
     assert entry in str(caught.value) or f"tyres.{'rear' if entry.startswith('corn') else 'front'}" in str(caught.value)
 
@@ -228,7 +228,7 @@ def test_real_vehicles_are_taken(name):
             "rear": {"cornering_stiffness_n_per_rad": stiffness_rear},
         },
     }
-    assert vehicle_from_dict(raw | more, where=name).mass_kg == mass
+    assert vehicle_of_entries(raw | more, where=name).vehicle.mass_kg == mass
 
 
 @pytest.mark.parametrize("path", [*sorted(FILES.glob("*.toml")), *sorted(SAMPLES.glob("vehicle*.toml"))], ids=str)
@@ -271,8 +271,8 @@ def test_plausible_vehicles_of_any_size_are_taken(
         "friction": friction,
         "tyres": {"front": tyre(mass * 9.81 * balance), "rear": tyre(mass * 9.81 * (1.0 - balance))},
     }
-    vehicle = vehicle_from_dict(raw, where="scaled")
-    again = vehicle_from_dict(as_plain(vehicle.model_dump(exclude_none=True)), where="again")
+    vehicle = vehicle_of_entries(raw, where="scaled").vehicle
+    again = vehicle_of_entries(as_plain(vehicle.model_dump(exclude_none=True)), where="again").vehicle
     assert again == vehicle
 
 
@@ -292,7 +292,7 @@ def test_a_folder_is_no_vehicle_file(tmp_path):
 @settings(derandomize=True, deadline=None, max_examples=50)
 @given(st.floats(0.05, 2.0))
 def test_axle_quantities(friction):
-    vehicle = vehicle_from_dict(tomllib.loads(EXAMPLE), where="example")
+    vehicle = vehicle_of_entries(tomllib.loads(EXAMPLE), where="example").vehicle
     assert vehicle.wheelbase_m == pytest.approx(2.87)
     weight = 1440.0 * 9.80665
     assert vehicle.axle_load_n(True) + vehicle.axle_load_n(False) == pytest.approx(weight)

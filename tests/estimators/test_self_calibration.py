@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from reference_car import FRICTION, Drive, cut, drive, keep, with_noise
 
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
-from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, drift_share, self_calibrate
-from pdhef_logtool.estimators.calibration.driving import LEAST_SPEED_M_S, STEP_S, Driving, DrivingReader
+from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
+from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving, DrivingReader
 from pdhef_logtool.records.signals import Signals
 
 RIGHT = default_vehicle()
@@ -104,21 +104,43 @@ def test_too_little_or_too_slow_driving_is_refused() -> None:
     short = found(drive(sweep(0.02), 8.0).signals, RIGHT)
     assert "are needed" in short.refused
     assert short.vehicle is RIGHT
-    slow = found(drive(sweep(0.02), 20.0, speed=LEAST_SPEED_M_S - 1.0).signals, RIGHT)
+    slow = found(drive(sweep(0.02), 20.0, speed=RIGHT.low_speed_blend_m_s - 0.5).signals, RIGHT)
     assert "0 s above" in slow.refused
 
 
 @pytest.mark.slow
-def test_straight_driving_leaves_the_file_as_it_stands() -> None:
-    straight = found(with_noise(drive(lambda _t: 0.0, 60.0).signals, 5), RIGHT)
-    assert "cornering stiffness" in straight.refused
-    assert "not calibrated" in straight.text
+def test_straight_driving_leaves_the_parameters_at_their_priors_and_is_not_exported() -> None:
+    log = driving(with_noise(drive(lambda _t: 0.0, 60.0).signals, 5), RIGHT)
+    calibration = self_calibrate([log], RIGHT)
+    assert not calibration.refused
+    by = {p.name: p for p in calibration.parameters}
+    for axle in ("front", "rear"):
+        p = by[f"{axle} cornering stiffness"]
+        assert p.sd > 0.8 * p.prior_sd
+        assert abs(math.log(p.value / p.prior)) < p.prior_sd
+    assert "cornering stiffness" in self_calibrate([log], RIGHT, exported=True).refused
 
 
-def test_a_drift_is_refused() -> None:
+def test_an_oversteering_pool_is_not_exported() -> None:
     signals = wide().signals
     against = replace(signals, steer_rad=-2.0 * signals.steer_rad)
-    assert found(against, RIGHT).refused
+    assert self_calibrate([driving(against, RIGHT)], RIGHT, exported=True).refused
+
+
+@pytest.mark.slow
+def test_slow_driving_calibrates_as_well() -> None:
+    signals = with_noise(drive(sweep(0.15), 60.0, speed=6.0).signals, 7)
+    for error, sd in stiffness_errors(found(signals, wrong(1.5, 0.7))):
+        assert abs(error) < 3.0 * sd
+
+
+@pytest.mark.slow
+def test_an_accelerometer_at_the_rear_axle_is_found_there() -> None:
+    signals = wide().signals
+    turned = np.gradient(signals.yaw_rate_rad_s, signals.stamps_ns * 1e-9)
+    signals = with_noise(replace(signals, ay_m_s2=signals.ay_m_s2 - 1.4 * turned), 8)
+    lever = next(p for p in found(signals, RIGHT).parameters if p.name == "lever of a_y")
+    assert abs(lever.value + 1.4) < 0.2
 
 
 def test_windows_change_no_bit() -> None:
@@ -156,18 +178,8 @@ def test_any_losses_give_a_grid_whose_stretches_are_whole(seed: int, share: floa
     d = driving(replace(signals, ay_m_s2=lost), RIGHT)
     for a, b in d.stretches:
         assert np.isfinite(d.columns[:, a:b]).all()
-        assert (d.columns[1, a:b] > LEAST_SPEED_M_S).all()
+        assert (d.columns[1, a:b] > RIGHT.low_speed_blend_m_s).all()
     assert (np.diff(d.stretches.ravel()) > 0).all()
-
-
-def test_a_fast_slalom_is_no_drift_and_a_held_counter_steer_is() -> None:
-    """In a fast slalom the yaw rate follows late, so that the steering is often against it."""
-    late = drive(lambda t: 0.02 * math.sin(2.0 * math.pi * t), 20.0).signals
-    late = replace(late, steer_rad=np.roll(late.steer_rad, -25))
-    assert drift_share([driving(late, RIGHT)], RIGHT) == 0.0
-    held = drive(lambda _t: 0.02, 20.0).signals
-    assert drift_share([driving(held, RIGHT)], RIGHT) == 0.0
-    assert drift_share([driving(replace(held, steer_rad=-2.0 * held.steer_rad), RIGHT)], RIGHT) > 0.9
 
 
 def test_the_vehicles_of_the_band_spread_as_the_posterior_does() -> None:

@@ -40,8 +40,6 @@ from pdhef_logtool.estimators.calibration.single_track import (
     OF_AY,
     OF_RATE,
     SPEED,
-    STEER,
-    YAW_RATE,
     TrackParameters,
     errors,
     low_pass,
@@ -80,18 +78,12 @@ SUPERELEVATION_STD = 0.2
 #: Parts and noise of ``physics`` on a calibrated car, chosen on simulated sweeps and roads: the stiffness was found
 #: with the lag, and the bank takes up what roads do to a_y; what the model leaves of a_y is no white sensor noise.
 PARTS, AY_STD = ("lag", "bank"), 1.0
-#: A stiffness that is less well known is no calibration (sd of its logarithm): of a log that it serves alone, and of a
-#: pool that is exported. On simulated roads, which leave 0.16 to 0.22, the log's own calibration is better than a file
-#: that may be wrong by two, and hardly worse than the right one (docs/calibration.md).
-LEAST_KNOWN, LEAST_KNOWN_EXPORTED = 0.25, 0.15
-#: Understeer gradients that a car may have, rad/(m/s²): a little oversteer, and 7 degrees per g.
-PLAUSIBLE_UNDERSTEER = (-2e-3, 12e-3)
+#: A stiffness that is less well known is not exported to other logs (sd of its logarithm), nor an understeer gradient
+#: that no car has, rad/(m/s²): a little oversteer to 7 degrees per g. The log itself uses what its driving says; the
+#: rest stays at its prior and widens the interval.
+LEAST_KNOWN_EXPORTED, PLAUSIBLE_UNDERSTEER = 0.15, (-2e-3, 12e-3)
 #: Least driving above the lowest speed.
 LEAST_S = 15.0
-#: Above this lateral acceleration a car that is steered against its bend drifts, on average over a second, for in fast
-#: slaloms the yaw rate follows the steering late; so much of that driving makes it a drift.
-DRIFT_AY, DRIFT_STEER_RAD, DRIFT_S, DRIFT_SHARE = 3.0, math.radians(1.0), 1.0, 0.1
-
 #: Directions of the posterior that a band follows, at most: those in which the drive's own sideslip is known least.
 VARIED = 5
 
@@ -250,14 +242,14 @@ def self_calibrate(
     drives: Sequence[Driving],
     own: VehicleParameters,
     *,
-    least_known: float = LEAST_KNOWN,
+    exported: bool = False,
     progress: Callable[[float], None] = lambda _share: None,
 ) -> SelfCalibration:
     """Calibrate a car on the driving of its logs, which were read with ``own``.
 
     Parameters
     ----------
-    least_known : largest sd of the logarithm of a cornering stiffness that is no refusal.
+    exported : whether other logs will use it, which takes better known parameters.
     """
     drives = [d for d in drives if len(d.stretches)]
     seconds = sum(d.seconds for d in drives)
@@ -284,34 +276,22 @@ def self_calibrate(
         len(drives),
         problem.varied(theta, covariance),
     )
-    return _with_refusal(found, drives, least_known)
+    return _with_refusal(found) if exported else found
 
 
-def _with_refusal(found: SelfCalibration, drives: Sequence[Driving], least_known: float) -> SelfCalibration:
+def _with_refusal(found: SelfCalibration) -> SelfCalibration:
+    """Return a calibration, refused where it says too little of the car for other logs."""
     gradient = found.vehicle.understeer_gradient_rad_per_m_s2(found.vehicle.assumed_friction)
     low, high = PLAUSIBLE_UNDERSTEER
-    unit = math.degrees(GRAVITY_M_S2)
-    drifted = drift_share(drives, found.vehicle)
     why = ""
-    if drifted > DRIFT_SHARE:
-        why = f"the car drifts: steered against the bend in {drifted:.0%} of its hard driving"
-    elif not low <= gradient <= high:
-        why = f"an understeer gradient of {gradient * unit:.1f} deg/g is no car's"
-    elif found.stiffness_sd > least_known:
-        why = f"the driving leaves the cornering stiffness at ± {found.stiffness_sd:.0%}, ± {least_known:.0%} is needed"
+    if not low <= gradient <= high:
+        why = f"an understeer gradient of {gradient * math.degrees(GRAVITY_M_S2):.1f} deg/g is no car's"
+    elif found.stiffness_sd > LEAST_KNOWN_EXPORTED:
+        why = (
+            f"the driving leaves the cornering stiffness at ± {found.stiffness_sd:.0%}, "
+            f"± {LEAST_KNOWN_EXPORTED:.0%} is needed"
+        )
     return replace(found, refused=why)
-
-
-def drift_share(drives: Sequence[Driving], vehicle: VehicleParameters) -> float:
-    """Return the share of hard driving in which the car is steered against its bend."""
-    hard = against = 0
-    for d in drives:
-        steer, rate, ay = (smoothed(d.columns[row], d.stretches, DRIFT_S) for row in (STEER, YAW_RATE, AY))
-        steer = steer + d.read_with.steer_offset_rad - vehicle.steer_offset_rad
-        use = np.abs(ay) > DRIFT_AY
-        hard += int(np.count_nonzero(use))
-        against += int(np.count_nonzero(use & (steer * np.sign(rate) < -DRIFT_STEER_RAD)))
-    return against / hard if hard else 0.0
 
 
 def understeer_of(drives: Sequence[Driving], own: VehicleParameters) -> Understeer | None:
