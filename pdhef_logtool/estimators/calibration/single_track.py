@@ -177,7 +177,7 @@ def simulate(columns, stretches, step_s, p, out):  # type: ignore[no-untyped-def
             r_dot = p.mass_over_inertia * (p.front_m * ffc - p.rear_m * fr)
             mu = friction[k] / p.friction
             slope = p.superelevation * slow_turn[k]
-            lost = (1.0 + contradicted / CONTRADICTED) ** 2
+            lost = (contradicted / CONTRADICTED) ** 2
             first_angle = angle
             last_angle = p.steer_gain * _at(steer, k + 1 - p.steer_delay, first, last) + p.steer_added
             for i in range(parts):
