@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,8 +19,8 @@ from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.estimators.base import VX, VY, YAW_RATE, Estimator, Steps
 from pdhef_logtool.estimators.kinematic import Kinematic
 from pdhef_logtool.estimators.pass_through import PassThrough
-from pdhef_logtool.estimators.stepwise import measured_speed
-from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.estimators.stepwise import SPEED_HOLD_S, measured_speed
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, step_durations_s
 
 #: Rate of the published filters in Hz, and the longest integration step in s.
@@ -59,6 +59,7 @@ class Peer:
         """Return the steps of a whole drive (see :class:`~pdhef_logtool.estimators.base.Estimator`)."""
         assert state is None
         vx, _ = measured_speed(signals, None)
+        signals = replace(signals, steer_rad=_held(signals.stamps_ns, signals.steer_rad))
         steps_s = step_durations_s(signals.stamps_ns, None)
         times_s = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
         vy = self.model(times_s, steps_s, signals, vx, self.vehicle)
@@ -69,6 +70,12 @@ class Peer:
         span = np.maximum(times_s - times_s[before], 1e-3)
         rates[:, VY] = np.nan_to_num((vy - vy[before]) / span)
         return Steps(values, rates, np.isfinite(vx) & np.isfinite(vy)), None
+
+
+def _held(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
+    """Return a signal [N] with its last finite value held over gaps, as long as the speed is."""
+    last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
+    return np.where((stamps_ns - stamps_ns[last]) * 1e-9 <= SPEED_HOLD_S, values[last], np.nan)
 
 
 def peers_of(vehicle: VehicleParameters) -> tuple[Estimator, ...]:
@@ -128,6 +135,9 @@ def _open_loop(steps_s, steer, vx, p):  # type: ignore[no-untyped-def]
     vy = np.full(len(vx), np.nan)
     x = np.full(2, np.nan)
     for k in range(len(vx)):
+        if not (math.isfinite(vx[k]) and math.isfinite(steer[k])):
+            x[:] = math.nan
+            continue
         a, b = _single_track(vx[k], p)
         if not (steps_s[k] <= RESTART_GAP_S and math.isfinite(x[0])):
             x = -np.linalg.solve(a, b * steer[k])
@@ -288,7 +298,9 @@ def slip_ukf(
     prediction integrates the accelerations; the lateral forces of the axles follow from a_y and the yaw acceleration
     and are compared with the tyre curves of the vehicle file. The published noise of the forces is scaled with the
     mass, the published speed limits with √wheelbase. The logs have neither brake pressures nor drive torque: the two
-    longitudinal axle forces are not measured.
+    longitudinal axle forces are not measured. Where the published filter fixes sideslip at 0 (at its start and at low
+    speed), this one fixes it at the sideslip of rolling without slip, and it starts again beyond 86°: otherwise the
+    filter finds the falling part of the tyre curve in slow, tight bends and diverges for good.
     """
     filtered = [
         _low_pass(times_s, channel) for channel in (signals.ax_m_s2, signals.ay_m_s2, signals.yaw_rate_rad_s)
@@ -349,9 +361,10 @@ def _slip_ukf(inputs, p, tyres, scale):  # type: ignore[no-untyped-def]
         if not (math.isfinite(vx[k]) and math.isfinite(steer[k])):
             running = False
             continue
-        if not (running and dt <= RESTART_GAP_S) or vx[k] <= 2.0 * scale:
-            x, cov, age_s, running = np.array([vx[k], 0.0]), start, 0.0, True
-            vy[k] = 0.0
+        rolling = math.atan(lr * yaw_rate[k] / max(vx[k], LEAST_SPEED_M_S))
+        if not (running and dt <= RESTART_GAP_S) or vx[k] <= 2.0 * scale or not abs(x[1]) < 1.5:
+            x, cov, age_s, running = np.array([vx[k], rolling]), start, 0.0, True
+            vy[k] = vx[k] * math.tan(rolling)
             continue
         root = np.linalg.cholesky(spread * cov)
         points = np.empty((5, 2))
@@ -378,12 +391,12 @@ def _slip_ukf(inputs, p, tyres, scale):  # type: ignore[no-untyped-def]
         gain = np.ascontiguousarray(np.linalg.solve(innovation, across.T).T)
         age_s += dt
         if age_s <= 20.0 / PUBLISHED_HZ:
-            x = np.array([min(max(x[0], vx[k] - 0.4), vx[k] + 0.4), 0.0])
+            x = np.array([min(max(x[0], vx[k] - 0.4), vx[k] + 0.4), rolling])
         else:
             x = x + gain @ (np.array([vx[k], front, rear]) - reading)
             cov = cov - gain @ innovation @ gain.T
             cov = 0.5 * (cov + cov.T)
             if vx[k] <= 5.0 * scale:
-                x = np.array([min(max(x[0], vx[k] - 0.25), vx[k] + 0.25), min(max(x[1], -0.0001), 0.0001)])
+                x = np.array([min(max(x[0], vx[k] - 0.25), vx[k] + 0.25), rolling])
         vy[k] = vx[k] * math.tan(x[1]) if abs(x[1]) < 1.5 else np.nan
     return vy
