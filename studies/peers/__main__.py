@@ -45,10 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not DRIVES.is_dir():
         print("nothing is compared: needs ../shared beside the repository")
         return 0
-    errors = [drive_errors(drive) for drive in PEER_DRIVES]
-    document = json.dumps([e.document() for e in errors], indent=1, ensure_ascii=False)
-    write(given.results / "errors.json", document + "\n")
-    write(given.out / "peers.md", page(errors))
+    documents = [drive_errors(drive).document() for drive in PEER_DRIVES]
+    write(given.results / "errors.json", json.dumps(documents, indent=1) + "\n")
+    write(given.out / "peers.md", page([DriveErrors.of(document) for document in documents]))
     return 0
 
 
@@ -101,7 +100,7 @@ def tool_estimates(
             print(f"{log.name}: {error}", file=sys.stderr)
             return {}
         if result.output is None:
-            print(f"{log.name}: {result.outcome.error}", file=sys.stderr)
+            print(f"{log.name}: {result.outcome.failed}", file=sys.stderr)
             return {}
         table = pl.read_parquet(result.output / ESTIMATES_FILE)
     tracks = {}

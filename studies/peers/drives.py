@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import tomllib
 from collections.abc import Mapping as Table
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -20,32 +20,16 @@ from studies.pages import DRIVES, ROOT
 REFERENCE = ROOT / "tests" / "reference"
 #: Groups of the page: full-size cars on roads, small or off-road cars, and drives whose ground truth has an offset.
 FULL_SIZE, SMALL, OFFSET = "full-size", "small", "offset"
+_WHEELS = (("front", "rear"), ("left", "right"))
 #: Quantities of the ``.signals.toml`` files beside the drives, by role; road wheel and steering wheel are sensors only.
 _SIGNALS = {
-    "longitudinal_acceleration": "ax_m_s2",
-    "lateral_acceleration": "ay_m_s2",
-    "yaw_rate": "yaw_rate_rad_s",
-    "road_wheel_angle": "steer_rad",
-    "steering_wheel_angle": "steering_wheel_rad",
-    "longitudinal_velocity": "speed_m_s",
-    "wheel_speed_front_left": "wheel_speed_fl_m_s",
-    "wheel_speed_front_right": "wheel_speed_fr_m_s",
-    "wheel_speed_rear_left": "wheel_speed_rl_m_s",
-    "wheel_speed_rear_right": "wheel_speed_rr_m_s",
-}
+    "longitudinal_acceleration": "ax_m_s2", "lateral_acceleration": "ay_m_s2", "yaw_rate": "yaw_rate_rad_s",
+    "road_wheel_angle": "steer_rad", "steering_wheel_angle": "steering_wheel_rad", "longitudinal_velocity": "speed_m_s",
+    **{f"wheel_speed_{end}_{side}": f"wheel_speed_{end[0]}{side[0]}_m_s" for end, side in product(*_WHEELS)},
+}  # fmt: skip
 _TRUTH = {"longitudinal_velocity": "vx_m_s", "lateral_velocity": "vy_m_s", "yaw_rate": "yaw_rate_rad_s"}
-#: Entries of the ``.vehicle.toml`` files beside the drives.
-_VEHICLE = {
-    "mass_kg": "mass_kg",
-    "yaw_inertia_kg_m2": "yaw_inertia_kg_m2",
-    "lf_m": "cg_to_front_axle_m",
-    "lr_m": "cg_to_rear_axle_m",
-    "track_m": "track_m",
-    "cg_height_m": "cg_height_m",
-    "wheel_radius_m": "wheel_radius_m",
-    "steering_ratio": "steering_ratio",
-}
-_DEGREE = math.pi / 180.0
+#: Entries of the ``.vehicle.toml`` files beside the drives with another name here.
+_VEHICLE = {"lf_m": "cg_to_front_axle_m", "lr_m": "cg_to_rear_axle_m"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +81,7 @@ PEER_DRIVES = (
 def mapping_of(drive: PeerDrive, folder: Path = DRIVES) -> Mapping:
     """Return the mapping of a drive."""
     if drive.log.startswith("v40_"):
-        return _v40_mapping()
+        return load_mapping(Path(__file__).with_name("v40_gnss.toml"))
     if drive.files:
         return load_mapping(REFERENCE / "mappings" / f"{drive.files}.toml")
     return beside_mapping(tomllib.loads((folder / f"{drive.log}.signals.toml").read_text(encoding="utf-8")))
@@ -115,28 +99,6 @@ def beside_mapping(document: Table[str, Any]) -> Mapping:
     return Mapping(sides["sensor"], sides["truth"])
 
 
-def _v40_mapping() -> Mapping:
-    """Return the mapping of the two V40 logs with a single-antenna GNSS receiver, whose speed is the only one."""
-    imu, slip = "/imu/data", "/reference/slip"
-    east_north = ("twist.linear.x", "twist.linear.y")
-    signals = (
-        SignalSource("ax_m_s2", imu, "linear_acceleration.x"),
-        SignalSource("ay_m_s2", imu, "linear_acceleration.y"),
-        SignalSource("yaw_rate_rad_s", imu, "angular_velocity.z"),
-        SignalSource(
-            "steering_wheel_rad", "/can/steering", "steering_wheel_angle_deg",
-            scale=_DEGREE, valid_min=-10.0, valid_max=10.0,
-        ),
-        SignalSource("speed_m_s", "/gnss/velocity", east_north, scale=(1.0, 1.0), combine="norm"),
-    )  # fmt: skip
-    truth = (
-        SignalSource("vx_m_s", slip, "lng_vel_kmh", scale=1.0 / 3.6),
-        SignalSource("vy_m_s", slip, "lat_vel_kmh", scale=1.0 / 3.6),
-        SignalSource("yaw_rate_rad_s", slip, "yaw_rate_deg_s", scale=-_DEGREE),
-    )
-    return Mapping({s.name: s for s in signals}, {t.name: t for t in truth})
-
-
 def vehicle_of(drive: PeerDrive, folder: Path = DRIVES) -> VehicleParameters:
     """Return the published vehicle of a drive."""
     if not drive.files:
@@ -150,8 +112,8 @@ def vehicle_of(drive: PeerDrive, folder: Path = DRIVES) -> VehicleParameters:
 def beside_vehicle(document: Table[str, Any]) -> VehicleParameters:
     """Return the vehicle of a ``.vehicle.toml`` document; friction is the mean of the axles."""
     given = document["vehicle"]
-    raw: dict[str, Any] = {ours: given[theirs] for theirs, ours in _VEHICLE.items() if theirs in given}
-    raw["name"] = given["name"]
+    renamed = {_VEHICLE.get(name, name): value for name, value in given.items()}
+    raw = {name: value for name, value in renamed.items() if name in VehicleParameters.model_fields}
     raw["tyres"] = {
         axle: {"cornering_stiffness_n_per_rad": given[f"c{axle[0]}_axle_n_per_rad"]} for axle in ("front", "rear")
     }

@@ -1,15 +1,16 @@
 """The peers, from their published descriptions. They get signals and a vehicle file, and no ground truth.
 
 Constants are published ones; a rule that counts per sample is converted from the published rate to the rate of the log.
-``kinematic`` and ``zero`` are the baselines of the tool: a leaky integral of a_y − v_x r, whose time constant was chosen
-on simulated drives (``studies.defaults.tune_kinematic_leak``), and sideslip 0.
+``kinematic`` and ``zero`` are the baselines of the tool: a leaky integral of a_y − v_x r, whose time constant was
+chosen on simulated drives (``studies.defaults.tune_kinematic_leak``), and sideslip 0.
 """
 
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -39,8 +40,11 @@ UKF_MASS_KG, UKF_WHEELBASE_M = 800.0, 2.971
 UKF_LOW_PASS = (0.0772218, 0.2452234, 0.3425609, 0.2452234, 0.0772218)
 UKF_YAW_SPAN_S = 1.0
 
-#: (time [N] and its steps in s, signals, v_x [N], vehicle) -> v_y [N] in m/s, NaN where there is no estimate.
-Model = Callable[[FloatArray, FloatArray, Signals, FloatArray, VehicleParameters], FloatArray]
+#: Vehicle of the kernels; ``tyres`` [2, 4] are B, C, peak force, E of the axles.
+Parameters = namedtuple("Parameters", "mass inertia lf lr cf cr imu_x ay_std yaw_rate_std steer_std tyres speed_scale")
+#: Inputs of the kernels, each [N]: steps of time in s, v_x, steering, a_x, a_y, yaw rate, the last three through the
+#: low pass of the unscented filter, and the yaw acceleration.
+Inputs = namedtuple("Inputs", "steps_s vx steer ax ay yaw_rate smooth_ax smooth_ay smooth_yaw_rate yaw_acceleration")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,42 +55,33 @@ class Peer:
     version = 1
 
     name: str
-    model: Model
+    kernel: Callable[[Inputs, Parameters], FloatArray]
     vehicle: VehicleParameters
     causal: bool = True
 
     def run(self, signals: Signals, state: Any | None) -> tuple[Steps, None]:
         """Return the steps of a whole drive (see :class:`~pdhef_logtool.estimators.base.Estimator`)."""
         assert state is None
-        vx, _ = measured_speed(signals, None)
-        signals = replace(signals, steer_rad=_held(signals.stamps_ns, signals.steer_rad))
-        steps_s = step_durations_s(signals.stamps_ns, None)
         times_s = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
-        vy = self.model(times_s, steps_s, signals, vx, self.vehicle)
+        inputs = inputs_of(signals, times_s)
+        vy = self.kernel(inputs, parameters_of(self.vehicle))
         before = np.searchsorted(times_s, times_s - RATE_SPAN_S)
-        values = np.full((len(vx), 4), np.nan)
-        values[:, VX], values[:, VY], values[:, YAW_RATE] = vx, vy, signals.yaw_rate_rad_s
+        values = np.full((len(vy), 4), np.nan)
+        values[:, VX], values[:, VY], values[:, YAW_RATE] = inputs.vx, vy, signals.yaw_rate_rad_s
         rates = np.zeros_like(values)
-        span = np.maximum(times_s - times_s[before], 1e-3)
-        rates[:, VY] = np.nan_to_num((vy - vy[before]) / span)
-        return Steps(values, rates, np.isfinite(vx) & np.isfinite(vy)), None
-
-
-def _held(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
-    """Return a signal [N] with its last finite value held over gaps, as long as the speed is."""
-    last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
-    return np.where((stamps_ns - stamps_ns[last]) * 1e-9 <= SPEED_HOLD_S, values[last], np.nan)
+        rates[:, VY] = np.nan_to_num((vy - vy[before]) / np.maximum(times_s - times_s[before], 1e-3))
+        return Steps(values, rates, np.isfinite(inputs.vx) & np.isfinite(vy)), None
 
 
 def peers_of(vehicle: VehicleParameters) -> tuple[Estimator, ...]:
     """Return the peers that use the vehicle file, and those that need none."""
-    models = {
+    kernels = {
         "linear-kf": linear_kf,
         "learned-single-track": learned_single_track,
         "open-loop-linear": open_loop,
         "slip-ukf": slip_ukf,
     }
-    peers = tuple(Peer(name, model, vehicle) for name, model in models.items())
+    peers = tuple(Peer(name, kernel, vehicle) for name, kernel in kernels.items())
     return *peers, Kinematic(), PassThrough("zero", claims_zero_sideslip=True)
 
 
@@ -96,23 +91,55 @@ def stiffness(vehicle: VehicleParameters) -> tuple[float, float]:
     return vehicle.cornering_stiffness_n_per_rad(True, mu), vehicle.cornering_stiffness_n_per_rad(False, mu)
 
 
-def _constants(vehicle: VehicleParameters) -> FloatArray:
+def parameters_of(vehicle: VehicleParameters) -> Parameters:
+    """Return what the kernels use of a vehicle."""
     lengths = vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
-    return np.array([vehicle.mass_kg, vehicle.yaw_inertia_kg_m2, *lengths, *stiffness(vehicle)])
+    noise = vehicle.sensors.ay_std_m_s2, vehicle.sensors.yaw_rate_std_rad_s, vehicle.sensors.steer_std_rad
+    tyres = np.array([vehicle.magic_formula(front, vehicle.assumed_friction) for front in (True, False)])
+    scale = math.sqrt(vehicle.wheelbase_m / UKF_WHEELBASE_M)
+    body = vehicle.mass_kg, vehicle.yaw_inertia_kg_m2
+    return Parameters(*body, *lengths, *stiffness(vehicle), vehicle.imu_position_m[0], *noise, tyres, scale)
+
+
+def inputs_of(signals: Signals, times_s: FloatArray) -> Inputs:
+    """Return the inputs of the kernels at the stamps [N] of a drive."""
+    vx, _ = measured_speed(signals, None)
+    steer = _held(signals.stamps_ns, signals.steer_rad)
+    sensors = signals.ax_m_s2, signals.ay_m_s2, signals.yaw_rate_rad_s
+    smooth = [_low_pass(times_s, values) for values in sensors]
+    yaw_acceleration = (smooth[2] - np.interp(times_s - UKF_YAW_SPAN_S, times_s, smooth[2])) / UKF_YAW_SPAN_S
+    columns = [step_durations_s(signals.stamps_ns, None), vx, steer, *sensors, *smooth, yaw_acceleration]
+    return Inputs(*columns)
+
+
+def _held(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
+    """Return a signal [N] with its last finite value held over gaps, as long as the speed is."""
+    last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
+    return np.where((stamps_ns - stamps_ns[last]) * 1e-9 <= SPEED_HOLD_S, values[last], np.nan)
+
+
+def _low_pass(times_s: FloatArray, values: FloatArray) -> FloatArray:
+    """Return a signal [N] through the published filter, 0 where the log has none of it."""
+    finite = np.isfinite(values)
+    if not finite.any():
+        return np.zeros_like(values)
+    total = np.zeros_like(values)
+    for i, weight in enumerate(UKF_LOW_PASS):
+        total += weight * np.interp(times_s - i / PUBLISHED_HZ, times_s[finite], values[finite])
+    return total / sum(UKF_LOW_PASS)
 
 
 @njit(cache=True)
-def _single_track(speed, p):  # type: ignore[no-untyped-def]
-    """Return A [2, 2] and B [2] of the linear single track over [v_y, r] with the road-wheel angle as input."""
-    mass, inertia, lf, lr, cf, cr = p
-    u = max(speed, LEAST_SPEED_M_S)
-    a = np.array(
-        [
-            [-(cf + cr) / (mass * u), -(cf * lf - cr * lr) / (mass * u) - u],
-            [-(cf * lf - cr * lr) / (inertia * u), -(cf * lf**2 + cr * lr**2) / (inertia * u)],
-        ]
-    )
-    return a, np.array([cf / mass, cf * lf / inertia])
+def _single_track(speed, p, factor=1.0):  # type: ignore[no-untyped-def]
+    """Return A [2, 2] and B [2] of the linear single track over [v_y, r] with the road-wheel angle as input.
+
+    ``factor`` is on the stiffness of both axles.
+    """
+    u, cf, cr = max(speed, LEAST_SPEED_M_S), factor * p.cf, factor * p.cr
+    moment = cf * p.lf - cr * p.lr
+    a = np.array([[-(cf + cr) / p.mass, -moment / p.mass - u**2],
+                  [-moment / p.inertia, -(cf * p.lf**2 + cr * p.lr**2) / p.inertia]])  # fmt: skip
+    return a / u, np.array([cf / p.mass, cf * p.lf / p.inertia])
 
 
 @njit(cache=True)
@@ -122,16 +149,10 @@ def _discrete(a, b, h):  # type: ignore[no-untyped-def]
     return np.linalg.solve(left, np.eye(2) + 0.5 * h * a), np.linalg.solve(left, h * b)
 
 
-def open_loop(
-    _times_s: FloatArray, steps_s: FloatArray, signals: Signals, vx: FloatArray, vehicle: VehicleParameters
-) -> FloatArray:
-    """Return v_y of the linear single track (Riekert and Schunck 1940) driven by steering and speed."""
-    vy: FloatArray = _open_loop(steps_s, signals.steer_rad, vx, _constants(vehicle))
-    return vy
-
-
 @njit(cache=True)
-def _open_loop(steps_s, steer, vx, p):  # type: ignore[no-untyped-def]
+def open_loop(inputs, p):  # type: ignore[no-untyped-def]
+    """Return v_y of the linear single track (Riekert and Schunck 1940) driven by steering and speed."""
+    steps_s, vx, steer = inputs[:3]
     vy = np.full(len(vx), np.nan)
     x = np.full(2, np.nan)
     for k in range(len(vx)):
@@ -150,25 +171,17 @@ def _open_loop(steps_s, steer, vx, p):  # type: ignore[no-untyped-def]
     return vy
 
 
-def linear_kf(
-    _times_s: FloatArray, steps_s: FloatArray, signals: Signals, vx: FloatArray, vehicle: VehicleParameters
-) -> FloatArray:
+@njit(cache=True)
+def linear_kf(inputs, p):  # type: ignore[no-untyped-def]
     """Return v_y of a Kalman filter on the linear single track that measures a_y and yaw rate.
 
     The noise rule is that of Leanza, Reina and Blanco-Claraco, Sensors 21 (2021) 5409, and of its program: R consists
     of the white noise of the sensors, Q of the input with 1000 times the white noise of the steering sensor, at 100 Hz.
     The noise of the sensors is that of the vehicle file.
     """
-    noise = vehicle.sensors
-    std = np.array([noise.ay_std_m_s2, noise.yaw_rate_std_rad_s, STEER_NOISE_FACTOR * noise.steer_std_rad])
-    inputs = steps_s, signals.steer_rad, signals.ay_m_s2, signals.yaw_rate_rad_s, vx
-    vy: FloatArray = _linear_kf(inputs, _constants(vehicle), vehicle.imu_position_m[0], std)
-    return vy
-
-
-@njit(cache=True)
-def _linear_kf(inputs, p, imu_x, std):  # type: ignore[no-untyped-def]
-    steps_s, steer, ay, yaw_rate, vx = inputs
+    steps_s, vx, steer, _, ay, yaw_rate = inputs[:6]
+    stds = p.ay_std, p.yaw_rate_std
+    q = (STEER_NOISE_FACTOR * p.steer_std) ** 2 / PUBLISHED_HZ
     vy = np.full(len(vx), np.nan)
     x, cov, running = np.zeros(2), np.eye(2), False
     for k in range(len(vx)):
@@ -183,15 +196,15 @@ def _linear_kf(inputs, p, imu_x, std):  # type: ignore[no-untyped-def]
             f, g = _discrete(a, b, steps_s[k] / count)
             for _ in range(count):
                 x = f @ x + g * 0.5 * (steer[k - 1] + steer[k])
-                cov = f @ cov @ f.T + np.outer(b, b) * std[2] ** 2 * steps_s[k] / count / PUBLISHED_HZ
+                cov = f @ cov @ f.T + np.outer(b, b) * q * steps_s[k] / count
         dt = steps_s[k] if steps_s[k] <= RESTART_GAP_S else 1.0 / PUBLISHED_HZ
-        row = a[0] + imu_x * a[1]
+        row = a[0] + p.imu_x * a[1]
         row[1] += max(vx[k], LEAST_SPEED_M_S)  # a_y = v̇_y + v_x r
         for i in range(2):
             h = row if i == 0 else np.array([0.0, 1.0])
-            z = ay[k] - (b[0] + imu_x * b[1]) * steer[k] if i == 0 else yaw_rate[k]
+            z = ay[k] - (b[0] + p.imu_x * b[1]) * steer[k] if i == 0 else yaw_rate[k]
             if math.isfinite(z):
-                variance = std[i] ** 2 / (PUBLISHED_HZ * dt)
+                variance = stds[i] ** 2 / (PUBLISHED_HZ * dt)
                 gain = cov @ h / (h @ cov @ h + variance)
                 x = x + gain * (z - h @ x)
                 keep = np.eye(2) - np.outer(gain, h)
@@ -200,27 +213,9 @@ def _linear_kf(inputs, p, imu_x, std):  # type: ignore[no-untyped-def]
     return vy
 
 
-def learned_single_track(
-    _times_s: FloatArray, steps_s: FloatArray, signals: Signals, vx: FloatArray, vehicle: VehicleParameters
-) -> FloatArray:
-    """Return the stationary v_y of a single track whose parameters a Kalman filter learns from the yaw rate.
-
-    After openpilot's parameter learner (``paramsd`` and ``car_kf``, 2022 to 2025): states are stiffness factor,
-    steering ratio, slow and fast steering offset, v_x, v_y, yaw rate, steering-wheel angle and road roll, with the
-    published noise and validity limits; steering and speed are observed at 100 Hz, the rest at 20 Hz. There is no roll
-    sensor: roll is observed as 0 with 10° as it is there when the localizer is not valid. The estimate is the
-    stationary solution of its vehicle model with the learned parameters.
-    """
-    inputs = steps_s, signals.steer_rad * LEARNER_RATIO, signals.yaw_rate_rad_s, vx
-    vy: FloatArray = _learner(inputs, _constants(vehicle), vehicle.sensors.yaw_rate_std_rad_s)
-    return vy
-
-
 @njit(cache=True)
 def _learner_rates(x, p):  # type: ignore[no-untyped-def]
-    scaled = p.copy()
-    scaled[4:] *= x[0]
-    a, b = _single_track(x[4], scaled)
+    a, b = _single_track(x[4], p, x[0])
     rates = a @ x[5:7] + b * (x[7] - x[2] - x[3]) / x[1]
     rates[0] -= GRAVITY_M_S2 * x[8]
     return rates
@@ -235,8 +230,16 @@ def _observe(x, cov, i, z, variance):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _learner(inputs, p, yaw_rate_std):  # type: ignore[no-untyped-def]
-    steps_s, wheel, yaw_rate, vx = inputs
+def learned_single_track(inputs, p):  # type: ignore[no-untyped-def]
+    """Return the stationary v_y of a single track whose parameters a Kalman filter learns from the yaw rate.
+
+    After openpilot's parameter learner (``paramsd`` and ``car_kf``, 2022 to 2025): states are stiffness factor,
+    steering ratio, slow and fast steering offset, v_x, v_y, yaw rate, steering-wheel angle and road roll, with the
+    published noise and validity limits; steering and speed are observed at 100 Hz, the rest at 20 Hz. There is no roll
+    sensor: roll is observed as 0 with 10° as it is there when the localizer is not valid. The estimate is the
+    stationary solution of its vehicle model with the learned parameters.
+    """
+    steps_s, vx, wheel, yaw_rate = inputs.steps_s, inputs.vx, inputs.steer * LEARNER_RATIO, inputs.yaw_rate
     degree = math.pi / 180.0
     q = np.array([0.0005, 0.01, 0.02 * degree, 0.25 * degree, 0.1, 0.01, 0.1 * degree, 0.1 * degree, degree]) ** 2
     x, cov = np.zeros(9), np.diag(q)
@@ -271,27 +274,34 @@ def _learner(inputs, p, yaw_rate_std):  # type: ignore[no-untyped-def]
             _observe(x, cov, 4, vx[k], 0.1**2)
         if active and due_slow >= 0.0499:
             due_slow = 0.0
-            if abs(yaw_rate[k]) < 1.0:
-                _observe(x, cov, 6, yaw_rate[k], yaw_rate_std**2)
-            else:
-                _observe(x, cov, 6, 0.0, (10.0 * degree) ** 2)
-            _observe(x, cov, 8, 0.0, (10.0 * degree) ** 2)
-            _observe(x, cov, 3, 0.0, (10.0 * degree) ** 2)
+            valid = abs(yaw_rate[k]) < 1.0
+            _observe(x, cov, 6, yaw_rate[k] if valid else 0.0, (p.yaw_rate_std if valid else 10.0 * degree) ** 2)
+            for i in (8, 3):
+                _observe(x, cov, i, 0.0, (10.0 * degree) ** 2)
             _observe(x, cov, 0, x[0], 0.5**2)
             _observe(x, cov, 1, x[1], 5.0**2)
         was_active = active
-        scaled = p.copy()
-        scaled[4:] *= max(x[0], 0.1)
-        a, b = _single_track(vx[k], scaled)
+        a, b = _single_track(vx[k], p, max(x[0], 0.1))
         drive = b * (wheel[k] - x[2] - x[3]) / max(x[1], 0.1)
         drive[0] -= GRAVITY_M_S2 * x[8]
         vy[k] = -np.linalg.solve(a, drive)[0]
     return vy
 
 
-def slip_ukf(
-    times_s: FloatArray, steps_s: FloatArray, signals: Signals, vx: FloatArray, vehicle: VehicleParameters
-) -> FloatArray:
+@njit(cache=True)
+def _axle_forces(speed, beta, steer, yaw_rate, p):  # type: ignore[no-untyped-def]
+    vx, vy = speed * math.cos(beta), speed * math.sin(beta)
+    slips = steer - math.atan2(vy + p.lf * yaw_rate, vx), -math.atan2(vy - p.lr * yaw_rate, vx)
+    forces = np.empty(2)
+    for i in range(2):
+        b, c, d, e = p.tyres[i]
+        bent = b * slips[i]
+        forces[i] = d * math.sin(c * math.atan(bent - e * (bent - math.atan(bent))))
+    return forces
+
+
+@njit(cache=True)
+def slip_ukf(inputs, p):  # type: ignore[no-untyped-def]
     """Return v_y of an unscented Kalman filter over speed and sideslip that measures axle forces.
 
     After Goblirsch, Weinmann and Betz, arXiv 2408.14885 (2024), and Bechtloff, dissertation, TU Darmstadt (2018): the
@@ -302,47 +312,9 @@ def slip_ukf(
     speed), this one fixes it at the sideslip of rolling without slip, and it starts again beyond 86°: otherwise the
     filter finds the falling part of the tyre curve in slow, tight bends and diverges for good.
     """
-    filtered = [
-        _low_pass(times_s, channel) for channel in (signals.ax_m_s2, signals.ay_m_s2, signals.yaw_rate_rad_s)
-    ]
-    earlier = np.interp(times_s - UKF_YAW_SPAN_S, times_s, filtered[2])
-    yaw_acceleration = (filtered[2] - earlier) / UKF_YAW_SPAN_S
-    ay = filtered[1] - vehicle.imu_position_m[0] * yaw_acceleration
-    inputs = steps_s, signals.steer_rad, filtered[0], ay, filtered[2], yaw_acceleration, vx
-    mu = vehicle.assumed_friction
-    tyres = np.array([vehicle.magic_formula(front, mu) for front in (True, False)])
-    scale = math.sqrt(vehicle.wheelbase_m / UKF_WHEELBASE_M)
-    vy: FloatArray = _slip_ukf(inputs, _constants(vehicle), tyres, scale)
-    return vy
-
-
-def _low_pass(times_s: FloatArray, values: FloatArray) -> FloatArray:
-    """Return a signal [N] through the published filter, 0 where the log has none of it."""
-    finite = np.isfinite(values)
-    if not finite.any():
-        return np.zeros_like(values)
-    total = np.zeros_like(values)
-    for i, weight in enumerate(UKF_LOW_PASS):
-        total += weight * np.interp(times_s - i / PUBLISHED_HZ, times_s[finite], values[finite])
-    return total / sum(UKF_LOW_PASS)
-
-
-@njit(cache=True)
-def _axle_forces(speed, beta, steer, yaw_rate, p, tyres):  # type: ignore[no-untyped-def]
-    vx, vy = speed * math.cos(beta), speed * math.sin(beta)
-    slips = steer - math.atan2(vy + p[2] * yaw_rate, vx), -math.atan2(vy - p[3] * yaw_rate, vx)
-    forces = np.empty(2)
-    for i in range(2):
-        b, c, d, e = tyres[i]
-        bent = b * slips[i]
-        forces[i] = d * math.sin(c * math.atan(bent - e * (bent - math.atan(bent))))
-    return forces
-
-
-@njit(cache=True)
-def _slip_ukf(inputs, p, tyres, scale):  # type: ignore[no-untyped-def]
-    steps_s, steer, ax, ay, yaw_rate, yaw_acceleration, vx = inputs
-    mass, inertia, lf, lr = p[:4]
+    steps_s, vx, steer, _, _, _, ax, ay, yaw_rate, yaw_acceleration = inputs
+    ay = ay - p.imu_x * yaw_acceleration
+    scale, share = p.speed_scale, p.mass / UKF_MASS_KG
     alpha = 0.001
     spread = 2.0 * alpha**2  # n + lambda
     mean_weights = np.full(5, 0.5 / spread)
@@ -352,7 +324,7 @@ def _slip_ukf(inputs, p, tyres, scale):  # type: ignore[no-untyped-def]
     start = np.diag(np.array([0.5**2, 0.0004**2]))
     q = np.diag(np.array([0.2**2, 0.001732**2]))
     # Two wheel speeds became one speed; forces per axle.
-    r = np.diag(np.array([0.5, (60.0 * mass / 800.0) ** 2, (120.0 * mass / 800.0) ** 2]))
+    r = np.diag(np.array([0.5, (60.0 * share) ** 2, (120.0 * share) ** 2]))
     x, cov, age_s = np.zeros(2), start, 0.0
     vy = np.full(len(vx), np.nan)
     running = False
@@ -361,7 +333,7 @@ def _slip_ukf(inputs, p, tyres, scale):  # type: ignore[no-untyped-def]
         if not (math.isfinite(vx[k]) and math.isfinite(steer[k])):
             running = False
             continue
-        rolling = math.atan(lr * yaw_rate[k] / max(vx[k], LEAST_SPEED_M_S))
+        rolling = math.atan(p.lr * yaw_rate[k] / max(vx[k], LEAST_SPEED_M_S))
         if not (running and dt <= RESTART_GAP_S) or vx[k] <= 2.0 * scale or not abs(x[1]) < 1.5:
             x, cov, age_s, running = np.array([vx[k], rolling]), start, 0.0, True
             vy[k] = vx[k] * math.tan(rolling)
@@ -376,7 +348,7 @@ def _slip_ukf(inputs, p, tyres, scale):  # type: ignore[no-untyped-def]
         readings = np.empty((5, 3))
         for i in range(5):
             readings[i, 0] = points[i, 0] * math.cos(points[i, 1])
-            readings[i, 1:] = _axle_forces(points[i, 0], points[i, 1], steer[k], yaw_rate[k], p, tyres)
+            readings[i, 1:] = _axle_forces(points[i, 0], points[i, 1], steer[k], yaw_rate[k], p)
         # Means relative to the centre: the weights are of the order of 1e6.
         x = points[0] + mean_weights @ (points - points[0])
         reading = readings[0] + mean_weights @ (readings - readings[0])
@@ -385,9 +357,9 @@ def _slip_ukf(inputs, p, tyres, scale):  # type: ignore[no-untyped-def]
         cov = apart.T @ weighted @ apart + q * dt * PUBLISHED_HZ
         across = apart.T @ weighted @ read_apart
         innovation = read_apart.T @ weighted @ read_apart + r / (dt * PUBLISHED_HZ)
-        length = lf + lr
-        front = (mass * ay[k] * lr + inertia * yaw_acceleration[k]) / length / math.cos(steer[k])
-        rear = (mass * ay[k] * lf - inertia * yaw_acceleration[k]) / length
+        force, moment, length = p.mass * ay[k], p.inertia * yaw_acceleration[k], p.lf + p.lr
+        front = (force * p.lr + moment) / length / math.cos(steer[k])
+        rear = (force * p.lf - moment) / length
         gain = np.ascontiguousarray(np.linalg.solve(innovation, across.T).T)
         age_s += dt
         if age_s <= 20.0 / PUBLISHED_HZ:

@@ -1,8 +1,9 @@
-"""The page of the peers."""
+"""The page of the peers, of the template beside it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from studies.pages import number, table
 from studies.peers.drives import FULL_SIZE, OFFSET, SMALL
@@ -26,61 +27,7 @@ OURS = {
 }
 #: Share of missing estimates from which a figure is marked.
 MARKED = 0.05
-PAGE = """# Peers
-
-This page shows the sideslip error of this tool and of published estimators on every recorded drive with ground truth.
-Command: `make peers`. {verdict}
-
-All estimators get the published vehicle file of the car and the same mapped and aligned signals, without ground truth
-and without tuning per drive. Errors are sideslip RMSE in degrees at the CG, on all stamps above 3 m/s (1 m/s for 1:10
-cars). A missing estimate counts as 0°.
-
-## Full-size cars
-
-Geometric mean over cars with one vote for each; the figure of a car is the geometric mean over its drives. The two
-logs of the V40 sine with dwell share the weight of one drive. `stanford_wet_1` counts as a drive of the GTI. The spread
-is the geometric standard deviation over the cars. *lowest*: number of logs, of {logs}, with the lowest error of all
-estimators.
-
-{means}
-
-{full_size}
-
-The last column is the error of `pd-hef` over the median of the {best} best peers of the drive. The speed of the 250 LM
-and the GTI comes from the ground truth, that of `lunda_v40` from a GNSS receiver. The accelerometer position in the
-TT-S file was regressed on ground truth and is left out here.
-
-## Small and off-road cars
-
-{small_means}
-
-{small}
-
-## Drives with an offset in the ground truth
-
-The heading or the mounting of the ground truth of these drives has an offset: the median of its sideslip on straights
-({offsets}) is subtracted from it. The Polaris vehicle file is a guess, the RAV4 hardly slips.
-
-{offset}
-
-## Estimators
-
-| estimator | method | source of method and noise |
-| --- | --- | --- |
-| `linear-kf` | Kalman filter on the linear single track, measures a_y and yaw rate | Leanza, Reina, Blanco-Claraco (2021) |
-| `learned-single-track` | Kalman filter of stiffness factor, steering ratio, offsets and road roll; stationary single track | openpilot `paramsd` |
-| `open-loop-linear` | linear single track from steering and speed | Riekert, Schunck (1940) |
-| `slip-ukf` | unscented Kalman filter on kinematics, measures axle forces with the tyre curves of the file | Goblirsch, Weinmann, Betz (2024); Bechtloff (2018) |
-| `open-loop-sedan` | `open-loop-linear` with the default sedan, without vehicle file | |
-| `kinematic` | leaky integral of a_y − v_x r, without vehicle file | time constant chosen on simulated drives |
-| `zero` | sideslip 0 | |
-| `phy-ukf`, `physics`, `pd-hef` | presets of `pdhef run`; `physics` and `pd-hef` are calibrated on the same log without ground truth (not causal) | [estimators](estimators.md) |
-| `pd-hef, causal` | the same with `--calibrate off` | |
-| `pd-hef, no file` | the same without `--car` | |
-
-A † marks an error where more than {marked:.0%} of the estimates are missing. The speeds and forces in the noise of
-`slip-ukf` are scaled to the car. Module `studies.peers.models` contains all differences from the published versions.
-"""
+PAGE = Path(__file__).with_suffix(".md")
 
 
 def page(errors: Sequence[DriveErrors]) -> str:
@@ -88,7 +35,7 @@ def page(errors: Sequence[DriveErrors]) -> str:
     groups = {group: [e for e in errors if e.drive.group == group] for group in (FULL_SIZE, SMALL, OFFSET)}
     full_size = groups[FULL_SIZE]
     offsets = ", ".join(f"{_name(e)} {number(e.offset_deg, 2)}°" for e in groups[OFFSET])
-    return PAGE.format(
+    return PAGE.read_text(encoding="utf-8").format(
         verdict=_verdict(full_size),
         logs=len(full_size),
         means=means_table(full_size),
@@ -116,8 +63,8 @@ def _verdict(errors: Sequence[DriveErrors]) -> str:
     best = min(peer_names(errors[0]), key=lambda name: means[name])
     ours = "pd-hef"
     return (
-        f"Geometric mean over {len(car_means(errors, ours))} full-size cars: `{ours}` {number(means[ours], 2)}°, the best "
-        f"peer, `{best}`, {number(means[best], 2)}°."
+        f"Geometric mean over {len(car_means(errors, ours))} full-size cars: `{ours}` {number(means[ours], 2)}°, "
+        f"lowest of the peers `{best}` {number(means[best], 2)}°."
     )
 
 

@@ -12,7 +12,7 @@ from pdhef_logtool.evaluation.track_errors import scorable, truth_speed
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
-from studies.peers.drives import OFFSET, PeerDrive
+from studies.peers.drives import OFFSET, PEER_DRIVES, PeerDrive
 
 SIDESLIP = "sideslip_rad"
 #: The offset of ground truth is its median on straights: yaw rate in rad/s below, speed in m/s above.
@@ -36,13 +36,19 @@ class DriveErrors:
         return {
             "log": self.drive.log,
             "car": self.drive.car,
-            "group": self.drive.group,
             "least_speed_m_s": self.drive.least_speed_m_s,
             "scored_stamps": self.scored,
             "offset_removed_deg": round(self.offset_deg, 4),
             "rmse_deg": {name: round(value, 4) for name, value in self.rmse_deg.items()},
             "missing": {name: round(value, 4) for name, value in self.missing.items()},
         }
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> DriveErrors:
+        """Return the errors of a document."""
+        drive = next(drive for drive in PEER_DRIVES if drive.log == document["log"])
+        offset_deg = document["offset_removed_deg"]
+        return cls(drive, document["scored_stamps"], offset_deg, document["rmse_deg"], document["missing"])
 
 
 def usable_sideslip(track: StateTrack) -> FloatArray:
@@ -71,7 +77,7 @@ def geometric(values: Sequence[float]) -> float:
 
 
 def car_means(errors: Sequence[DriveErrors], name: str) -> dict[str, float]:
-    """Return the RMSE of an estimator by car: geometric mean of the drives, where logs of one drive share its weight."""
+    """Return the RMSE of an estimator by car: geometric mean over drives; logs of the same drive share its weight."""
     cars: dict[str, dict[str, list[float]]] = {}
     for e in errors:
         cars.setdefault(e.drive.car, {}).setdefault(e.drive.drive, []).append(e.rmse_deg[name])
