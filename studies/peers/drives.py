@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.toml_files import load_vehicle
-from pdhef_logtool.car.vehicle import VehicleParameters, vehicle_from_dict
+from pdhef_logtool.car.toml_files import load_vehicle, vehicle_of_entries
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import WholeDrive, read_drive
 from pdhef_logtool.mapping import Mapping, SignalSource, load_mapping
@@ -123,9 +123,7 @@ def beside_vehicle(document: Table[str, Any]) -> VehicleParameters:
         raw["truth_position_m"] = (given["reference_point_x_from_cg_m"], 0.0, 0.0)
     if given["name"].startswith("Polaris"):
         raw["imu_position_m"] = raw["truth_position_m"]  # one instrument
-    if given["mass_kg"] < 3.0:
-        raw["low_speed_blend_m_s"] = 0.3  # as in the file of the other 1:10 car
-    return vehicle_from_dict(raw, where=given["name"])
+    return vehicle_of_entries(raw, where=given["name"]).vehicle
 
 
 def read_peer_drive(log: Path, vehicle: VehicleParameters, mapping: Mapping) -> WholeDrive:

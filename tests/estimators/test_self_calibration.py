@@ -116,8 +116,8 @@ def test_straight_driving_leaves_the_parameters_at_their_priors_and_is_not_expor
     by = {p.name: p for p in calibration.parameters}
     for axle in ("front", "rear"):
         p = by[f"{axle} cornering stiffness"]
-        assert p.sd > 0.8 * p.prior_sd
-        assert abs(math.log(p.value / p.prior)) < p.prior_sd
+        assert p.sd > 0.5 * p.prior_sd  # the understeer gradient has a prior, too
+        assert abs(math.log(p.value / p.prior)) < 2.0 * p.prior_sd
     assert "cornering stiffness" in self_calibrate([log], RIGHT, exported=True).refused
 
 
@@ -130,7 +130,8 @@ def test_an_oversteering_pool_is_not_exported() -> None:
 @pytest.mark.slow
 def test_slow_driving_calibrates_as_well() -> None:
     signals = with_noise(drive(sweep(0.15), 60.0, speed=6.0).signals, 7)
-    for error, sd in stiffness_errors(found(signals, wrong(1.5, 0.7))):
+    file = wrong(1.5, 0.7).model_copy(update={"relaxation_length_m": 0.02})  # the simulated tyres do not lag
+    for error, sd in stiffness_errors(found(signals, file)):
         assert abs(error) < 3.0 * sd
 
 
