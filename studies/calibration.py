@@ -34,9 +34,8 @@ are medians. The last column contains the median ratio and the 10 % and 90 % qua
 
 {simulated}
 
-A calibration is refused if the posterior of a cornering stiffness is wider than ± {least} (± {exported} if it is
-written to a car), if the understeer gradient is implausible, or if the lateral kinematic consistency of `physics`
-becomes {factor:g} times worse.
+A calibration is refused if the lateral kinematic consistency of `physics` becomes {factor:g} times worse. One that is
+written to a car also needs a cornering stiffness within ± {exported} and a plausible understeer gradient.
 
 ## 95 % confidence intervals of self-calibrated cars
 

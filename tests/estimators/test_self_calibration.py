@@ -101,7 +101,7 @@ def test_a_file_that_contradicts_the_drive_is_told() -> None:
 
 
 def test_too_little_or_too_slow_driving_is_refused() -> None:
-    short = found(drive(sweep(0.02), 8.0).signals, RIGHT)
+    short = found(drive(sweep(0.02), 3.0).signals, RIGHT)
     assert "are needed" in short.refused
     assert short.vehicle is RIGHT
     slow = found(drive(sweep(0.02), 20.0, speed=RIGHT.low_speed_blend_m_s - 0.5).signals, RIGHT)

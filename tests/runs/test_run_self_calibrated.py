@@ -112,7 +112,7 @@ def test_no_truth_is_read(sample_logs_dir: Path, wrong_car: Path) -> None:
 
 
 def test_a_short_log_is_refused_and_the_file_stays(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
-    report = run(sample_logs_dir / "sweep.mcap", wrong_car, tmp_path)
+    report = run(sample_logs_dir / "sweep.mcap", wrong_car, tmp_path, end="3.0")
     assert "are needed" in report["self_calibration"]["refused"]
     told = {e["name"]: e for e in report["estimators"]}
     assert told["open-loop:calibrated"]["outcome"] == "skipped"

@@ -83,7 +83,7 @@ PARTS, AY_STD = ("lag", "bank"), 1.0
 #: rest stays at its prior and widens the interval.
 LEAST_KNOWN_EXPORTED, PLAUSIBLE_UNDERSTEER = 0.15, (-2e-3, 12e-3)
 #: Least driving above the lowest speed.
-LEAST_S = 15.0
+LEAST_S = 4.0
 #: Directions of the posterior that a band follows, at most: those in which the drive's own sideslip is known least.
 VARIED = 5
 
