@@ -11,6 +11,8 @@ import stat
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from pathlib import Path
+from threading import Lock
+from typing import BinaryIO
 
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import LogError
@@ -108,24 +110,29 @@ class LocalFile(ByteSource):
     def __init__(self, path: Path, shown_path: LogPlace | None = None) -> None:
         require_regular(path, shown_path)
         self._file = path.open("rb", buffering=0)
+        self._lock = Lock()
         super().__init__(os.fstat(self._file.fileno()).st_size)
 
     def fetch(self, offset: int, size: int) -> bytes:
-        """Read at an offset; the file has no position that somebody else could move."""
-        descriptor = self._file.fileno()
-        found = os.pread(descriptor, size, offset)
-        if 0 < len(found) < size and offset + len(found) < self.size:  # the system reads 2 GiB at a time
-            parts = [found]
-            missing = size - len(found)
-            while missing and (part := os.pread(descriptor, missing, offset + size - missing)):
-                parts.append(part)
-                missing -= len(part)
-            found = b"".join(parts)
-        return found
+        """Read up to ``size`` bytes at an offset; several threads may read."""
+        with self._lock:
+            return read_at(self._file, offset, size)
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+def read_at(file: BinaryIO, offset: int, size: int) -> bytes:
+    """Read up to ``size`` bytes at an offset of an unbuffered file; fewer only at its end."""
+    file.seek(offset)
+    data = file.read(size)
+    if not 0 < len(data) < size:
+        return data
+    parts = [data]
+    while part := file.read(size - sum(map(len, parts))):  # the system reads at most 2 GiB at a time
+        parts.append(part)
+    return b"".join(parts)
 
 
 def require_regular(path: Path, shown_path: LogPlace | None = None) -> None:

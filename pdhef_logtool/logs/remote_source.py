@@ -7,6 +7,7 @@ once. Nothing but blocks on their way is in memory. A cut range goes on where it
 from __future__ import annotations
 
 import asyncio
+import errno
 import hashlib
 import os
 import shutil
@@ -17,9 +18,9 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
-from typing import TypeAlias
+from typing import BinaryIO, TypeAlias
 
-from pdhef_logtool.logs.byte_source import ByteSource, ChangedError, SourceError
+from pdhef_logtool.logs.byte_source import ByteSource, ChangedError, SourceError, read_at
 from pdhef_logtool.logs.remote_objects import (
     Answer,
     ObjectState,
@@ -190,7 +191,7 @@ class _Spool:
     def __post_init__(self) -> None:
         self._folder = scratch_folder()
         self.path = Path(self._folder.name) / (self.place.name.replace("/", "_")[-80:] or "log")
-        self._file = -1
+        self._file: BinaryIO | None = None
         self._lock = Lock()
         self._entering = Lock()
         self._at_once = asyncio.Semaphore(AT_ONCE)
@@ -204,9 +205,9 @@ class _Spool:
         ChangedError : It is another one by now. SourceError : It cannot be asked for.
         """
         with self._entering:
-            if self._file >= 0:
+            if self._file is not None:
                 return
-            self._file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o600)
+            self._file = self.path.open("r+b" if self.path.exists() else "x+b", buffering=0)
             try:
                 if self.state is _NOTHING:
                     self._run(try_in_turn(lambda: self._first(head_bytes), self.remote)).result()
@@ -222,9 +223,9 @@ class _Spool:
             future.cancel()
         self.coming.clear()
         with self._lock:  # nothing that is still under way writes to what gets this number next
-            file, self._file = self._file, -1
-        if file >= 0:
-            os.close(file)
+            file, self._file = self._file, None
+        if file is not None:
+            file.close()
 
     async def _first(self, head_bytes: int) -> None:
         async with self.remote.ask(0, head_bytes, None) as answer:
@@ -276,7 +277,9 @@ class _Spool:
             return b""
         if self.held_to(start, end) < end:
             self.wait(start, end)
-        return os.pread(self._file, end - start, start)
+        with self._lock:
+            assert self._file is not None
+            return read_at(self._file, start, end - start)
 
     def held_to(self, start: int, end: int) -> int:
         """Return up to where, at most to ``end``, bytes from ``start`` on are held; ``start``: none is."""
@@ -324,7 +327,10 @@ class _Spool:
             if self._room < 0:
                 raise OSError("the disk is full")
             with self._lock:
-                return os.pwrite(self._file, block, at)
+                if self._file is None:
+                    raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+                self._file.seek(at)
+                return self._file.write(block)
         except OSError:
             raise self.remote.error("no room for its bytes on this disk", "set TMPDIR to another") from None
 

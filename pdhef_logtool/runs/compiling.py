@@ -68,7 +68,7 @@ def compile_parts(parts: Sequence[str], work: Callable[[str, Tell], None] = comp
     from pdhef_logtool.compiled import cache
 
     cache.announce()
-    jobs = min(_processors(), len(parts)) if hasattr(os, "fork") else 1
+    jobs = min(_processors(), len(parts))
     preload = ("pdhef_logtool.estimators.*", "pdhef_logtool.compiled.cache:be_silent", work.__module__)
     for _ in supervise(work, parts, jobs=jobs, preload=preload):
         pass

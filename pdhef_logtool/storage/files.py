@@ -16,6 +16,7 @@ from typing import IO, Literal, Self
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.processes import NAME, is_alive, own_name
 
+WINDOWS = os.name == "nt"
 _PARTIAL = re.compile(rf"\..+\.({NAME})\.partial")
 _SCRATCH = re.compile(rf"pdhef-({NAME})-.+")
 #: Bytes of a name that leave room for what a temporary one adds; file systems take 255.
@@ -130,7 +131,12 @@ def cannot_write(target: Path, error: OSError) -> OutputError:
 
 def sync(path: Path) -> None:
     """Wait until a file's content, or a folder's names, are on the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        descriptor = os.open(path, os.O_RDWR if WINDOWS else os.O_RDONLY)
+    except PermissionError:
+        if WINDOWS:
+            return  # it flushes neither folders nor read-only files
+        raise
     try:
         os.fsync(descriptor)
     except OSError as error:
@@ -163,6 +169,11 @@ def scratch_folder() -> tempfile.TemporaryDirectory[str]:
         with contextlib.suppress(OSError):
             for path in list(root.iterdir()):
                 found = _SCRATCH.fullmatch(path.name)
-                if found and is_alive(found[1]) is False and path.stat().st_uid == os.getuid():
+                if found and is_alive(found[1]) is False and _is_ours(path):
                     shutil.rmtree(path, ignore_errors=True)
     return tempfile.TemporaryDirectory(prefix=f"pdhef-{own_name()}-")
+
+
+def _is_ours(path: Path) -> bool:
+    """Return whether a file belongs to this user; always where the temporary folder belongs to one user (Windows)."""
+    return not hasattr(os, "getuid") or path.stat().st_uid == os.getuid()

@@ -20,7 +20,7 @@ from typing import Self
 
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.records.processes import is_alive, own_name
-from pdhef_logtool.storage.files import OF_WRITING, cannot_write, open_new, sweep_files, sync, writing
+from pdhef_logtool.storage.files import OF_WRITING, WINDOWS, cannot_write, open_new, sweep_files, sync, writing
 
 #: The hidden folder beside outputs in which changes are prepared: ``.pdhef/NAME/{new,old,scratch}``.
 WORK = ".pdhef"
@@ -250,6 +250,8 @@ class FolderLock:
         self._file, self._descriptors = None, []
 
     def _try(self) -> bool:
+        if WINDOWS:  # which opens no folders
+            return self._try_file()
         descriptor = os.open(self._folder, os.O_RDONLY)
         try:
             if not _locked(descriptor):
@@ -387,14 +389,6 @@ def _repair(work: Path, place: Path) -> None:
         shutil.rmtree(work, ignore_errors=True)
 
 
-def _remove(path: Path) -> None:
-    with contextlib.suppress(OSError):
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink()
-
-
 def _sync_all(folder: Path) -> None:
     for path in [*(p for p in folder.rglob("*") if not p.is_symlink() and (p.is_file() or p.is_dir())), folder]:
         sync(path)
@@ -433,6 +427,8 @@ def _take_place(new: Path, place: Path, old: Path) -> None:
 
 def _exchanged(one: Path, other: Path) -> bool:
     """Exchange two names at once where system and file system can (Linux renameat2); False where they cannot."""
+    if WINDOWS:
+        return False
     at_cwd, exchange = -100, 2
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if rename is None:

@@ -12,6 +12,7 @@ import contextlib
 import json
 import os
 import pickle
+import platform
 import selectors
 import signal
 import socket
@@ -20,9 +21,10 @@ import sys
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from types import TracebackType
 from typing import Generic, Self, TypeVar
+
+import psutil
 
 from pdhef_logtool.records.errors import UsageError, WorkerError
 from pdhef_logtool.records.printable import shown
@@ -46,6 +48,11 @@ _TRIES = 2
 _RESTARTS = 3
 #: A worker that does not take an item within this time does not listen.
 _SEND_S = 60.0
+
+
+def can_fork() -> bool:
+    """Return whether workers can be forked; macOS has ``fork``, but its frameworks do not work after it."""
+    return hasattr(os, "fork") and platform.system() != "Darwin"
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +101,7 @@ def supervise(
     """Do the work on every item and yield how each ended, in the order of ending.
 
     Items are pulled as workers become free, and nothing of an item is kept once it has ended. With one job and no
-    limits all is done in this process.
+    limits all is done in this process; likewise, with a warning, on systems other than Linux.
 
     Parameters
     ----------
@@ -103,16 +110,19 @@ def supervise(
     preload : modules that the fork server imports: ``package.module``, ``package.*`` for all of a package, or
         ``package.module:function`` to call that too. ``pdhef_logtool.compiled.cache:load_kept`` behind others
         loads their compiled code. They must leave no thread behind that is needed, and run no query (polars) or tensor.
-    warn : called with a line for people whenever the fork server is restarted.
+    warn : called with a line for people whenever the fork server is restarted, or if there can be no worker processes.
 
     Raises
     ------
-    UsageError : fewer jobs than one, or more on a system that cannot fork.
+    UsageError : fewer jobs than one.
     WorkerError : the fork server died more often than it is restarted.
     """
     if jobs < 1:
         raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
     if jobs == 1 and limits == Limits():
+        return _in_this_process(work, items, progress)
+    if not can_fork():
+        warn("worker processes need Linux: one process does all the work, without limits on memory and time")
         return _in_this_process(work, items, progress)
     return _in_processes(work, items, jobs, limits, preload, progress, warn)
 
@@ -155,7 +165,6 @@ def _in_processes(  # positional: the arguments of `supervise`, which checked th
 class _Attempt(Generic[T]):
     number: int
     item: T
-    place: int | None
     tries: int = 0
     last: str = ""
 
@@ -167,15 +176,14 @@ class _Worker(Generic[T]):
     channel: socket.socket
     server: _Server
     attempt: _Attempt[T] | None
-    place: int | None
     pid: int | None = None
     silent_s: float = 0.0
     buffer: bytearray = field(default_factory=bytearray)
 
     def resident_bytes(self) -> int:
         try:
-            return int(Path(f"/proc/{self.pid}/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-        except (OSError, IndexError, ValueError):
+            return int(psutil.Process(self.pid).memory_info().rss)
+        except psutil.Error:
             return 0
 
     def end(self) -> str:
@@ -273,10 +281,8 @@ class Crew(Generic[T, R]):
         preload: Sequence[str] = (),
         warn: Callable[[str], None] = lambda _text: None,
     ) -> None:
-        if not hasattr(os, "fork"):
-            raise UsageError(
-                expected="a system with fork", got=sys.platform, where="--jobs", remedy="--jobs 1, and no limits"
-            )
+        if not can_fork():
+            raise UsageError(expected="Linux, for worker processes", got=platform.system(), where="Ray node")
         most = limits.memory_bytes
         self._orders = (pickle.dumps(work), None if most is None else most + _RESERVED_BYTES)
         self._jobs, self._limits, self._preload = jobs, limits, preload
@@ -310,21 +316,13 @@ class Crew(Generic[T, R]):
         self,
         items: Iterable[T],
         progress: Progress = lambda _number, _text, _share: None,
-        *,
-        place: Callable[[T], int] | None = None,
     ) -> Generator[Ended[T, R], None, None]:
-        """Do the work on every item, as :func:`supervise` does.
-
-        Parameters
-        ----------
-        place : which worker an item is for, by a number below ``jobs``, for work that goes on from what an earlier
-            item has left in its process; that is gone when the process is lost.
-        """
+        """Do the work on every item, as :func:`supervise` does."""
         self._progress = progress
         self._deaths = 0
         self._returned.clear()
         lost: list[_Attempt[T]] = []
-        attempts = (_Attempt(n, item, place and place(item)) for n, item in enumerate(items))
+        attempts = (_Attempt(n, item) for n, item in enumerate(items))
         try:
             for attempt, ended in self._run(attempts, self._jobs):
                 if ended is None:
@@ -353,7 +351,7 @@ class Crew(Generic[T, R]):
             # What the first item has compiled, the others find.
             while self._busy() < (jobs if self._warm else 1):
                 coming = coming or (self._returned.pop() if self._returned else next(attempts, None))
-                if coming is None or self._is_taken(coming):
+                if coming is None:
                     break
                 attempt, coming = coming, None
                 yield from self._give(attempt)
@@ -369,17 +367,13 @@ class Crew(Generic[T, R]):
                 yield from self._hear(worker)
             yield from self._watch()
 
-    def _is_taken(self, attempt: _Attempt[T]) -> bool:
-        """Tell whether the worker that an item is for is at work."""
-        return attempt.place is not None and any(w.attempt and w.place == attempt.place for w in self._workers)
-
     def _busy(self) -> int:
         return sum(w.attempt is not None for w in self._workers)
 
     def _give(self, attempt: _Attempt[T]) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
         """Hand an item to a worker that is free, or to a new one; an item that cannot be sent ends here."""
         attempt.tries, attempt.last = attempt.tries + 1, ""
-        free = next((w for w in self._workers if w.attempt is None and w.place == attempt.place), None)
+        free = next((w for w in self._workers if w.attempt is None), None)
         if free is None:
             self._start(attempt)
         else:
@@ -393,7 +387,7 @@ class Crew(Generic[T, R]):
             while not (server := self._live_server()).fork(self._started, theirs):
                 pass
         ours.settimeout(_SEND_S)
-        worker = _Worker(ours, server, attempt, attempt.place)
+        worker = _Worker(ours, server, attempt)
         self._workers.append(worker)
         self._selector.register(ours, selectors.EVENT_READ, worker)
 
