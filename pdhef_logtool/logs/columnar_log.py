@@ -203,7 +203,7 @@ class ColumnarLog(DriveLog):
         parts: dict[str, list[IntArray]] = {topic: [] for topic in self._by_topic}
         for c, container in enumerate(self.containers):
             for span in container.spans:
-                found = self._times(c, span) if span.end_ns > start_ns and span.start_ns < end_ns else None
+                found = self._times(c, span) if span.overlaps(start_ns, end_ns) else None
                 if found is None:
                     continue
                 channel, times = found
@@ -473,7 +473,7 @@ class ColumnarLog(DriveLog):
             container.expect(self._to_read(plans, container, start_ns, end_ns))
             with container.meter.running():
                 for span in container.spans:
-                    if (start_ns is None or span.end_ns > start_ns) and (end_ns is None or span.start_ns < end_ns):
+                    if span.overlaps(start_ns, end_ns):
                         self._collect_span(plans, c, span, (start_ns, end_ns), parts)
         return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
 
@@ -483,8 +483,7 @@ class ColumnarLog(DriveLog):
     ) -> Iterator[Span]:
         """Yield the spans of a window that hold any of the topics asked for."""
         for span in container.spans:
-            inside = (start_ns is None or span.end_ns > start_ns) and (end_ns is None or span.start_ns < end_ns)
-            if inside and any(container.channels[id_].topic in topics for id_ in span.counts):
+            if span.overlaps(start_ns, end_ns) and any(container.channels[id_].topic in topics for id_ in span.counts):
                 yield span
 
     def _collect_span(

@@ -67,6 +67,10 @@ class Span:
     counts: Mapping[int, int]
     ordered: bool = False
 
+    def overlaps(self, start_ns: int | None, end_ns: int | None) -> bool:
+        """Return whether some of its time is in [start, end); None: without limit."""
+        return (start_ns is None or self.end_ns > start_ns) and (end_ns is None or self.start_ns < end_ns)
+
 
 @dataclass(frozen=True, eq=False)
 class Block:

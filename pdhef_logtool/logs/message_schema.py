@@ -351,8 +351,17 @@ class _Json:
     unfolding: Unfolding
 
 
+#: Scalars of JSON Schema by their type.
+_JSON_SCALARS: dict[object, Scalar] = {
+    "number": Scalar("number"),
+    "integer": Scalar("number"),
+    "boolean": Scalar("bool"),
+    "string": Scalar("string"),
+}
+
+
 def _json_node(schema: Any, whole: _Json, times: int, inside: tuple[str, ...], depth: int) -> Node:
-    """Return a schema's tree; ``inside`` holds the references that lead here: what contains itself is left open."""
+    """Return a schema's tree; ``inside`` are the references that lead here: what contains itself is left open."""
     if not isinstance(schema, dict) or depth > whole.unfolding.budget.schema_depth:
         return Unknown()
     whole.unfolding.enter(times, 0)
@@ -360,13 +369,8 @@ def _json_node(schema: Any, whole: _Json, times: int, inside: tuple[str, ...], d
     if isinstance(reference, str) and reference.startswith("#/"):
         if reference in inside:
             return Unknown()
-        target: Any = whole.document
-        for part in reference[2:].split("/"):
-            target = target.get(part) if isinstance(target, dict) else None
-        return _json_node(target, whole, times, (*inside, reference), depth + 1)
-    declared = schema.get("type")
-    types = [t for t in declared if t != "null"] if isinstance(declared, list) else [declared]
-    kind = types[0] if len(types) == 1 else None
+        return _json_node(_referenced(whole.document, reference), whole, times, (*inside, reference), depth + 1)
+    kind = _json_type(schema.get("type"))
     if kind == "object" or (kind is None and "properties" in schema):
         properties = schema.get("properties")
         if not isinstance(properties, dict) or not properties:
@@ -376,13 +380,20 @@ def _json_node(schema: Any, whole: _Json, times: int, inside: tuple[str, ...], d
         least, most = schema.get("minItems"), schema.get("maxItems")
         length = least if isinstance(least, int) and least == most and least >= 0 else None
         return Array(_json_node(schema.get("items"), whole, times * _listed(length), inside, depth + 1), length)
-    if kind in ("number", "integer"):
-        return Scalar("number")
-    if kind == "boolean":
-        return Scalar("bool")
-    if kind == "string":
-        return Scalar("string")
-    return Unknown()
+    return _JSON_SCALARS.get(kind, Unknown())
+
+
+def _referenced(document: Any, reference: str) -> Any:
+    """Return the part of a document that ``#/definitions/Name`` names; None where there is none."""
+    for part in reference[2:].split("/"):
+        document = document.get(part) if isinstance(document, dict) else None
+    return document
+
+
+def _json_type(declared: object) -> str | None:
+    """Return the type that a JSON Schema declares, null aside; None where it declares none or several."""
+    types = [t for t in declared if t != "null"] if isinstance(declared, list) else [declared]
+    return str(types[0]) if len(types) == 1 and types[0] is not None else None
 
 
 def json_schema_of_message(type_name: str, message: bytes, budget: Budget = DEFAULT_BUDGET) -> MessageSchema:
@@ -466,16 +477,13 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
     """
     ending = next((e for e in TEXT_ENDINGS if path.endswith(e)), "")
     steps = parse_path(path.removesuffix(ending))
-    node: Node = schema.root
+    node: Node | None = schema.root
     for step in steps:
         if isinstance(node, Unknown):
             return Selection(path, "dynamic", (steps,))
-        if isinstance(step, str) and isinstance(node, Struct) and step in node.members:
-            node = node.members[step]
-        elif isinstance(step, int) and isinstance(node, Array) and (node.length is None or step < node.length):
-            node = node.item
-        else:
-            raise _no_such_path(schema, topic, path)
+        node = _part(node, step)
+    if node is None:
+        raise _no_such_path(schema, topic, path)
     if ending:
         # Records of ROS messages are read without their texts.
         is_text = isinstance(node, Unknown) or (isinstance(node, Scalar) and node.kind == "string")
@@ -494,18 +502,30 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
             raise _no_number(schema, topic, path, "a text")
         return Selection(path, "scalar", (steps,))
     if isinstance(node, Array):
-        if isinstance(node.item, Unknown):
-            return Selection(path, "dynamic", (steps,))
-        if not isinstance(node.item, Scalar) or node.item.kind == "string":
-            raise _no_number(schema, topic, path, "an array of structs or texts")
-        if node.length is not None and node.length > schema.budget.array_width:
-            raise _no_number(schema, topic, path, f"an array of {node.length} elements, too many for columns")
-        return Selection(path, "array", (steps,), node.length)
+        return _select_array(node, schema, topic, path, steps)
     if node.time:
         return Selection(path, "time", tuple((*steps, part) for part in node.time))
     if node.vector:
         return Selection(path, "vector", tuple((*steps, part) for part in node.vector))
     raise _no_number(schema, topic, path, "a struct")
+
+
+def _part(node: Node | None, step: Step) -> Node | None:
+    """Return a member of a struct or an element of an array; None where there is none."""
+    if isinstance(node, Struct) and isinstance(step, str):
+        return node.members.get(step)
+    is_element = isinstance(node, Array) and isinstance(step, int) and (node.length is None or step < node.length)
+    return node.item if isinstance(node, Array) and is_element else None
+
+
+def _select_array(node: Array, schema: MessageSchema, topic: str, path: str, steps: tuple[Step, ...]) -> Selection:
+    if isinstance(node.item, Unknown):
+        return Selection(path, "dynamic", (steps,))
+    if not isinstance(node.item, Scalar) or node.item.kind == "string":
+        raise _no_number(schema, topic, path, "an array of structs or texts")
+    if node.length is not None and node.length > schema.budget.array_width:
+        raise _no_number(schema, topic, path, f"an array of {node.length} elements, too many for columns")
+    return Selection(path, "array", (steps,), node.length)
 
 
 def _no_such_path(schema: MessageSchema, topic: str, path: str) -> MappingError:

@@ -269,20 +269,16 @@ def jsonable(value: Any) -> Any:
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return {utf8(str(k)): jsonable(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, set | frozenset):
+        value = sorted(value)
+    if isinstance(value, Sequence):
         return [jsonable(v) for v in value]
     if isinstance(value, PurePath):
         return utf8(str(value))
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: jsonable(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, Mapping):
-        return {utf8(str(k)): jsonable(v) for k, v in value.items()}
-    if isinstance(value, set | frozenset):
-        return [jsonable(v) for v in sorted(value)]
-    if isinstance(value, Sequence):
-        return [jsonable(v) for v in value]
     import numpy as np
 
     if isinstance(value, np.generic | np.ndarray):
