@@ -49,13 +49,13 @@ def _without_blas() -> None:
     def none() -> None:
         raise ImportError
 
-    found = linalg.ensure_blas
+    original = linalg.ensure_blas
     linalg.ensure_blas = none
     try:
         from numba.np import arraymath
     finally:
-        linalg.ensure_blas = found
-    arraymath.ensure_blas = found
+        linalg.ensure_blas = original
+    arraymath.ensure_blas = original
 
 
 def _sizes_differ(_given: Any, _expected: Any) -> None:
@@ -173,8 +173,8 @@ def _private_folder() -> Path | None:
         folder = Path(tempfile.gettempdir()) / f"pdhef-compiled-{os.getuid()}"
         with contextlib.suppress(FileExistsError):
             folder.mkdir(mode=0o700)
-        found = folder.lstat()
-        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077:
+        status = folder.lstat()
+        if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o077:
             return folder
     return None
 
@@ -203,13 +203,13 @@ class _Cache:
     def load_overload(self, signature: Any, context: Any) -> Any:
         for place in self._places:
             try:
-                found = place.load_overload(signature, context)
+                overload = place.load_overload(signature, context)
             except Exception:  # noqa: BLE001 (whatever a pickle that was cut short may raise)
                 with contextlib.suppress(OSError):
                     place.flush()
                 continue
-            if found is not None:
-                return found
+            if overload is not None:
+                return overload
         announce()
         return None
 
@@ -314,8 +314,8 @@ def announce() -> None:
         return
     announced, folder = True, kept_in()
     if folder is None:
-        told = f"compiling, about {COMPILING_S} s in every run: there is no folder to keep the code in"
+        text = f"compiling, about {COMPILING_S} s in every run: there is no folder to keep the code in"
     else:
-        told = f"compiling, once, about {COMPILING_S} s; the code is kept in {shown(str(folder))}"
-    sys.stderr.write(f"{told}\n")
+        text = f"compiling, once, about {COMPILING_S} s; the code is kept in {shown(str(folder))}"
+    sys.stderr.write(f"{text}\n")
     sys.stderr.flush()

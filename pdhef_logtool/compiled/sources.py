@@ -41,10 +41,10 @@ def compiled_sources(root: Path = ROOT) -> tuple[Path, ...]:
 
 def sources_digest(root: Path = ROOT) -> str:
     """Return the digest of the sources, and of the versions of the compiler."""
-    found = hashlib.sha256(f"numba {version('numba')}, llvmlite {version('llvmlite')}\n".encode())
+    digest = hashlib.sha256(f"numba {version('numba')}, llvmlite {version('llvmlite')}\n".encode())
     for path in compiled_sources(root):
-        found.update(f"{path.relative_to(root).as_posix()}\n".encode() + hashlib.sha256(path.read_bytes()).digest())
-    return found.hexdigest()[:16]
+        digest.update(f"{path.relative_to(root).as_posix()}\n".encode() + hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()[:16]
 
 
 @cache

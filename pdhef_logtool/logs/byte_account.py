@@ -38,8 +38,8 @@ class ByteLedger:
 def checksummed_share(ledgers: Sequence[ByteLedger]) -> float | None:
     """Return which share of the bytes that were read a verified checksum covers; None where that is not known."""
     decoded = sum(ledger.decoded for ledger in ledgers)
-    known = [ledger.checksummed for ledger in ledgers if ledger.checksummed is not None]
-    return sum(known) / decoded if decoded and len(known) == len(ledgers) else None
+    checksummed = [ledger.checksummed for ledger in ledgers if ledger.checksummed is not None]
+    return sum(checksummed) / decoded if decoded and len(checksummed) == len(ledgers) else None
 
 
 def checksum_text(share: float | None) -> str:

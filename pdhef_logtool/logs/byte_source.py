@@ -72,27 +72,27 @@ class ByteSource(ABC):
     def read(self, offset: int, size: int) -> bytes:
         """Return exactly these bytes; raises :class:`CutError` where the file has less."""
         start, block = self._block
-        at = offset - start
-        if at >= 0 and at + size <= len(block):
-            return block[at : at + size]
+        position = offset - start
+        if position >= 0 and position + size <= len(block):
+            return block[position : position + size]
         if size > _LARGE_READ_BYTES:
             if offset + size > self.size:  # a claim must not be allocated
                 raise CutError(f"the file has no {size} bytes at byte {offset}")
-            found = self.fetch(offset, size)
+            data = self.fetch(offset, size)
         else:
-            block, at = self.ahead(offset, size)
-            found = block[at : at + size]
-        if len(found) < size:
-            raise CutError(f"the file ends at byte {offset + len(found)}, before byte {offset + size}")
-        return found
+            block, position = self.ahead(offset, size)
+            data = block[position : position + size]
+        if len(data) < size:
+            raise CutError(f"the file ends at byte {offset + len(data)}, before byte {offset + size}")
+        return data
 
     def ahead(self, offset: int, size: int) -> tuple[bytes, int]:
         """Return a block and the place in it where ``size`` bytes or more from an offset lie, if the file has them."""
         start, block = self._block
-        at = offset - start
-        if at >= 0 and at + size <= len(block):
-            return block, at
-        follows = 0 <= at <= len(block)
+        position = offset - start
+        if position >= 0 and position + size <= len(block):
+            return block, position
+        follows = 0 <= position <= len(block)
         self._ahead_bytes = min(2 * self._ahead_bytes, _MOST_AHEAD_BYTES) if follows else _LEAST_AHEAD_BYTES
         block = self.fetch(offset, max(size, self.at_hand(offset, self._ahead_bytes)))
         self._block = (offset, block)

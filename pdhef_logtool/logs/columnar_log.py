@@ -124,8 +124,8 @@ class ColumnarLog(DriveLog):
                 channel, log_time = container.times(span)
             if container.by_index:
                 return channel, log_time
-            known = np.isin(channel, list(container.channels))
-            return channel[known], log_time[known]
+            declared = np.isin(channel, list(container.channels))
+            return channel[declared], log_time[declared]
         except SourceError:
             raise
         except Exception:  # noqa: BLE001 (a read of the span reports the damage)
@@ -134,21 +134,21 @@ class ColumnarLog(DriveLog):
     @property
     def lost(self) -> tuple[Loss, ...]:
         """What could not be read, as far as is known by now."""
-        found = [*self._opened_lost, *self.occupied.losses]
+        losses = [*self._opened_lost, *self.occupied.losses]
         damaged, schemas = sorted(self._damaged.items()), sorted(self._schemas.items())
         for c, container in enumerate(self.containers):
-            found.extend(container.lost)
-            found.extend(loss for (of, _), loss in damaged if of == c)
-            found.extend(loss for (of, _, _), loss in self._partial.items() if of == c)
+            losses.extend(container.lost)
+            losses.extend(loss for (of, _), loss in damaged if of == c)
+            losses.extend(loss for (of, _, _), loss in self._partial.items() if of == c)
             if c in self._late:
-                found.append(_out_of_time(container, list(self._late[c].values())))
-            found.extend(self._undecodable_losses(c, container))
+                losses.append(_out_of_time(container, list(self._late[c].values())))
+            losses.extend(self._undecodable_losses(c, container))
             for (of, channel), schema in schemas:
                 wanted = of == c and (of, channel) in self._asked
                 if wanted and isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError):
                     what = f"its messages cannot be decoded: {schema}"
-                    found.append(Loss("bad-schema", what, container.channels[channel].topic))
-        return tuple(found)
+                    losses.append(Loss("bad-schema", what, container.channels[channel].topic))
+        return tuple(losses)
 
     @property
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:
@@ -177,11 +177,11 @@ class ColumnarLog(DriveLog):
 
     def metadata(self) -> dict[str, str]:
         """Return the entries of metadata records by ``key`` and ``record.key``, and rosbag2's ``custom_data``."""
-        found: dict[str, str] = {}
+        entries: dict[str, str] = {}
         for container in self.containers:
             for record in container.metadata_records():
-                found |= {**record.values, **{f"{record.name}.{key}": value for key, value in record.values.items()}}
-        return found | dict(self._custom)
+                entries |= {**record.values, **{f"{record.name}.{key}": value for key, value in record.values.items()}}
+        return entries | dict(self._custom)
 
     @property
     def far(self) -> bool:
@@ -203,10 +203,10 @@ class ColumnarLog(DriveLog):
         parts: dict[str, list[IntArray]] = {topic: [] for topic in self._by_topic}
         for c, container in enumerate(self.containers):
             for span in container.spans:
-                found = self._times(c, span) if span.overlaps(start_ns, end_ns) else None
-                if found is None:
+                stamps = self._times(c, span) if span.overlaps(start_ns, end_ns) else None
+                if stamps is None:
                     continue
-                channel, times = found
+                channel, times = stamps
                 keep = in_window(times, start_ns, end_ns)
                 channel, times = (channel, times) if keep is None else (channel[keep], times[keep])
                 for id_ in span.counts:
@@ -226,8 +226,8 @@ class ColumnarLog(DriveLog):
     def expect(self, topics: Collection[str], spans_ns: Sequence[tuple[int, int]]) -> None:
         """Take note of what will be read soon: these topics in [start, end) of each."""
         for container in self.containers:
-            found = (s for start, end in spans_ns for s in self._to_read(topics, container, start, end))
-            container.expect({span.index: span for span in found}.values())
+            expected = (s for start, end in spans_ns for s in self._to_read(topics, container, start, end))
+            container.expect({span.index: span for span in expected}.values())
 
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
         """Return the scalar leaves of a topic's schema; empty when the encoding carries none.
@@ -265,7 +265,7 @@ class ColumnarLog(DriveLog):
 
     def first_messages(self, topic: str, most: int) -> list[object]:
         """Return the first messages of a topic whole; what does not decode is left out."""
-        found: list[object] = []
+        messages: list[object] = []
         for c, channel in self._by_topic.get(topic, ()):
             schema = self.schema_of(c, channel)
             if not isinstance(schema, MessageSchema):
@@ -273,13 +273,13 @@ class ColumnarLog(DriveLog):
             decode = ChannelDecoder(schema, ()).single_decoder()
             with self.containers[c].meter.running():
                 for span in (s for s in self.containers[c].spans if channel.id in s.counts):
-                    block = self.load(c, span, frozenset({channel.id})) if len(found) < most else None
+                    block = self.load(c, span, frozenset({channel.id})) if len(messages) < most else None
                     if block is None:
                         continue
-                    for row in block.rows.get(channel.id, np.empty(0, np.int64))[: most - len(found)]:
-                        at, n = int(block.offset[row]), int(block.length[row])
-                        found.append(decode(bytes(block.buffer[at : at + n])))
-        return [message for message in found if message is not None]
+                    for row in block.rows.get(channel.id, np.empty(0, np.int64))[: most - len(messages)]:
+                        start, n = int(block.offset[row]), int(block.length[row])
+                        messages.append(decode(bytes(block.buffer[start : start + n])))
+        return [message for message in messages if message is not None]
 
     def read(
         self,
@@ -363,29 +363,29 @@ class ColumnarLog(DriveLog):
         """Correct what an index claimed of a span by what the span holds, with a loss for what it should hold."""
         container = self.containers[c]
         held = block.counts
-        known = {id_: n for id_, n in held.items() if id_ in container.channels}
+        declared = {id_: n for id_, n in held.items() if id_ in container.channels}
         claimed = {id_: n for id_, n in span.counts.items() if want is None or id_ in want}
         times = block.log_time_ns
-        undeclared = sum(held.values()) - sum(known.values()) - container.undeclared.get(span.index, 0)
+        undeclared = sum(held.values()) - sum(declared.values()) - container.undeclared.get(span.index, 0)
         outside = 0
         if len(times) and (times.min() < span.start_ns or times.max() >= span.end_ns):
             outside = int(np.count_nonzero((times < span.start_ns) | (times >= span.end_ns)))
-        if known == claimed and not outside and undeclared <= 0:
+        if declared == claimed and not outside and undeclared <= 0:
             return
         others = {id_: n for id_, n in span.counts.items() if id_ not in claimed}
-        container.spans[span.index] = replace(span, counts=others | known)
-        missing = sum(max(n - known.get(id_, 0), 0) for id_, n in claimed.items())
-        at, end = container.extent(span)
+        container.spans[span.index] = replace(span, counts=others | declared)
+        missing = sum(max(n - declared.get(id_, 0), 0) for id_, n in claimed.items())
+        start, end = container.extent(span)
         for kind, count, text in (
             ("missing-messages", missing, "that the index names are not there"),
             ("unknown-channel", undeclared, "are on channels that no readable record declares"),
             ("bad-times", outside, "have log times outside of those that the index names"),
         ):
             if count > 0:
-                what = f"{count} messages {text}, at byte {at}"
+                what = f"{count} messages {text}, at byte {start}"
                 loss = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
                 self._partial[c, span.index, (kind, want)] = loss
-                container.account.lose_share((at, end), count / (len(block) + missing))
+                container.account.lose_share((start, end), count / (len(block) + missing))
 
     def schema_of(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
         """Return the schema of a channel of the c-th container, or why there is none."""
@@ -432,8 +432,8 @@ class ColumnarLog(DriveLog):
                 rows = np.flatnonzero(block.channel == channel.id)
                 if rows.size:
                     row = int(rows[0])
-                    at, n = int(block.offset[row]), int(block.length[row])
-                    return bytes(block.buffer[at : at + n])
+                    start, n = int(block.offset[row]), int(block.length[row])
+                    return bytes(block.buffer[start : start + n])
         return None
 
     def _plan(self, topic: str, paths: tuple[str, ...]) -> _Plan:

@@ -114,8 +114,8 @@ def _zstd_decompressor() -> zstandard.ZstdDecompressor:
 
     if not hasattr(_OF_THREAD, "zstd"):
         _OF_THREAD.zstd = zstandard.ZstdDecompressor()
-    found: zstandard.ZstdDecompressor = _OF_THREAD.zstd
-    return found
+    decompressor: zstandard.ZstdDecompressor = _OF_THREAD.zstd
+    return decompressor
 
 
 def _lz4(stored: _Bytes, size: int) -> bytes:

@@ -112,7 +112,7 @@ class Block:
         ordered = self.channel[order]
         firsts = [0, *(np.flatnonzero(ordered[1:] != ordered[:-1]) + 1).tolist()]
         ends = [*firsts[1:], len(self)]
-        return {int(ordered[at]): order[at:end] for at, end in zip(firsts, ends, strict=True)}
+        return {int(ordered[first]): order[first:end] for first, end in zip(firsts, ends, strict=True)}
 
     @property
     def counts(self) -> dict[int, int]:
@@ -314,8 +314,8 @@ class Container(ABC):
                 self.lose("unknown-channel", what, span.start_ns, span.end_ns, count)
                 self.account.lose_share(self.extent(span), count / sum(span.counts.values()))
                 self.undeclared[i] = count
-                known = {c: n for c, n in span.counts.items() if c not in unknown}
-                self.spans[i] = Span(span.index, span.start_ns, span.end_ns, known, span.ordered)
+                declared = {c: n for c, n in span.counts.items() if c not in unknown}
+                self.spans[i] = Span(span.index, span.start_ns, span.end_ns, declared, span.ordered)
 
 
 class FileContainer(Container):
@@ -340,11 +340,11 @@ class FileContainer(Container):
         self.source = path if isinstance(path, ByteSource) else LocalFile(path, shown_path)
         shown = shown_path or (Path() if isinstance(path, ByteSource) else path)
         super().__init__(shown, self.source.size, meter)
-        self.at = len(self.magic)  # where the walk is
+        self.position = len(self.magic)  # where the walk is
         try:
-            if self.source.size < self.at or self.source.read(0, self.at) != self.magic:
+            if self.source.size < self.position or self.source.read(0, self.position) != self.magic:
                 raise self.no_log(self.magic_text, "other content")
-            self.account.decode(0, self.at)
+            self.account.decode(0, self.position)
             with self.meter.running(self.source.size):
                 self._open()
         except BaseException:
@@ -364,8 +364,8 @@ class FileContainer(Container):
             if isinstance(error, PdhefError) and not isinstance(error, BudgetError):
                 raise
             kind, text = told(error)
-            self.lose(kind, f"what follows byte {self.at} of {self.source.size} is lost: {text}", self.last_ns())
-            self.account.lose(self.at, self.source.size)
+            self.lose(kind, f"what follows byte {self.position} of {self.source.size} is lost: {text}", self.last_ns())
+            self.account.lose(self.position, self.source.size)
             self.account.cut = True
         self._finish()
 
@@ -387,11 +387,11 @@ class FileContainer(Container):
     def _places(self) -> Iterator[int]:
         """Yield where the walk is, up to the file's end, looking at the time that it takes now and then."""
         n = 0
-        while self.at < self.source.size:
+        while self.position < self.source.size:
             n += 1
             if n % _RECORDS_A_CHECK == 0:
                 self.meter.check()
-            yield self.at
+            yield self.position
 
     @abstractmethod
     def _finish(self) -> None:

@@ -125,7 +125,7 @@ class ChannelDecoder:
             back = np.argsort(order)
             return {path: column[back] for path, column in columns.items()}
         joined = {s.path: concatenate_columns([part[s.path] for _, part in partial]) for s in self.selections}
-        back = np.argsort(np.concatenate([at for at, _ in partial]), kind="stable")
+        back = np.argsort(np.concatenate([part_rows for part_rows, _ in partial]), kind="stable")
         return {path: column[back] for path, column in joined.items()}
 
     def _read_records(
@@ -139,9 +139,10 @@ class ChannelDecoder:
             if tried == len(self._layouts):
                 if tried >= _LAYOUTS_PER_CHANNEL:
                     break
-                at, n = int(offset[left[0]]), int(length[left[0]])
+                start, n = int(offset[left[0]]), int(length[left[0]])
+                message = bytes(block.buffer[start : start + n])
                 try:
-                    layout = layout_of_message(self.schema.root, self.schema.wire, bytes(block.buffer[at : at + n]))
+                    layout = layout_of_message(self.schema.root, self.schema.wire, message)
                     self._check_widths(layout, len(rows))
                 except NoLayoutError:
                     no_layout.append(left[:1])
@@ -159,8 +160,8 @@ class ChannelDecoder:
     def _check_widths(self, layout: WireLayout, n: int) -> None:
         """Refuse a layout one of whose arrays has too many elements for N rows of columns."""
         most = min(self.schema.budget.array_width, _most_columns(n))
-        found = (layout.leaves.get(s.components[0]) for s in self.selections if s.shape == "array")
-        if any((leaf.count or 0) > most for leaf in found if leaf is not None):
+        selected = (layout.leaves.get(s.components[0]) for s in self.selections if s.shape == "array")
+        if any((leaf.count or 0) > most for leaf in selected if leaf is not None):
             raise NoLayoutError("an array is too wide for columns")
 
     def _read_layout(
@@ -196,8 +197,8 @@ class ChannelDecoder:
         getters = [(s.path, self._getter(s)) for s in self.selections]
         values: dict[str, list[object]] = {s.path: [] for s in self.selections}
         most = min(self.schema.budget.array_width, _most_columns(len(rows)))
-        for row, at, n in zip(rows.tolist(), block.offset[rows].tolist(), block.length[rows].tolist(), strict=True):
-            message = decode(bytes(block.buffer[at : at + n]))
+        for row, start, n in zip(rows.tolist(), block.offset[rows].tolist(), block.length[rows].tolist(), strict=True):
+            message = decode(bytes(block.buffer[start : start + n]))
             if message is None:
                 self.undecodable.append(row)
             for path, get in getters:
@@ -339,17 +340,17 @@ def missing_column(selection: Selection, n: int) -> NDArray[Any]:
 
 
 def _record_column(layout: LayoutReader, parts: Sequence[NDArray[Any]], n: int, selection: Selection) -> NDArray[Any]:
-    found = [layout.values(parts, n, steps) for steps in selection.components]
+    values = [layout.values(parts, n, steps) for steps in selection.components]
     if selection.shape == "time":
-        seconds, nanoseconds = found
+        seconds, nanoseconds = values
         if seconds is None or nanoseconds is None:
             return np.full(n, NO_TIME_NS, dtype=np.int64)
         return seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
     if selection.shape == "vector":
-        return np.column_stack([np.full(n, np.nan) if f is None else f.astype(np.float64) for f in found])
-    if found[0] is None:
+        return np.column_stack([np.full(n, np.nan) if f is None else f.astype(np.float64) for f in values])
+    if values[0] is None:
         return missing_column(selection, n)
-    return found[0].astype(np.float64)
+    return values[0].astype(np.float64)
 
 
 def _single_value(message: object, selection: Selection) -> object:

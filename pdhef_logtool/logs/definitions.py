@@ -55,10 +55,10 @@ class Definitions:
 
     def installed(self, type_name: str) -> Path | None:
         """Return the file of a type that only an installed ROS or a sourced workspace defines."""
-        found = _TYPE_NAME.fullmatch(type_name)
-        if found is None or type_name in self.files or found[2] in self.files or shipped_definition(type_name):
+        match = _TYPE_NAME.fullmatch(type_name)
+        if match is None or type_name in self.files or match[2] in self.files or shipped_definition(type_name):
             return None
-        return next((path for path in self._places(found[1], found[2]) if path.is_file()), None)
+        return next((path for path in self._places(match[1], match[2]) if path.is_file()), None)
 
     def _places(self, package: str, name: str) -> Iterator[Path]:
         file = Path("msg", f"{name}.msg")

@@ -66,7 +66,7 @@ def find_logs(arguments: Logs, *, private_redirects: bool = False) -> list[LogIn
     ------
     UsageError : An argument stands for no log at all. LogError : A store cannot be searched.
     """
-    found: dict[str, LogPlace] = {}
+    logs: dict[str, LogPlace] = {}
     several = [arguments] if isinstance(arguments, str | Path | RemotePlace) else arguments
     if already := [a for a in several if isinstance(a, LogInput)]:
         return already
@@ -81,8 +81,8 @@ def find_logs(arguments: Logs, *, private_redirects: bool = False) -> list[LogIn
                 remedy="name a log, a folder that holds some, or a glob pattern in quotes",
             )
         for place in places:
-            found.setdefault(place.identity if isinstance(place, RemotePlace) else os.path.realpath(place), place)
-    return _with_stems(list(found.values()))
+            logs.setdefault(place.identity if isinstance(place, RemotePlace) else os.path.realpath(place), place)
+    return _with_stems(list(logs.values()))
 
 
 def with_free_stem(log: LogInput, taken: Container[str]) -> LogInput:
@@ -217,8 +217,8 @@ def _matches(pattern: str) -> list[Path]:
     first = next(i for i, part in enumerate(parts) if glob.has_magic(part))
     root = Path(*parts[:first])
     below = str(Path(*(part if part == "**" else re.sub(r"\*\*+", "*", part) for part in parts[first:])))
-    found = (p for p in root.glob(below) if not any(x.startswith(".") for x in p.relative_to(root).parts))
-    return sorted(found, key=str)
+    paths = (p for p in root.glob(below) if not any(x.startswith(".") for x in p.relative_to(root).parts))
+    return sorted(paths, key=str)
 
 
 def _search(folder: Path, visited: set[str]) -> Iterator[Path]:

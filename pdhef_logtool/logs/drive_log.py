@@ -207,9 +207,9 @@ def windows(
     start_ns: int, end_ns: int, length_ns: int, occupied: OccupiedTime | None = None
 ) -> Iterator[tuple[int, int]]:
     """Cut [start, end) into consecutive windows of at most ``length_ns``; those in a silence are left out."""
-    at = start_ns
+    window_ns = start_ns
     for begin, end in ((start_ns, end_ns),) if occupied is None else occupied.intervals:
-        at += max(0, (begin - at) // length_ns) * length_ns
-        while at < min(end, end_ns):
-            yield at, min(at + length_ns, end_ns)
-            at += length_ns
+        window_ns += max(0, (begin - window_ns) // length_ns) * length_ns
+        while window_ns < min(end, end_ns):
+            yield window_ns, min(window_ns + length_ns, end_ns)
+            window_ns += length_ns

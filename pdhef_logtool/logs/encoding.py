@@ -121,8 +121,8 @@ class CdrEncoder:
 
             def length_of(steps: Sequence[Step], offset: int, is_text: bool) -> int:
                 del offset
-                at = tuple(steps)
-                return len(self._texts.get(at, b"")) + 1 if is_text else lengths.get(at, 0)
+                place = tuple(steps)
+                return len(self._texts.get(place, b"")) + 1 if is_text else lengths.get(place, 0)
 
             try:
                 layout = build_layout(self.schema.root, "cdr", length_of)

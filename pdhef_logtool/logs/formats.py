@@ -68,8 +68,8 @@ FORMATS = (
 
 @cache
 def _of_other_packages() -> tuple[LogFormat, ...]:
-    found = sorted(entry_points(group=GROUP), key=lambda entry: entry.name)
-    return tuple(entry.load() for entry in found)
+    entries = sorted(entry_points(group=GROUP), key=lambda entry: entry.name)
+    return tuple(entry.load() for entry in entries)
 
 
 def _every_format() -> Iterator[LogFormat]:

@@ -267,25 +267,25 @@ def _store_of(distro: str) -> Any:
 
 
 def _completed(
-    types: Mapping[str, Any], known: Mapping[str, Any], definitions: Definitions, budget: Budget, wanted: str = ""
+    types: Mapping[str, Any], distributed: Mapping[str, Any], definitions: Definitions, budget: Budget, wanted: str = ""
 ) -> dict[str, Any]:
     """Return the types with all that they contain: of the distribution, else of definitions; ``wanted`` is one more."""
     from rosbags.typesys import get_types_from_msg
 
-    found = dict(types)
+    completed = dict(types)
     todo = ({wanted} if wanted else set()) | (referenced(types) - set(types))
     while todo:
         name = todo.pop()
-        if name in known:
-            found[name] = known[name]
+        if name in distributed:
+            completed[name] = distributed[name]
         else:
             text = definitions.text_of(name)
             budget.check("schema_bytes", len(text) * _BYTES_OF_TEXT, f"the definition of {name}")
             if not text.strip():
                 raise MissingDefinitionError(name)
-            found |= get_types_from_msg(text, name)
-        todo |= referenced({name: found[name]}) - set(found)
-    return found
+            completed |= get_types_from_msg(text, name)
+        todo |= referenced({name: completed[name]}) - set(completed)
+    return completed
 
 
 def _ros_root(defs: Mapping[str, Any], type_name: str, budget: Budget) -> Struct:
@@ -447,20 +447,20 @@ def parse_path(path: str) -> tuple[Step, ...]:
     MappingError : the text is no path.
     """
     steps: list[Step] = []
-    at, after_dot = 0, True
+    position, after_dot = 0, True
     text = path.removesuffix("[]")
-    while at < len(text):
-        found = _PART.match(text, at)
-        valid = found is not None and (found[0] != "." or not after_dot) and (not found[1] or after_dot)
-        if found is None or not valid or found[2] == "" or (found[2] is not None and after_dot):
+    while position < len(text):
+        match = _PART.match(text, position)
+        valid = match is not None and (match[0] != "." or not after_dot) and (not match[1] or after_dot)
+        if match is None or not valid or match[2] == "" or (match[2] is not None and after_dot):
             after_dot = True
             break
-        if found[1]:
-            steps.append(found[1])
-        elif found[2]:
-            steps.append(int(found[2]))
-        after_dot = found[0] == "."
-        at = found.end()
+        if match[1]:
+            steps.append(match[1])
+        elif match[2]:
+            steps.append(int(match[2]))
+        after_dot = match[0] == "."
+        position = match.end()
     if after_dot:
         raise MappingError(
             expected="a dotted path such as twist.linear.x or data[0]", got=repr(path), where="field path"
@@ -529,11 +529,11 @@ def _select_array(node: Array, schema: MessageSchema, topic: str, path: str, ste
 
 
 def _no_such_path(schema: MessageSchema, topic: str, path: str) -> MappingError:
-    known = [leaf.path for leaf in leaves(schema.root)]
-    near = difflib.get_close_matches(path, known, n=3, cutoff=0.4)
+    paths = [leaf.path for leaf in leaves(schema.root)]
+    near = difflib.get_close_matches(path, paths, n=3, cutoff=0.4)
     if not near:
         last = path.rsplit(".", 1)[-1]
-        near = [p for p in known if p.rsplit(".", 1)[-1] == last][:3] or known[:3]
+        near = [p for p in paths if p.rsplit(".", 1)[-1] == last][:3] or paths[:3]
     return MappingError(
         expected=f"a field of {schema.type_name or 'the message'}",
         got=repr(path),

@@ -150,14 +150,14 @@ def recorded_twice(times_ns: IntArray) -> list[tuple[int, int, int]]:
     """
     begins = np.concatenate([[0], np.flatnonzero(np.diff(times_ns) < -STEP_BACK_NS) + 1])
     low, high = np.minimum.reduceat(times_ns, begins), np.maximum.reduceat(times_ns, begins)
-    found: list[tuple[int, int, int]] = []
+    repeated: list[tuple[int, int, int]] = []
     earlier: list[tuple[int, int]] = []
     for place, a, b in zip(begins.tolist(), low.tolist(), high.tolist(), strict=True):
         twice = [(x, y) for x, y in earlier if min(y, b) - max(x, a) > 0]
-        found += [(place, x - BREAK_NS, y + BREAK_NS) for x, y in twice]
+        repeated += [(place, x - BREAK_NS, y + BREAK_NS) for x, y in twice]
         apart = [(x, y) for x, y in earlier if (x, y) not in twice]
         earlier = [*apart, (min([a, *(x for x, _ in twice)]), max([b, *(y for _, y in twice)]))]
-    return found
+    return repeated
 
 
 def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> OccupiedTime:
@@ -175,10 +175,10 @@ def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> Occ
         place = (c, span.index)
         if not any(place >= cut.place[:2] and _touches(span, cut) for cut in cuts):
             continue
-        found = times(c, span)
-        for id_, own in _by_channel(found) if found is not None else ():
+        stamps = times(c, span)
+        for id_, channel_times in _by_channel(stamps) if stamps is not None else ():
             topic = containers[c].channels[id_].topic
-            again = own[_inside(own, intervals) & _cut_out(own, topic, place, cuts)]
+            again = channel_times[_inside(channel_times, intervals) & _cut_out(channel_times, topic, place, cuts)]
             if again.size:
                 left_out.setdefault(topic, Counter())[TIME_JUMP] += again.size
                 twice.append(again)
@@ -226,17 +226,17 @@ class _Looked:
     c: int
     span: Span
     topics: Mapping[int, str]
-    found: tuple[IntArray, IntArray] | None = None
+    stamps: tuple[IntArray, IntArray] | None = None
 
     def pieces(self) -> Iterator[tuple[int, int, int, Mapping[str, int]]]:
         """Yield start, end, messages, and messages by topic; one piece a stretch."""
-        if self.found is None:
+        if self.stamps is None:
             counts: Counter[str] = Counter()
             for id_, messages in self.span.counts.items():
                 counts[self.topics[id_]] += messages
             yield self.span.start_ns, self.span.end_ns, sum(counts.values()), counts
             return
-        channel, times = self.found
+        channel, times = self.stamps
         order = np.argsort(times, kind="stable")
         stretch = _groups(times[order], times[order], SILENCE_NS)
         for rows in np.split(order, np.flatnonzero(np.diff(stretch)) + 1):
@@ -248,13 +248,13 @@ class _Looked:
 
     def last_ns(self, id_: int) -> int:
         """Return the last time of a channel, 0 without any."""
-        return self.span.end_ns - 1 if self.found is None else int(self.of_channel(id_).max(initial=0))
+        return self.span.end_ns - 1 if self.stamps is None else int(self.of_channel(id_).max(initial=0))
 
     def of_channel(self, id_: int) -> IntArray:
         """Return the times of a channel in file order; of a span in order its bounds stand for them."""
-        if self.found is None:
+        if self.stamps is None:
             return np.array([self.span.start_ns, self.span.end_ns - 1])
-        channel, times = self.found
+        channel, times = self.stamps
         return np.asarray(times[channel == id_], dtype=np.int64)
 
 
@@ -271,12 +271,12 @@ def _look(containers: Sequence[Container], times: SpanTimes) -> list[_Looked]:
             behind = any(span.start_ns < newest.get(topics[id_], 0) - STEP_BACK_NS for id_ in span.counts)
             of = _Looked(c, span, topics)
             if lasts <= 0 or lasts > SILENCE_NS or behind or (lasts > STEP_BACK_NS and not span.ordered):
-                found = times(c, span)
-                if found is None:
+                stamps = times(c, span)
+                if stamps is None:
                     continue  # damaged: nothing of it can be read
-                disorder = any((np.diff(own) < -STEP_BACK_NS).any() for _, own in _by_channel(found))
-                if found[0].size and (lasts <= 0 or lasts > SILENCE_NS or behind or disorder):
-                    of = _Looked(c, span, topics, found)
+                disorder = any((np.diff(times_ns) < -STEP_BACK_NS).any() for _, times_ns in _by_channel(stamps))
+                if stamps[0].size and (lasts <= 0 or lasts > SILENCE_NS or behind or disorder):
+                    of = _Looked(c, span, topics, stamps)
             for id_ in span.counts:
                 newest[topics[id_]] = max(newest.get(topics[id_], 0), of.last_ns(id_))
             looked.append(of)
@@ -285,27 +285,27 @@ def _look(containers: Sequence[Container], times: SpanTimes) -> list[_Looked]:
 
 def _cuts(looked: Sequence[_Looked], intervals: Sequence[tuple[int, int]]) -> list[Cut]:
     """Return what was recorded twice, of all topics, if the time of one of them clearly stepped back."""
-    if all(of.found is None for of in looked):
+    if all(of.stamps is None for of in looked):
         return []
     sequences: dict[str, tuple[IntArray, list[tuple[int, int, int, int]]]] = {}
     parts: dict[str, list[tuple[IntArray, int, int]]] = {}
     for of in looked:
         for id_ in of.span.counts:
-            own = of.of_channel(id_)
-            inside = _inside(own, intervals)
+            channel_times = of.of_channel(id_)
+            inside = _inside(channel_times, intervals)
             if inside.any():  # what is left out anyway stands for its neighbour, so that rows keep their places
-                last = np.maximum.accumulate(np.where(inside, np.arange(own.shape[0]), -1))
-                own = own[np.where(last >= 0, last, int(np.argmax(inside)))]
-                parts.setdefault(of.topics[id_], []).append((own, of.c, of.span.index))
+                last = np.maximum.accumulate(np.where(inside, np.arange(channel_times.shape[0]), -1))
+                channel_times = channel_times[np.where(last >= 0, last, int(np.argmax(inside)))]
+                parts.setdefault(of.topics[id_], []).append((channel_times, of.c, of.span.index))
     for topic, those in parts.items():
-        at = np.cumsum([0, *(own.shape[0] for own, _, _ in those)]).tolist()
-        places = [(a, b, c, index) for a, b, (_, c, index) in zip(at[:-1], at[1:], those, strict=True)]
-        sequences[topic] = np.concatenate([own for own, _, _ in those]), places
-    if not any(steps_back(own).size for own, _ in sequences.values()):
+        bounds = np.cumsum([0, *(channel_times.shape[0] for channel_times, _, _ in those)]).tolist()
+        places = [(a, b, c, index) for a, b, (_, c, index) in zip(bounds[:-1], bounds[1:], those, strict=True)]
+        sequences[topic] = np.concatenate([channel_times for channel_times, _, _ in those]), places
+    if not any(steps_back(channel_times).size for channel_times, _ in sequences.values()):
         return []
     cuts = []
-    for topic, (own, places) in sequences.items():
-        for place, low, high in recorded_twice(own):
+    for topic, (channel_times, places) in sequences.items():
+        for place, low, high in recorded_twice(channel_times):
             c, index, row = next((c, index, place - a) for a, b, c, index in places if a <= place < b)
             cuts.append(Cut(topic, (c, index, row), low, high))
     return cuts
@@ -342,8 +342,8 @@ def _cut_out(times_ns: IntArray, topic: str, place: tuple[int, int], cuts: Itera
     return left_out
 
 
-def _by_channel(found: tuple[IntArray, IntArray]) -> Iterable[tuple[int, IntArray]]:
-    channel, times = found
+def _by_channel(stamps: tuple[IntArray, IntArray]) -> Iterable[tuple[int, IntArray]]:
+    channel, times = stamps
     return ((int(id_), times[channel == id_]) for id_ in np.unique(channel))
 
 

@@ -174,11 +174,11 @@ def _head_of(path: Path) -> bytes:
 
 def _open_plain(file: LogFile) -> Container | DriveLog:
     head = _head_of(file.path)
-    found = recognised_format(head, file.path.name)
-    if found is None:
+    log_format = recognised_format(head, file.path.name)
+    if log_format is None:
         got = "a file that is none of these" if head else "an empty file"
         raise LogError(expected=what_is_a_log(), got=got, where=str(file.place), remedy=_REMEDY)
-    opened = found.open(file)
+    opened = log_format.open(file)
     return _CopiedContainer(opened, file) if isinstance(opened, Container) and file.is_copy else opened
 
 
@@ -295,13 +295,13 @@ def _storage_file(folder: Path, name: str) -> Path | None:
 
 def _declared_encodings(information: Mapping[str, Any]) -> dict[str, str]:
     """Return the serialization format that metadata.yaml declares for each topic."""
-    found: dict[str, str] = {}
+    encodings: dict[str, str] = {}
     topics = information.get("topics_with_message_count")
     for entry in topics if isinstance(topics, list) else ():
         topic = entry.get("topic_metadata") if isinstance(entry, dict) else None
         if isinstance(topic, dict) and topic.get("serialization_format"):
-            found[_text(topic.get("name"))] = _text(topic["serialization_format"])
-    return found
+            encodings[_text(topic.get("name"))] = _text(topic["serialization_format"])
+    return encodings
 
 
 def _text(value: object) -> str:
@@ -374,8 +374,8 @@ class _Rosbag2Container(_Wrapped):
             return block
         payloads: list[bytes] = []
         size = 0
-        for at, n in zip(block.offset.tolist(), block.length.tolist(), strict=True):
-            payloads.append(decompress_message(block.buffer[at : at + n], self.meter.budget))
+        for start, n in zip(block.offset.tolist(), block.length.tolist(), strict=True):
+            payloads.append(decompress_message(block.buffer[start : start + n], self.meter.budget))
             size += len(payloads[-1])
             self.meter.budget.check("chunk_bytes", size, "compressed messages")
         length = np.array([len(p) for p in payloads], dtype=np.int64)

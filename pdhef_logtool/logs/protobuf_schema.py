@@ -95,11 +95,11 @@ def _well_known_file(name: str, importer: str) -> Any:
     if name.startswith(_WELL_KNOWN) and name.endswith(".proto"):
         module = name.removeprefix(_WELL_KNOWN).removesuffix(".proto")
         try:
-            found = importlib.import_module(f"google.protobuf.{module}_pb2")
+            imported = importlib.import_module(f"google.protobuf.{module}_pb2")
         except ImportError:
             pass
         else:
-            return descriptor_pb2.FileDescriptorProto.FromString(found.DESCRIPTOR.serialized_pb)
+            return descriptor_pb2.FileDescriptorProto.FromString(imported.DESCRIPTOR.serialized_pb)
     raise SchemaError(f"{importer} imports {name}, which the descriptors lack")
 
 
@@ -198,5 +198,5 @@ def _is_array(field: Any) -> bool:
 
 def _is_repeated(field: Any) -> bool:
     # Releases up to 6.30 say it by the label only, which later ones deprecate.
-    known = getattr(field, "is_repeated", None)
-    return bool(field.label == field.LABEL_REPEATED) if known is None else bool(known)
+    is_repeated = getattr(field, "is_repeated", None)
+    return bool(field.label == field.LABEL_REPEATED) if is_repeated is None else bool(is_repeated)

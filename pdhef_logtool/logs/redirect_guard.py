@@ -54,13 +54,13 @@ class RedirectGuard(AbstractResolver):
         self, host: str, port: int = 0, family: socket.AddressFamily = socket.AF_INET
     ) -> list[ResolveResult]:
         """Return the addresses of a host to connect to; raises PrivateRedirectError."""
-        found = await self._resolver.resolve(host, port, family)
-        public = all(is_public(one["host"]) for one in found)
+        addresses = await self._resolver.resolve(host, port, family)
+        public = all(is_public(address["host"]) for address in addresses)
         name = _host(host)
         if not public and (self._origin_was_public if name == self._origin else name not in self._proxies):
             raise PrivateRedirectError(name)
         self._origin_was_public |= public and name == self._origin
-        return found
+        return addresses
 
     async def check_redirect(self, _session: Any, _context: Any, redirect: Any) -> None:
         """Raise PrivateRedirectError for a redirect to another host that is not public."""
@@ -72,7 +72,7 @@ class RedirectGuard(AbstractResolver):
             addresses = [str(ipaddress.ip_address(host))]
         except ValueError:
             try:
-                addresses = [one["host"] for one in await self._resolver.resolve(host, 0, socket.AF_UNSPEC)]
+                addresses = [address["host"] for address in await self._resolver.resolve(host, 0, socket.AF_UNSPEC)]
             except OSError:  # a proxy may know it; without one the request fails by itself
                 return
         if not all(map(is_public, addresses)):

@@ -206,13 +206,13 @@ class HttpObject(RemoteObject):
     def _answer(self, response: Any, start: int, end: int, pinned: ObjectState | None) -> Answer:
         head: Mapping[str, str] = response.headers
         etag, modified = head.get("ETag", ""), head.get("Last-Modified", "")
-        found = _CONTENT_RANGE.fullmatch(head.get("Content-Range", "").strip())
-        if response.status == 416 and pinned is None and found is not None and found[3] == "0":
+        part = _CONTENT_RANGE.fullmatch(head.get("Content-Range", "").strip())
+        if response.status == 416 and pinned is None and part is not None and part[3] == "0":
             return Answer(ObjectState(0, etag, modified), 0, _nothing())
-        if response.status == 206 and found is not None and found[1] is not None and found[3] != "*":
-            state = ObjectState(int(found[3]), etag, modified)
+        if response.status == 206 and part is not None and part[1] is not None and part[3] != "*":
+            state = ObjectState(int(part[3]), etag, modified)
             self.hold_against(pinned, state)
-            if int(found[1]) != start or int(found[2]) >= end:
+            if int(part[1]) != start or int(part[2]) >= end:
                 raise self.error("other bytes than were asked for", "the server does not give ranges: read a copy")
             return Answer(state, start, paced(response.content.iter_chunked(_BLOCK_BYTES)))
         if response.status == 200:  # the server gives no ranges: all of it comes
@@ -239,12 +239,12 @@ class S3Object(RemoteObject):
         if pinned is not None and pinned.etag:
             asked["IfMatch"] = pinned.etag
         async with self.client() as client:
-            found = await self._found(client, asked, pinned)
-            if found is None:
+            response = await self._found(client, asked, pinned)
+            if response is None:
                 yield Answer(_EMPTY, 0, _nothing())
                 return
-            async with found["Body"] as body:
-                yield self._answer(found, body, start, pinned)
+            async with response["Body"] as body:
+                yield self._answer(response, body, start, pinned)
 
     async def _found(self, client: Any, asked: Mapping[str, str], pinned: ObjectState | None) -> Any:
         """Return what the store answers; None for an empty object, which has no range."""
@@ -284,16 +284,16 @@ class S3Object(RemoteObject):
         except BotoCoreError as error:
             raise self.error(f"a request that cannot be made ({type(error).__name__})", "check the URL") from None
 
-    def _answer(self, found: Mapping[str, Any], body: Any, start: int, pinned: ObjectState | None) -> Answer:
-        modified = found.get("LastModified")
-        part = _CONTENT_RANGE.fullmatch(str(found.get("ContentRange", "")))
-        size = int(part[3]) if part is not None and part[3] != "*" else int(found["ContentLength"])
-        state = ObjectState(size, found.get("ETag", ""), "" if modified is None else modified.isoformat())
+    def _answer(self, response: Mapping[str, Any], body: Any, start: int, pinned: ObjectState | None) -> Answer:
+        modified = response.get("LastModified")
+        part = _CONTENT_RANGE.fullmatch(str(response.get("ContentRange", "")))
+        size = int(part[3]) if part is not None and part[3] != "*" else int(response["ContentLength"])
+        state = ObjectState(size, response.get("ETag", ""), "" if modified is None else modified.isoformat())
         self.hold_against(pinned, state)
-        at = int(part[1]) if part is not None and part[1] is not None else 0
-        if part is not None and at != start:
+        first = int(part[1]) if part is not None and part[1] is not None else 0
+        if part is not None and first != start:
             raise self.error("other bytes than were asked for", "the store does not give ranges: read a copy")
-        return Answer(state, at, paced(body.iter_chunks(_BLOCK_BYTES)))
+        return Answer(state, first, paced(body.iter_chunks(_BLOCK_BYTES)))
 
 
 def keys_below(prefix: RemotePlace) -> list[str]:
@@ -393,11 +393,11 @@ def _conditions(pinned: ObjectState | None) -> dict[str, str]:
 
 def _status_of(error: Any) -> tuple[int, float]:
     """Return status and seconds to wait of an S3 error."""
-    found = error.response.get("ResponseMetadata", {})
-    status, code = int(found.get("HTTPStatusCode") or 0), str(error.response.get("Error", {}).get("Code", ""))
+    metadata = error.response.get("ResponseMetadata", {})
+    status, code = int(metadata.get("HTTPStatusCode") or 0), str(error.response.get("Error", {}).get("Code", ""))
     if code in ("SlowDown", "RequestTimeout", "ThrottlingException", "RequestLimitExceeded"):
         status = 503
-    return status, _seconds(found.get("HTTPHeaders", {}).get("retry-after", ""))
+    return status, _seconds(metadata.get("HTTPHeaders", {}).get("retry-after", ""))
 
 
 def _seconds(text: str) -> float:

@@ -94,18 +94,18 @@ def place_of(argument: str, *, private_redirects: bool = False) -> LogPlace:
     ------
     UsageError : A URL that is none of ours.
     """
-    found = _URL.match(argument)
-    if found is None or Path(argument).exists():
+    match = _URL.match(argument)
+    if match is None or Path(argument).exists():
         return Path(argument)
     place = RemotePlace(argument, private_redirects)
     try:
-        known = place.scheme in SCHEMES and bool(place.host)
+        valid = place.scheme in SCHEMES and bool(place.host)
     except ValueError:  # a malformed server
-        known = False
-    if not known:
+        valid = False
+    if not valid:
         raise UsageError(
             expected=", ".join(f"{scheme}://" for scheme in SCHEMES) + " and a server or bucket",
-            got=f"{found[1]}://",
+            got=f"{match[1]}://",
             where=argument.split("?")[0].rpartition("@")[2],
             remedy="give such a URL, or a path of this machine",
         )

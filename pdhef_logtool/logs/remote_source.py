@@ -60,47 +60,46 @@ def join_ranges(extents: Iterable[Extent], held: Sequence[Extent] = ()) -> list[
             joined[-1] = (last[0], end)
         else:
             joined.append((start, end))
-    return [
-        (at, min(at + MOST_RANGE_BYTES, end)) for start, end in joined for at in range(start, end, MOST_RANGE_BYTES)
-    ]
+    step = MOST_RANGE_BYTES
+    return [(first, min(first + step, end)) for start, end in joined for first in range(start, end, step)]
 
 
 def without(extents: Iterable[Extent], held: Sequence[Extent]) -> list[Extent]:
     """Return what of some extents is in none of others, ascending, neighbours joined."""
-    found: list[Extent] = []
+    missing: list[Extent] = []
     taken = sorted(held)
     for start, end in sorted(extents):
-        at = max(start, found[-1][1]) if found else start
+        position = max(start, missing[-1][1]) if missing else start
         for low, high in taken:
-            if high <= at:
+            if high <= position:
                 continue
             if low >= end:
                 break
-            if low > at:
-                _append(found, at, low)
-            at = max(at, high)
-        if at < end:
-            _append(found, at, end)
-    return found
+            if low > position:
+                _append(missing, position, low)
+            position = max(position, high)
+        if position < end:
+            _append(missing, position, end)
+    return missing
 
 
-def _append(found: list[Extent], start: int, end: int) -> None:
-    if found and found[-1][1] == start:
-        found[-1] = (found[-1][0], end)
+def _append(extents: list[Extent], start: int, end: int) -> None:
+    if extents and extents[-1][1] == start:
+        extents[-1] = (extents[-1][0], end)
     else:
-        found.append((start, end))
+        extents.append((start, end))
 
 
 def _insert(held: list[Extent], extent: Extent) -> None:
     """Add an extent to others that are apart from it and each other, and ascend; neighbours are joined."""
-    at = bisect_right(held, extent)
+    index = bisect_right(held, extent)
     start, end = extent
-    if at < len(held) and held[at][0] == end:
-        end = held.pop(at)[1]
-    if at > 0 and held[at - 1][1] == start:
-        at -= 1
-        start = held.pop(at)[0]
-    held.insert(at, (start, end))
+    if index < len(held) and held[index][0] == end:
+        end = held.pop(index)[1]
+    if index > 0 and held[index - 1][1] == start:
+        index -= 1
+        start = held.pop(index)[0]
+    held.insert(index, (start, end))
 
 
 def _any_in(held: Sequence[Extent], start: int, end: int) -> bool:
@@ -139,8 +138,8 @@ class RemoteSource(ByteSource):
     @property
     def identity(self) -> str:
         """Hash of the URL without what gives access to it, of the size, and of ETag or time of modification."""
-        known = (self.place.identity, str(self.size), self.state.etag or self.state.modified)
-        return hashlib.sha256("\0".join(known).encode()).hexdigest()
+        parts = (self.place.identity, str(self.size), self.state.etag or self.state.modified)
+        return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
     @property
     def path(self) -> Path:
@@ -283,41 +282,41 @@ class _Spool:
 
     def held_to(self, start: int, end: int) -> int:
         """Return up to where, at most to ``end``, bytes from ``start`` on are held; ``start``: none is."""
-        at = bisect_right(self.held, (start, _AT_END)) - 1
-        return min(self.held[at][1], end) if at >= 0 and self.held[at][1] > start else start
+        index = bisect_right(self.held, (start, _AT_END)) - 1
+        return min(self.held[index][1], end) if index >= 0 and self.held[index][1] > start else start
 
     async def _get(self, start: int, end: int) -> None:
         async with self._at_once:
-            at = start
+            position = start
 
             async def rest() -> None:
-                nonlocal at
-                async with self.remote.ask(at, end, self.state) as answer:
-                    if answer.start != at:
+                nonlocal position
+                async with self.remote.ask(position, end, self.state) as answer:
+                    if answer.start != position:
                         raise self.remote.error("all of it instead of a part", "the server stopped to give ranges")
                     written = 0
                     try:
                         async for block in answer.blocks:
-                            written += self._put(block[: end - at - written], at + written)
-                            if at + written >= end:
+                            written += self._put(block[: end - position - written], position + written)
+                            if position + written >= end:
                                 break
                     finally:
-                        at += written
-                if at < end:
+                        position += written
+                if position < end:
                     raise TryAgainError("an answer that is cut")
 
-            await try_in_turn(rest, self.remote, lambda: at)
+            await try_in_turn(rest, self.remote, lambda: position)
 
     async def _write(self, answer: Answer, size: int) -> int:
         """Write the blocks of a first answer, which may be all of the object; returns how many bytes came."""
-        at = 0
+        position = 0
         async for block in answer.blocks:
-            at += self._put(block, at)
-        if answer.start == 0 and size >= 0 and at > size:
+            position += self._put(block, position)
+        if answer.start == 0 and size >= 0 and position > size:
             raise self.remote.error("more bytes than it says it has", "read a copy")
-        return at
+        return position
 
-    def _put(self, block: bytes, at: int) -> int:
+    def _put(self, block: bytes, offset: int) -> int:
         """Write a block, leaving some of the disk to others."""
         self._room -= len(block)
         if self._room < 0:
@@ -329,7 +328,7 @@ class _Spool:
             with self._lock:
                 if self._file is None:
                     raise OSError(errno.EBADF, os.strerror(errno.EBADF))
-                self._file.seek(at)
+                self._file.seek(offset)
                 return self._file.write(block)
         except OSError:
             raise self.remote.error("no room for its bytes on this disk", "set TMPDIR to another") from None

@@ -41,9 +41,9 @@ _MESSAGES_A_CHECK = 1 << 16
 
 @dataclass(slots=True)
 class _Chunk:
-    """A chunk record in bytes [at, end) and what its index records tell."""
+    """A chunk record in bytes [offset, end) and what its index records tell."""
 
-    at: int
+    offset: int
     start: int  # of the stored bytes
     end: int
     compression: str
@@ -72,42 +72,42 @@ class Rosbag1Container(FileContainer):
 
     def _walk(self) -> None:
         size = self.source.size
-        for at in self._places():
-            record = self._record_at(at)
+        for offset in self._places():
+            record = self._record_at(offset)
             if record is None:
                 index_at = self._header[0] if self._header else 0
-                padded_to = index_at if at < index_at <= size else size
-                if self._is_zero(at, padded_to):
-                    self.at = padded_to  # some writers pad with zeros behind the last chunk or the last record
+                padded_to = index_at if offset < index_at <= size else size
+                if self._is_zero(offset, padded_to):
+                    self.position = padded_to  # some writers pad with zeros behind the last chunk or the last record
                     continue
                 if self._header is None:
                     raise self.no_log("a complete bag header record", "a cut or malformed one")
                 self._close_chunk(complete=False)
-                what = f"the file ends inside a record at byte {at} of {size}; what follows is gone"
+                what = f"the file ends inside a record at byte {offset} of {size}; what follows is gone"
                 self.lose("truncated", what, self.last_ns())
-                self.account.lose(at, size)
+                self.account.lose(offset, size)
                 self.account.cut = True
                 return
             fields, start, end = record
             try:
-                self._take(fields, at, start, end)
+                self._take(fields, offset, start, end)
             except Exception as error:  # noqa: BLE001 (whatever a record does, the next one is read)
-                self.lose_record(at, end, error)
-            self.at = end
+                self.lose_record(offset, end, error)
+            self.position = end
 
-    def _take(self, fields: Mapping[str, bytes], at: int, start: int, end: int) -> None:
+    def _take(self, fields: Mapping[str, bytes], offset: int, start: int, end: int) -> None:
         """Handle one complete record."""
         op = _op(fields)
         budget = self.meter.budget
         if op == _OP_INDEX and self._pending is not None:
             budget.check("metadata_bytes", end - start, "an index record")
             self._index_record(self._pending, fields, self.source.read(start, end - start))
-            self.account.decode(at, end)
+            self.account.decode(offset, end)
             return
         self._close_chunk()
         if op == _OP_CHUNK:
             compression, (size,) = fields["compression"].decode(), _U32.unpack(fields["size"])
-            self._pending = _Chunk(at, start, end, compression, size)
+            self._pending = _Chunk(offset, start, end, compression, size)
             return
         if op == _OP_BAG_HEADER:
             self._header = (int.from_bytes(fields["index_pos"], "little"), _U32.unpack(fields["chunk_count"])[0])
@@ -122,7 +122,7 @@ class Rosbag1Container(FileContainer):
             return
         else:
             raise SpanDamageError(f"no record of kind {op} may stand here")
-        self.account.decode(at, end)
+        self.account.decode(offset, end)
 
     def _finish(self) -> None:
         if self._header is None:
@@ -140,12 +140,12 @@ class Rosbag1Container(FileContainer):
 
     def _check_infos(self, chunks: int) -> None:
         """Open the chunks whose index records tell other counts than the bag's end, which could hide messages."""
-        found, spans = self._chunks, self.spans[:]
+        chunks_read, spans = self._chunks, self.spans[:]
         missing = chunks - self._found
         self._chunks = []
         self.spans.clear()
-        for chunk, span in zip(found, spans, strict=True):
-            if self._infos.get(chunk.at, chunk.counts) == chunk.counts:
+        for chunk, span in zip(chunks_read, spans, strict=True):
+            if self._infos.get(chunk.offset, chunk.counts) == chunk.counts:
                 self._add_span(chunk, span)
             else:
                 self._open_chunk(chunk)
@@ -153,16 +153,16 @@ class Rosbag1Container(FileContainer):
             self.lose("missing-messages", f"the bag's header names {chunks} chunks, of which {missing} are not there")
             self.account.lose(0, len(self.magic))
 
-    def _record_at(self, at: int) -> tuple[dict[str, bytes], int, int] | None:
+    def _record_at(self, offset: int) -> tuple[dict[str, bytes], int, int] | None:
         """Return header fields and data extent of the record at a byte; None if it is cut or no record."""
         source, size = self.source, self.source.size
-        if at + 8 > size:
+        if offset + 8 > size:
             return None
-        (header,) = _U32.unpack(source.read(at, 4))
-        if header == 0 or at + 8 + header > size or header > self.meter.budget.metadata_bytes:
+        (header,) = _U32.unpack(source.read(offset, 4))
+        if header == 0 or offset + 8 + header > size or header > self.meter.budget.metadata_bytes:
             return None
-        text = source.read(at + 4, header + 4)
-        start = at + 8 + header
+        text = source.read(offset + 4, header + 4)
+        start = offset + 8 + header
         (length,) = _U32.unpack_from(text, header)
         if start + length > size:
             return None
@@ -173,8 +173,8 @@ class Rosbag1Container(FileContainer):
 
     def _is_zero(self, start: int, end: int) -> bool:
         return all(
-            not any(self.source.read(at, min(_ZERO_BLOCK_BYTES, end - at)))
-            for at in range(start, end, _ZERO_BLOCK_BYTES)
+            not any(self.source.read(offset, min(_ZERO_BLOCK_BYTES, end - offset)))
+            for offset in range(start, end, _ZERO_BLOCK_BYTES)
         )
 
     def _index_record(self, chunk: _Chunk, fields: Mapping[str, bytes], payload: bytes) -> None:
@@ -240,12 +240,12 @@ class Rosbag1Container(FileContainer):
             block = self._decode(chunk, declare=True)
         except Exception as error:  # noqa: BLE001 (the boundary)
             kind, text = told(error)
-            what = f"an unknown number of messages lost in the chunk at byte {chunk.at}: {text}"
+            what = f"an unknown number of messages lost in the chunk at byte {chunk.offset}: {text}"
             self.lose(kind, what, self.last_ns())
-            self.account.lose(chunk.at, chunk.end)
+            self.account.lose(chunk.offset, chunk.end)
             return
         if not len(block):
-            self.account.decode(chunk.at, chunk.end)
+            self.account.decode(chunk.offset, chunk.end)
             return
         first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
         self._add_span(chunk, Span(0, first, last + 1, block.counts))
@@ -253,7 +253,7 @@ class Rosbag1Container(FileContainer):
     def extent(self, span: Span) -> tuple[int, int]:
         """Return the bytes of the chunk's record."""
         chunk = self._chunks[span.index]
-        return chunk.at, chunk.end
+        return chunk.offset, chunk.end
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         """Decode one chunk; see :class:`~pdhef_logtool.logs.container.Container`."""
@@ -265,12 +265,12 @@ class Rosbag1Container(FileContainer):
         stored = self.source.read(chunk.start, chunk.end - chunk.start)
         content = decompress(chunk.compression or "unnamed", stored, chunk.size, self.meter.budget)
         channels, stamps, offsets, lengths = (array("q") for _ in range(4))
-        at, size = 0, len(content)
-        while at < size:
-            record = _record_in(content, at, size)
+        offset, size = 0, len(content)
+        while offset < size:
+            record = _record_in(content, offset, size)
             if record is None:
                 raise SpanDamageError("its last record is cut")
-            fields, begin, at = record
+            fields, begin, offset = record
             op = _op(fields)
             try:
                 if op == _OP_MESSAGE:
@@ -280,11 +280,11 @@ class Rosbag1Container(FileContainer):
                     channels.append(_U32.unpack(fields["conn"])[0])
                     stamps.append(_time_ns(fields["time"]))
                     offsets.append(begin)
-                    lengths.append(at - begin)
+                    lengths.append(offset - begin)
                 elif op != _OP_CONNECTION:
                     raise SpanDamageError(f"it holds a record of kind {op}, which no chunk may")
                 elif declare:
-                    self._add_connection(fields, content[begin:at])
+                    self._add_connection(fields, content[begin:offset])
             except (KeyError, struct.error, ValueError) as error:
                 raise SpanDamageError(f"a record is malformed: {error}") from error
         self.meter.budget.check_messages(len(stamps), len(stored))
@@ -297,33 +297,33 @@ def _op(fields: Mapping[str, bytes]) -> int:
     return op[0] if len(op) == 1 else -1
 
 
-def _record_in(data: bytes, at: int, size: int) -> tuple[dict[str, bytes], int, int] | None:
+def _record_in(data: bytes, offset: int, size: int) -> tuple[dict[str, bytes], int, int] | None:
     """Return header fields and data extent of the record at a byte of a chunk; None if it is cut or no record."""
-    if at + 8 > size:
+    if offset + 8 > size:
         return None
-    (header,) = _U32.unpack_from(data, at)
-    if header == 0 or at + 8 + header > size:
+    (header,) = _U32.unpack_from(data, offset)
+    if header == 0 or offset + 8 + header > size:
         return None
-    start = at + 8 + header
+    start = offset + 8 + header
     (length,) = _U32.unpack_from(data, start - 4)
     if start + length > size:
         return None
     try:
-        return _header_fields(data[at + 4 : at + 4 + header]), start, start + length
+        return _header_fields(data[offset + 4 : offset + 4 + header]), start, start + length
     except (struct.error, ValueError):
         return None
 
 
 def _header_fields(text: bytes) -> dict[str, bytes]:
     fields: dict[str, bytes] = {}
-    at = 0
-    while at < len(text):
-        (length,) = _U32.unpack_from(text, at)
-        name, sign, value = text[at + 4 : at + 4 + length].partition(b"=")
-        if not sign or at + 4 + length > len(text):
+    offset = 0
+    while offset < len(text):
+        (length,) = _U32.unpack_from(text, offset)
+        name, sign, value = text[offset + 4 : offset + 4 + length].partition(b"=")
+        if not sign or offset + 4 + length > len(text):
             raise ValueError("a header field without '='")
         fields[name.decode("ascii", errors="replace")] = value
-        at += 4 + length
+        offset += 4 + length
     return fields
 
 

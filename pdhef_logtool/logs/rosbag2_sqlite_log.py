@@ -140,7 +140,7 @@ class SqliteContainer(Container):
         first = last = size = total = 0
         times: list[int] = []
         counts: Counter[int] = Counter()
-        unknown = found = 0
+        unknown = row_count = 0
 
         def close_page() -> None:
             if times:
@@ -153,7 +153,7 @@ class SqliteContainer(Container):
 
         try:
             for id_, topic, timestamp, length, kind in rows:
-                found += 1
+                row_count += 1
                 if topic not in self.channels or not isinstance(timestamp, int) or kind != "blob":
                     unknown += 1
                     continue
@@ -175,11 +175,11 @@ class SqliteContainer(Container):
         if unknown:
             what = f"{unknown} messages of topics that the database does not name, or without a time or data"
             self.lose("unknown-channel", what, count=unknown)
-            self.account.lose(total, total + round(self.account.size * unknown / found))
+            self.account.lose(total, total + round(self.account.size * unknown / row_count))
         if not self.lost:
-            self._check_indexes(found)
+            self._check_indexes(row_count)
 
-    def _check_indexes(self, found: int) -> None:
+    def _check_indexes(self, row_count: int) -> None:
         """Hold the rows that were found against the indexes of the table: a damaged page can hide rows."""
         names = [str(row[0]) for row in self._db.execute("SELECT name FROM pragma_index_list('messages')")]
         counts = [0]
@@ -193,9 +193,9 @@ class SqliteContainer(Container):
                 raise
             self.lose("bad-index", f"the index of the messages cannot be read: {error}")
             self.account.lose(self.account.size - 1, self.account.size)
-        missing = max(counts) - found
+        missing = max(counts) - row_count
         if missing > 0:
-            what = f"the index of the messages names {max(counts)} rows, of which {found} are there"
+            what = f"the index of the messages names {max(counts)} rows, of which {row_count} are there"
             self.lose("missing-messages", what, count=missing)
             end = self._ends[-1] if self._ends else 0
             self.account.lose(end, end + round(self.account.size * missing / max(counts)))
@@ -233,8 +233,8 @@ class SqliteContainer(Container):
         """Return channels and log times of one page."""
         query = "SELECT topic_id, timestamp FROM messages WHERE id BETWEEN ? AND ? ORDER BY id"
         try:
-            found = self._db.execute(query, self._pages[span.index])
-            rows = [(t, min(ns, MAX_TIME_NS)) for t, ns in found if isinstance(ns, int)]
+            cursor = self._db.execute(query, self._pages[span.index])
+            rows = [(t, min(ns, MAX_TIME_NS)) for t, ns in cursor if isinstance(ns, int)]
         except sqlite3.Error as error:
             raise SpanDamageError(str(error)) from error
         return np.array([t for t, _ in rows], dtype=np.int64), np.array([ns for _, ns in rows], dtype=np.int64)

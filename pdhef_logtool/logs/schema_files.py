@@ -49,9 +49,9 @@ def message_definition(type_name: str) -> str:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.LATEST)
-    own = schema_file(f"{type_name}.msg")
-    if own.is_file():
-        text = own.read_text(encoding="utf-8")
+    shipped = schema_file(f"{type_name}.msg")
+    if shipped.is_file():
+        text = shipped.read_text(encoding="utf-8")
         types = get_types_from_msg(text, type_name)
         store.register({**types, **_shipped_parts(types, set(store.fielddefs))})
         generated = store.generate_msgdef(type_name, ros_version=2)[0]
@@ -63,17 +63,17 @@ def message_definition(type_name: str) -> str:
     return store.generate_msgdef(type_name, ros_version=2)[0]
 
 
-def _shipped_parts(types: Mapping[str, Any], known: set[str]) -> dict[str, Any]:
+def _shipped_parts(types: Mapping[str, Any], distributed: set[str]) -> dict[str, Any]:
     """Return the shipped types that others contain and nobody knows, at any depth."""
     from rosbags.typesys import get_types_from_msg
 
-    found: dict[str, Any] = {}
-    todo = referenced(types) - known - set(types)
+    parts: dict[str, Any] = {}
+    todo = referenced(types) - distributed - set(types)
     while todo:
         name = todo.pop()
-        found |= get_types_from_msg(shipped_definition(name), name)
-        todo |= referenced(found) - known - set(types) - set(found)
-    return found
+        parts |= get_types_from_msg(shipped_definition(name), name)
+        todo |= referenced(parts) - distributed - set(types) - set(parts)
+    return parts
 
 
 def referenced(types: Mapping[str, Any]) -> set[str]:

@@ -97,7 +97,7 @@ def _records(block: Block, rows: IntArray, channel_id: int) -> tuple[bytes, IntA
     head_size = MESSAGE_HEAD.itemsize
     length = block.length[rows]
     size = length + head_size
-    at = np.cumsum(size) - size
+    start = np.cumsum(size) - size
     head = np.zeros(rows.shape[0], dtype=MESSAGE_HEAD)
     head["op"], head["size"], head["channel"] = int(Opcode.MESSAGE), length + _BEFORE_DATA, channel_id
     head["sequence"] = block.sequence[rows].astype(np.uint32)
@@ -112,8 +112,8 @@ def _records(block: Block, rows: IntArray, channel_id: int) -> tuple[bytes, IntA
         if n:
             places = np.ndarray((source.shape[0] - n + 1,), dtype=(np.void, n), buffer=source.data, strides=(1,))
             records[:, head_size:] = places[block.offset[rows[mine]]].view(np.uint8).reshape(-1, n)
-        scatter(content, at[mine], np.arange(mine.shape[0]), records)
-    return content.tobytes(), at
+        scatter(content, start[mine], np.arange(mine.shape[0]), records)
+    return content.tobytes(), start
 
 
 def _add_channel(writer: McapLogWriter, log: ColumnarLog, c: int, channel: ChannelRecord) -> int:

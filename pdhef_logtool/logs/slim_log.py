@@ -118,13 +118,13 @@ class SlimLog(ColumnarLog):
 
     def attached(self, name: str) -> Path:
         """Return a file that was attached, to be read until the log is closed; raises LogError where there is none."""
-        found = next((a for c in self.containers for a in c.attachments() if a.name == name), None)
-        if found is None:
+        attachment = next((a for c in self.containers for a in c.attachments() if a.name == name), None)
+        if attachment is None:
             raise LogError(expected=_EXPECTED, got=f"none with its {name}", where=str(self.path), remedy=_REMEDY)
         if self._extracted is None:
             self._extracted = scratch_folder()
         path = Path(self._extracted.name) / Path(name).name
-        write_bytes(path, found.data)
+        write_bytes(path, attachment.data)
         return path
 
     def close(self) -> None:

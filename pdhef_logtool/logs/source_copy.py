@@ -72,7 +72,7 @@ def register_channels(
     converters: dict[_Key, Callable[[bytes], bytes | None]] = {}
     numbered: set[_Key] = set()
     lost: list[Loss] = []
-    known: dict[tuple[object, ...], int] = {}
+    ids_by_content: dict[tuple[object, ...], int] = {}
     verbatim: set[_Key] = set()
     places = _Places(log)
     for c, container in enumerate(log.containers):
@@ -99,10 +99,10 @@ def register_channels(
                 target.encoding,
                 tuple(sorted(target.metadata.items())),
             )
-            id_ = known.get(identity)
+            id_ = ids_by_content.get(identity)
             if id_ is None or id_ in same_file:  # two publishers of one file stay two channels
                 id_ = writer.add_channel(target, *places.of(c, target))
-                known[identity] = id_
+                ids_by_content[identity] = id_
             same_file.add(id_)
             ids[(c, channel.id)] = id_
             if target is channel and places.keeps(c, channel, id_):

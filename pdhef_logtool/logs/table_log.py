@@ -144,12 +144,12 @@ class TableLog(DriveLog):
         kind = np.dtype(np.int64 if is_time else np.float64)
         try:
             parts = [np.asarray(table.load(path, r)).astype(kind) for r in rows]
-            found = np.concatenate(parts) if parts else np.empty(0, kind)
-            if found.shape[0] != n:
-                raise ValueError(f"{found.shape[0]} values for {n} times")
+            values = np.concatenate(parts) if parts else np.empty(0, kind)
+            if values.shape[0] != n:
+                raise ValueError(f"{values.shape[0]} values for {n} times")
         except Exception as error:  # noqa: BLE001
             if not quiet and (table.name, path) not in self._unreadable:
                 self._unreadable.add((table.name, path))
                 self._lost.append(Loss("bad-column", f"{path} cannot be read: {told(error)[1]}", table.name))
             return np.zeros(n, kind) if is_time else np.full(n, np.nan)
-        return found
+        return values

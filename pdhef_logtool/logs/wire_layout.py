@@ -94,7 +94,7 @@ class _Builder:
     def __init__(self, wire: str, length_of: LengthOf, end: int) -> None:
         self.aligned = wire == "cdr"
         self.origin = 4 if self.aligned else 0
-        self.at = self.origin
+        self.position = self.origin
         self.length_of = length_of
         self.end = end
         self.places = 0
@@ -104,26 +104,26 @@ class _Builder:
 
     def built(self, root: Node) -> WireLayout:
         self.place(root, ())
-        if self.at > self.end:
+        if self.position > self.end:
             raise NoLayoutError("the message ends early")
-        return WireLayout(self.at, self.leaves, tuple(self.guards), self.texts)
+        return WireLayout(self.position, self.leaves, tuple(self.guards), self.texts)
 
     def align(self, size: int) -> None:
         if self.aligned:
-            self.at += -(self.at - self.origin) % size
+            self.position += -(self.position - self.origin) % size
 
     def length_word(self, steps: Steps, is_text: bool) -> int:
         self.align(4)
-        length = self.length_of(steps, self.at, is_text)
-        self.guards.append((self.at, length))
-        self.at += 4
+        length = self.length_of(steps, self.position, is_text)
+        self.guards.append((self.position, length))
+        self.position += 4
         return length
 
     def place(self, node: Node, steps: Steps) -> None:
         # Arrays in arrays multiply.
         self.places += 1
-        if self.at > self.end or self.places > _MOST_PLACES:
-            raise NoLayoutError("the message ends early" if self.at > self.end else "too many places")
+        if self.position > self.end or self.places > _MOST_PLACES:
+            raise NoLayoutError("the message ends early" if self.position > self.end else "too many places")
         if isinstance(node, Struct):
             for name, member in node.members.items():
                 self.place(member, (*steps, name))
@@ -141,8 +141,8 @@ class _Builder:
         if node.code:
             raise NoLayoutError("wide strings have no layout here")
         length = self.length_word(steps, True)
-        self.texts[steps] = (self.at, max(length - 1, 0) if self.aligned else length)
-        self.at += length
+        self.texts[steps] = (self.position, max(length - 1, 0) if self.aligned else length)
+        self.position += length
 
     def place_items(self, item: Node, steps: Steps, count: int) -> None:
         if isinstance(item, Scalar) and item.kind != "string":
@@ -157,8 +157,8 @@ class _Builder:
         dtype = np.dtype("<" + node.code)
         if count != 0:
             self.align(dtype.itemsize)
-        self.leaves[steps] = Leaf(self.at, dtype, count)
-        self.at += dtype.itemsize * (1 if count is None else count)
+        self.leaves[steps] = Leaf(self.position, dtype, count)
+        self.position += dtype.itemsize * (1 if count is None else count)
 
 
 class LayoutReader:
@@ -178,21 +178,21 @@ class LayoutReader:
         self._places: dict[Steps, tuple[int, str]] = {}
         self._stretches: list[_Stretch] = []
         self._empty: dict[Steps, np.dtype[Any]] = {}
-        found: list[tuple[int, np.dtype[Any], int | Steps]] = []
+        places: list[tuple[int, np.dtype[Any], int | Steps]] = []
         if wire == "cdr":
-            found.append((0, _CDR_HEAD, _LITTLE_ENDIAN_CDR))
-        found += [(offset, _WORD, expected) for offset, expected in layout.guards]
+            places.append((0, _CDR_HEAD, _LITTLE_ENDIAN_CDR))
+        places += [(offset, _WORD, expected) for offset, expected in layout.guards]
         for steps in wanted:
             leaf = leaf_at(layout, steps)
             if leaf is not None and leaf.count == 0:
                 self._empty[steps] = leaf.dtype
             elif leaf is not None:
                 dtype = leaf.dtype if leaf.count is None else np.dtype((leaf.dtype, (leaf.count,)))
-                found.append((leaf.offset, dtype, steps))
-        found.sort(key=lambda place: place[0])
+                places.append((leaf.offset, dtype, steps))
+        places.sort(key=lambda place: place[0])
         group: list[tuple[int, np.dtype[Any], int | Steps]] = []
         end = 0
-        for place in found:
+        for place in places:
             if group and place[0] - end > _STRETCH_GAP_BYTES:
                 self._add(group)
                 group = []

@@ -47,12 +47,12 @@ class SampleCount:
 
 def damage(samples: Iterable[SampleCount]) -> list[Loss]:
     """Return the losses of sources of which more than ``DAMAGED_SHARE`` was dropped; those of one kind are one."""
-    found: dict[str, list[SampleCount]] = {}
+    by_reason: dict[str, list[SampleCount]] = {}
     for s in samples:
         if s.damaged > DAMAGED_SHARE * s.total:
             why = ", ".join(f"{n} {reason}" for reason, n in sorted(s.dropped.items()) if reason in DAMAGE)
-            found.setdefault(f"{s.damaged} of {s.total} samples are not used ({why})", []).append(s)
+            by_reason.setdefault(f"{s.damaged} of {s.total} samples are not used ({why})", []).append(s)
     return [
         Loss("dropped-samples", what, ", ".join(dict.fromkeys(s.source for s in of)), count=sum(s.damaged for s in of))
-        for what, of in found.items()
+        for what, of in by_reason.items()
     ]

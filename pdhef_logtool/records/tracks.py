@@ -143,8 +143,8 @@ class StateTrack:
     @property
     def something_known(self) -> BoolArray:
         """Where one of its quantities is known, [N]."""
-        known = np.isfinite(self.vx_m_s) | np.isfinite(self.vy_m_s) | np.isfinite(self.yaw_rate_rad_s)
-        return np.asarray(known | np.isfinite(self.sideslip_rad) | np.isfinite(self.ay_m_s2), dtype=np.bool_)
+        finite = np.isfinite(self.vx_m_s) | np.isfinite(self.vy_m_s) | np.isfinite(self.yaw_rate_rad_s)
+        return np.asarray(finite | np.isfinite(self.sideslip_rad) | np.isfinite(self.ay_m_s2), dtype=np.bool_)
 
     def with_pose(self, x_m: FloatArray, y_m: FloatArray, yaw_rad: FloatArray) -> StateTrack:
         """Return a copy with another pose."""

@@ -175,18 +175,18 @@ def checked(model: type[ModelT], raw: object, table: str, problems: list[str]) -
     return record
 
 
-def unknown(name: str, known: Iterable[str], table: str = "") -> str:
+def unknown(name: str, names: Iterable[str], table: str = "") -> str:
     """Return the problem of an entry that a table does not know, with the nearest that it knows."""
-    return f"{_at(table, name)}: {_unknown(name, known, table)}"
+    return f"{_at(table, name)}: {_unknown(name, names, table)}"
 
 
-def _unknown(name: str, known: Iterable[str], table: str) -> str:
-    known = tuple(known)
+def _unknown(name: str, names: Iterable[str], table: str) -> str:
+    names = tuple(names)
     # The start of a name, such as "ay" of "ay_m_s2", is nearer than what happens to share its letters.
-    near = [k for k in known if name and k.startswith(name)] or get_close_matches(name, known, n=1, cutoff=0.4)
+    near = [k for k in names if name and k.startswith(name)] or get_close_matches(name, names, n=1, cutoff=0.4)
     if near:
         return f"unknown, did you mean {_at(table, near[0])}?"
-    return "unknown" + (f", known are {', '.join(known)}" if 0 < len(known) <= 12 else "")
+    return "unknown" + (f", known are {', '.join(names)}" if 0 < len(names) <= 12 else "")
 
 
 def one_of(names: Iterable[str]) -> AfterValidator:
@@ -194,11 +194,11 @@ def one_of(names: Iterable[str]) -> AfterValidator:
     from pydantic import AfterValidator
     from pydantic_core import PydanticCustomError
 
-    known = tuple(names)
+    allowed = tuple(names)
 
     def check(name: str) -> str:
-        if name not in known:
-            raise PydanticCustomError("unknown_name", "should be one of {names}", {"names": known})
+        if name not in allowed:
+            raise PydanticCustomError("unknown_name", "should be one of {names}", {"names": allowed})
         return name
 
     return AfterValidator(check)
@@ -209,13 +209,13 @@ def _at(table: str, name: str) -> str:
 
 
 def _problems(error: ValidationError, model: type, raw: object, table: str) -> list[str]:
-    found: dict[str, list[str]] = {}
+    texts_by_entry: dict[str, list[str]] = {}
     for e in error.errors(include_url=False, include_input=False):
         place, value = _place(e["loc"], raw, missing=e["type"].startswith("missing"))
-        at = _at(table, ".".join(place))
+        entry = _at(table, ".".join(place))
         if e["type"] in ("extra_forbidden", "unexpected_keyword_argument", "unknown_name"):
-            known = e["ctx"]["names"] if e["type"] == "unknown_name" else _entries(model, place[:-1])
-            text = _unknown(place[-1], known, ".".join(p for p in (table, *place[:-1]) if p))
+            names = e["ctx"]["names"] if e["type"] == "unknown_name" else _entries(model, place[:-1])
+            text = _unknown(place[-1], names, ".".join(p for p in (table, *place[:-1]) if p))
         elif e["type"].startswith("missing"):
             text = "is missing"
         else:
@@ -224,9 +224,9 @@ def _problems(error: ValidationError, model: type, raw: object, table: str) -> l
             text = text.replace("a valid tuple", "a list")
             # A table's problem says itself which entries it is about.
             text += f", got {value!r:.60}" if isinstance(value, str | int | float) else ""
-        found.setdefault(at, []).append(text)
+        texts_by_entry.setdefault(entry, []).append(text)
     # A union reports one message an alternative; together they are one problem.
-    return [f"{at}: {' or '.join(dict.fromkeys(texts))}" for at, texts in found.items()]
+    return [f"{entry}: {' or '.join(dict.fromkeys(texts))}" for entry, texts in texts_by_entry.items()]
 
 
 def _place(loc: tuple[int | str, ...], raw: object, *, missing: bool) -> tuple[list[str], object]:

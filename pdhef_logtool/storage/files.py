@@ -154,8 +154,8 @@ def sweep_files(folder: Path, *, held: bool = False) -> None:
     """
     with contextlib.suppress(OSError):
         for path in list(folder.iterdir()):
-            if found := _PARTIAL.fullmatch(path.name):
-                alive = is_alive(found[1])
+            if match := _PARTIAL.fullmatch(path.name):
+                alive = is_alive(match[1])
                 if alive is False or (held and alive is None):
                     with contextlib.suppress(OSError):
                         path.unlink()
@@ -168,8 +168,8 @@ def scratch_folder() -> tempfile.TemporaryDirectory[str]:
         _swept.add(root)
         with contextlib.suppress(OSError):
             for path in list(root.iterdir()):
-                found = _SCRATCH.fullmatch(path.name)
-                if found and is_alive(found[1]) is False and _is_ours(path):
+                match = _SCRATCH.fullmatch(path.name)
+                if match and is_alive(match[1]) is False and _is_ours(path):
                     shutil.rmtree(path, ignore_errors=True)
     return tempfile.TemporaryDirectory(prefix=f"pdhef-{own_name()}-")
 

@@ -71,9 +71,9 @@ class ObjectFolder:
         with self._asking():
             store, root = self._store()
             store.invalidate_cache()
-            found = store.find(root)
+            paths = store.find(root)
         # Some stores give paths a slash more than they take.
-        return sorted(path.lstrip("/").removeprefix(f"{root.lstrip('/')}/") for path in found)
+        return sorted(path.lstrip("/").removeprefix(f"{root.lstrip('/')}/") for path in paths)
 
     def get(self, name: str, to: Path) -> bool:
         """Copy an object to a file; False where there is none."""

@@ -270,7 +270,7 @@ class FolderLock:
 
     def _try_file(self) -> bool:
         """Take the lock file, which appears with its content; one of a dead process is removed first."""
-        file, own = self._folder / LOCK_FILE, self._folder / f"{LOCK_FILE}.{own_name()}"
+        file, prepared = self._folder / LOCK_FILE, self._folder / f"{LOCK_FILE}.{own_name()}"
         if (holder := _holder(file)) is not None and is_alive(holder) is False:
             stale = self._folder / f"{LOCK_FILE}.{own_name()}.stale"
             with contextlib.suppress(FileNotFoundError):
@@ -280,13 +280,13 @@ class FolderLock:
                     return False
                 stale.unlink()
         try:
-            with open_new(own) as made:
+            with open_new(prepared) as made:
                 made.write(own_name().encode())
-            os.link(own, file)
+            os.link(prepared, file)
         except FileExistsError:
             return False
         finally:
-            own.unlink(missing_ok=True)
+            prepared.unlink(missing_ok=True)
         self._file = file
         return True
 
@@ -301,7 +301,7 @@ class FolderLock:
 
 def local_path(place: Path | str) -> Path:
     """Return an output's place on this machine; raises UsageError for a URL, which as a path has lost a slash."""
-    if (found := _URL.match(str(place))) and not Path(found[1]).exists():
+    if (match := _URL.match(str(place))) and not Path(match[1]).exists():
         raise UsageError(
             expected="a place on this machine",
             got=re.sub(":/+", "://", str(place), count=1),
@@ -326,12 +326,12 @@ def check_no_input(inputs: Iterable[Path | None], files: Iterable[Path], folders
     """
     read = {identity: path for given in inputs if given is not None for identity, path in _identities(given)}
     within = {i: path for path in read.values() for parent in _lineage(path) if (i := _identity(parent)) is not None}
-    for output, known in [*((f, read) for f in files), *((f, within) for f in folders)]:
+    for output, inputs_by_identity in [*((f, read) for f in files), *((f, within) for f in folders)]:
         identity = _identity(output)
-        if identity is not None and identity in known:
+        if identity is not None and identity in inputs_by_identity:
             raise UsageError(
                 expected="an output that is no input of the same command",
-                got=f"{output}, which would replace the input {known[identity]}",
+                got=f"{output}, which would replace the input {inputs_by_identity[identity]}",
                 where="output",
                 remedy="choose another output folder, or move the input first",
             )
@@ -339,17 +339,17 @@ def check_no_input(inputs: Iterable[Path | None], files: Iterable[Path], folders
 
 def _identities(path: Path) -> Iterator[tuple[tuple[int, int], Path]]:
     """Yield what identifies a file, or a folder and the files in it."""
-    for one in [path, *(p for p in path.iterdir() if p.is_file())] if path.is_dir() else [path]:
-        if (identity := _identity(one)) is not None:
-            yield identity, one
+    for member in [path, *(p for p in path.iterdir() if p.is_file())] if path.is_dir() else [path]:
+        if (identity := _identity(member)) is not None:
+            yield identity, member
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
     try:
-        found = path.stat()
+        status = path.stat()
     except (OSError, ValueError):
         return None
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino
 
 
 def _lineage(path: Path) -> Iterator[Path]:
@@ -425,7 +425,7 @@ def _take_place(new: Path, place: Path, old: Path) -> None:
         new.rename(place)
 
 
-def _exchanged(one: Path, other: Path) -> bool:
+def _exchanged(path: Path, other: Path) -> bool:
     """Exchange two names at once where system and file system can (Linux renameat2); False where they cannot."""
     if WINDOWS:
         return False
@@ -433,7 +433,7 @@ def _exchanged(one: Path, other: Path) -> bool:
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if rename is None:
         return False
-    if rename(at_cwd, os.fsencode(one), at_cwd, os.fsencode(other), exchange) == 0:
+    if rename(at_cwd, os.fsencode(path), at_cwd, os.fsencode(other), exchange) == 0:
         return True
     if ctypes.get_errno() in (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP):
         return False

@@ -174,13 +174,13 @@ def _work(channel: socket.socket) -> None:
 
 
 def _answer(channel: socket.socket, work: bytes, item: bytes) -> tuple[str, ...] | tuple[str, bytes]:
-    told: tuple[str, float] = ("", 0.0)
+    reported: tuple[str, float] = ("", 0.0)
 
     def tell(text: str, share: float) -> None:
-        nonlocal told
+        nonlocal reported
         now = time.monotonic()
-        if text != told[0] or now - told[1] > _TELL_EVERY_S:
-            told = (text, now)
+        if text != reported[0] or now - reported[1] > _TELL_EVERY_S:
+            reported = (text, now)
             _say(channel, "tell", text, share)
 
     try:
