@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from pdhef_logtool.records.processes import is_alive, own_name
+from pdhef_logtool.records.processes import is_alive, process_name
 from pdhef_logtool.workers import supervisor
 from pdhef_logtool.workers.supervisor import Limits, supervise
 from tests.workers.planted_work import planted
@@ -66,6 +66,6 @@ def test_processes_are_known_by_their_start_without_proc(monkeypatch: pytest.Mon
         raise FileNotFoundError
 
     monkeypatch.setattr(Path, "read_bytes", unreadable)
-    host, pid, start = own_name().split("-")
-    assert is_alive(own_name()) is True
+    host, pid, start = process_name().split("-")
+    assert is_alive(process_name()) is True
     assert is_alive(f"{host}-{pid}-{int(start) + 1}") is False

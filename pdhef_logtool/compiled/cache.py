@@ -34,7 +34,7 @@ from numba.np import arrayobj, linalg
 
 from pdhef_logtool.compiled import sources
 from pdhef_logtool.records import processes
-from pdhef_logtool.records.printable import shown
+from pdhef_logtool.records.printable import printable
 
 #: How long the first run compiles on two processors, in seconds; a rough figure for the user.
 COMPILING_S = 25
@@ -316,6 +316,6 @@ def announce() -> None:
     if folder is None:
         text = f"compiling, about {COMPILING_S} s in every run: there is no folder to keep the code in"
     else:
-        text = f"compiling, once, about {COMPILING_S} s; the code is kept in {shown(str(folder))}"
+        text = f"compiling, once, about {COMPILING_S} s; the code is kept in {printable(str(folder))}"
     sys.stderr.write(f"{text}\n")
     sys.stderr.flush()

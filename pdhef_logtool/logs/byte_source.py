@@ -45,7 +45,7 @@ class ByteSource(ABC):
     """
 
     size: int
-    far = False
+    is_remote = False
 
     def __init__(self, size: int) -> None:
         self.size = size
@@ -60,12 +60,12 @@ class ByteSource(ABC):
     def close(self) -> None:
         """Release what is open."""
 
-    def at_hand(self, offset: int, size: int) -> int:
+    def held_size(self, offset: int, size: int) -> int:
         """Return how many of the ``size`` bytes from an offset on a read may as well take along."""
         del offset
         return size
 
-    def expect(self, extents: Iterable[tuple[int, int]]) -> None:
+    def prefetch(self, extents: Iterable[tuple[int, int]]) -> None:
         """Take note of bytes [start, end) that will be read soon, in this order."""
         del extents
 
@@ -94,7 +94,7 @@ class ByteSource(ABC):
             return block, position
         follows = 0 <= position <= len(block)
         self._ahead_bytes = min(2 * self._ahead_bytes, _MOST_AHEAD_BYTES) if follows else _LEAST_AHEAD_BYTES
-        block = self.fetch(offset, max(size, self.at_hand(offset, self._ahead_bytes)))
+        block = self.fetch(offset, max(size, self.held_size(offset, self._ahead_bytes)))
         self._block = (offset, block)
         return block, 0
 

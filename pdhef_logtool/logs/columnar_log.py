@@ -11,10 +11,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from pdhef_logtool.logs.budget import BudgetError
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.byte_source import SourceError
-from pdhef_logtool.logs.container import UNVERIFIED, Block, ChannelRecord, Container, Span, told
+from pdhef_logtool.logs.container import UNVERIFIED, Block, ChannelRecord, Container, Span, describe_damage
 from pdhef_logtool.logs.decoding import (
     ChannelDecoder,
     channel_schema,
@@ -34,8 +33,9 @@ from pdhef_logtool.logs.message_schema import (
     leaves,
     resolve,
 )
-from pdhef_logtool.logs.occupied_time import OccupiedTime, survey
+from pdhef_logtool.logs.recording_span import RecordingSpan, survey
 from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.logs.resource_limits import LimitError
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
@@ -93,7 +93,7 @@ class ColumnarLog(DriveLog):
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
         self._kept_bytes = 0
-        self._occupied: OccupiedTime | None = None
+        self._recording_span: RecordingSpan | None = None
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
@@ -109,11 +109,11 @@ class ColumnarLog(DriveLog):
         return tuple(TopicInfo(name, first.type_name, first.encoding, counts[name]) for name, first in firsts)
 
     @property
-    def occupied(self) -> OccupiedTime:
+    def recording_span(self) -> RecordingSpan:
         """When the log was recorded, found when it is first asked for."""
-        if self._occupied is None:
-            self._occupied = survey(self.containers, self._times, str(self.path))
-        return self._occupied
+        if self._recording_span is None:
+            self._recording_span = survey(self.containers, self._times, str(self.path))
+        return self._recording_span
 
     def _times(self, c: int, span: Span) -> tuple[IntArray, IntArray] | None:
         """Return channels and log times of a span's messages on known channels [N]; None if they cannot be read."""
@@ -134,7 +134,7 @@ class ColumnarLog(DriveLog):
     @property
     def lost(self) -> tuple[Loss, ...]:
         """What could not be read, as far as is known by now."""
-        losses = [*self._opened_lost, *self.occupied.losses]
+        losses = [*self._opened_lost, *self.recording_span.losses]
         damaged, schemas = sorted(self._damaged.items()), sorted(self._schemas.items())
         for c, container in enumerate(self.containers):
             losses.extend(container.lost)
@@ -184,9 +184,9 @@ class ColumnarLog(DriveLog):
         return entries | dict(self._custom)
 
     @property
-    def far(self) -> bool:
+    def is_remote(self) -> bool:
         """Whether each read costs a journey."""
-        return any(container.far for container in self.containers)
+        return any(container.is_remote for container in self.containers)
 
     @property
     def size(self) -> int:
@@ -194,7 +194,7 @@ class ColumnarLog(DriveLog):
         return sum(container.account.size for container in self.containers)
 
     @property
-    def looked_at(self) -> tuple[int, int]:
+    def chunks_read(self) -> tuple[int, int]:
         """How many spans were read, and how many there are."""
         return len({(c, index) for c, index, _ in self._seen}), sum(len(c.spans) for c in self.containers)
 
@@ -213,7 +213,7 @@ class ColumnarLog(DriveLog):
                     parts[container.channels[id_].topic].append(times[channel == id_])
         return {topic: np.sort(np.concatenate(part)) for topic, part in parts.items() if part}
 
-    def beside(self, topics: Collection[str]) -> frozenset[str]:
+    def topics_in_same_chunks(self, topics: Collection[str]) -> frozenset[str]:
         """Return the topics whose messages all lie in spans that hold one of these: they cost no further read."""
         held, apart = set(topics), set[str]()
         for container in self.containers:
@@ -223,11 +223,11 @@ class ColumnarLog(DriveLog):
                 (apart if inside.isdisjoint(topics) else held).update(inside)
         return frozenset(held - apart)
 
-    def expect(self, topics: Collection[str], spans_ns: Sequence[tuple[int, int]]) -> None:
+    def prefetch(self, topics: Collection[str], spans_ns: Sequence[tuple[int, int]]) -> None:
         """Take note of what will be read soon: these topics in [start, end) of each."""
         for container in self.containers:
             expected = (s for start, end in spans_ns for s in self._to_read(topics, container, start, end))
-            container.expect({span.index: span for span in expected}.values())
+            container.prefetch({span.index: span for span in expected}.values())
 
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
         """Return the scalar leaves of a topic's schema; empty when the encoding carries none.
@@ -334,7 +334,7 @@ class ColumnarLog(DriveLog):
         extent = container.extent(span)
         try:
             container.meter.check()
-        except BudgetError:
+        except LimitError:
             self._late.setdefault(c, {})[span.index] = span
             container.account.lose(*extent)
             return None
@@ -342,7 +342,7 @@ class ColumnarLog(DriveLog):
             with container.meter.running(extent[1] - extent[0]):
                 block = container.load(span, want)
         except Exception as error:  # noqa: BLE001
-            kind, text = told(error)
+            kind, text = describe_damage(error)
             count = sum(span.counts.values()) or None
             held = f"{count} messages" if count else "an unknown number of messages"
             what = f"{held} lost at byte {extent[0]}: {text}"
@@ -352,14 +352,14 @@ class ColumnarLog(DriveLog):
         if (*key, want) not in self._seen:
             self._seen.add((*key, want))
             container.account.decode(*extent)
-            self._hold_against(c, span, block, want)
+            self._correct_span(c, span, block, want)
         self._kept[(*key, want)] = block
         self._kept_bytes += block.nbytes
         while len(self._kept) > _KEPT_SPANS and self._kept_bytes > _KEPT_BYTES:
             self._kept_bytes -= self._kept.pop(next(iter(self._kept))).nbytes
         return block
 
-    def _hold_against(self, c: int, span: Span, block: Block, want: frozenset[int] | None) -> None:
+    def _correct_span(self, c: int, span: Span, block: Block, want: frozenset[int] | None) -> None:
         """Correct what an index claimed of a span by what the span holds, with a loss for what it should hold."""
         container = self.containers[c]
         held = block.counts
@@ -406,17 +406,17 @@ class ColumnarLog(DriveLog):
         started = time.process_time()
         try:
             meter.check()
-            meter.budget.check("seconds", self._schemas_s, "the time for all schemas")
+            meter.limits.check("seconds", self._schemas_s, "the time for all schemas")
             with meter.running():
                 if definition not in self._parsed:
                     self._parsed[definition] = channel_schema(
-                        channel, self.distro, example, meter.budget, self.definitions
+                        channel, self.distro, example, meter.limits, self.definitions
                     )
                 return self._parsed[definition]
         except SchemaError as error:
             return self._parsed.setdefault(definition, error)
-        except BudgetError as error:  # of time
-            return SchemaError(told(error)[1])
+        except LimitError as error:  # of time
+            return SchemaError(describe_damage(error)[1])
         finally:
             self._schemas_s += time.process_time() - started
 
@@ -470,7 +470,7 @@ class ColumnarLog(DriveLog):
     def _collect(self, plans: Mapping[str, _Plan], start_ns: int | None, end_ns: int | None) -> dict[str, Columns]:
         parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
         for c, container in enumerate(self.containers):
-            container.expect(self._to_read(plans, container, start_ns, end_ns))
+            container.prefetch(self._to_read(plans, container, start_ns, end_ns))
             with container.meter.running():
                 for span in container.spans:
                     if span.overlaps(start_ns, end_ns):
@@ -505,8 +505,8 @@ class ColumnarLog(DriveLog):
         for id_ in sorted(block.rows, key=lambda id_: self._rank[c].get(id_, -1)):
             topic = channels[id_].topic if id_ in channels else ""
             rows = block.rows[id_]
-            if self.occupied.left_out:
-                unused = self.occupied.unused(topic, c, span, block.log_time_ns[rows])
+            if self.recording_span.left_out:
+                unused = self.recording_span.unused(topic, c, span, block.log_time_ns[rows])
                 rows = rows if unused is None else rows[~unused]
             rows = rows if keep is None else rows[keep[rows]]
             if topic in plans and rows.size:
@@ -525,7 +525,7 @@ class ColumnarLog(DriveLog):
             else:
                 fields = decoder.columns(block, rows)
         except Exception as error:  # noqa: BLE001
-            kind, text = told(error)
+            kind, text = describe_damage(error)
             kind = "undecodable" if kind == "bad-chunk" else kind
             what = f"{len(rows)} messages cannot be decoded: {text}"
             self._partial[c, span.index, id_] = Loss(kind, what, topic, span.start_ns, span.end_ns, len(rows))

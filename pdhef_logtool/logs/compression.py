@@ -8,8 +8,8 @@ from pathlib import Path
 from threading import local
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from pdhef_logtool.logs.budget import Budget, BudgetError, Meter
 from pdhef_logtool.logs.container import SpanDamageError
+from pdhef_logtool.logs.resource_limits import LimitError, Meter, ResourceLimits
 
 if TYPE_CHECKING:
     import zstandard
@@ -22,7 +22,7 @@ _FRAME_HEAD_BYTES = 18
 _DISK_RESERVE_BYTES = 256 << 20
 
 
-def decompress(compression: str, stored: _Bytes, size: int, budget: Budget) -> bytes:
+def decompress(compression: str, stored: _Bytes, size: int, limits: ResourceLimits) -> bytes:
     """Decompress a chunk that claims ``size`` bytes.
 
     Parameters
@@ -31,17 +31,17 @@ def decompress(compression: str, stored: _Bytes, size: int, budget: Budget) -> b
 
     Raises
     ------
-    SpanDamageError : unknown, damaged, or of another size. BudgetError : the claim is above the budget.
+    SpanDamageError : unknown, damaged, or of another size. LimitError : the claim is above the budget.
     """
     length = memoryview(stored).nbytes
     if compression in ("", "none"):
-        budget.check("chunk_bytes", length, "a chunk")
+        limits.check("chunk_bytes", length, "a chunk")
         content = bytes(stored)
     else:
         unpack = _UNPACK.get(compression)
         if unpack is None:
             raise SpanDamageError(f"unknown compression {compression!r}")
-        budget.check_unpacked(size, length, "a compressed chunk")
+        limits.check_unpacked(size, length, "a compressed chunk")
         try:
             content = unpack(stored, size)
         except (OSError, RuntimeError, EOFError, ValueError, OverflowError, MemoryError) as error:
@@ -52,15 +52,15 @@ def decompress(compression: str, stored: _Bytes, size: int, budget: Budget) -> b
     return content
 
 
-def decompress_message(stored: _Bytes, budget: Budget) -> bytes:
+def decompress_message(stored: _Bytes, limits: ResourceLimits) -> bytes:
     """Decompress a message that is a zstd frame; errors as of :func:`decompress`."""
     import zstandard
 
     try:
         size = zstandard.frame_content_size(stored)
-        limit = budget.chunk_bytes if size < 0 else size
+        limit = limits.chunk_bytes if size < 0 else size
         if size > 0:
-            budget.check_unpacked(size, memoryview(stored).nbytes, "a compressed message")
+            limits.check_unpacked(size, memoryview(stored).nbytes, "a compressed message")
         return _zstd_decompressor().decompress(stored, max_output_size=limit)
     except (zstandard.ZstdError, OverflowError, MemoryError) as error:
         raise SpanDamageError(f"a compressed message is damaged: {error}") from error
@@ -72,7 +72,7 @@ def decompress_file(source: Path, target: Path, meter: Meter) -> str:
 
     import zstandard
 
-    allowed = max(_BLOCK_BYTES, meter.budget.chunk_ratio * source.stat().st_size)
+    allowed = max(_BLOCK_BYTES, meter.limits.chunk_ratio * source.stat().st_size)
     free = shutil.disk_usage(target.parent).free - _DISK_RESERVE_BYTES
     written = 0
     with source.open("rb") as packed, target.open("wb") as unpacked:
@@ -83,7 +83,7 @@ def decompress_file(source: Path, target: Path, meter: Meter) -> str:
             try:
                 meter.check()
                 block = reader.read(_BLOCK_BYTES)
-            except BudgetError as error:
+            except LimitError as error:
                 return error.got
             except zstandard.ZstdError as error:
                 return f"the compressed file is damaged: {error}"

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from pdhef_logtool.logs.budget import BudgetError, Meter
 from pdhef_logtool.logs.byte_account import ByteAccount
 from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, SourceError
 from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import IntArray, Loss
 
@@ -200,14 +200,14 @@ class SpanDamageError(Exception):
     """A span cannot be decoded; caught inside this package and turned into a loss."""
 
 
-def told(error: Exception) -> tuple[str, str]:
+def describe_damage(error: Exception) -> tuple[str, str]:
     """Return the kind of loss that an error makes, and what to tell of it: the one boundary's words.
 
     A log whose place fails is not damaged: that error goes on.
     """
     if isinstance(error, SourceError):
         raise error
-    if isinstance(error, BudgetError):
+    if isinstance(error, LimitError):
         return "over-budget", f"expected {error.expected}, got {error.got} ({error.where}); {error.remedy}"
     text = str(error) if isinstance(error, SpanDamageError | CutError) else f"{type(error).__name__}: {error}"
     return "bad-chunk", " ".join(text.split())[:_TOLD_CHARACTERS]
@@ -231,7 +231,7 @@ class Container(ABC):
 
     form = ""
     selective = False
-    far = False
+    is_remote = False
     by_index = False
     profile = "ros2"
     distro = ""
@@ -274,7 +274,7 @@ class Container(ABC):
         """Read the metadata records; a damaged one is among the losses and left out."""
         yield from ()
 
-    def expect(self, spans: Iterable[Span]) -> None:
+    def prefetch(self, spans: Iterable[Span]) -> None:
         """Take note of spans that will be loaded soon, in this order."""
         del spans
 
@@ -361,9 +361,9 @@ class FileContainer(Container):
         try:
             self._walk()
         except Exception as error:
-            if isinstance(error, PdhefError) and not isinstance(error, BudgetError):
+            if isinstance(error, PdhefError) and not isinstance(error, LimitError):
                 raise
-            kind, text = told(error)
+            kind, text = describe_damage(error)
             self.lose(kind, f"what follows byte {self.position} of {self.source.size} is lost: {text}", self.last_ns())
             self.account.lose(self.position, self.source.size)
             self.account.cut = True
@@ -375,7 +375,7 @@ class FileContainer(Container):
 
     def lose_record(self, start: int, end: int, error: Exception) -> None:
         """Note that the record in bytes [start, end) cannot be read: the boundary of the walk."""
-        kind, text = told(error)
+        kind, text = describe_damage(error)
         kind = "bad-record" if kind == "bad-chunk" else kind
         self.lose(kind, f"the record at byte {start} is malformed: {text}")
         self.account.lose(start, end)

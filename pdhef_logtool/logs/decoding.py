@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget, BudgetError
 from pdhef_logtool.logs.container import Block, ChannelRecord
 from pdhef_logtool.logs.definitions import SHIPPED, Definitions
 from pdhef_logtool.logs.message_schema import (
@@ -39,6 +38,7 @@ from pdhef_logtool.logs.message_schema import (
     ros_schema,
     value_at,
 )
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError, ResourceLimits
 from pdhef_logtool.logs.wire_layout import LayoutReader, NoLayoutError, WireLayout, layout_of_message
 from pdhef_logtool.records.signals import IntArray
 
@@ -54,7 +54,7 @@ def channel_schema(
     channel: ChannelRecord,
     distro: str = "",
     example: bytes | None = None,
-    budget: Budget = DEFAULT_BUDGET,
+    limits: ResourceLimits = DEFAULT_LIMITS,
     definitions: Definitions = SHIPPED,
 ) -> MessageSchema:
     """Parse the schema of a channel.
@@ -79,20 +79,20 @@ def channel_schema(
         if not channel.type_name:
             raise NoSchemaError("no type name")
         return ros_schema(
-            channel.type_name, channel.schema_encoding, text, channel.encoding, distro, budget, definitions
+            channel.type_name, channel.schema_encoding, text, channel.encoding, distro, limits, definitions
         )
     if channel.encoding == "json":
         if channel.schema_encoding == "jsonschema" and channel.schema_data.strip():
-            return json_schema(channel.type_name, channel.schema_data.decode("utf-8", errors="replace"), budget)
+            return json_schema(channel.type_name, channel.schema_data.decode("utf-8", errors="replace"), limits)
         if example is not None:
-            return json_schema_of_message(channel.type_name, example, budget)
+            return json_schema_of_message(channel.type_name, example, limits)
         raise NoSchemaError("JSON without a schema and without a message")
     if channel.encoding == "protobuf":
         if channel.schema_encoding != "protobuf":
             raise NoSchemaError(f"protobuf messages with a {channel.schema_encoding!r} schema")
         from pdhef_logtool.logs.protobuf_schema import protobuf_schema
 
-        return protobuf_schema(channel.schema_name, channel.schema_data, budget)
+        return protobuf_schema(channel.schema_name, channel.schema_data, limits)
     raise NoSchemaError(f"messages encoded as {channel.encoding!r} are not decoded")
 
 
@@ -159,7 +159,7 @@ class ChannelDecoder:
 
     def _check_widths(self, layout: WireLayout, n: int) -> None:
         """Refuse a layout one of whose arrays has too many elements for N rows of columns."""
-        most = min(self.schema.budget.array_width, _most_columns(n))
+        most = min(self.schema.limits.array_width, _most_columns(n))
         selected = (layout.leaves.get(s.components[0]) for s in self.selections if s.shape == "array")
         if any((leaf.count or 0) > most for leaf in selected if leaf is not None):
             raise NoLayoutError("an array is too wide for columns")
@@ -196,7 +196,7 @@ class ChannelDecoder:
         decode = self.single_decoder()
         getters = [(s.path, self._getter(s)) for s in self.selections]
         values: dict[str, list[object]] = {s.path: [] for s in self.selections}
-        most = min(self.schema.budget.array_width, _most_columns(len(rows)))
+        most = min(self.schema.limits.array_width, _most_columns(len(rows)))
         for row, start, n in zip(rows.tolist(), block.offset[rows].tolist(), block.length[rows].tolist(), strict=True):
             message = decode(bytes(block.buffer[start : start + n]))
             if message is None:
@@ -257,10 +257,10 @@ def _tolerant(decode: Callable[[bytes], object], schema: MessageSchema) -> Calla
 def _affordable_bytes(schema: MessageSchema) -> float:
     """Return the bytes of a message whose objects fit a memory: one of a byte or two takes a hundred."""
     if schema.wire == "protobuf":
-        return schema.budget.chunk_bytes / 4
+        return schema.limits.chunk_bytes / 4
     if schema.wire == "json":
-        return schema.budget.chunk_bytes / 16
-    return schema.budget.chunk_bytes / 128 * _bytes_an_object(schema.root)
+        return schema.limits.chunk_bytes / 16
+    return schema.limits.chunk_bytes / 128 * _bytes_an_object(schema.root)
 
 
 def _bytes_an_object(node: Node) -> float:
@@ -296,7 +296,7 @@ def concatenate_columns(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
     Raises
     ------
-    BudgetError : some arrays are so wide, and the others so many, that they would fill the memory.
+    LimitError : some arrays are so wide, and the others so many, that they would fill the memory.
     """
     if len(parts) == 1:
         return parts[0]
@@ -306,7 +306,7 @@ def concatenate_columns(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
         return np.concatenate(filled)
     rows = sum(p.shape[0] for p in filled)
     if width > _most_columns(rows):
-        raise BudgetError(
+        raise LimitError(
             expected=f"at most {_most_columns(rows)} elements in an array of {rows} messages",
             got=str(width),
             where="an array as columns",

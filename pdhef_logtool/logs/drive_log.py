@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.occupied_time import OccupiedTime
+from pdhef_logtool.logs.recording_span import RecordingSpan
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import IntArray, Loss
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.columnar_log import ColumnarLog
-    from pdhef_logtool.logs.slim_log import SlimLog
+    from pdhef_logtool.logs.reduced_log import ReducedLog
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class LogIndex(Protocol):
     """What a sound index tells of a log before its messages are read."""
 
     @property
-    def far(self) -> bool:
+    def is_remote(self) -> bool:
         """Whether each read costs a network request."""
 
     @property
@@ -72,16 +72,16 @@ class LogIndex(Protocol):
         """Bytes of all files."""
 
     @property
-    def looked_at(self) -> tuple[int, int]:
+    def chunks_read(self) -> tuple[int, int]:
         """Number of chunks that were read, and of all chunks."""
 
     def index_times(self, start_ns: int, end_ns: int) -> dict[str, IntArray]:
         """Return each topic's log times in [start, end), ascending."""
 
-    def beside(self, topics: Collection[str]) -> frozenset[str]:
+    def topics_in_same_chunks(self, topics: Collection[str]) -> frozenset[str]:
         """Return the topics whose messages all lie in chunks that hold one of these: they cost no further read."""
 
-    def expect(self, topics: Collection[str], spans_ns: Sequence[tuple[int, int]]) -> None:
+    def prefetch(self, topics: Collection[str], spans_ns: Sequence[tuple[int, int]]) -> None:
         """Prepare to read these topics in [start, end) of each span."""
 
 
@@ -104,7 +104,7 @@ class DriveLog(ABC):
 
     @property
     @abstractmethod
-    def occupied(self) -> OccupiedTime:
+    def recording_span(self) -> RecordingSpan:
         """When the log was recorded; what was recorded at other times is never read."""
 
     @property
@@ -151,12 +151,12 @@ class DriveLog(ABC):
     @property
     def start_ns(self) -> int:
         """First log time that counts; 0 for a log without messages."""
-        return self.occupied.start_ns
+        return self.recording_span.start_ns
 
     @property
     def end_ns(self) -> int:
         """Last log time that counts + 1 (intervals are [start, end)); 0 for a log without messages."""
-        return self.occupied.end_ns
+        return self.recording_span.end_ns
 
     @property
     def messages(self) -> ColumnarLog | None:
@@ -169,7 +169,7 @@ class DriveLog(ABC):
         return None
 
     @property
-    def slim(self) -> SlimLog | None:
+    def reduced(self) -> ReducedLog | None:
         """The log as a slim log, with the record of its source; None: it is a source itself."""
         return None
 
@@ -204,11 +204,11 @@ def nearest(name: str, names: Sequence[str], expected: str, where: object) -> Ma
 
 
 def windows(
-    start_ns: int, end_ns: int, length_ns: int, occupied: OccupiedTime | None = None
+    start_ns: int, end_ns: int, length_ns: int, recording_span: RecordingSpan | None = None
 ) -> Iterator[tuple[int, int]]:
     """Cut [start, end) into consecutive windows of at most ``length_ns``; those in a silence are left out."""
     window_ns = start_ns
-    for begin, end in ((start_ns, end_ns),) if occupied is None else occupied.intervals:
+    for begin, end in ((start_ns, end_ns),) if recording_span is None else recording_span.intervals:
         window_ns += max(0, (begin - window_ns) // length_ns) * length_ns
         while window_ns < min(end, end_ns):
             yield window_ns, min(window_ns + length_ns, end_ns)

@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 
 from pdhef_logtool.logs.byte_source import ByteSource, CutError
 from pdhef_logtool.logs.container import MAX_TIME_NS, MCAP_MAGIC
-from pdhef_logtool.logs.occupied_time import SILENCE_NS, STEP_BACK_NS
+from pdhef_logtool.logs.recording_span import SILENCE_NS, STEP_BACK_NS
 
 #: One request brings the summary of a drive of several minutes; what is missing of a longer one comes with a second.
 TAIL_BYTES = 256 << 10
@@ -70,14 +70,14 @@ def _summary(source: ByteSource) -> tuple[bytes, int] | None:
     if foot <= len(MCAP_MAGIC):
         return None
     tail = max(0, size - TAIL_BYTES)
-    source.expect([(tail, size)])
+    source.prefetch([(tail, size)])
     end = source.read(foot, size - foot)
     opcode, length, start, _, crc = FOOTER.unpack_from(end)
     if opcode != Opcode.FOOTER or length != FOOTER.size - 9 or end[FOOTER.size :] != MCAP_MAGIC:
         return None
     if not 0 < start < foot or foot - start > _MOST_SUMMARY_BYTES:
         return None
-    source.expect([(start, size)])
+    source.prefetch([(start, size)])
     summary = source.read(start, foot - start)
     if crc and zlib.crc32(end[: FOOTER.size - 4], zlib.crc32(summary)) != crc:
         return None

@@ -27,7 +27,6 @@ from mcap.records import Attachment as AttachmentRecord
 from mcap.records import Channel, Metadata, Schema
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.budget import BudgetError, Meter
 from pdhef_logtool.logs.byte_source import ByteSource
 from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.container import (
@@ -45,10 +44,11 @@ from pdhef_logtool.logs.container import (
     SpanDamageError,
     Wanted,
     block_from_lists,
-    told,
+    describe_damage,
 )
 from pdhef_logtool.logs.mcap_index import FOOTER, RECORD, IndexedChunk, read_index
 from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.logs.type_names import ros2_type_name
 from pdhef_logtool.records.signals import IntArray, Loss
 
@@ -120,8 +120,8 @@ class McapContainer(FileContainer):
         self._extents: list[_Extent] = []
         self._attachment_at: list[tuple[int, int]] = []
         self._metadata_at: list[tuple[int, int]] = []
-        self._index_believed = False
-        self._misled = False  # whether an index named other messages than are there
+        self._index_used = False
+        self._index_wrong = False  # whether an index named other messages than are there
         self._indexed: list[int] | None = None  # where the chunks lie that the summary names
         self._walked = _Walk(self)
         super().__init__(path, shown_path, meter)
@@ -129,10 +129,10 @@ class McapContainer(FileContainer):
     def _walk(self) -> None:
         source, size, walk = self.source, self.source.size, self._walked
         header_seen = False
-        believed = self._believed() if source.far else {}
+        skippable = self._skippable() if source.is_remote else {}
         for offset in self._places():
-            if offset in believed:
-                self.position = walk.believe(believed[offset])
+            if offset in skippable:
+                self.position = walk.add_indexed(skippable[offset])
                 continue
             if size - offset == len(MCAP_MAGIC) and source.read(offset, len(MCAP_MAGIC)) == MCAP_MAGIC:
                 self.account.decode(offset, size)
@@ -168,12 +168,12 @@ class McapContainer(FileContainer):
 
     def _finish(self) -> None:
         self._walked.finish()
-        self.far = self.source.far
+        self.is_remote = self.source.is_remote
         chunked = bool(self._extents) and all(extent.is_chunk for extent in self._extents)
-        indexed = self._index_believed if self.far else self._walked.statistics is not None
-        self.by_index = chunked and indexed and not self._misled and all(x.kind == UNVERIFIED for x in self.lost)
+        indexed = self._index_used if self.is_remote else self._walked.statistics is not None
+        self.by_index = chunked and indexed and not self._index_wrong and all(x.kind == UNVERIFIED for x in self.lost)
 
-    def _believed(self) -> dict[int, IndexedChunk | tuple[int, int]]:
+    def _skippable(self) -> dict[int, IndexedChunk | tuple[int, int]]:
         """Return the chunks and attachments that are not wanted by their place, and have all else fetched."""
         everything = self._wanted == EVERYTHING or self.source.size <= self._wanted.above_bytes
         index = None if everything else read_index(self.source)
@@ -184,23 +184,23 @@ class McapContainer(FileContainer):
             for channel in index.channels if index else ():
                 self.add_channel(channel)
         except Exception as error:  # noqa: BLE001 (the walk tells what is wrong)
-            told(error)
+            describe_damage(error)
             self._schemas.clear()
             self._raw_channels.clear()
             index = None
         if index is not None:
-            self._index_believed = True
+            self._index_used = True
             topics = {id_: channel.topic for id_, channel in self._raw_channels.items()}
             for chunk in index.chunks:
                 if not self._wanted.has([topics[id_] for id_ in chunk.counts], chunk.first_ns, chunk.last_ns):
                     unwanted[chunk.start] = chunk
             unwanted |= {extent[0]: extent for extent in index.attachments}
         ends = {start: (x.index_end if isinstance(x, IndexedChunk) else x[1]) for start, x in unwanted.items()}
-        self.source.expect(zip([0, *ends.values()], [*ends, self.source.size], strict=True))
+        self.source.prefetch(zip([0, *ends.values()], [*ends, self.source.size], strict=True))
         return unwanted
 
     def _read_header(self, offset: int, length: int) -> None:
-        self.meter.budget.check("metadata_bytes", length, "the header record")
+        self.meter.limits.check("metadata_bytes", length, "the header record")
         payload = self.source.read(offset + 9, length)
         try:
             (n,) = _U32.unpack_from(payload, 0)
@@ -238,16 +238,16 @@ class McapContainer(FileContainer):
 
     def add_schema(self, payload: bytes) -> None:
         """Take note of a schema record."""
-        self.meter.budget.check("metadata_bytes", len(payload), "a schema record")
+        self.meter.limits.check("metadata_bytes", len(payload), "a schema record")
         schema = Schema.read(ReadDataStream(BytesIO(payload)))
         self._schemas.setdefault(schema.id, schema)
 
     def add_channel(self, payload: bytes) -> None:
         """Take note of a channel record."""
-        self.meter.budget.check("metadata_bytes", len(payload), "a channel record")
+        self.meter.limits.check("metadata_bytes", len(payload), "a channel record")
         channel = Channel.read(ReadDataStream(BytesIO(payload)))
         if channel.id not in self._raw_channels:
-            self.meter.budget.check("channels", len(self._raw_channels) + 1, f"channel {channel.id}")
+            self.meter.limits.check("channels", len(self._raw_channels) + 1, f"channel {channel.id}")
             self._raw_channels[channel.id] = channel
 
     def resolve_channels(self) -> None:
@@ -274,19 +274,19 @@ class McapContainer(FileContainer):
         extent = self._extents[span.index]
         return extent.start, extent.end
 
-    def expect(self, spans: Iterable[Span]) -> None:
+    def prefetch(self, spans: Iterable[Span]) -> None:
         """See :class:`~pdhef_logtool.logs.container.Container`."""
-        if self.source.far:
+        if self.source.is_remote:
             extents = (self._extents[span.index] for span in spans)
-            self.source.expect((extent.start, extent.index_end) for extent in extents)
+            self.source.prefetch((extent.start, extent.index_end) for extent in extents)
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         """Decode one span."""
         del want
         extent = self._extents[span.index]
-        budget = self.meter.budget
+        limits = self.meter.limits
         if not extent.is_chunk:
-            budget.check("chunk_bytes", extent.end - extent.start, "messages without a chunk")
+            limits.check("chunk_bytes", extent.end - extent.start, "messages without a chunk")
             return self._scan(self.source.read(extent.start, extent.end - extent.start))
         record = self.source.read(extent.start, extent.index_end - extent.start)
         content = self.chunk_content(record, extent.end - extent.start)
@@ -294,13 +294,13 @@ class McapContainer(FileContainer):
             self.account.verify(extent.start, extent.index_end)
         block = _indexed_messages(content, record, extent.end - extent.start)
         block = self._scan(content) if block is None else block
-        budget.check_messages(len(block), extent.end - extent.start)
+        limits.check_messages(len(block), extent.end - extent.start)
         return block
 
     def chunk_content(self, record: bytes, end: int) -> bytes:
         """Decompress the chunk record that is the first ``end`` bytes, and check its CRC."""
         size, crc, compression, start, stored = _chunk_head(record, end)
-        content = decompress(compression, memoryview(record)[start : start + stored], size, self.meter.budget)
+        content = decompress(compression, memoryview(record)[start : start + stored], size, self.meter.limits)
         if crc and zlib.crc32(content) != crc:
             raise SpanDamageError("its CRC does not match")
         return content
@@ -320,14 +320,14 @@ class McapContainer(FileContainer):
                 if length < 22:
                     raise SpanDamageError("a message record is too short")
                 if len(offsets) % _MESSAGES_A_CHECK == 0:
-                    self.meter.budget.check("chunk_messages", len(offsets), "a chunk")
+                    self.meter.limits.check("chunk_messages", len(offsets), "a chunk")
                     self.meter.check()
                 offsets.append(offset)
             elif declare and opcode in _DECLARATIONS:
                 try:
                     (self.add_schema if opcode == _OP_SCHEMA else self.add_channel)(content[offset + 9 : end])
-                except BudgetError as error:
-                    self.lose(*told(error))
+                except LimitError as error:
+                    self.lose(*describe_damage(error))
             elif opcode < _FIRST_PRIVATE and opcode not in _DECLARATIONS:
                 raise SpanDamageError(f"it holds a record of kind {opcode}, which no chunk may")
             offset = end
@@ -425,7 +425,7 @@ class McapContainer(FileContainer):
             (n,) = width.unpack(source.read(place, 4))
             if place + 4 + n > end:
                 raise SpanDamageError("it runs past its end")
-            self.meter.budget.check("metadata_bytes", n, "an attachment's name")
+            self.meter.limits.check("metadata_bytes", n, "an attachment's name")
             text = source.read(place + 4, n).decode()
             name, place = name or text, place + 4 + n
         (n,) = _U64.unpack(source.read(place, 8))
@@ -458,7 +458,7 @@ class McapContainer(FileContainer):
 
     def read_metadata(self, start: int, end: int) -> Metadata:
         """Read a metadata record."""
-        self.meter.budget.check("metadata_bytes", end - start, "a metadata record")
+        self.meter.limits.check("metadata_bytes", end - start, "a metadata record")
         metadata: Metadata = Metadata.read(ReadDataStream(BytesIO(self.source.read(start + 9, end - start - 9))))
         return metadata
 
@@ -477,9 +477,9 @@ class McapContainer(FileContainer):
         try:
             record = self.source.read(extent.start, extent.end - extent.start)
             block = self._scan(self.chunk_content(record, len(record)), declare=True)
-            self.meter.budget.check_messages(len(block), len(record))
+            self.meter.limits.check_messages(len(block), len(record))
         except Exception as error:  # noqa: BLE001 (the boundary)
-            kind, text = told(error)
+            kind, text = describe_damage(error)
             count = sum(claimed.counts.values()) or None
             gone = f"{count} messages" if count else "an unknown number of messages"
             what = f"{gone} lost in the chunk at byte {extent.start}: {text}"
@@ -496,7 +496,7 @@ class McapContainer(FileContainer):
             self.account.decode(extent.start, extent.end)
             return
         first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
-        self._misled |= (claimed.start_ns, claimed.end_ns, claimed.counts) != (first, last + 1, held)
+        self._index_wrong |= (claimed.start_ns, claimed.end_ns, claimed.counts) != (first, last + 1, held)
         self.add_span(extent, Span(0, first, last + 1, held, block.ordered))
 
     def add_span(self, extent: _Extent, span: Span) -> None:
@@ -515,7 +515,7 @@ class McapContainer(FileContainer):
             counts.update(span.counts)
         if self.lost or (counts.total() == total and (not by_channel or counts == Counter(by_channel))):
             return
-        self._misled = True
+        self._index_wrong = True
         spans, extents = self.spans[:], self._extents[:]
         self.spans.clear()
         self._extents.clear()
@@ -567,7 +567,7 @@ class _Walk:
         self._end_chunk()
         if opcode in _DECLARATIONS:
             # Stay inside a run: writers interleave declarations with the messages.
-            of.meter.budget.check("metadata_bytes", end - start, "a declaration")
+            of.meter.limits.check("metadata_bytes", end - start, "a declaration")
             (of.add_schema if opcode == _OP_SCHEMA else of.add_channel)(source.read(start + 9, end - start - 9))
             of.account.decode(start, end)
             return
@@ -601,7 +601,7 @@ class _Walk:
         (n,) = _U32.unpack_from(head, 37)
         return n <= 4 and bool(49 + n + _U64.unpack_from(head, 41 + n)[0] == end - start)
 
-    def believe(self, indexed: IndexedChunk | tuple[int, int]) -> int:
+    def add_indexed(self, indexed: IndexedChunk | tuple[int, int]) -> int:
         """Take a chunk or an attachment as the index has it; returns where the next record begins."""
         of = self.of
         self._end_chunk()
@@ -673,7 +673,7 @@ class _Walk:
         assert self.chunk is not None
         of, size, counts = self.of, self.head[2], self.index_counts
         held = counts.total() * MESSAGE_HEAD.itemsize
-        if not self.index_sound or not held or held > size or size > of.meter.budget.chunk_bytes:
+        if not self.index_sound or not held or held > size or size > of.meter.limits.chunk_bytes:
             return False, False
         if not counts.keys() <= of._raw_channels.keys():
             return False, False
@@ -705,7 +705,7 @@ class _Walk:
         in_chunks = all(extent.is_chunk for extent in of._extents)
         if self.statistics is not None and in_chunks and not self.bare_chunks:
             return
-        if of._index_believed:
+        if of._index_used:
             what = "the CRC of the data section was not verified, as not all of the log was read"
             of.lost.append(Loss(UNVERIFIED, what, str(of.path), severity="note"))
         elif of.crc(0, self.data_end[0]) == self.data_crc:

@@ -13,8 +13,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
 from pdhef_logtool.logs.definitions import SHIPPED, Definitions
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 from pdhef_logtool.logs.schema_files import referenced
 from pdhef_logtool.records.errors import MappingError, PdhefError
 
@@ -111,7 +111,7 @@ class MessageSchema:
     root: Node
     store: Typestore | None = None
     message_class: Any = None
-    budget: Budget = DEFAULT_BUDGET
+    limits: ResourceLimits = DEFAULT_LIMITS
     borrowed: tuple[Path, ...] = ()
 
 
@@ -174,15 +174,15 @@ def parsing(what: str) -> Iterator[None]:
 class Unfolding:
     """Counts the places of a schema while its tree is built: a short text can describe an endless one."""
 
-    def __init__(self, budget: Budget, what: str) -> None:
-        self.budget, self.what = budget, what
+    def __init__(self, limits: ResourceLimits, what: str) -> None:
+        self.limits, self.what = limits, what
         self.places = 0
 
     def enter(self, times: int, depth: int) -> None:
-        """Count a node that stands ``times`` times in the tree, below ``depth`` others; raises BudgetError."""
+        """Count a node that stands ``times`` times in the tree, below ``depth`` others; raises LimitError."""
         self.places += times
-        self.budget.check("schema_leaves", self.places, self.what)
-        self.budget.check("schema_depth", depth, self.what)
+        self.limits.check("schema_leaves", self.places, self.what)
+        self.limits.check("schema_depth", depth, self.what)
 
 
 _CODES = {
@@ -210,7 +210,7 @@ def ros_schema(
     text: str,
     wire: str,
     distro: str = "",
-    budget: Budget = DEFAULT_BUDGET,
+    limits: ResourceLimits = DEFAULT_LIMITS,
     definitions: Definitions = SHIPPED,
 ) -> MessageSchema:
     """Parse a ROS message definition.
@@ -236,7 +236,7 @@ def ros_schema(
     what = f"the definition of {type_name}"
     borrowed: tuple[Path, ...] = ()
     with parsing(what):
-        budget.check("schema_bytes", len(text) * _BYTES_OF_TEXT, what)
+        limits.check("schema_bytes", len(text) * _BYTES_OF_TEXT, what)
         base = Stores.ROS1_NOETIC if wire == "ros1" else _store_of(distro)
         if text.strip():
             text = _SEPARATOR.sub("=" * 80, text)
@@ -244,20 +244,20 @@ def ros_schema(
             store = get_typestore(Stores.EMPTY)
             try:
                 if referenced(types) - set(types):  # a distribution's types take long to load
-                    types = _completed(types, get_typestore(base).fielddefs, definitions, budget)
+                    types = _completed(types, get_typestore(base).fielddefs, definitions, limits)
             except MissingDefinitionError as error:  # the log's own text is not whole: its messages are lost
                 raise SchemaError(str(error)) from error
-            root = _ros_root(types, type_name, budget)
+            root = _ros_root(types, type_name, limits)
             store.register(types)
         else:
             store = get_typestore(base)
             if type_name not in store.fielddefs:
-                types = _completed({}, store.fielddefs, definitions, budget, type_name)
+                types = _completed({}, store.fielddefs, definitions, limits, type_name)
                 files = (definitions.installed(name) for name in sorted(set(types) - set(store.fielddefs)))
                 borrowed = tuple(file for file in files if file is not None)
                 store.register(types)
-            root = _ros_root(store.fielddefs, type_name, budget)
-    return MessageSchema(type_name, wire, root, store, budget=budget, borrowed=borrowed)
+            root = _ros_root(store.fielddefs, type_name, limits)
+    return MessageSchema(type_name, wire, root, store, limits=limits, borrowed=borrowed)
 
 
 def _store_of(distro: str) -> Any:
@@ -267,7 +267,11 @@ def _store_of(distro: str) -> Any:
 
 
 def _completed(
-    types: Mapping[str, Any], distributed: Mapping[str, Any], definitions: Definitions, budget: Budget, wanted: str = ""
+    types: Mapping[str, Any],
+    distributed: Mapping[str, Any],
+    definitions: Definitions,
+    limits: ResourceLimits,
+    wanted: str = "",
 ) -> dict[str, Any]:
     """Return the types with all that they contain: of the distribution, else of definitions; ``wanted`` is one more."""
     from rosbags.typesys import get_types_from_msg
@@ -280,7 +284,7 @@ def _completed(
             completed[name] = distributed[name]
         else:
             text = definitions.text_of(name)
-            budget.check("schema_bytes", len(text) * _BYTES_OF_TEXT, f"the definition of {name}")
+            limits.check("schema_bytes", len(text) * _BYTES_OF_TEXT, f"the definition of {name}")
             if not text.strip():
                 raise MissingDefinitionError(name)
             completed |= get_types_from_msg(text, name)
@@ -288,13 +292,13 @@ def _completed(
     return completed
 
 
-def _ros_root(defs: Mapping[str, Any], type_name: str, budget: Budget) -> Struct:
+def _ros_root(defs: Mapping[str, Any], type_name: str, limits: ResourceLimits) -> Struct:
     if type_name not in defs:
         raise SchemaError(f"no definition of {type_name}")
     members = defs[type_name][1]
     if not members or [field for field, _ in members] == [_FILLER]:
         return Struct({})
-    return _ros_node(defs, type_name, (), 1, Unfolding(budget, f"the definition of {type_name}"))
+    return _ros_node(defs, type_name, (), 1, Unfolding(limits, f"the definition of {type_name}"))
 
 
 def _ros_node(defs: Mapping[str, Any], name: str, above: tuple[str, ...], times: int, unfolding: Unfolding) -> Struct:
@@ -333,14 +337,14 @@ def _listed(length: int | None) -> int:
     return length if length is not None and length <= LISTED_ELEMENTS else 1
 
 
-def json_schema(type_name: str, text: str, budget: Budget = DEFAULT_BUDGET) -> MessageSchema:
+def json_schema(type_name: str, text: str, limits: ResourceLimits = DEFAULT_LIMITS) -> MessageSchema:
     """Parse a JSON Schema; raises :class:`SchemaError`."""
     what = f"the JSON Schema of {type_name}"
     with parsing(what):
-        budget.check("schema_bytes", len(text), what)
+        limits.check("schema_bytes", len(text), what)
         document = json.loads(text)
-        root = _json_node(document, _Json(document, Unfolding(budget, what)), 1, (), 0)
-    return MessageSchema(type_name, "json", root, budget=budget)
+        root = _json_node(document, _Json(document, Unfolding(limits, what)), 1, (), 0)
+    return MessageSchema(type_name, "json", root, limits=limits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -362,7 +366,7 @@ _JSON_SCALARS: dict[object, Scalar] = {
 
 def _json_node(schema: Any, whole: _Json, times: int, inside: tuple[str, ...], depth: int) -> Node:
     """Return a schema's tree; ``inside`` are the references that lead here: what contains itself is left open."""
-    if not isinstance(schema, dict) or depth > whole.unfolding.budget.schema_depth:
+    if not isinstance(schema, dict) or depth > whole.unfolding.limits.schema_depth:
         return Unknown()
     whole.unfolding.enter(times, 0)
     reference = schema.get("$ref")
@@ -396,13 +400,13 @@ def _json_type(declared: object) -> str | None:
     return str(types[0]) if len(types) == 1 and types[0] is not None else None
 
 
-def json_schema_of_message(type_name: str, message: bytes, budget: Budget = DEFAULT_BUDGET) -> MessageSchema:
+def json_schema_of_message(type_name: str, message: bytes, limits: ResourceLimits = DEFAULT_LIMITS) -> MessageSchema:
     """Take the schema from a JSON message; raises :class:`SchemaError`."""
     what = "the first message"
     with parsing(what):
-        budget.check("schema_bytes", len(message), what)
-        root = _example_node(json.loads(message), Unfolding(budget, what), 0)
-    return MessageSchema(type_name, "json", root, budget=budget)
+        limits.check("schema_bytes", len(message), what)
+        root = _example_node(json.loads(message), Unfolding(limits, what), 0)
+    return MessageSchema(type_name, "json", root, limits=limits)
 
 
 def _example_node(value: object, unfolding: Unfolding, depth: int) -> Node:
@@ -523,7 +527,7 @@ def _select_array(node: Array, schema: MessageSchema, topic: str, path: str, ste
         return Selection(path, "dynamic", (steps,))
     if not isinstance(node.item, Scalar) or node.item.kind == "string":
         raise _no_number(schema, topic, path, "an array of structs or texts")
-    if node.length is not None and node.length > schema.budget.array_width:
+    if node.length is not None and node.length > schema.limits.array_width:
         raise _no_number(schema, topic, path, f"an array of {node.length} elements, too many for columns")
     return Selection(path, "array", (steps,), node.length)
 

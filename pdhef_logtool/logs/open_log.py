@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget, Meter
 from pdhef_logtool.logs.byte_source import require_regular
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.compression import decompress_file, decompress_message
@@ -23,7 +22,7 @@ from pdhef_logtool.logs.container import (
     MetadataRecord,
     Span,
     Wanted,
-    told,
+    describe_damage,
 )
 from pdhef_logtool.logs.definitions import read_definitions
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -37,8 +36,9 @@ from pdhef_logtool.logs.formats import (
     what_is_a_log,
 )
 from pdhef_logtool.logs.log_file import LogFile
+from pdhef_logtool.logs.reduced_log import ReducedLog, reduced_record
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
-from pdhef_logtool.logs.slim_log import SlimLog, slim_record
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, Meter, ResourceLimits
 from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import IntArray, Loss
 from pdhef_logtool.storage.documents import read_text
@@ -51,13 +51,16 @@ _FOLDER_KINDS = {**_KINDS, "mcap": "rosbag2-mcap"}
 
 
 def open_log(
-    path: LogPlace | str, budget: Budget = DEFAULT_BUDGET, msgs: Path | str | None = None, wanted: Wanted = EVERYTHING
+    path: LogPlace | str,
+    limits: ResourceLimits = DEFAULT_LIMITS,
+    msgs: Path | str | None = None,
+    wanted: Wanted = EVERYTHING,
 ) -> DriveLog:
     """Open a log, recognised by its content.
 
     A file of one of the :mod:`~pdhef_logtool.logs.formats`, each also zstd-compressed; a rosbag2 folder with its
     ``metadata.yaml`` (split files are one log), or a folder that holds exactly one such file. Each file also by its URL
-    (``https://``, ``s3://``). A slim log (:mod:`~pdhef_logtool.logs.slim_log`) reads like what it stands for.
+    (``https://``, ``s3://``). A slim log (:mod:`~pdhef_logtool.logs.reduced_log`) reads like what it stands for.
 
     Parameters
     ----------
@@ -71,7 +74,7 @@ def open_log(
     UsageError : ``msgs`` holds no definitions.
     """
     definitions = read_definitions(msgs)
-    log = _opened(place_of(path) if isinstance(path, str) else path, Meter(budget), wanted)
+    log = _opened(place_of(path) if isinstance(path, str) else path, Meter(limits), wanted)
     if log.messages is not None:
         log.messages.definitions = definitions
     return log
@@ -97,27 +100,29 @@ def _opened(path: LogPlace, meter: Meter, wanted: Wanted) -> DriveLog:
     except PdhefError:
         raise
     except Exception as error:
-        raise LogError(expected=what_is_a_log(), got=told(error)[1], where=str(path), remedy=_REMEDY) from error
+        raise LogError(
+            expected=what_is_a_log(), got=describe_damage(error)[1], where=str(path), remedy=_REMEDY
+        ) from error
     if isinstance(opened, DriveLog):
         return opened
     try:
-        record = slim_record(opened)
+        record = reduced_record(opened)
     except BaseException:
         opened.close()
         raise
     if record is not None:
-        return SlimLog(path, opened, record)
+        return ReducedLog(path, opened, record)
     return ColumnarLog(path, _KINDS[opened.form], [opened], distro=opened.distro)
 
 
-def log_metadata(path: LogPlace, budget: Budget = DEFAULT_BUDGET) -> dict[str, str]:
+def log_metadata(path: LogPlace, limits: ResourceLimits = DEFAULT_LIMITS) -> dict[str, str]:
     """Return what a log says of itself: MCAP metadata records by ``key`` and ``record.key``, rosbag2's ``custom_data``.
 
     Raises
     ------
     LogError : as for :func:`open_log`.
     """
-    with closing(open_log(path, budget, wanted=Wanted(frozenset()))) as log:
+    with closing(open_log(path, limits, wanted=Wanted(frozenset()))) as log:
         return log.metadata()
 
 
@@ -213,11 +218,11 @@ def _open_folder(path: Path, meter: Meter) -> DriveLog:
     return ColumnarLog(path, _FOLDER_KINDS[opened.form], [opened], distro=opened.distro)
 
 
-def _read_metadata(path: Path, budget: Budget) -> Mapping[str, Any]:
+def _read_metadata(path: Path, limits: ResourceLimits) -> Mapping[str, Any]:
     from ruamel.yaml import YAML
 
     file = path / ROSBAG2_METADATA
-    budget.check("metadata_bytes", file.stat().st_size, str(file))
+    limits.check("metadata_bytes", file.stat().st_size, str(file))
     try:
         document = YAML(typ="safe").load(read_text(file))
         information = document["rosbag2_bagfile_information"]
@@ -238,7 +243,7 @@ def _read_metadata(path: Path, budget: Budget) -> Mapping[str, Any]:
 
 
 def _open_rosbag2_folder(path: Path, meter: Meter) -> ColumnarLog:
-    information = _read_metadata(path, meter.budget)
+    information = _read_metadata(path, meter.limits)
     per_message = _text(information.get("compression_mode")).lower() == "message"
     encodings = _declared_encodings(information)
     containers: list[Container] = []
@@ -261,7 +266,7 @@ def _open_rosbag2_folder(path: Path, meter: Meter) -> ColumnarLog:
                 lost.append(Loss("bad-file", f"expected {error.expected}, got {error.got}", str(file)))
                 continue
             except Exception as error:  # noqa: BLE001 (one file of several)
-                lost.append(Loss("bad-file", told(error)[1], str(file)))
+                lost.append(Loss("bad-file", describe_damage(error)[1], str(file)))
                 continue
             forms.add(container.form)
             containers.append(_Rosbag2Container(container, per_message, encodings))
@@ -318,7 +323,7 @@ class _Wrapped(Container):
         self.channels, self.spans, self.lost = container.channels, container.spans, container.lost
         self.undeclared = container.undeclared
         self.meter, self.account, self.selective = container.meter, container.account, container.selective
-        self.far, self.by_index = container.far, container.by_index
+        self.is_remote, self.by_index = container.is_remote, container.by_index
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         return self.container.load(span, want)
@@ -335,8 +340,8 @@ class _Wrapped(Container):
     def metadata_records(self) -> Iterator[MetadataRecord]:
         return self.container.metadata_records()
 
-    def expect(self, spans: Iterable[Span]) -> None:
-        self.container.expect(spans)
+    def prefetch(self, spans: Iterable[Span]) -> None:
+        self.container.prefetch(spans)
 
     def close(self) -> None:
         self.container.close()
@@ -375,9 +380,9 @@ class _Rosbag2Container(_Wrapped):
         payloads: list[bytes] = []
         size = 0
         for start, n in zip(block.offset.tolist(), block.length.tolist(), strict=True):
-            payloads.append(decompress_message(block.buffer[start : start + n], self.meter.budget))
+            payloads.append(decompress_message(block.buffer[start : start + n], self.meter.limits))
             size += len(payloads[-1])
-            self.meter.budget.check("chunk_bytes", size, "compressed messages")
+            self.meter.limits.check("chunk_bytes", size, "compressed messages")
         length = np.array([len(p) for p in payloads], dtype=np.int64)
         offset = np.cumsum(length) - length
         return replace(block, buffer=b"".join(payloads), offset=offset, length=length)

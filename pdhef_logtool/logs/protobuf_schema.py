@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
-from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
 from pdhef_logtool.logs.message_schema import (
     Array,
     MessageSchema,
@@ -24,6 +23,7 @@ from pdhef_logtool.logs.message_schema import (
     Unfolding,
     parsing,
 )
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 
 #: Protobuf nests by reference, so that a small file can describe an endless tree.
 _MAX_DEPTH = 16
@@ -31,7 +31,7 @@ _WELL_KNOWN = "google/protobuf/"
 
 
 @lru_cache(maxsize=256)
-def protobuf_schema(type_name: str, data: bytes, budget: Budget = DEFAULT_BUDGET) -> MessageSchema:
+def protobuf_schema(type_name: str, data: bytes, limits: ResourceLimits = DEFAULT_LIMITS) -> MessageSchema:
     """Parse a serialized ``FileDescriptorSet``.
 
     Parameters
@@ -47,11 +47,11 @@ def protobuf_schema(type_name: str, data: bytes, budget: Budget = DEFAULT_BUDGET
 
     what = f"the descriptors of {type_name}"
     with parsing(what):
-        budget.check("schema_bytes", len(data), what)
+        limits.check("schema_bytes", len(data), what)
         files = descriptor_pb2.FileDescriptorSet.FromString(data)
         pool = descriptor_pool.DescriptorPool()
         by_name = {file.name: file for file in files.file}
-        unfolding = Unfolding(budget, what)
+        unfolding = Unfolding(limits, what)
         unfolding.enter(len(by_name), 0)
         for name in _in_order(by_name):
             pool.AddSerializedFile(by_name[name].SerializeToString())
@@ -61,7 +61,7 @@ def protobuf_schema(type_name: str, data: bytes, budget: Budget = DEFAULT_BUDGET
             raise SchemaError(f"the descriptors hold no message {type_name}") from error
         root = _message_node(descriptor, (), unfolding)
         message_class = message_factory.GetMessageClass(descriptor)
-    return MessageSchema(type_name, "protobuf", root, None, message_class, budget)
+    return MessageSchema(type_name, "protobuf", root, None, message_class, limits)
 
 
 def _in_order(files: dict[str, Any]) -> list[str]:

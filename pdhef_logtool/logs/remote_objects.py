@@ -124,7 +124,7 @@ class RemoteObject(ABC):
             raise self.error("no such object", "check the URL")
         raise self.error(f"status {status}", "check the URL")
 
-    def hold_against(self, pinned: ObjectState | None, state: ObjectState) -> None:
+    def require_unchanged(self, pinned: ObjectState | None, state: ObjectState) -> None:
         """Raise the error for a changed object if two states are not of one."""
         if pinned is None:
             return
@@ -211,7 +211,7 @@ class HttpObject(RemoteObject):
             return Answer(ObjectState(0, etag, modified), 0, _nothing())
         if response.status == 206 and part is not None and part[1] is not None and part[3] != "*":
             state = ObjectState(int(part[3]), etag, modified)
-            self.hold_against(pinned, state)
+            self.require_unchanged(pinned, state)
             if int(part[1]) != start or int(part[2]) >= end:
                 raise self.error("other bytes than were asked for", "the server does not give ranges: read a copy")
             return Answer(state, start, paced(response.content.iter_chunked(_BLOCK_BYTES)))
@@ -219,7 +219,7 @@ class HttpObject(RemoteObject):
             if head.get("Content-Encoding", "identity") != "identity":
                 raise self.error("an answer that is compressed on its way", "read a copy")
             state = ObjectState(int(head.get("Content-Length", -1)), etag, modified)
-            self.hold_against(pinned, state)
+            self.require_unchanged(pinned, state)
             return Answer(state, 0, paced(response.content.iter_chunked(_BLOCK_BYTES)))
         if response.status == 206:
             raise self.error("a part of unknown size", "the server does not give ranges: read a copy")
@@ -289,7 +289,7 @@ class S3Object(RemoteObject):
         part = _CONTENT_RANGE.fullmatch(str(response.get("ContentRange", "")))
         size = int(part[3]) if part is not None and part[3] != "*" else int(response["ContentLength"])
         state = ObjectState(size, response.get("ETag", ""), "" if modified is None else modified.isoformat())
-        self.hold_against(pinned, state)
+        self.require_unchanged(pinned, state)
         first = int(part[1]) if part is not None and part[1] is not None else 0
         if part is not None and first != start:
             raise self.error("other bytes than were asked for", "the store does not give ranges: read a copy")

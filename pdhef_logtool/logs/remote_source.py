@@ -121,14 +121,14 @@ class RemoteSource(ByteSource):
     UsageError : What it takes to ask is not installed.
     """
 
-    far = True
+    is_remote = True
 
     def __init__(self, place: RemotePlace, head_bytes: int = HEAD_BYTES) -> None:
         self._spool = _acquire(place, head_bytes)
         self._closed = False
         self.place = place
         super().__init__(self._spool.state.size)
-        self.expect([(0, head_bytes)])
+        self.prefetch([(0, head_bytes)])
 
     @property
     def state(self) -> ObjectState:
@@ -150,17 +150,17 @@ class RemoteSource(ByteSource):
         """See :class:`ByteSource`."""
         return self._spool.read(offset, min(offset + size, self.size))
 
-    def at_hand(self, offset: int, size: int) -> int:
+    def held_size(self, offset: int, size: int) -> int:
         """See :class:`ByteSource`."""
         return self._spool.held_to(offset, offset + size) - offset
 
-    def expect(self, extents: Iterable[Extent]) -> None:
+    def prefetch(self, extents: Iterable[Extent]) -> None:
         """See :class:`ByteSource`."""
         self._spool.order([(max(start, 0), min(end, self.size)) for start, end in extents])
 
     def fetch_whole(self) -> None:
         """Have all of it in the scratch file."""
-        self.expect([(0, self.size)])
+        self.prefetch([(0, self.size)])
         self._spool.wait(0, self.size)
 
     def close(self) -> None:

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pdhef_logtool.logs.budget import Meter
 from pdhef_logtool.logs.byte_source import ByteSource
 from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.container import (
@@ -26,9 +25,10 @@ from pdhef_logtool.logs.container import (
     Span,
     SpanDamageError,
     block_from_lists,
-    told,
+    describe_damage,
 )
 from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.logs.resource_limits import Meter
 from pdhef_logtool.logs.type_names import ros2_type_name
 
 _OP_MESSAGE, _OP_BAG_HEADER, _OP_INDEX, _OP_CHUNK, _OP_CHUNK_INFO, _OP_CONNECTION = 2, 3, 4, 5, 6, 7
@@ -98,9 +98,9 @@ class Rosbag1Container(FileContainer):
     def _take(self, fields: Mapping[str, bytes], offset: int, start: int, end: int) -> None:
         """Handle one complete record."""
         op = _op(fields)
-        budget = self.meter.budget
+        limits = self.meter.limits
         if op == _OP_INDEX and self._pending is not None:
-            budget.check("metadata_bytes", end - start, "an index record")
+            limits.check("metadata_bytes", end - start, "an index record")
             self._index_record(self._pending, fields, self.source.read(start, end - start))
             self.account.decode(offset, end)
             return
@@ -112,10 +112,10 @@ class Rosbag1Container(FileContainer):
         if op == _OP_BAG_HEADER:
             self._header = (int.from_bytes(fields["index_pos"], "little"), _U32.unpack(fields["chunk_count"])[0])
         elif op == _OP_CONNECTION:
-            budget.check("metadata_bytes", end - start, "a connection record")
+            limits.check("metadata_bytes", end - start, "a connection record")
             self._add_connection(fields, self.source.read(start, end - start))
         elif op == _OP_CHUNK_INFO:
-            budget.check("metadata_bytes", end - start, "a chunk info record")
+            limits.check("metadata_bytes", end - start, "a chunk info record")
             pairs = np.frombuffer(self.source.read(start, end - start), dtype="<u4")
             counts = Counter(dict(zip(pairs[::2].tolist(), pairs[1::2].tolist(), strict=True)))
             self._infos[int.from_bytes(fields["chunk_pos"], "little")] = counts
@@ -159,7 +159,7 @@ class Rosbag1Container(FileContainer):
         if offset + 8 > size:
             return None
         (header,) = _U32.unpack(source.read(offset, 4))
-        if header == 0 or offset + 8 + header > size or header > self.meter.budget.metadata_bytes:
+        if header == 0 or offset + 8 + header > size or header > self.meter.limits.metadata_bytes:
             return None
         text = source.read(offset + 4, header + 4)
         start = offset + 8 + header
@@ -201,7 +201,7 @@ class Rosbag1Container(FileContainer):
         id_ = _U32.unpack(fields["conn"])[0]
         if id_ in self.channels:
             return
-        self.meter.budget.check("channels", len(self.channels) + 1, f"connection {id_}")
+        self.meter.limits.check("channels", len(self.channels) + 1, f"connection {id_}")
         type_name = inner["type"].decode()
         metadata: dict[str, str] = {
             name: inner[name].decode("utf-8", errors="replace")
@@ -239,7 +239,7 @@ class Rosbag1Container(FileContainer):
         try:
             block = self._decode(chunk, declare=True)
         except Exception as error:  # noqa: BLE001 (the boundary)
-            kind, text = told(error)
+            kind, text = describe_damage(error)
             what = f"an unknown number of messages lost in the chunk at byte {chunk.offset}: {text}"
             self.lose(kind, what, self.last_ns())
             self.account.lose(chunk.offset, chunk.end)
@@ -261,9 +261,9 @@ class Rosbag1Container(FileContainer):
         return self._decode(self._chunks[span.index], declare=False)
 
     def _decode(self, chunk: _Chunk, declare: bool) -> Block:
-        self.meter.budget.check("chunk_bytes", chunk.end - chunk.start, "a chunk")
+        self.meter.limits.check("chunk_bytes", chunk.end - chunk.start, "a chunk")
         stored = self.source.read(chunk.start, chunk.end - chunk.start)
-        content = decompress(chunk.compression or "unnamed", stored, chunk.size, self.meter.budget)
+        content = decompress(chunk.compression or "unnamed", stored, chunk.size, self.meter.limits)
         channels, stamps, offsets, lengths = (array("q") for _ in range(4))
         offset, size = 0, len(content)
         while offset < size:
@@ -275,7 +275,7 @@ class Rosbag1Container(FileContainer):
             try:
                 if op == _OP_MESSAGE:
                     if len(stamps) % _MESSAGES_A_CHECK == 0:
-                        self.meter.budget.check("chunk_messages", len(stamps), "a chunk")
+                        self.meter.limits.check("chunk_messages", len(stamps), "a chunk")
                         self.meter.check()
                     channels.append(_U32.unpack(fields["conn"])[0])
                     stamps.append(_time_ns(fields["time"]))
@@ -287,7 +287,7 @@ class Rosbag1Container(FileContainer):
                     self._add_connection(fields, content[begin:offset])
             except (KeyError, struct.error, ValueError) as error:
                 raise SpanDamageError(f"a record is malformed: {error}") from error
-        self.meter.budget.check_messages(len(stamps), len(stored))
+        self.meter.limits.check_messages(len(stamps), len(stored))
         return block_from_lists(content, channels, stamps, stamps, [0] * len(stamps), offsets, lengths)
 
 

@@ -13,7 +13,6 @@ from urllib.parse import quote
 
 import numpy as np
 
-from pdhef_logtool.logs.budget import BudgetError, Meter
 from pdhef_logtool.logs.byte_source import require_regular
 from pdhef_logtool.logs.container import (
     MAX_TIME_NS,
@@ -23,9 +22,10 @@ from pdhef_logtool.logs.container import (
     Span,
     SpanDamageError,
     block_from_lists,
-    told,
+    describe_damage,
 )
 from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.logs.type_names import ros2_type_name
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.storage.files import scratch_folder
@@ -63,11 +63,11 @@ class SqliteContainer(Container):
         self._pages: list[tuple[int, int]] = []  # first and last row id
         self._ends: list[int] = []  # bytes of the rows up to the end of each page
         self._folder: tempfile.TemporaryDirectory[str] | None = None
-        self._late: BudgetError | None = None
+        self._late: LimitError | None = None
         self._db = self._connect(path)
         try:
             self._db.text_factory = _text
-            self._db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(self.meter.budget.chunk_bytes, 2**31 - 1))
+            self._db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(self.meter.limits.chunk_bytes, 2**31 - 1))
             self._db.set_progress_handler(self._out_of_time, _STEPS_A_CHECK)
             for pragma in ("trusted_schema = OFF", "mmap_size = 0", "cell_size_check = ON"):
                 self._db.execute(f"PRAGMA {pragma}")
@@ -85,7 +85,7 @@ class SqliteContainer(Container):
         """Tell SQLite to stop: a query over a hostile database need not end."""
         try:
             self.meter.check()
-        except BudgetError as error:
+        except LimitError as error:
             self._late = error
             return True
         return False
@@ -122,7 +122,7 @@ class SqliteContainer(Container):
         extra = [c for c in ("offered_qos_profiles", "type_description_hash") if c in topic_columns]
         query = f"SELECT {', '.join(['id', 'name', 'type', 'serialization_format', *extra])} FROM topics ORDER BY id"  # noqa: S608
         for id_, name, type_name, encoding, *rest in self._db.execute(query):
-            self.meter.budget.check("channels", len(self.channels) + 1, f"topic {id_}")
+            self.meter.limits.check("channels", len(self.channels) + 1, f"topic {id_}")
             schema_encoding, text = definitions.get(type_name, ("", ""))
             self.channels[int(id_)] = ChannelRecord(
                 id=int(id_),
@@ -167,7 +167,7 @@ class SqliteContainer(Container):
                 if len(times) >= _PAGE_ROWS or size >= _PAGE_BYTES:
                     close_page()
         except sqlite3.Error as error:
-            what = f"the rows after id {last} cannot be read: {told(self._late or error)[1]}"
+            what = f"the rows after id {last} cannot be read: {describe_damage(self._late or error)[1]}"
             self.lose("over-budget" if self._late else "truncated", what, max(times) + 1 if times else None)
             self.account.lose(total, self.account.size)
             self.account.cut = True

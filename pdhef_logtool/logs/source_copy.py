@@ -167,7 +167,7 @@ def iterate_copy(
     if whole:
         spans = _in_file_order_where_overlapping(spans, unchanged)
     for c, container in enumerate(log.containers):
-        container.expect(span for of, span in spans if of == c)
+        container.prefetch(span for of, span in spans if of == c)
     cursors: list[tuple[int, int, int, int, _Cursor]] = []  # next log time, file, span, row: order of ties
     position = 0
     while position < len(spans) or cursors:

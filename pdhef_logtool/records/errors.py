@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from pdhef_logtool.records.printable import shown
+from pdhef_logtool.records.printable import printable
 
 EXIT_OK = 0
 EXIT_FAILURE = 1
@@ -41,7 +41,7 @@ class PdhefError(Exception):
     def __str__(self) -> str:
         """One line, without a traceback's noise and fit for a terminal, whatever its parts quote."""
         where, expected, got, remedy = (
-            shown(" ".join(str(part).split())) for part in (self.where, self.expected, self.got, self.remedy)
+            printable(" ".join(str(part).split())) for part in (self.where, self.expected, self.got, self.remedy)
         )
         return f"{where}: expected {expected}, got {got}" + (f"; {remedy}" if remedy else "")
 

@@ -18,7 +18,7 @@ NAME = r"[0-9a-f]{8}-\d+-\d+"
 worker_number = 0
 
 
-def own_name() -> str:
+def process_name() -> str:
     """Return host, process id and start time of this process as one word: no two processes ever share it."""
     return f"{_host()}-{os.getpid()}-{_start(os.getpid()) or 0}"
 

@@ -354,7 +354,7 @@ def read_truth(
     samples: dict[str, int] = {}
     counts: dict[tuple[Role, str], Counter[str]] = {}
     done_ns: int | None = None
-    ends = list(windows(plan.start_ns, plan.end_ns, round(window_s * 1e9), log.occupied))
+    ends = list(windows(plan.start_ns, plan.end_ns, round(window_s * 1e9), log.recording_span))
     for a, b in ends:
         if plan.truth is None:
             break

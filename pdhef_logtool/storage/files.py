@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import IO, Literal, Self
 
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.processes import NAME, is_alive, own_name
+from pdhef_logtool.records.processes import NAME, is_alive, process_name
 
 WINDOWS = os.name == "nt"
 _PARTIAL = re.compile(rf"\..+\.({NAME})\.partial")
@@ -56,7 +56,7 @@ class PendingFile:
     def __init__(self, target: Path) -> None:
         self.target = target
         name = target.name if len(os.fsencode(target.name)) <= _LONGEST_NAME else _digest(target.name)
-        self.path = target.with_name(f".{name}.{own_name()}.partial")
+        self.path = target.with_name(f".{name}.{process_name()}.partial")
         with writing(target):
             target.parent.mkdir(parents=True, exist_ok=True)
             self._remove()
@@ -171,7 +171,7 @@ def scratch_folder() -> tempfile.TemporaryDirectory[str]:
                 match = _SCRATCH.fullmatch(path.name)
                 if match and is_alive(match[1]) is False and _is_ours(path):
                     shutil.rmtree(path, ignore_errors=True)
-    return tempfile.TemporaryDirectory(prefix=f"pdhef-{own_name()}-")
+    return tempfile.TemporaryDirectory(prefix=f"pdhef-{process_name()}-")
 
 
 def _is_ours(path: Path) -> bool:

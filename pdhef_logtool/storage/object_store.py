@@ -20,7 +20,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from pdhef_logtool.records.errors import OutputError, UsageError
-from pdhef_logtool.records.processes import is_alive, own_name
+from pdhef_logtool.records.processes import is_alive, process_name
 from pdhef_logtool.storage.files import scratch_folder
 from pdhef_logtool.storage.outputs import LOCK_FILE
 
@@ -105,7 +105,7 @@ class ObjectFolder:
             if self._is_whole:
                 store.put_file(str(path), f"{root}/{name}")
                 return
-            partial = f"{root}/{name}.{own_name()}.partial"
+            partial = f"{root}/{name}.{process_name()}.partial"
             store.makedirs(partial.rpartition("/")[0], exist_ok=True)
             store.put_file(str(path), partial)
             store.mv(partial, f"{root}/{name}")
@@ -133,7 +133,7 @@ class ObjectFolder:
                 try:
                     if not self._is_whole:
                         store.makedirs(root, exist_ok=True)
-                    store.pipe_file(f"{root}/{LOCK_FILE}", own_name().encode(), mode="create")
+                    store.pipe_file(f"{root}/{LOCK_FILE}", process_name().encode(), mode="create")
                 except Exception:
                     holder = self._holder()
                     if holder is None:
@@ -150,14 +150,14 @@ class ObjectFolder:
         with self._asking():
             store, root = self._store()
             holder = self._holder()
-            if holder != own_name():
+            if holder != process_name():
                 raise self._held(holder or "")
-            store.pipe_file(f"{root}/{LOCK_FILE}", own_name().encode())
+            store.pipe_file(f"{root}/{LOCK_FILE}", process_name().encode())
 
     def release(self) -> None:
         """Let go of the folder; harmless when it is not held."""
         with suppress(OutputError), self._asking():
-            if self._holder() == own_name():
+            if self._holder() == process_name():
                 self.remove([LOCK_FILE])
 
     def _holder(self) -> str | None:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Self
 
 from pdhef_logtool.records.errors import OutputError, UsageError
-from pdhef_logtool.records.processes import is_alive, own_name
+from pdhef_logtool.records.processes import is_alive, process_name
 from pdhef_logtool.storage.files import OF_WRITING, WINDOWS, cannot_write, open_new, sweep_files, sync, writing
 
 #: The hidden folder beside outputs in which changes are prepared: ``.pdhef/NAME/{new,old,scratch}``.
@@ -270,9 +270,9 @@ class FolderLock:
 
     def _try_file(self) -> bool:
         """Take the lock file, which appears with its content; one of a dead process is removed first."""
-        file, prepared = self._folder / LOCK_FILE, self._folder / f"{LOCK_FILE}.{own_name()}"
+        file, prepared = self._folder / LOCK_FILE, self._folder / f"{LOCK_FILE}.{process_name()}"
         if (holder := _holder(file)) is not None and is_alive(holder) is False:
-            stale = self._folder / f"{LOCK_FILE}.{own_name()}.stale"
+            stale = self._folder / f"{LOCK_FILE}.{process_name()}.stale"
             with contextlib.suppress(FileNotFoundError):
                 file.rename(stale)
                 if _holder(stale) != holder:  # another took it in the meantime: it is theirs
@@ -281,7 +281,7 @@ class FolderLock:
                 stale.unlink()
         try:
             with open_new(prepared) as made:
-                made.write(own_name().encode())
+                made.write(process_name().encode())
             os.link(prepared, file)
         except FileExistsError:
             return False

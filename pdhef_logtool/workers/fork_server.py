@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.records import processes
-from pdhef_logtool.records.printable import shown
+from pdhef_logtool.records.printable import printable
 
 #: One thread a worker: what libraries read when they are loaded.
 ONE_THREAD = dict.fromkeys(
@@ -123,7 +123,7 @@ def _prepare(preload: Sequence[str]) -> tuple[str, bool]:
             if function:
                 warm &= getattr(loaded, function)() is not False
         except Exception as error:  # noqa: BLE001 (told by the parent, whatever it is)
-            return f"{name}: {told_error(error)}", warm
+            return f"{name}: {describe_error(error)}", warm
     gc.collect()
     gc.freeze()  # so that collecting in a worker does not copy what all share
     return "", warm
@@ -190,11 +190,11 @@ def _answer(channel: socket.socket, work: bytes, item: bytes) -> tuple[str, ...]
     except _Gone:
         raise
     except BaseException as error:  # noqa: BLE001 (a worker outlives whatever an item raises)
-        return "failed", f"raised {told_error(error)}"
+        return "failed", f"raised {describe_error(error)}"
     try:
         return "done", pickle.dumps(result)
     except Exception as error:  # noqa: BLE001 (whatever a pickler may raise)
-        return "failed", f"its result cannot be sent: {told_error(error)}"
+        return "failed", f"its result cannot be sent: {describe_error(error)}"
 
 
 @cache
@@ -216,13 +216,13 @@ def _bound(more_bytes: int | None) -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (bound, bound))
 
 
-def told_error(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """Return an exception as one line."""
     try:
         text = " ".join(str(error).split())
     except Exception:  # noqa: BLE001 (an exception that cannot even be told)
         text = ""
-    return shown(f"{type(error).__name__}: {text}", _LONGEST) if text else type(error).__name__
+    return printable(f"{type(error).__name__}: {text}", _LONGEST) if text else type(error).__name__
 
 
 def _exactly(channel: socket.socket, count: int) -> bytes:

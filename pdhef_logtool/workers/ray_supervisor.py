@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.processes import own_name
-from pdhef_logtool.workers.fork_server import told_error
+from pdhef_logtool.records.processes import process_name
+from pdhef_logtool.workers.fork_server import describe_error
 from pdhef_logtool.workers.supervisor import Crew, Ended, Failure, Limits, Tell
 
 T = TypeVar("T")
@@ -65,7 +65,7 @@ def supervise_on_ray(
     ------
     UsageError : Ray is not installed, or there is no cluster.
     """
-    orders = _Orders(f"{own_name()}-{next(_RUNS)}", work, limits, tuple(preload))
+    orders = _Orders(f"{process_name()}-{next(_RUNS)}", work, limits, tuple(preload))
     with _connected(address) as ray:
         task = ray.remote(num_cpus=1, max_retries=MAX_RETRIES, retry_exceptions=False)(_end_on_node)
         waiting = enumerate(items)
@@ -118,7 +118,7 @@ def _connected(address: str) -> Iterator[Any]:
     except (ConnectionError, ValueError, RuntimeError, OSError) as error:
         raise UsageError(
             expected="the address of a Ray cluster",
-            got=f"{address} ({told_error(error).partition('. ')[0]})",
+            got=f"{address} ({describe_error(error).partition('. ')[0]})",
             where="--ray",
             remedy="ray status tells whether it is up",
         ) from None
@@ -150,7 +150,7 @@ def _end_on_node(orders: _Orders, item: Any) -> tuple[Any, Failure | None]:
         for ended in _crew(orders).each([item]):
             return ended.result, ended.failure
     except Exception as error:  # noqa: BLE001 (what a task raises, Ray would take for its own)
-        return None, Failure(f"raised {told_error(error)}")
+        return None, Failure(f"raised {describe_error(error)}")
     raise AssertionError("an item ends")
 
 

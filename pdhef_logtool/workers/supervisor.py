@@ -27,9 +27,9 @@ from typing import Generic, Self, TypeVar
 import psutil
 
 from pdhef_logtool.records.errors import UsageError, WorkerError
-from pdhef_logtool.records.printable import shown
+from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.processes import wait_for_end
-from pdhef_logtool.workers.fork_server import FORK, ONE_THREAD, STATUS, ask, receive, send, split, told_error
+from pdhef_logtool.workers.fork_server import FORK, ONE_THREAD, STATUS, ask, describe_error, receive, send, split
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -141,7 +141,7 @@ def _in_this_process(
         try:
             result = work(item, tell)
         except Exception as error:  # noqa: BLE001 (one item never stops the others)
-            yield Ended(number, item, failure=Failure(f"raised {told_error(error)}", last))
+            yield Ended(number, item, failure=Failure(f"raised {describe_error(error)}", last))
         else:
             yield Ended(number, item, result)
             del result
@@ -425,7 +425,7 @@ class Crew(Generic[T, R]):
             packed = pickle.dumps(attempt.item)
         except Exception as error:  # noqa: BLE001 (whatever a pickler may raise)
             worker.attempt = None
-            yield attempt, _failed(attempt, f"it cannot be sent to a worker: {told_error(error)}")
+            yield attempt, _failed(attempt, f"it cannot be sent to a worker: {describe_error(error)}")
             return
         worker.silent_s = 0.0
         with contextlib.suppress(OSError):  # a worker that is dead or does not listen is found by the watch
@@ -495,11 +495,13 @@ class Crew(Generic[T, R]):
 
 
 def _failed(attempt: _Attempt[T], reason: str) -> Ended[T, R]:
-    return Ended(attempt.number, attempt.item, failure=Failure(shown(reason), shown(attempt.last), attempt.tries))
+    return Ended(
+        attempt.number, attempt.item, failure=Failure(printable(reason), printable(attempt.last), attempt.tries)
+    )
 
 
 def _opened(attempt: _Attempt[T], answer: bytes) -> Ended[T, R]:
     try:
         return Ended(attempt.number, attempt.item, pickle.loads(answer))  # noqa: S301 (from our own process)
     except Exception as error:  # noqa: BLE001 (whatever a pickle may raise)
-        return _failed(attempt, f"its result cannot be read: {told_error(error)}")
+        return _failed(attempt, f"its result cannot be read: {describe_error(error)}")

@@ -28,7 +28,7 @@ from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 #: A longer silence ends a stretch. Shorter ones cost no window of their own.
 SILENCE_NS = 600_000_000_000
 #: A stretch of no more messages than this is stray: no drive, and nothing that an estimate could be made of.
-STRAY_MESSAGES = 3
+OUTLIER_MESSAGES = 3
 #: Nobody drives on in the same log after a longer pause; clocks that are set jump by months and years.
 EPOCH_NS = 86_400_000_000_000
 #: Recorders with several threads write up to a second out of order; a clock that is set back falls further...
@@ -63,7 +63,7 @@ class Cut:
 
 
 @dataclass(frozen=True, slots=True)
-class OccupiedTime:
+class RecordingSpan:
     """The log times that count.
 
     Attributes
@@ -118,7 +118,7 @@ def find_epochs(
     size = np.bincount(stretch, weights=count[order])
     first = np.flatnonzero(np.diff(stretch, prepend=-1))
     begin, end = start_ns[order][first], np.maximum.reduceat(end_ns[order], first)
-    solid = np.flatnonzero(size > STRAY_MESSAGES)
+    solid = np.flatnonzero(size > OUTLIER_MESSAGES)
     if solid.size == 0:  # a handful of messages: the largest stretch is the log
         solid = np.array([int(np.argmax(size))])
     epoch = _groups(begin[solid], end[solid], EPOCH_NS)
@@ -160,7 +160,7 @@ def recorded_twice(times_ns: IntArray) -> list[tuple[int, int, int]]:
     return repeated
 
 
-def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> OccupiedTime:
+def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> RecordingSpan:
     """Find the times of a log; only the stamps of spans that are torn or out of order are looked at.
 
     Parameters
@@ -185,15 +185,15 @@ def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> Occ
     if twice:
         all_of_it = np.concatenate(twice)
         losses.append(_loss(TIME_JUMP, where, all_of_it, all_of_it + 1, all_of_it.size, total))
-    return OccupiedTime(tuple(intervals), tuple(cuts), left_out, tuple(losses))
+    return RecordingSpan(tuple(intervals), tuple(cuts), left_out, tuple(losses))
 
 
-def survey_stamps(stamps_ns: Mapping[str, IntArray], where: str) -> OccupiedTime:
+def survey_stamps(stamps_ns: Mapping[str, IntArray], where: str) -> RecordingSpan:
     """Find the times of a log from all log times [N] of each topic; ``where`` as for :func:`survey`."""
     none = Span(0, 0, 0, {})
     look = [_Looked(0, none, {0: t}, (np.zeros(len(s), np.int64), s)) for t, s in stamps_ns.items() if len(s)]
     intervals, left_out, losses, _ = _kept_epoch(look, where)
-    return OccupiedTime(tuple(intervals), left_out=left_out, losses=tuple(losses))
+    return RecordingSpan(tuple(intervals), left_out=left_out, losses=tuple(losses))
 
 
 def _kept_epoch(

@@ -12,7 +12,7 @@ from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import Block, ChannelRecord
 from pdhef_logtool.logs.mcap_log import MESSAGE_HEAD
 from pdhef_logtool.logs.message_schema import MessageSchema, parsing
-from pdhef_logtool.logs.slim_log import RECORD_ENTRY, RECORD_NAME, SlimRecord
+from pdhef_logtool.logs.reduced_log import RECORD_ENTRY, RECORD_NAME, ReducedRecord
 from pdhef_logtool.logs.writer import CHUNK_BYTES, McapLogWriter, scatter
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import IntArray
@@ -21,11 +21,11 @@ from pdhef_logtool.records.signals import IntArray
 _BEFORE_DATA = 22
 
 
-def write_record(writer: McapLogWriter, record: SlimRecord) -> None:
+def write_record(writer: McapLogWriter, record: ReducedRecord) -> None:
     """Write the record that makes a file a slim log."""
     from pydantic import TypeAdapter
 
-    writer.metadata(RECORD_NAME, {RECORD_ENTRY: TypeAdapter(SlimRecord).dump_json(record).decode()})
+    writer.metadata(RECORD_NAME, {RECORD_ENTRY: TypeAdapter(ReducedRecord).dump_json(record).decode()})
 
 
 def copy_topics(writer: McapLogWriter, log: ColumnarLog, topics: Collection[str]) -> None:
@@ -57,7 +57,7 @@ def copy_topics(writer: McapLogWriter, log: ColumnarLog, topics: Collection[str]
                 for id_ in of_topic:
                     rows = block.rows.get(id_, np.empty(0, np.int64))
                     times = block.log_time_ns[rows]
-                    left_out = log.occupied.recorded_before(topic, c, span, times)
+                    left_out = log.recording_span.recorded_before(topic, c, span, times)
                     chunk.add(block, rows[~left_out & (times >= 0)], ids[id_])
                 # Which of two channels comes first at equal times hangs on what is read together.
                 if chunk.size >= CHUNK_BYTES or len(of_topic) > 1:

@@ -22,7 +22,7 @@ from pdhef_logtool.logs.container import MAX_TIME_NS, MCAP_MAGIC, Container
 from pdhef_logtool.logs.drive_log import TopicInfo
 from pdhef_logtool.logs.mcap_index import FOOTER
 from pdhef_logtool.logs.mcap_log import McapContainer
-from pdhef_logtool.logs.occupied_time import OccupiedTime
+from pdhef_logtool.logs.recording_span import RecordingSpan
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
@@ -43,14 +43,14 @@ _REMEDY = "delete it; pdhef run LOG --cache DIR writes it again"
 
 
 @dataclass(frozen=True, slots=True)
-class SlimRecord:
+class ReducedRecord:
     """What a slim log knows of its source beside the messages.
 
     Attributes
     ----------
     file, kind, identity : the source's name, container, and what it is known by. tool : version that made this.
     distro : ROS distribution of types that the source does not define.
-    intervals, left_out : of its :class:`OccupiedTime`. topics : all of them with their messages, kept or not.
+    intervals, left_out : of its :class:`RecordingSpan`. topics : all of them with their messages, kept or not.
     losses, byte_ledgers : complete, as a run of the whole source tells them.
     metadata : what the source says of itself. mapped : the mapping as the floor above has written it.
     signals_sha256, truth_sha256 : hashes of the mapped channels.
@@ -73,7 +73,7 @@ class SlimRecord:
     truth_sha256: str | None
 
 
-class SlimLog(ColumnarLog):
+class ReducedLog(ColumnarLog):
     """Reads like the log that it stands for; a topic that was not kept is there with its messages, but without fields.
 
     Attributes
@@ -81,10 +81,10 @@ class SlimLog(ColumnarLog):
     record : what is known of the source.
     """
 
-    def __init__(self, path: LogPlace, container: Container, record: SlimRecord) -> None:
+    def __init__(self, path: LogPlace, container: Container, record: ReducedRecord) -> None:
         super().__init__(path, record.kind, [container], distro=record.distro)
         self.record = record
-        self._occupied = OccupiedTime(record.intervals, left_out=record.left_out)
+        self._recording_span = RecordingSpan(record.intervals, left_out=record.left_out)
         self._extracted: tempfile.TemporaryDirectory[str] | None = None
 
     @property
@@ -93,7 +93,7 @@ class SlimLog(ColumnarLog):
         return None
 
     @property
-    def slim(self) -> SlimLog:
+    def reduced(self) -> ReducedLog:
         """The log itself."""
         return self
 
@@ -134,7 +134,7 @@ class SlimLog(ColumnarLog):
             self._extracted.cleanup()
 
 
-def slim_record(container: Container) -> SlimRecord | None:
+def reduced_record(container: Container) -> ReducedRecord | None:
     """Return the record of a slim log; None for any other file.
 
     Raises
@@ -149,7 +149,7 @@ def slim_record(container: Container) -> SlimRecord | None:
     from pydantic import TypeAdapter, ValidationError
 
     try:
-        record = TypeAdapter(SlimRecord).validate_json(text)
+        record = TypeAdapter(ReducedRecord).validate_json(text)
     except ValidationError as error:
         got = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()[:3])
         raise LogError(expected=_EXPECTED, got=got, where=str(container.path), remedy=_REMEDY) from error

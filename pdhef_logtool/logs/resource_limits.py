@@ -19,12 +19,12 @@ _MIB = 1 << 20
 _FEW_MESSAGES = 1 << 16
 
 
-class BudgetError(LogError):
+class LimitError(LogError):
     """Input claims more than it may cost; inside a log it becomes a loss at its place."""
 
 
 @dataclass(frozen=True, slots=True)
-class Budget:
+class ResourceLimits:
     """Limits for one log.
 
     Attributes
@@ -53,16 +53,16 @@ class Budget:
     seconds: float = 5.0
     seconds_per_mib: float = 20.0
 
-    def times(self, factor: float) -> Budget:
+    def times(self, factor: float) -> ResourceLimits:
         """Return the budget with every limit raised by a factor."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Budget(**{name: type(value)(value * factor) for name, value in values.items()})
+        return ResourceLimits(**{name: type(value)(value * factor) for name, value in values.items()})
 
     def check(self, limit: str, amount: float, what: str) -> None:
-        """Raise :class:`BudgetError` if an amount is above the limit of this name; ``what`` claims it."""
+        """Raise :class:`LimitError` if an amount is above the limit of this name; ``what`` claims it."""
         allowed = getattr(self, limit)
         if amount > allowed:
-            raise BudgetError(
+            raise LimitError(
                 expected=f"at most {allowed:.10g} {limit.replace('_', ' ')}",
                 got=f"{amount:.10g}",
                 where=what,
@@ -70,19 +70,19 @@ class Budget:
             )
 
     def check_unpacked(self, size: int, stored: int, what: str) -> None:
-        """Raise :class:`BudgetError` if ``stored`` bytes may not become, or claim to become, ``size`` bytes."""
+        """Raise :class:`LimitError` if ``stored`` bytes may not become, or claim to become, ``size`` bytes."""
         self.check("chunk_bytes", size, what)
         if size > _MIB:
             self.check("chunk_ratio", size / max(stored, 1), what)
 
     def check_messages(self, count: int, stored: int) -> None:
-        """Raise :class:`BudgetError` if ``stored`` bytes may not hold so many messages."""
+        """Raise :class:`LimitError` if ``stored`` bytes may not hold so many messages."""
         self.check("chunk_messages", count, "a chunk")
         if count > _FEW_MESSAGES:
             self.check("messages_per_byte", count / max(stored, 1), "a chunk")
 
 
-DEFAULT_BUDGET = Budget()
+DEFAULT_LIMITS = ResourceLimits()
 
 
 class Meter:
@@ -91,8 +91,8 @@ class Meter:
     What is read again counts again on both sides, so that a sound log can be read for ever.
     """
 
-    def __init__(self, budget: Budget = DEFAULT_BUDGET) -> None:
-        self.budget = budget
+    def __init__(self, limits: ResourceLimits = DEFAULT_LIMITS) -> None:
+        self.limits = limits
         self._seconds = 0.0
         self._bytes = 0
         self._since: float | None = None
@@ -100,13 +100,13 @@ class Meter:
     @property
     def allowed_s(self) -> float:
         """Seconds that may have been spent by now."""
-        return self.budget.seconds + self.budget.seconds_per_mib * self._bytes / _MIB
+        return self.limits.seconds + self.limits.seconds_per_mib * self._bytes / _MIB
 
     def check(self) -> None:
-        """Raise :class:`BudgetError` if reading has taken too long."""
+        """Raise :class:`LimitError` if reading has taken too long."""
         spent = self._seconds + (0.0 if self._since is None else time.thread_time() - self._since)
         if spent > self.allowed_s:
-            raise BudgetError(
+            raise LimitError(
                 expected="a log that is read in time",
                 got=f"reading took longer than {self.allowed_s:.3g} s",
                 where=f"{self._bytes} bytes read",
