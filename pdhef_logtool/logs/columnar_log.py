@@ -13,6 +13,7 @@ import numpy as np
 
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.byte_source import SourceError
+from pdhef_logtool.logs.compression import decompress_messages
 from pdhef_logtool.logs.container import UNVERIFIED, Block, ChannelRecord, Container, Span, describe_damage
 from pdhef_logtool.logs.decoding import (
     ChannelDecoder,
@@ -180,7 +181,10 @@ class ColumnarLog(DriveLog):
         entries: dict[str, str] = {}
         for container in self.containers:
             for record in container.metadata_records():
-                entries |= {**record.values, **{f"{record.name}.{key}": value for key, value in record.values.items()}}
+                entries |= {
+                    **record.metadata,
+                    **{f"{record.name}.{key}": value for key, value in record.metadata.items()},
+                }
         return entries | dict(self._custom)
 
     @property
@@ -213,7 +217,7 @@ class ColumnarLog(DriveLog):
                     parts[container.channels[id_].topic].append(times[channel == id_])
         return {topic: np.sort(np.concatenate(part)) for topic, part in parts.items() if part}
 
-    def topics_in_same_chunks(self, topics: Collection[str]) -> frozenset[str]:
+    def covered_topics(self, topics: Collection[str]) -> frozenset[str]:
         """Return the topics whose messages all lie in spans that hold one of these: they cost no further read."""
         held, apart = set(topics), set[str]()
         for container in self.containers:
@@ -276,9 +280,8 @@ class ColumnarLog(DriveLog):
                     block = self.load(c, span, frozenset({channel.id})) if len(messages) < most else None
                     if block is None:
                         continue
-                    for row in block.rows.get(channel.id, np.empty(0, np.int64))[: most - len(messages)]:
-                        start, n = int(block.offset[row]), int(block.length[row])
-                        messages.append(decode(bytes(block.buffer[start : start + n])))
+                    rows = block.rows.get(channel.id, np.empty(0, np.int64))
+                    messages += [decode(block.message(row)) for row in rows[: most - len(messages)]]
         return [message for message in messages if message is not None]
 
     def read(
@@ -341,6 +344,8 @@ class ColumnarLog(DriveLog):
         try:
             with container.meter.running(extent[1] - extent[0]):
                 block = container.load(span, want)
+                if container.zstd_messages:
+                    block = decompress_messages(block, container.meter.limits)
         except Exception as error:  # noqa: BLE001
             kind, text = describe_damage(error)
             count = sum(span.counts.values()) or None
@@ -427,13 +432,8 @@ class ColumnarLog(DriveLog):
         for span in self.containers[c].spans:
             if channel.id in span.counts:
                 block = self.load(c, span)
-                if block is None:
-                    continue
-                rows = np.flatnonzero(block.channel == channel.id)
-                if rows.size:
-                    row = int(rows[0])
-                    start, n = int(block.offset[row]), int(block.length[row])
-                    return bytes(block.buffer[start : start + n])
+                if block is not None and channel.id in block.rows:
+                    return block.message(block.rows[channel.id][0])
         return None
 
     def _plan(self, topic: str, paths: tuple[str, ...]) -> _Plan:

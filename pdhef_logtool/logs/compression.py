@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import bz2
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from threading import local
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from pdhef_logtool.logs.container import SpanDamageError
+import numpy as np
+
+from pdhef_logtool.logs.container import Block, SpanDamageError
 from pdhef_logtool.logs.resource_limits import LimitError, Meter, ResourceLimits
 
 if TYPE_CHECKING:
@@ -50,6 +53,18 @@ def decompress(compression: str, stored: _Bytes, size: int, limits: ResourceLimi
         more = "more" if len(content) > size else f"{len(content)}"
         raise SpanDamageError(f"decompressed to {more} bytes instead of {size}")
     return content
+
+
+def decompress_messages(block: Block, limits: ResourceLimits) -> Block:
+    """Decompress the messages of a block, each a zstd frame; errors as of :func:`decompress`."""
+    payloads: list[bytes] = []
+    size = 0
+    for start, n in zip(block.offset.tolist(), block.length.tolist(), strict=True):
+        payloads.append(decompress_message(block.buffer[start : start + n], limits))
+        size += len(payloads[-1])
+        limits.check("chunk_bytes", size, "compressed messages")
+    length = np.array([len(p) for p in payloads], dtype=np.int64)
+    return replace(block, buffer=b"".join(payloads), offset=np.cumsum(length) - length, length=length)
 
 
 def decompress_message(stored: _Bytes, limits: ResourceLimits) -> bytes:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
+from mcap.records import Metadata
 
 from pdhef_logtool.logs.byte_account import ByteAccount
 from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, SourceError
@@ -95,6 +97,10 @@ class Block:
         """Return the number of messages."""
         return int(self.channel.shape[0])
 
+    def message(self, row: int) -> bytes:
+        """Return the payload of a message."""
+        return bytes(self.buffer[self.offset[row] : self.offset[row] + self.length[row]])
+
     @property
     def nbytes(self) -> int:
         """Memory that it takes."""
@@ -166,14 +172,6 @@ class Attachment:
 
 
 @dataclass(frozen=True, slots=True)
-class MetadataRecord:
-    """A named record of key-value pairs inside a log."""
-
-    name: str
-    values: Mapping[str, str]
-
-
-@dataclass(frozen=True, slots=True)
 class Wanted:
     """Of which topics messages will be read, and of which log times [start, end); None: of all.
 
@@ -226,6 +224,7 @@ class Container(ABC):
     selective : whether a load can leave out the payloads of unwanted channels.
     profile : MCAP profile that a copy should carry. distro : ROS distribution that the file names; empty if none.
     remedy : what to do about a file that is none of this format.
+    zstd_messages : whether each message is a zstd frame. whole_chunks : whether chunks can be copied as they are.
     far : whether reading costs a journey. by_index : whether a sound index names all messages.
     """
 
@@ -236,6 +235,8 @@ class Container(ABC):
     profile = "ros2"
     distro = ""
     remedy = ""
+    zstd_messages = False
+    whole_chunks = False
 
     def __init__(self, path: LogPlace, size: int, meter: Meter | None = None) -> None:
         self.path = path
@@ -245,6 +246,7 @@ class Container(ABC):
         self.undeclared: dict[int, int] = {}
         self.meter = meter or Meter()
         self.account = ByteAccount(size)
+        self._closing = ExitStack()
         self._losses: dict[str, int] = {}  # how many of a kind
         self._folded: dict[str, int] = {}  # where in ``lost`` those behind the first ones stand
 
@@ -266,11 +268,27 @@ class Container(ABC):
         block = self.load(span)
         return block.channel, block.log_time_ns
 
+    def raw_chunk(self, span: Span, block: Block, kept: frozenset[int]) -> RawChunk | None:
+        """Return the chunk that a block was read from, to be written to another file as it is.
+
+        Parameters
+        ----------
+        span, block : the span, and what :meth:`load` returned, so that the chunk is known to be sound.
+        kept : channels that have the same id and definition in the other file.
+
+        Returns
+        -------
+        The chunk; None if these messages are in none, or if it contains or declares anything that the other file does
+        not.
+        """
+        del span, block, kept
+        return None
+
     def attachments(self) -> Iterator[Attachment]:
         """Read the attachments; a damaged one is among the losses and left out."""
         yield from ()
 
-    def metadata_records(self) -> Iterator[MetadataRecord]:
+    def metadata_records(self) -> Iterator[Metadata]:
         """Read the metadata records; a damaged one is among the losses and left out."""
         yield from ()
 
@@ -278,9 +296,13 @@ class Container(ABC):
         """Take note of spans that will be loaded soon, in this order."""
         del spans
 
-    @abstractmethod
+    def on_close(self, callback: Callable[[], None]) -> None:
+        """Call something when the container is closed; the last added comes first."""
+        self._closing.callback(callback)
+
     def close(self) -> None:
         """Release the file."""
+        self._closing.close()
 
     def no_log(self, expected: str, got: str) -> LogError:
         """Return the error for a file that cannot be opened."""
@@ -340,6 +362,7 @@ class FileContainer(Container):
         self.source = path if isinstance(path, ByteSource) else LocalFile(path, shown_path)
         shown = shown_path or (Path() if isinstance(path, ByteSource) else path)
         super().__init__(shown, self.source.size, meter)
+        self.on_close(self.source.close)
         self.position = len(self.magic)  # where the walk is
         try:
             if self.source.size < self.position or self.source.read(0, self.position) != self.magic:
@@ -396,10 +419,6 @@ class FileContainer(Container):
     @abstractmethod
     def _finish(self) -> None:
         """Close what the walk left open, and check what only the whole file tells."""
-
-    def close(self) -> None:
-        """Release the file."""
-        self.source.close()
 
 
 def block_from_lists(buffer: bytes | memoryview, *columns: Sequence[int]) -> Block:

@@ -139,8 +139,7 @@ class ChannelDecoder:
             if tried == len(self._layouts):
                 if tried >= _LAYOUTS_PER_CHANNEL:
                     break
-                start, n = int(offset[left[0]]), int(length[left[0]])
-                message = bytes(block.buffer[start : start + n])
+                message = block.message(rows[left[0]])
                 try:
                     layout = layout_of_message(self.schema.root, self.schema.wire, message)
                     self._check_widths(layout, len(rows))

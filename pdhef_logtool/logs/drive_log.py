@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from numpy.typing import NDArray
 
@@ -58,31 +58,6 @@ class Columns:
     def __len__(self) -> int:
         """Return the number of messages."""
         return int(self.log_time_ns.shape[0])
-
-
-class LogIndex(Protocol):
-    """What a sound index tells of a log before its messages are read."""
-
-    @property
-    def is_remote(self) -> bool:
-        """Whether each read costs a network request."""
-
-    @property
-    def size(self) -> int:
-        """Bytes of all files."""
-
-    @property
-    def chunks_read(self) -> tuple[int, int]:
-        """Number of chunks that were read, and of all chunks."""
-
-    def index_times(self, start_ns: int, end_ns: int) -> dict[str, IntArray]:
-        """Return each topic's log times in [start, end), ascending."""
-
-    def topics_in_same_chunks(self, topics: Collection[str]) -> frozenset[str]:
-        """Return the topics whose messages all lie in chunks that hold one of these: they cost no further read."""
-
-    def prefetch(self, topics: Collection[str], spans_ns: Sequence[tuple[int, int]]) -> None:
-        """Prepare to read these topics in [start, end) of each span."""
 
 
 class DriveLog(ABC):
@@ -164,7 +139,7 @@ class DriveLog(ABC):
         return None
 
     @property
-    def index(self) -> LogIndex | None:
+    def index(self) -> ColumnarLog | None:
         """What an index tells; None: there is none, or none that is sound."""
         return None
 

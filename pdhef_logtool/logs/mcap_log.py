@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from io import BytesIO
 from itertools import accumulate
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -38,7 +38,6 @@ from pdhef_logtool.logs.container import (
     Block,
     ChannelRecord,
     FileContainer,
-    MetadataRecord,
     RawChunk,
     Span,
     SpanDamageError,
@@ -104,6 +103,7 @@ class McapContainer(FileContainer):
     magic = MCAP_MAGIC
     magic_text = "the MCAP magic bytes"
     remedy = "is it an MCAP 1.0 recording?"
+    whole_chunks = True
 
     def __init__(
         self,
@@ -339,18 +339,7 @@ class McapContainer(FileContainer):
         return block
 
     def raw_chunk(self, span: Span, block: Block, kept: frozenset[int]) -> RawChunk | None:
-        """Return the chunk that a block was read from, to be written to another file as it is.
-
-        Parameters
-        ----------
-        span, block : the span, and what :meth:`load` gave, so that the chunk is known to be sound.
-        kept : channels that have the same id and definition in the other file.
-
-        Returns
-        -------
-        The chunk; None if these messages are in none, or if it holds or declares anything that the other file has
-        not.
-        """
+        """See :class:`~pdhef_logtool.logs.container.Container`."""
         extent = self._extents[span.index]
         if not extent.is_chunk or not len(block) or not kept.issuperset(np.unique(block.channel).tolist()):
             return None
@@ -406,15 +395,22 @@ class McapContainer(FileContainer):
 
     def attachments(self) -> Iterator[Attachment]:
         """Read the attachments; a damaged one is among the losses and left out."""
-        for start, end in self._attachment_at:
+        for record in self._sound_records(self._attachment_at, AttachmentRecord):
+            yield Attachment(record.name, record.media_type, record.data, record.log_time, record.create_time)
+
+    def metadata_records(self) -> Iterator[Metadata]:
+        """Read the metadata records; a damaged one is among the losses and left out."""
+        yield from self._sound_records(self._metadata_at, Metadata)
+
+    def _sound_records(self, extents: Iterable[tuple[int, int]], kind: Any) -> Iterator[Any]:
+        for start, end in extents:
             try:
-                payload = self.source.read(start + 9, end - start - 9)
-                record = AttachmentRecord.read(ReadDataStream(BytesIO(payload)))
+                record = kind.read(ReadDataStream(BytesIO(self.source.read(start + 9, end - start - 9))))
             except Exception as error:  # noqa: BLE001 (the boundary)
                 self.lose_record(start, end, error)
                 continue
             self.account.decode(start, end)
-            yield Attachment(record.name, record.media_type, record.data, record.log_time, record.create_time)
+            yield record
 
     def note_attachment(self, start: int, end: int) -> None:
         """Take note of an attachment record, checking its CRC without holding it."""
@@ -445,26 +441,10 @@ class McapContainer(FileContainer):
         """Take note of an attachment record."""
         self._attachment_at.append((start, end))
 
-    def metadata_records(self) -> Iterator[MetadataRecord]:
-        """Read the metadata records; a damaged one is among the losses and left out."""
-        for start, end in self._metadata_at:
-            try:
-                record = self.read_metadata(start, end)
-            except Exception as error:  # noqa: BLE001 (the boundary)
-                self.lose_record(start, end, error)
-                continue
-            self.account.decode(start, end)
-            yield MetadataRecord(record.name, dict(record.metadata))
-
-    def read_metadata(self, start: int, end: int) -> Metadata:
-        """Read a metadata record."""
-        self.meter.limits.check("metadata_bytes", end - start, "a metadata record")
-        metadata: Metadata = Metadata.read(ReadDataStream(BytesIO(self.source.read(start + 9, end - start - 9))))
-        return metadata
-
     def note_metadata(self, start: int, end: int) -> None:
         """Take note of a metadata record that can be read."""
-        self.read_metadata(start, end)
+        self.meter.limits.check("metadata_bytes", end - start, "a metadata record")
+        Metadata.read(ReadDataStream(BytesIO(self.source.read(start + 9, end - start - 9))))
         self._metadata_at.append((start, end))
 
     def open_chunk(self, extent: _Extent, claimed: Span) -> None:

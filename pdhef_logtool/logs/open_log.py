@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pdhef_logtool.logs.byte_source import require_regular
 from pdhef_logtool.logs.columnar_log import ColumnarLog
-from pdhef_logtool.logs.compression import decompress_file, decompress_message
+from pdhef_logtool.logs.compression import decompress_file
 from pdhef_logtool.logs.container import (
     EVERYTHING,
     MCAP_MAGIC,
-    Attachment,
-    Block,
     Container,
-    MetadataRecord,
-    Span,
     Wanted,
     describe_damage,
 )
@@ -40,7 +34,7 @@ from pdhef_logtool.logs.reduced_log import ReducedLog, reduced_record
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, Meter, ResourceLimits
 from pdhef_logtool.records.errors import LogError, PdhefError
-from pdhef_logtool.records.signals import IntArray, Loss
+from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.storage.documents import read_text
 from pdhef_logtool.storage.files import scratch_folder
 
@@ -184,7 +178,12 @@ def _open_plain(file: LogFile) -> Container | DriveLog:
         got = "a file that is none of these" if head else "an empty file"
         raise LogError(expected=what_is_a_log(), got=got, where=str(file.place), remedy=_REMEDY)
     opened = log_format.open(file)
-    return _CopiedContainer(opened, file) if isinstance(opened, Container) and file.is_copy else opened
+    if isinstance(opened, Container) and file.is_copy:
+        opened.on_close(file.release)
+        if file.cut:
+            opened.lose("truncated", file.cut)
+            opened.account.cut = True
+    return opened
 
 
 def _open_compressed(
@@ -269,7 +268,14 @@ def _open_rosbag2_folder(path: Path, meter: Meter) -> ColumnarLog:
                 lost.append(Loss("bad-file", describe_damage(error)[1], str(file)))
                 continue
             forms.add(container.form)
-            containers.append(_Rosbag2Container(container, per_message, encodings))
+            containers.append(container)
+            container.zstd_messages = per_message
+            # A topics table may name cdr by default where the recorder used another format: do not decode it as CDR.
+            named = {id_: encodings.get(c.topic, c.encoding) for id_, c in container.channels.items()}
+            container.whole_chunks &= not per_message and all(
+                c.encoding == named[c.id] for c in container.channels.values()
+            )
+            container.channels |= {id_: replace(c, encoding=named[id_]) for id_, c in container.channels.items()}
     except BaseException:
         for opened in containers:
             opened.close()
@@ -312,77 +318,3 @@ def _declared_encodings(information: Mapping[str, Any]) -> dict[str, str]:
 def _text(value: object) -> str:
     """Return a scalar of a YAML document as a text: lists of lists of one anchor have no end when they are written."""
     return str(value) if isinstance(value, str | int | float) else ""
-
-
-class _Wrapped(Container):
-    """Passes everything to another container."""
-
-    def __init__(self, container: Container) -> None:
-        self.container = container
-        self.path, self.form, self.distro = container.path, container.form, container.distro
-        self.channels, self.spans, self.lost = container.channels, container.spans, container.lost
-        self.undeclared = container.undeclared
-        self.meter, self.account, self.selective = container.meter, container.account, container.selective
-        self.is_remote, self.by_index = container.is_remote, container.by_index
-
-    def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
-        return self.container.load(span, want)
-
-    def extent(self, span: Span) -> tuple[int, int]:
-        return self.container.extent(span)
-
-    def times(self, span: Span) -> tuple[IntArray, IntArray]:
-        return self.container.times(span)
-
-    def attachments(self) -> Iterator[Attachment]:
-        return self.container.attachments()
-
-    def metadata_records(self) -> Iterator[MetadataRecord]:
-        return self.container.metadata_records()
-
-    def prefetch(self, spans: Iterable[Span]) -> None:
-        self.container.prefetch(spans)
-
-    def close(self) -> None:
-        self.container.close()
-
-
-class _CopiedContainer(_Wrapped):
-    """A container of a copy, which is removed with it."""
-
-    def __init__(self, container: Container, file: LogFile) -> None:
-        super().__init__(container)
-        self._release = file.release
-        if file.cut:
-            self.container.lose("truncated", file.cut)
-            self.account.cut = True
-
-    def close(self) -> None:
-        super().close()
-        self._release()
-
-
-class _Rosbag2Container(_Wrapped):
-    """A file of a rosbag2 folder, read as the folder's metadata.yaml says: encodings, compression by message."""
-
-    def __init__(self, container: Container, per_message: bool, encodings: Mapping[str, str]) -> None:
-        super().__init__(container)
-        self._per_message = per_message
-        # A topics table may say cdr by default where the recorder used another format: do not decode it as CDR.
-        self.channels = {
-            id_: replace(c, encoding=encodings.get(c.topic, c.encoding)) for id_, c in container.channels.items()
-        }
-
-    def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
-        block = self.container.load(span, want)
-        if not self._per_message:
-            return block
-        payloads: list[bytes] = []
-        size = 0
-        for start, n in zip(block.offset.tolist(), block.length.tolist(), strict=True):
-            payloads.append(decompress_message(block.buffer[start : start + n], self.meter.limits))
-            size += len(payloads[-1])
-            self.meter.limits.check("chunk_bytes", size, "compressed messages")
-        length = np.array([len(p) for p in payloads], dtype=np.int64)
-        offset = np.cumsum(length) - length
-        return replace(block, buffer=b"".join(payloads), offset=offset, length=length)

@@ -143,7 +143,7 @@ def reduced_record(container: Container) -> ReducedRecord | None:
     """
     if not isinstance(container, McapContainer) or not container.library.startswith(LIBRARY.partition(" ")[0]):
         return None
-    text = next((m.values.get(RECORD_ENTRY) for m in container.metadata_records() if m.name == RECORD_NAME), None)
+    text = next((m.metadata.get(RECORD_ENTRY) for m in container.metadata_records() if m.name == RECORD_NAME), None)
     if text is None:
         return None
     from pydantic import TypeAdapter, ValidationError

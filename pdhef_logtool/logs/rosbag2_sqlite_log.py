@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-import tempfile
 from collections import Counter
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -62,9 +61,9 @@ class SqliteContainer(Container):
         super().__init__(shown_path or path, path.stat().st_size, meter)
         self._pages: list[tuple[int, int]] = []  # first and last row id
         self._ends: list[int] = []  # bytes of the rows up to the end of each page
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._late: LimitError | None = None
         self._db = self._connect(path)
+        self.on_close(self._db.close)
         try:
             self._db.text_factory = _text
             self._db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(self.meter.limits.chunk_bytes, 2**31 - 1))
@@ -93,8 +92,9 @@ class SqliteContainer(Container):
     def _connect(self, path: Path) -> sqlite3.Connection:
         wal = path.with_name(path.name + "-wal")
         if wal.is_file() and wal.stat().st_size > 0:
-            self._folder = scratch_folder()
-            copy = Path(self._folder.name) / path.name
+            folder = scratch_folder()
+            self.on_close(folder.cleanup)
+            copy = Path(folder.name) / path.name
             shutil.copyfile(path, copy)
             shutil.copyfile(wal, copy.with_name(wal.name))
             return sqlite3.connect(f"file:{quote(str(copy))}", uri=True, check_same_thread=False)
@@ -238,13 +238,6 @@ class SqliteContainer(Container):
         except sqlite3.Error as error:
             raise SpanDamageError(str(error)) from error
         return np.array([t for t, _ in rows], dtype=np.int64), np.array([ns for _, ns in rows], dtype=np.int64)
-
-    def close(self) -> None:
-        """Release the file and the temporary copy."""
-        self._db.close()
-        if self._folder is not None:
-            self._folder.cleanup()
-            self._folder = None
 
 
 def _text(stored: bytes) -> str:

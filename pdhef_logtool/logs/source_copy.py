@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from mcap.records import Metadata
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog, in_window
-from pdhef_logtool.logs.container import Attachment, Block, ChannelRecord, MetadataRecord, RawChunk, Span
-from pdhef_logtool.logs.mcap_log import McapContainer
+from pdhef_logtool.logs.container import Attachment, Block, ChannelRecord, RawChunk, Span
 from pdhef_logtool.logs.message_schema import SchemaError, parsing, ros_schema
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
@@ -114,7 +114,7 @@ class _Places:
     """Which ids the channels and schemas of MCAP files get in the copy: their own where these are free."""
 
     def __init__(self, log: ColumnarLog) -> None:
-        self._files = {c: f for c, f in enumerate(log.containers) if isinstance(f, McapContainer)}
+        self._files = {c: f for c, f in enumerate(log.containers) if f.whole_chunks}
         used = [id_ for f in self._files.values() for id_ in f.channels]
         self._next_channel = max(used, default=0) + 1
         self._channels: dict[int, int] = {}  # schema id by channel id, both of the copy
@@ -177,13 +177,12 @@ def iterate_copy(
             block = log.load(c, span)
             if block is None:
                 continue
-            container = log.containers[c]
-            if whole and isinstance(container, McapContainer):
-                chunk = container.raw_chunk(span, block, unchanged[c])
-                if chunk is not None and in_window(block.log_time_ns, start_ns, end_ns) is None:
-                    yield chunk
-                    continue
-            _push(cursors, c, span.index, _Cursor(block, start_ns, end_ns))
+            inside = in_window(block.log_time_ns, start_ns, end_ns) is None
+            chunk = log.containers[c].raw_chunk(span, block, unchanged[c]) if whole and inside else None
+            if chunk is None:
+                _push(cursors, c, span.index, _Cursor(block, start_ns, end_ns))
+            else:
+                yield chunk
         if cursors:
             _, c, index, _, cursor = heapq.heappop(cursors)
             # Continue in this span until another one can come first.
@@ -241,7 +240,7 @@ def iterate_attachments(log: ColumnarLog) -> Iterator[Attachment]:
         yield from container.attachments()
 
 
-def iterate_metadata(log: ColumnarLog) -> Iterator[MetadataRecord]:
+def iterate_metadata(log: ColumnarLog) -> Iterator[Metadata]:
     """Yield the metadata records of a log."""
     for container in log.containers:
         yield from container.metadata_records()

@@ -124,7 +124,12 @@ def supervise(
     if not can_fork():
         warn("worker processes need Linux: one process does all the work, without limits on memory and time")
         return _in_this_process(work, items, progress)
-    return _in_processes(work, items, jobs, limits, preload, progress, warn)
+
+    def in_workers() -> Generator[Ended[T, R], None, None]:
+        with Crew[T, R](work, jobs=jobs, limits=limits, preload=preload, warn=warn) as crew:
+            yield from crew.each(items, progress)
+
+    return in_workers()
 
 
 def _in_this_process(
@@ -146,19 +151,6 @@ def _in_this_process(
             yield Ended(number, item, result)
             del result
         del item
-
-
-def _in_processes(  # positional: the arguments of `supervise`, which checked them
-    work: Callable[[T, Tell], R],
-    items: Iterable[T],
-    jobs: int,
-    limits: Limits,
-    preload: Sequence[str],
-    progress: Progress,
-    warn: Callable[[str], None],
-) -> Generator[Ended[T, R], None, None]:
-    with Crew[T, R](work, jobs=jobs, limits=limits, preload=preload, warn=warn) as crew:
-        yield from crew.each(items, progress)
 
 
 @dataclass(slots=True)

@@ -34,7 +34,7 @@ def _copy(source: Path, target: Path, whole: bool = False) -> None:
         for a in iterate_attachments(log):
             writer.attachment(a.name, a.media_type, a.data, a.log_time_ns, a.create_time_ns)
         for m in iterate_metadata(log):
-            writer.metadata(m.name, m.values)
+            writer.metadata(m.name, m.metadata)
     log.close()
 
 
