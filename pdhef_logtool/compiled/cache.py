@@ -1,9 +1,9 @@
-"""The one ``njit`` of the package: machine code is kept where this user can keep it, and no cache can end a run.
+"""The ``njit`` of the package: machine code is cached where this user can write, and a cache error never ends a run.
 
-Numba looks for a folder when a function is decorated and refuses where it finds none; a file in its cache that is cut
-short, or a full disk, ends the call. Here the first place that can be written takes the code: that of
-``NUMBA_CACHE_DIR``, the installation's, the user's, a private temporary one; else none, and every run compiles. What
-lies in the installation is used where nobody can write it, too.
+Numba searches a cache folder when a function is decorated and raises an error if there is none; a truncated cache file
+or a full disk also ends the call. Here the code goes to the first folder that can be written: ``NUMBA_CACHE_DIR``, the
+installation, the user's cache, a private temporary folder; if there is none, every run compiles. Code that the
+installation contains is also used if the installation is read-only.
 
 In each place the code lies in a folder that is named after the digest of all sources (:mod:`~.sources`). The
 first process that uses a new digest removes the folders of other sources of this same installation; those of other
@@ -59,7 +59,7 @@ def _without_blas() -> None:
 
 
 def _sizes_differ(_given: Any, _expected: Any) -> None:
-    """Stand for what numba calls where an array is assigned to a slice of another shape."""
+    """Placeholder of the function that numba calls if an array is assigned to a slice of another shape."""
 
 
 @overload(_sizes_differ)  # type: ignore[untyped-decorator]
@@ -76,7 +76,7 @@ arrayobj.raise_with_shape_context = _sizes_differ
 
 
 def njit(function: Any = None, *, cache: bool = False, **options: Any) -> Any:
-    """Compile a function as ``numba.njit`` does; ``cache`` keeps its machine code as said above."""
+    """Compile a function as ``numba.njit`` does; ``cache`` keeps its machine code as described above."""
     if function is None:
         return functools.partial(njit, cache=cache, **options)
     options |= {"no_cfunc_wrapper": True}
@@ -112,7 +112,7 @@ _kept: list[Any] = []
 
 
 def load_kept() -> bool:
-    """Load all machine code that is kept for them, for the processes that are forked from this one; tell if any is."""
+    """Load all cached machine code, for the processes that are forked from this one; return whether there is any."""
     for function in _kept:
         codegen = function.targetctx.codegen()
         for signature in function._cache.signatures(codegen):
@@ -204,7 +204,7 @@ class _Cache:
         for place in self._places:
             try:
                 overload = place.load_overload(signature, context)
-            except Exception:  # noqa: BLE001 (whatever a pickle that was cut short may raise)
+            except Exception:  # noqa: BLE001 (any error of a pickle that was cut short)
                 with contextlib.suppress(OSError):
                     place.flush()
                 continue
@@ -239,7 +239,7 @@ class _Place(caching.FunctionCache):  # type: ignore[misc]
     def signatures(self, codegen: Any) -> list[Any]:
         try:
             index = self._cache_file._load_index()
-        except Exception:  # noqa: BLE001 (whatever a pickle that was cut short may raise)
+        except Exception:  # noqa: BLE001 (any error of a pickle that was cut short)
             return []
         return [key[0] for key in index if key == self._index_key(key[0], codegen)]
 
@@ -265,7 +265,7 @@ class _Code(caching.CompileResultCacheImpl):  # type: ignore[misc]
 
 
 class _Locator(caching._CacheLocator):  # type: ignore[misc]
-    """Tells numba the folder that was chosen above."""
+    """Gives numba the folder that was chosen above."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -287,28 +287,28 @@ class _Locator(caching._CacheLocator):  # type: ignore[misc]
 
 @functools.cache
 def _stamp(file: str) -> bytes:
-    """Return the digest of a file that the name of the folder does not stand for already."""
+    """Return the digest of a file that is not part of the digest in the folder's name."""
     path = Path(file)
     return b"" if path in sources.compiled_sources() else hashlib.sha256(path.read_bytes()).digest()
 
 
 def is_kept(name: str) -> bool:
-    """Tell whether there is machine code of a function, ``module.function``, for some arguments."""
+    """Return whether there is machine code of a function, ``module.function``, for some arguments."""
     return any(any(folder.glob(f"{name}-*.nbi")) for folder in (_installed(), kept_in()) if folder is not None)
 
 
-#: Whether somebody has said that compiling begins.
+#: Whether the note that compiling begins was printed.
 announced = False
 
 
 def be_silent() -> None:
-    """Say nothing in this process and in those that are forked from it, for which another one has."""
+    """Print no note about compiling in this process and its forks, as another process prints it."""
     global announced
     announced = True
 
 
 def announce() -> None:
-    """Say on stderr, once, that compiling begins; of the workers of a command the first one does."""
+    """Print a note on stderr, once, that compiling begins; of several workers only the first prints it."""
     global announced
     if announced or processes.worker_number > 1:
         return

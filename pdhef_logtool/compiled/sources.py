@@ -1,7 +1,7 @@
-"""The digest of all that machine code depends on: sources, compiler and processor. It is found without the compiler.
+"""The digest of all that machine code depends on: sources, compiler and processor, computed without the compiler.
 
-Numba's own cache knows a function by the file that it stands in and never looks at the files of the functions that it
-calls. Here all compiled code is kept under one digest, so that code of other sources is never loaded.
+Numba's own cache identifies a function by its file and ignores the files of the functions that it calls. Here all
+compiled code is kept under one digest, so that code of other sources is never loaded.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ _vector = _Vector()
 
 @dataclass(frozen=True)
 class _Place:
-    """The numbers of an array for who says in the compiler's language what is to be done."""
+    """The numbers of an array, for code that is written as LLVM instructions."""
 
     builder: Any
     data: Any
@@ -237,7 +237,7 @@ def factor(_typing, P, there, L):  # type: ignore[no-untyped-def]
                     rows[i, half] = builder.fsub(rows[i, half], taken, flags=("contract",))
             for half in halves:
                 rows[k, half] = builder.fmul(rows[k, half], everywhere(per_root))
-            before = k % LANES  # what stands before the diagonal is no part of the column
+            before = k % LANES  # entries before the diagonal are not part of the column
             lanes = [LANES + i if i < before else i for i in range(LANES)]
             rows[k, k // LANES] = _chosen(builder, rows[k, k // LANES], zeros, lanes)
         for columns, half in ((0, 0), (0, 1), (1, 1)):

@@ -15,9 +15,9 @@ class ByteLedger:
     Attributes
     ----------
     file : its path. size : bytes when it was opened; of a file that is compressed as a whole, those inside of it.
-    decoded : bytes that were read: framing, and chunks (or runs of messages or rows) of which any message was read.
+    decoded : bytes that were read: framing, and chunks (or runs of messages or rows) with a message that was read.
     unwanted : sound as far as is known, and never asked for: attachments, metadata, index, other topics' chunks.
-    lost : damaged, cut, above the budget. Where the place of damage is not known, the record that tells of it.
+    lost : damaged, cut, above the resource limits. If the place of damage is unknown: the record that reports it.
     cut : the file ends before its time. What should follow is in no sum.
     checksummed : of ``decoded``, the bytes that a checksum of the file covers and that agree with it; None in a record
         of an earlier version.
@@ -52,7 +52,7 @@ def checksum_text(share: float | None) -> str:
 
 
 class _Extents:
-    """Extents, of which neighbours are joined where they come one after the other."""
+    """Extents; an extent that continues the last one is joined to it."""
 
     def __init__(self) -> None:
         self._found: set[_Extent] = set()
@@ -75,7 +75,7 @@ class ByteAccount:
 
     Parameters
     ----------
-    size : bytes of the file; what is told beyond them is left out.
+    size : bytes of the file; extents beyond it are ignored.
     """
 
     def __init__(self, size: int) -> None:

@@ -1,7 +1,7 @@
-"""Bytes of a recording by offset and size: the one thing that containers know of where a file lies.
+"""Bytes of a recording by offset and size, wherever the file is.
 
-Nothing is mapped into memory: a file that another process cuts while it is open ends a read with an error, never this
-process, and what was read stays valid after the file is closed.
+Files are not mapped into memory: if another process truncates a file while it is open, a read raises an error and does
+not end this process. Bytes that were read stay valid after the file is closed.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ _KINDS = {stat.S_IFIFO: "a FIFO", stat.S_IFCHR: "a device", stat.S_IFBLK: "a dev
 
 
 class CutError(Exception):
-    """A file ends earlier than it did when it was opened; caught inside this package and turned into a loss."""
+    """A file is shorter than when it was opened. This package catches it and reports a loss."""
 
 
 class SourceError(LogError):
-    """The place of a log does not give its bytes (any more): no damage of the log, and so never one of its losses."""
+    """A log cannot be read at its location (any more). The log is not damaged, so this is never one of its losses."""
 
 
 class ChangedError(SourceError):
-    """A log is another one than was opened."""
+    """A log has changed since it was opened."""
 
 
 class ByteSource(ABC):
@@ -41,7 +41,7 @@ class ByteSource(ABC):
 
     Attributes
     ----------
-    size : bytes when it was opened. far : whether each read costs a journey, so that few and large ones are better.
+    size : bytes when it was opened. is_remote : whether each read is a request, so that few large reads are faster.
     """
 
     size: int
@@ -54,19 +54,19 @@ class ByteSource(ABC):
 
     @abstractmethod
     def fetch(self, offset: int, size: int) -> bytes:
-        """Read up to ``size`` bytes where they lie; fewer only at the end of the file as it is now."""
+        """Read up to ``size`` bytes; fewer only at the present end of the file."""
 
     @abstractmethod
     def close(self) -> None:
-        """Release what is open."""
+        """Close the file or connection."""
 
     def held_size(self, offset: int, size: int) -> int:
-        """Return how many of the ``size`` bytes from an offset on a read may as well take along."""
+        """Return how many of the ``size`` bytes from an offset can be read at no extra cost."""
         del offset
         return size
 
     def prefetch(self, extents: Iterable[tuple[int, int]]) -> None:
-        """Take note of bytes [start, end) that will be read soon, in this order."""
+        """Prepare to read bytes [start, end), in this order."""
         del extents
 
     def read(self, offset: int, size: int) -> bytes:
@@ -136,11 +136,11 @@ def read_at(file: BinaryIO, offset: int, size: int) -> bytes:
 
 
 def require_regular(path: Path, shown_path: LogPlace | None = None) -> None:
-    """Refuse what is no regular file, without opening it: opening a FIFO waits for ever, some devices act on it.
+    """Reject anything but a regular file, without opening it: opening a FIFO blocks, and some devices react to it.
 
     Raises
     ------
-    LogError : it is none. OSError : there is nothing, or nothing that may be looked at.
+    LogError : it is no regular file. OSError : it does not exist or cannot be accessed.
     """
     mode = path.stat().st_mode
     if not stat.S_ISREG(mode):

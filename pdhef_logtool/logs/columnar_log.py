@@ -88,8 +88,8 @@ class ColumnarLog(DriveLog):
         self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
         self._fields: dict[tuple[int, int], tuple[FieldInfo, ...]] = {}
         self._parsed: dict[tuple[object, ...], MessageSchema | SchemaError] = {}  # by definition
-        self._asked: set[tuple[int, int]] = set()  # channels of which somebody wanted something
-        self._wanted: set[tuple[int, int]] = set()  # and of these the ones whose messages somebody wanted
+        self._asked: set[tuple[int, int]] = set()  # channels that were requested or listed
+        self._wanted: set[tuple[int, int]] = set()  # channels whose messages were requested
         self._schemas_s = 0.0  # processor time that parsing took
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
@@ -111,7 +111,7 @@ class ColumnarLog(DriveLog):
 
     @property
     def recording_span(self) -> RecordingSpan:
-        """When the log was recorded, found when it is first asked for."""
+        """When the log was recorded; determined at the first access."""
         if self._recording_span is None:
             self._recording_span = survey(self.containers, self._times, str(self.path))
         return self._recording_span
@@ -134,7 +134,7 @@ class ColumnarLog(DriveLog):
 
     @property
     def lost(self) -> tuple[Loss, ...]:
-        """What could not be read, as far as is known by now."""
+        """Losses so far."""
         losses = [*self._opened_lost, *self.recording_span.losses]
         damaged, schemas = sorted(self._damaged.items()), sorted(self._schemas.items())
         for c, container in enumerate(self.containers):
@@ -153,7 +153,7 @@ class ColumnarLog(DriveLog):
 
     @property
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:
-        """Where the bytes of each file went, as far as is known by now."""
+        """Byte ledger of each file so far."""
         return tuple(c.account.ledger(str(c.path)) for c in self.containers)
 
     def _undecodable_losses(self, c: int, container: Container) -> Iterator[Loss]:
@@ -172,7 +172,7 @@ class ColumnarLog(DriveLog):
 
     @property
     def index(self) -> ColumnarLog | None:
-        """The log itself where everything but the content of chunks is known, and nothing of it is odd."""
+        """The log itself if its index is complete and consistent; else None."""
         sound = all(container.by_index for container in self.containers)
         return self if sound and all(loss.kind == UNVERIFIED for loss in self.lost) else None
 
@@ -189,7 +189,7 @@ class ColumnarLog(DriveLog):
 
     @property
     def is_remote(self) -> bool:
-        """Whether each read costs a journey."""
+        """Whether each read is a network request."""
         return any(container.is_remote for container in self.containers)
 
     @property
@@ -199,7 +199,7 @@ class ColumnarLog(DriveLog):
 
     @property
     def chunks_read(self) -> tuple[int, int]:
-        """How many spans were read, and how many there are."""
+        """Number of spans that were read, and of all spans."""
         return len({(c, index) for c, index, _ in self._seen}), sum(len(c.spans) for c in self.containers)
 
     def index_times(self, start_ns: int, end_ns: int) -> dict[str, IntArray]:
@@ -218,7 +218,7 @@ class ColumnarLog(DriveLog):
         return {topic: np.sort(np.concatenate(part)) for topic, part in parts.items() if part}
 
     def covered_topics(self, topics: Collection[str]) -> frozenset[str]:
-        """Return the topics whose messages all lie in spans that hold one of these: they cost no further read."""
+        """Return the topics whose messages are all in spans with one of these topics: they need no further read."""
         held, apart = set(topics), set[str]()
         for container in self.containers:
             names = {id_: channel.topic for id_, channel in container.channels.items()}
@@ -228,15 +228,15 @@ class ColumnarLog(DriveLog):
         return frozenset(held - apart)
 
     def prefetch(self, topics: Collection[str], spans_ns: Sequence[tuple[int, int]]) -> None:
-        """Take note of what will be read soon: these topics in [start, end) of each."""
+        """Prepare to read these topics in [start, end) of each span."""
         for container in self.containers:
             expected = (s for start, end in spans_ns for s in self._to_read(topics, container, start, end))
             container.prefetch({span.index: span for span in expected}.values())
 
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
-        """Return the scalar leaves of a topic's schema; empty when the encoding carries none.
+        """Return the scalar leaves of a topic's schema; empty if the encoding has none.
 
-        ``quiet`` only looks: a schema that does not parse is no loss of whoever wants nothing of the topic.
+        With ``quiet`` a schema that does not parse is not reported as a loss.
         """
         for c, channel in self._by_topic.get(topic, ()):
             if not quiet:
@@ -249,7 +249,7 @@ class ColumnarLog(DriveLog):
         return ()
 
     def unreadable(self, topic: str) -> str:
-        """Return why no field of a topic is known: a definition that is missing, an encoding; empty where one is."""
+        """Return why a topic has no readable fields, for example a missing definition; empty if it has some."""
         reasons = []
         for c, channel in self._by_topic.get(topic, ()):
             schema = self.schema_of(c, channel)
@@ -263,12 +263,12 @@ class ColumnarLog(DriveLog):
         return reasons[0] if reasons else ""
 
     def borrowed(self, topic: str) -> tuple[Path, ...]:
-        """Return the files of an installed ROS that a topic's type is read by."""
+        """Return the files of an installed ROS that define a topic's type."""
         schemas = (self.schema_of(c, channel) for c, channel in self._by_topic.get(topic, ()))
         return tuple(dict.fromkeys(f for s in schemas if isinstance(s, MessageSchema) for f in s.borrowed))
 
     def first_messages(self, topic: str, most: int) -> list[object]:
-        """Return the first messages of a topic whole; what does not decode is left out."""
+        """Return the first messages of a topic, decoded; messages that do not decode are left out."""
         messages: list[object] = []
         for c, channel in self._by_topic.get(topic, ()):
             schema = self.schema_of(c, channel)
@@ -295,8 +295,8 @@ class ColumnarLog(DriveLog):
     ) -> dict[str, Columns]:
         """Read the fields asked for of messages with log time in [start, end).
 
-        ``quiet`` only looks: messages that do not decode are no loss of whoever wants nothing of the topic.
-        ``stamps`` are further topics, of which only the times are read.
+        With ``quiet`` messages that do not decode are not reported as a loss. ``stamps`` are further topics; only their
+        times are read.
 
         Raises
         ------
@@ -324,7 +324,7 @@ class ColumnarLog(DriveLog):
     def load(self, c: int, span: Span, want: frozenset[int] | None = None) -> Block | None:
         """Read a span of the c-th container; None and a recorded loss if it is damaged.
 
-        The boundary: whatever escapes a container's load is the loss of the span.
+        Any error of a container's load is a loss of the span.
         """
         container = self.containers[c]
         want = want if container.selective else None
@@ -365,7 +365,7 @@ class ColumnarLog(DriveLog):
         return block
 
     def _correct_span(self, c: int, span: Span, block: Block, want: frozenset[int] | None) -> None:
-        """Correct what an index claimed of a span by what the span holds, with a loss for what it should hold."""
+        """Correct the counts of a span, which an index gave, by its content; missing messages are a loss."""
         container = self.containers[c]
         held = block.counts
         declared = {id_: n for id_, n in held.items() if id_ in container.channels}
@@ -402,7 +402,7 @@ class ColumnarLog(DriveLog):
     def _parse_schema(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
         """Parse a schema once, within the log's time; one that does not parse is a loss of its topic.
 
-        All schemas together get the time that a log has whatever its size: they do not grow with it.
+        All schemas together get the part of the time limit that does not depend on the size of the log.
         """
         example = self._example(c, channel)
         names = (channel.encoding, channel.schema_encoding, channel.schema_name, channel.type_name)
@@ -481,7 +481,7 @@ class ColumnarLog(DriveLog):
     def _to_read(
         topics: Collection[str], container: Container, start_ns: int | None, end_ns: int | None
     ) -> Iterator[Span]:
-        """Yield the spans of a window that hold any of the topics asked for."""
+        """Yield the spans of a window that contain any of the requested topics."""
         for span in container.spans:
             if span.overlaps(start_ns, end_ns) and any(container.channels[id_].topic in topics for id_ in span.counts):
                 yield span
@@ -494,14 +494,14 @@ class ColumnarLog(DriveLog):
         window_ns: tuple[int | None, int | None],
         parts: Mapping[str, list[Columns]],
     ) -> None:
-        """Add what a span holds of the topics asked for."""
+        """Add the columns of the requested topics in a span."""
         channels = self.containers[c].channels
         want = frozenset(id_ for id_ in span.counts if channels[id_].topic in plans)
         block = self.load(c, span, want) if want else None
         if block is None:
             return
         keep = in_window(block.log_time_ns, *window_ns)
-        # By what the block holds: the span's counts may have come from an index that is wrong.
+        # By the channels of the block: the counts of the span can be from a wrong index.
         for id_ in sorted(block.rows, key=lambda id_: self._rank[c].get(id_, -1)):
             topic = channels[id_].topic if id_ in channels else ""
             rows = block.rows[id_]
@@ -517,7 +517,7 @@ class ColumnarLog(DriveLog):
     def _decode(
         self, topic: str, plan: _Plan, c: int, span: Span, id_: int, block: Block, rows: IntArray
     ) -> Columns | None:
-        """Decode some messages of a channel. The boundary: whatever escapes a decoder is the loss of these messages."""
+        """Decode some messages of a channel. Any error of a decoder is a loss of these messages."""
         decoder = plan.decoders.get((c, id_))
         try:
             if decoder is None:
@@ -533,7 +533,7 @@ class ColumnarLog(DriveLog):
         if decoder is not None and decoder.undecodable:
             key = (c, id_, span.index)
             seen = self._undecodable.get(key, np.empty(0, dtype=np.int64))
-            # Count by place in the channel: which other channels a block holds depends on what was asked for.
+            # Count by position in the channel: the other channels of a block depend on the request.
             places = np.searchsorted(block.rows[id_], decoder.undecodable)
             self._undecodable[key] = np.union1d(seen, places.astype(np.int64))
         return Columns(topic, block.log_time_ns[rows], block.publish_time_ns[rows], fields)
@@ -558,7 +558,7 @@ def _out_of_time(container: Container, spans: Sequence[Span]) -> Loss:
 
 
 def in_window(log_time_ns: IntArray, start_ns: int | None, end_ns: int | None) -> BoolArray | None:
-    """Tell which log times lie in [start, end); None: all of them."""
+    """Return a mask of the log times in [start, end); None if all are."""
     keep: BoolArray | None = None
     if start_ns is not None:
         keep = log_time_ns >= start_ns

@@ -1,4 +1,4 @@
-"""Undoing the compressions that recorders use, never further than a claim and a budget allow."""
+"""Decompression of chunks, messages and files, up to the declared size and the resource limits."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _Bytes: TypeAlias = bytes | memoryview
 _OF_THREAD = local()
 _BLOCK_BYTES = 1 << 20
 _FRAME_HEAD_BYTES = 18
-#: A decompressed copy leaves this much of the disk to others.
+#: Free disk space that a decompressed copy leaves.
 _DISK_RESERVE_BYTES = 256 << 20
 
 
@@ -34,7 +34,7 @@ def decompress(compression: str, stored: _Bytes, size: int, limits: ResourceLimi
 
     Raises
     ------
-    SpanDamageError : unknown, damaged, or of another size. LimitError : the claim is above the budget.
+    SpanDamageError : unknown, damaged, or of another size. LimitError : the declared size is above a limit.
     """
     length = memoryview(stored).nbytes
     if compression in ("", "none"):
@@ -106,7 +106,7 @@ def decompress_file(source: Path, target: Path, meter: Meter) -> str:
                 return "the compressed file ends early" if written < claimed else ""
             written += len(block)
             if written > allowed:
-                return f"the file decompresses to more than {allowed} bytes, above the budget (--set budget=FACTOR)"
+                return f"the file decompresses to more than {allowed} bytes, above the limit (--set budget=FACTOR)"
             if written > free:
                 return "the disk has no room for the decompressed file (set TMPDIR to another)"
             unpacked.write(block)
@@ -124,7 +124,7 @@ def _zstd(stored: _Bytes, size: int) -> bytes:
 
 
 def _zstd_decompressor() -> zstandard.ZstdDecompressor:
-    """Return the one of this thread: it is no small thing to make, and serves one call at a time."""
+    """Return the decompressor of this thread: it is slow to make and not thread-safe."""
     import zstandard
 
     if not hasattr(_OF_THREAD, "zstd"):
@@ -144,7 +144,7 @@ def _bz2(stored: _Bytes, size: int) -> bytes:
 
 
 def _in_turn(stored: _Bytes, size: int, decompressor: Callable[[], Any]) -> bytes:
-    """Decompress one stream after another to at most a byte more than ``size``."""
+    """Decompress concatenated streams to at most ``size`` + 1 bytes."""
     parts: list[bytes] = []
     missing = size + 1
     rest = bytes(stored)

@@ -1,4 +1,4 @@
-"""What every container format reduces to: channels, spans of messages, and blocks of undecoded messages."""
+"""Common interface of container formats: channels, spans of messages, and blocks of undecoded messages."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from pdhef_logtool.records.signals import IntArray, Loss
 if TYPE_CHECKING:
     from pdhef_logtool.logs.log_file import LogFile
 
-# What the files of each format begin with.
+# First bytes of the files of each format.
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
 SQLITE_MAGIC = b"SQLite format 3\0"
-#: Log times above this (unsigned in the file) cannot be held in int64 and are set to it.
+#: Log times above this (unsigned in the file) do not fit int64 and are set to it.
 MAX_TIME_NS = int(np.iinfo(np.int64).max) - 1
 #: Kind of the note that a checksum of a file was not verified, as not all that it covers was read.
 UNVERIFIED = "unverified"
-_LOSSES_OF_A_KIND = 20  # of one file; what comes behind them is told as one
+_LOSSES_OF_A_KIND = 20  # of one file; further ones become one loss
 _IDS_TOLD = 5
 _TOLD_CHARACTERS = 300
 _RECORDS_A_CHECK = 256  # of the time that a walk takes
@@ -80,7 +80,7 @@ class Block:
 
     Attributes
     ----------
-    buffer : bytes that hold all payloads.
+    buffer : bytes that contain all payloads.
     channel, log_time_ns, publish_time_ns, sequence, offset, length : int64 [N]; message i is
         ``buffer[offset[i]:offset[i] + length[i]]``.
     """
@@ -134,10 +134,10 @@ class Block:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawChunk:
-    """A chunk that another file holds, to be written as it is.
+    """A chunk of another file, to be written as it is.
 
-    Whoever makes one has decompressed it and checked its CRC, and knows that the channels it holds or declares have
-    the same ids and the same definitions in the file that is written.
+    Its maker has decompressed it, checked its CRC, and made sure that its channels have the same ids and definitions in
+    the file that is written.
 
     Attributes
     ----------
@@ -173,10 +173,10 @@ class Attachment:
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """Of which topics messages will be read, and of which log times [start, end); None: of all.
+    """Topics and log times [start, end) that will be read; None: all.
 
-    A hint that changes no byte of what is read: where reading is far, an index is believed for all else, if the file
-    has more than ``above_bytes``.
+    A hint that does not change the result: of a remote file with more than ``above_bytes``, the other chunks are taken
+    from the index.
     """
 
     topics: frozenset[str] | None = None
@@ -185,23 +185,23 @@ class Wanted:
     above_bytes: int = 0
 
     def has(self, topics: Iterable[str], first_ns: int, last_ns: int) -> bool:
-        """Tell whether something that holds messages of these topics and log times is wanted."""
+        """Return whether messages of these topics and log times are wanted."""
         inside = (self.start_ns is None or last_ns >= self.start_ns) and (self.end_ns is None or first_ns < self.end_ns)
         return inside and (self.topics is None or not self.topics.isdisjoint(topics))
 
 
-#: What all of a log is read for.
+#: Of a log that is read as a whole.
 EVERYTHING = Wanted()
 
 
 class SpanDamageError(Exception):
-    """A span cannot be decoded; caught inside this package and turned into a loss."""
+    """A span cannot be decoded. This package catches it and reports a loss."""
 
 
 def describe_damage(error: Exception) -> tuple[str, str]:
-    """Return the kind of loss that an error makes, and what to tell of it: the one boundary's words.
+    """Return kind and text of the loss that an error causes.
 
-    A log whose place fails is not damaged: that error goes on.
+    A log that cannot be reached is not damaged: a :class:`SourceError` is raised again.
     """
     if isinstance(error, SourceError):
         raise error
@@ -212,20 +212,20 @@ def describe_damage(error: Exception) -> tuple[str, str]:
 
 
 class Container(ABC):
-    """One open file of a log. Opening it fills what stands below.
+    """One open file of a log. Opening it fills these attributes.
 
     Attributes
     ----------
     path : the file as the user named it.
     channels : by their id in this file. spans : in file order. lost : damage found while the file was opened.
     undeclared : messages by span that are not in its counts, as no record declares their channels.
-    meter : what reading may cost. account : where the file's bytes went; the spans' are told by who loads them.
+    meter : resource limits. account : byte ledger of the file; its user adds the spans that it loads.
     form : ``mcap``, ``rosbag1`` or ``sqlite3``.
     selective : whether a load can leave out the payloads of unwanted channels.
     profile : MCAP profile that a copy should carry. distro : ROS distribution that the file names; empty if none.
     remedy : what to do about a file that is none of this format.
     zstd_messages : whether each message is a zstd frame. whole_chunks : whether chunks can be copied as they are.
-    far : whether reading costs a journey. by_index : whether a sound index names all messages.
+    is_remote : whether each read is a network request. by_index : whether a sound index names all messages.
     """
 
     form = ""
@@ -248,18 +248,18 @@ class Container(ABC):
         self.account = ByteAccount(size)
         self._closing = ExitStack()
         self._losses: dict[str, int] = {}  # how many of a kind
-        self._folded: dict[str, int] = {}  # where in ``lost`` those behind the first ones stand
+        self._folded: dict[str, int] = {}  # index in ``lost`` of the loss that sums up further ones
 
     @abstractmethod
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
-        """Read a span's messages (of the channels in ``want`` at least); whatever it raises is the loss of the span."""
+        """Read a span's messages (at least of the channels in ``want``); any error is a loss of the span."""
 
     @abstractmethod
     def extent(self, span: Span) -> tuple[int, int]:
         """Return the bytes [start, end) of a span, by which :attr:`account` counts it."""
 
     def times(self, span: Span) -> tuple[IntArray, IntArray]:
-        """Return channels and log times of a span's messages [N], a channel's in file order, as cheaply as it goes.
+        """Return channels and log times of a span's messages [N], each channel's in file order.
 
         Raises
         ------
@@ -293,7 +293,7 @@ class Container(ABC):
         yield from ()
 
     def prefetch(self, spans: Iterable[Span]) -> None:
-        """Take note of spans that will be loaded soon, in this order."""
+        """Prepare to load spans, in this order."""
         del spans
 
     def on_close(self, callback: Callable[[], None]) -> None:
@@ -311,7 +311,7 @@ class Container(ABC):
     def lose(
         self, kind: str, what: str, start_ns: int | None = None, end_ns: int | None = None, count: int | None = None
     ) -> None:
-        """Note damage of this file; from the 21st of a kind on they are told as one."""
+        """Note damage of this file; the 21st and later losses of a kind become one."""
         n = self._losses[kind] = self._losses.get(kind, 0) + 1
         more = n - _LOSSES_OF_A_KIND
         if more <= 0:
@@ -348,7 +348,7 @@ class FileContainer(Container):
     path : file to read, or its bytes wherever they lie.
     shown_path : what to call it in messages (a decompressed copy has another name than its source).
     undeclared : messages by span that are not in its counts, as no record declares their channels.
-    meter : what reading may cost; None = the default budget.
+    meter : resource limits; None: the default.
 
     Raises
     ------
@@ -418,7 +418,7 @@ class FileContainer(Container):
 
     @abstractmethod
     def _finish(self) -> None:
-        """Close what the walk left open, and check what only the whole file tells."""
+        """Finish open records and check the file as a whole."""
 
 
 def block_from_lists(buffer: bytes | memoryview, *columns: Sequence[int]) -> Block:

@@ -42,10 +42,10 @@ from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError, Resou
 from pdhef_logtool.logs.wire_layout import LayoutReader, NoLayoutError, WireLayout, layout_of_message
 from pdhef_logtool.records.signals import IntArray
 
-#: Stands in a time column where the message lacks the time (NaN of int64).
+#: Value of a time column if the message has no time (NaN of int64).
 NO_TIME_NS = int(np.iinfo(np.int64).min)
 _LAYOUTS_PER_CHANNEL = 8
-#: Columns of an array are as many as its longest value has: at most so many cells, or columns where values are many.
+#: An array has as many columns as its longest value: at most this many cells, or columns if there are many values.
 _CELLS = 1 << 26
 _COLUMNS = 64
 
@@ -64,7 +64,7 @@ def channel_schema(
     channel : channel to decode.
     distro : ROS distribution for types without a definition.
     example : first message, for JSON without a schema.
-    budget : what the schema may cost.
+    limits : resource limits of the schema.
     definitions : of ROS types that neither the channel nor the distribution has.
 
     Raises
@@ -100,7 +100,7 @@ def channel_schema(
 class ChannelDecoder:
     """Decodes the messages of one channel for one set of paths.
 
-    ``undecodable`` holds the rows of the last block whose payload does not fit their type (their fields are NaN).
+    ``undecodable`` are the rows of the last block whose payload does not fit their type (their fields are NaN).
     """
 
     schema: MessageSchema
@@ -247,7 +247,7 @@ def _tolerant(decode: Callable[[bytes], object], schema: MessageSchema) -> Calla
     def tolerant(data: bytes) -> object:
         try:
             return decode(data) if len(data) <= most else None
-        except Exception:  # noqa: BLE001 (somebody else's bytes and somebody else's decoder)
+        except Exception:  # noqa: BLE001 (third-party data and decoder)
             return None
 
     return tolerant

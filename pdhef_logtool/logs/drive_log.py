@@ -80,23 +80,23 @@ class DriveLog(ABC):
     @property
     @abstractmethod
     def recording_span(self) -> RecordingSpan:
-        """When the log was recorded; what was recorded at other times is never read."""
+        """When the log was recorded; messages of other times are never read."""
 
     @property
     @abstractmethod
     def lost(self) -> tuple[Loss, ...]:
-        """What could not be read, as far as is known by now (complete after a full read)."""
+        """Losses so far (complete after a full read)."""
 
     @property
     @abstractmethod
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:
-        """Where the bytes of each file went, as far as is known by now."""
+        """Byte ledger of each file so far."""
 
     @abstractmethod
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
         """Return the scalar leaves of a topic; empty where none is known.
 
-        ``quiet`` only looks: a schema that does not parse is no loss then.
+        With ``quiet`` a schema that does not parse is not reported as a loss.
         """
 
     @abstractmethod
@@ -111,8 +111,8 @@ class DriveLog(ABC):
     ) -> dict[str, Columns]:
         """Read the requested fields of messages with log time in [start, end). No other topic is decoded.
 
-        ``quiet`` only looks: messages that do not decode are no loss then. ``stamps`` are further topics, of which
-        only the times are read.
+        With ``quiet`` messages that do not decode are not reported as a loss. ``stamps`` are further topics; only their
+        times are read.
 
         Raises
         ------
@@ -140,30 +140,30 @@ class DriveLog(ABC):
 
     @property
     def index(self) -> ColumnarLog | None:
-        """What an index tells; None: there is none, or none that is sound."""
+        """The log's index; None if there is none, or an inconsistent one."""
         return None
 
     @property
     def reduced(self) -> ReducedLog | None:
-        """The log as a slim log, with the record of its source; None: it is a source itself."""
+        """The log as a reduced log, with the record of its source; None if it is a complete log."""
         return None
 
     def metadata(self) -> dict[str, str]:
-        """Return what the log says of itself by ``key`` and ``record.key``."""
+        """Return the metadata of the log by ``key`` and ``record.key``."""
         return {}
 
     def unreadable(self, topic: str) -> str:
-        """Return why no field of a topic is known; empty where one is."""
+        """Return why a topic has no readable fields; empty if it has some."""
         del topic
         return ""
 
     def borrowed(self, topic: str) -> tuple[Path, ...]:
-        """Return the files of an installed ROS that a topic's type is read by, as the log does not define it."""
+        """Return the files of an installed ROS that define a topic's type, if the log does not define it."""
         del topic
         return ()
 
     def first_messages(self, topic: str, most: int) -> list[object]:
-        """Return the first messages of a topic whole, with their texts; what does not decode is left out.
+        """Return the first messages of a topic, decoded with texts; messages that do not decode are left out.
 
         ``value_at`` of ``message_schema`` reads places in them.
         """

@@ -1,7 +1,7 @@
-"""The summary of an MCAP as an index: where its chunks lie and what they hold, without walking the file.
+"""The summary of an MCAP as an index: extents and contents of its chunks, without walking the file.
 
-For places where every read is a journey. An index is a claim: it is taken only if it is whole, if its sums agree with
-the file's statistics, and if it tells of nothing unusual in time; otherwise the file is walked like any other.
+For remote files, where every read is a request. An index is used only if it is complete, if its sums agree with the
+file's statistics, and if its times are those of a sound recording; otherwise the file is walked like any other.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class IndexedChunk:
 
 @dataclass(frozen=True, slots=True)
 class McapIndex:
-    """What a summary tells: schema and channel records, chunks and attachments [start, end) in file order."""
+    """Content of a summary: schema and channel records, chunks and attachments [start, end) in file order."""
 
     schemas: tuple[bytes, ...]
     channels: tuple[bytes, ...]
@@ -55,7 +55,7 @@ class McapIndex:
 
 
 def read_index(source: ByteSource) -> McapIndex | None:
-    """Read the summary of an MCAP from its end; None if there is none that can be believed."""
+    """Read the summary of an MCAP from its end; None if there is none that can be used."""
     try:
         section = _summary(source)
         return None if section is None else _index(*section)
@@ -146,14 +146,14 @@ def _chunk(record: bytes) -> IndexedChunk:
 
 
 def _apart(chunks: list[IndexedChunk], attachments: list[tuple[int, int]], limit: int) -> bool:
-    """Tell whether no two records overlap, and all end before the summary."""
+    """Return whether no two records overlap, and all end before the summary."""
     extents = sorted([*((c.start, c.index_end) for c in chunks), *attachments])
     ends = [len(MCAP_MAGIC), *(end for _, end in extents)]
     return all(start >= end for (start, _), end in zip(extents, ends, strict=False)) and max(ends) <= limit
 
 
 def _in_order(chunks: list[IndexedChunk]) -> bool:
-    """Tell whether the chunks' times are those of a sound recording: whatever is not is looked at by walking."""
+    """Return whether the chunks' times are those of a sound recording; any other file is walked."""
     newest: dict[int, int] = {}
     for chunk in chunks:
         if not 0 <= chunk.last_ns - chunk.first_ns < SILENCE_NS or chunk.last_ns >= MAX_TIME_NS:

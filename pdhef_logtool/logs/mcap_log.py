@@ -1,8 +1,8 @@
 """MCAP files as a container: one walk over the record headers, chunks decoded one at a time, every CRC checked.
 
-The walk visits every top-level record by its length and trusts no index, so that a file without a summary, with
-channels that only its chunks declare, with chunks that no index names, or with a cut end reads like any other. Where
-reading is far, chunks of which nothing is wanted are taken from the index, if it can be believed.
+The walk visits every top-level record by its length and uses no index, so that a file without a summary, with
+channels that only its chunks declare, with chunks that no index names, or with a cut end reads like any other. Of a
+remote file, chunks that are not wanted are taken from the index, if it is consistent.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ _SUMMARY_ONLY = frozenset(
     )
 )
 _FIRST_PRIVATE = 0x80  # what is neither known nor private is no record of the format
-#: What stands before the payload of a message record.
+#: Head of a message record, before its payload.
 MESSAGE_HEAD = np.dtype(
     [("op", "u1"), ("size", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
@@ -160,7 +160,7 @@ class McapContainer(FileContainer):
             else:
                 try:
                     walk.record(opcode, offset, end)
-                except Exception as error:  # noqa: BLE001 (whatever a record does, the next one is read)
+                except Exception as error:  # noqa: BLE001 (the next record is read in any case)
                     self.lose_record(offset, end, error)
             self.position = end
         if not header_seen:
@@ -183,7 +183,7 @@ class McapContainer(FileContainer):
                 self.add_schema(schema)
             for channel in index.channels if index else ():
                 self.add_channel(channel)
-        except Exception as error:  # noqa: BLE001 (the walk tells what is wrong)
+        except Exception as error:  # noqa: BLE001 (the walk reports the damage)
             describe_damage(error)
             self._schemas.clear()
             self._raw_channels.clear()
@@ -306,7 +306,7 @@ class McapContainer(FileContainer):
         return content
 
     def _scan(self, content: bytes, declare: bool = False) -> Block:
-        """Walk the records of a chunk's content; notes the schemas and channels it declares if told to."""
+        """Walk the records of a chunk's content; with ``declare``, add the schemas and channels in it."""
         offsets = array("q")
         offset, size = 0, len(content)
         while offset < size:
@@ -329,7 +329,7 @@ class McapContainer(FileContainer):
                 except LimitError as error:
                     self.lose(*describe_damage(error))
             elif opcode < _FIRST_PRIVATE and opcode not in _DECLARATIONS:
-                raise SpanDamageError(f"it holds a record of kind {opcode}, which no chunk may")
+                raise SpanDamageError(f"it contains a record of kind {opcode}, which no chunk may")
             offset = end
         if not offsets:
             return block_from_lists(content, *[()] * 6)
@@ -344,7 +344,7 @@ class McapContainer(FileContainer):
         if not extent.is_chunk or not len(block) or not kept.issuperset(np.unique(block.channel).tolist()):
             return None
         if max(int(block.log_time_ns.max()), int(block.publish_time_ns.max())) >= MAX_TIME_NS:
-            return None  # the index could not hold the time that the message has
+            return None  # the time does not fit the index
         content = bytes(block.buffer)
         head = block.offset - MESSAGE_HEAD.itemsize
         others = _records_between(content, np.append(0, block.offset + block.length), np.append(head, len(content)))
@@ -363,7 +363,7 @@ class McapContainer(FileContainer):
         )
 
     def _is_known(self, opcode: int, payload: bytes, kept: frozenset[int]) -> bool:
-        """Tell whether a record of a chunk declares only what the kept channels are declared as in this file."""
+        """Return whether a record of a chunk declares only what the kept channels are declared as in this file."""
         try:
             if opcode == Opcode.CHANNEL:
                 channel = Channel.read(ReadDataStream(BytesIO(payload)))
@@ -448,11 +448,11 @@ class McapContainer(FileContainer):
         self._metadata_at.append((start, end))
 
     def open_chunk(self, extent: _Extent, claimed: Span) -> None:
-        """Add a chunk by its content, which alone tells its channels or its messages; losing it if it is damaged.
+        """Add a chunk by its content, if its channels or messages are not in an index; a damaged chunk is a loss.
 
         Parameters
         ----------
-        claimed : log times of its header; counts of its message indexes, empty where these cannot be trusted.
+        claimed : log times of its header; counts of its message indexes, empty if these are inconsistent.
         """
         try:
             record = self.source.read(extent.start, extent.end - extent.start)
@@ -485,10 +485,9 @@ class McapContainer(FileContainer):
         self.spans.append(replace(span, index=len(self.spans)))
 
     def check_statistics(self, total: int, by_channel: Mapping[int, int]) -> None:
-        """Hold what the walk found against the file's statistics.
+        """Compare the counts of the walk with the file's statistics.
 
-        An index can hide messages; the statistics are believed in nothing, but where they name others than the
-        indexes, every chunk is opened.
+        An index can hide messages: if the statistics differ from the indexes, every chunk is opened.
         """
         counts: Counter[int] = Counter()
         for span in self.spans:
@@ -506,7 +505,7 @@ class McapContainer(FileContainer):
                 self.add_span(extent, span)
         held = sum(sum(span.counts.values()) for span in self.spans)
         if held < total and not self.lost:
-            what = f"the file's statistics name {total} messages, of which {held} are there"
+            what = f"the file's statistics name {total} messages, {held} of them are there"
             self.lose("missing-messages", what, count=total - held)
             self.account.lose(*self._walked.statistics_at)
 
@@ -569,12 +568,12 @@ class _Walk:
         elif opcode == Opcode.FOOTER and self.data_end:
             self.footer = (start, end)
         elif opcode < _FIRST_PRIVATE and (opcode not in _SUMMARY_ONLY or not self.data_end):
-            raise SpanDamageError(f"no record of kind {opcode} may stand here")
+            raise SpanDamageError(f"no record of kind {opcode} is allowed here")
         elif opcode - _FIRST_PRIVATE == _OP_CHUNK and self._is_chunk(start, end):
             raise SpanDamageError("a chunk whose kind has one wrong bit, which makes it a private record")
 
     def _is_chunk(self, start: int, end: int) -> bool:
-        """Tell whether a record of a private kind is laid out like a chunk."""
+        """Return whether a record of a private kind is laid out like a chunk."""
         head = self.of.source.read(start, min(end - start, _CHUNK_HEAD_BYTES))
         if len(head) < _CHUNK_HEAD_BYTES:
             return False
@@ -649,7 +648,7 @@ class _Walk:
         of.account.decode(start, end)
 
     def _index_agrees(self) -> tuple[bool, bool]:
-        """Tell whether the chunk's indexes can be believed without opening it, and whether no channel steps back."""
+        """Return whether the chunk's indexes are consistent, and whether no channel steps back in time."""
         assert self.chunk is not None
         of, size, counts = self.of, self.head[2], self.index_counts
         held = counts.total() * MESSAGE_HEAD.itemsize
@@ -675,9 +674,9 @@ class _Walk:
         self.of.account.decode(start, end)
 
     def _check_data(self) -> None:
-        """Check the CRC of the data section where nothing else protects the messages, or tells of missing ones.
+        """Check the CRC of the data section if no other checksum or count protects the messages.
 
-        Where other damage was found already, it would tell nothing new.
+        If other damage is known already, the check would add nothing.
         """
         of = self.of
         if self.data_end is None or not self.data_crc or of.lost:
@@ -692,8 +691,8 @@ class _Walk:
             of.account.verify(0, self.data_end[1])
         else:
             what = (
-                "the CRC of the data section does not match: some messages are damaged or missing, and nothing tells "
-                "which; what can be decoded is used"
+                "the CRC of the data section does not match: some messages are damaged or missing, and it is "
+                "unknown which; the messages that decode are used"
             )
             of.lose("bad-data-crc", what)
             of.account.lose(*self.data_end)
@@ -730,7 +729,7 @@ class _Walk:
         self.run, self.run_counts, self.run_ordered = None, Counter(), True
 
     def _end_chunk(self, index_complete: bool = True) -> None:
-        """Close a chunk; open it now if only its content tells its channels or its messages."""
+        """Close a chunk; open it now if its channels or messages are only in its content."""
         if self.chunk is None:
             return
         first, last, size = self.head
@@ -759,12 +758,12 @@ class _Walk:
         of = self.of
         self._end_chunk(index_complete=False)
         self._end_run()
-        what = f"bytes {start} to {resume} hold no readable record; reading resumes at the next chunk"
+        what = f"bytes {start} to {resume} contain no readable record; reading resumes at the next chunk"
         of.lose("bad-record", what, of.last_ns())
         of.account.lose(start, resume)
 
     def finish(self) -> None:
-        """Close what is open and check what only the whole file tells."""
+        """Finish open records and check the file as a whole."""
         of = self.of
         self._end_chunk(index_complete=self.closed)
         self._end_run()
@@ -823,7 +822,7 @@ def _indexed_messages(content: bytes, record: bytes, index_start: int) -> Block 
 
 
 def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
-    """Read message headers at known ascending offsets; None if the content holds other messages than these."""
+    """Read message headers at known ascending offsets; None if the content has other messages than these."""
     n = len(content)
     if offset.size == 0 or offset[0] < 0 or offset[-1] + MESSAGE_HEAD.itemsize > n:
         return None

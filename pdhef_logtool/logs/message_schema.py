@@ -1,4 +1,4 @@
-"""Message types as trees of nodes, whatever text they were declared in, and dotted paths resolved against them."""
+"""Message types as trees of nodes, for all schema languages, and dotted paths resolved against them."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class Array:
 
 @dataclass(frozen=True, slots=True)
 class Unknown:
-    """A place that the schema leaves open; what stands there is found in the messages."""
+    """A place that the schema leaves open; its type follows from the messages."""
 
 
 Node: TypeAlias = Scalar | Struct | Array | Unknown
@@ -101,9 +101,9 @@ Node: TypeAlias = Scalar | Struct | Array | Unknown
 class MessageSchema:
     """A message type: its tree, and what its messages are decoded with.
 
-    ``wire`` is ``cdr``, ``ros1``, ``json`` or ``protobuf``; ``store`` holds the definitions of ROS types,
-    ``message_class`` is the class of a protobuf type; ``budget`` holds for its messages, too; ``borrowed`` are the
-    files of an installed ROS that it was read from, where the log holds no definition.
+    ``wire`` is ``cdr``, ``ros1``, ``json`` or ``protobuf``; ``store`` has the definitions of ROS types,
+    ``message_class`` is the class of a protobuf type; ``limits`` apply to its messages, too; ``borrowed`` are the files
+    of an installed ROS that it was read from, if the log contains no definition.
     """
 
     type_name: str
@@ -121,7 +121,7 @@ class Selection:
 
     ``components`` are the places to read, as steps (member name or index): one for a scalar or an array, one a
     column for a vector, seconds and nanoseconds for a time; ``dynamic`` places are judged by their first value.
-    ``text`` is how an array of bytes is written where it stands as a text: ``hex``, ``base64`` or empty.
+    ``text`` is the encoding of an array of bytes that is a text: ``hex``, ``base64`` or empty.
     """
 
     path: str
@@ -134,21 +134,21 @@ class Selection:
 #: Endings of a path that read a text as the bytes that it encodes.
 TEXT_ENDINGS = {"|hex": "hex", "|base64": "base64"}
 
-#: Member that stands in a message type without members, and its description by rosbags.
+#: Member that message types without members get, and its description by rosbags.
 _FILLER = "structure_needs_at_least_one_member"
 _NO_MEMBERS = ((_FILLER, (1, ("uint8", 0))),)
 
 
 class SchemaError(Exception):
-    """A schema cannot be parsed; the topic stays countable, its fields are unknown."""
+    """A schema cannot be parsed; the messages of the topic are counted, its fields are unknown."""
 
 
 class NoSchemaError(SchemaError):
-    """A channel brings no schema of a kind that is read here; nothing of the recording is lost by that."""
+    """A channel has no schema of a supported kind; this is no loss."""
 
 
 class MissingDefinitionError(NoSchemaError):
-    """Neither the log nor what is known beside it defines a type."""
+    """No definition of a type is available."""
 
     def __init__(self, type_name: str) -> None:
         super().__init__(f"no definition of {type_name}")
@@ -157,12 +157,12 @@ class MissingDefinitionError(NoSchemaError):
 
 @contextmanager
 def parsing(what: str) -> Iterator[None]:
-    """Turn whatever escapes the parser of somebody else's text into a :class:`SchemaError`."""
+    """Turn any error of a parser into a :class:`SchemaError`."""
     try:
         yield
     except SchemaError:
         raise
-    except PdhefError as error:  # the budget's
+    except PdhefError as error:  # of the resource limits
         raise SchemaError(f"{what}: expected {error.expected}, got {error.got}; {error.remedy}") from error
     except RecursionError as error:
         raise SchemaError(f"{what}: nested too deeply") from error
@@ -172,14 +172,14 @@ def parsing(what: str) -> Iterator[None]:
 
 
 class Unfolding:
-    """Counts the places of a schema while its tree is built: a short text can describe an endless one."""
+    """Counts the places of a schema while its tree is built: a short text can describe an unlimited tree."""
 
     def __init__(self, limits: ResourceLimits, what: str) -> None:
         self.limits, self.what = limits, what
         self.places = 0
 
     def enter(self, times: int, depth: int) -> None:
-        """Count a node that stands ``times`` times in the tree, below ``depth`` others; raises LimitError."""
+        """Count a node that occurs ``times`` times in the tree, below ``depth`` others; raises LimitError."""
         self.places += times
         self.limits.check("schema_leaves", self.places, self.what)
         self.limits.check("schema_depth", depth, self.what)
@@ -222,7 +222,7 @@ def ros_schema(
     text : concatenated definitions; empty takes the type from the distribution's own packages, else from definitions.
     wire : ``cdr`` or ``ros1``.
     distro : ROS distribution for a type without a text; the latest one if empty or unknown.
-    budget : what the schema may cost.
+    limits : resource limits of the schema.
     definitions : of types that neither the text nor the distribution has.
 
     Raises
@@ -477,7 +477,7 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
 
     Raises
     ------
-    MappingError : the type has no such path, or it names what is no number; the nearest paths are named.
+    MappingError : the type has no such path, or it is no number; the message names similar paths.
     """
     ending = next((e for e in TEXT_ENDINGS if path.endswith(e)), "")
     steps = parse_path(path.removesuffix(ending))

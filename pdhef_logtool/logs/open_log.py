@@ -53,19 +53,19 @@ def open_log(
     """Open a log, recognised by its content.
 
     A file of one of the :mod:`~pdhef_logtool.logs.formats`, each also zstd-compressed; a rosbag2 folder with its
-    ``metadata.yaml`` (split files are one log), or a folder that holds exactly one such file. Each file also by its URL
-    (``https://``, ``s3://``). A slim log (:mod:`~pdhef_logtool.logs.reduced_log`) reads like what it stands for.
+    ``metadata.yaml`` (split files are one log), or a folder with exactly one such file. Each file also by its URL
+    (``https://``, ``s3://``). A reduced log (:mod:`~pdhef_logtool.logs.reduced_log`) reads like its source.
 
     Parameters
     ----------
-    budget : what reading it may cost; what claims more is among the log's losses.
+    limits : resource limits of reading; what exceeds them is a loss.
     msgs : folder, zip file or wheel with definitions of types that the log does not define (:func:`read_definitions`).
-    wanted : what of a log that is far will be read.
+    wanted : what of a remote log will be read.
 
     Raises
     ------
     LogError : the path is missing, no regular file, or no log.
-    UsageError : ``msgs`` holds no definitions.
+    UsageError : ``msgs`` contains no definitions.
     """
     definitions = read_definitions(msgs)
     log = _opened(place_of(path) if isinstance(path, str) else path, Meter(limits), wanted)
@@ -110,7 +110,7 @@ def _opened(path: LogPlace, meter: Meter, wanted: Wanted) -> DriveLog:
 
 
 def log_metadata(path: LogPlace, limits: ResourceLimits = DEFAULT_LIMITS) -> dict[str, str]:
-    """Return what a log says of itself: MCAP metadata records by ``key`` and ``record.key``, rosbag2's ``custom_data``.
+    """Return the metadata of a log: MCAP metadata records by ``key`` and ``record.key``, rosbag2's ``custom_data``.
 
     Raises
     ------
@@ -121,12 +121,12 @@ def log_metadata(path: LogPlace, limits: ResourceLimits = DEFAULT_LIMITS) -> dic
 
 
 def is_log_folder(path: Path) -> bool:
-    """Tell whether a folder is one log (a rosbag2 folder) rather than a folder of logs."""
+    """Return whether a folder is one log (a rosbag2 folder) rather than a folder of logs."""
     return path.is_dir() and (path / ROSBAG2_METADATA).is_file()
 
 
 def looks_like_log(path: Path) -> bool:
-    """Tell by the first bytes and the name whether a file can be a log, without opening it further."""
+    """Return, by the first bytes and the name, whether a file can be a log, without opening it further."""
     if not path.is_file():
         return is_log_folder(path)
     with path.open("rb") as file:
@@ -291,9 +291,9 @@ def _open_rosbag2_folder(path: Path, meter: Meter) -> ColumnarLog:
 
 
 def _storage_file(folder: Path, name: str) -> Path | None:
-    """Find a file that metadata.yaml names: as given, by its last part, or with the suffix of file compression.
+    """Find a file that metadata.yaml names: as given, by its name alone, or with the suffix of file compression.
 
-    A name that leads out of the folder counts by its last part only.
+    Of a name that leads out of the folder only the last component counts.
     """
     given = Path(name)
     inside = not given.is_absolute() and ".." not in given.parts
@@ -316,5 +316,5 @@ def _declared_encodings(information: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _text(value: object) -> str:
-    """Return a scalar of a YAML document as a text: lists of lists of one anchor have no end when they are written."""
+    """Return a scalar of a YAML document as a text; lists with anchors can be endless and give an empty text."""
     return str(value) if isinstance(value, str | int | float) else ""

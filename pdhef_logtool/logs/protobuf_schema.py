@@ -1,6 +1,6 @@
 """Protobuf message types from the descriptors that a log carries, and accessors compiled from dotted paths.
 
-A message without a value tells two cases apart, as the language does: a plain scalar of proto3 that is not on the wire
+Two cases of a missing value differ, as in the language: a plain scalar of proto3 that is not on the wire
 is its default (0), whereas an absent sub-message, an unset ``optional`` and the members of a ``oneof`` that are not the
 set one are absent (NaN). Maps and types that contain themselves have no place among columns and are left out.
 """
@@ -41,7 +41,7 @@ def protobuf_schema(type_name: str, data: bytes, limits: ResourceLimits = DEFAUL
 
     Raises
     ------
-    SchemaError : the set does not parse, lacks a file, does not hold the type, or costs too much.
+    SchemaError : the set does not parse, lacks a file or the type, or exceeds a resource limit.
     """
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
@@ -58,7 +58,7 @@ def protobuf_schema(type_name: str, data: bytes, limits: ResourceLimits = DEFAUL
         try:
             descriptor = pool.FindMessageTypeByName(type_name.removeprefix("."))
         except KeyError as error:
-            raise SchemaError(f"the descriptors hold no message {type_name}") from error
+            raise SchemaError(f"the descriptors contain no message {type_name}") from error
         root = _message_node(descriptor, (), unfolding)
         message_class = message_factory.GetMessageClass(descriptor)
     return MessageSchema(type_name, "protobuf", root, None, message_class, limits)
@@ -171,7 +171,7 @@ def _compile_steps(descriptor: Any, steps: Sequence[Step]) -> Callable[[Any], ob
             plan[-1] = (name, optional, step)
             continue
         field = descriptor.fields_by_name[step]
-        # A default that the type declares (proto2) stands for an absent value.
+        # A default that the type declares (proto2) replaces an absent value.
         plan.append((step, field.has_presence and not field.has_default_value, -1))
         descriptor = field.message_type
     whole = bool(plan) and plan[-1][2] < 0 and field is not None and _is_array(field)
@@ -197,6 +197,6 @@ def _is_array(field: Any) -> bool:
 
 
 def _is_repeated(field: Any) -> bool:
-    # Releases up to 6.30 say it by the label only, which later ones deprecate.
+    # Releases up to 6.30 have the label only, which later ones deprecate.
     is_repeated = getattr(field, "is_repeated", None)
     return bool(field.label == field.LABEL_REPEATED) if is_repeated is None else bool(is_repeated)

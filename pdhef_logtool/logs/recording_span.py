@@ -1,15 +1,15 @@
-"""When a log was recorded: found before anything is read in windows, from spans, and from stamps where a span is torn.
+"""The recording span of a log: determined before windows are read, from spans, and from stamps where spans are wide.
 
-Log times are a recorder's claim. One message at time 0 makes a log 56 years long; a clock that is set after boot tears
-a recording in two; a clock that is set back records the same times twice. So three questions come first:
+Log times depend on the recorder's clock. One message at time 0 makes a log 56 years long; a clock that is set after
+boot splits a recording in two; a clock that is set back records the same times twice. So three cases are removed:
 
-* *Strays*: a few messages that lie far from all others are left out.
-* *Epochs*: stretches too far apart for a pause. The one with most messages is kept, the others are left out.
-* *Steps back*: where a topic's time falls back in file order, the order in the file is the truth of order. What was
-  recorded after the step is left out for as long as its times were recorded before, and ``BREAK_NS`` around, so that
-  two passes are never interleaved and the break shows as a gap.
+* *Outlier stamps*: a few messages that are far from all others are left out.
+* *Clock resets*: stretches that are too far apart for a pause. The stretch with most messages is kept.
+* *Steps back*: if a topic's time falls back in file order, the order in the file is the right one. Messages after the
+  step are left out while their times were recorded before, and ``BREAK_NS`` around, so that two passes are never
+  interleaved and the break is a gap.
 
-On a sound log nothing is left out, and its first and last log time are what they were.
+Of a sound log nothing is left out, and its first and last log time do not change.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
 #: A longer silence ends a stretch. Shorter ones cost no window of their own.
 SILENCE_NS = 600_000_000_000
-#: A stretch of no more messages than this is stray: no drive, and nothing that an estimate could be made of.
+#: A stretch with at most this many messages is an outlier: too short for any estimate.
 OUTLIER_MESSAGES = 3
-#: Nobody drives on in the same log after a longer pause; clocks that are set jump by months and years.
+#: No drive continues in the same log after a longer pause; clocks that are set jump by months and years.
 EPOCH_NS = 86_400_000_000_000
 #: Recorders with several threads write up to a second out of order; a clock that is set back falls further...
 STEP_BACK_NS = 1_000_000_000
-#: ... for at least this many messages, behind the middle one of as many before, where wrong times stand alone.
+#: ... for at least this many messages, behind the median of as many before; single wrong times are no step.
 STEP_BACK_MESSAGES = 5
-#: Left out beside times that were recorded twice: nothing says how much time really passed at the step.
+#: Left out beside times that were recorded twice: the true duration of the step is unknown.
 BREAK_NS = 1_000_000_000
 #: Below this share of a log's messages what is left out is a note, above it is a loss.
 NOTED_SHARE = 0.01
@@ -88,7 +88,7 @@ class RecordingSpan:
         return self.intervals[-1][1] if self.intervals else 0
 
     def unused(self, topic: str, c: int, span: Span, log_time_ns: IntArray) -> BoolArray | None:
-        """Tell which of a topic's messages in a span (all of them, in file order) are left out; None: none of them.
+        """Return which of a topic's messages in a span (all of them, in file order) are left out; None: none of them.
 
         To be asked where anything is ``left_out`` at all.
         """
@@ -96,7 +96,7 @@ class RecordingSpan:
         return unused if unused.any() else None
 
     def recorded_before(self, topic: str, c: int, span: Span, log_time_ns: IntArray) -> BoolArray:
-        """Tell which of a topic's messages in a span (all of them, in file order) have times of an earlier pass."""
+        """Return which of a topic's messages in a span (all of them, in file order) have times of an earlier pass."""
         return _cut_out(log_time_ns, topic, (c, span.index), self.cuts)
 
 
@@ -107,8 +107,8 @@ def find_epochs(
 
     Returns
     -------
-    intervals : [start, end) that are kept, ascending. kept, stray : bool [K], by piece; what is neither is of another
-        epoch.
+    intervals : [start, end) that are kept, ascending. kept, outlier : bool [K], by piece; a piece that is neither
+        belongs to another clock reset.
     """
     n = start_ns.shape[0]
     if n == 0:
@@ -125,10 +125,10 @@ def find_epochs(
     weight = np.bincount(epoch, weights=size[solid])
     best = int(np.flatnonzero(weight == weight.max())[-1])  # of equals the last: its clock was set
     chosen = solid[epoch == best]
-    kept, stray = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+    kept, outlier = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
     kept[order] = np.isin(stretch, chosen)
-    stray[order] = ~np.isin(stretch, solid)
-    return [(int(begin[s]), int(end[s])) for s in chosen], kept, stray
+    outlier[order] = ~np.isin(stretch, solid)
+    return [(int(begin[s]), int(end[s])) for s in chosen], kept, outlier
 
 
 def steps_back(times_ns: IntArray) -> IntArray:
@@ -202,11 +202,11 @@ def _kept_epoch(
     """Return the intervals that are kept, the messages left out by topic and reason, their losses, and all messages."""
     pieces = [piece for of in look for piece in of.pieces()]
     start, end, count = (np.array([p[i] for p in pieces], dtype=np.int64) for i in (0, 1, 2))
-    intervals, kept, stray = find_epochs(start, end, count)
+    intervals, kept, outlier = find_epochs(start, end, count)
     left_out: dict[str, Counter[str]] = {}
     losses = []
     total = int(count.sum())
-    for reason, which in ((OUTLIER, stray), (OTHER_EPOCH, ~kept & ~stray)):
+    for reason, which in ((OUTLIER, outlier), (OTHER_EPOCH, ~kept & ~outlier)):
         for i in np.flatnonzero(which).tolist():
             for topic, n in pieces[i][3].items():
                 left_out.setdefault(topic, Counter())[reason] += n
@@ -221,7 +221,7 @@ def _kept_epoch(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Looked:
-    """A span, and its channels and times where these had to be looked at and say more than the span does."""
+    """A span, with its channels and times if these were read because the bounds of the span are not enough."""
 
     c: int
     span: Span
@@ -251,7 +251,7 @@ class _Looked:
         return self.span.end_ns - 1 if self.stamps is None else int(self.of_channel(id_).max(initial=0))
 
     def of_channel(self, id_: int) -> IntArray:
-        """Return the times of a channel in file order; of a span in order its bounds stand for them."""
+        """Return the times of a channel in file order; of an ordered span its bounds."""
         if self.stamps is None:
             return np.array([self.span.start_ns, self.span.end_ns - 1])
         channel, times = self.stamps
@@ -259,7 +259,7 @@ class _Looked:
 
 
 def _look(containers: Sequence[Container], times: SpanTimes) -> list[_Looked]:
-    """Return all spans in file order, with their times where the span does not tell when its messages are."""
+    """Return all spans in file order, with their times if the bounds of a span are not enough."""
     looked: list[_Looked] = []
     newest: dict[str, int] = {}
     for c, container in enumerate(containers):
@@ -293,7 +293,7 @@ def _cuts(looked: Sequence[_Looked], intervals: Sequence[tuple[int, int]]) -> li
         for id_ in of.span.counts:
             channel_times = of.of_channel(id_)
             inside = _inside(channel_times, intervals)
-            if inside.any():  # what is left out anyway stands for its neighbour, so that rows keep their places
+            if inside.any():  # left-out rows take the time of a neighbour, so that rows keep their places
                 last = np.maximum.accumulate(np.where(inside, np.arange(channel_times.shape[0]), -1))
                 channel_times = channel_times[np.where(last >= 0, last, int(np.argmax(inside)))]
                 parts.setdefault(of.topics[id_], []).append((channel_times, of.c, of.span.index))
@@ -332,7 +332,7 @@ def _inside(times_ns: IntArray, intervals: Sequence[tuple[int, int]]) -> BoolArr
 
 
 def _cut_out(times_ns: IntArray, topic: str, place: tuple[int, int], cuts: Iterable[Cut]) -> BoolArray:
-    """Tell which of a topic's messages in the span of a place, file and span, the cuts leave out."""
+    """Return which of a topic's messages in the span of a place, file and span, the cuts leave out."""
     left_out = np.zeros(times_ns.shape[0], np.bool_)
     for cut in cuts:
         if cut.topic == topic and place >= cut.place[:2]:
@@ -361,7 +361,7 @@ def _loss(reason: str, where: str, start_ns: IntArray, end_ns: IntArray, count: 
 
 
 def shown_time(ns: int) -> str:
-    """Return a time of the log's clock in UTC to the second, whatever it is."""
+    """Return any time of the log's clock in UTC to the second."""
     try:
         return (datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=ns // 10**9)).strftime("%Y-%m-%d %H:%M:%S UTC")
     except (OverflowError, ValueError):

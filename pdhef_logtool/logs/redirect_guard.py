@@ -1,7 +1,7 @@
 """Where a web server may redirect a request for a log: to public addresses, and to other places of the same host.
 
-A log's server is not trusted: a redirect could make this machine ask its own services, or those of its network. So the
-target of each redirect is checked, and once more the addresses that are connected to, as names can change in between.
+A log's server may be malicious: a redirect could make this machine send requests to itself or to its network. So the
+target of each redirect is checked, and also the addresses of each connection, as names can change in between.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class PrivateRedirectError(Exception):
 
 
 def is_public(address: str) -> bool:
-    """Tell whether an IP address is reached over the internet, and not only on this machine or its network."""
+    """Return whether an IP address is reached over the internet, and not only on this machine or its network."""
     ip = ipaddress.ip_address(address.partition("%")[0])
     if isinstance(ip, ipaddress.IPv6Address):
         inner = ip.ipv4_mapped or ip.sixtofour or (ip.teredo[1] if ip.teredo else None)
@@ -73,7 +73,7 @@ class RedirectGuard(AbstractResolver):
         except ValueError:
             try:
                 addresses = [address["host"] for address in await self._resolver.resolve(host, 0, socket.AF_UNSPEC)]
-            except OSError:  # a proxy may know it; without one the request fails by itself
+            except OSError:  # a proxy may resolve it; without one the request fails
                 return
         if not all(map(is_public, addresses)):
             raise PrivateRedirectError(host)

@@ -1,4 +1,4 @@
-"""Writing of slim logs: some topics of a log as they are, each in chunks of its own, and the record of the source."""
+"""Writing of reduced logs: some topics of a log as they are, each in separate chunks, and the record of the source."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BEFORE_DATA = 22
 
 
 def write_record(writer: McapLogWriter, record: ReducedRecord) -> None:
-    """Write the record that makes a file a slim log."""
+    """Write the record that marks a file as a reduced log."""
     from pydantic import TypeAdapter
 
     writer.metadata(RECORD_NAME, {RECORD_ENTRY: TypeAdapter(ReducedRecord).dump_json(record).decode()})
@@ -31,11 +31,11 @@ def write_record(writer: McapLogWriter, record: ReducedRecord) -> None:
 def copy_topics(writer: McapLogWriter, log: ColumnarLog, topics: Collection[str]) -> None:
     """Write the messages of some topics as they are, a chunk holding one topic's, each topic's in the log's order.
 
-    Messages whose times were recorded before are left out: which they are would not be known any more.
+    Messages whose times were recorded before are left out, as they could not be recognised in the copy.
 
     Raises
     ------
-    LogError : the log is of a time before 1970, which an MCAP cannot hold.
+    LogError : the log is of a time before 1970, which an MCAP cannot represent.
     """
     if log.start_ns < 0:
         raise LogError(expected="log times from 1970 on", got=f"{log.start_ns} ns", where=str(log.path))

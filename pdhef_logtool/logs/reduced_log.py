@@ -1,8 +1,8 @@
-"""A slim log: the topics that a run reads of a log, in one small MCAP that stands for it.
+"""A reduced log: the topics that a run reads of a log, in one small MCAP that replaces it.
 
-Messages are kept as they were recorded, byte for byte, so that whatever is computed of them is the same bit for bit.
-What is known of the source beyond its messages stands in a record beside them: when it was recorded, what it lost, what
-else it held, and which mapping was used. Each chunk holds one topic, so that reading a topic costs its own bytes alone.
+Messages are kept byte for byte, so that all results are bit-equal. A metadata record describes the source: when it was
+recorded, its losses, its other topics, and the mapping that was used. Each chunk contains one topic, so that reading a
+topic reads no other bytes.
 """
 
 from __future__ import annotations
@@ -38,21 +38,21 @@ _DATA_END = struct.Struct("<BQI")
 _LONGEST_NS = 366 * 86_400_000_000_000
 #: Losses that come up again when the kept messages are read.
 _FOUND_AGAIN = frozenset({"undecodable", "bad-schema"})
-_EXPECTED = f"a slim log of format {FORMAT}"
+_EXPECTED = f"a reduced log of format {FORMAT}"
 _REMEDY = "delete it; pdhef run LOG --cache DIR writes it again"
 
 
 @dataclass(frozen=True, slots=True)
 class ReducedRecord:
-    """What a slim log knows of its source beside the messages.
+    """Description of the source of a reduced log.
 
     Attributes
     ----------
-    file, kind, identity : the source's name, container, and what it is known by. tool : version that made this.
+    file, kind, identity : name, format and identity of the source. tool : version that wrote this.
     distro : ROS distribution of types that the source does not define.
     intervals, left_out : of its :class:`RecordingSpan`. topics : all of them with their messages, kept or not.
-    losses, byte_ledgers : complete, as a run of the whole source tells them.
-    metadata : what the source says of itself. mapped : the mapping as the floor above has written it.
+    losses, byte_ledgers : complete, as after a run of the whole source.
+    metadata : of the source. mapped : the mapping, as the package ``drive`` writes it.
     signals_sha256, truth_sha256 : hashes of the mapped channels.
     """
 
@@ -74,11 +74,11 @@ class ReducedRecord:
 
 
 class ReducedLog(ColumnarLog):
-    """Reads like the log that it stands for; a topic that was not kept is there with its messages, but without fields.
+    """Reads like its source; a topic that was not kept has its number of messages, but no fields.
 
     Attributes
     ----------
-    record : what is known of the source.
+    record : description of the source.
     """
 
     def __init__(self, path: LogPlace, container: Container, record: ReducedRecord) -> None:
@@ -98,7 +98,7 @@ class ReducedLog(ColumnarLog):
         return self
 
     def metadata(self) -> dict[str, str]:
-        """Return what the source says of itself."""
+        """Return the metadata of the source."""
         return dict(self.record.metadata)
 
     @property
@@ -108,7 +108,7 @@ class ReducedLog(ColumnarLog):
 
     @property
     def lost(self) -> tuple[Loss, ...]:
-        """What of the source could not be read, and what of this file cannot."""
+        """Losses of the source and of this file."""
         return (*self.record.losses, *(x for x in super().lost if x.kind not in _FOUND_AGAIN))
 
     @property
@@ -135,7 +135,7 @@ class ReducedLog(ColumnarLog):
 
 
 def reduced_record(container: Container) -> ReducedRecord | None:
-    """Return the record of a slim log; None for any other file.
+    """Return the record of a reduced log; None for any other file.
 
     Raises
     ------
@@ -164,7 +164,7 @@ def reduced_record(container: Container) -> ReducedRecord | None:
 
 
 def is_whole(path: Path) -> bool:
-    """Tell by its checksums whether a file that our writer wrote is as it was written."""
+    """Return, by its checksums, whether a file that our writer wrote is as it was written."""
     data = path.read_bytes()
     foot = len(data) - FOOTER.size - len(MCAP_MAGIC)
     if foot < _DATA_END.size or not data.endswith(MCAP_MAGIC):

@@ -1,7 +1,7 @@
 """Objects on servers, asked for ranges of their bytes: HTTP by aiohttp, S3 by aiobotocore, both as fsspec sets them up.
 
-Each answer is held against what the object was when it was opened. Whether asking again helps is told by which of two
-errors is raised: :class:`TryAgainError`, or one that ends it.
+Each response is compared with the state of the object when it was opened. If a new request can help, the
+error is :class:`TryAgainError`; any other error is final.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pdhef_logtool.records.errors import UsageError
 _BLOCK_BYTES = 1 << 20
 #: Progress from which on a cut answer counts as none of the tries.
 _PROGRESS_BYTES = 64 << 10
-#: What a server says that will pass: too many requests, timeouts, restarts.
+#: Temporary status codes: too many requests, timeouts, restarts.
 _PASSING = frozenset({408, 425, 429, 500, 502, 503, 504, 520, 521, 522, 523, 524})
 _REFUSED = {401: "it asks who you are", 403: "it refuses access", 407: "the proxy asks who you are"}
 _CONTENT_RANGE = re.compile(r"bytes (?:(\d+)-(\d+)|\*)/(\d+|\*)")
@@ -48,7 +48,7 @@ _LONG_RUN_SILENCES = 4
 
 
 class TryAgainError(Exception):
-    """The answer did not come whole; asking again may help. ``wait_s`` is what the server asks for, 0 without."""
+    """The response is incomplete; a new request may help. ``wait_s`` is the wait that the server asks for, else 0."""
 
     def __init__(self, what: str, wait_s: float = 0.0) -> None:
         super().__init__(what)
@@ -179,7 +179,7 @@ class HttpObject(RemoteObject):
         url = self.place.url
         try:
             session = await self._system.set_session()
-            # What is encoded already is sent as it stands: a signature may be of just these characters.
+            # An encoded URL is sent unchanged: a signature may depend on its characters.
             asked = yarl.URL(url, encoded=url.isascii() and url.isprintable() and " " not in url)
             async with session.get(asked, headers=headers) as response:
                 yield self._answer(response, start, end, pinned)
@@ -199,7 +199,7 @@ class HttpObject(RemoteObject):
             raise TryAgainError(f"silence of {PATIENCE.silence_s:g} s") from None
         except aiohttp.ClientPayloadError:
             raise TryAgainError("an answer that is cut") from None
-        except (aiohttp.ClientError, OSError) as error:  # without its text, which may hold the URL
+        except (aiohttp.ClientError, OSError) as error:  # without its text, which can contain the URL
             why = getattr(error, "strerror", None) or type(error).__name__
             raise TryAgainError(f"no connection ({why})") from None
 
@@ -301,7 +301,7 @@ def keys_below(prefix: RemotePlace) -> list[str]:
 
     Raises
     ------
-    SourceError : The store does not tell.
+    SourceError : The store does not list them.
     """
     store = S3Object(prefix)
 

@@ -1,7 +1,7 @@
-"""Bytes of an object on a server: each is fetched once, into a file of this machine from which all reading is done.
+"""Bytes of an object on a server: each is fetched once, into a local file from which all reads are served.
 
-What is wanted is joined to ranges across gaps of at most 64 kB, of at most 8 MB each, several of which are under way at
-once. Nothing but blocks on their way is in memory. A cut range goes on where it was cut.
+Wanted bytes are joined to ranges of at most 8 MB across gaps of at most 64 kB, and several ranges are fetched in
+parallel. Only blocks in transfer are in memory. An interrupted range continues where it was cut.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from pdhef_logtool.storage.files import scratch_folder
 
 Extent: TypeAlias = tuple[int, int]
 
-#: Fetching this many bytes that nobody asked for is cheaper than one request more.
+#: Fetching this many unwanted bytes is cheaper than another request.
 JOINED_GAP_BYTES = 64 << 10
 MOST_RANGE_BYTES = 8 << 20
 AT_ONCE = 4
-#: Enough to tell what an object is.
+#: Enough to recognise the format of an object.
 HEAD_BYTES = 4 << 10
-#: A scratch file leaves this much of the disk to others.
+#: Free disk space that a scratch file leaves.
 _DISK_RESERVE_BYTES = 256 << 20
 #: Objects that were closed stay for the next opening, so that no pass over the same log fetches it again.
 _KEPT_BYTES = 4 << 30
@@ -112,13 +112,13 @@ class RemoteSource(ByteSource):
     Parameters
     ----------
     head_bytes : that are fetched at once.
-    place : where it lies. What the object is (size, ETag, time of modification) is pinned now; that it became another
-        one ends any later read.
+    place : its URL. Its state (size, ETag, time of modification) is recorded now; any later read fails if it has
+        changed.
 
     Raises
     ------
-    SourceError : There is none, it may not be read, or the server does not answer.
-    UsageError : What it takes to ask is not installed.
+    SourceError : It does not exist, may not be read, or the server does not respond.
+    UsageError : A required package is not installed.
     """
 
     is_remote = True
@@ -143,7 +143,7 @@ class RemoteSource(ByteSource):
 
     @property
     def path(self) -> Path:
-        """The scratch file, of which what was fetched holds; all of it after :meth:`fetch_whole`."""
+        """The scratch file: fetched ranges are valid, all of it after :meth:`fetch_whole`."""
         return self._spool.path
 
     def fetch(self, offset: int, size: int) -> bytes:
@@ -164,7 +164,7 @@ class RemoteSource(ByteSource):
         self._spool.wait(0, self.size)
 
     def close(self) -> None:
-        """Release the scratch file, which stays for a while for who opens the same object again."""
+        """Release the scratch file, which is kept for some time in case the same object is opened again."""
         if not self._closed:
             self._closed = True
             _release(self._spool)
@@ -197,7 +197,7 @@ class _Spool:
         self._room = 0
 
     def enter(self, head_bytes: int) -> None:
-        """Open the scratch file; who is first pins what the object is, whoever comes later asks if it still is.
+        """Open the scratch file; the first user records the state of the object, later ones compare it.
 
         Raises
         ------
@@ -313,7 +313,7 @@ class _Spool:
         async for block in answer.blocks:
             position += self._put(block, position)
         if answer.start == 0 and size >= 0 and position > size:
-            raise self.remote.error("more bytes than it says it has", "read a copy")
+            raise self.remote.error("more bytes than its declared size", "read a copy")
         return position
 
     def _put(self, block: bytes, offset: int) -> int:

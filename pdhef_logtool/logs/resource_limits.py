@@ -1,8 +1,7 @@
-"""What a log may cost before its claims count as damage: one object through all readers of untrusted input.
+"""Resource limits of reading a log, for all readers of untrusted input; exceeding one counts as damage.
 
-A recording is somebody else's file: a hundred bytes can claim gigabytes, a short schema can unfold without end. Each
-limit lies far above what recorders write and far below what harms a machine; one factor raises them all
-(``--set budget=FACTOR``).
+A hundred bytes of a third-party file can declare gigabytes, and a short schema can unfold without end. Each limit is
+far above what recorders write and far below what harms a machine; one factor raises all (``--set budget=FACTOR``).
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ _FEW_MESSAGES = 1 << 16
 
 
 class LimitError(LogError):
-    """Input claims more than it may cost; inside a log it becomes a loss at its place."""
+    """Input exceeds a resource limit; inside a log this is a loss."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +36,7 @@ class ResourceLimits:
     schema_bytes : text or descriptors of one schema. schema_leaves : scalar places of an unfolded schema.
     schema_depth : structs inside one another, also of a JSON message.
     array_width : elements of an array that become columns.
-    seconds, seconds_per_mib : processor time that reading may take, whatever is read and by what is read.
+    seconds, seconds_per_mib : processor time of reading: a constant part, and a part per MiB read.
     """
 
     chunk_bytes: int = 256 << 20
@@ -54,7 +53,7 @@ class ResourceLimits:
     seconds_per_mib: float = 20.0
 
     def times(self, factor: float) -> ResourceLimits:
-        """Return the budget with every limit raised by a factor."""
+        """Return limits that are higher by a factor."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         return ResourceLimits(**{name: type(value)(value * factor) for name, value in values.items()})
 
@@ -76,7 +75,7 @@ class ResourceLimits:
             self.check("chunk_ratio", size / max(stored, 1), what)
 
     def check_messages(self, count: int, stored: int) -> None:
-        """Raise :class:`LimitError` if ``stored`` bytes may not hold so many messages."""
+        """Raise :class:`LimitError` if ``stored`` bytes may not contain so many messages."""
         self.check("chunk_messages", count, "a chunk")
         if count > _FEW_MESSAGES:
             self.check("messages_per_byte", count / max(stored, 1), "a chunk")
@@ -86,7 +85,7 @@ DEFAULT_LIMITS = ResourceLimits()
 
 
 class Meter:
-    """Processor time that reading one log took, against what its budget allows for the bytes read so far.
+    """Processor time of reading one log, with the limit for the bytes read so far.
 
     What is read again counts again on both sides, so that a sound log can be read for ever.
     """

@@ -41,7 +41,7 @@ _MESSAGES_A_CHECK = 1 << 16
 
 @dataclass(slots=True)
 class _Chunk:
-    """A chunk record in bytes [offset, end) and what its index records tell."""
+    """A chunk record in bytes [offset, end) and the content of its index records."""
 
     offset: int
     start: int  # of the stored bytes
@@ -67,7 +67,9 @@ class Rosbag1Container(FileContainer):
         self._found = 0
         self._pending: _Chunk | None = None  # the chunk whose index records are being read
         self._header: tuple[int, int] | None = None  # where the index begins, and how many chunks there are
-        self._infos: dict[int, Counter[int]] = {}  # counts by connection of the chunk at a byte, as the bag's end says
+        self._infos: dict[
+            int, Counter[int]
+        ] = {}  # counts by connection of the chunk at a byte, by the bag's index section
         super().__init__(path, shown_path, meter)
 
     def _walk(self) -> None:
@@ -91,7 +93,7 @@ class Rosbag1Container(FileContainer):
             fields, start, end = record
             try:
                 self._take(fields, offset, start, end)
-            except Exception as error:  # noqa: BLE001 (whatever a record does, the next one is read)
+            except Exception as error:  # noqa: BLE001 (the next record is read in any case)
                 self.lose_record(offset, end, error)
             self.position = end
 
@@ -121,7 +123,7 @@ class Rosbag1Container(FileContainer):
             self._infos[int.from_bytes(fields["chunk_pos"], "little")] = counts
             return
         else:
-            raise SpanDamageError(f"no record of kind {op} may stand here")
+            raise SpanDamageError(f"no record of kind {op} is allowed here")
         self.account.decode(offset, end)
 
     def _finish(self) -> None:
@@ -139,7 +141,7 @@ class Rosbag1Container(FileContainer):
         self.drop_undeclared("connections")
 
     def _check_infos(self, chunks: int) -> None:
-        """Open the chunks whose index records tell other counts than the bag's end, which could hide messages."""
+        """Open the chunks whose index records differ from the bag's index section, as these could hide messages."""
         chunks_read, spans = self._chunks, self.spans[:]
         missing = chunks - self._found
         self._chunks = []
@@ -150,7 +152,7 @@ class Rosbag1Container(FileContainer):
             else:
                 self._open_chunk(chunk)
         if missing > 0 and not self.lost:
-            self.lose("missing-messages", f"the bag's header names {chunks} chunks, of which {missing} are not there")
+            self.lose("missing-messages", f"the bag's header names {chunks} chunks, {missing} of them are not there")
             self.account.lose(0, len(self.magic))
 
     def _record_at(self, offset: int) -> tuple[dict[str, bytes], int, int] | None:
@@ -282,7 +284,7 @@ class Rosbag1Container(FileContainer):
                     offsets.append(begin)
                     lengths.append(offset - begin)
                 elif op != _OP_CONNECTION:
-                    raise SpanDamageError(f"it holds a record of kind {op}, which no chunk may")
+                    raise SpanDamageError(f"it contains a record of kind {op}, which no chunk may")
                 elif declare:
                     self._add_connection(fields, content[begin:offset])
             except (KeyError, struct.error, ValueError) as error:

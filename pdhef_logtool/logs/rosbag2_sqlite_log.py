@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 _PAGE_ROWS = 8192
 _PAGE_BYTES = 4 << 20
-_STEPS_A_CHECK = 100_000  # of the database's machine, between looks at the time
+_STEPS_A_CHECK = 100_000  # instructions of SQLite between checks of the time
 
 
 class SqliteContainer(Container):
@@ -81,7 +81,7 @@ class SqliteContainer(Container):
             raise
 
     def _out_of_time(self) -> bool:
-        """Tell SQLite to stop: a query over a hostile database need not end."""
+        """Stop SQLite: a query over a hostile database need not end."""
         try:
             self.meter.check()
         except LimitError as error:
@@ -180,7 +180,7 @@ class SqliteContainer(Container):
             self._check_indexes(row_count)
 
     def _check_indexes(self, row_count: int) -> None:
-        """Hold the rows that were found against the indexes of the table: a damaged page can hide rows."""
+        """Compare the rows that were read with the indexes of the table: a damaged page can hide rows."""
         names = [str(row[0]) for row in self._db.execute("SELECT name FROM pragma_index_list('messages')")]
         counts = [0]
         try:
@@ -195,7 +195,7 @@ class SqliteContainer(Container):
             self.account.lose(self.account.size - 1, self.account.size)
         missing = max(counts) - row_count
         if missing > 0:
-            what = f"the index of the messages names {max(counts)} rows, of which {row_count} are there"
+            what = f"the index of the messages names {max(counts)} rows, {row_count} of them are there"
             self.lose("missing-messages", what, count=missing)
             end = self._ends[-1] if self._ends else 0
             self.account.lose(end, end + round(self.account.size * missing / max(counts)))

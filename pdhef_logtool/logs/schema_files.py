@@ -55,7 +55,7 @@ def message_definition(type_name: str) -> str:
         types = get_types_from_msg(text, type_name)
         store.register({**types, **_shipped_parts(types, set(store.fielddefs))})
         generated = store.generate_msgdef(type_name, ros_version=2)[0]
-        # Keep the comments of the own text: units stand there.
+        # Keep the comments of the shipped text: they contain the units.
         _, separator, rest = generated.partition(_MESSAGE_SEPARATOR)
         return text.rstrip("\n") + "\n" + separator + rest
     if type_name not in store.fielddefs:
@@ -64,7 +64,7 @@ def message_definition(type_name: str) -> str:
 
 
 def _shipped_parts(types: Mapping[str, Any], distributed: set[str]) -> dict[str, Any]:
-    """Return the shipped types that others contain and nobody knows, at any depth."""
+    """Return the shipped types that others contain and the distribution does not have, at any depth."""
     from rosbags.typesys import get_types_from_msg
 
     parts: dict[str, Any] = {}

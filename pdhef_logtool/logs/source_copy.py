@@ -1,6 +1,6 @@
 """Lossless copies of a log's messages into an MCAP: ready bytes in log-time order, a few spans in memory at a time.
 
-Chunks of an MCAP whose channels are all kept are copied as they are, checked but not compressed anew.
+Chunks of an MCAP whose channels are all kept are copied as they are: checked, but not compressed again.
 
 MCAP sources keep schema, topic, encoding, channel metadata, both times, sequence and payload; attachments and metadata
 records come along. rosbag2 databases keep their CDR bytes and definitions. ROS 1 messages become ROS 2 CDR.
@@ -39,7 +39,7 @@ class SourceChannels:
     Attributes
     ----------
     ids : channel of the copy by file and channel of the source.
-    converters : turns a payload into what the copy holds; absent where bytes are kept.
+    converters : functions from payload to payload of the copy; absent where bytes are kept.
     numbered : ROS 1 channels whose messages begin with a header: its sequence number, which a ROS 2 header has not,
         becomes the message's.
     lost : channels and messages that cannot be copied.
@@ -141,7 +141,7 @@ class _Places:
         return channel.schema_id if fits else None
 
     def keeps(self, c: int, channel: ChannelRecord, id_: int) -> bool:
-        """Tell whether a channel has its own ids in the copy."""
+        """Return whether a channel keeps its ids in the copy."""
         return c in self._files and id_ == channel.id and self._channels.get(id_) == channel.schema_id
 
 
@@ -326,7 +326,7 @@ def _as_ros2(channel: ChannelRecord) -> tuple[ChannelRecord, Callable[[bytes], b
     def convert(data: bytes) -> bytes | None:
         try:
             return bytes(source.ros1_to_cdr(data, name))
-        except Exception:  # noqa: BLE001 (somebody else's bytes and somebody else's converter)
+        except Exception:  # noqa: BLE001 (third-party data and converter)
             return None
 
     members = parsed.fielddefs[name][1]

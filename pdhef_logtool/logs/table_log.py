@@ -25,7 +25,7 @@ class Table:
 
     Attributes
     ----------
-    name : of the topic. type_name : what kind of source it is, where the file says so.
+    name : of the topic. type_name : kind of source, if the file contains it.
     stamps_ns : int64 [N], log time, ascending; derived by the format.
     fields : columns with their kinds and units; elements of an array are ``name[0]``, ``name[1]``, ...
     load : returns rows of a column by its path: numbers [N], for kind ``time`` int64 nanoseconds [N]; for the path of
@@ -88,7 +88,7 @@ class TableLog(DriveLog):
 
     @property
     def lost(self) -> tuple[Loss, ...]:
-        """What could not be read, as far as is known by now."""
+        """Losses so far."""
         return tuple(self._lost)
 
     @property
@@ -139,7 +139,7 @@ class TableLog(DriveLog):
         return Columns(table.name, stamps, stamps, columns)
 
     def _column(self, table: Table, path: str, rows: Sequence[slice], n: int, quiet: bool) -> NDArray[Any]:
-        """Load rows of a column. The boundary: whatever escapes the format is the loss of the column."""
+        """Load rows of a column. Any error of the format is a loss of the column."""
         is_time = any(f.path == path and f.kind == "time" for f in table.fields)
         kind = np.dtype(np.int64 if is_time else np.float64)
         try:

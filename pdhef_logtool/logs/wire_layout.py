@@ -53,17 +53,17 @@ class WireLayout:
     ----------
     size : bytes of one message, encapsulation header included.
     leaves : by their steps; arrays of primitives as one leaf.
-    guards : (offset, uint32) in wire order: lengths of strings and sequences, which hold for this layout only.
+    lengths : (offset, uint32) in wire order: lengths of strings and sequences, which identify this layout.
     texts : (offset, length without terminator) of every string, by its steps.
     """
 
     size: int
     leaves: Mapping[Steps, Leaf]
-    guards: tuple[tuple[int, int], ...]
+    lengths: tuple[tuple[int, int], ...]
     texts: Mapping[Steps, tuple[int, int]]
 
 
-#: Tells the length word of the string or sequence at these steps, whose length word lies at this offset.
+#: Returns the length of the string or sequence at these steps, whose length word is at this offset.
 LengthOf: TypeAlias = Callable[[Steps, int, bool], int]
 
 
@@ -86,7 +86,7 @@ def layout_of_message(root: Node, wire: str, message: bytes) -> WireLayout:
 
 
 def build_layout(root: Node, wire: str, length_of: LengthOf) -> WireLayout:
-    """Lay out a message type whose variable lengths ``length_of`` tells; raises :class:`NoLayoutError`."""
+    """Lay out a message type with the variable lengths of ``length_of``; raises :class:`NoLayoutError`."""
     return _Builder(wire, length_of, sys.maxsize).built(root)
 
 
@@ -99,14 +99,14 @@ class _Builder:
         self.end = end
         self.places = 0
         self.leaves: dict[Steps, Leaf] = {}
-        self.guards: list[tuple[int, int]] = []
+        self.lengths: list[tuple[int, int]] = []
         self.texts: dict[Steps, tuple[int, int]] = {}
 
     def built(self, root: Node) -> WireLayout:
         self.place(root, ())
         if self.position > self.end:
             raise NoLayoutError("the message ends early")
-        return WireLayout(self.position, self.leaves, tuple(self.guards), self.texts)
+        return WireLayout(self.position, self.leaves, tuple(self.lengths), self.texts)
 
     def align(self, size: int) -> None:
         if self.aligned:
@@ -115,7 +115,7 @@ class _Builder:
     def length_word(self, steps: Steps, is_text: bool) -> int:
         self.align(4)
         length = self.length_of(steps, self.position, is_text)
-        self.guards.append((self.position, length))
+        self.lengths.append((self.position, length))
         self.position += 4
         return length
 
@@ -164,8 +164,8 @@ class _Builder:
 class LayoutReader:
     """Reads chosen leaves of the messages that have one layout.
 
-    The places needed (leaves, and the guards that tell whether a message has the layout) are gathered in stretches:
-    one copy a stretch and message, whatever else the message holds.
+    The places needed (leaves, and the lengths that identify the layout) are gathered in stretches: one copy per stretch
+    and message.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ class LayoutReader:
         places: list[tuple[int, np.dtype[Any], int | Steps]] = []
         if wire == "cdr":
             places.append((0, _CDR_HEAD, _LITTLE_ENDIAN_CDR))
-        places += [(offset, _WORD, expected) for offset, expected in layout.guards]
+        places += [(offset, _WORD, expected) for offset, expected in layout.lengths]
         for steps in wanted:
             leaf = leaf_at(layout, steps)
             if leaf is not None and leaf.count == 0:
@@ -212,18 +212,18 @@ class LayoutReader:
                 "itemsize": end - start,
             }
         )
-        guards = []
+        lengths = []
         for i, (_, _, what) in enumerate(group):
             if isinstance(what, int):
-                guards.append((f"f{i}", what))
+                lengths.append((f"f{i}", what))
             else:
                 self._places[what] = (len(self._stretches), f"f{i}")
-        self._stretches.append(_Stretch(start, np.dtype((np.void, end - start)), record, tuple(guards)))
+        self._stretches.append(_Stretch(start, np.dtype((np.void, end - start)), record, tuple(lengths)))
 
     def gather(
         self, buffer: bytes | memoryview, offset: NDArray[np.int64]
     ) -> tuple[NDArray[np.bool_] | None, list[NDArray[Any]]]:
-        """Gather the messages at these offsets [N], all of which hold ``size`` bytes.
+        """Gather the messages of ``size`` bytes at these offsets [N].
 
         Returns
         -------
@@ -238,7 +238,7 @@ class LayoutReader:
             view = np.ndarray((places,), dtype=stretch.plain, buffer=buffer, offset=stretch.start, strides=(1,))
             part = view[offset].view(stretch.record)
             parts.append(part)
-            for name, expected in stretch.guards:
+            for name, expected in stretch.lengths:
                 right = part[name] == expected
                 fits = right if fits is None else fits & right
         if fits is None or fits.all():
@@ -261,7 +261,7 @@ class _Stretch:
     start: int
     plain: np.dtype[Any]
     record: np.dtype[Any]
-    guards: tuple[tuple[str, int], ...]
+    lengths: tuple[tuple[str, int], ...]
 
 
 def leaf_at(layout: WireLayout, steps: Steps) -> Leaf | None:

@@ -1,7 +1,7 @@
 """MCAP writing: ROS 2 topics from columns, other messages as ready bytes, merged by log time.
 
 Every file has zstd chunks, message indexes, statistics, a summary and CRCs: other readers need them. Channels and
-schemas stand before the first chunk that uses them and again in the summary.
+schemas are written before the first chunk that uses them and again in the summary.
 """
 
 from __future__ import annotations
@@ -188,7 +188,7 @@ class McapLogWriter:
         ----------
         topic : topic name.
         type_name : ROS 2 type, ``pkg/msg/Type``.
-        constants : what every message holds, by path (texts, numbers, arrays such as covariances).
+        constants : constant fields of every message, by path (texts, numbers, arrays such as covariances).
         definition : ros2msg text; the type's own from ``schemas/`` or the common ROS 2 packages when absent.
 
         Raises
@@ -246,7 +246,7 @@ class McapLogWriter:
         """Add a channel for :class:`RawMessage` and return its id; without name and encoding it has no schema.
 
         Ids are given out in ascending order unless named: a :class:`RawChunk` needs its channels and schemas under
-        the ids that it holds.
+        the ids that it contains.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""One exception tree; every error says what was expected, what came, where, and what to do."""
+"""One exception tree; every error has the parts expected, got, where, and what to do."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class PdhefError(Exception):
         return partial(type(self), **parts), ()
 
     def __str__(self) -> str:
-        """One line, without a traceback's noise and fit for a terminal, whatever its parts quote."""
+        """One line, without a traceback's noise and safe for a terminal, as its parts are escaped."""
         where, expected, got, remedy = (
             printable(" ".join(str(part).split())) for part in (self.where, self.expected, self.got, self.remedy)
         )
@@ -57,7 +57,7 @@ class LogError(PdhefError):
 
 
 class MappingError(PdhefError):
-    """A log does not hold what is to be mapped, or what is asked of it."""
+    """A log does not contain what is to be mapped, or what is asked of it."""
 
 
 class MappingFileError(MappingError):

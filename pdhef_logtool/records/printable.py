@@ -1,7 +1,7 @@
-"""What comes from outside, as a person may see it: nothing in it moves a cursor, begins a line or turns text around.
+"""Escaping of text from input files: no control character moves the cursor, starts a line or reverses text.
 
-Names of topics, files, cars and whatever a document holds are somebody else's: a terminal escape in one would paint
-over a warning, a line break would forge one. Results and errors go through here on their way to a person, in one place.
+Names of topics, files and cars and the content of documents are third-party data: a terminal escape could hide a
+warning, a line break could fake one. All results and errors for users are escaped here.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _T = TypeVar("_T")
 
 
 def printable(text: object, most: int = MOST_SIGNS) -> str:
-    r"""Return a text in one line of at most so many signs; what cannot be printed stands as its escape, ``\x1b``."""
+    r"""Return a text as one line of at most ``most`` characters; unprintable ones are escaped, ``\x1b``."""
     line = str(text)
     if not line.isprintable():
         line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
@@ -60,5 +60,5 @@ def _all_printable(value: Any) -> Any:
 
 
 def utf8(text: str) -> str:
-    r"""Return a text that UTF-8 can hold: bytes of a file name that is none stand as ``\udcff``."""
+    r"""Return a text that UTF-8 can encode: invalid bytes of a file name are escaped, ``\udcff``."""
     return text if text.isascii() else text.encode("utf-8", "backslashreplace").decode("utf-8")

@@ -1,4 +1,4 @@
-"""Which process something belongs to: a name for this one, and whether that of another is still alive."""
+"""Names of processes: that of this process, and whether another one is still alive."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ worker_number = 0
 
 
 def process_name() -> str:
-    """Return host, process id and start time of this process as one word: no two processes ever share it."""
+    """Return host, process id and start time of this process as one word, which is unique."""
     return f"{_host()}-{os.getpid()}-{_start(os.getpid()) or 0}"
 
 
 def is_alive(name: str) -> bool | None:
-    """Tell whether the process of an :func:`own_name` is alive; None for one of another host or container."""
+    """Return whether the process of an :func:`own_name` is alive; None for a process of another host or container."""
     host, pid, start = name.split("-")
     if host != _host():
         return None

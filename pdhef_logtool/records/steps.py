@@ -11,7 +11,7 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 #: An output is not predicted further than this beyond the newest processed step; the stamp is then not valid.
 MAX_PREDICTION_S = 0.3
-#: A longer step between stamps is a gap: behind it every filter and every watch starts anew.
+#: A longer step between stamps is a gap: after it every filter and every monitor starts again.
 RESTART_GAP_S = 0.5
 
 
@@ -50,7 +50,7 @@ def _cut(column: Any, part: slice) -> Any:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Release:
-    """Which step stands at each scored stamp, [M]: ``arrived`` says whether there is one, ``row`` is 0 where not.
+    """Newest available step at each scored stamp, [M]: ``arrived`` is whether there is any, ``row`` is 0 if not.
 
     ``needed`` is the first step that a coming stamp may still ask for.
     """
@@ -69,7 +69,7 @@ def released_steps(ready_ns: IntArray, stamps_ns: IntArray) -> IntArray:
 
 
 def release(ready_ns: IntArray, stamps_ns: IntArray) -> Release:
-    """Return what :func:`released_steps` says, ready to index the steps with; [0] where there are no stamps."""
+    """Return the result of :func:`released_steps`, ready to index the steps with; [0] where there are no stamps."""
     index = released_steps(ready_ns, stamps_ns)
     row = np.maximum(index, 0)
     return Release(index >= 0, row, int(row[-1]) if len(row) else 0)

@@ -1,4 +1,4 @@
-"""The one record that estimates and truth share: a state track."""
+"""The state track, the record of estimates and ground truth."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ OPTIONAL_COLUMNS = ("mixture_weight", "reason", *ESTIMATED_COLUMNS)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateTrack:
-    """Planar vehicle state over time, at the CG, ISO 8855, SI; an estimate or the truth.
+    """Planar vehicle state over time, at the CG, ISO 8855, SI; an estimate or the ground truth.
 
     Every float column has shape [N]; NaN means "not known". ``covariance`` is [N, 3, 3] over [v_x, v_y, r] or of
     length 0 when the source gives none. ``x_m``, ``y_m``, ``yaw_rad`` are in a local ENU frame.
-    ``valid`` is False where the source says that its state must not be used. ``diverged`` flags the stamps at
+    ``valid`` is False where the source marks its state as invalid. ``diverged`` flags the stamps at
     which the estimator itself reports divergence. ``nis`` has the degrees of freedom ``nis_dof`` at each stamp.
     ``mixture_weight`` (of all filters of an adaptive estimator but its first) and ``reason`` (bits of
     :mod:`pdhef_logtool.records.reasons`, what is reported of a_y and yaw rate) are [N], or of length 0 where the source

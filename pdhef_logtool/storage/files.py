@@ -1,4 +1,4 @@
-"""The file that appears only when it is complete, and the one line for a place that cannot be written."""
+"""Files that appear only when they are complete, and the error for a place that cannot be written."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _PARTIAL = re.compile(rf"\..+\.({NAME})\.partial")
 _SCRATCH = re.compile(rf"pdhef-({NAME})-.+")
 #: Bytes of a name that leave room for what a temporary one adds; file systems take 255.
 _LONGEST_NAME = 200
-#: Folders in which this process has looked for what killed ones left.
+#: Folders in which this process has searched for files of killed processes.
 _swept: set[Path] = set()
 
-#: Errors that only writing has, whatever the code was doing.
+#: Errors that only writing can cause.
 OF_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 _REMEDIES = {
     errno.ENOSPC: "free some space or choose another place",
@@ -44,8 +44,8 @@ _REMEDIES = {
 class PendingFile:
     """A file that is written beside its target and takes the target's name when it is complete.
 
-    The temporary name holds that of the process, so that two never write to one file, and so that what a killed one
-    left is found and removed by the next that writes to the folder.
+    The temporary name contains the name of the process, so that two processes never write to the same file, and files
+    of killed processes are removed by the next process that writes to the folder.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def write_bytes(target: Path, data: bytes) -> None:
 
 @contextlib.contextmanager
 def writing(target: Path) -> Iterator[None]:
-    """Turn what the system says of a place that cannot be written into an OutputError."""
+    """Turn errors of the system for a place that cannot be written into an OutputError."""
     try:
         yield
     except OSError as error:
@@ -148,9 +148,9 @@ def sync(path: Path) -> None:
 
 
 def sweep_files(folder: Path, *, held: bool = False) -> None:
-    """Remove what killed processes left of files in a folder.
+    """Remove incomplete files of killed processes from a folder.
 
-    ``held``: no other process of ours writes here, so that files of other hosts are left over too.
+    ``held``: no other process of ours writes here, so that files of other hosts are also left over.
     """
     with contextlib.suppress(OSError):
         for path in list(folder.iterdir()):
@@ -162,7 +162,7 @@ def sweep_files(folder: Path, *, held: bool = False) -> None:
 
 
 def scratch_folder() -> tempfile.TemporaryDirectory[str]:
-    """Return a new folder in the system's place for such; those of killed processes are removed."""
+    """Return a new temporary folder; those of killed processes are removed."""
     root = Path(tempfile.gettempdir())
     if root not in _swept:
         _swept.add(root)

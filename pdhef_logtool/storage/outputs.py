@@ -1,7 +1,7 @@
-"""Where outputs go: a folder that one command at a time holds, and changes to it that happen whole or not at all.
+"""Output folders: locked by one command at a time, and changed completely or not at all.
 
-A change is written into a hidden folder beside what it replaces and takes its place by exchange: killed at any point,
-the old or the new stands whole under the name. What a killed command left is removed by the next one.
+A change is written into a hidden folder beside the folder that it replaces, then both are exchanged: if the command is
+killed at any point, the old or the new folder is complete. Remains of a killed command are removed by the next one.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pdhef_logtool.storage.files import OF_WRITING, WINDOWS, cannot_write, open_
 
 #: The hidden folder beside outputs in which changes are prepared: ``.pdhef/NAME/{new,old,scratch}``.
 WORK = ".pdhef"
-#: Stands for the kernel's lock where the file system has none.
+#: Lock file for file systems without the kernel's lock.
 LOCK_FILE = ".pdhef.lock"
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+:)/.")
 _NO_LOCK = (errno.EBADF, errno.EINVAL, errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EISDIR)
@@ -42,7 +42,7 @@ class Transaction(ABC):
 
     #: A local folder for what is needed until then; gone afterwards.
     scratch: Path
-    #: What a person is told of as the place of the outputs.
+    #: Location of the outputs in messages.
     target: Path
 
     @abstractmethod
@@ -51,7 +51,7 @@ class Transaction(ABC):
 
     @abstractmethod
     def commit(self) -> None:
-        """Make the files the outputs; raises OutputError, and what was there then stands as it was."""
+        """Make the files the outputs; raises OutputError, and the former outputs are unchanged."""
 
     @abstractmethod
     def discard(self) -> None:
@@ -78,12 +78,12 @@ class Transaction(ABC):
 
 
 class FolderTransaction(Transaction):
-    """A folder that is replaced; files in the old one that the new one has not are kept by a second name (hard link).
+    """A folder that is replaced; files that only the old one has are kept by a hard link.
 
     Parameters
     ----------
-    target : the folder, which the process must hold. keep : whether what the new one has not is kept.
-    stale : names of files that are not, as they tell of what is replaced.
+    target : the folder, which the process must have locked. keep : whether files that only the old one has are kept.
+    stale : names of files that are not kept, as they describe the old content.
 
     Raises
     ------
@@ -151,16 +151,16 @@ class FolderTransaction(Transaction):
 
 
 class OutputFolder:
-    """A folder that this process holds, so that no other of ours writes to it; made when it is missing.
+    """A folder that this process locks, so that no other of ours writes to it; created if it is missing.
 
     Parameters
     ----------
-    path : the folder. parts : names of folders in it that hold outputs of their own.
+    path : the folder. parts : names of folders in it with outputs of their own.
 
     Raises
     ------
     OutputError
-        It cannot be made or is held by another command.
+        It cannot be created or is locked by another command.
     """
 
     def __init__(self, path: Path, parts: Iterable[str] = ()) -> None:
@@ -173,7 +173,7 @@ class OutputFolder:
         return FolderTransaction(self.path / name, stale=stale)
 
     def sweep(self) -> None:
-        """Remove what killed commands left here, and finish an exchange that one was killed in."""
+        """Remove remains of killed commands, and finish an interrupted exchange."""
         sweep_files(self.path, held=True)
         for part in (self.path / name for name in self._parts):
             with contextlib.suppress(OSError):
@@ -186,23 +186,23 @@ class OutputFolder:
                     sweep_files(folder, held=True)
 
     def __enter__(self) -> Self:
-        """Take hold of the folder and sweep it."""
+        """Lock the folder and sweep it."""
         self._lock.acquire()
         self.sweep()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Let go of it; what a request to end has kept from being cleaned up is swept."""
+        """Release the lock; after an interruption, sweep first."""
         if kind is not None:
             self.sweep()
         self._lock.release()
 
 
 class FolderLock:
-    """Holds a folder until it is released or this process ends, however it ends; the folder is made when missing.
+    """Lock of a folder until it is released or this process ends; the folder is created if it is missing.
 
-    The kernel's lock on the folder itself, which no child process inherits. Where the file system has none, a file in
-    the folder names the process, and counts for nothing once that is dead.
+    The kernel's lock on the folder itself, which no child process inherits. If the file system has none, or on Windows,
+    a file in the folder names the process; it is void when the process has ended.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -211,7 +211,7 @@ class FolderLock:
         self._file: Path | None = None
 
     def acquire(self, wait_s: float = 0.0) -> None:
-        """Take hold of the folder, after at most ``wait_s``; raises OutputError when another command holds it."""
+        """Lock the folder, after at most ``wait_s``; raises OutputError if another command has locked it."""
         end = time.monotonic() + wait_s
         while True:
             with writing(self._folder):
@@ -228,9 +228,9 @@ class FolderLock:
             time.sleep(_POLL_S)
 
     def hold_next(self, folder: Path) -> None:
-        """Hold a folder of ours as well that is about to take the place of the one that is held.
+        """Also lock a folder of ours that is about to replace the locked one.
 
-        Else whoever waits would take hold of it before this command has swept what it leaves.
+        Otherwise a waiting command would lock it before this command has swept it.
         """
         with writing(folder):
             if self._file is not None:
@@ -241,7 +241,7 @@ class FolderLock:
             _locked(descriptor)
 
     def release(self) -> None:
-        """Let go; harmless when it is not held."""
+        """Release the lock; harmless if there is none."""
         if self._file is not None:
             with contextlib.suppress(OSError):
                 self._file.unlink(missing_ok=True)
@@ -322,7 +322,7 @@ def check_no_input(inputs: Iterable[Path | None], files: Iterable[Path], folders
     Raises
     ------
     UsageError
-        One is the other, by whatever name or link, or an input lies in a folder that would be replaced.
+        An output is an input, also by another name or link, or an input is in a folder that would be replaced.
     """
     read = {identity: path for given in inputs if given is not None for identity, path in _identities(given)}
     within = {i: path for path in read.values() for parent in _lineage(path) if (i := _identity(parent)) is not None}
@@ -395,7 +395,7 @@ def _sync_all(folder: Path) -> None:
 
 
 def _take_over(old: Path, new: Path, stale: Container[str]) -> None:
-    """Give everything of the old folder that the new one has not, but for stale files, a second name there."""
+    """Link everything that only the old folder has, except stale files, into the new one."""
     for path in old.iterdir():
         to = new / path.name
         if path.name in stale or os.path.lexists(to):
@@ -416,11 +416,11 @@ def _link(source: str | Path, target: str | Path) -> None:
 
 
 def _take_place(new: Path, place: Path, old: Path) -> None:
-    """Give ``new`` the name of ``place``; what stood there is at ``new`` or gone to ``old`` afterwards."""
+    """Give ``new`` the name of ``place``; the former folder is at ``new`` or ``old`` afterwards."""
     if not os.path.lexists(place):
         new.rename(place)
     elif not _exchanged(new, place):
-        # A file system without exchange: for a moment nothing stands under the name; a kill then is repaired.
+        # A file system without exchange: for a moment the name does not exist; a kill at that moment is repaired.
         place.rename(old)
         new.rename(place)
 

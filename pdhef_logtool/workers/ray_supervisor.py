@@ -1,7 +1,7 @@
-"""The same as ``supervisor.py`` on the machines of a Ray cluster.
+"""The supervisor of ``supervisor.py`` on the machines of a Ray cluster.
 
-A task is a worker under watch on whatever node Ray has chosen: what dies, falls silent or grows there is an outcome
-like any other, so that Ray has to repeat a task only where its node is lost, and does so as often as it takes.
+A task is a supervised worker on a node that Ray chooses: a worker that dies, hangs or exceeds its memory is an ordinary
+outcome, so that Ray repeats a task only if its node is lost.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _CONNECT_S = 20.0
 
 @dataclass(frozen=True, slots=True)
 class _Orders:
-    """What a node is to do with items; ``run`` tells the orders of one run from those of others."""
+    """The work of a node; ``run`` identifies the run."""
 
     run: str
     work: Callable[[Any, Tell], Any]
@@ -120,7 +120,7 @@ def _connected(address: str) -> Iterator[Any]:
             expected="the address of a Ray cluster",
             got=f"{address} ({describe_error(error).partition('. ')[0]})",
             where="--ray",
-            remedy="ray status tells whether it is up",
+            remedy="check the cluster with ray status",
         ) from None
     if main:
         signal.signal(signal.SIGTERM, was)  # Ray has put its own in its place

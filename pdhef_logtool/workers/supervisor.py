@@ -1,9 +1,9 @@
-"""Work on many items in processes of their own, under watch.
+"""Work on many items in supervised processes.
 
-A worker lives as long as the run and has one thread. What dies, falls silent or takes too much memory costs the item
-in flight only: that is tried once more when nothing else runs, in a new process, and then given up and told. Workers
-come from a fork server (``fork_server.py``), a pipe each; they end when their parent does, however that ends. A fork
-server that dies is restarted, a bounded number of times; its workers finish their items without it.
+A worker lives as long as the run and has one thread. A worker that dies, hangs or takes too much memory costs only the
+item in progress, which is repeated once alone in a new process, and then reported as failed. Workers come from a fork
+server (``fork_server.py``) with a socket each; they end with their parent. A fork server that dies is restarted a
+bounded number of times; its workers finish their items without it.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ from pdhef_logtool.workers.fork_server import FORK, ONE_THREAD, STATUS, ask, des
 
 T = TypeVar("T")
 R = TypeVar("R")
-#: Tells what an item is at, and its share from 0 to 1.
+#: Progress callback of an item: a text, and a share from 0 to 1.
 Tell = Callable[[str, float], None]
-#: Hears the same, with the number of the item.
+#: The same with the number of the item first.
 Progress = Callable[[int, str, float], None]
 
 _TICK_S = 0.05
-#: The most that one look at the workers counts as silence: more means that the parent itself was stopped or busy.
+#: Most silence that one poll of the workers counts: more means that the parent itself was stopped or busy.
 _LONGEST_TICK_S = 5.0
-#: No allocation brings a worker further beyond its bound than this, however fast; allocators reserve more than needed.
+#: A worker can exceed its limit by at most this much; allocators reserve more than they need.
 _RESERVED_BYTES = 2 << 30
 _TRIES = 2
 #: How often a fork server that died is replaced while the items of one list are worked on.
 _RESTARTS = 3
-#: A worker that does not take an item within this time does not listen.
+#: Timeout for handing an item to a worker.
 _SEND_S = 60.0
 
 
@@ -57,11 +57,11 @@ def can_fork() -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What an item may take; None: as much as it likes.
+    """Limits of an item; None: unlimited.
 
     Parameters
     ----------
-    silence_s : between two words of progress.
+    silence_s : between two reports of progress.
     memory_bytes : of a worker's resident set.
     """
 
@@ -71,7 +71,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """Why there is no result: a line for people, the last progress that was told, and how often it was tried."""
+    """Why there is no result: a line for users, the last reported progress, and the number of tries."""
 
     reason: str
     last: str = ""
@@ -80,7 +80,7 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Ended(Generic[T, R]):
-    """How an item ended, with its number in the order of the items; with no ``failure`` it has a result."""
+    """Outcome of an item, with its number in the order of the items; without ``failure`` it has a result."""
 
     number: int
     item: T
@@ -100,12 +100,12 @@ def supervise(
 ) -> Generator[Ended[T, R], None, None]:
     """Do the work on every item and yield how each ended, in the order of ending.
 
-    Items are pulled as workers become free, and nothing of an item is kept once it has ended. With one job and no
+    Items are requested as workers become free, and an item is released when it has ended. With one job and no
     limits all is done in this process; likewise, with a warning, on systems other than Linux.
 
     Parameters
     ----------
-    work : a function of a module; takes an item and what tells its progress, and returns something small.
+    work : a function of a module with an item and a progress callback as arguments; its result should be small.
     jobs : processes at once.
     preload : modules that the fork server imports: ``package.module``, ``package.*`` for all of a package, or
         ``package.module:function`` to call that too. ``pdhef_logtool.compiled.cache:load_kept`` behind others
@@ -163,7 +163,7 @@ class _Attempt(Generic[T]):
 
 @dataclass(slots=True)
 class _Worker(Generic[T]):
-    """A process as the parent knows it; ``pid`` is None until it has said that it is ready."""
+    """A worker process in the parent; ``pid`` is None until the worker is ready."""
 
     channel: socket.socket
     server: _Server
@@ -229,7 +229,7 @@ class _Server:
         return bool(warm)
 
     def is_dead(self) -> bool:
-        """Return whether its side of the socket is closed, which precedes the end of whatever it has in hand."""
+        """Return whether its side of the socket is closed, which precedes the end of its workers."""
         try:
             return not self._control.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
         except BlockingIOError:
@@ -415,16 +415,16 @@ class Crew(Generic[T, R]):
         assert attempt is not None
         try:
             packed = pickle.dumps(attempt.item)
-        except Exception as error:  # noqa: BLE001 (whatever a pickler may raise)
+        except Exception as error:  # noqa: BLE001 (any error of a pickler)
             worker.attempt = None
             yield attempt, _failed(attempt, f"it cannot be sent to a worker: {describe_error(error)}")
             return
         worker.silent_s = 0.0
-        with contextlib.suppress(OSError):  # a worker that is dead or does not listen is found by the watch
+        with contextlib.suppress(OSError):  # dead and hanging workers are handled by _watch
             send(worker.channel, packed)
 
     def _hear(self, worker: _Worker[T]) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
-        """Take what a worker says."""
+        """Handle the messages of a worker."""
         try:
             data = worker.channel.recv(1 << 16)
         except OSError:
@@ -495,5 +495,5 @@ def _failed(attempt: _Attempt[T], reason: str) -> Ended[T, R]:
 def _opened(attempt: _Attempt[T], answer: bytes) -> Ended[T, R]:
     try:
         return Ended(attempt.number, attempt.item, pickle.loads(answer))  # noqa: S301 (from our own process)
-    except Exception as error:  # noqa: BLE001 (whatever a pickle may raise)
+    except Exception as error:  # noqa: BLE001 (any error of a pickle)
         return _failed(attempt, f"its result cannot be read: {describe_error(error)}")

@@ -197,7 +197,7 @@ def test_a_file_that_unpacks_to_too_much_gives_its_beginning(tmp_path: Path) -> 
     path = tmp_path / "a.mcap.zst"
     path.write_bytes(zstandard.ZstdCompressor().compress(plain + bytes(64 << 20)))
     log = open_log(path, ResourceLimits(chunk_ratio=100))
-    assert [loss.what for loss in log.lost if "above the budget" in loss.what]
+    assert [loss.what for loss in log.lost if "above the limit" in loss.what]
     log.close()
 
 
