@@ -14,7 +14,7 @@ import numpy as np
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.compression import decompress_messages
-from pdhef_logtool.logs.container import UNVERIFIED, Block, ChannelRecord, Container, Span, describe_damage
+from pdhef_logtool.logs.container import UNVERIFIED, Block, ChannelRecord, Container, Span, count_text, describe_damage
 from pdhef_logtool.logs.decoding import (
     ChannelDecoder,
     channel_schema,
@@ -349,8 +349,7 @@ class ColumnarLog(DriveLog):
         except Exception as error:  # noqa: BLE001
             kind, text = describe_damage(error)
             count = sum(span.counts.values()) or None
-            held = f"{count} messages" if count else "an unknown number of messages"
-            what = f"{held} lost at byte {extent[0]}: {text}"
+            what = f"{count_text(count)} lost at byte {extent[0]}: {text}"
             self._damaged[key] = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
             container.account.lose(*extent)
             return None

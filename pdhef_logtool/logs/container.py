@@ -5,10 +5,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from mcap.records import Metadata
@@ -211,6 +211,11 @@ def describe_damage(error: Exception) -> tuple[str, str]:
     return "bad-chunk", " ".join(text.split())[:_TOLD_CHARACTERS]
 
 
+def count_text(count: int | None) -> str:
+    """Return a number of messages in words."""
+    return f"{count} messages" if count else "an unknown number of messages"
+
+
 class Container(ABC):
     """One open file of a log. Opening it fills these attributes.
 
@@ -337,7 +342,7 @@ class Container(ABC):
                 self.account.lose_share(self.extent(span), count / sum(span.counts.values()))
                 self.undeclared[i] = count
                 declared = {c: n for c, n in span.counts.items() if c not in unknown}
-                self.spans[i] = Span(span.index, span.start_ns, span.end_ns, declared, span.ordered)
+                self.spans[i] = replace(span, counts=declared)
 
 
 class FileContainer(Container):
@@ -363,7 +368,8 @@ class FileContainer(Container):
         shown = shown_path or (Path() if isinstance(path, ByteSource) else path)
         super().__init__(shown, self.source.size, meter)
         self.on_close(self.source.close)
-        self.position = len(self.magic)  # where the walk is
+        self.position = len(self.magic)  # of the walk
+        self.chunks: list[Any] = []  # by index of the span
         try:
             if self.source.size < self.position or self.source.read(0, self.position) != self.magic:
                 raise self.no_log(self.magic_text, "other content")
@@ -395,6 +401,45 @@ class FileContainer(Container):
     def last_ns(self) -> int | None:
         """End of the last span so far; None before the first."""
         return self.spans[-1].end_ns if self.spans else None
+
+    def add_span(self, chunk: Any, span: Span) -> None:
+        """Add a span and its chunk at the end."""
+        self.chunks.append(chunk)
+        self.spans.append(replace(span, index=len(self.spans)))
+
+    def add_content(
+        self, chunk: Any, extent: tuple[int, int], claimed: Span | None, read: Callable[[], Block]
+    ) -> Block | None:
+        """Add a chunk by its content; return None if it is damaged, which is a loss.
+
+        Parameters
+        ----------
+        chunk : with ``start`` and ``end`` of its bytes. extent : bytes that are lost with it. read : decodes it.
+        claimed : times and counts by its header and index, if these are known.
+        """
+        try:
+            block = read()
+        except Exception as error:  # noqa: BLE001 (the boundary)
+            kind, text = describe_damage(error)
+            count = sum(claimed.counts.values()) or None if claimed else None
+            what = f"{count_text(count)} lost in the chunk at byte {chunk.start}: {text}"
+            start_ns, end_ns = (claimed.start_ns, claimed.end_ns) if claimed else (self.last_ns(), None)
+            self.lose(kind, what, start_ns, end_ns, count)
+            self.account.lose(*extent)
+            return None
+        if len(block):
+            first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
+            self.add_span(chunk, Span(0, first, last + 1, block.counts, block.ordered))
+        else:
+            self.account.decode(chunk.start, chunk.end)
+        return block
+
+    def lose_end(self, offset: int) -> None:
+        """Note that the file ends inside a record."""
+        what = f"the file ends inside a record at byte {offset} of {self.source.size}; what follows is gone"
+        self.lose("truncated", what, self.last_ns())
+        self.account.lose(offset, self.source.size)
+        self.account.cut = True
 
     def lose_record(self, start: int, end: int, error: Exception) -> None:
         """Note that the record in bytes [start, end) cannot be read: the boundary of the walk."""

@@ -26,8 +26,3 @@ class LogFile:
     meter: Meter
     release: Callable[[], None] = lambda: None
     cut: str = ""
-
-    @property
-    def is_copy(self) -> bool:
-        """Whether it is not the file itself."""
-        return self.path != self.place

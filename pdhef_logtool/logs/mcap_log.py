@@ -104,6 +104,7 @@ class McapContainer(FileContainer):
     magic_text = "the MCAP magic bytes"
     remedy = "is it an MCAP 1.0 recording?"
     whole_chunks = True
+    chunks: list[_Extent]
 
     def __init__(
         self,
@@ -117,7 +118,6 @@ class McapContainer(FileContainer):
         self.library = ""
         self._schemas: dict[int, Schema] = {}
         self._raw_channels: dict[int, Channel] = {}
-        self._extents: list[_Extent] = []
         self._attachment_at: list[tuple[int, int]] = []
         self._metadata_at: list[tuple[int, int]] = []
         self._index_used = False
@@ -169,7 +169,7 @@ class McapContainer(FileContainer):
     def _finish(self) -> None:
         self._walked.finish()
         self.is_remote = self.source.is_remote
-        chunked = bool(self._extents) and all(extent.is_chunk for extent in self._extents)
+        chunked = bool(self.chunks) and all(extent.is_chunk for extent in self.chunks)
         indexed = self._index_used if self.is_remote else self._walked.statistics is not None
         self.by_index = chunked and indexed and not self._index_wrong and all(x.kind == UNVERIFIED for x in self.lost)
 
@@ -271,19 +271,19 @@ class McapContainer(FileContainer):
 
     def extent(self, span: Span) -> tuple[int, int]:
         """Return the bytes of the span's record or records."""
-        extent = self._extents[span.index]
+        extent = self.chunks[span.index]
         return extent.start, extent.end
 
     def prefetch(self, spans: Iterable[Span]) -> None:
         """See :class:`~pdhef_logtool.logs.container.Container`."""
         if self.source.is_remote:
-            extents = (self._extents[span.index] for span in spans)
+            extents = (self.chunks[span.index] for span in spans)
             self.source.prefetch((extent.start, extent.index_end) for extent in extents)
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         """Decode one span."""
         del want
-        extent = self._extents[span.index]
+        extent = self.chunks[span.index]
         limits = self.meter.limits
         if not extent.is_chunk:
             limits.check("chunk_bytes", extent.end - extent.start, "messages without a chunk")
@@ -340,7 +340,7 @@ class McapContainer(FileContainer):
 
     def raw_chunk(self, span: Span, block: Block, kept: frozenset[int]) -> RawChunk | None:
         """See :class:`~pdhef_logtool.logs.container.Container`."""
-        extent = self._extents[span.index]
+        extent = self.chunks[span.index]
         if not extent.is_chunk or not len(block) or not kept.issuperset(np.unique(block.channel).tolist()):
             return None
         if max(int(block.log_time_ns.max()), int(block.publish_time_ns.max())) >= MAX_TIME_NS:
@@ -378,7 +378,7 @@ class McapContainer(FileContainer):
 
     def times(self, span: Span) -> tuple[IntArray, IntArray]:
         """Return a span's channels and log times; a chunk's from its message indexes, where it has them."""
-        extent = self._extents[span.index]
+        extent = self.chunks[span.index]
         indexes = _message_indexes(self.source.read(extent.end, extent.index_end - extent.end), 0)
         if not indexes:
             return super().times(span)
@@ -454,17 +454,15 @@ class McapContainer(FileContainer):
         ----------
         claimed : log times of its header; counts of its message indexes, empty if these are inconsistent.
         """
-        try:
+
+        def read() -> Block:
             record = self.source.read(extent.start, extent.end - extent.start)
             block = self._scan(self.chunk_content(record, len(record)), declare=True)
             self.meter.limits.check_messages(len(block), len(record))
-        except Exception as error:  # noqa: BLE001 (the boundary)
-            kind, text = describe_damage(error)
-            count = sum(claimed.counts.values()) or None
-            gone = f"{count} messages" if count else "an unknown number of messages"
-            what = f"{gone} lost in the chunk at byte {extent.start}: {text}"
-            self.lose(kind, what, claimed.start_ns, claimed.end_ns, count)
-            self.account.lose(extent.start, extent.index_end)
+            return block
+
+        block = self.add_content(extent, (extent.start, extent.index_end), claimed, read)
+        if block is None:
             return
         held = block.counts
         missing = sum(max(n - held.get(id_, 0), 0) for id_, n in claimed.counts.items())
@@ -472,17 +470,8 @@ class McapContainer(FileContainer):
             what = f"{missing} messages that the index names are not in the chunk at byte {extent.start}"
             self.lose("missing-messages", what, claimed.start_ns, claimed.end_ns, missing)
             self.account.lose(extent.end, extent.index_end)
-        if not len(block):
-            self.account.decode(extent.start, extent.end)
-            return
-        first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
-        self._index_wrong |= (claimed.start_ns, claimed.end_ns, claimed.counts) != (first, last + 1, held)
-        self.add_span(extent, Span(0, first, last + 1, held, block.ordered))
-
-    def add_span(self, extent: _Extent, span: Span) -> None:
-        """Add a span at the end."""
-        self._extents.append(extent)
-        self.spans.append(replace(span, index=len(self.spans)))
+        if len(block):
+            self._index_wrong |= self.spans[-1] != replace(claimed, index=len(self.spans) - 1, ordered=block.ordered)
 
     def check_statistics(self, total: int, by_channel: Mapping[int, int]) -> None:
         """Compare the counts of the walk with the file's statistics.
@@ -495,9 +484,9 @@ class McapContainer(FileContainer):
         if self.lost or (counts.total() == total and (not by_channel or counts == Counter(by_channel))):
             return
         self._index_wrong = True
-        spans, extents = self.spans[:], self._extents[:]
+        spans, extents = self.spans[:], self.chunks[:]
         self.spans.clear()
-        self._extents.clear()
+        self.chunks.clear()
         for extent, span in zip(extents, spans, strict=True):
             if extent.is_chunk:
                 self.open_chunk(extent, span)
@@ -516,7 +505,6 @@ class _Walk:
     def __init__(self, container: McapContainer) -> None:
         self.of = container
         self.closed = False
-        self.cut_off = False
         self.data_end: tuple[int, int] | None = None  # extent of the record
         self.data_crc = 0
         self.footer: tuple[int, int] | None = None  # extent of the record
@@ -681,7 +669,7 @@ class _Walk:
         of = self.of
         if self.data_end is None or not self.data_crc or of.lost:
             return
-        in_chunks = all(extent.is_chunk for extent in of._extents)
+        in_chunks = all(extent.is_chunk for extent in of.chunks)
         if self.statistics is not None and in_chunks and not self.bare_chunks:
             return
         if of._index_used:
@@ -747,11 +735,7 @@ class _Walk:
         of = self.of
         self._end_chunk(index_complete=False)
         self._end_run()
-        self.cut_off = True
-        what = f"the file ends inside a record at byte {offset} of {of.source.size}; what follows is gone"
-        of.lose("truncated", what, of.last_ns())
-        of.account.lose(offset, of.source.size)
-        of.account.cut = True
+        of.lose_end(offset)
 
     def skipped(self, start: int, resume: int) -> None:
         """Note that a damaged stretch was stepped over."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from pdhef_logtool.logs.definitions import SHIPPED, Definitions
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
-from pdhef_logtool.logs.schema_files import referenced
+from pdhef_logtool.logs.schema_files import referenced, with_contained_types
 from pdhef_logtool.records.errors import MappingError, PdhefError
 
 if TYPE_CHECKING:
@@ -235,6 +235,14 @@ def ros_schema(
 
     what = f"the definition of {type_name}"
     borrowed: tuple[Path, ...] = ()
+
+    def text_of(name: str) -> str:
+        text = definitions.text_of(name)
+        limits.check("schema_bytes", len(text) * _BYTES_OF_TEXT, f"the definition of {name}")
+        if not text.strip():
+            raise MissingDefinitionError(name)
+        return text
+
     with parsing(what):
         limits.check("schema_bytes", len(text) * _BYTES_OF_TEXT, what)
         base = Stores.ROS1_NOETIC if wire == "ros1" else _store_of(distro)
@@ -244,7 +252,7 @@ def ros_schema(
             store = get_typestore(Stores.EMPTY)
             try:
                 if referenced(types) - set(types):  # a distribution's types take long to load
-                    types = _completed(types, get_typestore(base).fielddefs, definitions, limits)
+                    types = with_contained_types(types, get_typestore(base).fielddefs, text_of)
             except MissingDefinitionError as error:  # the log's own text is not whole: its messages are lost
                 raise SchemaError(str(error)) from error
             root = _ros_root(types, type_name, limits)
@@ -252,7 +260,7 @@ def ros_schema(
         else:
             store = get_typestore(base)
             if type_name not in store.fielddefs:
-                types = _completed({}, store.fielddefs, definitions, limits, type_name)
+                types = with_contained_types({}, store.fielddefs, text_of, type_name)
                 files = (definitions.installed(name) for name in sorted(set(types) - set(store.fielddefs)))
                 borrowed = tuple(file for file in files if file is not None)
                 store.register(types)
@@ -264,32 +272,6 @@ def _store_of(distro: str) -> Any:
     from rosbags.typesys import Stores
 
     return getattr(Stores, f"ROS2_{distro.upper()}", Stores.LATEST) if distro else Stores.LATEST
-
-
-def _completed(
-    types: Mapping[str, Any],
-    distributed: Mapping[str, Any],
-    definitions: Definitions,
-    limits: ResourceLimits,
-    wanted: str = "",
-) -> dict[str, Any]:
-    """Return the types with all that they contain: of the distribution, else of definitions; ``wanted`` is one more."""
-    from rosbags.typesys import get_types_from_msg
-
-    completed = dict(types)
-    todo = ({wanted} if wanted else set()) | (referenced(types) - set(types))
-    while todo:
-        name = todo.pop()
-        if name in distributed:
-            completed[name] = distributed[name]
-        else:
-            text = definitions.text_of(name)
-            limits.check("schema_bytes", len(text) * _BYTES_OF_TEXT, f"the definition of {name}")
-            if not text.strip():
-                raise MissingDefinitionError(name)
-            completed |= get_types_from_msg(text, name)
-        todo |= referenced({name: completed[name]}) - set(completed)
-    return completed
 
 
 def _ros_root(defs: Mapping[str, Any], type_name: str, limits: ResourceLimits) -> Struct:

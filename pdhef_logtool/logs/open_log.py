@@ -178,7 +178,7 @@ def _open_plain(file: LogFile) -> Container | DriveLog:
         got = "a file that is none of these" if head else "an empty file"
         raise LogError(expected=what_is_a_log(), got=got, where=str(file.place), remedy=_REMEDY)
     opened = log_format.open(file)
-    if isinstance(opened, Container) and file.is_copy:
+    if isinstance(opened, Container) and file.path != file.place:
         opened.on_close(file.release)
         if file.cut:
             opened.lose("truncated", file.cut)

@@ -64,7 +64,7 @@ class ObjectState:
     modified: str
 
 
-_EMPTY = ObjectState(0, "", "")
+EMPTY = ObjectState(0, "", "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,7 +241,7 @@ class S3Object(RemoteObject):
         async with self.client() as client:
             response = await self._found(client, asked, pinned)
             if response is None:
-                yield Answer(_EMPTY, 0, _nothing())
+                yield Answer(EMPTY, 0, _nothing())
                 return
             async with response["Body"] as body:
                 yield self._answer(response, body, start, pinned)

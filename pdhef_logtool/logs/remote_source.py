@@ -22,6 +22,7 @@ from typing import BinaryIO, TypeAlias
 
 from pdhef_logtool.logs.byte_source import ByteSource, ChangedError, SourceError, read_at
 from pdhef_logtool.logs.remote_objects import (
+    EMPTY,
     Answer,
     ObjectState,
     RemoteObject,
@@ -48,7 +49,6 @@ _KEPT_OBJECTS = 1000
 
 
 _AT_END = sys.maxsize
-_NOTHING = ObjectState(0, "", "")
 
 
 def join_ranges(extents: Iterable[Extent], held: Sequence[Extent] = ()) -> list[Extent]:
@@ -181,7 +181,7 @@ class _Spool:
 
     place: RemotePlace
     remote: RemoteObject
-    state: ObjectState = _NOTHING
+    state: ObjectState = EMPTY
     held: list[Extent] = field(default_factory=list)
     coming: list[tuple[Extent, Future[None]]] = field(default_factory=list)
     users: int = 0
@@ -208,7 +208,7 @@ class _Spool:
                 return
             self._file = self.path.open("r+b" if self.path.exists() else "x+b", buffering=0)
             try:
-                if self.state is _NOTHING:
+                if self.state is EMPTY:
                     self._run(try_in_turn(lambda: self._first(head_bytes), self.remote)).result()
                 elif self.state.size:
                     self._run(try_in_turn(self._ask_again, self.remote)).result()
@@ -364,7 +364,7 @@ def _acquire(place: RemotePlace, head_bytes: int) -> _Spool:
             spool.users -= 1
             if not spool.users:
                 _forget(spool)
-        if isinstance(error, ChangedError) and spool.state is not _NOTHING:
+        if isinstance(error, ChangedError) and spool.state is not EMPTY:
             return _acquire(place, head_bytes)  # another one since it was closed: opening pins what it is now
         raise
     return spool

@@ -10,7 +10,7 @@ import struct
 from array import array
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,6 @@ from pdhef_logtool.logs.container import (
     Span,
     SpanDamageError,
     block_from_lists,
-    describe_damage,
 )
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import Meter
@@ -41,10 +40,10 @@ _MESSAGES_A_CHECK = 1 << 16
 
 @dataclass(slots=True)
 class _Chunk:
-    """A chunk record in bytes [offset, end) and the content of its index records."""
+    """A chunk record in bytes [start, end) and the content of its index records."""
 
-    offset: int
-    start: int  # of the stored bytes
+    start: int
+    stored_start: int  # of the compressed bytes
     end: int
     compression: str
     size: int
@@ -61,9 +60,9 @@ class Rosbag1Container(FileContainer):
     magic = ROSBAG1_MAGIC
     magic_text = "'#ROSBAG V2.0' at its start"
     remedy = "is it a ROS 1 bag?"
+    chunks: list[_Chunk]
 
     def __init__(self, path: Path | ByteSource, shown_path: LogPlace | None = None, meter: Meter | None = None) -> None:
-        self._chunks: list[_Chunk] = []
         self._found = 0
         self._pending: _Chunk | None = None  # the chunk whose index records are being read
         self._header: tuple[int, int] | None = None  # where the index begins, and how many chunks there are
@@ -85,10 +84,7 @@ class Rosbag1Container(FileContainer):
                 if self._header is None:
                     raise self.no_log("a complete bag header record", "a cut or malformed one")
                 self._close_chunk(complete=False)
-                what = f"the file ends inside a record at byte {offset} of {size}; what follows is gone"
-                self.lose("truncated", what, self.last_ns())
-                self.account.lose(offset, size)
-                self.account.cut = True
+                self.lose_end(offset)
                 return
             fields, start, end = record
             try:
@@ -142,13 +138,13 @@ class Rosbag1Container(FileContainer):
 
     def _check_infos(self, chunks: int) -> None:
         """Open the chunks whose index records differ from the bag's index section, as these could hide messages."""
-        chunks_read, spans = self._chunks, self.spans[:]
+        chunks_read, spans = self.chunks, self.spans[:]
         missing = chunks - self._found
-        self._chunks = []
+        self.chunks = []
         self.spans.clear()
         for chunk, span in zip(chunks_read, spans, strict=True):
-            if self._infos.get(chunk.offset, chunk.counts) == chunk.counts:
-                self._add_span(chunk, span)
+            if self._infos.get(chunk.start, chunk.counts) == chunk.counts:
+                self.add_span(chunk, span)
             else:
                 self._open_chunk(chunk)
         if missing > 0 and not self.lost:
@@ -196,7 +192,7 @@ class Rosbag1Container(FileContainer):
         for span in self.spans:
             if not set(span.counts) <= set(self.channels):
                 with contextlib.suppress(Exception):  # a read of the span reports the damage
-                    self._decode(self._chunks[span.index], declare=True)
+                    self._decode(self.chunks[span.index], declare=True)
 
     def _add_connection(self, fields: Mapping[str, bytes], payload: bytes) -> None:
         inner = _header_fields(payload)
@@ -230,41 +226,25 @@ class Rosbag1Container(FileContainer):
         if not complete or not chunk.counts or chunk.counts.total() * _LEAST_MESSAGE_BYTES > chunk.size:
             self._open_chunk(chunk)
         else:
-            self._add_span(chunk, Span(0, chunk.first_ns, chunk.last_ns + 1, dict(chunk.counts), chunk.ordered))
-
-    def _add_span(self, chunk: _Chunk, span: Span) -> None:
-        self._chunks.append(chunk)
-        self.spans.append(replace(span, index=len(self.spans)))
+            self.add_span(chunk, Span(0, chunk.first_ns, chunk.last_ns + 1, dict(chunk.counts), chunk.ordered))
 
     def _open_chunk(self, chunk: _Chunk) -> None:
-        """Add a chunk by its content; lose it if it is damaged."""
-        try:
-            block = self._decode(chunk, declare=True)
-        except Exception as error:  # noqa: BLE001 (the boundary)
-            kind, text = describe_damage(error)
-            what = f"an unknown number of messages lost in the chunk at byte {chunk.offset}: {text}"
-            self.lose(kind, what, self.last_ns())
-            self.account.lose(chunk.offset, chunk.end)
-            return
-        if not len(block):
-            self.account.decode(chunk.offset, chunk.end)
-            return
-        first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
-        self._add_span(chunk, Span(0, first, last + 1, block.counts))
+        """Add a chunk by its content; a damaged chunk is a loss."""
+        self.add_content(chunk, (chunk.start, chunk.end), None, lambda: self._decode(chunk, declare=True))
 
     def extent(self, span: Span) -> tuple[int, int]:
         """Return the bytes of the chunk's record."""
-        chunk = self._chunks[span.index]
-        return chunk.offset, chunk.end
+        chunk = self.chunks[span.index]
+        return chunk.start, chunk.end
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         """Decode one chunk; see :class:`~pdhef_logtool.logs.container.Container`."""
         del want
-        return self._decode(self._chunks[span.index], declare=False)
+        return self._decode(self.chunks[span.index], declare=False)
 
     def _decode(self, chunk: _Chunk, declare: bool) -> Block:
-        self.meter.limits.check("chunk_bytes", chunk.end - chunk.start, "a chunk")
-        stored = self.source.read(chunk.start, chunk.end - chunk.start)
+        self.meter.limits.check("chunk_bytes", chunk.end - chunk.stored_start, "a chunk")
+        stored = self.source.read(chunk.stored_start, chunk.end - chunk.stored_start)
         content = decompress(chunk.compression or "unnamed", stored, chunk.size, self.meter.limits)
         channels, stamps, offsets, lengths = (array("q") for _ in range(4))
         offset, size = 0, len(content)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
@@ -53,7 +53,7 @@ def message_definition(type_name: str) -> str:
     if shipped.is_file():
         text = shipped.read_text(encoding="utf-8")
         types = get_types_from_msg(text, type_name)
-        store.register({**types, **_shipped_parts(types, set(store.fielddefs))})
+        store.register(with_contained_types(types, store.fielddefs, shipped_definition))
         generated = store.generate_msgdef(type_name, ros_version=2)[0]
         # Keep the comments of the shipped text: they contain the units.
         _, separator, rest = generated.partition(_MESSAGE_SEPARATOR)
@@ -63,17 +63,28 @@ def message_definition(type_name: str) -> str:
     return store.generate_msgdef(type_name, ros_version=2)[0]
 
 
-def _shipped_parts(types: Mapping[str, Any], distributed: set[str]) -> dict[str, Any]:
-    """Return the shipped types that others contain and the distribution does not have, at any depth."""
+def with_contained_types(
+    types: Mapping[str, Any], distributed: Mapping[str, Any], text_of: Callable[[str], str], wanted: str = ""
+) -> dict[str, Any]:
+    """Return types with all types that they contain, at any depth.
+
+    Parameters
+    ----------
+    distributed : types of a distribution. text_of : returns the definition of any other type.
+    wanted : name of a further type.
+    """
     from rosbags.typesys import get_types_from_msg
 
-    parts: dict[str, Any] = {}
-    todo = referenced(types) - distributed - set(types)
+    completed = dict(types)
+    todo = ({wanted} if wanted else set()) | (referenced(types) - set(types))
     while todo:
         name = todo.pop()
-        parts |= get_types_from_msg(shipped_definition(name), name)
-        todo |= referenced(parts) - distributed - set(types) - set(parts)
-    return parts
+        if name in distributed:
+            completed[name] = distributed[name]
+        else:
+            completed |= get_types_from_msg(text_of(name), name)
+        todo |= referenced({name: completed[name]}) - set(completed)
+    return completed
 
 
 def referenced(types: Mapping[str, Any]) -> set[str]:

@@ -22,6 +22,7 @@ from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
+    Chunk,
     ChunkIndex,
     DataEnd,
     Footer,
@@ -394,17 +395,16 @@ class McapLogWriter:
     def _emit_chunk(self, chunk: RawChunk) -> None:
         channel, log_time, offset, stored = chunk.channel, chunk.log_time_ns, chunk.offset, chunk.stored
         start_ns, end_ns = int(log_time.min()), int(log_time.max())
-        compression = chunk.compression.encode()
-        body = (
-            struct.pack("<QQQI", start_ns, end_ns, chunk.size, chunk.crc)
-            + struct.pack("<I", len(compression))
-            + compression
-            + struct.pack("<Q", len(stored))
+        chunk_start, chunk_length = self._emit_record(
+            Chunk(
+                compression=chunk.compression,
+                data=stored,
+                message_start_time=start_ns,
+                message_end_time=end_ns,
+                uncompressed_crc=chunk.crc,
+                uncompressed_size=chunk.size,
+            )
         )
-        chunk_at = self._at
-        self._emit(struct.pack("<BQ", Opcode.CHUNK, len(body) + len(stored)) + body)
-        self._emit(stored)
-        chunk_length = self._at - chunk_at
         index_at = self._at
         offsets: dict[int, int] = {}
         index = bytearray()
@@ -420,7 +420,7 @@ class McapLogWriter:
         self._emit(bytes(index))
         self._chunk_indexes.append(
             ChunkIndex(
-                chunk_start_offset=chunk_at,
+                chunk_start_offset=chunk_start,
                 chunk_length=chunk_length,
                 message_start_time=start_ns,
                 message_end_time=end_ns,

@@ -69,7 +69,7 @@ from pdhef_logtool.runs.pipeline import (
     write_verdicts,
 )
 from pdhef_logtool.runs.scoring import diverged_events, in_time, segment_events
-from pdhef_logtool.storage.outputs import OutputFolder, Transaction
+from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
@@ -312,7 +312,7 @@ def _same_column(estimate: FloatArray, truth: FloatArray) -> bool:
 
 
 def _write(
-    change: Transaction,
+    change: FolderTransaction,
     report: dict[str, Any],
     rows: Sequence[MetricRow],
     tracks: Sequence[StateTrack],

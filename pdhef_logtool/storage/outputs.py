@@ -13,7 +13,6 @@ import os
 import re
 import shutil
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Container, Iterable, Iterator
 from pathlib import Path
 from typing import Self
@@ -33,52 +32,15 @@ _POLL_S = 0.05
 _TRIES = 100
 
 
-class Transaction(ABC):
-    """A named set of files that replaces the set of that name whole, or not at all.
+class FolderTransaction:
+    """A folder that is replaced completely, or not at all; files that only the old one has are kept by a hard link.
 
     Files are written to the paths that :meth:`file` returns. Then either :meth:`commit` makes them the outputs, or
-    :meth:`discard` leaves what was there. As a context it commits at its end and discards on an exception.
-    """
+    :meth:`discard` keeps the old ones. As a context it commits at its end and discards on an exception.
 
-    #: A local folder for what is needed until then; gone afterwards.
-    scratch: Path
-    #: Location of the outputs in messages.
-    target: Path
-
-    @abstractmethod
-    def file(self, name: str) -> Path:
-        """Return where to write the file of a name."""
-
-    @abstractmethod
-    def commit(self) -> None:
-        """Make the files the outputs; raises OutputError, and the former outputs are unchanged."""
-
-    @abstractmethod
-    def discard(self) -> None:
-        """Remove what was written; harmless after :meth:`commit` and when called twice."""
-
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        """Commit on success, discard on an exception; a full disk is an OutputError wherever it was noticed."""
-        if kind is None:
-            self.commit()
-            return
-        self.discard()
-        if isinstance(error, OutputError):
-            error.where = self._shown(error.where)
-        if isinstance(error, OSError) and error.errno in OF_WRITING:
-            raise cannot_write(self.target, error) from error
-
-    def _shown(self, where: str) -> str:
-        """Return the final name of a place that an error names."""
-        return where
-
-
-class FolderTransaction(Transaction):
-    """A folder that is replaced; files that only the old one has are kept by a hard link.
+    Attributes
+    ----------
+    scratch : a local folder for temporary files, removed at the end. target : location of the outputs in messages.
 
     Parameters
     ----------
@@ -108,6 +70,22 @@ class FolderTransaction(Transaction):
             self.discard()
             raise
 
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        """Commit on success, discard on an exception; a full disk is an OutputError wherever it was noticed."""
+        if kind is None:
+            self.commit()
+            return
+        self.discard()
+        if isinstance(error, OutputError):
+            for folder in (self._new, self.scratch):
+                error.where = error.where.replace(str(folder), str(self.target))
+        if isinstance(error, OSError) and error.errno in OF_WRITING:
+            raise cannot_write(self.target, error) from error
+
     def _make(self) -> None:
         for left in reversed(range(_TRIES)):
             try:
@@ -122,13 +100,8 @@ class FolderTransaction(Transaction):
         """Return where to write the file of a name."""
         return self._new / name
 
-    def _shown(self, where: str) -> str:
-        for folder in (self._new, self.scratch):
-            where = where.replace(str(folder), str(self.target))
-        return where
-
     def commit(self) -> None:
-        """Put everything on the disk, take over what is kept, and exchange the folders."""
+        """Flush all files, link those that are kept, exchange the folders; raises OutputError, then nothing changes."""
         try:
             with writing(self.target):
                 shutil.rmtree(self.scratch)
@@ -143,7 +116,7 @@ class FolderTransaction(Transaction):
             self.discard()
 
     def discard(self) -> None:
-        """Remove what was written, or what was replaced."""
+        """Remove what was written, or what was replaced; harmless after :meth:`commit` and when called twice."""
         with contextlib.suppress(OSError):
             _repair(self._work, self._place)
         with contextlib.suppress(OSError):
@@ -168,7 +141,7 @@ class OutputFolder:
         self._parts = tuple(parts)
         self._lock = FolderLock(path)
 
-    def begin(self, name: str, stale: Container[str] = ()) -> Transaction:
+    def begin(self, name: str, stale: Container[str] = ()) -> FolderTransaction:
         """Begin to replace a folder, such as ``logs/drive``, without its stale files; raises OutputError."""
         return FolderTransaction(self.path / name, stale=stale)
 
