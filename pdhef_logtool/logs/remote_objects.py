@@ -13,11 +13,13 @@ from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from pdhef_logtool.logs.byte_source import ChangedError, SourceError
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.errors import UsageError
+
+T = TypeVar("T")
 
 _BLOCK_BYTES = 1 << 20
 #: Progress from which on a cut answer counts as none of the tries.
@@ -235,27 +237,21 @@ class S3Object(RemoteObject):
     @asynccontextmanager
     async def ask(self, start: int, end: int, pinned: ObjectState | None) -> AsyncIterator[Answer]:
         """See :class:`RemoteObject`."""
+        from botocore.exceptions import ClientError
+
         asked: dict[str, str] = {"Bucket": self.place.host, "Key": self.place.key, "Range": f"bytes={start}-{end - 1}"}
         if pinned is not None and pinned.etag:
             asked["IfMatch"] = pinned.etag
         async with self.client() as client:
-            response = await self._found(client, asked, pinned)
-            if response is None:
-                yield Answer(EMPTY, 0, _nothing())
+            try:
+                response = await client.get_object(**asked)
+            except ClientError as error:
+                if _status_of(error)[0] != 416 or pinned is not None:
+                    raise
+                yield Answer(EMPTY, 0, _nothing())  # an empty object, which has no range
                 return
             async with response["Body"] as body:
                 yield self._answer(response, body, start, pinned)
-
-    async def _found(self, client: Any, asked: Mapping[str, str], pinned: ObjectState | None) -> Any:
-        """Return what the store answers; None for an empty object, which has no range."""
-        from botocore.exceptions import ClientError
-
-        try:
-            return await client.get_object(**asked)
-        except ClientError as error:
-            if _status_of(error)[0] == 416 and pinned is None:
-                return None
-            raise
 
     @asynccontextmanager
     async def client(self) -> AsyncIterator[Any]:
@@ -313,22 +309,13 @@ def keys_below(prefix: RemotePlace) -> list[str]:
                 keys += [str(entry["Key"]) for entry in page.get("Contents", ())]
         return keys
 
-    async def in_turn() -> list[str]:
-        keys: list[str] = []
-
-        async def once() -> None:
-            keys[:] = await listed()
-
-        await try_in_turn(once, store)
-        return keys
-
-    return asyncio.run_coroutine_threadsafe(in_turn(), store.loop).result()
+    return asyncio.run_coroutine_threadsafe(try_in_turn(listed, store), store.loop).result()
 
 
 async def try_in_turn(
-    once: Callable[[], Awaitable[None]], remote: RemoteObject, place: Callable[[], int] = lambda: 0
-) -> None:
-    """Do something until it succeeds; give up after some tries in turn that brought nothing.
+    once: Callable[[], Awaitable[T]], remote: RemoteObject, place: Callable[[], int] = lambda: 0
+) -> T:
+    """Do something until it succeeds and return its result; give up after some tries in turn without progress.
 
     Parameters
     ----------
@@ -341,7 +328,7 @@ async def try_in_turn(
     tries, reached = 0, place()
     while True:
         try:
-            await once()
+            return await once()
         except TryAgainError as error:
             tries += 1
             if place() - reached >= _PROGRESS_BYTES:
@@ -351,8 +338,6 @@ async def try_in_turn(
                 raise remote.error(got, "try again later", "a server that answers") from None
             wait_s = max(error.wait_s, PATIENCE.first_wait_s * 2 ** (tries - 1))
             await asyncio.sleep(min(wait_s, PATIENCE.most_wait_s))
-        else:
-            return
 
 
 def s3_system(place: RemotePlace) -> Any:

@@ -65,41 +65,18 @@ def join_ranges(extents: Iterable[Extent], held: Sequence[Extent] = ()) -> list[
 
 
 def without(extents: Iterable[Extent], held: Sequence[Extent]) -> list[Extent]:
-    """Return what of some extents is in none of others, ascending, neighbours joined."""
+    """Return the parts of some extents that are in none of others, ascending, neighbours joined."""
     missing: list[Extent] = []
     taken = sorted(held)
     for start, end in sorted(extents):
         position = max(start, missing[-1][1]) if missing else start
-        for low, high in taken:
-            if high <= position:
-                continue
-            if low >= end:
-                break
-            if low > position:
-                _append(missing, position, low)
+        for low, high in (*taken, (end, end)):
+            stop = min(low, end)
+            if stop > position:
+                joined = missing and missing[-1][1] == position
+                missing.append((missing.pop()[0] if joined else position, stop))
             position = max(position, high)
-        if position < end:
-            _append(missing, position, end)
     return missing
-
-
-def _append(extents: list[Extent], start: int, end: int) -> None:
-    if extents and extents[-1][1] == start:
-        extents[-1] = (extents[-1][0], end)
-    else:
-        extents.append((start, end))
-
-
-def _insert(held: list[Extent], extent: Extent) -> None:
-    """Add an extent to others that are apart from it and each other, and ascend; neighbours are joined."""
-    index = bisect_right(held, extent)
-    start, end = extent
-    if index < len(held) and held[index][0] == end:
-        end = held.pop(index)[1]
-    if index > 0 and held[index - 1][1] == start:
-        index -= 1
-        start = held.pop(index)[0]
-    held.insert(index, (start, end))
 
 
 def _any_in(held: Sequence[Extent], start: int, end: int) -> bool:
@@ -268,7 +245,7 @@ class _Spool:
         with self._lock:
             if (extent, future) in self.coming:
                 self.coming.remove((extent, future))
-                _insert(self.held, extent)
+                self.held = without([*self.held, extent], ())
 
     def read(self, start: int, end: int) -> bytes:
         """Return bytes [start, end)."""
