@@ -41,7 +41,7 @@ COMPILING_S = 25
 
 
 def _without_blas() -> None:
-    """Let numba load without SciPy's BLAS, which takes longer than a short log: nothing compiled here asks for it.
+    """Let numba load without SciPy's BLAS, which takes longer than a short log: no function here needs it.
 
     What needs LAPACK, such as the repair of a covariance, loads that when it is called.
     """
@@ -189,7 +189,7 @@ def _writable(folder: Path) -> bool:
 
 
 class _Cache:
-    """What a compiled function asks for its machine code: the installation's, and what this user keeps."""
+    """Cache of a compiled function: machine code of the installation and of this user."""
 
     def __init__(self, function: Any) -> None:
         kept = kept_in()

@@ -10,7 +10,7 @@ _Extent = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class ByteLedger:
-    """Where the bytes of one file of a log went; the three sums are its size.
+    """Account of the bytes of one file of a log; the three sums add up to its size.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class ByteAccount:
         self.lose(start, start + round((end - start) * share))
 
     def ledger(self, file: str) -> ByteLedger:
-        """Add up what there is by now."""
+        """Return the sums so far."""
         lost = self._covered(self._lost)
         decoded = self._covered([*self._lost, *self._decoded]) - lost
         verified = self._covered([*self._lost, *self._verified]) - lost

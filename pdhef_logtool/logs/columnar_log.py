@@ -40,8 +40,8 @@ from pdhef_logtool.logs.resource_limits import LimitError
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
-#: Neighbouring windows share the span at their border: so many loaded spans are kept for the next window, and of a
-#: short log all that fit into so many bytes, for it is looked at several times before it is read.
+#: Neighbouring windows share the span at their border: this many loaded spans are kept for the next window, and of a
+#: short log all that fit into this many bytes, as it is surveyed several times before it is read.
 _KEPT_SPANS, _KEPT_BYTES = 2, 8 << 20
 
 
@@ -540,7 +540,7 @@ class ColumnarLog(DriveLog):
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """What is read of one topic: the resolved paths and a decoder a channel."""
+    """How a topic is read: the resolved paths and a decoder per channel."""
 
     selections: tuple[Selection, ...]
     decoders: Mapping[tuple[int, int], ChannelDecoder]

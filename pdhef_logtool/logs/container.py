@@ -60,7 +60,7 @@ class Span:
     """A run of messages that is read as a whole: an MCAP or bag chunk, a run of unchunked records, a page of rows.
 
     ``start_ns`` and ``end_ns`` bound the log times as [start, end). ``counts`` gives messages by channel id.
-    ``ordered``: the log times of each channel are known not to step back in file order; False: nobody looked.
+    ``ordered``: the log times of each channel are known not to step back in file order; False: unknown.
     """
 
     index: int
@@ -103,7 +103,7 @@ class Block:
 
     @property
     def nbytes(self) -> int:
-        """Memory that it takes."""
+        """Its memory."""
         columns = self.channel, self.log_time_ns, self.publish_time_ns, self.sequence, self.offset, self.length
         return memoryview(self.buffer).nbytes + sum(c.nbytes for c in columns)
 
@@ -331,7 +331,7 @@ class Container(ABC):
             self.lost[self._folded[kind]] = Loss(kind, text, str(self.path), old.start_ns, end_ns, total)
 
     def drop_undeclared(self, called: str) -> None:
-        """Take the messages of channels that the file does not declare out of the spans' counts, with a loss each."""
+        """Remove the messages of undeclared channels from the spans' counts, with a loss per span."""
         for i, span in enumerate(self.spans):
             unknown = {c: n for c, n in span.counts.items() if c not in self.channels}
             if unknown:
@@ -453,7 +453,7 @@ class FileContainer(Container):
         """Find channels, spans and losses, keeping :attr:`at` up to date."""
 
     def _places(self) -> Iterator[int]:
-        """Yield where the walk is, up to the file's end, looking at the time that it takes now and then."""
+        """Yield the position of the walk up to the file's end; check the time limit now and then."""
         n = 0
         while self.position < self.source.size:
             n += 1

@@ -286,7 +286,7 @@ def _least_size(node: Node) -> tuple[int, int]:
 
 
 def _most_columns(rows: int) -> int:
-    """Return how many columns so many rows may have."""
+    """Return the largest number of columns for a number of rows."""
     return max(_COLUMNS, _CELLS // max(rows, 1))
 
 
@@ -295,7 +295,7 @@ def concatenate_columns(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
     Raises
     ------
-    LimitError : some arrays are so wide, and the others so many, that they would fill the memory.
+    LimitError : the arrays are too wide and too many for the memory.
     """
     if len(parts) == 1:
         return parts[0]

@@ -71,7 +71,7 @@ class Definitions:
             yield from sorted(source.glob(f"*/{package}/{file.as_posix()}"))
 
 
-#: What there is without anything of the user's or the machine's.
+#: Shipped definitions only, without those of the user and the machine.
 SHIPPED = Definitions()
 
 

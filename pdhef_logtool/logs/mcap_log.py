@@ -237,13 +237,13 @@ class McapContainer(FileContainer):
         return sorted(chunks)
 
     def add_schema(self, payload: bytes) -> None:
-        """Take note of a schema record."""
+        """Add a schema record."""
         self.meter.limits.check("metadata_bytes", len(payload), "a schema record")
         schema = Schema.read(ReadDataStream(BytesIO(payload)))
         self._schemas.setdefault(schema.id, schema)
 
     def add_channel(self, payload: bytes) -> None:
-        """Take note of a channel record."""
+        """Add a channel record."""
         self.meter.limits.check("metadata_bytes", len(payload), "a channel record")
         channel = Channel.read(ReadDataStream(BytesIO(payload)))
         if channel.id not in self._raw_channels:
@@ -413,7 +413,7 @@ class McapContainer(FileContainer):
             yield record
 
     def note_attachment(self, start: int, end: int) -> None:
-        """Take note of an attachment record, checking its CRC without holding it."""
+        """Add an attachment record; check its CRC block by block."""
         source = self.source
         place = start + 9 + 16  # behind both times
         name = ""
@@ -438,11 +438,11 @@ class McapContainer(FileContainer):
         self.add_attachment(start, end)
 
     def add_attachment(self, start: int, end: int) -> None:
-        """Take note of an attachment record."""
+        """Add an attachment record."""
         self._attachment_at.append((start, end))
 
     def note_metadata(self, start: int, end: int) -> None:
-        """Take note of a metadata record that can be read."""
+        """Add a metadata record that can be read."""
         self.meter.limits.check("metadata_bytes", end - start, "a metadata record")
         Metadata.read(ReadDataStream(BytesIO(self.source.read(start + 9, end - start - 9))))
         self._metadata_at.append((start, end))
@@ -569,7 +569,7 @@ class _Walk:
         return n <= 4 and bool(49 + n + _U64.unpack_from(head, 41 + n)[0] == end - start)
 
     def add_indexed(self, indexed: IndexedChunk | tuple[int, int]) -> int:
-        """Take a chunk or an attachment as the index has it; returns where the next record begins."""
+        """Add a chunk or an attachment by its entry in the index; return the start of the next record."""
         of = self.of
         self._end_chunk()
         self._end_run()
@@ -581,7 +581,7 @@ class _Walk:
         return indexed.index_end
 
     def messages(self, offset: int) -> int:
-        """Take the message records from here on whose heads are read ahead; returns where the next record begins."""
+        """Add the message records from here on whose heads are read ahead; return the start of the next record."""
         of = self.of
         self._end_chunk()
         size = of.source.size
@@ -618,7 +618,7 @@ class _Walk:
         return base + place
 
     def _message_index(self, start: int, end: int) -> None:
-        """Take note of the messages that an index names, as far as it can be right."""
+        """Add the messages that an index names, if it is consistent."""
         of = self.of
         if self.chunk is None:
             self._end_run()

@@ -383,7 +383,7 @@ def _json_type(declared: object) -> str | None:
 
 
 def json_schema_of_message(type_name: str, message: bytes, limits: ResourceLimits = DEFAULT_LIMITS) -> MessageSchema:
-    """Take the schema from a JSON message; raises :class:`SchemaError`."""
+    """Derive the schema from a JSON message; raises :class:`SchemaError`."""
     what = "the first message"
     with parsing(what):
         limits.check("schema_bytes", len(message), what)
@@ -539,7 +539,7 @@ def _no_number(schema: MessageSchema, topic: str, path: str, what: str) -> Mappi
 
 
 def bytes_of_text(value: object, encoding: str) -> list[int] | None:
-    """Decode a text of ``hex`` or ``base64`` digits; None where it is no such text."""
+    """Decode a text of ``hex`` or ``base64`` digits; None for any other text."""
     if not isinstance(value, str):
         return None
     try:
@@ -552,7 +552,7 @@ def bytes_of_text(value: object, encoding: str) -> list[int] | None:
 
 
 def value_at(message: object, steps: Sequence[Step]) -> object:
-    """Follow steps through attributes, mappings and sequences; None where the message has no such place."""
+    """Follow steps through attributes, mappings and sequences; None where the message lacks one."""
     value: Any = message
     for step in steps:
         if value is None:

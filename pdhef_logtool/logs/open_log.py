@@ -39,7 +39,7 @@ from pdhef_logtool.storage.documents import read_text
 from pdhef_logtool.storage.files import scratch_folder
 
 _REMEDY = "give the recording itself"
-#: What a log of a container is called in reports, as a file and as a folder.
+#: Kinds of logs by container format, as a file and as a folder.
 _KINDS = {"mcap": "mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}
 _FOLDER_KINDS = {**_KINDS, "mcap": "rosbag2-mcap"}
 

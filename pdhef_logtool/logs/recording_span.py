@@ -266,7 +266,7 @@ def _look(containers: Sequence[Container], times: SpanTimes) -> list[_Looked]:
         topics = {id_: channel.topic for id_, channel in container.channels.items()}
         for span in container.spans:
             if not span.counts:
-                continue  # nothing of it is of a channel that is known; its times are nobody's
+                continue  # it has no message of a declared channel
             lasts = span.end_ns - span.start_ns
             behind = any(span.start_ns < newest.get(topics[id_], 0) - STEP_BACK_NS for id_ in span.counts)
             of = _Looked(c, span, topics)

@@ -1,4 +1,4 @@
-"""Where a web server may redirect a request for a log: to public addresses, and to other places of the same host.
+"""Check of redirects of web servers: to public addresses and within the same host only.
 
 A log's server may be malicious: a redirect could make this machine send requests to itself or to its network. So the
 target of each redirect is checked, and also the addresses of each connection, as names can change in between.

@@ -59,7 +59,7 @@ def copy_topics(writer: McapLogWriter, log: ColumnarLog, topics: Collection[str]
                     times = block.log_time_ns[rows]
                     left_out = log.recording_span.recorded_before(topic, c, span, times)
                     chunk.add(block, rows[~left_out & (times >= 0)], ids[id_])
-                # Which of two channels comes first at equal times hangs on what is read together.
+                # The order of two channels at equal times depends on what is read together.
                 if chunk.size >= CHUNK_BYTES or len(of_topic) > 1:
                     chunk.write(writer)
     for chunk in pending.values():
@@ -74,7 +74,7 @@ class _Pending:
     _parts: list[tuple[bytes, IntArray, IntArray, IntArray]] = field(default_factory=list)
 
     def add(self, block: Block, rows: IntArray, channel_id: int) -> None:
-        """Take messages [K] of a block, to be written under a channel's id."""
+        """Add messages [K] of a block, to be written under a channel's id."""
         if not rows.size:
             return
         content, offset = _records(block, rows, channel_id)

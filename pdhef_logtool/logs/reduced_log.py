@@ -113,7 +113,7 @@ class ReducedLog(ColumnarLog):
 
     @property
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:
-        """Where the bytes of each file of the source went."""
+        """Byte ledger of each file of the source."""
         return self.record.byte_ledgers
 
     def attached(self, name: str) -> Path:

@@ -32,7 +32,7 @@ _CONTENT_RANGE = re.compile(r"bytes (?:(\d+)-(\d+)|\*)/(\d+|\*)")
 
 @dataclass(frozen=True, slots=True)
 class Patience:
-    """How long a server is waited for: silence of a connection, tries of a range without progress, waits between."""
+    """Timeouts and retries: silence of a connection, tries of a range without progress, waits between tries."""
 
     connect_s: float = 15.0
     silence_s: float = 30.0
@@ -59,7 +59,7 @@ class TryAgainError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class ObjectState:
-    """What an object was when it was opened: bytes, and what the server calls this version of it (empty: nothing)."""
+    """State of an object when it was opened: bytes, and the server's names of this version (empty: none)."""
 
     size: int
     etag: str
@@ -71,7 +71,7 @@ EMPTY = ObjectState(0, "", "")
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """An answer on its way: the object's state, where its bytes begin, and the bytes. Size -1: known at the end."""
+    """A response in transfer: the object's state, the offset of its bytes, and the bytes. Size -1: known at the end."""
 
     state: ObjectState
     start: int
@@ -93,19 +93,19 @@ class RemoteObject(ABC):
 
     @abstractmethod
     def ask(self, start: int, end: int, pinned: ObjectState | None) -> AbstractAsyncContextManager[Answer]:
-        """Ask for bytes [start, end); with ``pinned`` only if the object still is what it was.
+        """Request bytes [start, end); with ``pinned`` only if the object is unchanged.
 
         Raises
         ------
-        TryAgainError : the server is busy, or does not answer. SourceError : it answers that there is no such thing.
+        TryAgainError : no response yet. SourceError : the object does not exist or is unreadable.
         """
 
     def error(self, got: str, remedy: str, expected: str = "an object that can be read") -> SourceError:
-        """Return the one line for what is wrong."""
+        """Return the error for this object."""
         return SourceError(expected=expected, got=got, where=str(self.place), remedy=remedy)
 
     def changed(self, what: str) -> ChangedError:
-        """Return the error for an object that is another one than was opened."""
+        """Return the error for an object that has changed since it was opened."""
         return ChangedError(
             expected="the object that was opened",
             got=f"another one ({what})",
@@ -114,7 +114,7 @@ class RemoteObject(ABC):
         )
 
     def refuse(self, status: int, wait_s: float) -> NoReturn:
-        """Raise what a status that brings no bytes means."""
+        """Raise the error of a status without content."""
         if status in _PASSING:
             raise TryAgainError(f"status {status}", wait_s)
         if status in (412, 416):
@@ -127,7 +127,7 @@ class RemoteObject(ABC):
         raise self.error(f"status {status}", "check the URL")
 
     def require_unchanged(self, pinned: ObjectState | None, state: ObjectState) -> None:
-        """Raise the error for a changed object if two states are not of one."""
+        """Raise the error for a changed object if two states differ."""
         if pinned is None:
             return
         for was, now, what in (
@@ -141,11 +141,11 @@ class RemoteObject(ABC):
 
 
 def remote_object(place: RemotePlace) -> RemoteObject:
-    """Return the object at a place; nothing is asked yet.
+    """Return the object at a place, without a request.
 
     Raises
     ------
-    UsageError : What it takes to ask is not installed.
+    UsageError : A required package is not installed.
     """
     return S3Object(place) if place.scheme == "s3" else HttpObject(place)
 
@@ -255,7 +255,7 @@ class S3Object(RemoteObject):
 
     @asynccontextmanager
     async def client(self) -> AsyncIterator[Any]:
-        """Give the client for a bucket, whose errors become ours."""
+        """Yield the client of the bucket; convert its errors."""
         import aiohttp
         from botocore.exceptions import (
             BotoCoreError,
@@ -315,11 +315,11 @@ def keys_below(prefix: RemotePlace) -> list[str]:
 async def try_in_turn(
     once: Callable[[], Awaitable[T]], remote: RemoteObject, place: Callable[[], int] = lambda: 0
 ) -> T:
-    """Do something until it succeeds and return its result; give up after some tries in turn without progress.
+    """Call a function until it succeeds and return its result; give up after several tries without progress.
 
     Parameters
     ----------
-    place : how many bytes have come by now.
+    place : returns the number of bytes received so far.
 
     Raises
     ------

@@ -109,7 +109,7 @@ class RemoteSource(ByteSource):
 
     @property
     def state(self) -> ObjectState:
-        """What the object was when it was opened."""
+        """State of the object when it was opened."""
         return self._spool.state
 
     @property
@@ -136,7 +136,7 @@ class RemoteSource(ByteSource):
         self._spool.order([(max(start, 0), min(end, self.size)) for start, end in extents])
 
     def fetch_whole(self) -> None:
-        """Have all of it in the scratch file."""
+        """Fetch the whole object into the scratch file."""
         self.prefetch([(0, self.size)])
         self._spool.wait(0, self.size)
 
@@ -178,7 +178,7 @@ class _Spool:
 
         Raises
         ------
-        ChangedError : It is another one by now. SourceError : It cannot be asked for.
+        ChangedError : The object has changed. SourceError : It cannot be requested.
         """
         with self._entering:
             if self._file is not None:
@@ -194,7 +194,7 @@ class _Spool:
                 raise
 
     def leave(self) -> None:
-        """Close the scratch file, when nobody uses it any more."""
+        """Close the scratch file, after its last use."""
         for _, future in self.coming:
             future.cancel()
         self.coming.clear()

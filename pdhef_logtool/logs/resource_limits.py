@@ -87,7 +87,7 @@ DEFAULT_LIMITS = ResourceLimits()
 class Meter:
     """Processor time of reading one log, with the limit for the bytes read so far.
 
-    What is read again counts again on both sides, so that a sound log can be read for ever.
+    Repeated reads count again in time and in bytes, so that a sound log can be read any number of times.
     """
 
     def __init__(self, limits: ResourceLimits = DEFAULT_LIMITS) -> None:
@@ -98,7 +98,7 @@ class Meter:
 
     @property
     def allowed_s(self) -> float:
-        """Seconds that may have been spent by now."""
+        """Time limit for the bytes read so far, in seconds."""
         return self.limits.seconds + self.limits.seconds_per_mib * self._bytes / _MIB
 
     def check(self) -> None:

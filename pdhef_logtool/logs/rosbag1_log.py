@@ -176,7 +176,7 @@ class Rosbag1Container(FileContainer):
         )
 
     def _index_record(self, chunk: _Chunk, fields: Mapping[str, bytes], payload: bytes) -> None:
-        """Take note of the connection and the log times that an index record lists."""
+        """Add the connection and the log times of an index record."""
         (connection,), (count,) = _U32.unpack(fields["conn"]), _U32.unpack(fields["count"])
         words = np.frombuffer(payload, dtype="<u4", count=3 * count).reshape(count, 3).astype(np.int64)
         if count:

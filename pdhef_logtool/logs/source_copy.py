@@ -34,7 +34,7 @@ _Key = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class SourceChannels:
-    """Where the channels of a log went in the copy.
+    """Channels of a log and of its copy.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ def register_channels(
 
 
 class _Places:
-    """Which ids the channels and schemas of MCAP files get in the copy: their own where these are free."""
+    """Ids of the channels and schemas of MCAP files in the copy: unchanged if these are free."""
 
     def __init__(self, log: ColumnarLog) -> None:
         self._files = {c: f for c, f in enumerate(log.containers) if f.whole_chunks}
@@ -292,7 +292,7 @@ class _Cursor:
 
 
 def _with_definition(channel: ChannelRecord) -> ChannelRecord:
-    """Give a channel of an old database the definition that its type has in the common packages, if any."""
+    """Return a channel of an old database with the definition of its type in the common packages, if any."""
     try:
         text = message_definition(channel.type_name)
     except KeyError:

@@ -47,7 +47,7 @@ class Leaf:
 
 @dataclass(frozen=True, slots=True)
 class WireLayout:
-    """Where every leaf of a message lies.
+    """Offsets of all leaves of a message.
 
     Attributes
     ----------
@@ -246,7 +246,7 @@ class LayoutReader:
         return fits, [part[fits] for part in parts]
 
     def values(self, parts: Sequence[NDArray[Any]], n: int, steps: Steps) -> NDArray[Any] | None:
-        """Return a leaf of N gathered messages, [N] or [N, k] in its own type; None where the layout has no such."""
+        """Return a leaf of N gathered messages, [N] or [N, k] in its own type; None if the layout lacks it."""
         place = self._places.get(steps)
         if place is not None:
             values: NDArray[Any] = parts[place[0]][place[1]]

@@ -110,14 +110,14 @@ class _Merged:
         self.position = 0
 
     def take_until(self, until_ns: int | None) -> slice:
-        """Take what lies before a time (all that is left when None)."""
+        """Remove and return the records before a time (None: all)."""
         first, self.position = self.position, len(self.log_time_ns)
         if until_ns is not None:
             self.position = max(first, int(np.searchsorted(self.log_time_ns, until_ns, side="left")))
         return slice(first, self.position)
 
     def take_chunk(self) -> slice:
-        """Take one chunk full."""
+        """Remove and return the records of one chunk."""
         first = self.position
         base = int(self.ends[first - 1]) if first else 0
         self.position = max(int(np.searchsorted(self.ends, base + CHUNK_BYTES, side="right")), first + 1)

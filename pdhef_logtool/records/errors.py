@@ -57,7 +57,7 @@ class LogError(PdhefError):
 
 
 class MappingError(PdhefError):
-    """A log does not contain what is to be mapped, or what is asked of it."""
+    """A log does not contain a mapped or requested field."""
 
 
 class MappingFileError(MappingError):

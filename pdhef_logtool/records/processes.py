@@ -12,7 +12,7 @@ from pathlib import Path
 
 import psutil
 
-#: What :func:`own_name` returns, as a regular expression.
+#: Result of :func:`process_name`, as a regular expression.
 NAME = r"[0-9a-f]{8}-\d+-\d+"
 #: Which worker of a command this process is, from 1; 0 in the command itself.
 worker_number = 0

@@ -1,4 +1,4 @@
-"""What is reported to be wrong with a_y or yaw rate: the bits of a track's ``reason``, and their names.
+"""Reported faults of a_y and yaw rate: the bits of a track's ``reason``, and their names.
 
 The bits are written to estimates.parquet and ``pdhef_msgs/VehicleStateEstimate``: none may change its meaning.
 """

@@ -124,7 +124,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Signals:
-    """What an estimator may see, aligned on the IMU's stamps; contains no ground truth.
+    """Inputs of an estimator, aligned on the IMU's stamps; contains no ground truth.
 
     All columns have length N and NaN where the channel has no usable sample. ``speed_m_s`` and the columns of
     ``wheel_speed_m_s`` are finite only at the first stamp after a new sample (a measurement is used once);

@@ -39,7 +39,7 @@ TRACK_COLUMNS = (
     "ay_bias_m_s2",
     "yaw_rate_bias_rad_s",
 )
-#: What a filter may estimate beside the motion.
+#: Quantities that a filter may estimate in addition to the motion.
 ESTIMATED_COLUMNS = TRACK_COLUMNS[-6:]
 #: Those that a source may not have at all.
 OPTIONAL_COLUMNS = ("mixture_weight", "reason", *ESTIMATED_COLUMNS)
@@ -142,7 +142,7 @@ class StateTrack:
 
     @property
     def something_known(self) -> BoolArray:
-        """Where one of its quantities is known, [N]."""
+        """Mask of the stamps with a known quantity, [N]."""
         finite = np.isfinite(self.vx_m_s) | np.isfinite(self.vy_m_s) | np.isfinite(self.yaw_rate_rad_s)
         return np.asarray(finite | np.isfinite(self.sideslip_rad) | np.isfinite(self.ay_m_s2), dtype=np.bool_)
 

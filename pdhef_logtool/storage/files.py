@@ -65,7 +65,7 @@ class PendingFile:
             sweep_files(target.parent)
 
     def commit(self) -> None:
-        """Give the written file its final name; it is on the disk before the name is."""
+        """Flush the file, then give it its final name."""
         try:
             with writing(self.target):
                 sync(self.path)

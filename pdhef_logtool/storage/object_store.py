@@ -28,7 +28,7 @@ _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://.")
 _WHOLE = frozenset({"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "memory"})
 #: A lock that was not renewed for this time is left over. Stores refuse clocks that differ by more than 15 minutes.
 LEFT_OVER_S = 1800.0
-#: How S3 is asked again, by botocore with growing waits; a request that is not answered is given up.
+#: Timeouts and retries of S3, by botocore with growing waits.
 S3_CLIENT: dict[str, Any] = {
     "connect_timeout": 15.0,
     "read_timeout": 60.0,
@@ -262,7 +262,7 @@ class Mirror:
         self.folder.mkdir()
 
     def fetch(self, name: str) -> Path | None:
-        """Return the file of an object, None where there is none; it is asked for once."""
+        """Return the local file of an object, fetched once; None if there is none."""
         path = self.folder / name
         if not path.is_file():
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -242,7 +242,7 @@ class FolderLock:
         return True
 
     def _try_file(self) -> bool:
-        """Take the lock file, which appears with its content; one of a dead process is removed first."""
+        """Create the lock file, complete with its content; that of a dead process is removed first."""
         file, prepared = self._folder / LOCK_FILE, self._folder / f"{LOCK_FILE}.{process_name()}"
         if (holder := _holder(file)) is not None and is_alive(holder) is False:
             stale = self._folder / f"{LOCK_FILE}.{process_name()}.stale"
@@ -384,7 +384,7 @@ def _take_over(old: Path, new: Path, stale: Container[str]) -> None:
 def _link(source: str | Path, target: str | Path) -> None:
     try:
         os.link(source, target)
-    except OSError:  # a file system without hard links, or somebody else's file
+    except OSError:  # a file system without hard links, or a file of another user
         shutil.copy2(source, target)
 
 

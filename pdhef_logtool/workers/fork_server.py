@@ -39,7 +39,7 @@ ONE_THREAD = dict.fromkeys(
     ),
     "1",
 )
-#: What the server is asked: a new worker (its socket comes along), or how the worker of a process id ended.
+#: Requests to the server: fork a worker (with its socket), or return the exit status of a worker.
 FORK, STATUS = b"fork", b"stat"
 _REQUEST = struct.Struct("<4sq")
 _HEAD = struct.Struct("<q")
@@ -65,7 +65,7 @@ def receive(channel: socket.socket) -> Any:
 
 
 def split(buffer: bytearray) -> Iterator[Any]:
-    """Take the whole messages off the front of what came; what is not yet whole stays."""
+    """Remove and yield the complete messages at the front of a buffer."""
     while len(buffer) >= _HEAD.size:
         end = _HEAD.size + _HEAD.unpack_from(buffer)[0]
         if len(buffer) < end:
@@ -81,7 +81,7 @@ def ask(control: socket.socket, what: bytes, number: int, descriptors: Sequence[
 
 
 def serve(descriptor: int) -> None:
-    """Be the server, on the socket of this descriptor, until its other side closes; no worker outlives it."""
+    """Run the server on the socket of this descriptor until the other side closes; no worker outlives it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends
     control = socket.socket(fileno=descriptor)
     workers: set[int] = set()

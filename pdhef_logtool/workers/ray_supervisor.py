@@ -28,7 +28,7 @@ R = TypeVar("R")
 
 #: Nodes that an item may lose: machines that are taken away at any time count as such.
 MAX_RETRIES = 1000
-#: Items that are with Ray for each of its processors: so many that none waits for the next.
+#: Items submitted to Ray per processor, so that no processor waits for the next one.
 _AHEAD = 2
 _LOOK_S = 5.0
 _CONNECT_S = 20.0
@@ -125,7 +125,7 @@ def _connected(address: str) -> Iterator[Any]:
     if main:
         signal.signal(signal.SIGTERM, was)  # Ray has put its own in its place
     with suppress(AttributeError):
-        # It prints on stdout, where results go, that a node was lost and that it goes on.
+        # It prints messages about lost nodes on stdout, where results go.
         ray._private.worker.print_to_stdstream = lambda *_, **__: None
     try:
         yield ray
@@ -134,7 +134,7 @@ def _connected(address: str) -> Iterator[Any]:
 
 
 def _check_reachable(address: str) -> None:
-    """Raise OSError where nobody listens: Ray itself would try for minutes."""
+    """Raise OSError if the port is closed: Ray itself would try for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdigit():
         socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT_S).close()
@@ -145,7 +145,7 @@ _crews: dict[str, Crew[Any, Any]] = {}
 
 
 def _end_on_node(orders: _Orders, item: Any) -> tuple[Any, Failure | None]:
-    """Do the work on an item in a worker beside this process, which lives as long as this one does its run's tasks."""
+    """Do the work on an item in a worker process, which is kept for further tasks of the run."""
     try:
         for ended in _crew(orders).each([item]):
             return ended.result, ended.failure

@@ -44,7 +44,7 @@ _LONGEST_TICK_S = 5.0
 #: A worker can exceed its limit by at most this much; allocators reserve more than they need.
 _RESERVED_BYTES = 2 << 30
 _TRIES = 2
-#: How often a fork server that died is replaced while the items of one list are worked on.
+#: Most restarts of the fork server per list of items.
 _RESTARTS = 3
 #: Timeout for handing an item to a worker.
 _SEND_S = 60.0
@@ -336,11 +336,11 @@ class Crew(Generic[T, R]):
             self._end(worker)
 
     def _run(self, attempts: Iterator[_Attempt[T]], jobs: int) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
-        """Try items, so many at once; yield how each ended, None if it was lost and may be tried again."""
+        """Try items, ``jobs`` at once; yield the outcome of each, None if it was lost and may be tried again."""
         since = time.monotonic()
         coming: _Attempt[T] | None = None
         while True:
-            # What the first item has compiled, the others find.
+            # The first item compiles alone; the others use its code.
             while self._busy() < (jobs if self._warm else 1):
                 coming = coming or (self._returned.pop() if self._returned else next(attempts, None))
                 if coming is None:
