@@ -46,11 +46,6 @@ class Improvement:
         """Whether the whole interval lies above 0."""
         return bool(self.low > 0.0)
 
-    @property
-    def disproven(self) -> bool:
-        """Whether the whole interval lies below 0: the scheme is worse."""
-        return bool(self.high < 0.0)
-
 
 def _chosen(runs: Iterable[Run], scenario: str, scheme: str, figure: str) -> list[Run]:
     return [r for r in runs if r.scenario == scenario and r.scheme == scheme and figure in r.values]

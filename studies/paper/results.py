@@ -128,6 +128,18 @@ def gather(
     return Results(experiment, cars, histories, fits, curves, inflations, times, withheld, without)
 
 
+def _withheld(r: Results) -> dict[str, Any] | None:
+    """Return the training drives, and gain limit and errors of the network that lacked some manoeuvres."""
+    if r.withheld is None or r.without is None:
+        return None
+    errors = {s.name: spread(r.without, s.name, HYBRID, FIGURE) for s in (A, B)}
+    return {
+        "drives": dict(r.withheld.drives),
+        "gain_limit": r.withheld.car.allowed_trust.cap,
+        "sideslip_deg": {name: None if s is None else asdict(s) for name, s in errors.items()},
+    }
+
+
 def _plain(value: Any) -> Any:
     """Return JSON-able values, floats to six digits; what is not finite is null."""
     if isinstance(value, float):
@@ -209,6 +221,7 @@ def document(results: Results) -> dict[str, Any]:
             "network_schemes": sorted(n for n in r.ran if spec_of(n).network),
             "summary": summary,
             "improvements": gains,
+            "withheld": _withheld(r),
             "residuals": residuals,
             "trust": trust,
             "r_factor": {name: asdict(i) for name, i in r.inflations.items()},

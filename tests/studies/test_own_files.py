@@ -1,4 +1,4 @@
-"""Damaged files of our own, with a fixed seed: ``studies/torture/own_files.py``."""
+"""Damaged files of our own, with a fixed seed: ``own_files.py``."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-
-from studies.torture.own_files import numbers, own_file_judge
+from own_files import numbers, own_file_judge
 
 CASES = 36
 
