@@ -120,7 +120,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     _page(
         "recorded-drives", "real", "real", "tests/reference", RECORDED,
-        arguments="--network many-cars --trials 64", work=("out/real",),
+        arguments="--network many-cars --trials 64",
     ),
     _page(
         "calibration", "calibration", "calibration", "studies/self_calibration.py", "studies/identified_bands.py",

@@ -24,7 +24,6 @@ from studies.strangers.layouts import layouts
 from studies.strangers.page import OUTCOMES, Result, merged, page
 from studies.strangers.recordings import ITEMS, Recording
 from studies.strangers.scoring import Score, look, score_log
-from studies.strangers.vehicles import vehicle_layouts
 
 #: What layouts held out gave when they were run for the first time: those now held out, and those that were before.
 FIRST_RUN = RESULTS / "third_party_logs" / "held_out_first_run.json"
@@ -145,13 +144,6 @@ def _wanted(name: str, only: Sequence[str]) -> bool:
     return not only or any(part in name for part in only)
 
 
-def held_out() -> Iterator[Recording]:
-    """Yield the layouts that were built last; none as long as there are none."""
-    from studies.strangers.held_out import held_out_layouts
-
-    return held_out_layouts()
-
-
 def main() -> int:
     """Make the logs, score them, write the page."""
     parser = options("strangers", __doc__)
@@ -162,7 +154,7 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, help="write the results as JSON, to compare with later")
     given = parser.parse_args()
     given.work.mkdir(parents=True, exist_ok=True)
-    made = chain(faults(), layouts(), vehicle_layouts(), held_out() if given.held_out else ())
+    made = chain(faults(), layouts("layout"), layouts("held-out") if given.held_out else ())
     recordings = [r for r in made if _wanted(r.name, given.only)]
     kinds: dict[str, list[Result]] = {}
     for kind, result in chain(score_own(recordings, given.work), score_others(given.only)):

@@ -16,12 +16,10 @@ from studies.strangers.answers import Answer, load_answers
 from studies.strangers.cars import Series, drive
 from studies.strangers.containers import write
 from studies.strangers.faults import faults, right_angles, units_and_signs
-from studies.strangers.held_out import held_out_layouts
-from studies.strangers.layouts import autoware, layouts, vbox
+from studies.strangers.layouts import layout, layouts
 from studies.strangers.page import Result, merged, page
 from studies.strangers.recordings import ITEMS, answers, imu, road_car, scalar
 from studies.strangers.scoring import Finding, Score, Told, agrees, bias_of, score_log
-from studies.strangers.vehicles import vehicle_layouts
 
 _NS = np.arange(0, 20_000_000_000, 10_000_000, dtype=np.int64)
 _WAVE = np.sin(2.0 * np.pi * 0.2 * _NS * 1e-9)
@@ -108,11 +106,11 @@ def test_an_accelerometer_may_have_a_bias_and_no_tilt() -> None:
 
 @pytest.mark.slow
 def test_a_sound_log_is_right_and_a_wrong_one_is_not(tmp_path: Path) -> None:
-    sound = score_recording(autoware(), tmp_path)
+    sound = score_recording(layout("autoware"), tmp_path)
     assert set(sound.items.values()) == {"right"}
     assert not list(tmp_path.iterdir())
     car = drive("short")
-    turned = replace(autoware(), topics=road_car(car, truth=None), right=answers(car, "steer", "speed"))
+    turned = replace(layout("autoware"), topics=road_car(car, truth=None), right=answers(car, "steer", "speed"))
     absent = score_recording(turned, tmp_path)  # what is mapped and stands in no answer is wrong
     assert absent.items["yaw rate"].startswith("wrong")
 
@@ -157,8 +155,8 @@ def test_an_undecided_check_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.slow
 def test_forty_kinds_with_distinct_names_and_pages() -> None:
-    last = [*held_out_layouts()]
-    own = [*faults(), *layouts(), *vehicle_layouts(), *last]
+    last = [*layouts("held-out")]
+    own = [*faults(), *layouts()]
     assert len({r.name for r in own}) == len(own)
     assert len({r.counted_as for r in own}) >= 40
     assert len(last) == 10
@@ -180,7 +178,7 @@ def test_the_page_says_what_is_wrong() -> None:
 
 
 def test_a_log_without_type_names_is_still_scored(tmp_path: Path) -> None:
-    result = score_recording(vbox(), tmp_path)
+    result = score_recording(layout("vbox"), tmp_path)
     assert set(result.items) >= {"ax", "ay", "yaw rate", "speed"}
     assert result.count("wrong, not told") == 0
 
