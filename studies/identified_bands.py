@@ -25,7 +25,7 @@ from pdhef_logtool.runs.estimating import calibrator
 from studies.condition_drives import root_mean_square
 from studies.many_cars import FIT_ITERATIONS, PARTS
 from studies.pages import number, table
-from studies.self_calibration import Simulated, make_wrong, say, simulate
+from studies.self_calibration import COVERAGE_HEAD, Simulated, coverage_cells, make_wrong, say, simulate
 
 #: Manoeuvre, km/h, seconds (None: its own). The first of each kind is identified on where it is one of ``FIT_ON``.
 DRIVEN = (
@@ -124,12 +124,8 @@ def bands_table(found: Sequence[Judged]) -> str:
     """Return shares and widths, driving like that of the identification apart."""
     body = []
     for name, some in _groups(found).items():
-        for which, values in (("its own", [j.own for j in some]), ("with the posterior", [j.band for j in some])):
-            shares, widths = np.array(values).T
-            low, middle, high = (f"{x:.0%}" for x in np.percentile(shares, [10, 50, 90]))
-            within = f"{np.mean((shares >= 0.90) & (shares <= 0.98)):.0%}"
+        for which, pairs in (("its own", [j.own for j in some]), ("with the posterior", [j.band for j in some])):
+            shares, width = coverage_cells(pairs)
             rmse = number(float(np.degrees(np.median([j.rmse for j in some]))))
-            row = [name, str(len(some)), rmse, which, f"{np.mean(shares):.0%}", low, middle, high, within]
-            body.append([*row, number(float(np.median(widths)), 2)])
-    head = ["driving", "drives", "RMSE, deg: median", "interval", "coverage: mean", "10 %", "median", "90 %"]
-    return table([*head, "intervals at 90 to 98 %", "width / RMSE: median"], body, right_from=4)
+            body.append([name, str(len(some)), rmse, which, *shares, width])
+    return table(["driving", "drives", "RMSE, deg: median", "interval", *COVERAGE_HEAD], body, right_from=4)

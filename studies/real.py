@@ -17,6 +17,7 @@ import json
 import re
 import sys
 import tempfile
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -123,74 +124,17 @@ class Case:
     remark: str = ""
 
 
-_SPINS = "Drifts and spins; the origin of the true body frame against the CG is not stated."
-CASES = (
-    Case(
-        "250lm",
-        "Ferrari 250 LM on a race track, fitted on 0 to 150 s, scored on 155 to 300 s",
-        Part("revs_250lm_a.mcap", 155.0),
-        "revs_250lm",
-        "revs_250lm",
-        Part("revs_250lm_a.mcap", 0.0, 150.0),
-        remark="The speed and the yaw rate of this log are the truth's own channels: neither is scored, and the "
-        "sideslip is that of estimators that know the true longitudinal velocity.",
-    ),
-    Case(
-        "f1tenth-xray",
-        "1:10 race car, fitted on run hoons 2, scored on run xray 24",
-        Part("f1tenth_xray_run24.bag"),
-        "f1tenth",
-        "f1tenth",
-        Part("f1tenth_hoons_run2.bag"),
-        1.0,
-        _SPINS,
-    ),
-    Case(
-        "f1tenth-hoons",
-        "1:10 race car, fitted on run xray 24, scored on run hoons 2",
-        Part("f1tenth_hoons_run2.bag"),
-        "f1tenth",
-        "f1tenth",
-        Part("f1tenth_xray_run24.bag"),
-        1.0,
-        _SPINS,
-    ),
-    Case(
-        "gti",
-        "VW GTI on a handling course, fitted on 0 to 50 s, scored on 55 to 102 s",
-        Part("niki_gti_1khz.mcap", 55.0),
-        "niki_gti",
-        "niki_gti",
-        Part("niki_gti_1khz.mcap", 0.0, 50.0),
-        remark="The speed is that of the INS and the yaw rate the truth's own channel: neither is scored.",
-    ),
-    Case(
-        "tts",
-        "Audi TT-S, fitted on 0 to 60 s, scored on 65 to 125 s",
-        Part("tts_kk.mcap", 65.0),
-        "tts_kk",
-        "tts_kk",
-        Part("tts_kk.mcap", 0.0, 60.0),
-        remark="The accelerometer is at the rear axle; there is no longitudinal acceleration.",
-    ),
-    Case(
-        "v40",
-        "Volvo V40, sine with dwell at 80 km/h, scored only",
-        Part("lunda_v40"),
-        "lunda_v40",
-        "lunda_v40",
-        remark="The speed is GNSS ground speed, nearly the truth itself. Three blocks at most: intervals say little.",
-    ),
-    Case(
-        "comma2k19",
-        "Toyota RAV4 on a motorway, scored only",
-        Part("comma2k19_segment.mcap"),
-        "comma2k19",
-        "comma2k19_rav4",
-        remark="The truth is at a camera that is turned by about 0.8 degrees, too coarse for sideslip: nothing can be "
-        "claimed here.",
-    ),
-)
+def load_cases() -> tuple[Case, ...]:
+    """Return the cases of ``real.toml``."""
+    cases = []
+    for name, entry in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items():
+        for key in {"score", "fit"} & entry.keys():
+            entry[key] = Part(*entry[key])
+        cases.append(Case(name=name, **entry))
+    return tuple(cases)
+
+
+CASES = load_cases()
 
 
 def files(case: Case) -> tuple[Path, Path]:

@@ -2,11 +2,11 @@
 
     python -m studies.recalibrate [--list] [--only STAGE ...]
 
-The stages run in the order of the table. A stage is skipped if the command and the digest of its inputs are those of
-its last completion and its outputs exist. After a failure or an interruption, the same command continues with the stage
-that was not completed; if its inputs have changed since, its work folders are deleted first. Comments, docstrings and
-the layout of pages (``studies.pages``, ``studies.pictures``) do not count as inputs. Constants that were chosen once
-(``studies/defaults/tune_*.py``) stay. The stamp files are in ``out/recalibrate``.
+The stages run in the order of ``recalibrate.toml``. A stage is skipped if the command and the digest of its inputs are
+those of its last completion and its outputs exist. After a failure or an interruption, the same command continues with
+the stage that was not completed; if its inputs have changed since, its work folders are deleted first. Comments,
+docstrings and the layout of pages (``studies.pages``, ``studies.pictures``) do not count as inputs. Constants that were
+chosen once (``studies/defaults/tune_*.py``) stay. The stamp files are in ``out/recalibrate``.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import shutil
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -29,27 +30,12 @@ from pdhef_logtool.storage.documents import digest
 from studies.pages import ROOT, options, table
 
 STAMPS = Path("out") / "recalibrate"
-SIMULATOR = ("truthsim",)
-#: Packages that decide estimates and parameters.
-FILTERS = tuple(
-    f"pdhef_logtool/{name}"
-    for name in ("car", "drive", "estimators", "evaluation", "learning", "logs", "mapping", "records", "residual_model")
-)
-TOOL = ("pdhef_logtool/**/*.py", *SIMULATOR)
-CAR, TRAINING = "pdhef_logtool/models/default", "out/train-default"
-_TRAIN = "python -m studies.defaults.train_default --steps"
-#: Parts of the shipped car, and both shipped networks.
-SHIPPED = ("pdhef_logtool/models",)
-RECORDED = "../shared/data/drives"
-INDEPENDENT = "../shared/data/independent_sim"
+TABLE = Path(__file__).with_suffix(".toml")
 
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """One command. Paths and glob patterns are relative to the repository; a folder stands for all files below it.
-
-    ``work`` : folders in which the command continues after an interruption. ``duration`` : on two cores.
-    """
+    """One command, with paths as in the table (``recalibrate.toml``)."""
 
     name: str
     command: str
@@ -59,84 +45,26 @@ class Stage:
     work: tuple[str, ...] = ()
 
 
-def _trained(step: str, inputs: tuple[str, ...], outputs: tuple[str, ...], *work: str, **more: str) -> Stage:
-    sources = (*FILTERS, "studies/defaults/train_default.py", "studies/defaults/fit_physics.py")
-    return Stage(step, f"{_TRAIN} {step}", (*sources, *inputs), outputs, work=work, **more)
+def load_stages(file: Path = TABLE) -> tuple[Stage, ...]:
+    """Return the stages of a table, with the sets of its inputs expanded."""
+    document = tomllib.loads(file.read_text(encoding="utf-8"))
+    sets = document.pop("sets", {})
 
+    def expanded(patterns: Sequence[str]) -> Iterator[str]:
+        for pattern in patterns:
+            yield from expanded(sets[pattern[1:]]) if pattern.startswith("@") else (pattern,)
 
-def _page(name: str, module: str, page: str, *inputs: str, arguments: str = "", **more: Any) -> Stage:
-    sources = f"studies/{module}" if (ROOT / "studies" / module).is_dir() else f"studies/{module}.py"
-    command = f"python -m studies.{module} {arguments}".rstrip()
-    return Stage(name, command, (*TOOL, *SHIPPED, sources, *inputs), (f"docs/{page}.md",), **more)
-
-
-_DRIVES = tuple(f"{TRAINING}/{name}/manifest.json" for name in ("one_car", "other_cars", "evidence"))
-_DATASETS = tuple(f"{TRAINING}/{model}/manifest.json" for model in ("physics", "nominal"))
-_CONDITION_SOURCES = ("studies/condition_drives.py", "studies/condition_runs.py", "studies/conditions_page.py")
-STAGES: tuple[Stage, ...] = (
-    Stage(
-        "vehicle-files",
-        "python -m studies.defaults.fit_nominal_tyres",
-        (*SIMULATOR, "studies/defaults/fit_nominal_tyres.py"),
-        ("sample_logs/vehicle.toml", "sample_logs/vehicle_mu03.toml"),
-        duration="2 s",
-    ),
-    Stage(
-        "simulate",
-        f"{_TRAIN} simulate",
-        (*SIMULATOR, "studies/defaults/train_default.py", "sample_logs/vehicle.toml"),
-        (f"{CAR}/vehicle.toml", *_DRIVES),
-        work=tuple(f"{TRAINING}/{name}" for name in ("one_car", "other_cars", "evidence")),
-    ),
-    _trained("fit", (*SIMULATOR, f"{CAR}/vehicle.toml"), (f"{CAR}/fit.toml",), f"{TRAINING}/fit"),
-    _trained(
-        "extract",
-        (f"{CAR}/vehicle.toml", f"{CAR}/fit.toml", _DRIVES[0]),
-        _DATASETS,
-        f"{TRAINING}/physics",
-        f"{TRAINING}/nominal",
-    ),
-    _trained("train", _DATASETS, (f"{CAR}/network",)),
-    _trained("noise", (f"{CAR}/vehicle.toml", f"{CAR}/fit.toml", f"{CAR}/network", _DRIVES[0]), (f"{CAR}/noise.toml",)),
-    _trained("gain", (f"{CAR}/noise.toml", f"{CAR}/network", _DRIVES[2]), (f"{CAR}/network.toml",)),
-    _trained(
-        "intervals",
-        (f"{CAR}/noise.toml", f"{CAR}/network.toml", f"{CAR}/network", _DRIVES[0]),
-        (f"{CAR}/intervals.json", f"{CAR}/intervals-unsure.json"),
-        f"{TRAINING}/unsure",
-    ),
-    Stage(
-        "many-cars",
-        "python -m studies.many_cars",
-        (*FILTERS, *SIMULATOR, "studies/many_cars.py", "sample_logs/vehicle.toml"),
-        ("pdhef_logtool/models/many-cars",),
-        duration="25 min",
-        work=("out/many-cars", "out/many-cars-data"),
-    ),
-    _page("model-card", "model_card", "model_card", *_DRIVES, *_DATASETS, "studies/condition_drives.py"),
-    _page(
-        "conditions", "conditions", "conditions", *_CONDITION_SOURCES, INDEPENDENT,
-        arguments="--car saloon --drives 30 --seed 1", work=("out/conditions",),
-    ),
-    _page(
-        "recorded-drives", "real", "real", "tests/reference", RECORDED,
-        arguments="--network many-cars --trials 64",
-    ),
-    _page(
-        "calibration", "calibration", "calibration", "studies/self_calibration.py", "studies/identified_bands.py",
-        "studies/many_cars.py", "tests/reference", RECORDED,
-    ),
-    _page("paper", "paper", "paper", *_DRIVES, *_DATASETS, work=("out/paper",)),
-    _page("third-party-logs", "strangers", "third_party_logs", RECORDED, "../shared/reader_corpus",
-          arguments="--held-out", duration="2 min"),
-    _page("comparison", "comparing", "comparing"),
-    _page("simulator", "truthsim_docs", "truthsim", INDEPENDENT, duration="15 s"),
-    _page("reliability", "torture", "reliability", duration="up to 2 h", work=("out/torture",)),
-    Stage(
-        "performance", "python -m benchmarks.performance --write-docs", (*TOOL, *SHIPPED, "benchmarks"),
-        ("docs/performance.md",),
-    ),
-)  # fmt: skip
+    return tuple(
+        Stage(
+            name,
+            entry["command"],
+            tuple(expanded(entry["inputs"])),
+            tuple(entry["outputs"]),
+            entry.get("duration", "not measured"),
+            tuple(entry.get("work", ())),
+        )
+        for name, entry in document.items()
+    )
 
 
 def input_digest(root: Path, inputs: Sequence[str]) -> str:
@@ -240,9 +168,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """List or run the stages."""
     parser = options("recalibrate", __doc__)
     parser.add_argument("--list", action="store_true", help="print the stages and run none")
-    parser.add_argument("--only", nargs="+", choices=[s.name for s in STAGES], metavar="STAGE", help="run these alone")
+    stages = load_stages()
+    parser.add_argument("--only", nargs="+", choices=[s.name for s in stages], metavar="STAGE", help="run these alone")
     given = parser.parse_args(arguments)
-    recalibration = Recalibration(ROOT, STAGES)
+    recalibration = Recalibration(ROOT, stages)
     if given.list:
         print(recalibration.listed())
         return 0

@@ -43,8 +43,6 @@ from truthsim.batch import sensor_noise
 from truthsim.drive import simulate_drive
 from truthsim.vehicle_choice import choose_vehicle
 
-SEED = 77_002
-CARS = 50
 #: Manoeuvre, km/h, seconds (None: its own).
 DRIVEN: tuple[tuple[str, float, float | None], ...] = (("sine-sweep-wide", 90.0, None), ("road", 100.0, 240.0))
 FRICTIONS = (0.85, 1.0)
@@ -225,17 +223,25 @@ def simulated_table(outcomes: Sequence[Outcome]) -> str:
     return table(head, body, right_from=1)
 
 
+def coverage_cells(pairs: Sequence[tuple[float, float]]) -> tuple[list[str], str]:
+    """Return mean, 10, 50 and 90 % quantiles and share at 90 to 98 % of coverages, and the median relative width."""
+    coverage, width = np.array(pairs).T
+    shares = (np.mean(coverage), *np.percentile(coverage, [10, 50, 90]))
+    shares += (np.mean((coverage >= 0.90) & (coverage <= 0.98)),)
+    return [f"{x:.0%}" for x in shares], number(float(np.median(width)), 2)
+
+
+COVERAGE_HEAD = ["coverage: mean", "10 %", "median", "90 %", "intervals at 90 to 98 %", "width / RMSE: median"]
+
+
 def band_table(outcomes: Sequence[Outcome]) -> str:
-    """Return coverage and width of the 95 % bands on calibrated cars."""
+    """Return coverage and width of the 95 % intervals on calibrated cars."""
     body = []
     for name in [*dict.fromkeys(o.manoeuvre for o in outcomes), "all"]:
-        found = np.array([b for o in outcomes if name in (o.manoeuvre, "all") for b in o.bands])
-        low, middle, high = (f"{x:.0%}" for x in np.percentile(found[:, 0], [10, 50, 90]))
-        inside = np.mean((found[:, 0] >= 0.90) & (found[:, 0] <= 0.98))
-        mean, width = f"{np.mean(found[:, 0]):.0%}", number(float(np.median(found[:, 1])), 2)
-        body.append([name, str(len(found)), mean, low, middle, high, f"{inside:.0%}", width])
-    head = ["drive", "intervals", "coverage: mean", "10 %", "median", "90 %", "intervals at 90 to 98 %"]
-    return table([*head, "width / RMSE: median"], body, right_from=1)
+        pairs = [b for o in outcomes if name in (o.manoeuvre, "all") for b in o.bands]
+        shares, width = coverage_cells(pairs)
+        body.append([name, str(len(pairs)), *shares, width])
+    return table(["drive", "intervals", *COVERAGE_HEAD], body, right_from=1)
 
 
 def d2_table(outcomes: Sequence[Outcome]) -> str:

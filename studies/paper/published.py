@@ -16,7 +16,6 @@ PHY_RMSE = {("A", "yaw_rate_rad_s"): 0.068, ("A", "position_m"): 0.025, ("B", "s
 IMPROVEMENT = 0.60
 #: Milliseconds a step (section 5.5.2): Phy-UKF from "increased by about 2.1 ms".
 STEP_MS = {"phy-ukf": 1.9, "pd-hef": 4.0}
-CYCLE_MS = 10.0
 #: β from the linear region to the limit (section 5.4.3).
 TRUST = (0.1, 0.9)
 #: Norm of R before and in the disturbance (section 5.4.2).

@@ -25,12 +25,10 @@ from studies.paper.experiment import (
     run_experiment,
 )
 from studies.paper.probes import (
-    History,
     Inflation,
     ResidualFit,
     TrustCurve,
     inflation,
-    read_history,
     residual_fit,
     trust_curve,
 )
@@ -54,14 +52,13 @@ class Results:
     Attributes
     ----------
     ran : schemes in the order of the tables.
-    cars, histories : by training seed. fits : residual fits by scenario, one a car.
+    cars : by training seed. fits : residual fits by scenario, one a car.
     curves : β over |a_y| by scenario and scheme. inflations : of R by scheme.
     without : A and B with the network that had no lane change and no sweep, None where there is none.
     """
 
     experiment: Experiment
     cars: Mapping[int, Car]
-    histories: Mapping[int, History]
     fits: Mapping[str, tuple[ResidualFit, ...]]
     curves: Mapping[str, Mapping[str, TrustCurve]]
     inflations: Mapping[str, Inflation]
@@ -113,7 +110,6 @@ def gather(
     cars : by the training seed of their networks; the first is the one that the pictures show.
     """
     experiment = run_experiment(cars, scenarios=SCENARIOS, noise_seeds=noise_seeds, progress=progress)
-    histories = {seed: h for seed, car in cars.items() if (h := read_history(car)) is not None}
     fits = {s.name: tuple(residual_fit(experiment.drives[s.name], c) for c in cars.values()) for s in (A, B)}
     curves = {s.name: {n: c for n in ADAPTIVE if (c := trust_curve(experiment, s.name, n)) is not None} for s in (A, B)}
     inflations = {n: i for n in ADAPTIVE if (i := inflation(experiment, n, BURST_S)) is not None}
@@ -125,7 +121,7 @@ def gather(
         progress("the network without lane changes and sweeps")
         seeds = {0: withheld.car}
         without = run_experiment(seeds, scenarios=(A, B), noise_seeds=noise_seeds, names=(HYBRID,))
-    return Results(experiment, cars, histories, fits, curves, inflations, times, withheld, without)
+    return Results(experiment, cars, fits, curves, inflations, times, withheld, without)
 
 
 def _withheld(r: Results) -> dict[str, Any] | None:

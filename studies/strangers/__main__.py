@@ -19,8 +19,8 @@ from pathlib import Path
 from studies.pages import DOCS, RESULTS, ROOT, options, write
 from studies.strangers.answers import SHARED, answered_files, load_answers
 from studies.strangers.containers import write as write_log
-from studies.strangers.faults import faults
 from studies.strangers.layouts import layouts
+from studies.strangers.mountings import mountings
 from studies.strangers.page import OUTCOMES, Result, merged, page
 from studies.strangers.recordings import ITEMS, Recording
 from studies.strangers.scoring import Score, look, score_log
@@ -154,7 +154,7 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, help="write the results as JSON, to compare with later")
     given = parser.parse_args()
     given.work.mkdir(parents=True, exist_ok=True)
-    made = chain(faults(), layouts("layout"), layouts("held-out") if given.held_out else ())
+    made = chain(mountings(), layouts("fault", "layout"), layouts("held-out") if given.held_out else ())
     recordings = [r for r in made if _wanted(r.name, given.only)]
     kinds: dict[str, list[Result]] = {}
     for kind, result in chain(score_own(recordings, given.work), score_others(given.only)):

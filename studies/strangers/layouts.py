@@ -1,4 +1,4 @@
-"""Logs in the layouts of published message definitions and recorders' exports: ``layouts.txt``."""
+"""Logs with faults, and logs in the layouts of published message definitions and exports: ``layouts.txt``."""
 
 from __future__ import annotations
 
@@ -16,13 +16,33 @@ from studies.strangers.containers import Topic
 from studies.strangers.recordings import DEG, DOWN, G_M_S2, KMH, Recording, answers, message
 from truthsim.recording import quaternion
 
+#: Patterns of messages that name a cause.
+CAUSES = {
+    # An IMU whose axes are not those of the car.
+    "MOUNTING": r"mount|rotat|upside|z-down|z down|lies|imu[^.;]{0,60}(turned|tilt)|(turned|tilt)[^.;]{0,60}imu",
+    "UNITS": r"unit|degree|deg/s|\bdeg\b|km/h|\bg\b|factor|scale|57\.|9\.8|3\.6",
+    "SIGNS": r"sign|negat|opposite|mirror",
+}
+
+
+def rotation(axis: tuple[float, float, float], angle_rad: float) -> FloatArray:
+    """Return the matrix of a rotation about an axis (Rodrigues)."""
+    x, y, z = np.array(axis) / np.linalg.norm(axis)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + np.sin(angle_rad) * cross + (1.0 - np.cos(angle_rad)) * cross @ cross)
+
+
+_NUMPY = ("clip", "cumsum", "diag", "gradient", "maximum", "pi", "rint", "sqrt", "stack", "tan")
 #: Names of expressions beside the columns of the car. ``shift`` is a command ahead of its measurement.
 _NAMES = {
     "DEG": DEG, "DOWN": DOWN, "FORWARD": np.diag([1.0, 0.0]), "G": G_M_S2, "KMH": KMH, "RPM": 2.0 * np.pi / 60.0,
-    "quaternion": quaternion, "shift": np.roll,
-    **{name: getattr(np, name) for name in ("cumsum", "gradient", "maximum", "pi", "sqrt", "stack", "tan")},
+    "quaternion": quaternion, "rng": np.random.default_rng, "shift": np.roll,
+    **{name: getattr(np, name) for name in _NUMPY},
 }  # fmt: skip
-_TOPICS = {name: getattr(recordings, name) for name in ("fix", "imu", "odometry", "scalar", "steering", "velocity")}
+_TOPICS = {
+    name: getattr(recordings, name)
+    for name in ("Topic", "fix", "imu", "odometry", "road_car", "scalar", "steering", "velocity")
+}
 
 
 class Columns(dict[str, Any]):
@@ -31,7 +51,9 @@ class Columns(dict[str, Any]):
     def __init__(self, car: Car, clock: Series) -> None:
         stamps_ns = clock.stamps_ns
         # Microseconds since the device was switched on, 100 s before the drive.
-        super().__init__(stamps_ns=stamps_ns, micros=(stamps_ns - stamps_ns[0]) / 1000.0 + 1e8)
+        super().__init__(
+            stamps_ns=stamps_ns, count=np.arange(len(stamps_ns)), micros=(stamps_ns - stamps_ns[0]) / 1000.0 + 1e8
+        )
         self.car, self.clock = car, clock
 
     def __missing__(self, name: str) -> FloatArray:
@@ -71,17 +93,24 @@ def layouts(*groups: str) -> Iterator[Recording]:
         name, group, container, kind = head.split()
         if groups and group not in groups:
             continue
-        car = drive(kind)
-        expected = {key: value for key, _, value in (x.partition(": ") for x in lines) if key in ("right", "allowed")}
+        vehicle, _, imu_x = kind.partition(",")
+        car = drive(vehicle, float(imu_x)) if imu_x else drive(vehicle)
+        names = {**_NAMES, **_TOPICS, "car": car, "drive": drive, "rotation": rotation}
+        entries = [line.partition(": ")[::2] for line in lines]
+        about = dict(entries)
+        also = (value.partition(" = ")[::2] for key, value in entries if key == "also")
+        cause = re.sub("|".join(CAUSES), lambda found: CAUSES[found[0]], about.get("cause", ""))
         yield Recording(
             name=name,
             group=group,
             what=what,
             container=container,
-            topics=tuple(_topics(car, lines)),
-            right=_answers(car, expected["right"]),
-            allowed=_answers(car, expected.get("allowed", "")),
-            page=page,
+            topics=tuple(_topics(car, lines, names)),
+            right=_answers(car, about["right"]) | {n: eval(value, dict(names)) for n, value in also},
+            allowed=_answers(car, about.get("allowed", "")),
+            page=page.strip("-"),
+            cause=cause,
+            at_fault=frozenset(about.get("fault", "").split()),
         )
 
 
@@ -102,10 +131,11 @@ def _answers(car: Car, text: str) -> dict[str, tuple[Series, ...]]:
     return found
 
 
-def _topics(car: Car, lines: Sequence[str]) -> Iterator[Topic]:
+def _topics(car: Car, lines: Sequence[str], names: dict[str, Any]) -> Iterator[Topic]:
     for i, line in enumerate(lines):
         if line.startswith("= "):
-            yield eval(line[2:], {**_NAMES, **_TOPICS, "car": car})  # of layouts.txt
+            topics = eval(line[2:], dict(names))
+            yield from (topics,) if isinstance(topics, Topic) else topics
         elif line.startswith("/"):
             name, type_name, clock_name, *stamp = line.split()
             sensor, _, step = clock_name.partition("/")
@@ -117,11 +147,16 @@ def _topics(car: Car, lines: Sequence[str]) -> Iterator[Topic]:
                     break
                 field, _, expression = field_line.strip().partition(" = ")
                 fields |= _fields(field, eval(expression, dict(_NAMES), columns), len(clock.stamps_ns))
-            yield message(name, type_name.strip("-"), clock, fields, stamp=stamp[0] if stamp else None)
+            constants = {field: value for field, value in fields.items() if isinstance(value, str)}
+            fields = {field: value for field, value in fields.items() if field not in constants}
+            stamp_field = stamp[0] if stamp else None
+            yield message(name, type_name.strip("-"), clock, fields, stamp=stamp_field, constants=constants)
 
 
 def _fields(field: str, values: Any, count: int) -> dict[str, Any]:
     """Return the columns of a field; names in braces take a column each, a number is a constant."""
+    if isinstance(values, str):
+        return {field: values}
     if np.ndim(values) == 0:
         return {field: np.full(count, float(values))}
     if braces := re.search(r"{(.*)}", field):

@@ -26,25 +26,16 @@ window_s = 600.0
 friction = 0.9
 sensors = "full"
 """
+_IMU = {"name": "/imu/data", "type": "sensor_msgs/msg/Imu", "serialization_format": "cdr"}
 _METADATA = {
     "rosbag2_bagfile_information": {
-        "version": 9,
-        "storage_identifier": "sqlite3",
-        "duration": {"nanoseconds": 1180000000},
-        "starting_time": {"nanoseconds_since_epoch": 1767225600000000000},
-        "message_count": 240,
-        "topics_with_message_count": [
-            {
-                "topic_metadata": {"name": "/imu/data", "type": "sensor_msgs/msg/Imu", "serialization_format": "cdr"},
-                "message_count": 60,
-            }
-        ],
-        "compression_format": "",
-        "compression_mode": "",
-        "relative_file_paths": ["rosbag2.db3"],
+        "version": 9, "storage_identifier": "sqlite3", "duration": {"nanoseconds": 1180000000},
+        "starting_time": {"nanoseconds_since_epoch": 1767225600000000000}, "message_count": 240,
+        "topics_with_message_count": [{"topic_metadata": _IMU, "message_count": 60}],
+        "compression_format": "", "compression_mode": "", "relative_file_paths": ["rosbag2.db3"],
         "ros_distro": "jazzy",
     }
-}
+}  # fmt: skip
 _DEEP = 2000
 
 

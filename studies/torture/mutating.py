@@ -17,47 +17,15 @@ from pathlib import PurePath
 
 #: Numbers at which arithmetic, allocation and time go wrong.
 EDGES = (
-    0,
-    1,
-    2,
-    7,
-    255,
-    256,
-    0x7FFF,
-    0x8000,
-    0xFFFF,
-    2**31 - 1,
-    2**31,
-    2**32 - 1,
-    2**32,
-    2**62,
-    2**63 - 1,
-    2**63,
+    0, 1, 2, 7, 255, 256, 0x7FFF, 0x8000, 0xFFFF, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**62, 2**63 - 1, 2**63,
     2**64 - 1,
-)
+)  # fmt: skip
 #: Texts that turn into paths, markup, terminal codes, forged lines, recursion.
 TEXTS = (
-    b"",
-    b"..",
-    b"/",
-    b"../../../etc/passwd",
-    b"/wheels[/red]",
-    b"[bold]x[/]",
-    b"\x1b[2J\x1b[31mwarning",
-    b"a\nwarning: b",
-    b"\0",
-    b"\xff\xfe",
-    b"\xed\xa0\x80",
-    "\u202etxt.mcap".encode(),
-    b"a" * 5000,
-    b"$(id)",
-    b"</script>",
-    b"%s%n",
-    b"../../odd/msg/T",
-    b"sensor_msgs/msg/Imu",
-    b"nav_msgs/msg/Odometry",
-    b"std_msgs/String",
-)
+    b"", b"..", b"/", b"../../../etc/passwd", b"/wheels[/red]", b"[bold]x[/]", b"\x1b[2J\x1b[31mwarning",
+    b"a\nwarning: b", b"\0", b"\xff\xfe", b"\xed\xa0\x80", "\u202etxt.mcap".encode(), b"a" * 5000, b"$(id)",
+    b"</script>", b"%s%n", b"../../odd/msg/T", b"sensor_msgs/msg/Imu", b"nav_msgs/msg/Odometry", b"std_msgs/String",
+)  # fmt: skip
 SCHEMAS = (
     b"float64[4294967296] x\n",
     b"float64[99999999999999999999] x\n",

@@ -15,8 +15,8 @@ from studies.strangers.__main__ import result_of, score_recording
 from studies.strangers.answers import Answer, load_answers
 from studies.strangers.cars import Series, drive
 from studies.strangers.containers import write
-from studies.strangers.faults import faults, right_angles, units_and_signs
 from studies.strangers.layouts import layout, layouts
+from studies.strangers.mountings import mountings, right_angles
 from studies.strangers.page import Result, merged, page
 from studies.strangers.recordings import ITEMS, answers, imu, road_car, scalar
 from studies.strangers.scoring import Finding, Score, Told, agrees, bias_of, score_log
@@ -118,7 +118,7 @@ def test_a_sound_log_is_right_and_a_wrong_one_is_not(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["yaw-rate-deg", "steering-sign"])
 def test_wrong_units_and_signs_are_corrected_or_told(name: str, tmp_path: Path) -> None:
-    (recording,) = (r for r in units_and_signs() if r.name == name)
+    recording = layout(name)
     result = score_recording(recording, tmp_path)
     assert result.count("wrong, not told") == 0
     assert result.named is not False
@@ -156,7 +156,7 @@ def test_an_undecided_check_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.slow
 def test_forty_kinds_with_distinct_names_and_pages() -> None:
     last = [*layouts("held-out")]
-    own = [*faults(), *layouts()]
+    own = [*mountings(), *layouts()]
     assert len({r.name for r in own}) == len(own)
     assert len({r.counted_as for r in own}) >= 40
     assert len(last) == 10
