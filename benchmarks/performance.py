@@ -24,7 +24,7 @@ _INTRODUCTION = """# Performance
 
 This page shows processor time and memory, also against peers. Command: `python -m benchmarks.performance
 --write-docs`; `make bench` prints the tables. Seconds are processor seconds (user and system, with child processes),
-the best of several interleaved rounds unless a section says otherwise. A ratio to a peer is measured in the same run.
+the best of several interleaved rounds unless stated otherwise. A ratio to a peer is measured in the same run.
 """
 
 

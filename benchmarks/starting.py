@@ -1,8 +1,8 @@
-"""Seconds until a run is done that has little to do, and what the network costs a step.
+"""Duration of a short run, and step time of the network.
 
-A run of a 10 s log in a new process, with the compiled code at hand: of its figures alone, and with all outputs. The
-network stands against PyTorch, which trains it, over the same steps and with the same answer; the hybrid filter, its
-parallel filter and the network in it, against the physics filter alone, all parts on.
+A run of a 10 s log in a new process, with code compiled before: metrics only, and all outputs. The network is compared
+with PyTorch over the same steps and with the same result; the hybrid filter (with parallel filter and network) with the
+physics filter alone, all parts on.
 """
 
 from __future__ import annotations

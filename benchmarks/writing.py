@@ -1,8 +1,8 @@
-"""Writing 4 x 360 k estimates: an hour at 100 Hz of two estimators, each as our own message and as Odometry.
+"""Writing 4 x 360 k estimates: an hour at 100 Hz of two estimators, each as our message and as Odometry.
 
 The peer serialises a tenth of them with rosbags and writes them with mcap's Writer (scaled by 10); its messages are
-built before the clock starts. Both ways write zstd chunks with CRCs, message indexes and a summary, and the first
-messages of both files are compared.
+built before the measurement. Both write zstd chunks with CRCs, message indexes and a summary, and the first messages of
+both files are compared.
 """
 
 from __future__ import annotations

@@ -100,8 +100,7 @@ def run(given: argparse.Namespace) -> None:
         command=_command(given),
         car=setup.loaded.vehicle.name,
         setup=setup.identity,
-        rows={r.name: r.description for r in ROWS}
-        | {INDEPENDENT_ROW: "runs of another simulator, friction as it says"},
+        rows={r.name: r.description for r in ROWS} | {INDEPENDENT_ROW: "runs of another simulator, true friction"},
         subject=SUBJECT if SUBJECT in ran else None,
         references=REFERENCES,
         order=given.estimators,

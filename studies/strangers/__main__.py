@@ -37,7 +37,7 @@ def result_of(score: Score, name: str, group: str, what: str, page_url: str = ""
     verdicts: dict[str, str] = {}
     doubted: list[str] = []
     for f in score.findings:
-        items[f.item] = f.verdict if f.verdict != "wrong" else "wrong, told" if f.told else "wrong, not told"
+        items[f.item] = f.verdict if f.verdict != "wrong" else "wrong, reported" if f.told else "wrong, not reported"
         if f.verdict == "wrong":
             wrong[f.item] = f.what
         if f.verdict == "right":
@@ -101,21 +101,18 @@ def first_run() -> str:
     """Return the figures of the first runs of layouts held out, where they are over."""
     said = ""
     for file, what in (
-        (FIRST_RUN, "layouts held out were built last"),
-        (FIRST_RUN_BEFORE, "layouts of vehicles, simulators and data sets were held out before them"),
+        (FIRST_RUN, "held-out layouts were built last"),
+        (FIRST_RUN_BEFORE, "layouts of vehicles, simulators and data sets were held out earlier"),
     ):
         if file.is_file():
             logs = json.loads(file.read_text(encoding="utf-8"))
             ends = Counter(outcome for log in logs.values() for outcome in log["items"].values())
             rest = ", ".join(f"{ends[outcome]} {outcome.replace(', ', ' and ')}" for outcome in OUTCOMES[:3])
             said += (
-                f"The {len(logs)} {what}. Run for the first time, {ends['right']} of their {ends.total()} items were "
+                f"The {len(logs)} {what}. In their first run, {ends['right']} of {ends.total()} items were "
                 f"right ({100.0 * ends['right'] / ends.total():.0f} %); {rest}.\n\n"
             )
-    return (
-        said
-        and f"{said}What the tables say of these layouts is a later run, after the causes of the first were mended.\n\n"
-    )
+    return said and f"{said}The tables contain a later run, after corrections of the causes.\n\n"
 
 
 def others_without_answers() -> str:
@@ -136,8 +133,8 @@ def others_without_answers() -> str:
         if taken:
             most = max(taken.values())
             found.append(f"`{entry['file']}` ({', '.join(sorted(taken))}; {most} samples at most)")
-    text = f"{count} further recordings of `reader_corpus` hold nothing of a car. "
-    return text + (f"Something is mapped in {'; '.join(found)}.\n" if found else "Nothing is mapped in them.\n")
+    text = f"{count} further recordings of `reader_corpus` contain no vehicle signals. "
+    return text + (f"Channels are mapped in {'; '.join(found)}.\n" if found else "No channel is mapped in them.\n")
 
 
 def _wanted(name: str, only: Sequence[str]) -> bool:
@@ -164,11 +161,11 @@ def main() -> int:
         for result in chain.from_iterable(kinds.values()):
             _show(result)
     else:
-        remark = first_run() + ("" if given.held_out else "The layouts held out were not run now.\n\n")
+        remark = first_run() + ("" if given.held_out else "Without the held-out layouts.\n\n")
         write(given.out, page(results, remark + others_without_answers()))
     if given.keep:
         write(given.keep, json.dumps({r.name: r.as_json() for r in results}, indent=1, sort_keys=True) + "\n")
-    return 1 if any(r.count("wrong, not told") for r in results) else 0
+    return 1 if any(r.count("wrong, not reported") for r in results) else 0
 
 
 def _show(result: Result) -> None:

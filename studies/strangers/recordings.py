@@ -28,14 +28,14 @@ ITEMS: dict[str, tuple[str, ...]] = {
     "yaw rate": ("yaw_rate_rad_s",),
     "speed": ("speed_m_s",),
     "wheel speeds": tuple(f"wheel_speed_{w}_{unit}" for unit in ("m_s", "rad_s") for w in WHEELS),
-    "truth: velocity": (
+    "ground truth: velocity": (
         "truth.vx_m_s",
         "truth.vy_m_s",
         "truth.sideslip_rad",
         "truth.enu_velocity_m_s",
         "truth.ecef_velocity_m_s",
     ),
-    "truth: yaw rate": ("truth.yaw_rate_rad_s",),
+    "ground truth: yaw rate": ("truth.yaw_rate_rad_s",),
 }
 
 

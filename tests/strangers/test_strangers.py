@@ -120,7 +120,7 @@ def test_a_sound_log_is_right_and_a_wrong_one_is_not(tmp_path: Path) -> None:
 def test_wrong_units_and_signs_are_corrected_or_told(name: str, tmp_path: Path) -> None:
     recording = layout(name)
     result = score_recording(recording, tmp_path)
-    assert result.count("wrong, not told") == 0
+    assert result.count("wrong, not reported") == 0
     assert result.named is not False
 
 
@@ -131,11 +131,11 @@ def test_told_means_that_a_check_or_a_doubt_is_on_the_channel() -> None:
         Finding("ax", "right", True, frozenset(), "y"),
     )
     result = result_of(Score(findings, ("alarm",), None, told), "n", "fault", "w")
-    assert result.items == {"ay": "wrong, told", "ax": "right"}
+    assert result.items == {"ay": "wrong, reported", "ax": "right"}
     assert result.verdicts == {"ax": "none"}
-    worse = replace(result, items={"ay": "wrong, not told", "ax": "missing"}, silent=("ay",))
+    worse = replace(result, items={"ay": "wrong, not reported", "ax": "missing"}, silent=("ay",))
     both = merged([result, worse])
-    assert both.items == {"ay": "wrong, not told", "ax": "missing"}
+    assert both.items == {"ay": "wrong, not reported", "ax": "missing"}
 
 
 def test_an_undecided_check_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -167,20 +167,20 @@ def test_forty_kinds_with_distinct_names_and_pages() -> None:
 
 def test_the_page_says_what_is_wrong() -> None:
     rows = [
-        Result("a", "fault", "w", "", {"ay": "wrong, not told"}, silent=("ay (ay_m_s2 = /x.y)",), named=False),
+        Result("a", "fault", "w", "", {"ay": "wrong, not reported"}, silent=("ay (ay_m_s2 = /x.y)",), named=False),
         Result("b", "layout", "w", "https://x", {"ax": "right"}, verdicts={"ax": "passed"}),
     ]
     text = page(rows, "")
-    assert "- a: wrong, not told: ay (ay_m_s2 = /x.y)" in text
+    assert "- a: wrong, not reported: ay (ay_m_s2 = /x.y)" in text
     assert "- a: cause not named" in text
     assert "[w](https://x)" in text
-    assert "all passed on 1, some stayed undecided on 0, some failed on 0" in text
+    assert "all passed for 1, some undecided for 0, some failed for 0, no check for 0" in text
 
 
 def test_a_log_without_type_names_is_still_scored(tmp_path: Path) -> None:
     result = score_recording(layout("vbox"), tmp_path)
     assert set(result.items) >= {"ax", "ay", "yaw rate", "speed"}
-    assert result.count("wrong, not told") == 0
+    assert result.count("wrong, not reported") == 0
 
 
 _QUICK = ("data/drives/comma2k19_segment.mcap", "data/drives/lunda_v40", "data/drives/revs_250lm_a.mcap")
