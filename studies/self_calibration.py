@@ -261,7 +261,7 @@ def d2_table(outcomes: Sequence[Outcome]) -> str:
         if inside.size:
             cells = [f"{x:.2f}" for x in np.percentile(inside, [0, 10, 50, 100])]
             body.append([f"{low:g} to {high:g}", str(inside.size), *cells])
-    head = ["d2 / least of the others", "estimates", "RMSE / that one's: least", "10 %", "median", "most"]
+    head = ["v̇_y residual / lowest of the others", "estimates", "RMSE ratio: lowest", "10 %", "median", "most"]
     return table(head, body, right_from=1)
 
 

@@ -160,8 +160,8 @@ def _remarks(results: Sequence[Result]) -> str:
     counts = {verdict: right.count(verdict) for verdict in ("passed", "undecided", "failed", "none")}
     doubted = sum(len(r.doubted) for r in sound)
     return (
-        f"In the logs of published layouts (no fault, sufficient excitation) {len(right)} items are right. Checks of these "
-        f"items: all passed for {counts['passed']}, some undecided for {counts['undecided']}, some failed for "
+        f"In the logs of published layouts (no fault, sufficient excitation) {len(right)} items are right. Checks of "
+        f"these items: all passed for {counts['passed']}, some undecided for {counts['undecided']}, some failed for "
         f"{counts['failed']}, no check for {counts['none']}. A remark questions {doubted} of them.\n"
     )
 

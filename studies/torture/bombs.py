@@ -248,12 +248,12 @@ def _chunks() -> tuple[Bomb, ...]:
 
     return (
         mcap("zstd chunk of 4 GiB", b"zstd", _zeros_zstd, 4 * GIB, 4 * GIB),
-        mcap("zstd chunk that claims 1000 bytes and holds 4 GiB", b"zstd", _zeros_zstd, 4 * GIB, 1000),
+        mcap("zstd chunk that claims 1000 bytes and contains 4 GiB", b"zstd", _zeros_zstd, 4 * GIB, 1000),
         mcap("zstd chunk that claims 100 GB", b"zstd", _zeros_zstd, 1 << 20, 10**11),
         mcap("lz4 chunk of 2 GiB", b"lz4", _zeros_lz4, 2 * GIB, 2 * GIB),
-        mcap("lz4 chunk that claims 1000 bytes and holds 2 GiB", b"lz4", _zeros_lz4, 2 * GIB, 1000),
-        bag("bag: bz2 chunk that claims 1000 bytes and holds 3 GiB", b"bz2", _zeros_bz2, 3 * GIB),
-        bag("bag: lz4 chunk that claims 1000 bytes and holds 2 GiB", b"lz4", _zeros_lz4, 2 * GIB),
+        mcap("lz4 chunk that claims 1000 bytes and contains 2 GiB", b"lz4", _zeros_lz4, 2 * GIB, 1000),
+        bag("bag: bz2 chunk that claims 1000 bytes and contains 3 GiB", b"bz2", _zeros_bz2, 3 * GIB),
+        bag("bag: lz4 chunk that claims 1000 bytes and contains 2 GiB", b"lz4", _zeros_lz4, 2 * GIB),
         _made("whole file of 8 GiB as zstd", _EITHER, lambda: _zeros_zstd(8 * GIB), ".mcap.zst"),
         _made("MCAP header and 4 GiB of zeros as zstd", _EITHER, lambda: _zeros_zstd(4 * GIB), ".mcap.zstd"),
     )
@@ -280,7 +280,7 @@ def _declarations() -> tuple[Bomb, ...]:
         _made("an index that claims 268 million messages", _ANY, _claimed_counts),
         _made("a message size near 2^63", _EITHER, lambda: _mcap(*ends)),
         ros("ROS type of 10^12 leaves", _EITHER, b"p/msg/Root", _nested(12)),
-        ros("ROS type that holds itself", _EITHER, b"p/msg/A", b"A a\n" + _MEMBERS + b"p/A\nA a\n"),
+        ros("ROS type that contains itself", _EITHER, b"p/msg/A", b"A a\n" + _MEMBERS + b"p/A\nA a\n"),
         ros("ROS array of 2^32", _ANY, b"p/msg/A", b"float64[4294967296] a\nfloat64 b\n"),
         _made(
             "ROS 1 sequence that claims 2^32 - 1",
