@@ -48,7 +48,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def section(name: str, rows: Sequence[Row]) -> str:
-    """Return what the page says of one benchmark, from its name on."""
+    """Return the section of one benchmark, from its name on."""
     about = cleandoc(import_module(f"benchmarks.{name}").__doc__ or "")
     machine = ", ".join(f"{key} {value}" for key, value in machine_facts().items())
     return f"{name}\n\n{about}\n\n{table(rows)}\n\nMachine: {machine}.\n"

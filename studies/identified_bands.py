@@ -41,7 +41,7 @@ FIT_ON = ("sine-sweep-wide", "road")
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A band on a drive: what the car was identified on, what is driven, RMSE in rad, and how two bands stand.
+    """An interval on a drive: what the car was identified on, what is driven, RMSE in rad, and two intervals.
 
     ``own``, ``band`` : of the filter alone, and with the posterior: share of the errors inside, and the whole mean
     width over the RMSE.
@@ -74,7 +74,7 @@ def identified(one: Simulated) -> Car:
 
 
 def judged(car: Car, fit: Simulated, one: Simulated) -> Judged:
-    """Judge the band of a car on a drive."""
+    """Evaluate the interval of a car on a drive."""
     estimator, signals = make_estimator(PHYSICS, car), one.drive.signals
     plain, _ = run_window(estimator, signals)
     wide = calibrator(car, [estimator]).add(plain, signals)

@@ -1,11 +1,10 @@
 """Short drives of many simulated cars, each with a vehicle file of its own: what one network for many cars learns from.
 
-Saloons and SUVs of all loads, heights, tyres and wear, with sensors of all qualities; the hatchback is kept for cars
-that no network ever saw. A car's file is fitted to a ramp steer of it (``fit_vehicle``), as somebody who
-has measured his car would have it; ``physics`` of it is identified by the tool on its first drives, with the truth of
-an INS that is mounted a little askew: the network is trained for filters as it will meet them. Residuals are taken from
-the other drives, with perfect truth: from those of the INS the network learnt its noise (the validation loss rose from
-the second epoch on). Drives are split by car.
+Saloons and SUVs of all loads, heights, tyres and wear, with sensors of all qualities; hatchbacks are reserved for cars
+that no network was trained on. The file of a car is fitted to a ramp steer (``fit_vehicle``), as after a measurement.
+``physics`` is identified by the tool on the first drives, with ground truth of an INS that is mounted slightly askew.
+Residuals are computed from the other drives with exact ground truth, because the network learned the noise of the INS
+(the validation loss rose from the second epoch on). Drives are split by car.
 
     python -m studies.many_cars
 
@@ -91,7 +90,7 @@ STEER_GAIN = 0.01
 STEER_PLAY_RAD = (0.0, 0.003)
 #: Where the IMU may be from where the car's file has it, forward and to the left; the same of the INS, and its heading.
 LEVER_M, TRUTH_LEVER_M, TRUTH_HEADING_RAD = 0.15, 0.1, np.radians(0.3)
-#: What a car is identified with: recognised types, the friction that was driven on, a proving ground's truth.
+#: What a car is identified with: recognised types, the friction that was driven on, ground truth of a proving ground.
 MAPPING = TRAINING_MAPPING + "".join(
     f"""
 [truth.{name}]
@@ -222,7 +221,7 @@ def write_cars(
 def identify_cars(folder: Path) -> list[str]:
     """Identify the cars of a set on their first drives; return the logs of the others.
 
-    Those of the others stand in a manifest of their own in ``folder``/residuals, with the files of the identified cars.
+    Those of the others are in a manifest of their own in ``folder``/residuals, with the files of the identified cars.
     """
     manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
     by_car: dict[int, list[dict[str, Any]]] = {}

@@ -63,7 +63,7 @@ def error_table(found: dict[str, list[float]]) -> str:
 
 
 def network_line(name: str, network: ModelBundle) -> list[str]:
-    """Say what a network is and how its training ended."""
+    """Return what a network is and how its training ended."""
     p: dict[str, Any] = network.provenance
     shape = (str(len(network.feature_names)), f"{network.layers} × {network.hidden}")
     weights = f"{sum(w.size for w in network.weights.values()):,}"

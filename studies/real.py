@@ -58,7 +58,7 @@ YARDSTICKS = ("phy-ukf:tuned, identified", "phy-ukf, datasheet")
 FREE = ("zero", "kinematic")
 PHYSICAL = tuple(s.name for s in SPECS if not s.network and s.name not in (*FREE, "zero:no-lateral", OPEN_LOOP))
 NETWORKS = tuple(s.name for s in SPECS if s.network)
-#: Versions of this page, and of the published files on docs/calibration.md, before looks were counted.
+#: Versions of this page, and of the published files on docs/calibration.md, before evaluations were counted.
 LOOKS_BEFORE = 6
 LOOKS_BEFORE_PUBLISHED = {"250lm": 9, "gti": 8, "tts": 8, "v40": 8}
 LOOKS_FILE = "looks.json"
@@ -91,7 +91,7 @@ errors of each block. The drives may not be redistributed.
 
 
 def say(text: str) -> None:
-    """Tell who waits."""
+    """Print progress."""
     print(text, file=sys.stderr)
 
 
@@ -151,14 +151,14 @@ def read_part(part: Part, mapping_file: Path, car: Car) -> WholeDrive:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Row:
-    """Errors of one line of a table, and the mean width of their 95 % band over their RMSE; NaN without a band."""
+    """Errors of one line of a table, and the mean width of the 95 % interval over the RMSE (NaN: none)."""
 
     errors: Errors
     width: float = float("nan")
 
 
 def scored(case: Case, label: str, car: Car, names: Sequence[str]) -> list[Row]:
-    """Run estimators of a car on the scored part, with the bands that ``pdhef run`` gives them."""
+    """Run estimators of a car on the scored part, with the intervals of ``pdhef run``."""
     part = read_part(case.score, files(case)[0], car)
     assert part.truth is not None
     ready, skipped = runnable(names, car, part.plan.alignment.available)
@@ -191,14 +191,14 @@ def run_case(case: Case, network: Path, trials: int) -> tuple[list[Row], list[st
 
 
 def given_car(case: Case, network: Path) -> tuple[list[Row], str]:
-    """Score the datasheet car as it stands."""
+    """Score the unchanged datasheet car."""
     datasheet = Car.load(files(case)[1], network=network)
     rows = scored(case, "", datasheet, FREE) + scored(case, "datasheet", datasheet, PHYSICAL)
     return rows + (scored(case, "datasheet, given network", datasheet, NETWORKS) if datasheet.network else []), ""
 
 
 def self_calibrated_car(case: Case) -> tuple[list[Row], str]:
-    """Score the datasheet car after the scored part has calibrated it, without truth."""
+    """Score the datasheet car after the scored part has calibrated it, without ground truth."""
     mapping_file, vehicle_file = files(case)
     car, options = Car.load(vehicle_file), replace(case.score.config.read_options, friction=None)
     with read_drive(DRIVES / case.score.log, car, load_mapping(mapping_file), options) as drive:
@@ -212,12 +212,12 @@ def self_calibrated_car(case: Case) -> tuple[list[Row], str]:
 
 
 def trained_car(case: Case, network: Path, trials: int) -> tuple[list[Row], str]:
-    """Score the car that ``pdhef learn`` makes of the fit part, before which it knows the datasheet file."""
+    """Score the car that ``pdhef learn`` makes of the datasheet car on the training part."""
     assert case.fit is not None
     mapping_file, vehicle_file = files(case)
     given = None if str(network) == NO_MODEL else network
     config = replace(case.fit.config, mapping=mapping_file, car=vehicle_file, network=given)
-    # The scored part is the last part here: nothing of the fit part is held back for one.
+    # The scored part is the test split: the training part has none of its own.
     settings = LearnSettings(config=config, trials=trials, holdout=0.0)
     with tempfile.TemporaryDirectory() as name:
         car = Path(name) / "car"
@@ -231,7 +231,7 @@ def trained_car(case: Case, network: Path, trials: int) -> tuple[list[Row], str]
 
 
 def identified_car(case: Case) -> tuple[list[Row], str]:
-    """Score the car that is identified on the fit part, without a network."""
+    """Score the car that is identified on the training part, without a network."""
     assert case.fit is not None
     mapping_file, vehicle_file = files(case)
     config = replace(case.fit.config, mapping=mapping_file, car=vehicle_file)
@@ -256,7 +256,7 @@ def blocks(case: Case, results: Sequence[Row]) -> list[tuple[str, str, int, int,
 
 
 def case_table(results: Sequence[Row]) -> str:
-    """Return a case's table: RMSE, how much was scored, the difference to the yardstick, and the 95 % bands."""
+    """Return a case's table: RMSE, how much was scored, the difference to the yardstick, and the 95 % intervals."""
     errors, widths = [r.errors for r in results], {r.errors.name: r.width for r in results}
     yard = next((n for n in YARDSTICKS if n in widths), None)
     body = []

@@ -1,4 +1,4 @@
-"""Cars that calibrate themselves without truth: simulated ones with wrong files, and published files of real cars.
+"""Calibration without ground truth: simulated cars with wrong files, and published files of real cars.
 
 Each simulated car drives a wide sine sweep and a road. Its vehicle file, fitted to a ramp steer, gets a stiffness error
 of a factor 0.5 to 2 at each axle. Each drive calibrates the car for itself, as ``pdhef run`` does.
@@ -92,7 +92,7 @@ def make_wrong(vehicle: VehicleParameters, front: float, rear: float) -> Vehicle
 
 
 def simulate(cars: int, seed: int, driven: Sequence[tuple[str, float, float | None]] = DRIVEN) -> list[Simulated]:
-    """Return the drives of the cars; one that cannot be driven is left out and told."""
+    """Return the drives of the cars; one that cannot be driven is left out, with a message."""
     found = []
     for index in range(cars):
         rng = np.random.default_rng([seed, index])
@@ -140,7 +140,7 @@ def taken(signals: Signals, file: VehicleParameters, found: SelfCalibration) -> 
 
 
 def band_of(drive: WholeDrive, car: Car) -> tuple[float, float]:
-    """Return how much of the sideslip errors the 95 % band of ``physics`` holds, and its mean whole width over RMSE."""
+    """Return coverage of the 95 % interval of ``physics``, and its mean whole width over RMSE."""
     assert drive.truth is not None
     estimator = make_estimator("physics", car)
     track = calibrator(car, [estimator]).add(run_window(estimator, drive.signals)[0], drive.signals)
@@ -266,7 +266,7 @@ def d2_table(outcomes: Sequence[Outcome]) -> str:
 
 
 def published_table() -> tuple[str, list[str]]:
-    """Return the published files on their drives, and what each calibration said."""
+    """Return the published files on their drives, and the text of each calibration."""
     body, said = [], []
     for car, (name, log) in PUBLISHED.items():
         try:

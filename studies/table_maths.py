@@ -81,7 +81,7 @@ def interval_score(error: FloatArray, sigma: FloatArray) -> FloatArray:
 
 
 def verdict(bound: Bound, *, margin: float = 1.05) -> str:
-    """Say what the interval of a ratio decides: better, worse (by more than the margin), not worse, or open."""
+    """Return what the interval of a ratio decides: better, worse (by more than the margin), not worse, or open."""
     if not np.isfinite(bound.low):
         return "–"
     if bound.high < 1.0:

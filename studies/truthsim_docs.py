@@ -1,4 +1,4 @@
-"""Build the figures and tables of ``docs/truthsim.md``: what the truth simulator does beside what theory says.
+"""Build the figures and tables of ``docs/truthsim.md``: the simulator compared with theory.
 
     python -m studies.truthsim_docs [docs]
 
@@ -46,7 +46,7 @@ def open_loop(speed_m_s: float, steer_rad: FloatArray) -> Plan:
 
 
 def free_rolling(car: Vehicle) -> Vehicle:
-    """Return a car without drag and rolling resistance: linear theory knows no traction."""
+    """Return a car without drag and rolling resistance: linear theory has no traction."""
     return car._replace(drag_area_m2=0.0, rolling_resistance=0.0)
 
 

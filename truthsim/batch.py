@@ -83,7 +83,7 @@ class Job:
 
     @property
     def key(self) -> str:
-        """Digest of all that the file depends on; an entry with another key is made anew."""
+        """Digest of all that the file depends on; an entry with another key is simulated again."""
         text = json.dumps([__version__, [asdict(c) for c in self.candidates]], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -1,10 +1,10 @@
-"""The drives of the condition table: the same drives again and again, with one thing wrong in each row.
+"""Drives of the condition table: the same base drives, with one changed condition in each row.
 
 See docs/method.md#evaluation.
 
-A row that changes the car, the sensors or the road changes the truth; the nominal vehicle file stays. A row that
-changes only what an estimator is told (friction, which sensors) has no drives of its own: it names those of the row
-``in-domain`` and says what to tell. Recorded drives and independent simulators, the table's last rows, are not made
+A row that changes the car, the sensors or the road changes the ground truth; the nominal vehicle file stays. A row that
+changes only inputs of the estimators (friction, sensors) reuses the drives of the row ``in-domain``; its entry in the
+manifest contains the change. Recorded drives and independent simulators, the table's last rows, are not made
 here.
 """
 
@@ -43,7 +43,7 @@ class Row:
     Attributes
     ----------
     draw : the drive of a number, from a stream of its own and the base drive of that number.
-    assume : what the estimator is told besides, for the reader of the manifest.
+    assume : changed inputs of the estimators, for the reader of the manifest.
     reuses : the row whose drives these are.
     """
 
@@ -243,7 +243,7 @@ def write_conditions(
 
 
 def _row_entry(row: Row, entries: list[dict[str, Any]]) -> dict[str, Any]:
-    """What the manifest says of a row: its files, what to tell the estimator, and how many drives each bin has."""
+    """Return the manifest entry of a row: files, changed inputs of the estimators, number of drives in each bin."""
     made = [entry for entry in entries if entry["row"] == (row.reuses or row.name) and "sha256" in entry]
     return {
         "name": row.name,

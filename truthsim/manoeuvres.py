@@ -68,13 +68,13 @@ class Plan:
     start_speed_m_s : running straight at this speed at time 0.
     steer_rad : mean road-wheel angle every 1 ms, [duration / 1 ms + 1]; empty when a path is followed.
     path : x, y (m), yaw (rad), speed (m/s) every ``PATH_STEP_M``, [P, 4]; empty when the steering is given.
-    stops : arc length (m) and dwell (s) of the places to stand still at, [K, 2].
+    stops : arc length (m) and dwell (s) of the stops, [K, 2].
     torque_n_m : drive and brake torque (N m, all wheels, at least 0) every 1 ms, [duration / 1 ms + 1, 2]; rows of NaN
-        leave the pedals to the driver, who holds the speed. Empty: the driver's throughout.
+        leave the pedals to the driver, who controls the speed. Empty: the driver throughout.
     road : friction under the left and the right wheels, bank (rad) and grade (rad) every ``PATH_STEP_M`` of the
-        distance driven (along the path where one is followed), [R, 4]; beyond its end the last row holds. Empty: level,
-        the same friction everywhere. Bank is positive where the road leans to the right (its left edge higher), as a
-        car's roll; grade is positive uphill.
+        distance driven (along the path where one is followed), [R, 4]; beyond its end the last row applies. Empty:
+        level, the same friction everywhere. Bank is positive where the road leans to the right (its left edge higher),
+        as a car's roll; grade is positive uphill.
     goal_window_s : where the mean |a_y| is what the scale is searched for; None: the peak over the whole drive.
     """
 
@@ -90,12 +90,12 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Manoeuvre:
-    """One entry of the catalogue.
+    """Definition of a manoeuvre.
 
     Attributes
     ----------
     default_duration_s : duration in s by speed in m/s.
-    rtk_rate_hz : default rate of the truth; long drives take less.
+    rtk_rate_hz : default rate of the ground truth; long drives take less.
     peak_share : goal |a_y| over μ g that the scale is searched for; None where nothing is searched.
     least_share : peak |a_y| over μ g below which the manoeuvre has failed its purpose.
     uses_reference : the amplitude is a multiple of the angle at 0.3 g.
@@ -467,7 +467,7 @@ def _eased(values: FloatArray) -> FloatArray:
 
 
 def _stop_and_go(request: Request) -> Plan:
-    """Standstill, drive, standstill, again and again, on a road with gentle bends; the first stand lasts 3 s."""
+    """Standstill, drive, standstill, again and again, on a road with gentle bends; the first stop lasts 3 s."""
     rng = np.random.default_rng(np.random.SeedSequence(entropy=request.seed, spawn_key=(102,)))
     grip = min(1.0, request.friction / 0.6)
     curvature, limit, stops = [np.zeros(10)], [np.full(10, request.speed_m_s)], [(0.0, 3.0)]

@@ -94,7 +94,7 @@ class Course:
     ----------
     curvature_1_m, limit_m_s, bank_rad, grade_rad : [P]; bank positive leaning to the right, grade positive uphill.
     kind : [P], index into ``TOUR``.
-    stops : distance (m) and dwell (s) of places to stand still at, [K, 2].
+    stops : distance (m) and dwell (s) of the stops, [K, 2].
     """
 
     curvature_1_m: FloatArray

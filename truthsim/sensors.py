@@ -52,7 +52,7 @@ class SensorNoise(NamedTuple):
     #: Time constant of the INS's own error; white noise of a third of each sigma comes on top.
     rtk_time_s: float = 2.0
     rtk_delay_s: float = 0.020
-    #: What nobody has told of the INS: its heading's offset, and how far its place is from the CG, forward and left.
+    #: Unknown mounting of the INS: offset of its heading, and position relative to the CG, forward and left.
     rtk_heading_offset_rad: float = 0.0
     rtk_x_m: float = 0.0
     rtk_y_m: float = 0.0

@@ -1,8 +1,8 @@
-"""Make the car that the package ships from nothing: simulate, fit, extract, train, tune, trust, calibrate.
+"""Make the car that the package ships from nothing: simulate, fit, extract, train, tune, evaluate, calibrate.
 
     python -m studies.defaults.train_default [--seed 0] [-o FOLDER] [--work out/train-default] [--steps STEP ...]
 
-Short drives of one simulated car whose vehicle file is right, with the friction told. ``physics`` is fitted on five
+Short drives of one simulated car whose vehicle file is right, with the true friction. ``physics`` is fitted on five
 minutes of other drives (:mod:`studies.defaults.fit_physics`), its noise with it; the residual network learns what it
 lacks. The direct network, the regression and the paper's network see the same drives, with the nominal model. Filter
 noise of all tuned estimators is chosen on validation drives in one search (stage noise). Seeds other than 0 train
@@ -50,8 +50,8 @@ OTHER_DRIVES = {"other_cars": 200, "evidence": 200}
 EPOCHS, BASELINE_EPOCHS = 66, 40
 PAPER_EPOCHS = 15
 TRIALS = 64
-#: Wrong frictions and vehicle files that the intervals allow for: no car is as its file says, a load alone makes this
-#: much; and those for an unsure car.
+#: Relative errors of friction and vehicle files that the intervals allow for: of a usual car (load alone causes such
+#: errors), and of a car that may have changed.
 USUAL_SPREAD, UNSURE_SPREAD = 0.08, 0.2
 MAPPING = """# Recognised types, and the friction that the simulator drove on.
 fill_recognised = true
@@ -152,7 +152,7 @@ def gain(t: Training) -> None:
 
 
 def intervals(t: Training) -> None:
-    """Calibrate the intervals: for a car that is nearly as its file says, and for a car that may have changed."""
+    """Calibrate the intervals: for a car that is nearly as in its file, and for a car that may have changed."""
     for spread, place in ((USUAL_SPREAD, t.car), (UNSURE_SPREAD, t.work / "unsure")):
         pdhef("learn", *t.validation, "--stages", "intervals", "--vary", spread, "-o", place)
     shutil.copyfile(t.work / "unsure" / INTERVALS_FILE, t.car / UNSURE_FILE)

@@ -1,4 +1,4 @@
-"""Find the process noise of a filter on physics by innovation likelihood, without any truth.
+"""Find the process noise of a filter on physics by innovation likelihood, without ground truth.
 
     python -m studies.defaults.tune_physics_q {phy-ukf,physics}
 
@@ -89,7 +89,7 @@ def log_likelihood(drives: list[TuningDrive], build: Build, q_std: Q) -> float:
 def search(score: Callable[[Q], float], start: Q, given: dict[str, float]) -> dict[str, Any]:
     """Run one Nelder-Mead on the logarithms, print and return what it found.
 
-    The values are rounded to two significant digits: the likelihood knows no more.
+    The values are rounded to two significant digits: the likelihood is no more precise.
     """
     low, high = np.log(LOWEST), np.log(HIGHEST)
 

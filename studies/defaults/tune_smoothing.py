@@ -1,4 +1,4 @@
-"""Tune by what the process noise of v_y and yaw rate is multiplied where a car is smoothed, before truth says better.
+"""Tune the factors on the process noise of v_y and yaw rate for smoothing of cars without ground truth.
 
     python -m studies.defaults.tune_smoothing
 

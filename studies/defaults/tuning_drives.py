@@ -1,7 +1,7 @@
 """Simulated drives on which the fixed baselines are tuned, and what those who tune on them share.
 
-A drive is aligned signals as from a log, and the perfect truth. None of their seeds is used for a sample log or for an
-evaluation drive. Results are written to ``studies/defaults/results``.
+A drive consists of aligned signals, as from a log, and the exact ground truth. No sample log or evaluation drive has
+one of their seeds. Results are written to ``studies/defaults/results``.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def tuning_drives() -> list[TuningDrive]:
 
 
 def sideslip_rmse_deg(drive: TuningDrive, estimator: Estimator | None) -> float:
-    """Return the sideslip RMSE of a drive in degrees; None stands for no sideslip at all."""
+    """Return the sideslip RMSE of a drive in degrees; None: no sideslip."""
     error = drive.sideslip_rad
     if estimator is not None:
         track, _ = run_window(estimator, drive.signals)

@@ -25,7 +25,7 @@ class ResidualFit:
     Attributes
     ----------
     time_s : [N]. target : [N, 2], what the nominal model misses at the true state with the measured steering.
-    output : [N, 2], what the network says. step_s : median step.
+    output : [N, 2], output of the network. step_s : median step.
     """
 
     time_s: FloatArray
@@ -80,7 +80,7 @@ class TrustCurve:
 
 
 def trust_curve(experiment: Experiment, scenario: str, scheme: str, bins: int = 12) -> TrustCurve | None:
-    """Return β of a scheme over the true |a_y|; None where the scheme did not run or has one trust throughout."""
+    """Return β of a scheme over the true |a_y|; None where the scheme did not run or has a constant gain."""
     track = experiment.tracks.get((scenario, scheme))
     if track is None:
         return None

@@ -1,4 +1,4 @@
-"""What the paper says, with its section; the only figures in the page that are not computed here."""
+"""Published values, with their section; the only figures in the page that are not computed here."""
 
 from __future__ import annotations
 

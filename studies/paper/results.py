@@ -38,9 +38,9 @@ from studies.paper.withheld import Withheld
 from truthsim.suite import is_held_out
 
 SCENARIOS: tuple[Scenario, ...] = (A, B, BURST)
-#: Schemes whose trust or factor on R may move.
+#: Schemes with a variable gain or factor on R.
 ADAPTIVE = ("pd-hef-paper", "pd-hef")
-#: What improvements are about where nothing else is said.
+#: What improvements are about by default.
 FIGURE = "sideslip_deg"
 BASELINES = ("phy-ukf", "phy-ukf:tuned", "physics", "linear-regression", "pure-lstm", "pd-hef-paper")
 
@@ -206,7 +206,7 @@ def document(results: Results) -> dict[str, Any]:
                 }
                 for s in SCENARIOS
             ],
-            "friction": "known: the vehicle file is told the friction of each drive",
+            "friction": "given: the vehicle file contains the friction of each drive",
             "vehicle": {"name": car.vehicle.name, "sha256": car.physics_sha256},
             "models": [
                 {"training_seed": seed, "sha256": n.sha256, "provenance": n.provenance}

@@ -39,7 +39,7 @@ def counts(work: Path) -> Counter[str]:
 
 
 def train_withheld(work: Path, output: Path) -> None:
-    """Train the shipped network's like without :data:`WITHHELD`, and find its trust on the drives of the shipped one's.
+    """Train a network without :data:`WITHHELD`, and determine its gain limit on the drives of the shipped network.
 
     Physics and noise are the shipped car's.
     """

@@ -2,8 +2,8 @@
 
     python -m studies.strangers [--only NAME ...] [--held-out] [--work out/strangers] [--out docs/third_party_logs.md]
 
-``--only`` takes parts of names, prints what the tool says of these logs, and writes no page. ``--held-out`` adds the
-layouts that were built last. Exit code 1: something is wrong and the tool did not say so.
+``--only`` takes parts of names, prints the messages of the tool for these logs, and writes no page. ``--held-out`` adds
+the layouts that were built last. Exit code 1: something is wrong and not reported.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def first_run() -> str:
 
 
 def others_without_answers() -> str:
-    """Look through the recordings of ``reader_corpus`` that hold nothing of a car, and say what is mapped in them."""
+    """Return what is mapped in the recordings of ``reader_corpus`` without vehicle signals."""
     catalogue = SHARED / "reader_corpus" / "CATALOG.json"
     if not catalogue.is_file():
         return ""

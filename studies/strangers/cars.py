@@ -39,7 +39,7 @@ class Series:
         return Series(self.stamps_ns[::n], self.arrival_ns[::n], self.values[::n])
 
     def along(self, clock: Series) -> Series:
-        """Return it at another series' times: one message that holds several sensors."""
+        """Return it at another series' times: one message with several sensors."""
         at, have = clock.stamps_ns * 1e-9, self.stamps_ns * 1e-9
         columns = self.values if self.values.ndim == 2 else self.values[:, None]
         read = np.stack([np.interp(at - at[0], have - at[0], column) for column in columns.T], axis=1)

@@ -57,7 +57,7 @@ class Columns(dict[str, Any]):
         self.car, self.clock = car, clock
 
     def __missing__(self, name: str) -> FloatArray:
-        """Return a column; raises KeyError for a name that is none, which Python then looks up elsewhere."""
+        """Return a column; raises KeyError for a name that is none, which Python then searches elsewhere."""
         return series(self.car, name).along(self.clock).values
 
 

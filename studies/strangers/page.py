@@ -41,9 +41,9 @@ class Result:
     Attributes
     ----------
     items : outcome by item, one of :data:`OUTCOMES`. wrong : what was taken in a wrong item's place.
-    silent : the wrong ones that nothing was said of, with their sources. doubted : right ones that a sentence doubts.
-    verdicts : by right item the worst that its checks say: ``failed``, ``undecided``, ``passed``, or ``none``.
-    alarms : failed checks on right channels that are not at fault. named : whether a planted cause is said.
+    silent : the wrong ones that are not reported, with their sources. doubted : right ones that a sentence doubts.
+    verdicts : by right item the worst verdict of its checks: ``failed``, ``undecided``, ``passed``, or ``none``.
+    alarms : failed checks on right channels that are not at fault. named : whether the cause is named.
     """
 
     name: str

@@ -48,9 +48,9 @@ class Recording:
     name : of the log; logs of one ``kind`` count as one.
     group : ``fault``, ``layout`` or ``held-out`` (built last, run once).
     what : one line for a person.
-    right : by channel (``truth.`` before those of the truth) what it must be, any of the series.
-    allowed : channels that may be mapped, and are not missed: an INS whose figures are no truth, a second source.
-    cause : pattern of what a message must say; empty where nothing is wrong.
+    right : by channel (``truth.`` before ground truth) what it must be, any of the series.
+    allowed : channels that may be mapped, and are not missed: an INS that is no ground truth, a second source.
+    cause : pattern of a message that names the cause; empty where nothing is wrong.
     at_fault : channels with the fault; of all others no check may fail.
     page : where the layout is documented.
     """
@@ -193,7 +193,7 @@ def scalar(name: str, series: Series, type_name: str = "std_msgs/msg/Float32") -
 
 
 def road_car(car: Car, **replaced: Topic | None) -> tuple[Topic, ...]:
-    """Return IMU, steering, speed and GNSS/INS truth; a keyword of these names takes a topic's place, None drops it."""
+    """Return IMU, steering, speed and GNSS/INS ground truth; keywords replace a topic, None drops it."""
     usual: dict[str, Topic | None] = {
         "imu": imu(car.force, car.rate),
         "steering": steering(car.steer),

@@ -45,15 +45,15 @@ FLOORS: dict[str, float] = {
     "truth.yaw_rate_rad_s": 0.004,
 }
 WEAK_SHARE = 0.6
-#: A constant of so much (m/s²) is the bias of an accelerometer, which nothing tells from a tilt of two degrees.
+#: Largest constant (m/s²) that counts as accelerometer bias: it cannot be distinguished from a tilt of two degrees.
 BIAS_M_S2 = 0.3
-#: A share of right samples from which a channel counts as right: some logs hold invalid samples.
+#: A share of right samples from which a channel counts as right: some logs contain invalid samples.
 RIGHT_BINS = 0.95
 
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What the tool says of a log.
+    """Messages of the tool for a log.
 
     ``checks`` as in report.json (name, subject, verdict, evidence, remedy); ``doubts`` are its other sentences:
     ambiguities, notes, what is missing; ``suspects`` are the channels of warnings, where there are such.
@@ -99,11 +99,11 @@ class Score:
     told: Told
 
 
-# ------------------------------------------------------------------------------------------------ what the tool says
+# ------------------------------------------------------------------------------------------------ messages of the tool
 
 
 def look(path: Path) -> tuple[SignalMapping | None, Told, dict[str, Channel]]:
-    """Let the tool read a log on its own; return its mapping, what it says, and its channels."""
+    """Let the tool read a log on its own; return its mapping, its messages, and its channels."""
     try:
         with closing(open_log(path)) as log:
             return _look(log)
@@ -170,7 +170,7 @@ def agrees(channel: Channel, right: Series, floor: float, bias: float = 0.0) -> 
     if count < 1:
         return False
     if np.median(np.diff(channel.stamps_ns)) > width and right.values.ndim == 1:
-        # A channel this slow holds samples, which are no means.
+        # A channel this slow contains samples, not means.
         got = channel.values[:, None]
         wanted = np.interp(channel.stamps_ns - start, right.stamps_ns - start, right.values)[:, None]
         count = len(channel)
@@ -186,9 +186,9 @@ def agrees(channel: Channel, right: Series, floor: float, bias: float = 0.0) -> 
     difference = got[both] - wanted[both]
     difference -= np.clip(np.median(difference), -bias, bias)
     apart = np.sqrt(np.mean(difference**2, axis=1))
-    # A few bins may hold invalid samples; the others must agree as a whole.
+    # A few bins may contain invalid samples; the others must agree as a whole.
     kept = np.sort(apart)[: int(np.ceil(RIGHT_BINS * apart.shape[0]))]
-    # Of a weak signal the floor is no more than a share: noise may stand in it, another sign may not.
+    # Of a weak signal the floor is no more than a share: noise is accepted, another sign is not.
     return bool(np.sqrt(np.mean(kept**2)) <= max(SHARE * rms, min(floor, WEAK_SHARE * rms)))
 
 
@@ -226,13 +226,13 @@ def score_log(
     cause: str = "",
     at_fault: Iterable[str] = (),
 ) -> Score:
-    """Let the tool map a log and hold what it took against the right answers.
+    """Let the tool map a log and compare the mapping with the right answers.
 
     Parameters
     ----------
     right : by channel, what it must be. A channel of :data:`ITEMS` that is neither here nor allowed is wrong.
     allowed : what may be mapped too, and is not missed where it is not.
-    cause : pattern of which some message must hold a part; empty where there is nothing to say.
+    cause : pattern that a message must match; empty without a cause.
     at_fault : channels whose checks may fail even where they were mapped rightly.
     """
     mapping, told, channels = look(path)

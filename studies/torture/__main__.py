@@ -1,9 +1,9 @@
-"""Torture, counted: ``docs/reliability.md``.
+"""Fuzz and fault-injection tests, counted: ``docs/reliability.md``.
 
     python -m studies.torture [--work out/torture] [--seed 1] [--logs 200000] [--configs 20000] [--kills 200]
                               [--hours 10] [--jobs 2] [--only mutations ...] [--out docs/reliability.md]
 
-Resumable: what stands in the work folder is not done again; remove it after a change of the code. Exit code 1:
+Resumable: results in the work folder are not computed again; remove it after a change of the code. Exit code 1:
 something ended as it should not.
 """
 
@@ -235,7 +235,7 @@ def main() -> int:
 
 
 def _wrong(result: Any) -> bool:
-    """Tell whether anything in a part's results ended as it should not."""
+    """Return whether anything in a part's results ended as it should not."""
     if isinstance(result, list):
         return any(r.get("problem") or r.get("code", 0) not in (0, 3) for r in result)
     return bool(result.get("problems")) or any(isinstance(r, dict) and r.get("problems") for r in result.values())

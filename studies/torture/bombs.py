@@ -115,7 +115,7 @@ def _bag_chunk(compression: bytes, stored: bytes, size: int) -> bytes:
 
 
 def _nested(levels: int) -> bytes:
-    """Return a ROS type whose every level holds ten of the next."""
+    """Return a ROS type with ten members of the next level in each level."""
     parts = [b"L0 a"]
     parts += [
         b"=" * 80 + b"\nMSG: p/L%d\n" % i + b"\n".join(b"L%d f%d" % (i + 1, k) for k in range(10))

@@ -75,7 +75,7 @@ def judge_config(work: Path, seed: int, log: Path, documents: dict[str, bytes], 
 
 
 def _arguments(name: str, content: bytes, log: Path, folder: Path) -> list[str]:
-    """Write the document where its reader looks for it; return the command that reads it."""
+    """Write the document where its reader expects it; return the command that reads it."""
     run = ["run", str(log), "-o", str(folder / "out"), "--annotate", "none"]
     some = ["--estimators", "zero,kinematic,phy-ukf"]
     path = folder / Path(name).name
@@ -113,7 +113,7 @@ def damage_document(name: str, content: bytes, rng: random.Random) -> bytes:
         for _ in range(rng.choice((1, 1, 2, 3))):
             _damage_entry(document, rng)
         return _dumped(document, toml, lines)
-    except (ValueError, TypeError, RecursionError):  # what the format, or its writer, cannot say
+    except (ValueError, TypeError, RecursionError):  # what the format, or its writer, cannot express
         return damage_bytes(content, rng)
 
 

@@ -1,4 +1,4 @@
-"""Ends ``pdhef run`` at any moment and tells what it left: for the tests here, and for longer torture."""
+"""Ends ``pdhef run`` at any moment and reports what it left."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-#: Content that holds the time at which it was recorded, so that two runs never give the same bytes.
+#: Content with the time of recording, so that two runs never give the same bytes.
 TIMED = (".rrd",)
 #: What a whole file has near its end.
 ENDS = {".mcap": b"\x89MCAP0\r\n", ".rrd": b"RRF2FOOT"}
@@ -131,7 +131,7 @@ def faults(output: Path) -> list[str]:
 
 
 def hidden(path: Path, output: Path) -> bool:
-    """Tell whether a path lies under a hidden name, where commands prepare what they write."""
+    """Return whether a path lies under a hidden name, where commands prepare what they write."""
     return any(part.startswith(".") for part in path.relative_to(output).parts)
 
 

@@ -85,7 +85,7 @@ def damage_bytes(content: bytes, rng: random.Random) -> bytes:
 
 
 def _place(size: int, rng: random.Random) -> int:
-    """Return a byte: anywhere, or near either end, where what decides most stands."""
+    """Return a byte: anywhere, or near either end, where the most critical bytes are."""
     near = min(size, 400)
     return rng.choice((rng.randrange(size), rng.randrange(near), size - 1 - rng.randrange(near)))
 
@@ -112,7 +112,7 @@ def _damage_payload(payload: bytes, rng: random.Random) -> bytes:
 
 
 def _with_text(payload: bytes, rng: random.Random) -> bytes:
-    """Put a hostile text in the place of one that stands in the record behind its length."""
+    """Put a hostile text in the place of one in the record, after its length."""
     places = []
     for at in range(min(len(payload) - 4, 400)):
         (n,) = struct.unpack_from("<I", payload, at)
@@ -182,7 +182,7 @@ def _damage_chunk(payload: bytes, rng: random.Random) -> bytes:
         (n,) = struct.unpack_from("<I", payload, 28)
         compression = payload[32 : 32 + n]
         inner = _mcap_records(_unpacked(compression, payload[40 + n :], size))
-    except Exception:  # noqa: BLE001 (what an earlier fault left, whatever its decompressor calls it)
+    except Exception:  # noqa: BLE001 (what an earlier fault left, with any exception of the decompressor)
         return damage_bytes(payload, rng)
     if inner:
         _damage_list(inner, rng)
@@ -244,7 +244,7 @@ class BagRecord:
 
 
 def damage_bag(content: bytes, rng: random.Random) -> bytes:
-    """Change header fields and data of records, inside chunks as well; chunks are compressed anew."""
+    """Change header fields and data of records, inside chunks as well; chunks are compressed again."""
     head = content.index(b"\n") + 1
     records = _bag_records(content[head:])
     for record in records:

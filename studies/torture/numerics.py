@@ -79,7 +79,7 @@ def write_samples(path: Path, drives: Iterable[Drive]) -> None:
 
 
 def _sensors(change: Callable[[Samples, np.random.Generator], Samples]) -> Callable[[Drive], Drive]:
-    """Make a change of one topic's samples one of all topics but the truth."""
+    """Make a change of one topic's samples one of all topics except the ground truth."""
 
     def changed(drive: Drive) -> Drive:
         rng = np.random.default_rng(7)

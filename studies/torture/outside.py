@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from studies.pages import ROOT
 from studies.torture.workers import LIMIT_BYTES, Ended
 
-#: Harms nobody's machine, whatever a case does; what a case may take is checked against what it took.
+#: Protects the machine from any case; what a case may take is checked against what it took.
 _HARD_LIMIT_BYTES = 8 << 30
 
 

@@ -100,7 +100,7 @@ def shrinking_file(work: Path) -> Verdict:
 
 
 def _opened(files: Path) -> set[str]:
-    """Return what the descriptors below a folder of ``/proc`` stand for."""
+    """Return what the descriptors below a folder of ``/proc`` refer to."""
     found = set()
     for file in files.iterdir():
         with contextlib.suppress(OSError):

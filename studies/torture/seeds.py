@@ -35,7 +35,7 @@ class Message:
 
 
 def messages() -> list[Message]:
-    """Return a car that turns: IMU, odometry as truth, and a type of nobody's."""
+    """Return a car that turns: IMU, odometry as ground truth, and an unknown type."""
     store = _store("LATEST")
     types = store.types
     steering_type, speed_type = _OWN
