@@ -54,8 +54,8 @@ def said_by_torch(bundle: ModelBundle, features: FloatArray) -> FloatArray:
     both = np.stack([rows, rows * bundle.signs]).astype(np.float32)
     parts, state = [], None
     with torch.inference_mode():
-        for at in range(0, len(rows), _BLOCK_STEPS):
-            output, state = network(torch.from_numpy(both[:, at : at + _BLOCK_STEPS].copy()), state)
+        for index in range(0, len(rows), _BLOCK_STEPS):
+            output, state = network(torch.from_numpy(both[:, index : index + _BLOCK_STEPS].copy()), state)
             parts.append(output.numpy().astype(np.float64))
     straight, mirrored = np.concatenate(parts, axis=1)
     return np.asarray(0.5 * (straight - mirrored) * np.array(bundle.normalisation.target_std))

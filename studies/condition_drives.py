@@ -145,10 +145,10 @@ def interval_rows(
     error: FloatArray, sigma: FloatArray, masks: dict[str, BoolArray], *, log: str, estimator: str
 ) -> list[MetricRow]:
     """Return ``interval_score95`` and ``width95`` (mean of the whole width) of the sideslip by segment."""
-    known = np.isfinite(error) & np.isfinite(sigma)
+    finite = np.isfinite(error) & np.isfinite(sigma)
     rows = []
     for segment, mask in masks.items():
-        use = mask & known
+        use = mask & finite
         n = int(np.count_nonzero(use))
         if n:
             mean = float(np.mean(interval_score(error[use], sigma[use])))
@@ -165,8 +165,8 @@ def sideslip_error(estimator: Estimator, drive: ConditionDrive, signals: Signals
 
 def root_mean_square(error: FloatArray) -> float:
     """Return the root mean square of what is known of an error [N]; NaN for nothing."""
-    known = error[np.isfinite(error)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
+    finite = error[np.isfinite(error)]
+    return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
 
 
 def drives_of(folder: Path, split: str | None = None) -> list[dict[str, Any]]:

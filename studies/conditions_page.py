@@ -82,8 +82,8 @@ class Figures:
         self, row: str, estimator: str, metric: str = "rmse", *, signal: str = SIDESLIP, segment: str = ALL
     ) -> tuple[FloatArray, FloatArray]:
         """Return values [N] and samples [N] over the drives; empty where there are none."""
-        found = self._by.get((row, estimator, signal, segment, metric), {})
-        pairs = [found[d] for d in sorted(found)]
+        by_drive = self._by.get((row, estimator, signal, segment, metric), {})
+        pairs = [by_drive[d] for d in sorted(by_drive)]
         return np.array([v for v, _ in pairs], dtype=np.float64), np.array([n for _, n in pairs], dtype=np.float64)
 
     def pair(self, row: str, first: str, second: str) -> tuple[FloatArray, FloatArray]:
@@ -337,8 +337,8 @@ def _plot(
     for i, span in enumerate(medians.values()):
         label_of = None if i else "the others of the table"
         axes.plot(span[:, 1], np.arange(len(rows)), "|", markersize=7, color="0.6", zorder=1.5, label=label_of)
-    for at, dash in limits.items():
-        axes.axvline(at, color="black", linewidth=0.8, linestyle=dash)
+    for limit, dash in limits.items():
+        axes.axvline(limit, color="black", linewidth=0.8, linestyle=dash)
     axes.set(xscale="log", xlabel=label, ylim=(len(rows) - 0.5, -0.5))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.set_yticks(range(len(rows)), rows)

@@ -132,8 +132,8 @@ def draw_car(rng: np.random.Generator, base: VehicleParameters, kinds: tuple[str
             fitted = fit_vehicle(car, FIT_FRICTION, base)
         except (SimulationError, ValueError):
             continue  # rolls over or spins in the ramp
-        own = {"name": text, "wheel_radius_m": car.wheel_radius_m, "steering_ratio": car.steering_ratio}
-        return DrawnCar(text, fitted.model_copy(update=own), _sensors(rng))
+        entries = {"name": text, "wheel_radius_m": car.wheel_radius_m, "steering_ratio": car.steering_ratio}
+        return DrawnCar(text, fitted.model_copy(update=entries), _sensors(rng))
 
 
 def _sensors(rng: np.random.Generator) -> tuple[tuple[str, float], ...]:
@@ -235,10 +235,10 @@ def identify_cars(folder: Path) -> list[str]:
     for index, entries in by_car.items():
         name = f"car_{index:04d}"
         if not (others / name / FIT_FILE).is_file():
-            own, logs = folder / entries[0]["vehicle_file"], [folder / e["file"] for e in entries[:FIT_DRIVES]]
+            vehicle_file, logs = folder / entries[0]["vehicle_file"], [folder / e["file"] for e in entries[:FIT_DRIVES]]
             (others / name).mkdir(exist_ok=True)
-            shutil.copy(own, others / name / VEHICLE_FILE)
-            (others / name / FIT_FILE).write_text(identified(own, logs, mapping), encoding="utf-8")
+            shutil.copy(vehicle_file, others / name / VEHICLE_FILE)
+            (others / name / FIT_FILE).write_text(identified(vehicle_file, logs, mapping), encoding="utf-8")
         for entry in entries[FIT_DRIVES:]:
             link = others / entry["file"]
             if not link.exists():
@@ -250,13 +250,13 @@ def identify_cars(folder: Path) -> list[str]:
 
 def identified(file: Path, logs: Sequence[Path], mapping: Path) -> str:
     """Return the fit of a car with its ``physics`` as the tool identifies it on drives."""
-    own, given = load_vehicle(file), load_mapping(mapping)
-    read = (load_fit_drive(LogInput(log, log.stem), Car.of(own), given, ReadOptions())[1] for log in logs)
+    vehicle, given = load_vehicle(file), load_mapping(mapping)
+    read = (load_fit_drive(LogInput(log, log.stem), Car.of(vehicle), given, ReadOptions())[1] for log in logs)
     drives = [drive for drive in read if drive is not None]
-    found = fit_physics(drives, own, PARTS, starts=({},), iterations=FIT_ITERATIONS)
-    values = FittedValues.of(found.vehicle)
-    noise = found.noise.model_copy(update={"physics_sha256": physics_sha256(values.applied_to(own))})
-    fit = Fit(physics_sha256=physics_sha256(own), physics=FittedPhysics(values=values, noise=noise))
+    fitted = fit_physics(drives, vehicle, PARTS, starts=({},), iterations=FIT_ITERATIONS)
+    values = FittedValues.of(fitted.vehicle)
+    noise = fitted.noise.model_copy(update={"physics_sha256": physics_sha256(values.applied_to(vehicle))})
+    fit = Fit(physics_sha256=physics_sha256(vehicle), physics=FittedPhysics(values=values, noise=noise))
     return part_toml(fit, "Written by python -m studies.many_cars.")
 
 

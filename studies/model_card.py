@@ -34,21 +34,21 @@ LEAST_SAMPLES = 100
 
 def errors_deg(folder: Path, split: str, car: Car) -> dict[str, list[float]]:
     """Return the sideslip RMSE in degrees of every estimator on every drive of a split."""
-    found: dict[str, list[float]] = {}
+    errors: dict[str, list[float]] = {}
     for entry in drives_of(folder, split):
         drive = read_drive(folder / entry["file"], car)
         ready, _ = runnable(ESTIMATORS, car, drive.signals.available)
         for estimator in ready:
             error = np.degrees(sideslip_error(estimator, drive))
             if np.count_nonzero(np.isfinite(error)) >= LEAST_SAMPLES:
-                found.setdefault(estimator.name, []).append(root_mean_square(error))
-    return found
+                errors.setdefault(estimator.name, []).append(root_mean_square(error))
+    return errors
 
 
-def error_table(found: dict[str, list[float]]) -> str:
+def error_table(errors: dict[str, list[float]]) -> str:
     """Return a Markdown table: median, 10th and 90th percentile and pooled RMSE."""
     body = []
-    for name, values in found.items():
+    for name, values in errors.items():
         low, mid, high = np.quantile(values, [0.1, 0.5, 0.9])
         body.append(
             [

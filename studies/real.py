@@ -174,9 +174,9 @@ def scored(case: Case, label: str, car: Car, names: Sequence[str]) -> list[Row]:
         if e.name in ("pd-hef", "pd-hef-smoothed"):
             shown += f" at gain limit {car.allowed_trust.cap:g}"
         half = NORMAL_95 * track.sideslip_std_rad
-        known = np.isfinite(error) & np.isfinite(half)
-        inside = np.abs(error) <= half if known.any() else None
-        width = 2.0 * np.mean(half[known]) / np.sqrt(np.mean(error[known] ** 2)) if known.any() else np.nan
+        finite = np.isfinite(error) & np.isfinite(half)
+        inside = np.abs(error) <= half if finite.any() else None
+        width = 2.0 * np.mean(half[finite]) / np.sqrt(np.mean(error[finite] ** 2)) if finite.any() else np.nan
         name = f"{shown}, {label}" if label else shown
         rows.append(Row(Errors(name, error, part.truth.stamps_ns, inside), float(width)))
     return rows
@@ -223,11 +223,11 @@ def trained_car(case: Case, network: Path, trials: int) -> tuple[list[Row], str]
         car = Path(name) / "car"
         say(f"{case.name}: learn")
         try:
-            found = learn([str(DRIVES / case.fit.log)], car, settings, warn=say)
+            learned = learn([str(DRIVES / case.fit.log)], car, settings, warn=say)
         except PdhefError as error:
             return [], f"The car could not be trained: expected {error.expected}, got {error.got}."
         rows = scored(case, "learn", Car.load(car), ("physics", "pd-hef", "pd-hef-smoothed"))
-    return rows, f"learn: {', '.join(f'{s.name} {s.status}' for s in found.stages)}."
+    return rows, f"learn: {', '.join(f'{s.name} {s.status}' for s in learned.stages)}."
 
 
 def identified_car(case: Case) -> tuple[list[Row], str]:
@@ -249,9 +249,11 @@ def blocks(case: Case, results: Sequence[Row]) -> list[tuple[str, str, int, int,
     """Return case, estimator, block, stamps and RMSE in degrees of each block, for comparisons in pairs."""
     rows = []
     for r in (row.errors for row in results):
-        (sums,), counts, at = block_sums([r.error], r.stamps_ns)
+        (sums,), counts, block_ids = block_sums([r.error], r.stamps_ns)
         rmse = np.degrees(np.sqrt(sums / counts))
-        rows += [(case.name, r.name, *row) for row in zip(at.tolist(), counts.tolist(), rmse.tolist(), strict=True)]
+        rows += [
+            (case.name, r.name, *row) for row in zip(block_ids.tolist(), counts.tolist(), rmse.tolist(), strict=True)
+        ]
     return rows
 
 
@@ -272,12 +274,12 @@ def case_table(results: Sequence[Row]) -> str:
 def count_look(file: Path, case: Case, basis: str) -> int:
     """Count a look at a scored part, unless it is the same that was counted last, and return how many there were."""
     looks = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    known = looks.get(case.name, {"looks": LOOKS_BEFORE + LOOKS_BEFORE_PUBLISHED.get(case.name, 0), "basis": ""})
-    if known["basis"] != basis:
-        known = {"looks": known["looks"] + 1, "basis": basis}
+    entry = looks.get(case.name, {"looks": LOOKS_BEFORE + LOOKS_BEFORE_PUBLISHED.get(case.name, 0), "basis": ""})
+    if entry["basis"] != basis:
+        entry = {"looks": entry["looks"] + 1, "basis": basis}
         file.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(file, (json.dumps({**looks, case.name: known}, indent=1, sort_keys=True) + "\n").encode())
-    return int(known["looks"])
+        write_bytes(file, (json.dumps({**looks, case.name: entry}, indent=1, sort_keys=True) + "\n").encode())
+    return int(entry["looks"])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -292,9 +294,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not DRIVES.is_dir():
         print("needs ../shared beside the repository (recorded drives that may not be redistributed); nothing is done")
         return 0
-    wanted, known = given.cases.split(","), [c.name for c in CASES]
-    if set(wanted) - set(known):
-        parser.error(f"--cases: expected names out of {', '.join(known)}, got {given.cases}")
+    wanted, case_names = given.cases.split(","), [c.name for c in CASES]
+    if set(wanted) - set(case_names):
+        parser.error(f"--cases: expected names out of {', '.join(case_names)}, got {given.cases}")
 
     network = Car.load(network=given.network).network
     used = "none" if network is None else f"sha256 {network.sha256[:12]}"

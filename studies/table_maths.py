@@ -35,14 +35,14 @@ def pooled_rmse(rmse: FloatArray, samples: FloatArray) -> float:
 
 def pooled_mean(mean: FloatArray, samples: FloatArray) -> float:
     """Return the mean over all samples of all drives from each drive's mean [N] and number of samples [N]."""
-    known = np.isfinite(mean) & (samples > 0)
-    return float(np.sum(samples[known] * mean[known]) / np.sum(samples[known])) if known.any() else float("nan")
+    finite = np.isfinite(mean) & (samples > 0)
+    return float(np.sum(samples[finite] * mean[finite]) / np.sum(samples[finite])) if finite.any() else float("nan")
 
 
 def percentiles(values: FloatArray, levels: tuple[float, ...] = (10.0, 50.0, 90.0)) -> tuple[float, ...]:
     """Return percentiles over drives [N] by linear interpolation."""
-    known = values[np.isfinite(values)]
-    return tuple(np.percentile(known, levels).tolist()) if known.size else (float("nan"),) * len(levels)
+    finite = values[np.isfinite(values)]
+    return tuple(np.percentile(finite, levels).tolist()) if finite.size else (float("nan"),) * len(levels)
 
 
 def median(values: FloatArray) -> float:
@@ -55,8 +55,8 @@ def median_ratio(rmse: FloatArray, other: FloatArray) -> Bound:
 
     The bootstrap draws whole drives with replacement, the same for both sides.
     """
-    known = np.isfinite(rmse) & np.isfinite(other)
-    a, b = rmse[known], other[known]
+    finite = np.isfinite(rmse) & np.isfinite(other)
+    a, b = rmse[finite], other[finite]
     drives, nan = len(a), float("nan")
     if drives == 0:
         return Bound(nan, nan, nan, 0)

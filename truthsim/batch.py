@@ -218,12 +218,12 @@ def _kept(jobs: Sequence[Job], folder: Path) -> dict[int, dict[str, Any]]:
     """Entries of an earlier manifest whose files are there with the right content."""
     try:
         old = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))["drives"]
-        known = {entry["file"]: entry for entry in old}
+        entries_by_file = {entry["file"]: entry for entry in old}
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return {}
     kept: dict[int, dict[str, Any]] = {}
     for i, job in enumerate(jobs):
-        entry = known.get(job.file)
+        entry = entries_by_file.get(job.file)
         path = folder / job.file
         if entry is None or entry.get("key") != job.key:
             continue

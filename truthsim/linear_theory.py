@@ -142,5 +142,5 @@ def frequency_response(
         a[turn, force] = -roll.centres[i]
         a[turn, a_y], a[turn, r] = -arm, -arm * at_x * s
     b[4] = stiffness[0]
-    found = np.linalg.solve(a, b)
-    return complex(found[r]), complex(found[a_y]), complex(found[body])
+    solution = np.linalg.solve(a, b)
+    return complex(solution[r]), complex(solution[a_y]), complex(solution[body])

@@ -233,13 +233,13 @@ def iso_3888_2_line_m() -> tuple[float, ...]:
     before, after = x <= -settle_m, x >= total + settle_m
     low[before], high[before] = 0.0, 0.0
     low[after], high[after] = middle, middle
-    found = linprog(
+    solution = linprog(
         np.concatenate([np.zeros(n), [1.0, 3.0]]),
         A_ub=rows,
         b_ub=np.zeros(rows.shape[0]),
         bounds=[*zip(low.tolist(), high.tolist(), strict=True), (0.0, None), (0.0, None)],
     )
-    return tuple(found.x[:n].tolist())
+    return tuple(solution.x[:n].tolist())
 
 
 def iso_3888_2_start_m(speed_m_s: float) -> float:
@@ -392,9 +392,9 @@ def _friction_jump(request: Request) -> Plan:
     t = np.maximum(_times_s(request.duration_s) - 1.0, 0.0)
     top = steer_for(0.6 * request.friction * GRAVITY_M_S2, request.speed_m_s)
     third_m = request.speed_m_s * request.duration_s / 3.0
-    at = np.arange(int(3.0 * third_m / PATH_STEP_M) + 1) * PATH_STEP_M
-    friction = request.friction * np.where((at >= third_m) & (at < 2.0 * third_m), JUMP_SHARE, 1.0)
-    flat = np.zeros_like(at)
+    distance_m = np.arange(int(3.0 * third_m / PATH_STEP_M) + 1) * PATH_STEP_M
+    friction = request.friction * np.where((distance_m >= third_m) & (distance_m < 2.0 * third_m), JUMP_SHARE, 1.0)
+    flat = np.zeros_like(distance_m)
     return Plan(
         request.speed_m_s,
         request.duration_s,
@@ -471,7 +471,7 @@ def _stop_and_go(request: Request) -> Plan:
     rng = np.random.default_rng(np.random.SeedSequence(entropy=request.seed, spawn_key=(102,)))
     grip = min(1.0, request.friction / 0.6)
     curvature, limit, stops = [np.zeros(10)], [np.full(10, request.speed_m_s)], [(0.0, 3.0)]
-    left_s, at = request.duration_s, 10 * PATH_STEP_M
+    left_s, distance_m = request.duration_s, 10 * PATH_STEP_M
     while left_s > 0.0:
         top = request.speed_m_s * rng.uniform(0.4, 1.0)
         a_y, side = grip * rng.uniform(0.5, 2.0), 1.0 if rng.uniform() < 0.5 else -1.0
@@ -480,8 +480,8 @@ def _stop_and_go(request: Request) -> Plan:
         piece = np.concatenate([straight, bend, straight])
         curvature.append(piece)
         limit.append(np.full(piece.shape[0], top))
-        at += piece.shape[0] * PATH_STEP_M
-        stops.append((at, float(rng.uniform(2.0, 6.0))))
+        distance_m += piece.shape[0] * PATH_STEP_M
+        stops.append((distance_m, float(rng.uniform(2.0, 6.0))))
         left_s -= piece.shape[0] * PATH_STEP_M / top + top / (1.8 * grip) + stops[-1][1]
     curvature.append(np.zeros(40))
     limit.append(np.full(40, request.speed_m_s))

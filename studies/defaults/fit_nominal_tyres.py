@@ -80,10 +80,10 @@ def fit_axle(alpha: FloatArray, force: FloatArray, load_n: float) -> AxleFit:
     top = float(force.max())
     start = [10.0, 1.3, 1.01 * top, 0.0]
     bounds = ([3.0, 1.05, 1.0 * top, -2.0], [40.0, 1.7, max(load_n, 1.02 * top), 1.1])
-    found = least_squares(
+    solution = least_squares(
         lambda p: (magic_formula(alpha, *p) - force) / top, start, bounds=bounds, x_scale=[10.0, 1.0, top, 1.0]
     )
-    b, c, d, e = found.x
+    b, c, d, e = solution.x
     error = magic_formula(alpha, b, c, d, e) - force
     return AxleFit(b, c, d, 1.0 - float(np.exp(e)), float(np.sqrt(np.mean(error**2))), top)
 

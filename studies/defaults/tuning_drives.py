@@ -63,8 +63,10 @@ def tuning_drives() -> list[TuningDrive]:
             continue
         vehicle = nominal.model_copy(update={"friction": friction})
         signals = as_logged(drive, Car.of(vehicle)).signals
-        at = (signals.stamps_ns - drive.start_ns) * 1e-9
-        vx, vy = (np.interp(at, drive.times_s, drive.truth[k], left=np.nan, right=np.nan) for k in ("vx_m_s", "vy_m_s"))
+        time_s = (signals.stamps_ns - drive.start_ns) * 1e-9
+        vx, vy = (
+            np.interp(time_s, drive.times_s, drive.truth[k], left=np.nan, right=np.nan) for k in ("vx_m_s", "vy_m_s")
+        )
         moving = np.hypot(vx, vy) > vehicle.low_speed_blend_m_s
         sideslip = np.where(moving, np.arctan2(vy, vx), np.nan)
         drives.append(TuningDrive(manoeuvre, drive.command, vehicle, signals, sideslip))
@@ -80,9 +82,9 @@ def sideslip_rmse_deg(drive: TuningDrive, estimator: Estimator | None) -> float:
     return float(np.rad2deg(np.sqrt(np.nanmean(error**2))))
 
 
-def write_result(name: str, drives: list[TuningDrive], **found: Any) -> None:
+def write_result(name: str, drives: list[TuningDrive], **figures: Any) -> None:
     """Write ``results/NAME.json`` with the drives that it comes from."""
-    document = {**found, "first_seed": FIRST_SEED, "drives": [d.command for d in drives]}
+    document = {**figures, "first_seed": FIRST_SEED, "drives": [d.command for d in drives]}
     path = RESULTS / f"{name}.json"
     path.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     print(f"wrote {path.relative_to(ROOT)}")

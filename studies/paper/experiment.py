@@ -221,8 +221,8 @@ def run_experiment(
             first_drive = scenario.name not in drives
             drives.setdefault(scenario.name, drive)
             for seed, car in cars.items():
-                own = on_the_road(car, scenario.friction)
-                schemes, skipped = runnable(names, own, drive.whole.plan.alignment.available)
+                on_road = on_the_road(car, scenario.friction)
+                schemes, skipped = runnable(names, on_road, drive.whole.plan.alignment.available)
                 missing.update({s.name: s.reason for s in skipped})
                 for scheme in schemes:
                     by_network = bool(spec_of(scheme.name).network)

@@ -105,8 +105,8 @@ def position(folder: Path, name: str, experiment: Experiment, scenario: str, sch
     axes[0, 0].plot(truth.x_m, truth.y_m, color=COLOURS["truth"], linewidth=3.0, label="truth")
     for scheme in schemes:
         track = experiment.tracks[scenario, scheme]
-        known = track.valid & np.isfinite(track.vx_m_s) & np.isfinite(track.vy_m_s) & np.isfinite(truth.x_m)
-        first = int(np.flatnonzero(known)[0])
+        finite = track.valid & np.isfinite(track.vx_m_s) & np.isfinite(track.vy_m_s) & np.isfinite(truth.x_m)
+        first = int(np.flatnonzero(finite)[0])
         start = (float(truth.x_m[first]), float(truth.y_m[first]), float(truth.yaw_rad[first]))
         part = slice(first, None)
         x, y, _ = dead_reckon(

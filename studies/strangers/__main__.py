@@ -122,7 +122,7 @@ def others_without_answers() -> str:
         return ""
     answered = answered_files()
     channels = {name for names in ITEMS.values() for name in names}
-    found, count = [], 0
+    mapped_files, count = [], 0
     for entry in json.loads(catalogue.read_text(encoding="utf-8")):
         file = f"reader_corpus/{entry['file']}"
         if entry["expected"] != "ok" or file in answered or "/conformance/" in file:
@@ -132,9 +132,11 @@ def others_without_answers() -> str:
         taken = {name: len(c) for name, c in mapped.items() if name in channels}
         if taken:
             most = max(taken.values())
-            found.append(f"`{entry['file']}` ({', '.join(sorted(taken))}; {most} samples at most)")
+            mapped_files.append(f"`{entry['file']}` ({', '.join(sorted(taken))}; {most} samples at most)")
     text = f"{count} further recordings of `reader_corpus` contain no vehicle signals. "
-    return text + (f"Channels are mapped in {'; '.join(found)}.\n" if found else "No channel is mapped in them.\n")
+    return text + (
+        f"Channels are mapped in {'; '.join(mapped_files)}.\n" if mapped_files else "No channel is mapped in them.\n"
+    )
 
 
 def _wanted(name: str, only: Sequence[str]) -> bool:

@@ -79,10 +79,10 @@ def series(car: Car, name: str) -> Series:
     if name in derived:
         clock, values = derived[name]
         return Series(clock.stamps_ns, clock.arrival_ns, values)
-    found = getattr(car, name, None)
-    if not isinstance(found, Series):
+    sensor = getattr(car, name, None)
+    if not isinstance(sensor, Series):
         raise KeyError(name)
-    return found
+    return sensor
 
 
 def layouts(*groups: str) -> Iterator[Recording]:
@@ -99,7 +99,7 @@ def layouts(*groups: str) -> Iterator[Recording]:
         entries = [line.partition(": ")[::2] for line in lines]
         about = dict(entries)
         also = (value.partition(" = ")[::2] for key, value in entries if key == "also")
-        cause = re.sub("|".join(CAUSES), lambda found: CAUSES[found[0]], about.get("cause", ""))
+        cause = re.sub("|".join(CAUSES), lambda match: CAUSES[match[0]], about.get("cause", ""))
         yield Recording(
             name=name,
             group=group,
@@ -120,15 +120,15 @@ def layout(name: str) -> Recording:
 
 
 def _answers(car: Car, text: str) -> dict[str, tuple[Series, ...]]:
-    found: dict[str, tuple[Series, ...]] = {}
+    by_channel: dict[str, tuple[Series, ...]] = {}
     for item in filter(None, text.split(", ")):
         if item.startswith("-"):
-            del found[item[1:]]
+            del by_channel[item[1:]]
         elif item.startswith("truth."):
-            found[item] = answers(car, "truth")[item]
+            by_channel[item] = answers(car, "truth")[item]
         else:
-            found |= answers(car, item)
-    return found
+            by_channel |= answers(car, item)
+    return by_channel
 
 
 def _topics(car: Car, lines: Sequence[str], names: dict[str, Any]) -> Iterator[Topic]:

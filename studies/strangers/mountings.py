@@ -15,13 +15,13 @@ from studies.strangers.recordings import Recording, answers, imu, road_car
 
 def right_angles() -> list[FloatArray]:
     """Return the 24 rotations in steps of 90 degrees, the identity first."""
-    found = []
+    turns = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         turn = np.zeros((3, 3))
         turn[range(3), order] = signs
         if np.linalg.det(turn) > 0.0:
-            found.append(turn)
-    return found
+            turns.append(turn)
+    return turns
 
 
 def mountings() -> Iterator[Recording]:

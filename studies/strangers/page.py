@@ -101,9 +101,9 @@ def page(results: Sequence[Result], remark: str) -> str:
     ----------
     results : one a kind. remark : text below the score.
     """
-    own = [r for r in results if r.group in ("fault", "layout", "held-out")]
+    generated = [r for r in results if r.group in ("fault", "layout", "held-out")]
     others = [r for r in results if r.group == "recording"]
-    counts = f"{len(own)} generated logs and {len(others)} third-party recordings"
+    counts = f"{len(generated)} generated logs and {len(others)} third-party recordings"
     parts = [
         _INTRO.replace("<!-- counts -->", counts),
         "## Score\n",

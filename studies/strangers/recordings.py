@@ -88,7 +88,7 @@ def answers(car: Car, *parts: str) -> dict[str, tuple[Series, ...]]:
     yaw_rates = (car.rate[2], car.yaw_rate)
     # All that goes for the speed: rims, the body's forward velocity, the speed over ground.
     speeds = (car.speed, car.body_velocity[0], car.ground_speed)
-    known: dict[str, dict[str, tuple[Series, ...]]] = {
+    by_part: dict[str, dict[str, tuple[Series, ...]]] = {
         "imu": {"ax_m_s2": (car.force[0],), "ay_m_s2": (car.force[1],), "yaw_rate_rad_s": yaw_rates},
         "yaw rate": {"yaw_rate_rad_s": yaw_rates},
         "steer": {"steer_rad": (car.steer,)},
@@ -104,7 +104,7 @@ def answers(car: Car, *parts: str) -> dict[str, tuple[Series, ...]]:
         },
         "truth rate": {"truth.yaw_rate_rad_s": yaw_rates},
     }
-    return {name: series for part in parts for name, series in known[part].items()}
+    return {name: series for part in parts for name, series in by_part[part].items()}
 
 
 def message(
@@ -156,16 +156,16 @@ def odometry(
 ) -> Topic:
     """Return GNSS/INS as ``nav_msgs/Odometry``; ``body`` and ``rate`` take the place of its velocity and yaw rate."""
     clock = (body or car.body_velocity).every(up_to)
-    at = car.position.every(up_to).values
+    position = car.position.every(up_to).values
     roll, pitch, yaw = car.attitude.every(up_to).values.T
     return message(
         name,
         "nav_msgs/msg/Odometry",
         clock,
         {
-            "pose.pose.position.x": at[:, 0],
-            "pose.pose.position.y": at[:, 1],
-            "pose.pose.position.z": at[:, 2],
+            "pose.pose.position.x": position[:, 0],
+            "pose.pose.position.y": position[:, 1],
+            "pose.pose.position.z": position[:, 2],
             "pose.pose.orientation": quaternion(roll, pitch, yaw),
             "twist.twist.linear.x": clock.values[:, 0],
             "twist.twist.linear.y": clock.values[:, 1],

@@ -131,11 +131,11 @@ def _look(log: DriveLog) -> tuple[SignalMapping | None, Told, dict[str, Channel]
     more, refused_run = _checks_of_a_run(Path(str(log.path)))
     checks += [check for check in more if check["name"] not in {c["name"] for c in checks}]
     error = error or refused_run
-    told = Told(tuple(checks), tuple(dict.fromkeys(said)), error, suspects)
+    messages = Told(tuple(checks), tuple(dict.fromkeys(said)), error, suspects)
     clocks = fit_clocks(log, inspection.mapping, log.start_ns, log.end_ns)
     read = read_signals(log, inspection.mapping, clocks, log.start_ns, log.end_ns)
     channels = read.signals | {f"truth.{name}": channel for name, channel in read.truth.items()}
-    return inspection.mapping, told, channels
+    return inspection.mapping, messages, channels
 
 
 def _checks_of_a_run(path: Path) -> tuple[list[dict[str, Any]], str]:
@@ -235,7 +235,7 @@ def score_log(
     cause : pattern that a message must match; empty without a cause.
     at_fault : channels whose checks may fail even where they were mapped rightly.
     """
-    mapping, told, channels = look(path)
+    mapping, messages, channels = look(path)
     sources = {} if mapping is None else _sources(mapping)
     fitting = {**(allowed or {}), **right}
     is_right = {
@@ -251,21 +251,21 @@ def score_log(
                 findings.append(Finding(item, "missing", True, frozenset(), ""))
             continue
         wrong = [n for n in mapped if not is_right[n]]
-        checked = frozenset(c["verdict"] for c in told.checks if c["subject"] in mapped)
+        checked = frozenset(c["verdict"] for c in messages.checks if c["subject"] in mapped)
         what = ", ".join(f"{n} = {sources[n]}" for n in (wrong or mapped) if n in sources)
         if wrong:
-            findings.append(Finding(item, "wrong", all(_is_told(n, sources, told) for n in wrong), checked, what))
+            findings.append(Finding(item, "wrong", all(_is_told(n, sources, messages) for n in wrong), checked, what))
         elif present:
-            doubted = any(_is_doubted(n, sources.get(n, ""), told) for n in mapped)
+            doubted = any(_is_doubted(n, sources.get(n, ""), messages) for n in mapped)
             findings.append(Finding(item, "right", True, checked, what, doubted))
     blamed = set(at_fault)
     false_alarms = tuple(
         f"{c['name']} ({c['subject']}): {c.get('evidence', '')}"
-        for c in told.checks
+        for c in messages.checks
         if c["verdict"] == "failed" and is_right.get(c["subject"], False) and c["subject"] not in blamed
     )
-    named = bool(re.search(cause, told.text, re.IGNORECASE)) if cause else None
-    return Score(tuple(findings), false_alarms, named, told)
+    named = bool(re.search(cause, messages.text, re.IGNORECASE)) if cause else None
+    return Score(tuple(findings), false_alarms, named, messages)
 
 
 def _sources(mapping: SignalMapping) -> dict[str, str]:
@@ -273,23 +273,23 @@ def _sources(mapping: SignalMapping) -> dict[str, str]:
     return {name: source.label for name, source in (mapping.signals | truth).items()}
 
 
-def _is_told(name: str, sources: Mapping[str, str], told: Told) -> bool:
+def _is_told(name: str, sources: Mapping[str, str], messages: Told) -> bool:
     """Return whether a check that did not pass is on the channel, or a doubt names it or its source."""
     subject = name.removeprefix("truth.")
-    if subject in told.suspects:
+    if subject in messages.suspects:
         return True
-    for check in told.checks:
+    for check in messages.checks:
         if check["verdict"] != "passed" and check["subject"] in (name, subject):
             return True
-    return _is_doubted(name, sources.get(name, ""), told)
+    return _is_doubted(name, sources.get(name, ""), messages)
 
 
 #: Words of a sentence that doubts what it names.
 _DOUBT = re.compile(r"doubt|took|is taken, but|waive|suspect|contradict|not sure|ambig|disagree|may be|might|perhaps")
 
 
-def _is_doubted(name: str, source: str, told: Told) -> bool:
+def _is_doubted(name: str, source: str, messages: Told) -> bool:
     """Return whether a sentence doubts a channel, by its name or the field or topic that it comes from."""
     topic = source.partition(".")[0]
     named = [part for part in (name.removeprefix("truth."), source, topic) if part]
-    return any(_DOUBT.search(d) and any(part in d for part in named) for d in told.doubts)
+    return any(_DOUBT.search(d) and any(part in d for part in named) for d in messages.doubts)

@@ -128,8 +128,8 @@ def _json_references(levels: int) -> bytes:
     def kind(i: int) -> dict[str, object]:
         return {"type": "object", "properties": {f"p{k}": {"$ref": f"#/definitions/d{i + 1}"} for k in range(10)}}
 
-    own = {f"d{i}": kind(i) for i in range(levels)} | {f"d{levels}": {"type": "number"}}
-    return json.dumps({"type": "object", "$ref": "#/definitions/d0", "definitions": own}).encode()
+    definitions = {f"d{i}": kind(i) for i in range(levels)} | {f"d{levels}": {"type": "number"}}
+    return json.dumps({"type": "object", "$ref": "#/definitions/d0", "definitions": definitions}).encode()
 
 
 def _descriptors(levels: int, width: int) -> bytes:

@@ -138,9 +138,9 @@ def _damage_entry(document: Any, rng: random.Random) -> None:
         case 1 if isinstance(holder, dict):
             holder[rng.choice((key + "x", key[:-1], key.upper(), "", "a.b", "\n", "é"))] = holder.pop(key)
         case 2:
-            other, at = rng.choice(places)
-            if at in other if isinstance(other, dict) else at < len(other):
-                holder[key] = copy.deepcopy(other[at])
+            other, place = rng.choice(places)
+            if place in other if isinstance(other, dict) else place < len(other):
+                holder[key] = copy.deepcopy(other[place])
         case 3:
             times = rng.choice((1, 2, 1000))  # once only a thousand: writing two million entries is not ours to time
             holder[key] = [holder[key]] * (times if len(places) < 1000 else min(times, 2))

@@ -108,7 +108,7 @@ def kill_many(
 
 def faults(output: Path) -> list[str]:
     """Return what under final names is not whole, in words; empty after any kill."""
-    found = []
+    problems = []
     for path in sorted(p for p in output.rglob("*") if p.is_file() and not hidden(p, output)):
         try:
             if path.suffix == ".json":
@@ -116,18 +116,18 @@ def faults(output: Path) -> list[str]:
             elif path.suffix == ".parquet":
                 pq.ParquetFile(path).read()
             elif any(end not in path.read_bytes()[-64:] for suffix, end in ENDS.items() if suffix == path.suffix):
-                found.append(f"{path.name}: cut")
+                problems.append(f"{path.name}: cut")
         except (OSError, ValueError) as error:
-            found.append(f"{path.name}: {error}")
+            problems.append(f"{path.name}: {error}")
     for folder in (output / "logs").glob("[!.]*"):
         names = {p.name for p in folder.iterdir()}
         if not {"estimates.parquet", "metrics.parquet", "recording.rrd", "report.json"} <= names:
-            found.append(f"{folder.name}: only {', '.join(sorted(names))}")
+            problems.append(f"{folder.name}: only {', '.join(sorted(names))}")
     run = output / "run.json"
     if run.is_file():
         logs = json.loads(run.read_text(encoding="utf-8"))["logs"]
-        found += [f"run.json names {e['log']}" for e in logs if not (output / "logs" / e["log"]).is_dir()]
-    return found
+        problems += [f"run.json names {e['log']}" for e in logs if not (output / "logs" / e["log"]).is_dir()]
+    return problems
 
 
 def hidden(path: Path, output: Path) -> bool:

@@ -57,11 +57,11 @@ def read_samples(path: Path) -> Drive:
         columns = log.read({topic: [stamp, *paths] for topic, (_, stamp, paths) in _TOPICS.items()})
     finally:
         log.close()
-    found = {}
+    samples_by_topic = {}
     for topic, (_, stamp, paths) in _TOPICS.items():
         read = columns[topic]
-        found[topic] = Samples(read.log_time_ns, read.fields[stamp], {p: read.fields[p] for p in paths})
-    return found
+        samples_by_topic[topic] = Samples(read.log_time_ns, read.fields[stamp], {p: read.fields[p] for p in paths})
+    return samples_by_topic
 
 
 def write_samples(path: Path, drives: Iterable[Drive]) -> None:

@@ -90,8 +90,8 @@ def judge(ended: Ended, allowed: Sequence[int] = (0, 1, 2, 3)) -> Verdict:
         return Verdict(end, f"exit code {ended.code}: {ended.err[-500:]}")
     if ended.code in (1, 2) and not last.startswith("pdhef"):
         return Verdict(end, f"no line of an error: {ended.err[-500:]!r}")
-    if found := _CONTROL.search(ended.out + ended.err):
-        around = (ended.out + ended.err)[max(0, found.start() - 60) : found.end() + 20]
+    if control := _CONTROL.search(ended.out + ended.err):
+        around = (ended.out + ended.err)[max(0, control.start() - 60) : control.end() + 20]
         return Verdict(end, f"a control character in the output: {around!r}")
     return Verdict(end)
 
