@@ -1,7 +1,7 @@
-"""A full annotated copy of the one-hour log: two estimators beside the source, whose chunks pass through as they are.
+"""A full annotated copy of the one-hour log: two estimators and the source, whose chunks are copied unchanged.
 
-Peers: the same copy with every message of the source taken apart and compressed anew by our own writer, and mcap's
-reader and Writer copying the source alone (a tenth, scaled by 10).
+Peers: the same copy with every message of the source read and compressed again by our writer, and reader and Writer of
+mcap copying the source alone (a tenth, scaled by 10).
 """
 
 from __future__ import annotations
