@@ -1,0 +1,1 @@
+"""Published sideslip estimators, re-implemented, on the recorded drives beside the presets of this tool."""

@@ -1,0 +1,95 @@
+"""The page of the peers, of the template beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from studies.pages import number, table
+from studies.peers.drives import FULL_SIZE, OFFSET, SMALL
+from studies.peers.scoring import (
+    BEST_PEERS,
+    DriveErrors,
+    best_of,
+    best_peers_median,
+    car_means,
+    geometric,
+    spread,
+)
+
+#: The presets of the tool: calibration, car and track.
+OURS = {
+    "phy-ukf": ("log", "file", "phy-ukf"),
+    "physics": ("log", "file", "physics"),
+    "pd-hef": ("log", "file", "pd-hef"),
+    "pd-hef, causal": ("off", "file", "pd-hef"),
+    "pd-hef, no file": ("log", "none", "pd-hef"),
+}
+#: Share of missing estimates from which a figure is marked.
+MARKED = 0.05
+PAGE = Path(__file__).with_suffix(".md")
+
+
+def page(errors: Sequence[DriveErrors]) -> str:
+    """Return the page."""
+    groups = {group: [e for e in errors if e.drive.group == group] for group in (FULL_SIZE, SMALL, OFFSET)}
+    full_size = groups[FULL_SIZE]
+    offsets = ", ".join(f"{_name(e)} {number(e.offset_deg, 2)}°" for e in groups[OFFSET])
+    return PAGE.read_text(encoding="utf-8").format(
+        verdict=_verdict(full_size),
+        logs=len(full_size),
+        means=means_table(full_size),
+        full_size=drives_table(full_size),
+        best=BEST_PEERS,
+        small_means=means_table(groups[SMALL]),
+        small=drives_table(groups[SMALL]),
+        offsets=offsets,
+        offset=drives_table(groups[OFFSET]),
+        marked=MARKED,
+    )
+
+
+def _name(errors: DriveErrors) -> str:
+    return errors.drive.log.partition(".")[0]
+
+
+def peer_names(errors: DriveErrors) -> list[str]:
+    """Return the names of the peers."""
+    return [name for name in errors.rmse_deg if name not in OURS]
+
+
+def _verdict(errors: Sequence[DriveErrors]) -> str:
+    means = {name: geometric([*car_means(errors, name).values()]) for name in errors[0].rmse_deg}
+    best = min(peer_names(errors[0]), key=lambda name: means[name])
+    ours = "pd-hef"
+    return (
+        f"Geometric mean over {len(car_means(errors, ours))} full-size cars: `{ours}` {number(means[ours], 2)}°, "
+        f"lowest of the peers `{best}` {number(means[best], 2)}°."
+    )
+
+
+def means_table(errors: Sequence[DriveErrors]) -> str:
+    """Return the means by car and over cars, a line an estimator."""
+    names = [*errors[0].rmse_deg]
+    lowest = [best_of(e, names) for e in errors]
+    body = []
+    for name in names:
+        cars = car_means(errors, name)
+        cells = [number(value, 2) for value in (*cars.values(), geometric([*cars.values()]), spread([*cars.values()]))]
+        body.append([f"`{name}`", *cells, str(lowest.count(name))])
+    head = ["estimator", *car_means(errors, names[0]), "geometric mean", "spread", "lowest"]
+    return table(head, body, right_from=1)
+
+
+def drives_table(errors: Sequence[DriveErrors]) -> str:
+    """Return the errors, a line a drive; the lowest one is bold."""
+    names = [*errors[0].rmse_deg]
+    body = []
+    for e in errors:
+        cells = []
+        for name in names:
+            text = number(e.rmse_deg[name], 2) + ("†" if e.missing[name] > MARKED else "")
+            cells.append(f"**{text}**" if name == best_of(e, names) else text)
+        ratio = e.rmse_deg["pd-hef"] / best_peers_median(e, peer_names(e))
+        body.append([f"`{_name(e)}`", *cells, number(ratio, 2)])
+    return table(["drive", *(f"`{name}`" for name in names), "ratio"], body, right_from=1)
