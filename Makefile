@@ -16,7 +16,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(if $(ORDER_SEED),--randomly-seed=$(ORDER_SEED))
 
 .PHONY: help demo test quick fleet pages mutants mutants-fixed check lint format bench train-default samples conditions real peers torture \
-  retrain docs docs-truthsim paper strangers wheel release lock clean
+  recalibrate retrain docs docs-truthsim paper strangers wheel release lock clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
@@ -30,6 +30,7 @@ help:
 	@echo "make torture  damaged, hostile and odd input, counted: docs/reliability.md (two hours or less on two cores; resumable)"
 	@echo "make strangers  docs/third_party_logs.md: signals recognised in logs with unknown layouts (under two minutes)"
 	@echo "make bench    speed against peers"
+	@echo "make recalibrate  regenerate all that is derived: shipped cars and networks, evidence pages (hours; resumable)"
 	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, 20 minutes or so)"
 	@echo "make retrain LOGS=drives/ CAR=mycar OUT=folder  train the network of a car again, behind a gate (docs/retrain.md)"
 	@echo "make samples  write sample_logs/ anew with the simulator"
@@ -123,6 +124,10 @@ check: lint test
 
 bench: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.performance
+
+# Stages with their durations: python -m studies.recalibrate --list; a part of them: make recalibrate ONLY="noise gain".
+recalibrate: $(VENV)/installed-dev $(VENV)/compiled
+	$(BIN)/python -m studies.recalibrate $(if $(ONLY),--only $(ONLY))
 
 train-default: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.defaults.train_default

@@ -1,7 +1,7 @@
-"""A full annotated copy of the one-hour log: two estimators beside the source, whose chunks pass through as they are.
+"""A full annotated copy of the one-hour log: two estimators and the source, whose chunks are copied unchanged.
 
-Peers: the same copy with every message of the source taken apart and compressed anew by our own writer, and mcap's
-reader and Writer copying the source alone (a tenth, scaled by 10).
+Peers: the same copy with every message of the source read and compressed again by our writer, and reader and Writer of
+mcap copying the source alone (a tenth, scaled by 10).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.measuring import CACHE, Row, best_seconds
 from benchmarks.one_hour_log import HOUR_S, START_NS, hour_log
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.source_copy import iterate_copy, iterate_raw, register_channels
+from pdhef_logtool.logs.source_copy import iterate_copy, register_channels
 from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.results.mcap_sink import AnnotatedMcapSink
@@ -50,8 +50,7 @@ def copy_ours(path: Path, whole: bool, end_ns: int | None = None) -> None:
     assert log is not None
     with McapLogWriter(CACHE / "copy.mcap") as writer:
         channels = register_channels(writer, log)
-        iterate = iterate_copy if whole else iterate_raw
-        writer.write([], iterate(log, channels, None, end_ns))
+        writer.write([], iterate_copy(log, channels, None, end_ns, whole=whole))
     log.close()
 
 

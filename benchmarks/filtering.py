@@ -1,8 +1,7 @@
-"""Microseconds a step of ``phy-ukf`` against filterpy's UKF with the same compiled vehicle model, on the same drive.
+"""Microseconds per step of ``phy-ukf`` and of the UKF of filterpy, with the same compiled vehicle model and drive.
 
-Both run the same state, noise and measurements on one thread; only the filter around the model differs. The posteriors
-are compared before anything is printed. Ours also gates, watches for divergence and keeps what the output needs.
-``physics`` with all its parts stands beside them.
+Both use the same state, noise and measurements on one thread; only the filter around the model differs. The posteriors
+are compared first. Our filter also gates, detects divergence and stores the outputs. ``physics`` has all its parts.
 """
 
 from __future__ import annotations

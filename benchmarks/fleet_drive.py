@@ -1,9 +1,8 @@
-"""Processor seconds that a simulated drive of 12.5 s costs within a fleet, in one process that is warm.
+"""Processor seconds of a simulated drive of 12.5 s in a fleet, in one process after its first drive.
 
-The default estimators on the shipped car, with its network, and on the default sedan, which each log calibrates first;
-everything of ``pdhef run --keep metrics`` but the files of the whole run, which are written once. Then its parts, what
-all estimators cost, and what is written on top of figures: tracks, and with ``full`` recording, annotated copy, error
-budget and page.
+The default estimators on the shipped car with its network, and on the default sedan, which each log calibrates first:
+all of ``pdhef run --keep metrics`` except the files of the whole run. Then the parts, all estimators, and further
+outputs: tracks, and with ``full`` the recording, annotated copy, error decomposition and page.
 """
 
 from __future__ import annotations
@@ -83,7 +82,7 @@ def rows() -> list[Row]:
     took = {name: s / len(logs) for name, s in best_seconds(of_all).items()}
     took |= {name: s / len(few) for name, s in best_seconds(of_few, rounds=2).items()}
     return [
-        Row("drives a second and core", 1.0 / took["saloon"], "1/s", TARGET_PER_S, "at least", command=_COMMAND),
+        Row("drives per second and core", 1.0 / took["saloon"], "1/s", TARGET_PER_S, "at least", command=_COMMAND),
         Row("the same on the default sedan", 1.0 / took["sedan"], "1/s", TARGET_PER_S, "at least"),
         Row("a drive", took["saloon"], "s"),
         Row("of it open, map, plan and read", took["read"], "s"),

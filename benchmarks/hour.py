@@ -1,6 +1,6 @@
-"""An hour of a simulated road drive through the commands, and where the seconds of its run go.
+"""Commands on an hour of a simulated road drive, and the time of the parts of a run.
 
-Each command runs once, in a process of its own on one core with compiled code at hand, start included. The peer is the
+Each command runs once, in a new process on one core, with code compiled before, start included. The peer is the
 straightforward pipeline of `benchmarks/peers.py` on the first 30 s, scaled to the hour by its steps.
 """
 
@@ -83,7 +83,7 @@ def rows() -> list[Row]:
         *light,
         Row("straightforward pipeline / run, light outputs", ratio, "x", 30.0, "at least"),
         *whole,
-        Row("written by it", _written_bytes(CACHE / "run-all") / 1e6, "MB", 300.0),
+        Row("written bytes", _written_bytes(CACHE / "run-all") / 1e6, "MB", 300.0),
         Row("of it: the log's own messages", drive_hour().stat().st_size / 1e6, "MB"),
     ]
 
@@ -128,9 +128,9 @@ def _parts_of_a_run() -> None:
 
     timed(windows.DriveReader, "windows", "reading and aligning", lazy=True)
     timed(estimating, "run_window", None)
-    timed(pipeline, "_estimate", "watches, intervals, poses, store")
+    timed(pipeline, "_estimate", "monitors, intervals, poses, store")
     timed(pipeline, "evaluate", "figures")
-    timed(drive_details, "drive_details", "error budget and details")
+    timed(drive_details, "drive_details", "error decomposition and details")
     for sink, what in (
         (parquet.EstimatesSink, "estimates.parquet"),
         (mcap.AnnotatedMcapSink, "annotated.mcap"),
@@ -147,7 +147,7 @@ def _parts_of_a_run() -> None:
         pass
     finally:
         total = time.process_time() - began
-        spent["start, and what else there is"] = total - sum(spent.values())
+        spent["start and others"] = total - sum(spent.values())
         print(json.dumps(dict(sorted(spent.items(), key=lambda part: -part[1]))), file=sys.stderr)
 
 

@@ -85,7 +85,7 @@ def peak_bytes(module: str, *arguments: str) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Processor seconds and peak resident memory of a command, and the last line of what it says on stderr."""
+    """Processor seconds and peak resident memory of a command, and the last line on stderr."""
 
     seconds: float
     peak_bytes: int
@@ -100,7 +100,7 @@ def command_cost(*arguments: str | Path, module: str = "pdhef_logtool") -> Cost:
         "print(json.dumps([done.returncode, used.ru_utime + used.ru_stime, used.ru_maxrss, *said]))"
     )
     command = [sys.executable, "-c", code, sys.executable, "-m", module, *map(str, arguments)]
-    # As where it is installed: its modules are not compiled anew by every command.
+    # As where it is installed: its modules are not compiled again by every command.
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"} | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True, env=environment)
     code_of, seconds, peak, *said = json.loads(done.stdout)

@@ -2,7 +2,7 @@
 
 mcap and mcap_ros2 decode the messages one by one; at each one of the IMU, with the last ones of the others, torch steps
 an LSTM of the shipped shape, filterpy updates one filter with its residual and one without, and mcap_ros2 writes both
-estimates. It checks nothing, watches nothing and scores nothing.
+estimates. It has no checks, no monitors and no scores.
 """
 
 from __future__ import annotations

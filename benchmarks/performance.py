@@ -24,7 +24,7 @@ _INTRODUCTION = """# Performance
 
 This page shows processor time and memory, also against peers. Command: `python -m benchmarks.performance
 --write-docs`; `make bench` prints the tables. Seconds are processor seconds (user and system, with child processes),
-the best of several interleaved rounds unless a section says otherwise. A ratio to a peer is measured in the same run.
+the best of several interleaved rounds unless stated otherwise. A ratio to a peer is measured in the same run.
 """
 
 
@@ -48,7 +48,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def section(name: str, rows: Sequence[Row]) -> str:
-    """Return what the page says of one benchmark, from its name on."""
+    """Return the section of one benchmark, from its name on."""
     about = cleandoc(import_module(f"benchmarks.{name}").__doc__ or "")
     machine = ", ".join(f"{key} {value}" for key, value in machine_facts().items())
     return f"{name}\n\n{about}\n\n{table(rows)}\n\nMachine: {machine}.\n"

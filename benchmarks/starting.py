@@ -1,8 +1,8 @@
-"""Seconds until a run is done that has little to do, and what the network costs a step.
+"""Duration of a short run, and step time of the network.
 
-A run of a 10 s log in a new process, with the compiled code at hand: of its figures alone, and with all outputs. The
-network stands against PyTorch, which trains it, over the same steps and with the same answer; the hybrid filter, its
-parallel filter and the network in it, against the physics filter alone, all parts on.
+A run of a 10 s log in a new process, with code compiled before: metrics only, and all outputs. The network is compared
+with PyTorch over the same steps and with the same result; the hybrid filter (with parallel filter and network) with the
+physics filter alone, all parts on.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ def said_by_torch(bundle: ModelBundle, features: FloatArray) -> FloatArray:
     both = np.stack([rows, rows * bundle.signs]).astype(np.float32)
     parts, state = [], None
     with torch.inference_mode():
-        for at in range(0, len(rows), _BLOCK_STEPS):
-            output, state = network(torch.from_numpy(both[:, at : at + _BLOCK_STEPS].copy()), state)
+        for index in range(0, len(rows), _BLOCK_STEPS):
+            output, state = network(torch.from_numpy(both[:, index : index + _BLOCK_STEPS].copy()), state)
             parts.append(output.numpy().astype(np.float64))
     straight, mirrored = np.concatenate(parts, axis=1)
     return np.asarray(0.5 * (straight - mirrored) * np.array(bundle.normalisation.target_std))

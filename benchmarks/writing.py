@@ -1,8 +1,8 @@
-"""Writing 4 x 360 k estimates: an hour at 100 Hz of two estimators, each as our own message and as Odometry.
+"""Writing 4 x 360 k estimates: an hour at 100 Hz of two estimators, each as our message and as Odometry.
 
 The peer serialises a tenth of them with rosbags and writes them with mcap's Writer (scaled by 10); its messages are
-built before the clock starts. Both ways write zstd chunks with CRCs, message indexes and a summary, and the first
-messages of both files are compared.
+built before the measurement. Both write zstd chunks with CRCs, message indexes and a summary, and the first messages of
+both files are compared.
 """
 
 from __future__ import annotations
@@ -81,9 +81,9 @@ def _peer_messages(
     quats = quat_from_yaw(values[:, 3]).tolist()
     made = []
     for stamp, v, (w, x, y, z), p in zip(stamps_ns.tolist(), values.tolist(), quats, covariance, strict=True):
-        at = time(sec=stamp // 10**9, nanosec=stamp % 10**9)
+        time_of_stamp = time(sec=stamp // 10**9, nanosec=stamp % 10**9)
         state = types[STATE_TYPE](
-            header=header(stamp=at, frame_id=BODY_FRAME),
+            header=header(stamp=time_of_stamp, frame_id=BODY_FRAME),
             covariance=p,
             network_trust=0.0,
             r_scale=0.0,
@@ -95,7 +95,7 @@ def _peer_messages(
             **dict(zip(_STATE_FIELDS, v, strict=True)),
         )
         odometry = types[ODOMETRY_TYPE](
-            header=header(stamp=at, frame_id=MAP_FRAME),
+            header=header(stamp=time_of_stamp, frame_id=MAP_FRAME),
             child_frame_id=BODY_FRAME,
             pose=posed(pose=pose(position=point(*v[:3]), orientation=quaternion(x=x, y=y, z=z, w=w)), covariance=zero),
             twist=moved(twist=twist(linear=vector(*v[3:6]), angular=vector(0.0, 0.0, 0.0)), covariance=zero),
@@ -134,12 +134,12 @@ def _check_equal() -> None:
 
     from mcap.reader import make_reader
 
-    found = []
+    messages = []
     for name in ("estimates.mcap", "estimates_peer.mcap"):
         with (CACHE / name).open("rb") as file:
             first = [(c.topic, m.log_time, m.data) for _, c, m in islice(make_reader(file).iter_messages(), 400)]
-        found.append(sorted(first))
-    if found[0] != found[1]:
+        messages.append(sorted(first))
+    if messages[0] != messages[1]:
         raise SystemExit("the two ways wrote different messages")
 
 

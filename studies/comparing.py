@@ -55,7 +55,7 @@ def share_closed(draw: Draw, drives: int, times: int, planted: float, seed: int)
     rng = np.random.default_rng(seed)
     signs = rng.choice((-1.0, 1.0), (times, drives))
     ratios = signs * draw(rng, (times, drives)) + math.log1p(planted)
-    return float(np.mean([paired_change(one).verdict(LIMIT) == "worse" for one in ratios]))
+    return float(np.mean([paired_change(drive_ratios).verdict(LIMIT) == "worse" for drive_ratios in ratios]))
 
 
 def share_of_means(draw: Draw, drives: int, times: int, seed: int) -> float:
@@ -131,13 +131,13 @@ def _processor_s() -> float:
 
 def page(times: int, planted: int, drives: int) -> str:
     """Return the page of results."""
-    false_alarms, found = [], []
+    false_alarms, detected = [], []
     for count in COUNTS:
         alarms = [share_closed(draw, count, times, 0.0, 1) for draw in (normal, heavy_tailed)]
         hits = [share_closed(draw, count, planted, PLANTED, 2) for draw in (normal, heavy_tailed)]
         naive = share_of_means(normal, count, times, 3)
         false_alarms.append([str(count), *(f"{x:.1%}" for x in (*alarms, naive))])
-        found.append([str(count), *(f"{x:.1%}" for x in hits)])
+        detected.append([str(count), *(f"{x:.1%}" for x in hits)])
     return "\n".join(
         (
             "# Comparison of runs",
@@ -154,7 +154,7 @@ def page(times: int, planted: int, drives: int) -> str:
             "",
             f"## Every drive is worse by {PLANTED:.0%} beside that spread: how often the gate closes, of {planted:,}",
             "",
-            table(["drives", "normal", "heavy tails"], found, right_from=0),
+            table(["drives", "normal", "heavy tails"], detected, right_from=0),
             "",
             "## A run compared with itself",
             "",

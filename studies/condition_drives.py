@@ -1,7 +1,7 @@
 """A drive of the condition table in memory, and every estimator on it.
 
-A log is read once, as ``pdhef run`` reads it. Friction is the one thing that an estimator is told of the truth, and
-only through the factor of the row: 1.2 times it, or nothing at all. The bins are those of the true friction always.
+A log is read once, as ``pdhef run`` reads it. Friction is the only input of an estimator from the ground truth, and
+only with the factor of the row: 1.2 times it, or nothing at all. The bins are those of the true friction always.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ NONLINEAR = "nonlinear"
 #: A drive counts in a bin from this many seconds on.
 BIN_LEAST_S = 0.3
 _FRICTION = SignalSource("friction", "/truth/perfect/state", "friction")
-#: Recognised types tell no lateral acceleration, and the smoothed derivative in its place lacks the ends of a drive.
+#: Recognised types contain no lateral acceleration, and the smoothed derivative in its place lacks the ends of a drive.
 _TRUE_A_Y = SignalSource("ay_m_s2", "/truth/perfect/state", "ay_m_s2")
 #: What is kept of the metrics: the sideslip in all segments, of the rest these.
 _KEPT = {
@@ -56,7 +56,7 @@ _KEPT = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConditionDrive:
-    """Signals [N] as an estimator would get them with the true friction, and the perfect truth [N] at their stamps.
+    """Signals [N] with the true friction, and the exact ground truth [N] at their stamps.
 
     Slower than ``low_speed_m_s`` nothing is scored.
     """
@@ -74,7 +74,7 @@ class ConditionDrive:
 def read_drive(path: Path, car: Car, *, friction: float | None = None) -> ConditionDrive:
     """Read a simulated log; ``friction`` where the log has none of its own.
 
-    The perfect truth stands on the sensors' clock, so that no latency is looked for: a stuck gyro would bend it.
+    The exact ground truth stands on the sensors' clock, so that no latency is looked for: a stuck gyro would bend it.
     """
 
     def with_true_friction(_log: DriveLog, mapping: Mapping, _tell: Tell) -> Mapping:
@@ -95,7 +95,7 @@ def read_drive(path: Path, car: Car, *, friction: float | None = None) -> Condit
 
 
 def as_logged(drive: Drive, car: Car) -> reading.WholeDrive:
-    """Return a simulated drive the way of every log: written as MCAP, mapped by recognition, read; no friction told."""
+    """Return a simulated drive the way of every log: written as MCAP, mapped by recognition, read; without friction."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.mcap"
         write_drive(drive, path)
@@ -104,7 +104,7 @@ def as_logged(drive: Drive, car: Car) -> reading.WholeDrive:
 
 
 def told(drive: ConditionDrive, assume: dict[str, Any]) -> Signals:
-    """Return the signals with what the row tells of the friction.
+    """Return the signals with the friction of the row.
 
     Raises
     ------
@@ -145,10 +145,10 @@ def interval_rows(
     error: FloatArray, sigma: FloatArray, masks: dict[str, BoolArray], *, log: str, estimator: str
 ) -> list[MetricRow]:
     """Return ``interval_score95`` and ``width95`` (mean of the whole width) of the sideslip by segment."""
-    known = np.isfinite(error) & np.isfinite(sigma)
+    finite = np.isfinite(error) & np.isfinite(sigma)
     rows = []
     for segment, mask in masks.items():
-        use = mask & known
+        use = mask & finite
         n = int(np.count_nonzero(use))
         if n:
             mean = float(np.mean(interval_score(error[use], sigma[use])))
@@ -165,8 +165,8 @@ def sideslip_error(estimator: Estimator, drive: ConditionDrive, signals: Signals
 
 def root_mean_square(error: FloatArray) -> float:
     """Return the root mean square of what is known of an error [N]; NaN for nothing."""
-    known = error[np.isfinite(error)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
+    finite = error[np.isfinite(error)]
+    return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
 
 
 def drives_of(folder: Path, split: str | None = None) -> list[dict[str, Any]]:

@@ -59,7 +59,7 @@ def simulated(given: argparse.Namespace, drives: int, seed: int) -> dict[str, li
     rows = [r for r in given.rows if r != INDEPENDENT_ROW]
     if not rows:
         return {}
-    # A manifest holds what was asked for: one of some rows must not take the place of that of all.
+    # A manifest contains the requested rows: one of some rows must not take the place of that of all.
     part = "" if set(rows) == set(ROW_NAMES) else "-" + hashlib.sha256(",".join(rows).encode()).hexdigest()[:8]
     folder = given.work / f"drives-{seed}-{drives}{part}"
     manifest = write_conditions(folder, drives=drives, seed=seed, rows=rows, processes=given.jobs)
@@ -100,8 +100,7 @@ def run(given: argparse.Namespace) -> None:
         command=_command(given),
         car=setup.loaded.vehicle.name,
         setup=setup.identity,
-        rows={r.name: r.description for r in ROWS}
-        | {INDEPENDENT_ROW: "runs of another simulator, friction as it says"},
+        rows={r.name: r.description for r in ROWS} | {INDEPENDENT_ROW: "runs of another simulator, true friction"},
         subject=SUBJECT if SUBJECT in ran else None,
         references=REFERENCES,
         order=given.estimators,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -22,12 +22,10 @@ from studies.pictures import save, subplots
 from studies.table_maths import (
     RESAMPLES,
     Bound,
-    geometric_mean,
     median,
     median_ratio,
     percentiles,
     pooled_mean,
-    pooled_ratio,
     pooled_rmse,
     verdict,
 )
@@ -45,6 +43,14 @@ MARGIN = 1.05
 DRAWN = ("zero", "open-loop", "phy-ukf", "physics", "pd-hef", "pd-hef-smoothed")
 #: Okabe and Ito (2008), without yellow.
 COLOURS = ("#000000", "#E69F00", "#56B4E9", "#0072B2", "#D55E00", "#009E73")
+_UNAVAILABLE = f"""† the estimator has no valid estimate at more than {100 * (1 - AVAILABLE):.0f} % of the stamps,
+which the figure leaves out.
+
+"""
+_RATIOS = f"""With the 95 % CI of a paired bootstrap over drives ({RESAMPLES} resamples). **<** the CI is below 1;
+= it is below {MARGIN}; **>** it is above {MARGIN}; ? otherwise.
+
+"""
 _MARKS = {"better": "**<**", "not worse": "=", "worse": "**>**", "open": "?", "–": ""}
 
 
@@ -76,17 +82,15 @@ class Figures:
         self, row: str, estimator: str, metric: str = "rmse", *, signal: str = SIDESLIP, segment: str = ALL
     ) -> tuple[FloatArray, FloatArray]:
         """Return values [N] and samples [N] over the drives; empty where there are none."""
-        found = self._by.get((row, estimator, signal, segment, metric), {})
-        pairs = [found[d] for d in sorted(found)]
+        by_drive = self._by.get((row, estimator, signal, segment, metric), {})
+        pairs = [by_drive[d] for d in sorted(by_drive)]
         return np.array([v for v, _ in pairs], dtype=np.float64), np.array([n for _, n in pairs], dtype=np.float64)
 
-    def pair(self, row: str, first: str, second: str) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return sideslip RMSE of two estimators on the drives that both have, and their samples; each [N]."""
+    def pair(self, row: str, first: str, second: str) -> tuple[FloatArray, FloatArray]:
+        """Return sideslip RMSE [N] of two estimators on the drives that both have."""
         a, b = (self._by.get((row, e, SIDESLIP, ALL, "rmse"), {}) for e in (first, second))
         both = sorted(a.keys() & b.keys())
-        columns = [[a[d][0] for d in both], [b[d][0] for d in both], [a[d][1] for d in both], [b[d][1] for d in both]]
-        first_rmse, second_rmse, first_n, second_n = (np.array(c, dtype=np.float64) for c in columns)
-        return first_rmse, second_rmse, first_n, second_n
+        return np.array([a[d][0] for d in both]), np.array([b[d][0] for d in both])
 
     def estimators(self, row: str | None = None) -> set[str]:
         """Return who has a sideslip RMSE, anywhere or in a row."""
@@ -119,18 +123,7 @@ def write_page(out: Path, folder: Path) -> None:
     names = sorted((n for n in facts.order if n in ran), key=lambda n: n in NOT_CAUSAL)
     rows = [r for r in facts.rows if r in figures.rows()]
     references = [r for r in facts.references if r in ran and r != facts.subject]
-    compared = [n for n in names if n in {facts.subject, *references}]
-    tables = [
-        "# Tables of the simulated conditions\n",
-        _sideslip(figures, rows, names),
-        _means(figures, rows, names),
-        _against(figures, rows, facts.subject, references),
-        _nonlinear(figures, rows, names),
-        _consistency(figures, rows, compared),
-        _coverage(figures, rows, names, facts.subject),
-        _lags(figures, rows, [n for n in names if n in {"zero", *compared}]),
-    ]
-    write(folder / "tables.md", "\n".join(t for t in tables if t))
+    write(folder / "tables.md", _tables(figures, rows, names, facts))
     pictures = out / "conditions"
     pictures.mkdir(parents=True, exist_ok=True)
     _plot_rows(pictures / "sideslip.png", figures, rows, names)
@@ -147,10 +140,6 @@ def write_page(out: Path, folder: Path) -> None:
 
 def _deg(value: float, digits: int = 3) -> str:
     return number(math.degrees(value), digits)
-
-
-def _grid(rows: Sequence[str], names: Sequence[str], cell: Callable[[str, str], str], corner: str = "row") -> str:
-    return _table([corner, *names], [[r, *(cell(r, n) for n in names)] for r in rows])
 
 
 def _table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
@@ -208,7 +197,7 @@ def _counts(figures: Figures, rows: Sequence[str], subject: str, references: Seq
     """Return in how many rows the ratio of medians is better, not worse, open or worse."""
     body = []
     for reference in references:
-        bounds = {r: b for r in rows if math.isfinite((b := ratios(figures, r, subject, reference)[0]).value)}
+        bounds = {r: b for r in rows if math.isfinite((b := ratio(figures, r, subject, reference)).value)}
         words = [verdict(b) for b in bounds.values()]
         above = [f"{r} ({b.value:.2f})" for r, b in bounds.items() if b.value > MARGIN]
         counts = [str(words.count(w)) for w in ("better", "not worse", "open", "worse")]
@@ -223,7 +212,11 @@ def _counts(figures: Figures, rows: Sequence[str], subject: str, references: Seq
     )
 
 
-def _sideslip(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
+def _tables(figures: Figures, rows: Sequence[str], names: Sequence[str], facts: Facts) -> str:
+    """Return all tables: a line for each row, a column for each estimator."""
+    references = [r for r in facts.references if r in names and r != facts.subject]
+    compared = [n for n in names if n in {facts.subject, *references}]
+
     def mark(row: str, name: str) -> str:
         return "†" if pooled_mean(*figures.get(row, name, "availability")) < AVAILABLE else ""
 
@@ -237,101 +230,40 @@ def _sideslip(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> st
     def pooled(row: str, name: str) -> str:
         return _deg(pooled_rmse(*figures.get(row, name))) + mark(row, name)
 
-    return "\n".join(
-        [
-            "## Sideslip RMSE in degrees: median over drives",
-            "",
-            f"† the estimator gave no valid estimate at more than {100 * (1 - AVAILABLE):.0f} % of the stamps, which",
-            "the figure leaves out.",
-            "",
-            _grid(rows, names, middle),
-            "## Sideslip RMSE in degrees: 10th to 90th percentile over drives",
-            "",
-            _grid(rows, names, spread),
-            "## Sideslip RMSE in degrees: pooled over all samples",
-            "",
-            _grid(rows, names, pooled),
-        ]
+    def ratio_text(row: str, reference: str) -> str:
+        bound = ratio(figures, row, str(facts.subject), reference)
+        if not math.isfinite(bound.value):
+            return "–"
+        return f"{bound.value:.2f} [{number(bound.low, 2)}, {number(bound.high, 2)}] {_MARKS[verdict(bound)]}"
+
+    def nonlinear(row: str, name: str) -> str:
+        return _deg(median(figures.get(row, name, segment=NONLINEAR)[0]))
+
+    def consistency(row: str, name: str) -> str:
+        nees, nis, dof = (
+            pooled_mean(*figures.get(row, name, metric, signal="state")) for metric in ("nees", "nis", "nis_dof")
+        )
+        return f"{number(nees / 3.0, 2)} / {number(nis / dof, 2)}"
+
+    sections = (
+        ("Sideslip RMSE in degrees: median over drives", _UNAVAILABLE, names, middle),
+        ("Sideslip RMSE in degrees: 10th to 90th percentile over drives", "", names, spread),
+        ("Sideslip RMSE in degrees: pooled over all samples", "", names, pooled),
+        (f"`{facts.subject}` against its references: ratio of the medians", _RATIOS, references, ratio_text),
+        ("Sideslip RMSE in degrees in the nonlinear range (|a_y| > 0.5 μ g): median over drives", "", names, nonlinear),
+        ("NEES and NIS over their degrees of freedom (expected value 1)", "", compared, consistency),
     )
-
-
-def common_rows(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the rows in which all estimators have figures, and those estimators: who misses most rows is left out."""
-    kept = [n for n in names if 2 * sum(figures.get(r, n)[0].size > 0 for r in rows) > len(rows)]
-    return [r for r in rows if all(figures.get(r, n)[0].size for n in kept)], kept
-
-
-def _means(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
-    shared, kept = common_rows(figures, rows, names)
-    if not shared:
-        return ""
-
-    def over(row_figure: Callable[[str, str], float]) -> list[float]:
-        return [geometric_mean(np.array([row_figure(r, n) for r in shared])) for n in kept]
-
-    medians = over(lambda r, n: median(figures.get(r, n)[0]))
-    pooled = over(lambda r, n: pooled_rmse(*figures.get(r, n)))
-    body = [[n, _deg(m), _deg(p)] for n, m, p in zip(kept, medians, pooled, strict=True)]
-    title = f"## Geometric mean over {len(shared)} rows, in degrees\n\nThe rows in which all of these ran.\n"
-    return f"{title}\n{_table(['estimator', 'of the medians', 'of the pooled RMSE'], body)}"
-
-
-def ratios(figures: Figures, row: str, subject: str, reference: str) -> tuple[Bound, Bound]:
-    """Return the ratio of medians and of pooled RMSE of two estimators in a row, paired."""
-    a, b, n_a, n_b = figures.pair(row, subject, reference)
-    return median_ratio(a, b), pooled_ratio(a, b, n_a, n_b)
-
-
-def _against(figures: Figures, rows: Sequence[str], subject: str | None, references: Sequence[str]) -> str:
-    if subject is None or not references:
-        return ""
-    found = {(r, ref): ratios(figures, r, subject, ref) for r in rows for ref in references}
-
-    def cell(which: int) -> Callable[[str, str], str]:
-        def text(row: str, reference: str) -> str:
-            bound = found[row, reference][which]
-            if not math.isfinite(bound.value):
-                return "–"
-            return f"{bound.value:.2f} [{number(bound.low, 2)}, {number(bound.high, 2)}] {_MARKS[verdict(bound)]}"
-
-        return text
-
-    lines = [
-        f"## `{subject}` against its references",
-        "",
-        f"Ratio of sideslip RMSE, below 1 where `{subject}` is better, with the 95 % interval of a paired bootstrap",
-        f"over drives ({RESAMPLES} resamples). **<** the whole interval lies below 1; = it lies below {MARGIN};",
-        f"**>** it lies above {MARGIN}; ? it decides nothing.",
-        "",
-        "Of the medians:",
-        "",
-        _grid(rows, references, cell(0)),
-        "Of the pooled RMSE:",
-        "",
-        _grid(rows, references, cell(1)),
+    texts = [
+        f"## {title}\n\n{text}{_table(['row', *columns], [[r, *(cell(r, n) for n in columns)] for r in rows])}"
+        for title, text, columns, cell in sections
+        if columns
     ]
-    return "\n".join(lines)
+    return "\n".join(["# Tables of the simulated conditions\n", *texts, _coverage(figures, rows, names, facts.subject)])
 
 
-def _nonlinear(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
-    title = "## Sideslip RMSE in the nonlinear range (|a_y| > 0.5 μ g), in degrees: median over drives\n\n"
-    return title + _grid(rows, names, lambda row, name: _deg(median(figures.get(row, name, segment=NONLINEAR)[0])))
-
-
-def _consistency(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
-    if not names:
-        return ""
-
-    def state(row: str, name: str, metric: str) -> float:
-        return pooled_mean(*figures.get(row, name, metric, signal="state"))
-
-    def cell(row: str, name: str) -> str:
-        nees = state(row, name, "nees") / 3.0
-        nis = state(row, name, "nis") / state(row, name, "nis_dof")
-        return f"{number(nees, 2)} / {number(nis, 2)}"
-
-    title = "## NEES and NIS, each over its degrees of freedom (1 is right)\n\n"
-    return title + _grid(rows, names, cell)
+def ratio(figures: Figures, row: str, subject: str, reference: str) -> Bound:
+    """Return the ratio of the medians of two estimators in a row, paired."""
+    return median_ratio(*figures.pair(row, subject, reference))
 
 
 def _bin_cell(figures: Figures, row: str, name: str, segment: str) -> str:
@@ -369,17 +301,6 @@ def _coverage(figures: Figures, rows: Sequence[str], names: Sequence[str], subje
     return "\n".join(lines)
 
 
-def _lags(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
-    def cell(row: str, name: str) -> str:
-        lags = [median(figures.get(row, name, "lag_s", signal=s)[0]) for s in (SIDESLIP, "yaw_rate_rad_s")]
-        return " / ".join(number(1e3 * x, 1) for x in lags)
-
-    if not names:
-        return ""
-    what = "By cross-correlation with the truth, median over drives; + is late."
-    return f"## Lag of sideslip / yaw rate in ms\n\n{what}\n\n{_grid(rows, names, cell)}"
-
-
 def _plot_rows(path: Path, figures: Figures, rows: Sequence[str], names: Sequence[str]) -> None:
     """Median with the span from the 10th to the 90th percentile, a line a row; most estimators as grey dots."""
     spans = {n: np.degrees([percentiles(figures.get(r, n)[0]) for r in rows]).reshape(-1, 3) for n in names}
@@ -392,7 +313,7 @@ def _plot_ratios(path: Path, figures: Figures, rows: Sequence[str], subject: str
     """Ratios of medians with their intervals."""
     spans = {}
     for reference in references:
-        bounds = [ratios(figures, r, subject, reference)[0] for r in rows]
+        bounds = [ratio(figures, r, subject, reference) for r in rows]
         spans[reference] = np.array([(b.low, b.value, b.high) for b in bounds])
     label = f"median sideslip RMSE of {subject} over that of the reference, 95 % interval"
     _plot(path, rows, spans, label, limits={1.0: "-", MARGIN: ":"})
@@ -416,8 +337,8 @@ def _plot(
     for i, span in enumerate(medians.values()):
         label_of = None if i else "the others of the table"
         axes.plot(span[:, 1], np.arange(len(rows)), "|", markersize=7, color="0.6", zorder=1.5, label=label_of)
-    for at, dash in limits.items():
-        axes.axvline(at, color="black", linewidth=0.8, linestyle=dash)
+    for limit, dash in limits.items():
+        axes.axvline(limit, color="black", linewidth=0.8, linestyle=dash)
     axes.set(xscale="log", xlabel=label, ylim=(len(rows) - 0.5, -0.5))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.set_yticks(range(len(rows)), rows)

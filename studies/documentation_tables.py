@@ -19,7 +19,7 @@ from pdhef_logtool.runs.config import RunConfig
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Return a page with its tables; raises KeyError for one of an unknown name."""
-    return re.sub(r"<!-- table: (\w+) -->", lambda found: "\n".join(_TABLES[found[1]]()), markdown)
+    return re.sub(r"<!-- table: (\w+) -->", lambda match: "\n".join(_TABLES[match[1]]()), markdown)
 
 
 def _metrics() -> Iterator[str]:

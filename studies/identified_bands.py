@@ -25,7 +25,7 @@ from pdhef_logtool.runs.estimating import calibrator
 from studies.condition_drives import root_mean_square
 from studies.many_cars import FIT_ITERATIONS, PARTS
 from studies.pages import number, table
-from studies.self_calibration import Simulated, make_wrong, say, simulate
+from studies.self_calibration import COVERAGE_HEAD, Simulated, coverage_cells, make_wrong, say, simulate
 
 #: Manoeuvre, km/h, seconds (None: its own). The first of each kind is identified on where it is one of ``FIT_ON``.
 DRIVEN = (
@@ -41,7 +41,7 @@ FIT_ON = ("sine-sweep-wide", "road")
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A band on a drive: what the car was identified on, what is driven, RMSE in rad, and how two bands stand.
+    """An interval on a drive: what the car was identified on, what is driven, RMSE in rad, and two intervals.
 
     ``own``, ``band`` : of the filter alone, and with the posterior: share of the errors inside, and the whole mean
     width over the RMSE.
@@ -54,82 +54,80 @@ class Judged:
     band: tuple[float, float]
 
 
-def identified(one: Simulated) -> Car:
+def identified(simulated: Simulated) -> Car:
     """Return the car as the tool identifies ``physics`` on a drive, from a file with the root of its factors wrong."""
-    file = make_wrong(one.file, *np.sqrt(one.factors))
-    drive = one.drive
+    file = make_wrong(simulated.file, *np.sqrt(simulated.factors))
+    drive = simulated.drive
     assert drive.truth is not None
     fit = [FitDrive(drive.name, drive.signals, drive.truth, independent_yaw_rate=True, log_start_ns=drive.log_start_ns)]
-    found = fit_physics(fit, file, PARTS, starts=({},), iterations=FIT_ITERATIONS)
+    fitted = fit_physics(fit, file, PARTS, starts=({},), iterations=FIT_ITERATIONS)
 
     def values(vehicle: VehicleParameters) -> FittedValues:
-        return FittedValues.between(found.vehicle, vehicle)
+        return FittedValues.between(fitted.vehicle, vehicle)
 
-    varied = tuple(map(values, varied_vehicles(fit, file, found)))
-    smoothing = fit_smoothing(fit, file, found)
+    varied = tuple(map(values, varied_vehicles(fit, file, fitted)))
+    smoothing = fit_smoothing(fit, file, fitted)
     physics = FittedPhysics(
-        values=FittedValues.of(found.vehicle), noise=found.noise, smoothing=smoothing, varied=varied
+        values=FittedValues.of(fitted.vehicle), noise=fitted.noise, smoothing=smoothing, varied=varied
     )
-    return replace(Car.of(file), fitted_physics=physics).with_noise(PHYSICS, found.noise)
+    return replace(Car.of(file), fitted_physics=physics).with_noise(PHYSICS, fitted.noise)
 
 
-def judged(car: Car, fit: Simulated, one: Simulated) -> Judged:
-    """Judge the band of a car on a drive."""
-    estimator, signals = make_estimator(PHYSICS, car), one.drive.signals
+def judged(car: Car, fit: Simulated, simulated: Simulated) -> Judged:
+    """Evaluate the interval of a car on a drive."""
+    estimator, signals = make_estimator(PHYSICS, car), simulated.drive.signals
     plain, _ = run_window(estimator, signals)
     wide = calibrator(car, [estimator]).add(plain, signals)
-    error = one.error(plain)
-    known = np.isfinite(error) & np.isfinite(plain.sideslip_std_rad)
-    error, rmse = np.abs(error[known]), root_mean_square(error[known])
+    error = simulated.error(plain)
+    finite = np.isfinite(error) & np.isfinite(plain.sideslip_std_rad)
+    error, rmse = np.abs(error[finite]), root_mean_square(error[finite])
 
     def stands(std: np.ndarray) -> tuple[float, float]:
-        half = NORMAL_95 * std[known]
+        half = NORMAL_95 * std[finite]
         return float(np.mean(error <= half)), float(2.0 * np.mean(half) / rmse)
 
-    own, band = stands(plain.sideslip_std_rad), stands(wide.sideslip_std_rad)
-    return Judged(fit.manoeuvre, one.manoeuvre, rmse, own, band)
+    of_filter, band = stands(plain.sideslip_std_rad), stands(wide.sideslip_std_rad)
+    return Judged(fit.manoeuvre, simulated.manoeuvre, rmse, of_filter, band)
 
 
 def judge(cars: int, seed: int) -> list[Judged]:
     """Simulate, identify and judge."""
-    found: list[Judged] = []
+    results: list[Judged] = []
     drives = simulate(cars, seed, DRIVEN)
     for index in sorted({d.car for d in drives}):
-        own = [d for d in drives if d.car == index]
+        of_car = [d for d in drives if d.car == index]
         for kind in FIT_ON:
-            fit = next((d for d in own if d.manoeuvre == kind), None)
+            fit = next((d for d in of_car if d.manoeuvre == kind), None)
             if fit is None:
                 continue
             car = identified(fit)
-            found += [judged(car, fit, d) for d in own if d is not fit and d not in fit_drives(own)]
+            results += [judged(car, fit, d) for d in of_car if d is not fit and d not in fit_drives(of_car)]
             say(f"car {index}, identified on {kind}")
-    return found
+    return results
 
 
-def fit_drives(own: Sequence[Simulated]) -> list[Simulated]:
+def fit_drives(drives: Sequence[Simulated]) -> list[Simulated]:
     """Return the drives that some car was identified on: they judge none."""
-    return [next(d for d in own if d.manoeuvre == kind) for kind in FIT_ON if any(d.manoeuvre == kind for d in own)]
+    return [
+        next(d for d in drives if d.manoeuvre == kind) for kind in FIT_ON if any(d.manoeuvre == kind for d in drives)
+    ]
 
 
-def _groups(found: Sequence[Judged]) -> dict[str, list[Judged]]:
+def _groups(results: Sequence[Judged]) -> dict[str, list[Judged]]:
     """Return driving like that of the identification, and other driving."""
     return {
-        "of the kind that it was identified on": [j for j in found if j.fit == j.driven],
-        "of other kinds": [j for j in found if j.fit != j.driven],
-        "all": list(found),
+        "of the kind that it was identified on": [j for j in results if j.fit == j.driven],
+        "of other kinds": [j for j in results if j.fit != j.driven],
+        "all": list(results),
     }
 
 
-def bands_table(found: Sequence[Judged]) -> str:
+def bands_table(results: Sequence[Judged]) -> str:
     """Return shares and widths, driving like that of the identification apart."""
     body = []
-    for name, some in _groups(found).items():
-        for which, values in (("its own", [j.own for j in some]), ("with the posterior", [j.band for j in some])):
-            shares, widths = np.array(values).T
-            low, middle, high = (f"{x:.0%}" for x in np.percentile(shares, [10, 50, 90]))
-            within = f"{np.mean((shares >= 0.90) & (shares <= 0.98)):.0%}"
+    for name, some in _groups(results).items():
+        for which, pairs in (("its own", [j.own for j in some]), ("with the posterior", [j.band for j in some])):
+            shares, width = coverage_cells(pairs)
             rmse = number(float(np.degrees(np.median([j.rmse for j in some]))))
-            row = [name, str(len(some)), rmse, which, f"{np.mean(shares):.0%}", low, middle, high, within]
-            body.append([*row, number(float(np.median(widths)), 2)])
-    head = ["driving", "drives", "RMSE, deg: median", "interval", "coverage: mean", "10 %", "median", "90 %"]
-    return table([*head, "intervals at 90 to 98 %", "width / RMSE: median"], body, right_from=4)
+            body.append([name, str(len(some)), rmse, which, *shares, width])
+    return table(["driving", "drives", "RMSE, deg: median", "interval", *COVERAGE_HEAD], body, right_from=4)

@@ -1,11 +1,10 @@
 """Short drives of many simulated cars, each with a vehicle file of its own: what one network for many cars learns from.
 
-Saloons and SUVs of all loads, heights, tyres and wear, with sensors of all qualities; the hatchback is kept for cars
-that no network ever saw. A car's file is fitted to a ramp steer of it (``fit_vehicle``), as somebody who
-has measured his car would have it; ``physics`` of it is identified by the tool on its first drives, with the truth of
-an INS that is mounted a little askew: the network is trained for filters as it will meet them. Residuals are taken from
-the other drives, with perfect truth: from those of the INS the network learnt its noise (the validation loss rose from
-the second epoch on). Drives are split by car.
+Saloons and SUVs of all loads, heights, tyres and wear, with sensors of all qualities; hatchbacks are reserved for cars
+that no network was trained on. The file of a car is fitted to a ramp steer (``fit_vehicle``), as after a measurement.
+``physics`` is identified by the tool on the first drives, with ground truth of an INS that is mounted slightly askew.
+Residuals are computed from the other drives with exact ground truth, because the network learned the noise of the INS
+(the validation loss rose from the second epoch on). Drives are split by car.
 
     python -m studies.many_cars
 
@@ -91,7 +90,7 @@ STEER_GAIN = 0.01
 STEER_PLAY_RAD = (0.0, 0.003)
 #: Where the IMU may be from where the car's file has it, forward and to the left; the same of the INS, and its heading.
 LEVER_M, TRUTH_LEVER_M, TRUTH_HEADING_RAD = 0.15, 0.1, np.radians(0.3)
-#: What a car is identified with: recognised types, the friction that was driven on, a proving ground's truth.
+#: What a car is identified with: recognised types, the friction that was driven on, ground truth of a proving ground.
 MAPPING = TRAINING_MAPPING + "".join(
     f"""
 [truth.{name}]
@@ -133,8 +132,8 @@ def draw_car(rng: np.random.Generator, base: VehicleParameters, kinds: tuple[str
             fitted = fit_vehicle(car, FIT_FRICTION, base)
         except (SimulationError, ValueError):
             continue  # rolls over or spins in the ramp
-        own = {"name": text, "wheel_radius_m": car.wheel_radius_m, "steering_ratio": car.steering_ratio}
-        return DrawnCar(text, fitted.model_copy(update=own), _sensors(rng))
+        entries = {"name": text, "wheel_radius_m": car.wheel_radius_m, "steering_ratio": car.steering_ratio}
+        return DrawnCar(text, fitted.model_copy(update=entries), _sensors(rng))
 
 
 def _sensors(rng: np.random.Generator) -> tuple[tuple[str, float], ...]:
@@ -222,7 +221,7 @@ def write_cars(
 def identify_cars(folder: Path) -> list[str]:
     """Identify the cars of a set on their first drives; return the logs of the others.
 
-    Those of the others stand in a manifest of their own in ``folder``/residuals, with the files of the identified cars.
+    Those of the others are in a manifest of their own in ``folder``/residuals, with the files of the identified cars.
     """
     manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
     by_car: dict[int, list[dict[str, Any]]] = {}
@@ -236,10 +235,10 @@ def identify_cars(folder: Path) -> list[str]:
     for index, entries in by_car.items():
         name = f"car_{index:04d}"
         if not (others / name / FIT_FILE).is_file():
-            own, logs = folder / entries[0]["vehicle_file"], [folder / e["file"] for e in entries[:FIT_DRIVES]]
+            vehicle_file, logs = folder / entries[0]["vehicle_file"], [folder / e["file"] for e in entries[:FIT_DRIVES]]
             (others / name).mkdir(exist_ok=True)
-            shutil.copy(own, others / name / VEHICLE_FILE)
-            (others / name / FIT_FILE).write_text(identified(own, logs, mapping), encoding="utf-8")
+            shutil.copy(vehicle_file, others / name / VEHICLE_FILE)
+            (others / name / FIT_FILE).write_text(identified(vehicle_file, logs, mapping), encoding="utf-8")
         for entry in entries[FIT_DRIVES:]:
             link = others / entry["file"]
             if not link.exists():
@@ -251,13 +250,13 @@ def identify_cars(folder: Path) -> list[str]:
 
 def identified(file: Path, logs: Sequence[Path], mapping: Path) -> str:
     """Return the fit of a car with its ``physics`` as the tool identifies it on drives."""
-    own, given = load_vehicle(file), load_mapping(mapping)
-    read = (load_fit_drive(LogInput(log, log.stem), Car.of(own), given, ReadOptions())[1] for log in logs)
+    vehicle, given = load_vehicle(file), load_mapping(mapping)
+    read = (load_fit_drive(LogInput(log, log.stem), Car.of(vehicle), given, ReadOptions())[1] for log in logs)
     drives = [drive for drive in read if drive is not None]
-    found = fit_physics(drives, own, PARTS, starts=({},), iterations=FIT_ITERATIONS)
-    values = FittedValues.of(found.vehicle)
-    noise = found.noise.model_copy(update={"physics_sha256": physics_sha256(values.applied_to(own))})
-    fit = Fit(physics_sha256=physics_sha256(own), physics=FittedPhysics(values=values, noise=noise))
+    fitted = fit_physics(drives, vehicle, PARTS, starts=({},), iterations=FIT_ITERATIONS)
+    values = FittedValues.of(fitted.vehicle)
+    noise = fitted.noise.model_copy(update={"physics_sha256": physics_sha256(values.applied_to(vehicle))})
+    fit = Fit(physics_sha256=physics_sha256(vehicle), physics=FittedPhysics(values=values, noise=noise))
     return part_toml(fit, "Written by python -m studies.many_cars.")
 
 

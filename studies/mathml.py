@@ -19,7 +19,7 @@ _PATTERN = re.compile(
     r"|(?<![\\\w$])\$(?=[^\s$])(?P<inline>[^$\n]*[^\s$\\])\$(?!\w)",
     re.MULTILINE | re.DOTALL,
 )
-#: What stands in a page for an equation until the page is HTML: Markdown must not read the equation.
+#: Placeholder of an equation in a page until the page is HTML: Markdown must not read the equation.
 _PLACEHOLDER = "\ue000{}\ue001"
 _equations: list[str] = []
 #: A function's name whose argument has no bracket: it needs a space.
@@ -43,7 +43,7 @@ def mathml(latex: str, *, block: bool = False) -> str:
     Raises
     ------
     PluginError
-        The converter does not know a command, or the braces do not match.
+        A command is not supported by the converter, or the braces do not match.
     """
     try:
         markup = convert(latex, display="block" if block else "inline")

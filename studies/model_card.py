@@ -34,21 +34,21 @@ LEAST_SAMPLES = 100
 
 def errors_deg(folder: Path, split: str, car: Car) -> dict[str, list[float]]:
     """Return the sideslip RMSE in degrees of every estimator on every drive of a split."""
-    found: dict[str, list[float]] = {}
+    errors: dict[str, list[float]] = {}
     for entry in drives_of(folder, split):
         drive = read_drive(folder / entry["file"], car)
         ready, _ = runnable(ESTIMATORS, car, drive.signals.available)
         for estimator in ready:
             error = np.degrees(sideslip_error(estimator, drive))
             if np.count_nonzero(np.isfinite(error)) >= LEAST_SAMPLES:
-                found.setdefault(estimator.name, []).append(root_mean_square(error))
-    return found
+                errors.setdefault(estimator.name, []).append(root_mean_square(error))
+    return errors
 
 
-def error_table(found: dict[str, list[float]]) -> str:
+def error_table(errors: dict[str, list[float]]) -> str:
     """Return a Markdown table: median, 10th and 90th percentile and pooled RMSE."""
     body = []
-    for name, values in found.items():
+    for name, values in errors.items():
         low, mid, high = np.quantile(values, [0.1, 0.5, 0.9])
         body.append(
             [
@@ -63,7 +63,7 @@ def error_table(found: dict[str, list[float]]) -> str:
 
 
 def network_line(name: str, network: ModelBundle) -> list[str]:
-    """Say what a network is and how its training ended."""
+    """Return what a network is and how its training ended."""
     p: dict[str, Any] = network.provenance
     shape = (str(len(network.feature_names)), f"{network.layers} × {network.hidden}")
     weights = f"{sum(w.size for w in network.weights.values()):,}"
@@ -95,29 +95,29 @@ def page(work: Path, car: Car) -> str:
 This page describes the shipped network. Command: `python -m studies.model_card`; training: `make train-default`.
 
 - Place: `pdhef_logtool/models/default`, {size / 2**20:.2f} MB, sha256 `{model.sha256[:16]}…`.
-- What it is for: what `physics` of the simulated saloon lacks (`vehicle.toml` and `fit.toml` beside it). On another car
-  its trust is capped by that car's own evidence; on this one it is {car.allowed_trust.cap:g}. The baselines beside it
-  are of the nominal model and older: they did not change with it.
+- Purpose: residual of `physics` of the simulated saloon (`vehicle.toml` and `fit.toml` beside it). On another car its
+  residual gain is limited by validation data of that car; on this one the limit is {car.allowed_trust.cap:g}. The
+  baselines in its folder use the nominal model.
 - Data: simulated, {DRIVES} drives of 12.5 s of that car (seed {SETS["one_car"][0]}), friction 0.3 to 1.0, 40 to
-  120 km/h, sensors with [their errors](method.md#sensors); friction is told by the simulator. {splits}; split by drive.
+  120 km/h, sensors with [errors](method.md#sensors); the simulator provides the friction. {splits}; split by drive.
 - Training: seed {recipe["seed"]}, one cycle up to a learning rate of {recipe["learning_rate"]:g}, on
   {model.provenance["training_hours"]:.2f} h of driving.
 
 {table(["network", "features", "LSTM", "weights", "epochs", "validation loss", "test loss"], networks)}
 
-Losses are mean squares of normalised targets. `pure-lstm` has another target: its losses compare with no other.
+Losses are mean squares of normalised targets. `pure-lstm` has a different target, so its losses are not comparable.
 
-## Sideslip RMSE on drives that took no part
+## Sideslip RMSE on test drives
 
-Sensors have [their errors](method.md#sensors); friction is told.
+Sensors have [errors](method.md#sensors); the true friction is given.
 
 {chr(10).join(parts)}
 ## Limits
 
-- One family of simulated cars. It knows nothing of trucks, of worn dampers, of tyres near their temperature limit.
-- Fishhooks are in no training drive; the condition table (`docs/conditions.md`) has them, faults, wrong friction, bank.
+- The training drives are of one family of simulated cars, without trucks, worn dampers or overheated tyres.
+- No training drive is a fishhook; [conditions](conditions.md) contains fishhooks, faults, wrong friction and bank.
 - Below the vehicle's low-speed limit the residual is switched off.
-- What a real car brings is in `make real`; for yours: `pdhef learn`.
+- Real cars: [recorded drives](real.md). For your car: `pdhef learn`.
 """
 
 

@@ -15,7 +15,7 @@ STYLE = {"font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "legend.fontsize"
 def subplots(
     rows: int, columns: int, width: float, height: float, style: Mapping[str, Any], **options: Any
 ) -> tuple[Any, Any]:
-    """Return a figure of a size in inches and its axes, [rows, columns]; ``style`` holds for all that follow."""
+    """Return a figure of a size in inches and its axes, [rows, columns]; ``style`` applies to all following figures."""
     import matplotlib as mpl
 
     mpl.use("Agg")

@@ -1,90 +1,76 @@
-"""Recorded drives: fit on one part, score once on another that took no part in anything (docs/method.md#evaluation).
+"""Recorded drives: identify and train on one part, score on another part (docs/method.md#evaluation).
 
-    python -m studies.real [--network model/] [--out docs] [--trials 64] [--cases 250lm,...] [--work out/real]
+    python -m studies.real [--network NETWORK] [--out docs] [--trials 64] [--cases 250lm,...]
 
-Every scored part calibrates the catalogue's car once without truth, as ``pdhef run`` does. Where a case has a part to
-fit on, the vehicle is identified there, a linear regression is fitted there, and the network is trained on the first
-80 % of it: alone, and from ``--network`` as its start. The rest of the part says how far each network may be trusted.
-The filters' noise is then tuned on the part with the same trials for each. ``pdhef learn`` then makes a car of the same
-part, all by itself: what a user gets. Every figure is on the other part, with an interval by bootstrap of blocks. The
-other cases are scored with their catalogue vehicle and ``--network`` as they are. The drives lie in ``../shared`` and
-may not be redistributed: where they are absent it says so and ends with 0, and the page holds figures only.
+Each case scores the published vehicle file, the same file calibrated on the scored part without ground truth (as
+``pdhef run`` does), and, where there is a part to learn from, the car that ``pdhef learn`` identifies there, without
+and with its other stages. RMSE has an interval by bootstrap of blocks. The drives are in ``../shared`` and may not be
+redistributed. Without them, the command ends with 0 and writes nothing.
 
-Rows that are finished stay in ``--work`` and are taken as long as nothing that they rest on has changed. How often a
-part was scored is in ``studies/results/real/looks.json`` and on the page: repeated
-evaluation makes figures optimistic.
+``studies/results/real/looks.json`` counts the evaluations of each scored part: repeated evaluation makes figures
+optimistic.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import polars as pl
-from scipy.signal import butter, sosfilt
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import Trust
 from pdhef_logtool.drive.reading import WholeDrive, read_drive
-from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
-from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
 from pdhef_logtool.estimators.table import SPECS, runnable
 from pdhef_logtool.evaluation.bootstrap import block_sums
 from pdhef_logtool.evaluation.comparison import Errors, compare, shown_interval
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
-from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive
-from pdhef_logtool.learning.drives import IDENTIFY, NOISE, LearnSettings
+from pdhef_logtool.learning.drives import IDENTIFY, LearnSettings
 from pdhef_logtool.learning.engine import learn
-from pdhef_logtool.learning.evidence.trust import decide_cap
-from pdhef_logtool.learning.stages.gain import errors_by_trust
-from pdhef_logtool.learning.stages.network import train_on_parts
-from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.errors import PdhefError
-from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.records.steps import released_steps
-from pdhef_logtool.residual_model.bundle import NO_MODEL, ModelBundle
+from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, self_calibrated
 from pdhef_logtool.storage.documents import digest
 from pdhef_logtool.storage.files import PendingFile, write_bytes
 from studies.condition_drives import SIDESLIP
+from studies.condition_runs import source_digest
 from studies.pages import DOCS, DRIVES, RESULTS, ROOT, number, options, table, table_rows, write
 
 REFERENCE = ROOT / "tests" / "reference"
 #: Share of the fit part that the network learns from; the rest, behind a guard, stops its training.
 TRAIN_SHARE, GUARD_S = 0.8, 5.0
 #: Against which all others are judged, the first that ran.
-YARDSTICKS = ("phy-ukf:tuned, identified", "phy-ukf, catalogue")
+YARDSTICKS = ("phy-ukf:tuned, identified", "phy-ukf, datasheet")
 
 
 #: What needs no car; what needs no network; what may have one.
 FREE = ("zero", "kinematic")
 PHYSICAL = tuple(s.name for s in SPECS if not s.network and s.name not in (*FREE, "zero:no-lateral", OPEN_LOOP))
 NETWORKS = tuple(s.name for s in SPECS if s.network)
-#: Versions of this page, and of the published files on docs/calibration.md, before looks were counted.
+#: Versions of this page, and of the published files on docs/calibration.md, before evaluations were counted.
 LOOKS_BEFORE = 6
 LOOKS_BEFORE_PUBLISHED = {"250lm": 9, "gti": 8, "tts": 8, "v40": 8}
 LOOKS_FILE = "looks.json"
 #: Columns of the page, with patterns of the names in the tables.
 SUMMARY = {
     "zero": "zero",
-    "open-loop, datasheet": "open-loop, catalogue",
-    "phy-ukf, datasheet": "phy-ukf, catalogue",
-    "physics, datasheet": "physics, catalogue",
+    "open-loop, datasheet": "open-loop, datasheet",
+    "phy-ukf, datasheet": "phy-ukf, datasheet",
+    "physics, datasheet": "physics, datasheet",
     "physics, self-calibrated": "physics .*self-calibrated",
     "physics, identified": "physics, identified",
-    "pd-hef, learn": "pd-hef( at trust .*)?, learnt",
+    "pd-hef, learn": "pd-hef( at gain limit .*)?, learn",
 }
 EVALUATED = "Number of evaluations on this part, at least:"
 PAGE = """# Recorded drives
@@ -105,7 +91,7 @@ errors of each block. The drives may not be redistributed.
 
 
 def say(text: str) -> None:
-    """Tell who waits."""
+    """Print progress."""
     print(text, file=sys.stderr)
 
 
@@ -138,78 +124,21 @@ class Case:
     remark: str = ""
 
 
-_SPINS = "Drifts and spins; the origin of the true body frame against the CG is not stated."
-CASES = (
-    Case(
-        "250lm",
-        "Ferrari 250 LM on a race track, fitted on 0 to 150 s, scored on 155 to 300 s",
-        Part("revs_250lm_a.mcap", 155.0),
-        "revs_250lm",
-        "revs_250lm",
-        Part("revs_250lm_a.mcap", 0.0, 150.0),
-        remark="The speed and the yaw rate of this log are the truth's own channels: neither is scored, and the "
-        "sideslip is that of estimators that know the true longitudinal velocity.",
-    ),
-    Case(
-        "f1tenth-xray",
-        "1:10 race car, fitted on run hoons 2, scored on run xray 24",
-        Part("f1tenth_xray_run24.bag"),
-        "f1tenth",
-        "f1tenth",
-        Part("f1tenth_hoons_run2.bag"),
-        1.0,
-        _SPINS,
-    ),
-    Case(
-        "f1tenth-hoons",
-        "1:10 race car, fitted on run xray 24, scored on run hoons 2",
-        Part("f1tenth_hoons_run2.bag"),
-        "f1tenth",
-        "f1tenth",
-        Part("f1tenth_xray_run24.bag"),
-        1.0,
-        _SPINS,
-    ),
-    Case(
-        "gti",
-        "VW GTI on a handling course, fitted on 0 to 50 s, scored on 55 to 102 s",
-        Part("niki_gti_1khz.mcap", 55.0),
-        "niki_gti",
-        "niki_gti",
-        Part("niki_gti_1khz.mcap", 0.0, 50.0),
-        remark="The speed is that of the INS and the yaw rate the truth's own channel: neither is scored.",
-    ),
-    Case(
-        "tts",
-        "Audi TT-S, fitted on 0 to 60 s, scored on 65 to 125 s",
-        Part("tts_kk.mcap", 65.0),
-        "tts_kk",
-        "tts_kk",
-        Part("tts_kk.mcap", 0.0, 60.0),
-        remark="The accelerometer is at the rear axle; there is no longitudinal acceleration.",
-    ),
-    Case(
-        "v40",
-        "Volvo V40, sine with dwell at 80 km/h, scored only",
-        Part("lunda_v40"),
-        "lunda_v40",
-        "lunda_v40",
-        remark="The speed is GNSS ground speed, nearly the truth itself. Three blocks at most: intervals say little.",
-    ),
-    Case(
-        "comma2k19",
-        "Toyota RAV4 on a motorway, scored only",
-        Part("comma2k19_segment.mcap"),
-        "comma2k19",
-        "comma2k19_rav4",
-        remark="The truth is at a camera that is turned by about 0.8 degrees, too coarse for sideslip: nothing can be "
-        "claimed here.",
-    ),
-)
+def load_cases() -> tuple[Case, ...]:
+    """Return the cases of ``real.toml``."""
+    cases = []
+    for name, entry in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items():
+        for key in {"score", "fit"} & entry.keys():
+            entry[key] = Part(*entry[key])
+        cases.append(Case(name=name, **entry))
+    return tuple(cases)
+
+
+CASES = load_cases()
 
 
 def files(case: Case) -> tuple[Path, Path]:
-    """Return the mapping file and the catalogue's vehicle file of a case."""
+    """Return the mapping file and the datasheet vehicle file of a case."""
     return REFERENCE / "mappings" / f"{case.mapping}.toml", REFERENCE / "vehicles" / f"{case.vehicle}.toml"
 
 
@@ -222,105 +151,56 @@ def read_part(part: Part, mapping_file: Path, car: Car) -> WholeDrive:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Row:
-    """Errors of one line of a table, and the mean width of their 95 % band over their RMSE; NaN without a band."""
+    """Errors of one line of a table, and the mean width of the 95 % interval over the RMSE (NaN: none)."""
 
     errors: Errors
     width: float = float("nan")
 
 
-@dataclass(frozen=True, slots=True)
-class Finished:
-    """What earlier calls have finished of a case, by stage, in a folder; only what has the same ``basis`` counts."""
-
-    folder: Path
-    basis: str
-
-    def stage(self, name: str, work: Callable[[], tuple[list[Row], str]]) -> tuple[list[Row], str]:
-        """Return the rows and the remark of a stage, from an earlier call where there is one."""
-        file = self.folder / f"{name}.npz"
-        if file.is_file():
-            with np.load(file) as stored:
-                told = json.loads(str(stored["told"]))
-                if told["basis"] == self.basis:
-                    say(f"{file.stem} of {self.folder.name} is finished")
-                    return [_stored_row(stored, i, *row) for i, row in enumerate(told["rows"])], told["remark"]
-        rows, remark = work()
-        columns = {"told": np.array(json.dumps(
-            {"basis": self.basis, "remark": remark, "rows": [[r.errors.name, r.width] for r in rows]}
-        ))}  # fmt: skip
-        for i, row in enumerate(rows):
-            columns |= {f"error{i}": row.errors.error, f"stamps{i}": row.errors.stamps_ns}
-            if row.errors.inside is not None:
-                columns[f"inside{i}"] = row.errors.inside
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with PendingFile(file) as pending, pending.path.open("wb") as out:
-            np.savez_compressed(out, allow_pickle=False, **columns)
-        return rows, remark
-
-
-def _stored_row(stored: np.lib.npyio.NpzFile, i: int, name: str, width: float) -> Row:
-    inside = stored.get(f"inside{i}")
-    return Row(Errors(name, stored[f"error{i}"], stored[f"stamps{i}"], inside), width)
-
-
-def source_sha256() -> str:
-    """Return the digest of all code that a figure may rest on."""
-    found = hashlib.sha256()
-    for folder in ("pdhef_logtool", "studies"):
-        for file in sorted((ROOT / folder).rglob("*.py")):
-            found.update(file.read_bytes())
-    return found.hexdigest()
-
-
 def scored(case: Case, label: str, car: Car, names: Sequence[str]) -> list[Row]:
-    """Run estimators of a car on the scored part, with the bands that ``pdhef run`` gives them."""
+    """Run estimators of a car on the scored part, with the intervals of ``pdhef run``."""
     part = read_part(case.score, files(case)[0], car)
     assert part.truth is not None
     ready, skipped = runnable(names, car, part.plan.alignment.available)
     for s in skipped:
         say(f"{case.name}: {s.name}, {label} is skipped: {s.reason}")
     rows = []
-    for e in [*ready, *half_trust(ready)]:
+    for e in ready:
         say(f"{case.name}: {e.name}, {label}")
         track, _ = run_window(e, part.signals)
         track = calibrator(car, [e]).add(track, part.signals)
         error = signal_error(track, part.truth, SIDESLIP, case.min_speed_m_s)
         shown = e.name if e.causal else f"{e.name} (not causal)"
         if e.name in ("pd-hef", "pd-hef-smoothed"):
-            shown += f" at trust {car.allowed_trust.cap:g}"
+            shown += f" at gain limit {car.allowed_trust.cap:g}"
         half = NORMAL_95 * track.sideslip_std_rad
-        known = np.isfinite(error) & np.isfinite(half)
-        inside = np.abs(error) <= half if known.any() else None
-        width = 2.0 * np.mean(half[known]) / np.sqrt(np.mean(error[known] ** 2)) if known.any() else np.nan
+        finite = np.isfinite(error) & np.isfinite(half)
+        inside = np.abs(error) <= half if finite.any() else None
+        width = 2.0 * np.mean(half[finite]) / np.sqrt(np.mean(error[finite] ** 2)) if finite.any() else np.nan
         name = f"{shown}, {label}" if label else shown
         rows.append(Row(Errors(name, error, part.truth.stamps_ns, inside), float(width)))
     return rows
 
 
-def run_case(case: Case, network: Path, trials: int, finished: Finished) -> tuple[list[Row], list[str]]:
+def run_case(case: Case, network: Path, trials: int) -> tuple[list[Row], list[str]]:
     """Fit what is to be fitted; return the rows of everything on the scored part, and remarks."""
-    stages: dict[str, Callable[[], tuple[list[Row], str]]] = {
-        "given": lambda: given_car(case, network),
-        "self-calibrated": lambda: self_calibrated_car(case),
-    }
+    parts = [given_car(case, network), self_calibrated_car(case)]
     if case.fit is not None:
-        stages |= {"identified": lambda: identified_car(case, network, trials)}
-        stages |= {"learnt": lambda: learnt_car(case, network, trials)}
-    found = [finished.stage(name, work) for name, work in stages.items()]
-    return [row for rows, _ in found for row in rows], [remark for _, remark in found if remark]
+        parts += [identified_car(case), trained_car(case, network, trials)]
+    return [row for rows, _ in parts for row in rows], [remark for _, remark in parts if remark]
 
 
 def given_car(case: Case, network: Path) -> tuple[list[Row], str]:
-    """Score the catalogue's car as it stands."""
-    catalogue = Car.load(files(case)[1], network=network)
-    rows = scored(case, "", catalogue, FREE) + scored(case, "catalogue", catalogue, PHYSICAL)
-    return rows + (scored(case, "catalogue, given network", catalogue, NETWORKS) if catalogue.network else []), ""
+    """Score the unchanged datasheet car."""
+    datasheet = Car.load(files(case)[1], network=network)
+    rows = scored(case, "", datasheet, FREE) + scored(case, "datasheet", datasheet, PHYSICAL)
+    return rows + (scored(case, "datasheet, given network", datasheet, NETWORKS) if datasheet.network else []), ""
 
 
 def self_calibrated_car(case: Case) -> tuple[list[Row], str]:
-    """Score the catalogue's car after the scored part has calibrated it, without truth."""
-    mapping_file, catalogue_file = files(case)
-    car, options = Car.load(catalogue_file), replace(case.score.config.read_options, friction=None)
+    """Score the datasheet car after the scored part has calibrated it, without ground truth."""
+    mapping_file, vehicle_file = files(case)
+    car, options = Car.load(vehicle_file), replace(case.score.config.read_options, friction=None)
     with read_drive(DRIVES / case.score.log, car, load_mapping(mapping_file), options) as drive:
         calibration = checked(drive, calibrate_drive(drive, RunConfig()))
         if calibration is None:
@@ -331,158 +211,54 @@ def self_calibrated_car(case: Case) -> tuple[list[Row], str]:
     return rows, f"Self-calibration: {calibration.text}."
 
 
-def learnt_car(case: Case, network: Path, trials: int) -> tuple[list[Row], str]:
-    """Score the car that ``pdhef learn`` makes of the fit part, before which it knows the catalogue's file."""
+def trained_car(case: Case, network: Path, trials: int) -> tuple[list[Row], str]:
+    """Score the car that ``pdhef learn`` makes of the datasheet car on the training part."""
     assert case.fit is not None
-    mapping_file, catalogue_file = files(case)
+    mapping_file, vehicle_file = files(case)
     given = None if str(network) == NO_MODEL else network
-    config = replace(case.fit.config, mapping=mapping_file, car=catalogue_file, network=given)
-    # The scored part is the last part here: nothing of the fit part is held back for one.
+    config = replace(case.fit.config, mapping=mapping_file, car=vehicle_file, network=given)
+    # The scored part is the test split: the training part has none of its own.
     settings = LearnSettings(config=config, trials=trials, holdout=0.0)
     with tempfile.TemporaryDirectory() as name:
-        car = Path(name) / "learnt"
+        car = Path(name) / "car"
         say(f"{case.name}: learn")
         try:
-            found = learn([str(DRIVES / case.fit.log)], car, settings, warn=say)
+            learned = learn([str(DRIVES / case.fit.log)], car, settings, warn=say)
         except PdhefError as error:
-            return [], f"Nothing could be learnt: expected {error.expected}, got {error.got}."
-        rows = scored(case, "learnt", Car.load(car), ("physics", "pd-hef", "pd-hef-smoothed"))
-    return rows, f"learn: {', '.join(f'{s.name} {s.status}' for s in found.stages)}."
+            return [], f"The car could not be trained: expected {error.expected}, got {error.got}."
+        rows = scored(case, "learn", Car.load(car), ("physics", "pd-hef", "pd-hef-smoothed"))
+    return rows, f"learn: {', '.join(f'{s.name} {s.status}' for s in learned.stages)}."
 
 
-def identified_car(case: Case, network: Path, trials: int) -> tuple[list[Row], str]:
-    """Score what the single commands make of the fit part, step by step."""
+def identified_car(case: Case) -> tuple[list[Row], str]:
+    """Score the car that is identified on the training part, without a network."""
     assert case.fit is not None
-    mapping_file, catalogue_file = files(case)
-    results: list[Row] = []
-
-    def add(label: str, car: Car, names: Sequence[str]) -> None:
-        results.extend(scored(case, label, car, names))
-
-    catalogue = Car.load(catalogue_file, network=network)
+    mapping_file, vehicle_file = files(case)
+    config = replace(case.fit.config, mapping=mapping_file, car=vehicle_file)
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        log, config = [str(DRIVES / case.fit.log)], replace(case.fit.config, mapping=mapping_file)
+        car = Path(name) / "identified"
         say(f"{case.name}: identification")
         try:
-            settings = LearnSettings(config=replace(config, car=catalogue_file), stages=(IDENTIFY,), holdout=0.0)
-            learn(log, folder / "identified", settings)
+            learn([str(DRIVES / case.fit.log)], car, LearnSettings(config=config, stages=(IDENTIFY,), holdout=0.0))
         except PdhefError as error:
-            say(str(error))
-            return results, f"The car could not be identified: expected {error.expected}, got {error.got}."
-        config = replace(config, car=folder / "identified")
-        identified = Car.load(config.car, network=NO_MODEL)
-        results += [Row(e) for e in regressions(case, case.fit, mapping_file, catalogue)]
-        add("identified", identified, PHYSICAL)
-        hybrids = [n for n in NETWORKS if n.startswith("pd-hef")]
-        tried = {"network of this part": train(case, config, folder / "alone", None)}
-        if catalogue.network is not None:
-            own = train(case, config, folder / "fine-tuned", catalogue.network)
-            tried = {"given network": catalogue.network, **tried, "network fine-tuned": own}
-        for label, bundle in tried.items():
-            say(f"{case.name}: trust in the {label}")
-            add(f"identified, {label}", with_evidence(case, identified, bundle), hybrids)
-        last, bundle = list(tried.items())[-1]
-        bundle.save(folder / "last")
-        say(f"{case.name}: tuning, {trials} trials")
-        config = replace(config, network=folder / "last")
-        learn(log, folder / "tuned", LearnSettings(config=config, stages=(NOISE,), trials=trials), warn=say)
-        tuned = Car.load(folder / "tuned", network=NO_MODEL)
-        add("tuned", tuned, ("phy-ukf:tuned", "physics"))
-        add(f"tuned, {last}", with_evidence(case, tuned, bundle), hybrids)
-    return results, ""
+            return [], f"The car could not be identified: expected {error.expected}, got {error.got}."
+        return scored(case, "identified", Car.load(car, network=NO_MODEL), PHYSICAL), ""
 
 
 def blocks(case: Case, results: Sequence[Row]) -> list[tuple[str, str, int, int, float]]:
     """Return case, estimator, block, stamps and RMSE in degrees of each block, for comparisons in pairs."""
     rows = []
     for r in (row.errors for row in results):
-        (sums,), counts, at = block_sums([r.error], r.stamps_ns)
+        (sums,), counts, block_ids = block_sums([r.error], r.stamps_ns)
         rmse = np.degrees(np.sqrt(sums / counts))
-        rows += [(case.name, r.name, *row) for row in zip(at.tolist(), counts.tolist(), rmse.tolist(), strict=True)]
+        rows += [
+            (case.name, r.name, *row) for row in zip(block_ids.tolist(), counts.tolist(), rmse.tolist(), strict=True)
+        ]
     return rows
 
 
-def split_fit(case: Case) -> dict[str, Part]:
-    """Return the part that a network learns from, and what is left of the fit part behind a guard."""
-    assert case.fit is not None
-    part, end_s = case.fit, case.fit.end_s
-    if end_s is None:
-        mapping_file, catalogue_file = files(case)
-        with read_drive(DRIVES / part.log, Car.load(catalogue_file), load_mapping(mapping_file)) as drive:
-            end_s = (drive.log.end_ns - drive.log.start_ns) * 1e-9
-    cut = part.start_s + TRAIN_SHARE * (end_s - part.start_s)
-    return {"train": replace(part, end_s=cut), "validation": replace(part, start_s=cut + GUARD_S, end_s=end_s)}
-
-
-def with_evidence(case: Case, car: Car, network: ModelBundle) -> Car:
-    """Return the car with a network and the trust that the end of the fit part allows, which none was fitted to.
-
-    The car and the filters' noise were fitted to that end as well: there is no more driving to have.
-    """
-    car = replace(car, network=network)
-    held = read_part(split_fit(case)["validation"], files(case)[0], car)
-    decision = decide_cap(errors_by_trust(car, held, use_speed=True))
-    return replace(car, trust=Trust(trust_cap=decision.cap, evidence=decision.reason, network_sha256=network.sha256))
-
-
-def half_trust(ready: Sequence[Estimator]) -> list[Estimator]:
-    """Return the fixed hybrid filter at half trust, where the fixed one runs."""
-    name = "pd-hef:fixed-r"
-    fixed = [e for e in ready if e.name == name and isinstance(e, AdaptivePhysics)]
-    return [replace(e, trust=0.5, name=f"{name} at trust 0.5") for e in fixed]
-
-
-def train(case: Case, config: RunConfig, folder: Path, init: ModelBundle | None) -> ModelBundle:
-    """Train a network on the first share of the fit part, stopped by the rest of it; ``init`` is its start."""
-    say(f"{case.name}: training {folder.name}")
-    slices = {
-        split: ([str(DRIVES / part.log)], replace(config, start=part.config.start, end=part.config.end))
-        for split, part in split_fit(case).items()
-    }
-    return train_on_parts(slices, folder, init)
-
-
-def regression_features(drive: FitDrive, *, low_pass: bool) -> FloatArray:
-    """Return δ, a_y, r, r/v_x, a_y/v_x², δ v_x, a_x and 1 at the stamps [N, 8], as old as an estimator has them.
-
-    With ``low_pass`` all go through a causal 2 Hz filter first.
-    """
-    s = drive.signals
-    known = np.isfinite(s.speed_m_s)
-    speed = np.interp(s.stamps_ns, s.stamps_ns[known], s.speed_m_s[known])
-    turning, sideways, steered = s.yaw_rate_rad_s / speed, s.ay_m_s2 / speed**2, s.steer_rad * speed
-    columns = [s.steer_rad, s.ay_m_s2, s.yaw_rate_rad_s, turning, sideways, steered, s.ax_m_s2]
-    x = np.nan_to_num(np.stack(columns, axis=1))
-    if low_pass:
-        x = sosfilt(butter(2, 2.0, fs=100.0, output="sos"), x, axis=0)
-    x = x[np.maximum(released_steps(s.ready_ns, s.stamps_ns), 0)]
-    return np.column_stack([x, np.ones(len(x))])
-
-
-def regressions(case: Case, part: Part, mapping_file: Path, car: Car) -> list[Errors]:
-    """Fit a linear regression of the sideslip on seven features, raw and low-passed, and score it."""
-    loaded = [
-        load_fit_drive(LogInput(DRIVES / p.log, p.log), car, load_mapping(mapping_file), p.config.read_options)[1]
-        for p in (part, case.score)
-    ]
-    fit, score = (d for d in loaded if d is not None)
-    results = []
-    for low_pass in (False, True):
-        moving = np.hypot(fit.truth.vx_m_s, fit.truth.vy_m_s) > case.min_speed_m_s
-        x = regression_features(fit, low_pass=low_pass)
-        known = np.isfinite(fit.truth.sideslip_rad) & moving & np.isfinite(x).all(axis=1)
-        weights, *_ = np.linalg.lstsq(x[known], fit.truth.sideslip_rad[known], rcond=None)
-        error = regression_features(score, low_pass=low_pass) @ weights - score.truth.sideslip_rad
-        speed = np.hypot(score.truth.vx_m_s, score.truth.vy_m_s)
-        error = np.where(speed > case.min_speed_m_s, error, np.nan)
-        label = "linear regression, 7 features" + (", 2 Hz" if low_pass else "")
-        results.append(Errors(label, error, score.truth.stamps_ns))
-    return results
-
-
 def case_table(results: Sequence[Row]) -> str:
-    """Return a case's table: RMSE, how much was scored, the difference to the yardstick, and the 95 % bands."""
+    """Return a case's table: RMSE, how much was scored, the difference to the yardstick, and the 95 % intervals."""
     errors, widths = [r.errors for r in results], {r.errors.name: r.width for r in results}
     yard = next((n for n in YARDSTICKS if n in widths), None)
     body = []
@@ -498,12 +274,12 @@ def case_table(results: Sequence[Row]) -> str:
 def count_look(file: Path, case: Case, basis: str) -> int:
     """Count a look at a scored part, unless it is the same that was counted last, and return how many there were."""
     looks = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    known = looks.get(case.name, {"looks": LOOKS_BEFORE + LOOKS_BEFORE_PUBLISHED.get(case.name, 0), "basis": ""})
-    if known["basis"] != basis:
-        known = {"looks": known["looks"] + 1, "basis": basis}
+    entry = looks.get(case.name, {"looks": LOOKS_BEFORE + LOOKS_BEFORE_PUBLISHED.get(case.name, 0), "basis": ""})
+    if entry["basis"] != basis:
+        entry = {"looks": entry["looks"] + 1, "basis": basis}
         file.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(file, (json.dumps({**looks, case.name: known}, indent=1, sort_keys=True) + "\n").encode())
-    return int(known["looks"])
+        write_bytes(file, (json.dumps({**looks, case.name: entry}, indent=1, sort_keys=True) + "\n").encode())
+    return int(entry["looks"])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -514,14 +290,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--cases", default=",".join(c.name for c in CASES))
     parser.add_argument("--out", type=Path, default=DOCS)
     parser.add_argument("--results", type=Path, default=RESULTS / "real")
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "real", help="rows that are finished; kept")
     given = parser.parse_args(arguments)
     if not DRIVES.is_dir():
         print("needs ../shared beside the repository (recorded drives that may not be redistributed); nothing is done")
         return 0
-    wanted, known = given.cases.split(","), [c.name for c in CASES]
-    if set(wanted) - set(known):
-        parser.error(f"--cases: expected names out of {', '.join(known)}, got {given.cases}")
+    wanted, case_names = given.cases.split(","), [c.name for c in CASES]
+    if set(wanted) - set(case_names):
+        parser.error(f"--cases: expected names out of {', '.join(case_names)}, got {given.cases}")
 
     network = Car.load(network=given.network).network
     used = "none" if network is None else f"sha256 {network.sha256[:12]}"
@@ -533,11 +308,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "",
     ]
     stored: list[tuple[str, str, int, int, float]] = []
-    source = source_sha256()
+    source = source_digest()
     for case in (c for c in CASES if c.name in wanted):
         lines += [f"## {case.title}", "", f"Scored above {case.min_speed_m_s:g} m/s. {case.remark}", ""]
         basis = digest([case.name, repr(case), used, given.trials, source])
-        results, remarks = run_case(case, given.network, given.trials, Finished(given.work / case.name, basis))
+        results, remarks = run_case(case, given.network, given.trials)
         looks = count_look(given.results / LOOKS_FILE, case, basis)
         remarks.append(f"{EVALUATED} {looks}.")
         lines += [case_table(results), "", *(line for remark in remarks for line in (remark, ""))]

@@ -1,4 +1,4 @@
-"""Cars that calibrate themselves without truth: simulated ones with wrong files, and published files of real cars.
+"""Calibration without ground truth: simulated cars with wrong files, and published files of real cars.
 
 Each simulated car drives a wide sine sweep and a road. Its vehicle file, fitted to a ramp steer, gets a stiffness error
 of a factor 0.5 to 2 at each axle. Each drive calibrates the car for itself, as ``pdhef run`` does.
@@ -43,8 +43,6 @@ from truthsim.batch import sensor_noise
 from truthsim.drive import simulate_drive
 from truthsim.vehicle_choice import choose_vehicle
 
-SEED = 77_002
-CARS = 50
 #: Manoeuvre, km/h, seconds (None: its own).
 DRIVEN: tuple[tuple[str, float, float | None], ...] = (("sine-sweep-wide", 90.0, None), ("road", 100.0, 240.0))
 FRICTIONS = (0.85, 1.0)
@@ -94,8 +92,8 @@ def make_wrong(vehicle: VehicleParameters, front: float, rear: float) -> Vehicle
 
 
 def simulate(cars: int, seed: int, driven: Sequence[tuple[str, float, float | None]] = DRIVEN) -> list[Simulated]:
-    """Return the drives of the cars; one that cannot be driven is left out and told."""
-    found = []
+    """Return the drives of the cars; one that cannot be driven is left out, with a message."""
+    drives_of_cars = []
     for index in range(cars):
         rng = np.random.default_rng([seed, index])
         car = draw_car(rng, load_vehicle(BASE), (*KINDS, "hatchback"))
@@ -118,8 +116,8 @@ def simulate(cars: int, seed: int, driven: Sequence[tuple[str, float, float | No
                 say(f"car {index}, {manoeuvre} is left out: {error}")
                 continue
             logged = as_logged(drive, Car.of(file))
-            found.append(Simulated(index, manoeuvre, logged, file, (float(front), float(rear))))
-    return found
+            drives_of_cars.append(Simulated(index, manoeuvre, logged, file, (float(front), float(rear))))
+    return drives_of_cars
 
 
 def calibrate(signals: Signals, file: VehicleParameters) -> SelfCalibration:
@@ -129,42 +127,42 @@ def calibrate(signals: Signals, file: VehicleParameters) -> SelfCalibration:
     return self_calibrate([reader.finish()], file)
 
 
-def taken(signals: Signals, file: VehicleParameters, found: SelfCalibration) -> Car:
+def taken(signals: Signals, file: VehicleParameters, calibration: SelfCalibration) -> Car:
     """Return a car as a run of a log has it after a calibration, which may have been refused."""
-    if found.refused:
+    if calibration.refused:
         return Car.of(file)
-    calibrated = WithoutTruth(found.vehicle, found.noise, told_friction=True, note="")
+    calibrated = WithoutTruth(calibration.vehicle, calibration.noise, told_friction=True, note="")
     car = replace(Car.of(file), self_calibrated=calibrated)
     track, _ = run_window(make_estimator("physics", car), signals)
-    low, sensors = file.low_speed_blend_m_s, log_sensors(file, found)
+    low, sensors = file.low_speed_blend_m_s, log_sensors(file, calibration)
     driven = driven_d2(*driving_products(track, signals, low_speed_m_s=low, sensors=sensors))
-    return replace(car, self_calibrated=replace(calibrated, varied=found.varied, driven_d2_m_s=driven))
+    return replace(car, self_calibrated=replace(calibrated, varied=calibration.varied, driven_d2_m_s=driven))
 
 
 def band_of(drive: WholeDrive, car: Car) -> tuple[float, float]:
-    """Return how much of the sideslip errors the 95 % band of ``physics`` holds, and its mean whole width over RMSE."""
+    """Return coverage of the 95 % interval of ``physics``, and its mean whole width over RMSE."""
     assert drive.truth is not None
     estimator = make_estimator("physics", car)
     track = calibrator(car, [estimator]).add(run_window(estimator, drive.signals)[0], drive.signals)
     error = signal_error(track, drive.truth, SIDESLIP, car.vehicle.low_speed_blend_m_s)
-    known = np.isfinite(error) & np.isfinite(track.sideslip_std_rad)
-    error, half = error[known], NORMAL_95 * track.sideslip_std_rad[known]
+    finite = np.isfinite(error) & np.isfinite(track.sideslip_std_rad)
+    error, half = error[finite], NORMAL_95 * track.sideslip_std_rad[finite]
     return float(np.mean(np.abs(error) <= half)), float(2.0 * np.mean(half) / np.sqrt(np.mean(error**2)))
 
 
 def errors_of(
-    drive: WholeDrive, car: Car, names: Sequence[str], found: SelfCalibration
+    drive: WholeDrive, car: Car, names: Sequence[str], calibration: SelfCalibration
 ) -> dict[str, tuple[float, float]]:
     """Return sideslip RMSE in degrees and d2 in m/s of estimators, by name."""
     whole = {ALL: np.ones(len(drive.signals), dtype=np.bool_)}
-    sensors = log_sensors(car.vehicle, found)
+    sensors = log_sensors(car.vehicle, calibration)
     errors = {}
     truth = drive.truth
     assert truth is not None
     low = car.vehicle.low_speed_blend_m_s
     for name in names:
         if name == "physics" and car.self_calibrated is None and "physics" not in car.noise:
-            car = car.with_noise("physics", found.noise.model_copy(update={"r_std": {}}))
+            car = car.with_noise("physics", calibration.noise.model_copy(update={"r_std": {}}))
         used = "open-loop" if name == OPEN_LOOP and car.self_calibrated is None else name
         track, _ = run_window(make_estimator(used, car), drive.signals)
         rows = d2_rows([track], drive.signals, whole, log="", low_speed_m_s=low, sensors=sensors)
@@ -186,21 +184,24 @@ class Outcome:
     bands: tuple[tuple[float, float], ...]  # from the wrong file and the right one, without those refused: band_of
 
 
-def outcome_of(one: Simulated) -> Outcome:
+def outcome_of(simulated: Simulated) -> Outcome:
     """Run a drive with its files."""
-    wrong = make_wrong(one.file, *one.factors)
-    found, from_right = calibrate(one.drive.signals, wrong), calibrate(one.drive.signals, one.file)
+    wrong = make_wrong(simulated.file, *simulated.factors)
+    calibration, from_right = (
+        calibrate(simulated.drive.signals, wrong),
+        calibrate(simulated.drive.signals, simulated.file),
+    )
     names, after = ("zero", "open-loop", "phy-ukf", "physics"), (OPEN_LOOP, "physics")
-    signals = one.drive.signals
-    calibrated, as_right = taken(signals, wrong, found), taken(signals, one.file, from_right)
+    signals = simulated.drive.signals
+    calibrated, as_right = taken(signals, wrong, calibration), taken(signals, simulated.file, from_right)
     return Outcome(
-        one.manoeuvre,
-        errors_of(one.drive, Car.of(one.file), names, found),
-        errors_of(one.drive, Car.of(wrong), names, found),
-        errors_of(one.drive, calibrated, after, found),
-        errors_of(one.drive, as_right, after, from_right),
-        found.refused,
-        tuple(band_of(one.drive, car) for car in (calibrated, as_right) if car.self_calibrated is not None),
+        simulated.manoeuvre,
+        errors_of(simulated.drive, Car.of(simulated.file), names, calibration),
+        errors_of(simulated.drive, Car.of(wrong), names, calibration),
+        errors_of(simulated.drive, calibrated, after, calibration),
+        errors_of(simulated.drive, as_right, after, from_right),
+        calibration.refused,
+        tuple(band_of(simulated.drive, car) for car in (calibrated, as_right) if car.self_calibrated is not None),
     )
 
 
@@ -225,17 +226,25 @@ def simulated_table(outcomes: Sequence[Outcome]) -> str:
     return table(head, body, right_from=1)
 
 
+def coverage_cells(pairs: Sequence[tuple[float, float]]) -> tuple[list[str], str]:
+    """Return mean, 10, 50 and 90 % quantiles and share at 90 to 98 % of coverages, and the median relative width."""
+    coverage, width = np.array(pairs).T
+    shares = (np.mean(coverage), *np.percentile(coverage, [10, 50, 90]))
+    shares += (np.mean((coverage >= 0.90) & (coverage <= 0.98)),)
+    return [f"{x:.0%}" for x in shares], number(float(np.median(width)), 2)
+
+
+COVERAGE_HEAD = ["coverage: mean", "10 %", "median", "90 %", "intervals at 90 to 98 %", "width / RMSE: median"]
+
+
 def band_table(outcomes: Sequence[Outcome]) -> str:
-    """Return coverage and width of the 95 % bands on calibrated cars."""
+    """Return coverage and width of the 95 % intervals on calibrated cars."""
     body = []
     for name in [*dict.fromkeys(o.manoeuvre for o in outcomes), "all"]:
-        found = np.array([b for o in outcomes if name in (o.manoeuvre, "all") for b in o.bands])
-        low, middle, high = (f"{x:.0%}" for x in np.percentile(found[:, 0], [10, 50, 90]))
-        inside = np.mean((found[:, 0] >= 0.90) & (found[:, 0] <= 0.98))
-        mean, width = f"{np.mean(found[:, 0]):.0%}", number(float(np.median(found[:, 1])), 2)
-        body.append([name, str(len(found)), mean, low, middle, high, f"{inside:.0%}", width])
-    head = ["drive", "intervals", "coverage: mean", "10 %", "median", "90 %", "intervals at 90 to 98 %"]
-    return table([*head, "width / RMSE: median"], body, right_from=1)
+        pairs = [b for o in outcomes if name in (o.manoeuvre, "all") for b in o.bands]
+        shares, width = coverage_cells(pairs)
+        body.append([name, str(len(pairs)), *shares, width])
+    return table(["drive", "intervals", *COVERAGE_HEAD], body, right_from=1)
 
 
 def d2_table(outcomes: Sequence[Outcome]) -> str:
@@ -248,19 +257,19 @@ def d2_table(outcomes: Sequence[Outcome]) -> str:
             best = min(others, key=lambda v: v[1], default=None)
             if best is not None and np.isfinite(d2):
                 pairs.append((d2 / best[1], error / best[0]))
-    found, body = np.array(pairs), []
+    values, body = np.array(pairs), []
     limits = (0.0, 0.9, 1.0, 1.05, 1.1, FACTOR, 1.5, 2.0, np.inf)
     for low, high in pairwise(limits):
-        inside = found[(found[:, 0] >= low) & (found[:, 0] < high), 1]
+        inside = values[(values[:, 0] >= low) & (values[:, 0] < high), 1]
         if inside.size:
             cells = [f"{x:.2f}" for x in np.percentile(inside, [0, 10, 50, 100])]
             body.append([f"{low:g} to {high:g}", str(inside.size), *cells])
-    head = ["d2 / least of the others", "estimates", "RMSE / that one's: least", "10 %", "median", "most"]
+    head = ["v̇_y residual / lowest of the others", "estimates", "RMSE ratio: lowest", "10 %", "median", "most"]
     return table(head, body, right_from=1)
 
 
 def published_table() -> tuple[str, list[str]]:
-    """Return the published files on their drives, and what each calibration said."""
+    """Return the published files on their drives, and the text of each calibration."""
     body, said = [], []
     for car, (name, log) in PUBLISHED.items():
         try:

@@ -1,11 +1,10 @@
-"""The maths of the condition table: pooling, percentiles, geometric means, paired bootstrap over drives, intervals.
+"""The maths of the condition table: pooling, percentiles, paired bootstrap over drives, intervals.
 
 All functions take one figure a drive. A drive whose figure is NaN (nothing to score) does not count.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,14 +35,14 @@ def pooled_rmse(rmse: FloatArray, samples: FloatArray) -> float:
 
 def pooled_mean(mean: FloatArray, samples: FloatArray) -> float:
     """Return the mean over all samples of all drives from each drive's mean [N] and number of samples [N]."""
-    known = np.isfinite(mean) & (samples > 0)
-    return float(np.sum(samples[known] * mean[known]) / np.sum(samples[known])) if known.any() else float("nan")
+    finite = np.isfinite(mean) & (samples > 0)
+    return float(np.sum(samples[finite] * mean[finite]) / np.sum(samples[finite])) if finite.any() else float("nan")
 
 
 def percentiles(values: FloatArray, levels: tuple[float, ...] = (10.0, 50.0, 90.0)) -> tuple[float, ...]:
     """Return percentiles over drives [N] by linear interpolation."""
-    known = values[np.isfinite(values)]
-    return tuple(np.percentile(known, levels).tolist()) if known.size else (float("nan"),) * len(levels)
+    finite = values[np.isfinite(values)]
+    return tuple(np.percentile(finite, levels).tolist()) if finite.size else (float("nan"),) * len(levels)
 
 
 def median(values: FloatArray) -> float:
@@ -51,50 +50,22 @@ def median(values: FloatArray) -> float:
     return percentiles(values, (50.0,))[0]
 
 
-def geometric_mean(values: FloatArray) -> float:
-    """Return exp(mean(log x)) of positive values; NaN if one of them is not."""
-    known = np.asarray(values, dtype=np.float64)
-    if known.size == 0 or not np.all(known > 0.0):
-        return float("nan")
-    return float(np.exp(np.mean(np.log(known))))
-
-
 def median_ratio(rmse: FloatArray, other: FloatArray) -> Bound:
-    """Return median(rmse) / median(other) over drives [N], paired, with its bootstrap interval."""
-    return _paired(lambda a, b, _a, _b: np.median(a, axis=1) / np.median(b, axis=1), rmse, other, None, None)
+    """Return median(rmse) / median(other) over drives [N], paired, with its bootstrap interval.
 
-
-def pooled_ratio(rmse: FloatArray, other: FloatArray, samples: FloatArray, other_samples: FloatArray) -> Bound:
-    """Return the ratio of pooled RMSE over drives [N], paired, with its bootstrap interval."""
-
-    def ratio(a: FloatArray, b: FloatArray, n_a: FloatArray, n_b: FloatArray) -> FloatArray:
-        first = (n_a * a**2).sum(axis=1) / n_a.sum(axis=1)
-        return np.asarray(np.sqrt(first / ((n_b * b**2).sum(axis=1) / n_b.sum(axis=1))))
-
-    return _paired(ratio, rmse, other, samples, other_samples)
-
-
-def _paired(
-    statistic: Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray],
-    first: FloatArray,
-    second: FloatArray,
-    first_samples: FloatArray | None,
-    second_samples: FloatArray | None,
-) -> Bound:
-    """Draw whole drives with replacement, the same for both sides; percentile interval of the statistic."""
-    known = np.isfinite(first) & np.isfinite(second)
-    columns = [first, second, *(np.ones_like(first) if s is None else s for s in (first_samples, second_samples))]
-    a, b, n_a, n_b = (np.asarray(c, dtype=np.float64)[known][None, :] for c in columns)
-    drives = a.shape[1]
-    nan = float("nan")
+    The bootstrap draws whole drives with replacement, the same for both sides.
+    """
+    finite = np.isfinite(rmse) & np.isfinite(other)
+    a, b = rmse[finite], other[finite]
+    drives, nan = len(a), float("nan")
     if drives == 0:
         return Bound(nan, nan, nan, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        value = float(statistic(a, b, n_a, n_b)[0])
+        value = float(np.median(a) / np.median(b))
         if drives < 2:
             return Bound(value, nan, nan, drives)
         draw = np.random.default_rng(0).integers(drives, size=(RESAMPLES, drives))
-        resampled = statistic(a[0][draw], b[0][draw], n_a[0][draw], n_b[0][draw])
+        resampled = np.median(a[draw], axis=1) / np.median(b[draw], axis=1)
     low, high = np.nanpercentile(resampled, [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)])
     return Bound(value, float(low), float(high), drives)
 
@@ -110,7 +81,7 @@ def interval_score(error: FloatArray, sigma: FloatArray) -> FloatArray:
 
 
 def verdict(bound: Bound, *, margin: float = 1.05) -> str:
-    """Say what the interval of a ratio decides: better, worse (by more than the margin), not worse, or open."""
+    """Return what the interval of a ratio decides: better, worse (by more than the margin), not worse, or open."""
     if not np.isfinite(bound.low):
         return "–"
     if bound.high < 1.0:

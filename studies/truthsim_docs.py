@@ -1,4 +1,4 @@
-"""Build the figures and tables of ``docs/truthsim.md``: what the truth simulator does beside what theory says.
+"""Build the figures and tables of ``docs/truthsim.md``: the simulator compared with theory.
 
     python -m studies.truthsim_docs [docs]
 
@@ -46,7 +46,7 @@ def open_loop(speed_m_s: float, steer_rad: FloatArray) -> Plan:
 
 
 def free_rolling(car: Vehicle) -> Vehicle:
-    """Return a car without drag and rolling resistance: linear theory knows no traction."""
+    """Return a car without drag and rolling resistance: linear theory has no traction."""
     return car._replace(drag_area_m2=0.0, rolling_resistance=0.0)
 
 
@@ -80,8 +80,8 @@ def steady_state(folder: Path) -> dict[str, str]:
         a_y = motion.column("ay_m_s2") / G
         angles = ((np.degrees(understeer), np.degrees(theory)), (np.degrees(roll), np.degrees(roll_theory)))
         loads = ((front, front_theory), (rear, rear_theory))
-        cells = [f"{own * G:.2f} / {said * G:.2f}" for own, said in angles]
-        rows.append([name, *cells, *(f"{own * G:.0f} / {said * G:.0f}" for own, said in loads), f"{a_y.max():.2f}"])
+        cells = [f"{sedan * G:.2f} / {said * G:.2f}" for sedan, said in angles]
+        rows.append([name, *cells, *(f"{sedan * G:.0f} / {said * G:.0f}" for sedan, said in loads), f"{a_y.max():.2f}"])
         ax.plot(a_y, np.degrees(beyond), color=COLOURS[name], label=f"{name}, simulated")
         line = np.array([0.0, 0.5])
         ax.plot(line, np.degrees(theory) * G * line, "--", color=COLOURS[name], linewidth=1.0)
@@ -123,11 +123,11 @@ def measured_response(car: Vehicle, frequency: float, speed: float) -> tuple[lis
     rows = t > t[-1] - 3.0 / frequency
     turn = 2 * np.pi * frequency * t[rows]
     basis = np.stack([np.sin(turn), np.cos(turn)], axis=1)
-    found = [
+    evaluated = [
         complex(*np.linalg.lstsq(basis, motion.column(name)[rows], rcond=None)[0]) / 0.002
         for name in ("yaw_rate_rad_s", "ay_m_s2", "roll_rad")
     ]
-    return found, float(motion.column("vx_m_s")[rows].mean())
+    return evaluated, float(motion.column("vx_m_s")[rows].mean())
 
 
 def responses(folder: Path) -> dict[str, str]:
@@ -138,17 +138,17 @@ def responses(folder: Path) -> dict[str, str]:
     fig, axes = subplots(2, 2, 8.4, 5.4, _STYLE)
     worst = {name: [0.0, 0.0] for name in ("yaw rate", "lateral acceleration", "roll")}
     for speed, colour in ((60.0 / 3.6, "#3b8550"), (100.0 / 3.6, "#1f5fa8")):
-        found = [measured_response(car, float(f), speed) for f in points]
+        evaluated = [measured_response(car, float(f), speed) for f in points]
         theory_here = [
-            frequency_response(free_rolling(car), float(f), v, DRY) for f, (_, v) in zip(points, found, strict=True)
+            frequency_response(free_rolling(car), float(f), v, DRY) for f, (_, v) in zip(points, evaluated, strict=True)
         ]
         for k, name in enumerate(worst):
-            ratios = np.array([m[k] for m, _ in found]) / np.array([h[k] for h in theory_here])
+            ratios = np.array([m[k] for m, _ in evaluated]) / np.array([h[k] for h in theory_here])
             worst[name][0] = max(worst[name][0], float(np.abs(np.abs(ratios) - 1.0).max()))
             worst[name][1] = max(worst[name][1], float(np.abs(np.degrees(np.angle(ratios))).max()))
         theory = np.array([frequency_response(free_rolling(car), float(f), speed, DRY) for f in fine])
         for k, scale in ((0, 1.0), (1, np.radians(1.0) / G)):
-            measured = np.array([m[k] for m, _ in found])
+            measured = np.array([m[k] for m, _ in evaluated])
             label = f"{speed * 3.6:.0f} km/h"
             axes[0, k].plot(fine, scale * np.abs(theory[:, k]), color=colour, label=f"{label}, linear theory")
             axes[0, k].plot(points, scale * np.abs(measured), "o", color=colour, markersize=4, label="simulated")
@@ -285,7 +285,7 @@ def other_stiffness_n_per_rad(ramp_run: Any) -> tuple[float, float]:
 def like_the_other(front_n_per_rad: float, rear_n_per_rad: float) -> Vehicle:
     """Return the sedan with what is known of the other simulator's car."""
     car = Vehicle()
-    own = axle_stiffness_n_per_rad(car, DRY)
+    sedan = axle_stiffness_n_per_rad(car, DRY)
 
     def tyre(of: Tyre, factor: float) -> Tyre:
         return of._replace(
@@ -302,8 +302,8 @@ def like_the_other(front_n_per_rad: float, rear_n_per_rad: float) -> Vehicle:
         front_compliance_rad_per_n=0.0,
         rear_compliance_rad_per_n=0.0,
         ackermann=0.0,
-        front_tyre=tyre(car.front_tyre, front_n_per_rad / own[0]),
-        rear_tyre=tyre(car.rear_tyre, rear_n_per_rad / own[1]),
+        front_tyre=tyre(car.front_tyre, front_n_per_rad / sedan[0]),
+        rear_tyre=tyre(car.rear_tyre, rear_n_per_rad / sedan[1]),
     )
 
 
@@ -372,10 +372,10 @@ def independent() -> dict[str, str]:
     head = ["run", "quantity", "other: peak"]
     for car_name in ("sedan", "like the other"):
         head += [f"{car_name}: peak", "ratio", "later by"]
-    own = axle_stiffness_n_per_rad(Vehicle(), DRY)
+    sedan = axle_stiffness_n_per_rad(Vehicle(), DRY)
     words = (
         f"Cornering stiffness of the axles, kN/rad: other {stiffness[0] / 1e3:.0f} and {stiffness[1] / 1e3:.0f}, "
-        f"sedan {own[0] / 1e3:.0f} and {own[1] / 1e3:.0f} before compliance.\n\n"
+        f"sedan {sedan[0] / 1e3:.0f} and {sedan[1] / 1e3:.0f} before compliance.\n\n"
     )
     return {"independent": words + table(head, rows)}
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.occupied_time import OccupiedTime
+from pdhef_logtool.logs.recording_span import RecordingSpan
 from pdhef_logtool.records.signals import IntArray, Loss
 
 
@@ -53,8 +53,8 @@ class FakeLog(DriveLog):
         return ()
 
     @property
-    def occupied(self) -> OccupiedTime:
-        return OccupiedTime(((self.start_ns, self.end_ns),) if self.end_ns else ())
+    def recording_span(self) -> RecordingSpan:
+        return RecordingSpan(((self.start_ns, self.end_ns),) if self.end_ns else ())
 
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
         out = []

@@ -83,7 +83,7 @@ class Job:
 
     @property
     def key(self) -> str:
-        """Digest of all that the file depends on; an entry with another key is made anew."""
+        """Digest of all that the file depends on; an entry with another key is simulated again."""
         text = json.dumps([__version__, [asdict(c) for c in self.candidates]], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -218,12 +218,12 @@ def _kept(jobs: Sequence[Job], folder: Path) -> dict[int, dict[str, Any]]:
     """Entries of an earlier manifest whose files are there with the right content."""
     try:
         old = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))["drives"]
-        known = {entry["file"]: entry for entry in old}
+        entries_by_file = {entry["file"]: entry for entry in old}
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return {}
     kept: dict[int, dict[str, Any]] = {}
     for i, job in enumerate(jobs):
-        entry = known.get(job.file)
+        entry = entries_by_file.get(job.file)
         path = folder / job.file
         if entry is None or entry.get("key") != job.key:
             continue

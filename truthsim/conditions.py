@@ -1,10 +1,10 @@
-"""The drives of the condition table: the same drives again and again, with one thing wrong in each row.
+"""Drives of the condition table: the same base drives, with one changed condition in each row.
 
 See docs/method.md#evaluation.
 
-A row that changes the car, the sensors or the road changes the truth; the nominal vehicle file stays. A row that
-changes only what an estimator is told (friction, which sensors) has no drives of its own: it names those of the row
-``in-domain`` and says what to tell. Recorded drives and independent simulators, the table's last rows, are not made
+A row that changes the car, the sensors or the road changes the ground truth; the nominal vehicle file stays. A row that
+changes only inputs of the estimators (friction, sensors) reuses the drives of the row ``in-domain``; its entry in the
+manifest contains the change. Recorded drives and independent simulators, the table's last rows, are not made
 here.
 """
 
@@ -43,7 +43,7 @@ class Row:
     Attributes
     ----------
     draw : the drive of a number, from a stream of its own and the base drive of that number.
-    assume : what the estimator is told besides, for the reader of the manifest.
+    assume : changed inputs of the estimators, for the reader of the manifest.
     reuses : the row whose drives these are.
     """
 
@@ -151,30 +151,28 @@ ROWS: tuple[Row, ...] = (
     Row(_IN_DOMAIN, "inside the training range, outside the held-out cells", _same),
     Row("paper-a", "double lane change, 100 km/h, friction 0.85, with new sensor errors", _standard("dlc")),
     Row("paper-b", "sine sweep, 60 km/h, friction 0.3, with new sensor errors", _standard("sine-sweep")),
-    Row("extrapolation", "cells of manoeuvre, speed and friction that no suite trains on", _held_out),
-    Row("unseen-manoeuvre", "fishhook, which no suite holds", _fishhook),
+    Row("extrapolation", "cells of manoeuvre, speed and friction without training drives", _held_out),
+    Row("unseen-manoeuvre", "fishhook, not in the training suites", _fishhook),
     Row("low-friction", "friction 0.15 to 0.25, below the training range", _slippery),
-    Row("friction-plus-20", "the estimator is told 1.2 times the friction", None, {"friction_factor": 1.2}, _IN_DOMAIN),
-    Row(
-        "friction-minus-20", "the estimator is told 0.8 times the friction", None, {"friction_factor": 0.8}, _IN_DOMAIN
-    ),
-    Row("friction-unknown", "the estimator is told no friction", None, {"friction": "unknown"}, _IN_DOMAIN),
-    Row("mass-plus-20", "mass and inertias 20 % up", _vehicle("sedan,mass=1.2")),
+    Row("friction-plus-20", "friction given 20 % too high", None, {"friction_factor": 1.2}, _IN_DOMAIN),
+    Row("friction-minus-20", "friction given 20 % too low", None, {"friction_factor": 0.8}, _IN_DOMAIN),
+    Row("friction-unknown", "friction not given", None, {"friction": "unknown"}, _IN_DOMAIN),
+    Row("mass-plus-20", "mass and inertias 20 % higher", _vehicle("sedan,mass=1.2")),
     Row("cg-shift", "CG 10 cm back or forward", _vehicle("sedan,cg=0.1", "sedan,cg=-0.1")),
-    Row("stiffness-plus-15", "cornering stiffness of all tyres 15 % up", _vehicle("sedan,stiffness=1.15")),
-    Row("stiffness-minus-15", "cornering stiffness of all tyres 15 % down", _vehicle("sedan,stiffness=0.85")),
+    Row("stiffness-plus-15", "cornering stiffness of all tyres 15 % higher", _vehicle("sedan,stiffness=1.15")),
+    Row("stiffness-minus-15", "cornering stiffness of all tyres 15 % lower", _vehicle("sedan,stiffness=0.85")),
     Row("other-tyres", "tyres of the hatchback", _vehicle("sedan,tyres=hatchback")),
-    Row("other-vehicle", "SUV and hatchback in turn", _vehicle("suv", "hatchback")),
-    Row("randomised-vehicle", "other cars of the sedan's kind", _randomised),
+    Row("other-vehicle", "SUV and hatchback alternately", _vehicle("suv", "hatchback")),
+    Row("randomised-vehicle", "random variants of the sedan", _randomised),
     Row("burst-5", "2.5 s of five times the noise on the whole IMU", _fault("burst5", "imu", length_s=2.5)),
     Row("burst-20", "2.5 s of twenty times the noise on the whole IMU", _fault("burst20", "imu", length_s=2.5)),
     Row("gyro-stuck", "the yaw rate repeats one value for 4 s", _fault("stuck", "yaw_rate", length_s=4.0)),
     Row("gyro-dead", "the yaw rate reads zero for 4 s", _fault("dead", "yaw_rate", length_s=4.0)),
-    Row("gyro-dropped", "there is no yaw rate for 4 s", _fault("dropout", "yaw_rate", length_s=4.0)),
+    Row("gyro-dropped", "no yaw rate for 4 s", _fault("dropout", "yaw_rate", length_s=4.0)),
     Row("bias", "three times the usual 1-sigma bias on accelerations, yaw rate and steering", _biased),
     Row("delay-30", "all sensors arrive 30 ms later", _always("delay30:all:0:end")),
-    Row("bank-and-grade", "bends banked inward, level and outward, uphill and down", _banked),
-    Row("no-wheel-speed", "the estimator gets no wheel speeds", None, {"sensors": "esp"}, _IN_DOMAIN),
+    Row("bank-and-grade", "bends banked inward, level and outward, uphill and downhill", _banked),
+    Row("no-wheel-speed", "no wheel speeds", None, {"sensors": "esp"}, _IN_DOMAIN),
 )
 ROW_NAMES = tuple(row.name for row in ROWS)
 
@@ -245,7 +243,7 @@ def write_conditions(
 
 
 def _row_entry(row: Row, entries: list[dict[str, Any]]) -> dict[str, Any]:
-    """What the manifest says of a row: its files, what to tell the estimator, and how many drives each bin has."""
+    """Return the manifest entry of a row: files, changed inputs of the estimators, number of drives in each bin."""
     made = [entry for entry in entries if entry["row"] == (row.reuses or row.name) and "sha256" in entry]
     return {
         "name": row.name,

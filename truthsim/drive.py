@@ -38,7 +38,7 @@ START_NS = 1_767_225_600_000_000_000
 DEFAULT_VEHICLE = "sedan"
 
 SPIN_RAD = math.radians(20.0)
-#: Sideslip of a car that hardly moves says nothing about a spin.
+#: Sideslip at walking speed does not indicate a spin.
 _SPIN_MIN_SPEED_M_S = 3.0
 _STEER_LIMIT_RAD = 0.6
 
@@ -57,14 +57,15 @@ class Drive:
     scale : the amplitude found, in the manoeuvre's own unit.
     start_ns : time 0 of the log.
     times_s : [N], 100 Hz.
-    truth : by the names of ``truthsim.vehicle.OBSERVED``, ``sideslip_rad`` and ``friction`` (mean of the wheels), [N].
+    truth : ground truth [N] by the names of ``truthsim.vehicle.OBSERVED``, ``sideslip_rad`` and ``friction`` (mean of
+        the wheels).
     channels : ``imu``, ``steering``, ``wheels``, ``rtk``, ``fix``, with the faults in them.
     vehicle, vehicle_name, noise, faults : what they were made with.
-    rtk_rate_hz : rate of ``rtk`` and of the perfect truth in a written log.
+    rtk_rate_hz : rate of ``rtk`` and of the exact ground truth in a written log.
     peak_ay_m_s2, peak_sideslip_rad : largest absolute values; sideslip where the car moves faster than 3 m/s.
     spun : the peak sideslip went beyond 20 degrees.
     lifted : a wheel left the road for 50 ms or longer.
-    notes : what a user must know of this drive, one sentence each.
+    notes : remarks for the user, one sentence each.
     """
 
     manoeuvre: str
@@ -116,7 +117,7 @@ class Drive:
         return " ".join(words)
 
     def facts(self) -> dict[str, float | int | str | bool | list[str]]:
-        """What to tell who asked for the drive."""
+        """Remarks for the user."""
         return {
             "command": self.command,
             "duration_s": self.duration_s,
@@ -129,7 +130,7 @@ class Drive:
         }
 
     def metadata(self) -> dict[str, str]:
-        """What the log's metadata record ``truthsim`` holds."""
+        """Content of the metadata record ``truthsim`` of the log."""
         import json
 
         import numba
@@ -190,7 +191,7 @@ def simulate_drive(
     amplitude : factor on the manoeuvre's own: of its share of μ g, of its standard's angle, or of its course.
     vehicle, vehicle_name : what drives, and what the command line calls it.
     keep_spins : keep a drive whose sideslip exceeds 20 degrees or in which a wheel lifts. Else the amplitude of a
-        manoeuvre that is measured by an angle is lowered until it does not (a note says so), one that is scaled to
+        manoeuvre that is measured by an angle is lowered until it does not (with a note), one that is scaled to
         μ g stays below such an amplitude, and one with a course of its own is an error.
     tolerance : how near the peak must come to its share of μ g.
 
@@ -311,7 +312,7 @@ class Outcome:
         return self.spun or self.lifted
 
     def describe(self) -> str:
-        """Say it in words."""
+        """Return a description."""
         words = []
         if self.spun:
             words.append(f"the car spun: sideslip reached {math.degrees(self.peak_sideslip_rad):.0f} degrees")
@@ -321,7 +322,7 @@ class Outcome:
 
 
 def judge(motion: Motion) -> Outcome:
-    """Tell how a motion went.
+    """Return the outcome of a motion.
 
     Raises
     ------
@@ -397,7 +398,7 @@ def search_scale(goal: Goal, request: Request, vehicle: Vehicle, notes: list[str
     """Find the scale at which the |a_y| reaches its goal, without a spin or a lifted wheel unless they may be kept.
 
     From a guess, by proportion while all results lie on one side, then by interpolation within the bracket. Where the
-    goal cannot be had, the scale that comes nearest is taken and a note says so.
+    goal cannot be had, the scale that comes nearest is taken, with a note.
     """
     low, high = (0.0, 0.0), (math.inf, math.nan)
     best_scale, best_value = 0.0, 0.0
@@ -452,15 +453,15 @@ def _achieved(goal: Goal, request: Request, vehicle: Vehicle) -> float:
     return float(np.abs(motion.column("ay_m_s2")[inside]).mean())
 
 
-#: Length of the pieces that a log is written in, so that the messages of a long drive never stand in memory at once.
+#: Length of the pieces that a log is written in, so that the messages of a long drive are never in memory at once.
 _WRITE_NS = 60_000_000_000
 
 
 def write_drive(drive: Drive, path: Path, *, without: Sequence[str] = (), steering_wheel: bool = False) -> None:
-    """Write a drive as ROS 2 MCAP: sensors, RTK truth, perfect truth, faults, and how it was made.
+    """Write a drive as ROS 2 MCAP: sensors, RTK and exact ground truth, faults, and provenance.
 
     ``header.stamp`` and publish time are the measurement time, log time is the arrival. The metadata record
-    ``truthsim`` says how the drive was made.
+    ``truthsim`` contains its provenance.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The driver: follows a path by preview, holds a speed, stops where the plan says, and has a human's lag."""
+"""Driver model: path preview, speed control, planned stops, human lag."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from pdhef_logtool.records.signals import FloatArray
 
 
 class Driver(NamedTuple):
-    """How the driver looks ahead and acts."""
+    """Preview and response of the driver."""
 
     preview_s: float = 0.55
     preview_min_m: float = 4.0
     steering_lag_s: float = 0.06
     steer_rate_limit_rad_s: float = 0.9
     steer_limit_rad: float = 0.6
-    #: What a driver has learnt of the car: road-wheel angle beyond L/R per lateral acceleration.
+    #: Understeer that the driver compensates: road-wheel angle beyond L/R per lateral acceleration.
     understeer_rad_per_m_s2: float = 0.0034
     wheelbase_m: float = 2.87
     speed_gain_per_s: float = 0.9
@@ -43,7 +43,7 @@ PATH_X, PATH_Y, PATH_YAW, PATH_SPEED = range(4)
 
 @register_jitable
 def _path_at(path: FloatArray, step_m: float, at_m: float, column: int) -> float:
-    """Interpolate one column of a path table; beyond its end the last row holds."""
+    """Interpolate one column of a path table; beyond its end the last row applies."""
     place = at_m / step_m
     last = path.shape[0] - 1
     if place <= 0.0:
@@ -114,7 +114,7 @@ def move_steering(driver: Driver, memory: FloatArray, demand_rad: float, dt_s: f
 def pedal_torques_n_m(
     driver: Driver, memory: FloatArray, target_m_s: float, target_rate_m_s2: float, speed_m_s: float, dt_s: float
 ) -> tuple[float, float]:
-    """Drive and brake torque (N m, all wheels) that hold a target speed (m/s) and its rate (m/s²)."""
+    """Drive and brake torque (N m, all wheels) for a target speed (m/s) and its rate (m/s²)."""
     error = target_m_s - speed_m_s
     demand = target_rate_m_s2 + driver.speed_gain_per_s * error + memory[INTEGRAL]
     limited = min(max(demand, -driver.braking_limit_m_s2), driver.acceleration_limit_m_s2)
@@ -150,7 +150,7 @@ def target_speed_m_s(path: FloatArray, step_m: float, stops: FloatArray, memory:
 
 @register_jitable
 def standing(stops: FloatArray, memory: FloatArray, speed_m_s: float, dt_s: float) -> bool:
-    """Tell whether the driver keeps the brake on at a stop, and count its dwell (``stops`` as above)."""
+    """Return whether the driver keeps the brake on at a stop, and count its dwell (``stops`` as above)."""
     k = int(memory[STOP])
     if k >= stops.shape[0]:
         return False

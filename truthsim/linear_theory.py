@@ -1,4 +1,4 @@
-"""What textbook linear theory says of a vehicle, to hold against what the simulator does.
+"""Textbook linear theory of a vehicle, for comparison with the simulator.
 
 Nothing here shares a line with the simulation: gradients are closed forms, frequency responses are solved from the
 linear equations of the single-track model with relaxing tyres, a rolling body and axles that roll on their tyres.
@@ -72,7 +72,7 @@ class _Roll:
 def steady_roll(vehicle: Vehicle) -> tuple[float, tuple[float, float]]:
     """Roll angle (rad) and load transfer (N, inner to outer wheel, front and rear) per lateral acceleration (m/s²).
 
-    Springs and bars of an axle stand in series with its tyres. The body's moment about the roll axis is
+    Springs and bars of an axle are in series with its tyres. The body's moment about the roll axis is
     m_s h_arm (a_y + g φ); what the links of an axle carry (roll centre, its own mass) reaches its tyres alone.
     """
     roll = _Roll(vehicle)
@@ -142,5 +142,5 @@ def frequency_response(
         a[turn, force] = -roll.centres[i]
         a[turn, a_y], a[turn, r] = -arm, -arm * at_x * s
     b[4] = stiffness[0]
-    found = np.linalg.solve(a, b)
-    return complex(found[r]), complex(found[a_y]), complex(found[body])
+    solution = np.linalg.solve(a, b)
+    return complex(solution[r]), complex(solution[a_y]), complex(solution[body])

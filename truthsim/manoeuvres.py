@@ -68,13 +68,13 @@ class Plan:
     start_speed_m_s : running straight at this speed at time 0.
     steer_rad : mean road-wheel angle every 1 ms, [duration / 1 ms + 1]; empty when a path is followed.
     path : x, y (m), yaw (rad), speed (m/s) every ``PATH_STEP_M``, [P, 4]; empty when the steering is given.
-    stops : arc length (m) and dwell (s) of the places to stand still at, [K, 2].
+    stops : arc length (m) and dwell (s) of the stops, [K, 2].
     torque_n_m : drive and brake torque (N m, all wheels, at least 0) every 1 ms, [duration / 1 ms + 1, 2]; rows of NaN
-        leave the pedals to the driver, who holds the speed. Empty: the driver's throughout.
+        leave the pedals to the driver, who controls the speed. Empty: the driver throughout.
     road : friction under the left and the right wheels, bank (rad) and grade (rad) every ``PATH_STEP_M`` of the
-        distance driven (along the path where one is followed), [R, 4]; beyond its end the last row holds. Empty: level,
-        the same friction everywhere. Bank is positive where the road leans to the right (its left edge higher), as a
-        car's roll; grade is positive uphill.
+        distance driven (along the path where one is followed), [R, 4]; beyond its end the last row applies. Empty:
+        level, the same friction everywhere. Bank is positive where the road leans to the right (its left edge higher),
+        as a car's roll; grade is positive uphill.
     goal_window_s : where the mean |a_y| is what the scale is searched for; None: the peak over the whole drive.
     """
 
@@ -90,12 +90,12 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Manoeuvre:
-    """One entry of the catalogue.
+    """Definition of a manoeuvre.
 
     Attributes
     ----------
     default_duration_s : duration in s by speed in m/s.
-    rtk_rate_hz : default rate of the truth; long drives take less.
+    rtk_rate_hz : default rate of the ground truth; long drives take less.
     peak_share : goal |a_y| over μ g that the scale is searched for; None where nothing is searched.
     least_share : peak |a_y| over μ g below which the manoeuvre has failed its purpose.
     uses_reference : the amplitude is a multiple of the angle at 0.3 g.
@@ -233,13 +233,13 @@ def iso_3888_2_line_m() -> tuple[float, ...]:
     before, after = x <= -settle_m, x >= total + settle_m
     low[before], high[before] = 0.0, 0.0
     low[after], high[after] = middle, middle
-    found = linprog(
+    solution = linprog(
         np.concatenate([np.zeros(n), [1.0, 3.0]]),
         A_ub=rows,
         b_ub=np.zeros(rows.shape[0]),
         bounds=[*zip(low.tolist(), high.tolist(), strict=True), (0.0, None), (0.0, None)],
     )
-    return tuple(found.x[:n].tolist())
+    return tuple(solution.x[:n].tolist())
 
 
 def iso_3888_2_start_m(speed_m_s: float) -> float:
@@ -392,9 +392,9 @@ def _friction_jump(request: Request) -> Plan:
     t = np.maximum(_times_s(request.duration_s) - 1.0, 0.0)
     top = steer_for(0.6 * request.friction * GRAVITY_M_S2, request.speed_m_s)
     third_m = request.speed_m_s * request.duration_s / 3.0
-    at = np.arange(int(3.0 * third_m / PATH_STEP_M) + 1) * PATH_STEP_M
-    friction = request.friction * np.where((at >= third_m) & (at < 2.0 * third_m), JUMP_SHARE, 1.0)
-    flat = np.zeros_like(at)
+    distance_m = np.arange(int(3.0 * third_m / PATH_STEP_M) + 1) * PATH_STEP_M
+    friction = request.friction * np.where((distance_m >= third_m) & (distance_m < 2.0 * third_m), JUMP_SHARE, 1.0)
+    flat = np.zeros_like(distance_m)
     return Plan(
         request.speed_m_s,
         request.duration_s,
@@ -467,11 +467,11 @@ def _eased(values: FloatArray) -> FloatArray:
 
 
 def _stop_and_go(request: Request) -> Plan:
-    """Standstill, drive, standstill, again and again, on a road with gentle bends; the first stand lasts 3 s."""
+    """Standstill, drive, standstill, again and again, on a road with gentle bends; the first stop lasts 3 s."""
     rng = np.random.default_rng(np.random.SeedSequence(entropy=request.seed, spawn_key=(102,)))
     grip = min(1.0, request.friction / 0.6)
     curvature, limit, stops = [np.zeros(10)], [np.full(10, request.speed_m_s)], [(0.0, 3.0)]
-    left_s, at = request.duration_s, 10 * PATH_STEP_M
+    left_s, distance_m = request.duration_s, 10 * PATH_STEP_M
     while left_s > 0.0:
         top = request.speed_m_s * rng.uniform(0.4, 1.0)
         a_y, side = grip * rng.uniform(0.5, 2.0), 1.0 if rng.uniform() < 0.5 else -1.0
@@ -480,8 +480,8 @@ def _stop_and_go(request: Request) -> Plan:
         piece = np.concatenate([straight, bend, straight])
         curvature.append(piece)
         limit.append(np.full(piece.shape[0], top))
-        at += piece.shape[0] * PATH_STEP_M
-        stops.append((at, float(rng.uniform(2.0, 6.0))))
+        distance_m += piece.shape[0] * PATH_STEP_M
+        stops.append((distance_m, float(rng.uniform(2.0, 6.0))))
         left_s -= piece.shape[0] * PATH_STEP_M / top + top / (1.8 * grip) + stops[-1][1]
     curvature.append(np.zeros(40))
     limit.append(np.full(40, request.speed_m_s))

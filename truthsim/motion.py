@@ -62,7 +62,7 @@ class Motion:
 def _compiled_loop() -> Callable[..., None]:
     """Compile (or load from the cache) the loop.
 
-    Numba's cache watches the file of the compiled function alone. The digest of all files that are compiled into it is
+    Numba's cache compares the file of the compiled function alone. The digest of all files that are compiled into it is
     a closure variable, which Numba does put into its key: an edited tyre is never run from an old cache entry.
     """
     folder = Path(__file__).parent

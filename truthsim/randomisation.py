@@ -11,7 +11,7 @@ from truthsim.linear_theory import understeer_gradient_rad_per_m_s2
 from truthsim.tyres import Tyre
 from truthsim.vehicle import GRAVITY_M_S2, Vehicle
 
-#: Relative half-widths of uniform factors, and what they stand for.
+#: Relative half-widths of uniform factors, and their meaning.
 SPREADS: dict[str, float] = {
     "load": 0.12,  # mass, between the driver alone and all seats with luggage; all inertias go with it
     "inertia": 0.10,  # each of yaw, roll and pitch beyond the load: where the load lies

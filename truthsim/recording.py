@@ -58,7 +58,7 @@ _EXACT = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Topic:
-    """One topic of the log: what stands in every message, and the columns.
+    """One topic of the log: constants of every message, and the columns.
 
     ``definition`` is given for a type that ROS 2 itself and our own ``schemas/`` lack.
     """
@@ -109,7 +109,7 @@ def topics_of(
     start_ns: int,
     steering_wheel: bool,
 ) -> Iterator[Topic]:
-    """Yield the topics of a log: sensors, RTK truth, perfect truth, and the faults where there are any.
+    """Yield the topics of a log: sensors, RTK and exact ground truth, and the faults if any.
 
     ``steering_wheel`` adds the angle at the steering wheel, which is what the steering sensor measures.
     """

@@ -11,7 +11,7 @@ from truthsim.vehicle import BANK, BANK_PER_M, FRICTION, GRADE, GRADE_PER_M
 
 @register_jitable
 def _at(table: FloatArray, place: float, column: int) -> float:
-    """Interpolate a column at a place counted in rows; beyond the ends the outer rows hold."""
+    """Interpolate a column at a place counted in rows; beyond the ends the outer rows apply."""
     last = table.shape[0] - 1
     if place <= 0.0:
         return float(table[0, column])
@@ -25,7 +25,7 @@ def _at(table: FloatArray, place: float, column: int) -> float:
 def read_road(
     table: FloatArray, step_m: float, at_m: float, front_m: float, rear_m: float, friction: float, road: FloatArray
 ) -> None:
-    """Write what ``truthsim.vehicle`` wants to know of the road, [ROAD_SIZE].
+    """Write the inputs of ``truthsim.vehicle`` from the road, [ROAD_SIZE].
 
     Parameters
     ----------

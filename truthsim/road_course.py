@@ -94,7 +94,7 @@ class Course:
     ----------
     curvature_1_m, limit_m_s, bank_rad, grade_rad : [P]; bank positive leaning to the right, grade positive uphill.
     kind : [P], index into ``TOUR``.
-    stops : distance (m) and dwell (s) of places to stand still at, [K, 2].
+    stops : distance (m) and dwell (s) of the stops, [K, 2].
     """
 
     curvature_1_m: FloatArray
@@ -115,22 +115,22 @@ def draw_course(
     limit = [np.full(lead, min(top_speed_m_s, TOUR[first].limit_km_h[0] / 3.6))]
     kind = [np.full(lead, float(first))]
     stops: list[tuple[float, float]] = []
-    at, place = lead * step_m, first
+    distance_m, place = lead * step_m, first
     until_m = rng.uniform(*TOUR[place].length_m)
-    while at < length_m:
-        if at > until_m:
+    while distance_m < length_m:
+        if distance_m > until_m:
             place = (place + 1) % len(TOUR)
-            until_m = at + rng.uniform(*TOUR[place].length_m)
+            until_m = distance_m + rng.uniform(*TOUR[place].length_m)
         here = TOUR[place]
         allowed = min(top_speed_m_s, rng.uniform(*here.limit_km_h) / 3.6)
         straight = np.zeros(int(rng.uniform(*here.straight_m) / step_m))
         feature, pace = _draw_feature(rng, here, allowed, grip, step_m)
         if rng.uniform() < here.stop_share:
-            stops.append((at + straight.shape[0] * step_m, float(rng.uniform(3.0, 12.0))))
+            stops.append((distance_m + straight.shape[0] * step_m, float(rng.uniform(3.0, 12.0))))
         curvature += [straight, feature]
         limit += [np.full(straight.shape[0], allowed), np.full(feature.shape[0], pace)]
         kind.append(np.full(straight.shape[0] + feature.shape[0], float(place)))
-        at += (straight.shape[0] + feature.shape[0]) * step_m
+        distance_m += (straight.shape[0] + feature.shape[0]) * step_m
     bends, limits, kinds = np.concatenate(curvature), np.concatenate(limit), np.concatenate(kind)
     return Course(
         bends,

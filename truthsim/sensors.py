@@ -52,7 +52,7 @@ class SensorNoise(NamedTuple):
     #: Time constant of the INS's own error; white noise of a third of each sigma comes on top.
     rtk_time_s: float = 2.0
     rtk_delay_s: float = 0.020
-    #: What nobody has told of the INS: its heading's offset, and how far its place is from the CG, forward and left.
+    #: Unknown mounting of the INS: offset of its heading, and position relative to the CG, forward and left.
     rtk_heading_offset_rad: float = 0.0
     rtk_x_m: float = 0.0
     rtk_y_m: float = 0.0
@@ -295,14 +295,14 @@ def _wheels(
 
 def _draw_outages(end_s: float, noise: SensorNoise, rng: np.random.Generator) -> list[Outage]:
     outages: list[Outage] = []
-    at = 0.0
+    time_s = 0.0
     while noise.rtk_outages_per_h > 0.0:
-        at += rng.exponential(3600.0 / noise.rtk_outages_per_h)
-        if at >= end_s:
+        time_s += rng.exponential(3600.0 / noise.rtk_outages_per_h)
+        if time_s >= end_s:
             break
         length = rng.exponential(noise.rtk_outage_s)
-        outages.append(Outage(at, at + length, RTK_FLOAT if rng.uniform() < 0.5 else RTK_LOST))
-        at += length
+        outages.append(Outage(time_s, time_s + length, RTK_FLOAT if rng.uniform() < 0.5 else RTK_LOST))
+        time_s += length
     return outages
 
 
@@ -392,5 +392,5 @@ def geodetic_from_enu(
     lat, lon, alt = (np.array([v]) for v in ORIGIN_GEODETIC)
     turn = enu_from_ecef_rotation(float(np.deg2rad(lat[0])), float(np.deg2rad(lon[0])))
     ecef = ecef_from_geodetic(lat, lon, alt) + np.stack([east_m, north_m, up_m], axis=1) @ turn
-    found = geodetic_from_ecef(ecef)
-    return np.rad2deg(found[:, 0]), np.rad2deg(found[:, 1]), found[:, 2]
+    geodetic = geodetic_from_ecef(ecef)
+    return np.rad2deg(geodetic[:, 0]), np.rad2deg(geodetic[:, 1]), geodetic[:, 2]

@@ -62,14 +62,14 @@ _ATTEMPTS = 6
 
 
 def cell_of(speed_km_h: float, friction: float) -> tuple[int, int]:
-    """Number of the speed bin and of the friction bin that hold a drive."""
+    """Number of the speed bin and of the friction bin of a drive."""
     speed = int(np.clip(np.searchsorted(SPEED_EDGES_KM_H, speed_km_h, side="right") - 1, 0, 3))
     grip = int(np.clip(np.searchsorted(FRICTION_EDGES, friction, side="right") - 1, 0, 3))
     return speed, grip
 
 
 def is_held_out(manoeuvre: str, speed_km_h: float, friction: float) -> bool:
-    """Tell whether a drive lies in a cell that is kept for the extrapolation test; the same cells for every seed."""
+    """Return whether a drive lies in a cell that is kept for the extrapolation test; the same cells for every seed."""
     return cell_of(speed_km_h, friction) in _EDGES[list(SHARES).index(manoeuvre) % len(_EDGES)]
 
 

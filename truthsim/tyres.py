@@ -1,4 +1,4 @@
-"""Tyres of the truth vehicle: load-sensitive magic formula with combined slip, and slip that builds up over distance.
+"""Tyres of the simulated vehicle: load-sensitive magic formula with combined and relaxed slip.
 
 Steady forces follow the similarity form of Pacejka (Tire and Vehicle Dynamics, 3rd ed., ch. 4.3 and 7): both slips
 are scaled by initial stiffness over peak force, their resultant enters one curve per direction, and the force points

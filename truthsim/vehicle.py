@@ -1,7 +1,7 @@
-"""The truth vehicle: a body with six degrees of freedom on four unsprung masses and four turning wheels.
+"""The simulated vehicle: a body with six degrees of freedom on four unsprung masses and four turning wheels.
 
 Axes are ISO 8855. The car moves in the plane of the road: ``v_x, v_y`` are the velocity of the whole car's CG along
-and across its heading, so that a_y = v̇_y + v_x r = (ΣF_y + weight across the road)/m holds exactly. On top of that
+and across its heading, so that a_y = v̇_y + v_x r = (ΣF_y + weight across the road)/m is exact. On top of that
 plane the sprung mass heaves, rolls (positive to the right) and pitches (positive nose down) on springs, dampers and
 anti-roll bars; each unsprung mass moves up and down between them and its tyre's vertical spring, and may leave the
 road. The links are swing arms from each wheel to the roll centre (across) and to the pitch centre (along): what they
@@ -33,7 +33,7 @@ class Vehicle(NamedTuple):
 
     See docs/method.md#simulator.
 
-    ``truthsim/vehicles/`` holds this one and others as files.
+    ``truthsim/vehicles/`` contains this vehicle and others as files.
     """
 
     mass_kg: float = 1440.0
@@ -96,12 +96,12 @@ BRAKE_GIVE_RAD = 0.01
 BRAKE_LAG_S = 0.005
 BRAKE_DAMPING_S = 0.002
 
-#: What the vehicle is told of the road where it stands: friction under the four wheels, bank (rad, positive to the
+#: Inputs of the vehicle from the road: friction under the four wheels, bank (rad, positive to the
 #: right), grade (rad, positive uphill), and how both change per metre driven (rad/m).
 FRICTION, BANK, GRADE, BANK_PER_M, GRADE_PER_M = 0, 4, 5, 6, 7
 ROAD_SIZE = 8
 
-#: What the world may know of a vehicle, in the order of :func:`observe`.
+#: Observable quantities of a vehicle, in the order of :func:`observe`.
 OBSERVED = (
     "x_m",
     "y_m",
@@ -204,7 +204,7 @@ def wheel_steer_rad(state: FloatArray, steer_rad: float, vehicle: Vehicle, wheel
 def brake_grip_rate(grip: float, spin_rad_s: float) -> float:
     """Rate of the share of its torque that a brake opposes turning with, -1 to 1 (Dahl's model of dry friction).
 
-    A turning wheel has it all; a standing one as much as holds it, so that a car on a hill does not creep.
+    A turning wheel has it all; a standing wheel as much as it needs to stay, so that a car on a hill does not creep.
     """
     turning = abs(spin_rad_s)
     return (spin_rad_s - turning * grip) / (BRAKE_GIVE_RAD + turning * BRAKE_LAG_S)
@@ -233,7 +233,7 @@ def _motion(
     rate: FloatArray,
     observed: FloatArray,
 ) -> None:
-    """Fill the state's rate and what forces say about it; the one place where the equations of motion stand."""
+    """Write the rate of the state and quantities from the forces: the equations of motion."""
     v_x, v_y, yaw_rate = state[V_X], state[V_Y], state[YAW_RATE]
     lf, lr, radius = vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m, vehicle.wheel_radius_m
     mass = vehicle.mass_kg
@@ -310,7 +310,7 @@ def _motion(
         else:
             axle_rear += fy
 
-        # The body stands on the springs at the wheel, on the swing arms at their pivots.
+        # The body is supported by the springs at the wheel, on the swing arms at their pivots.
         roll_centre = vehicle.front_roll_centre_height_m if front else vehicle.rear_roll_centre_height_m
         spring = suspension_force_n(travel, travel_rate, other, vehicle, front)
         pivot_y = -roll_centre * body_y / arm_y
@@ -394,7 +394,7 @@ def derivative(
     """Write the rate [STATE_SIZE] of a state under a mean road-wheel angle and total drive and brake torques.
 
     ``steer_rad`` is the mean angle of the front wheels as the rack has it; compliance comes on top in the vehicle.
-    ``road`` [ROAD_SIZE] holds the friction of the wheels, bank and grade (see ``FRICTION`` and below).
+    ``road`` [ROAD_SIZE] contains the friction of the wheels, bank and grade (see ``FRICTION`` and below).
     ``scratch`` [OBSERVED_SIZE] is overwritten.
     """
     _motion(state, steer_rad, drive_n_m, brake_n_m, road, vehicle, rate, scratch)
@@ -402,7 +402,7 @@ def derivative(
 
 @register_jitable
 def see(state: FloatArray, observed: FloatArray) -> None:
-    """Write the first six columns of ``OBSERVED`` only: pose, velocities and yaw rate, all that a driver looks at."""
+    """Write the first six columns of ``OBSERVED`` only: pose, velocities and yaw rate, the inputs of the driver."""
     for i in range(6):
         observed[i] = state[i]
 

@@ -69,7 +69,7 @@ def _require(holds: bool, words: str) -> None:
 
 
 class _Checked(BaseModel):
-    """What must hold between the values of a vehicle."""
+    """Check relations between the values of a vehicle."""
 
     model_config = _STRICT
 

@@ -13,7 +13,7 @@ import typer
 
 from pdhef_logtool.cli import stopping
 from pdhef_logtool.records.errors import EXIT_OK
-from pdhef_logtool.records.printable import all_shown, shown
+from pdhef_logtool.records.printable import all_printable, printable
 from pdhef_logtool.storage.documents import jsonable
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def set_verbosity(*, quiet: bool = False, verbose: bool = False) -> None:
 
 def error(text: str) -> None:
     """Print a line on stderr, also with ``--quiet``."""
-    print(shown(text, _MOST_SIGNS), file=sys.stderr)  # noqa: T201
+    print(printable(text, _MOST_SIGNS), file=sys.stderr)  # noqa: T201
 
 
 def say(text: str) -> None:
@@ -99,7 +99,7 @@ def print_json(document: Any) -> None:
 def print_facts(facts: dict[str, Any]) -> None:
     """Print one fact a line."""
     for key, value in facts.items():
-        print(f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {shown(value)}")  # noqa: T201
+        print(f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {printable(value)}")  # noqa: T201
 
 
 def show(result: _Shown, render: Callable[[_Shown, Console], None], as_json: bool) -> None:
@@ -107,7 +107,7 @@ def show(result: _Shown, render: Callable[[_Shown, Console], None], as_json: boo
     if as_json:
         print_json(result.to_dict())
     else:
-        render(all_shown(result), stdout())
+        render(all_printable(result), stdout())
 
 
 def finish(
@@ -149,6 +149,6 @@ def progress() -> Iterator[Callable[[str, float], None]]:
 
         def update(text: str, share: float) -> None:
             stopping.check()
-            bar.update(task, description=shown(text), completed=share)
+            bar.update(task, description=printable(text), completed=share)
 
         yield update

@@ -16,7 +16,7 @@ from pdhef_logtool.cli.console import cell, table
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.geometry import DEGREES
-from pdhef_logtool.records.printable import all_shown
+from pdhef_logtool.records.printable import all_printable
 from pdhef_logtool.results.opened_run import PAGE_FILE
 from pdhef_logtool.results.run_report import diverged_line, reasons_line
 from pdhef_logtool.results.selected_estimate import NEARLY_HOLDS, degrees
@@ -82,7 +82,7 @@ _TEXTS = {
 
 def render_run(result: RunResult, console: Console) -> None:
     """Print the answer of each log, or of several in one table, and where the outputs are."""
-    told = [(r, all_shown(r.report)) for r in result.results]
+    told = [(r, all_printable(r.report)) for r in result.results]
     reports = [report for _, report in told if report is not None]
     alike = None
     if len(reports) > 1 and all(report["answer"] for report in reports):

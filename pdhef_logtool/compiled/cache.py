@@ -1,9 +1,9 @@
-"""The one ``njit`` of the package: machine code is kept where this user can keep it, and no cache can end a run.
+"""The ``njit`` of the package: machine code is cached where this user can write, and a cache error never ends a run.
 
-Numba looks for a folder when a function is decorated and refuses where it finds none; a file in its cache that is cut
-short, or a full disk, ends the call. Here the first place that can be written takes the code: that of
-``NUMBA_CACHE_DIR``, the installation's, the user's, a private temporary one; else none, and every run compiles. What
-lies in the installation is used where nobody can write it, too.
+Numba searches a cache folder when a function is decorated and raises an error if there is none; a truncated cache file
+or a full disk also ends the call. Here the code goes to the first folder that can be written: ``NUMBA_CACHE_DIR``, the
+installation, the user's cache, a private temporary folder; if there is none, every run compiles. Code that the
+installation contains is also used if the installation is read-only.
 
 In each place the code lies in a folder that is named after the digest of all sources (:mod:`~.sources`). The
 first process that uses a new digest removes the folders of other sources of this same installation; those of other
@@ -34,14 +34,14 @@ from numba.np import arrayobj, linalg
 
 from pdhef_logtool.compiled import sources
 from pdhef_logtool.records import processes
-from pdhef_logtool.records.printable import shown
+from pdhef_logtool.records.printable import printable
 
 #: How long the first run compiles on two processors, in seconds; a rough figure for the user.
 COMPILING_S = 25
 
 
 def _without_blas() -> None:
-    """Let numba load without SciPy's BLAS, which takes longer than a short log: nothing compiled here asks for it.
+    """Let numba load without SciPy's BLAS, which takes longer than a short log: no function here needs it.
 
     What needs LAPACK, such as the repair of a covariance, loads that when it is called.
     """
@@ -49,17 +49,17 @@ def _without_blas() -> None:
     def none() -> None:
         raise ImportError
 
-    found = linalg.ensure_blas
+    original = linalg.ensure_blas
     linalg.ensure_blas = none
     try:
         from numba.np import arraymath
     finally:
-        linalg.ensure_blas = found
-    arraymath.ensure_blas = found
+        linalg.ensure_blas = original
+    arraymath.ensure_blas = original
 
 
 def _sizes_differ(_given: Any, _expected: Any) -> None:
-    """Stand for what numba calls where an array is assigned to a slice of another shape."""
+    """Placeholder of the function that numba calls if an array is assigned to a slice of another shape."""
 
 
 @overload(_sizes_differ)  # type: ignore[untyped-decorator]
@@ -76,7 +76,7 @@ arrayobj.raise_with_shape_context = _sizes_differ
 
 
 def njit(function: Any = None, *, cache: bool = False, **options: Any) -> Any:
-    """Compile a function as ``numba.njit`` does; ``cache`` keeps its machine code as said above."""
+    """Compile a function as ``numba.njit`` does; ``cache`` keeps its machine code as described above."""
     if function is None:
         return functools.partial(njit, cache=cache, **options)
     options |= {"no_cfunc_wrapper": True}
@@ -112,7 +112,7 @@ _kept: list[Any] = []
 
 
 def load_kept() -> bool:
-    """Load all machine code that is kept for them, for the processes that are forked from this one; tell if any is."""
+    """Load all cached machine code, for the processes that are forked from this one; return whether there is any."""
     for function in _kept:
         codegen = function.targetctx.codegen()
         for signature in function._cache.signatures(codegen):
@@ -173,8 +173,8 @@ def _private_folder() -> Path | None:
         folder = Path(tempfile.gettempdir()) / f"pdhef-compiled-{os.getuid()}"
         with contextlib.suppress(FileExistsError):
             folder.mkdir(mode=0o700)
-        found = folder.lstat()
-        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077:
+        status = folder.lstat()
+        if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o077:
             return folder
     return None
 
@@ -189,7 +189,7 @@ def _writable(folder: Path) -> bool:
 
 
 class _Cache:
-    """What a compiled function asks for its machine code: the installation's, and what this user keeps."""
+    """Cache of a compiled function: machine code of the installation and of this user."""
 
     def __init__(self, function: Any) -> None:
         kept = kept_in()
@@ -203,13 +203,13 @@ class _Cache:
     def load_overload(self, signature: Any, context: Any) -> Any:
         for place in self._places:
             try:
-                found = place.load_overload(signature, context)
-            except Exception:  # noqa: BLE001 (whatever a pickle that was cut short may raise)
+                overload = place.load_overload(signature, context)
+            except Exception:  # noqa: BLE001 (any error of a pickle that was cut short)
                 with contextlib.suppress(OSError):
                     place.flush()
                 continue
-            if found is not None:
-                return found
+            if overload is not None:
+                return overload
         announce()
         return None
 
@@ -239,7 +239,7 @@ class _Place(caching.FunctionCache):  # type: ignore[misc]
     def signatures(self, codegen: Any) -> list[Any]:
         try:
             index = self._cache_file._load_index()
-        except Exception:  # noqa: BLE001 (whatever a pickle that was cut short may raise)
+        except Exception:  # noqa: BLE001 (any error of a pickle that was cut short)
             return []
         return [key[0] for key in index if key == self._index_key(key[0], codegen)]
 
@@ -265,7 +265,7 @@ class _Code(caching.CompileResultCacheImpl):  # type: ignore[misc]
 
 
 class _Locator(caching._CacheLocator):  # type: ignore[misc]
-    """Tells numba the folder that was chosen above."""
+    """Gives numba the folder that was chosen above."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -287,35 +287,35 @@ class _Locator(caching._CacheLocator):  # type: ignore[misc]
 
 @functools.cache
 def _stamp(file: str) -> bytes:
-    """Return the digest of a file that the name of the folder does not stand for already."""
+    """Return the digest of a file that is not part of the digest in the folder's name."""
     path = Path(file)
     return b"" if path in sources.compiled_sources() else hashlib.sha256(path.read_bytes()).digest()
 
 
 def is_kept(name: str) -> bool:
-    """Tell whether there is machine code of a function, ``module.function``, for some arguments."""
+    """Return whether there is machine code of a function, ``module.function``, for some arguments."""
     return any(any(folder.glob(f"{name}-*.nbi")) for folder in (_installed(), kept_in()) if folder is not None)
 
 
-#: Whether somebody has said that compiling begins.
+#: Whether the note that compiling begins was printed.
 announced = False
 
 
 def be_silent() -> None:
-    """Say nothing in this process and in those that are forked from it, for which another one has."""
+    """Print no note about compiling in this process and its forks, as another process prints it."""
     global announced
     announced = True
 
 
 def announce() -> None:
-    """Say on stderr, once, that compiling begins; of the workers of a command the first one does."""
+    """Print a note on stderr, once, that compiling begins; of several workers only the first prints it."""
     global announced
     if announced or processes.worker_number > 1:
         return
     announced, folder = True, kept_in()
     if folder is None:
-        told = f"compiling, about {COMPILING_S} s in every run: there is no folder to keep the code in"
+        text = f"compiling, about {COMPILING_S} s in every run: there is no folder to keep the code in"
     else:
-        told = f"compiling, once, about {COMPILING_S} s; the code is kept in {shown(str(folder))}"
-    sys.stderr.write(f"{told}\n")
+        text = f"compiling, once, about {COMPILING_S} s; the code is kept in {printable(str(folder))}"
+    sys.stderr.write(f"{text}\n")
     sys.stderr.flush()

@@ -1,7 +1,7 @@
-"""The digest of all that machine code depends on: sources, compiler and processor. It is found without the compiler.
+"""The digest of all that machine code depends on: sources, compiler and processor, computed without the compiler.
 
-Numba's own cache knows a function by the file that it stands in and never looks at the files of the functions that it
-calls. Here all compiled code is kept under one digest, so that code of other sources is never loaded.
+Numba's own cache identifies a function by its file and ignores the files of the functions that it calls. Here all
+compiled code is kept under one digest, so that code of other sources is never loaded.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ def compiled_sources(root: Path = ROOT) -> tuple[Path, ...]:
 
 def sources_digest(root: Path = ROOT) -> str:
     """Return the digest of the sources, and of the versions of the compiler."""
-    found = hashlib.sha256(f"numba {version('numba')}, llvmlite {version('llvmlite')}\n".encode())
+    digest = hashlib.sha256(f"numba {version('numba')}, llvmlite {version('llvmlite')}\n".encode())
     for path in compiled_sources(root):
-        found.update(f"{path.relative_to(root).as_posix()}\n".encode() + hashlib.sha256(path.read_bytes()).digest())
-    return found.hexdigest()[:16]
+        digest.update(f"{path.relative_to(root).as_posix()}\n".encode() + hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()[:16]
 
 
 @cache

@@ -57,24 +57,24 @@ _vector = _Vector()
 
 @dataclass(frozen=True)
 class _Place:
-    """The numbers of an array for who says in the compiler's language what is to be done."""
+    """The numbers of an array, for code that is written as LLVM instructions."""
 
     builder: Any
     data: Any
 
-    def load(self, at: Any) -> Any:
+    def load(self, index: Any) -> Any:
         """Return the vector that begins at ``at``."""
-        value = self.builder.load(self._pointer(at))
+        value = self.builder.load(self._pointer(index))
         value.align = _NUMBER_BYTES
         return value
 
-    def store(self, at: Any, vector: Any) -> None:
+    def store(self, index: Any, vector: Any) -> None:
         """Write a vector that begins at ``at``."""
-        self.builder.store(vector, self._pointer(at)).align = _NUMBER_BYTES
+        self.builder.store(vector, self._pointer(index)).align = _NUMBER_BYTES
 
-    def _pointer(self, at: Any) -> Any:
-        at = ir.IntType(64)(at) if isinstance(at, int) else at
-        return self.builder.bitcast(self.builder.gep(self.data, [at]), _VECTOR.as_pointer())
+    def _pointer(self, index: Any) -> Any:
+        index = ir.IntType(64)(index) if isinstance(index, int) else index
+        return self.builder.bitcast(self.builder.gep(self.data, [index]), _VECTOR.as_pointer())
 
 
 def _vectors_at(context: Any, builder: Any, kind: Any, array: Any) -> _Place:
@@ -142,8 +142,8 @@ def spread(_typing, _number):  # type: ignore[no-untyped-def]
 
     def generate(_context, builder, _signature, args):  # type: ignore[no-untyped-def]
         nothing, first = ir.Constant(_VECTOR, ir.Undefined), ir.IntType(32)
-        one = builder.insert_element(nothing, args[0], first(0))
-        return builder.shuffle_vector(one, nothing, ir.Constant(ir.VectorType(first, LANES), [0] * LANES))
+        first_lane = builder.insert_element(nothing, args[0], first(0))
+        return builder.shuffle_vector(first_lane, nothing, ir.Constant(ir.VectorType(first, LANES), [0] * LANES))
 
     return _vector(types.float64), generate
 
@@ -207,11 +207,11 @@ def factor(_typing, P, there, L):  # type: ignore[no-untyped-def]
         is_there = context.make_array(signature.args[1])(context, builder, args[1]).data
         number, lane = ir.DoubleType(), ir.IntType(32)
         vector = ir.VectorType(number, LANES)
-        one, nothing, unknown = number(1.0), number(0.0), ir.Constant(vector, ir.Undefined)
+        unit, nothing, unknown = number(1.0), number(0.0), ir.Constant(vector, ir.Undefined)
         root = cgutils.get_or_insert_function(builder.module, ir.FunctionType(number, (number,)), "llvm.sqrt.f64")
 
-        def spread(of: Any, at: int) -> Any:
-            return builder.shuffle_vector(of, unknown, ir.Constant(ir.VectorType(lane, LANES), [at] * LANES))
+        def spread(of: Any, position: int) -> Any:
+            return builder.shuffle_vector(of, unknown, ir.Constant(ir.VectorType(lane, LANES), [position] * LANES))
 
         def everywhere(value: Any) -> Any:
             return spread(builder.insert_element(unknown, value, lane(0)), 0)
@@ -220,24 +220,24 @@ def factor(_typing, P, there, L):  # type: ignore[no-untyped-def]
         rows = {(i, half): P.load(i * ROOM + half * LANES) for i in range(MOST) for half in range(i // LANES, 2)}
         good = ir.IntType(1)(1)
         for k in range(MOST):
-            own = range(k // LANES, 2)
+            halves = range(k // LANES, 2)
             pivot = builder.extract_element(rows[k, k // LANES], lane(k % LANES))
             positive = builder.fcmp_ordered(">", pivot, nothing)
             lacks = builder.icmp_unsigned(
                 "==", builder.load(builder.gep(is_there, [ir.IntType(64)(k)])), ir.IntType(8)(0)
             )
             good = builder.and_(good, builder.or_(positive, lacks))
-            per_pivot = builder.select(positive, builder.fdiv(one, pivot), nothing)
-            per_root = builder.select(positive, builder.fdiv(one, builder.call(root, (pivot,))), nothing)
-            shares = {half: builder.fmul(rows[k, half], everywhere(per_pivot)) for half in own}
+            per_pivot = builder.select(positive, builder.fdiv(unit, pivot), nothing)
+            per_root = builder.select(positive, builder.fdiv(unit, builder.call(root, (pivot,))), nothing)
+            shares = {half: builder.fmul(rows[k, half], everywhere(per_pivot)) for half in halves}
             for i in range(k + 1, MOST):  # what the pivot's row leaves of those behind it
                 share = spread(shares[i // LANES], i % LANES)
                 for half in range(i // LANES, 2):
                     taken = builder.fmul(share, rows[k, half], flags=("contract",))
                     rows[i, half] = builder.fsub(rows[i, half], taken, flags=("contract",))
-            for half in own:
+            for half in halves:
                 rows[k, half] = builder.fmul(rows[k, half], everywhere(per_root))
-            before = k % LANES  # what stands before the diagonal is no part of the column
+            before = k % LANES  # entries before the diagonal are not part of the column
             lanes = [LANES + i if i < before else i for i in range(LANES)]
             rows[k, k // LANES] = _chosen(builder, rows[k, k // LANES], zeros, lanes)
         for columns, half in ((0, 0), (0, 1), (1, 1)):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 from pdhef_logtool.records.errors import UsageError
 
 #: A bare integer from here on is nanoseconds, not seconds from the log's start.
@@ -67,9 +67,9 @@ class ReadOptions:
         return self.sensors == "full"
 
     @property
-    def limits(self) -> Budget:
+    def limits(self) -> ResourceLimits:
         """What reading a log may cost."""
-        return DEFAULT_BUDGET.times(self.budget)
+        return DEFAULT_LIMITS.times(self.budget)
 
 
 def parse_time(text: str, start_ns: int, end_ns: int, *, option: str) -> int:

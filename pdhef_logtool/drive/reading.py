@@ -115,7 +115,7 @@ class Drive:
     @property
     def file(self) -> str:
         """Name of the file or folder; of a slim log that of the one that it stands for."""
-        return self.path.name if self.log.slim is None else self.log.slim.record.file
+        return self.path.name if self.log.reduced is None else self.log.reduced.record.file
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -150,8 +150,8 @@ class Drive:
 
         Of a slim log it is that of the one that it stands for.
         """
-        if self.log.slim is not None:
-            return self.log.slim.record.identity
+        if self.log.reduced is not None:
+            return self.log.reduced.record.identity
         self._sha256 = self._sha256 or identity_of(LogInput(self.path, self.name))
         return self._sha256
 
@@ -309,8 +309,8 @@ def read_drive(
         for ambiguity in chosen.ambiguities:
             told(str(ambiguity))
         remarks += chosen.remarks
-        if opened.slim is not None:
-            remarks.append(f"a slim log stands for {opened.slim.record.file}")
+        if opened.reduced is not None:
+            remarks.append(f"a slim log stands for {opened.reduced.record.file}")
         used = chosen.mapping
         if adjust is not None:
             used = adjust(opened, used, told)

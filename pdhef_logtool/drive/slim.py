@@ -11,8 +11,8 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Drive, read_drive
 from pdhef_logtool.logs.discovery import LogInput
-from pdhef_logtool.logs.slim_copy import copy_topics, write_record
-from pdhef_logtool.logs.slim_log import FORMAT, SlimRecord
+from pdhef_logtool.logs.reduced_copy import copy_topics, write_record
+from pdhef_logtool.logs.reduced_log import FORMAT, ReducedRecord
 from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.mapping.frames import holds_fixed_frames
@@ -29,7 +29,7 @@ def slim_log(
     mapping: Mapping | None,
     options: ReadOptions,
     tell: Callable[[str], None] = lambda _text: None,
-) -> SlimRecord:
+) -> ReducedRecord:
     """Write the slim log of a whole log, and return what is known of the log beside its messages.
 
     Parameters
@@ -50,19 +50,19 @@ def slim_log(
         return write_slim(drive, target)
 
 
-def write_slim(drive: Drive, target: Path) -> SlimRecord:
+def write_slim(drive: Drive, target: Path) -> ReducedRecord:
     """Write the slim log of a drive that was read from start to end, and return its record."""
     log = _messages_of(drive)
     lost, ledgers = log.lost, drive.byte_ledgers  # before the copy, which may look at more than a run does
-    record = SlimRecord(
+    record = ReducedRecord(
         format=FORMAT,
         tool=__version__,
         file=drive.file,
         kind=log.kind,
         identity=drive.sha256,
         distro=log.distro,
-        intervals=log.occupied.intervals,
-        left_out={topic: dict(by_reason) for topic, by_reason in log.occupied.left_out.items()},
+        intervals=log.recording_span.intervals,
+        left_out={topic: dict(by_reason) for topic, by_reason in log.recording_span.left_out.items()},
         topics=log.topics,
         losses=tuple(replace(x, where=drive.without_folder(x.where)) for x in lost),
         byte_ledgers=ledgers,

@@ -18,7 +18,7 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.slim import slim_log
 from pdhef_logtool.logs.discovery import LogInput, hash_log, identity_of
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.slim_log import FORMAT, is_whole
+from pdhef_logtool.logs.reduced_log import FORMAT, is_whole
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.mapping.vendors import load_vendors
 from pdhef_logtool.records.errors import OutputError, PdhefError
@@ -148,6 +148,6 @@ def _is_sound(path: Path) -> bool:
         if not is_whole(path):
             return False
         with closing(open_log(path)) as log:
-            return log.slim is not None
+            return log.reduced is not None
     except (OSError, PdhefError):
         return False

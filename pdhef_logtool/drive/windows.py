@@ -238,7 +238,7 @@ class DriveReader:
         counts: dict[str, int] = {}
         done_ns: int | None = None
         hashed_ns = _FIRST_NS
-        ends = list(windows(plan.start_ns, plan.end_ns, round(self.window_s * 1e9), self.log.occupied))
+        ends = list(windows(plan.start_ns, plan.end_ns, round(self.window_s * 1e9), self.log.recording_span))
         for a, b in ends:
             part = read_signals(self.log, plan.mapping, plan.clocks, a, b)
             self.losses = merge_losses([self.losses, part.losses])
@@ -337,7 +337,7 @@ def sample_ledger(
         dropped = Counter({reason: n for reason, n in count.items() if reason != "read"})
         total = count["read"]
         if source.read_topic in messages:  # a signal of raw CAN frames is read of some of its topic's messages
-            left_out = log.occupied.left_out.get(source.topic, {})
+            left_out = log.recording_span.left_out.get(source.topic, {})
             rest = messages[source.topic] - total - sum(left_out.values())
             total = messages[source.topic]
             dropped.update({**left_out, ("not-read" if whole else "outside-slice"): rest})

@@ -115,7 +115,7 @@ def wrong_branch(
     if state is not None:
         steps = state.waiting.joined(steps)
     released = release(steps.ready_ns, signals.stamps_ns)
-    flags: BoolArray = steps.flags[released.at] & released.arrived
+    flags: BoolArray = steps.flags[released.row] & released.arrived
     last = last_stamp_ns(signals.stamps_ns, before_ns)
     return flags, DivergenceState(memory, last, steps.since(released.needed))
 

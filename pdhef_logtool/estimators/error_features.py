@@ -100,7 +100,7 @@ def error_terms(
     if state is not None:
         steps = state.waiting.joined(steps)
     released = release(steps.ready_ns, signals.stamps_ns)
-    known = np.where(released.arrived[:, None], steps.terms[released.at], 0.0)
+    known = np.where(released.arrived[:, None], steps.terms[released.row], 0.0)
     grip = known[:, 0]
     terms = np.stack(
         [

@@ -19,7 +19,7 @@ from pdhef_logtool.estimators.presets import Options as Options
 from pdhef_logtool.estimators.presets import check_options, options_of, preset_of
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED, SelfCalibrated
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.printable import shown
+from pdhef_logtool.records.printable import printable
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 
 #: What drives the vehicle model; a filter uses a_y and yaw rate where the log has them.
@@ -206,7 +206,7 @@ def all_specs() -> tuple[Spec, ...]:
                 reason = f"an estimator named {spec.name} exists"
         if reason:
             where = f"entry point {entry.name} = {entry.value} ({ENTRY_POINTS})"
-            sys.stderr.write(f"pdhef: {shown(f'{where} is not used: {reason}')}\n")
+            sys.stderr.write(f"pdhef: {printable(f'{where} is not used: {reason}')}\n")
         else:
             specs.append(spec)
     return tuple(specs)

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from pdhef_logtool.learning.plots import new_figure, png_bytes
-from pdhef_logtool.records.printable import shown
+from pdhef_logtool.records.printable import printable
 
 _COLOURS = {"kept": "#009E73", "undone": "#D55E00", "not done": "0.6"}
 #: Use of each part of the drives.
@@ -98,7 +98,7 @@ def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 def _text(value: str) -> str:
     """Return a text from outside as a cell of a table can hold it."""
-    return shown(value).replace("|", "\\|")
+    return printable(value).replace("|", "\\|")
 
 
 def _figure(found: Sequence[Any] | None) -> str:

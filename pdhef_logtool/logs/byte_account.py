@@ -10,14 +10,14 @@ _Extent = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class ByteLedger:
-    """Where the bytes of one file of a log went; the three sums are its size.
+    """Account of the bytes of one file of a log; the three sums add up to its size.
 
     Attributes
     ----------
     file : its path. size : bytes when it was opened; of a file that is compressed as a whole, those inside of it.
-    decoded : bytes that were read: framing, and chunks (or runs of messages or rows) of which any message was read.
+    decoded : bytes that were read: framing, and chunks (or runs of messages or rows) with a message that was read.
     unwanted : sound as far as is known, and never asked for: attachments, metadata, index, other topics' chunks.
-    lost : damaged, cut, above the budget. Where the place of damage is not known, the record that tells of it.
+    lost : damaged, cut, above the resource limits. If the place of damage is unknown: the record that reports it.
     cut : the file ends before its time. What should follow is in no sum.
     checksummed : of ``decoded``, the bytes that a checksum of the file covers and that agree with it; None in a record
         of an earlier version.
@@ -38,8 +38,8 @@ class ByteLedger:
 def checksummed_share(ledgers: Sequence[ByteLedger]) -> float | None:
     """Return which share of the bytes that were read a verified checksum covers; None where that is not known."""
     decoded = sum(ledger.decoded for ledger in ledgers)
-    known = [ledger.checksummed for ledger in ledgers if ledger.checksummed is not None]
-    return sum(known) / decoded if decoded and len(known) == len(ledgers) else None
+    checksummed = [ledger.checksummed for ledger in ledgers if ledger.checksummed is not None]
+    return sum(checksummed) / decoded if decoded and len(checksummed) == len(ledgers) else None
 
 
 def checksum_text(share: float | None) -> str:
@@ -52,7 +52,7 @@ def checksum_text(share: float | None) -> str:
 
 
 class _Extents:
-    """Extents, of which neighbours are joined where they come one after the other."""
+    """Extents; an extent that continues the last one is joined to it."""
 
     def __init__(self) -> None:
         self._found: set[_Extent] = set()
@@ -75,7 +75,7 @@ class ByteAccount:
 
     Parameters
     ----------
-    size : bytes of the file; what is told beyond them is left out.
+    size : bytes of the file; extents beyond it are ignored.
     """
 
     def __init__(self, size: int) -> None:
@@ -104,7 +104,7 @@ class ByteAccount:
         self.lose(start, start + round((end - start) * share))
 
     def ledger(self, file: str) -> ByteLedger:
-        """Add up what there is by now."""
+        """Return the sums so far."""
         lost = self._covered(self._lost)
         decoded = self._covered([*self._lost, *self._decoded]) - lost
         verified = self._covered([*self._lost, *self._verified]) - lost

@@ -1,7 +1,7 @@
-"""Bytes of a recording by offset and size: the one thing that containers know of where a file lies.
+"""Bytes of a recording by offset and size, wherever the file is.
 
-Nothing is mapped into memory: a file that another process cuts while it is open ends a read with an error, never this
-process, and what was read stays valid after the file is closed.
+Files are not mapped into memory: if another process truncates a file while it is open, a read raises an error and does
+not end this process. Bytes that were read stay valid after the file is closed.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ import stat
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from pathlib import Path
+from threading import Lock
+from typing import BinaryIO
 
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import LogError
@@ -23,15 +25,15 @@ _KINDS = {stat.S_IFIFO: "a FIFO", stat.S_IFCHR: "a device", stat.S_IFBLK: "a dev
 
 
 class CutError(Exception):
-    """A file ends earlier than it did when it was opened; caught inside this package and turned into a loss."""
+    """A file is shorter than when it was opened. This package catches it and reports a loss."""
 
 
 class SourceError(LogError):
-    """The place of a log does not give its bytes (any more): no damage of the log, and so never one of its losses."""
+    """A log cannot be read at its location (any more). The log is not damaged, so this is never one of its losses."""
 
 
 class ChangedError(SourceError):
-    """A log is another one than was opened."""
+    """A log has changed since it was opened."""
 
 
 class ByteSource(ABC):
@@ -39,11 +41,11 @@ class ByteSource(ABC):
 
     Attributes
     ----------
-    size : bytes when it was opened. far : whether each read costs a journey, so that few and large ones are better.
+    size : bytes when it was opened. is_remote : whether each read is a request, so that few large reads are faster.
     """
 
     size: int
-    far = False
+    is_remote = False
 
     def __init__(self, size: int) -> None:
         self.size = size
@@ -52,47 +54,47 @@ class ByteSource(ABC):
 
     @abstractmethod
     def fetch(self, offset: int, size: int) -> bytes:
-        """Read up to ``size`` bytes where they lie; fewer only at the end of the file as it is now."""
+        """Read up to ``size`` bytes; fewer only at the present end of the file."""
 
     @abstractmethod
     def close(self) -> None:
-        """Release what is open."""
+        """Close the file or connection."""
 
-    def at_hand(self, offset: int, size: int) -> int:
-        """Return how many of the ``size`` bytes from an offset on a read may as well take along."""
+    def held_size(self, offset: int, size: int) -> int:
+        """Return how many of the ``size`` bytes from an offset can be read at no extra cost."""
         del offset
         return size
 
-    def expect(self, extents: Iterable[tuple[int, int]]) -> None:
-        """Take note of bytes [start, end) that will be read soon, in this order."""
+    def prefetch(self, extents: Iterable[tuple[int, int]]) -> None:
+        """Prepare to read bytes [start, end), in this order."""
         del extents
 
     def read(self, offset: int, size: int) -> bytes:
         """Return exactly these bytes; raises :class:`CutError` where the file has less."""
         start, block = self._block
-        at = offset - start
-        if at >= 0 and at + size <= len(block):
-            return block[at : at + size]
+        position = offset - start
+        if position >= 0 and position + size <= len(block):
+            return block[position : position + size]
         if size > _LARGE_READ_BYTES:
             if offset + size > self.size:  # a claim must not be allocated
                 raise CutError(f"the file has no {size} bytes at byte {offset}")
-            found = self.fetch(offset, size)
+            data = self.fetch(offset, size)
         else:
-            block, at = self.ahead(offset, size)
-            found = block[at : at + size]
-        if len(found) < size:
-            raise CutError(f"the file ends at byte {offset + len(found)}, before byte {offset + size}")
-        return found
+            block, position = self.ahead(offset, size)
+            data = block[position : position + size]
+        if len(data) < size:
+            raise CutError(f"the file ends at byte {offset + len(data)}, before byte {offset + size}")
+        return data
 
     def ahead(self, offset: int, size: int) -> tuple[bytes, int]:
         """Return a block and the place in it where ``size`` bytes or more from an offset lie, if the file has them."""
         start, block = self._block
-        at = offset - start
-        if at >= 0 and at + size <= len(block):
-            return block, at
-        follows = 0 <= at <= len(block)
+        position = offset - start
+        if position >= 0 and position + size <= len(block):
+            return block, position
+        follows = 0 <= position <= len(block)
         self._ahead_bytes = min(2 * self._ahead_bytes, _MOST_AHEAD_BYTES) if follows else _LEAST_AHEAD_BYTES
-        block = self.fetch(offset, max(size, self.at_hand(offset, self._ahead_bytes)))
+        block = self.fetch(offset, max(size, self.held_size(offset, self._ahead_bytes)))
         self._block = (offset, block)
         return block, 0
 
@@ -108,32 +110,37 @@ class LocalFile(ByteSource):
     def __init__(self, path: Path, shown_path: LogPlace | None = None) -> None:
         require_regular(path, shown_path)
         self._file = path.open("rb", buffering=0)
+        self._lock = Lock()
         super().__init__(os.fstat(self._file.fileno()).st_size)
 
     def fetch(self, offset: int, size: int) -> bytes:
-        """Read at an offset; the file has no position that somebody else could move."""
-        descriptor = self._file.fileno()
-        found = os.pread(descriptor, size, offset)
-        if 0 < len(found) < size and offset + len(found) < self.size:  # the system reads 2 GiB at a time
-            parts = [found]
-            missing = size - len(found)
-            while missing and (part := os.pread(descriptor, missing, offset + size - missing)):
-                parts.append(part)
-                missing -= len(part)
-            found = b"".join(parts)
-        return found
+        """Read up to ``size`` bytes at an offset; several threads may read."""
+        with self._lock:
+            return read_at(self._file, offset, size)
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
 
+def read_at(file: BinaryIO, offset: int, size: int) -> bytes:
+    """Read up to ``size`` bytes at an offset of an unbuffered file; fewer only at its end."""
+    file.seek(offset)
+    data = file.read(size)
+    if not 0 < len(data) < size:
+        return data
+    parts = [data]
+    while part := file.read(size - sum(map(len, parts))):  # the system reads at most 2 GiB at a time
+        parts.append(part)
+    return b"".join(parts)
+
+
 def require_regular(path: Path, shown_path: LogPlace | None = None) -> None:
-    """Refuse what is no regular file, without opening it: opening a FIFO waits for ever, some devices act on it.
+    """Reject anything but a regular file, without opening it: opening a FIFO blocks, and some devices react to it.
 
     Raises
     ------
-    LogError : it is none. OSError : there is nothing, or nothing that may be looked at.
+    LogError : it is no regular file. OSError : it does not exist or cannot be accessed.
     """
     mode = path.stat().st_mode
     if not stat.S_ISREG(mode):

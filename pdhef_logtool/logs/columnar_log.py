@@ -11,10 +11,10 @@ from types import MappingProxyType
 
 import numpy as np
 
-from pdhef_logtool.logs.budget import BudgetError
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.byte_source import SourceError
-from pdhef_logtool.logs.container import UNVERIFIED, Block, ChannelRecord, Container, Span, told
+from pdhef_logtool.logs.compression import decompress_messages
+from pdhef_logtool.logs.container import UNVERIFIED, Block, ChannelRecord, Container, Span, count_text, describe_damage
 from pdhef_logtool.logs.decoding import (
     ChannelDecoder,
     channel_schema,
@@ -34,13 +34,14 @@ from pdhef_logtool.logs.message_schema import (
     leaves,
     resolve,
 )
-from pdhef_logtool.logs.occupied_time import OccupiedTime, survey
+from pdhef_logtool.logs.recording_span import RecordingSpan, survey
 from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.logs.resource_limits import LimitError
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
-#: Neighbouring windows share the span at their border: so many loaded spans are kept for the next window, and of a
-#: short log all that fit into so many bytes, for it is looked at several times before it is read.
+#: Neighbouring windows share the span at their border: this many loaded spans are kept for the next window, and of a
+#: short log all that fit into this many bytes, as it is surveyed several times before it is read.
 _KEPT_SPANS, _KEPT_BYTES = 2, 8 << 20
 
 
@@ -87,13 +88,13 @@ class ColumnarLog(DriveLog):
         self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
         self._fields: dict[tuple[int, int], tuple[FieldInfo, ...]] = {}
         self._parsed: dict[tuple[object, ...], MessageSchema | SchemaError] = {}  # by definition
-        self._asked: set[tuple[int, int]] = set()  # channels of which somebody wanted something
-        self._wanted: set[tuple[int, int]] = set()  # and of these the ones whose messages somebody wanted
+        self._asked: set[tuple[int, int]] = set()  # channels that were requested or listed
+        self._wanted: set[tuple[int, int]] = set()  # channels whose messages were requested
         self._schemas_s = 0.0  # processor time that parsing took
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
         self._kept_bytes = 0
-        self._occupied: OccupiedTime | None = None
+        self._recording_span: RecordingSpan | None = None
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
@@ -109,11 +110,11 @@ class ColumnarLog(DriveLog):
         return tuple(TopicInfo(name, first.type_name, first.encoding, counts[name]) for name, first in firsts)
 
     @property
-    def occupied(self) -> OccupiedTime:
-        """When the log was recorded, found when it is first asked for."""
-        if self._occupied is None:
-            self._occupied = survey(self.containers, self._times, str(self.path))
-        return self._occupied
+    def recording_span(self) -> RecordingSpan:
+        """When the log was recorded; determined at the first access."""
+        if self._recording_span is None:
+            self._recording_span = survey(self.containers, self._times, str(self.path))
+        return self._recording_span
 
     def _times(self, c: int, span: Span) -> tuple[IntArray, IntArray] | None:
         """Return channels and log times of a span's messages on known channels [N]; None if they cannot be read."""
@@ -124,8 +125,8 @@ class ColumnarLog(DriveLog):
                 channel, log_time = container.times(span)
             if container.by_index:
                 return channel, log_time
-            known = np.isin(channel, list(container.channels))
-            return channel[known], log_time[known]
+            declared = np.isin(channel, list(container.channels))
+            return channel[declared], log_time[declared]
         except SourceError:
             raise
         except Exception:  # noqa: BLE001 (a read of the span reports the damage)
@@ -133,26 +134,26 @@ class ColumnarLog(DriveLog):
 
     @property
     def lost(self) -> tuple[Loss, ...]:
-        """What could not be read, as far as is known by now."""
-        found = [*self._opened_lost, *self.occupied.losses]
+        """Losses so far."""
+        losses = [*self._opened_lost, *self.recording_span.losses]
         damaged, schemas = sorted(self._damaged.items()), sorted(self._schemas.items())
         for c, container in enumerate(self.containers):
-            found.extend(container.lost)
-            found.extend(loss for (of, _), loss in damaged if of == c)
-            found.extend(loss for (of, _, _), loss in self._partial.items() if of == c)
+            losses.extend(container.lost)
+            losses.extend(loss for (of, _), loss in damaged if of == c)
+            losses.extend(loss for (of, _, _), loss in self._partial.items() if of == c)
             if c in self._late:
-                found.append(_out_of_time(container, list(self._late[c].values())))
-            found.extend(self._undecodable_losses(c, container))
+                losses.append(_out_of_time(container, list(self._late[c].values())))
+            losses.extend(self._undecodable_losses(c, container))
             for (of, channel), schema in schemas:
                 wanted = of == c and (of, channel) in self._asked
                 if wanted and isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError):
                     what = f"its messages cannot be decoded: {schema}"
-                    found.append(Loss("bad-schema", what, container.channels[channel].topic))
-        return tuple(found)
+                    losses.append(Loss("bad-schema", what, container.channels[channel].topic))
+        return tuple(losses)
 
     @property
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:
-        """Where the bytes of each file went, as far as is known by now."""
+        """Byte ledger of each file so far."""
         return tuple(c.account.ledger(str(c.path)) for c in self.containers)
 
     def _undecodable_losses(self, c: int, container: Container) -> Iterator[Loss]:
@@ -171,22 +172,25 @@ class ColumnarLog(DriveLog):
 
     @property
     def index(self) -> ColumnarLog | None:
-        """The log itself where everything but the content of chunks is known, and nothing of it is odd."""
+        """The log itself if its index is complete and consistent; else None."""
         sound = all(container.by_index for container in self.containers)
         return self if sound and all(loss.kind == UNVERIFIED for loss in self.lost) else None
 
     def metadata(self) -> dict[str, str]:
         """Return the entries of metadata records by ``key`` and ``record.key``, and rosbag2's ``custom_data``."""
-        found: dict[str, str] = {}
+        entries: dict[str, str] = {}
         for container in self.containers:
             for record in container.metadata_records():
-                found |= {**record.values, **{f"{record.name}.{key}": value for key, value in record.values.items()}}
-        return found | dict(self._custom)
+                entries |= {
+                    **record.metadata,
+                    **{f"{record.name}.{key}": value for key, value in record.metadata.items()},
+                }
+        return entries | dict(self._custom)
 
     @property
-    def far(self) -> bool:
-        """Whether each read costs a journey."""
-        return any(container.far for container in self.containers)
+    def is_remote(self) -> bool:
+        """Whether each read is a network request."""
+        return any(container.is_remote for container in self.containers)
 
     @property
     def size(self) -> int:
@@ -194,8 +198,8 @@ class ColumnarLog(DriveLog):
         return sum(container.account.size for container in self.containers)
 
     @property
-    def looked_at(self) -> tuple[int, int]:
-        """How many spans were read, and how many there are."""
+    def chunks_read(self) -> tuple[int, int]:
+        """Number of spans that were read, and of all spans."""
         return len({(c, index) for c, index, _ in self._seen}), sum(len(c.spans) for c in self.containers)
 
     def index_times(self, start_ns: int, end_ns: int) -> dict[str, IntArray]:
@@ -203,18 +207,18 @@ class ColumnarLog(DriveLog):
         parts: dict[str, list[IntArray]] = {topic: [] for topic in self._by_topic}
         for c, container in enumerate(self.containers):
             for span in container.spans:
-                found = self._times(c, span) if span.end_ns > start_ns and span.start_ns < end_ns else None
-                if found is None:
+                stamps = self._times(c, span) if span.overlaps(start_ns, end_ns) else None
+                if stamps is None:
                     continue
-                channel, times = found
+                channel, times = stamps
                 keep = in_window(times, start_ns, end_ns)
                 channel, times = (channel, times) if keep is None else (channel[keep], times[keep])
                 for id_ in span.counts:
                     parts[container.channels[id_].topic].append(times[channel == id_])
         return {topic: np.sort(np.concatenate(part)) for topic, part in parts.items() if part}
 
-    def beside(self, topics: Collection[str]) -> frozenset[str]:
-        """Return the topics whose messages all lie in spans that hold one of these: they cost no further read."""
+    def covered_topics(self, topics: Collection[str]) -> frozenset[str]:
+        """Return the topics whose messages are all in spans with one of these topics: they need no further read."""
         held, apart = set(topics), set[str]()
         for container in self.containers:
             names = {id_: channel.topic for id_, channel in container.channels.items()}
@@ -223,16 +227,16 @@ class ColumnarLog(DriveLog):
                 (apart if inside.isdisjoint(topics) else held).update(inside)
         return frozenset(held - apart)
 
-    def expect(self, topics: Collection[str], spans_ns: Sequence[tuple[int, int]]) -> None:
-        """Take note of what will be read soon: these topics in [start, end) of each."""
+    def prefetch(self, topics: Collection[str], spans_ns: Sequence[tuple[int, int]]) -> None:
+        """Prepare to read these topics in [start, end) of each span."""
         for container in self.containers:
-            found = (s for start, end in spans_ns for s in self._to_read(topics, container, start, end))
-            container.expect({span.index: span for span in found}.values())
+            expected = (s for start, end in spans_ns for s in self._to_read(topics, container, start, end))
+            container.prefetch({span.index: span for span in expected}.values())
 
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
-        """Return the scalar leaves of a topic's schema; empty when the encoding carries none.
+        """Return the scalar leaves of a topic's schema; empty if the encoding has none.
 
-        ``quiet`` only looks: a schema that does not parse is no loss of whoever wants nothing of the topic.
+        With ``quiet`` a schema that does not parse is not reported as a loss.
         """
         for c, channel in self._by_topic.get(topic, ()):
             if not quiet:
@@ -245,7 +249,7 @@ class ColumnarLog(DriveLog):
         return ()
 
     def unreadable(self, topic: str) -> str:
-        """Return why no field of a topic is known: a definition that is missing, an encoding; empty where one is."""
+        """Return why a topic has no readable fields, for example a missing definition; empty if it has some."""
         reasons = []
         for c, channel in self._by_topic.get(topic, ()):
             schema = self.schema_of(c, channel)
@@ -259,13 +263,13 @@ class ColumnarLog(DriveLog):
         return reasons[0] if reasons else ""
 
     def borrowed(self, topic: str) -> tuple[Path, ...]:
-        """Return the files of an installed ROS that a topic's type is read by."""
+        """Return the files of an installed ROS that define a topic's type."""
         schemas = (self.schema_of(c, channel) for c, channel in self._by_topic.get(topic, ()))
         return tuple(dict.fromkeys(f for s in schemas if isinstance(s, MessageSchema) for f in s.borrowed))
 
     def first_messages(self, topic: str, most: int) -> list[object]:
-        """Return the first messages of a topic whole; what does not decode is left out."""
-        found: list[object] = []
+        """Return the first messages of a topic, decoded; messages that do not decode are left out."""
+        messages: list[object] = []
         for c, channel in self._by_topic.get(topic, ()):
             schema = self.schema_of(c, channel)
             if not isinstance(schema, MessageSchema):
@@ -273,13 +277,12 @@ class ColumnarLog(DriveLog):
             decode = ChannelDecoder(schema, ()).single_decoder()
             with self.containers[c].meter.running():
                 for span in (s for s in self.containers[c].spans if channel.id in s.counts):
-                    block = self.load(c, span, frozenset({channel.id})) if len(found) < most else None
+                    block = self.load(c, span, frozenset({channel.id})) if len(messages) < most else None
                     if block is None:
                         continue
-                    for row in block.rows.get(channel.id, np.empty(0, np.int64))[: most - len(found)]:
-                        at, n = int(block.offset[row]), int(block.length[row])
-                        found.append(decode(bytes(block.buffer[at : at + n])))
-        return [message for message in found if message is not None]
+                    rows = block.rows.get(channel.id, np.empty(0, np.int64))
+                    messages += [decode(block.message(row)) for row in rows[: most - len(messages)]]
+        return [message for message in messages if message is not None]
 
     def read(
         self,
@@ -292,8 +295,8 @@ class ColumnarLog(DriveLog):
     ) -> dict[str, Columns]:
         """Read the fields asked for of messages with log time in [start, end).
 
-        ``quiet`` only looks: messages that do not decode are no loss of whoever wants nothing of the topic.
-        ``stamps`` are further topics, of which only the times are read.
+        With ``quiet`` messages that do not decode are not reported as a loss. ``stamps`` are further topics; only their
+        times are read.
 
         Raises
         ------
@@ -321,7 +324,7 @@ class ColumnarLog(DriveLog):
     def load(self, c: int, span: Span, want: frozenset[int] | None = None) -> Block | None:
         """Read a span of the c-th container; None and a recorded loss if it is damaged.
 
-        The boundary: whatever escapes a container's load is the loss of the span.
+        Any error of a container's load is a loss of the span.
         """
         container = self.containers[c]
         want = want if container.selective else None
@@ -334,58 +337,59 @@ class ColumnarLog(DriveLog):
         extent = container.extent(span)
         try:
             container.meter.check()
-        except BudgetError:
+        except LimitError:
             self._late.setdefault(c, {})[span.index] = span
             container.account.lose(*extent)
             return None
         try:
             with container.meter.running(extent[1] - extent[0]):
                 block = container.load(span, want)
+                if container.zstd_messages:
+                    block = decompress_messages(block, container.meter.limits)
         except Exception as error:  # noqa: BLE001
-            kind, text = told(error)
+            kind, text = describe_damage(error)
             count = sum(span.counts.values()) or None
-            held = f"{count} messages" if count else "an unknown number of messages"
-            what = f"{held} lost at byte {extent[0]}: {text}"
+            what = f"{count_text(count)} lost at byte {extent[0]}: {text}"
             self._damaged[key] = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
             container.account.lose(*extent)
             return None
         if (*key, want) not in self._seen:
             self._seen.add((*key, want))
             container.account.decode(*extent)
-            self._hold_against(c, span, block, want)
+            self._correct_span(c, span, block, want)
         self._kept[(*key, want)] = block
         self._kept_bytes += block.nbytes
         while len(self._kept) > _KEPT_SPANS and self._kept_bytes > _KEPT_BYTES:
             self._kept_bytes -= self._kept.pop(next(iter(self._kept))).nbytes
         return block
 
-    def _hold_against(self, c: int, span: Span, block: Block, want: frozenset[int] | None) -> None:
-        """Correct what an index claimed of a span by what the span holds, with a loss for what it should hold."""
+    def _correct_span(self, c: int, span: Span, block: Block, want: frozenset[int] | None) -> None:
+        """Correct the counts of a span, which an index gave, by its content; missing messages are a loss."""
         container = self.containers[c]
         held = block.counts
-        known = {id_: n for id_, n in held.items() if id_ in container.channels}
+        declared = {id_: n for id_, n in held.items() if id_ in container.channels}
         claimed = {id_: n for id_, n in span.counts.items() if want is None or id_ in want}
         times = block.log_time_ns
-        undeclared = sum(held.values()) - sum(known.values()) - container.undeclared.get(span.index, 0)
+        undeclared = sum(held.values()) - sum(declared.values()) - container.undeclared.get(span.index, 0)
         outside = 0
         if len(times) and (times.min() < span.start_ns or times.max() >= span.end_ns):
             outside = int(np.count_nonzero((times < span.start_ns) | (times >= span.end_ns)))
-        if known == claimed and not outside and undeclared <= 0:
+        if declared == claimed and not outside and undeclared <= 0:
             return
         others = {id_: n for id_, n in span.counts.items() if id_ not in claimed}
-        container.spans[span.index] = replace(span, counts=others | known)
-        missing = sum(max(n - known.get(id_, 0), 0) for id_, n in claimed.items())
-        at, end = container.extent(span)
+        container.spans[span.index] = replace(span, counts=others | declared)
+        missing = sum(max(n - declared.get(id_, 0), 0) for id_, n in claimed.items())
+        start, end = container.extent(span)
         for kind, count, text in (
             ("missing-messages", missing, "that the index names are not there"),
             ("unknown-channel", undeclared, "are on channels that no readable record declares"),
             ("bad-times", outside, "have log times outside of those that the index names"),
         ):
             if count > 0:
-                what = f"{count} messages {text}, at byte {at}"
+                what = f"{count} messages {text}, at byte {start}"
                 loss = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
                 self._partial[c, span.index, (kind, want)] = loss
-                container.account.lose_share((at, end), count / (len(block) + missing))
+                container.account.lose_share((start, end), count / (len(block) + missing))
 
     def schema_of(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
         """Return the schema of a channel of the c-th container, or why there is none."""
@@ -397,7 +401,7 @@ class ColumnarLog(DriveLog):
     def _parse_schema(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
         """Parse a schema once, within the log's time; one that does not parse is a loss of its topic.
 
-        All schemas together get the time that a log has whatever its size: they do not grow with it.
+        All schemas together get the part of the time limit that does not depend on the size of the log.
         """
         example = self._example(c, channel)
         names = (channel.encoding, channel.schema_encoding, channel.schema_name, channel.type_name)
@@ -406,17 +410,17 @@ class ColumnarLog(DriveLog):
         started = time.process_time()
         try:
             meter.check()
-            meter.budget.check("seconds", self._schemas_s, "the time for all schemas")
+            meter.limits.check("seconds", self._schemas_s, "the time for all schemas")
             with meter.running():
                 if definition not in self._parsed:
                     self._parsed[definition] = channel_schema(
-                        channel, self.distro, example, meter.budget, self.definitions
+                        channel, self.distro, example, meter.limits, self.definitions
                     )
                 return self._parsed[definition]
         except SchemaError as error:
             return self._parsed.setdefault(definition, error)
-        except BudgetError as error:  # of time
-            return SchemaError(told(error)[1])
+        except LimitError as error:  # of time
+            return SchemaError(describe_damage(error)[1])
         finally:
             self._schemas_s += time.process_time() - started
 
@@ -427,13 +431,8 @@ class ColumnarLog(DriveLog):
         for span in self.containers[c].spans:
             if channel.id in span.counts:
                 block = self.load(c, span)
-                if block is None:
-                    continue
-                rows = np.flatnonzero(block.channel == channel.id)
-                if rows.size:
-                    row = int(rows[0])
-                    at, n = int(block.offset[row]), int(block.length[row])
-                    return bytes(block.buffer[at : at + n])
+                if block is not None and channel.id in block.rows:
+                    return block.message(block.rows[channel.id][0])
         return None
 
     def _plan(self, topic: str, paths: tuple[str, ...]) -> _Plan:
@@ -470,10 +469,10 @@ class ColumnarLog(DriveLog):
     def _collect(self, plans: Mapping[str, _Plan], start_ns: int | None, end_ns: int | None) -> dict[str, Columns]:
         parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
         for c, container in enumerate(self.containers):
-            container.expect(self._to_read(plans, container, start_ns, end_ns))
+            container.prefetch(self._to_read(plans, container, start_ns, end_ns))
             with container.meter.running():
                 for span in container.spans:
-                    if (start_ns is None or span.end_ns > start_ns) and (end_ns is None or span.start_ns < end_ns):
+                    if span.overlaps(start_ns, end_ns):
                         self._collect_span(plans, c, span, (start_ns, end_ns), parts)
         return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
 
@@ -481,10 +480,9 @@ class ColumnarLog(DriveLog):
     def _to_read(
         topics: Collection[str], container: Container, start_ns: int | None, end_ns: int | None
     ) -> Iterator[Span]:
-        """Yield the spans of a window that hold any of the topics asked for."""
+        """Yield the spans of a window that contain any of the requested topics."""
         for span in container.spans:
-            inside = (start_ns is None or span.end_ns > start_ns) and (end_ns is None or span.start_ns < end_ns)
-            if inside and any(container.channels[id_].topic in topics for id_ in span.counts):
+            if span.overlaps(start_ns, end_ns) and any(container.channels[id_].topic in topics for id_ in span.counts):
                 yield span
 
     def _collect_span(
@@ -495,19 +493,19 @@ class ColumnarLog(DriveLog):
         window_ns: tuple[int | None, int | None],
         parts: Mapping[str, list[Columns]],
     ) -> None:
-        """Add what a span holds of the topics asked for."""
+        """Add the columns of the requested topics in a span."""
         channels = self.containers[c].channels
         want = frozenset(id_ for id_ in span.counts if channels[id_].topic in plans)
         block = self.load(c, span, want) if want else None
         if block is None:
             return
         keep = in_window(block.log_time_ns, *window_ns)
-        # By what the block holds: the span's counts may have come from an index that is wrong.
+        # By the channels of the block: the counts of the span can be from a wrong index.
         for id_ in sorted(block.rows, key=lambda id_: self._rank[c].get(id_, -1)):
             topic = channels[id_].topic if id_ in channels else ""
             rows = block.rows[id_]
-            if self.occupied.left_out:
-                unused = self.occupied.unused(topic, c, span, block.log_time_ns[rows])
+            if self.recording_span.left_out:
+                unused = self.recording_span.unused(topic, c, span, block.log_time_ns[rows])
                 rows = rows if unused is None else rows[~unused]
             rows = rows if keep is None else rows[keep[rows]]
             if topic in plans and rows.size:
@@ -518,7 +516,7 @@ class ColumnarLog(DriveLog):
     def _decode(
         self, topic: str, plan: _Plan, c: int, span: Span, id_: int, block: Block, rows: IntArray
     ) -> Columns | None:
-        """Decode some messages of a channel. The boundary: whatever escapes a decoder is the loss of these messages."""
+        """Decode some messages of a channel. Any error of a decoder is a loss of these messages."""
         decoder = plan.decoders.get((c, id_))
         try:
             if decoder is None:
@@ -526,7 +524,7 @@ class ColumnarLog(DriveLog):
             else:
                 fields = decoder.columns(block, rows)
         except Exception as error:  # noqa: BLE001
-            kind, text = told(error)
+            kind, text = describe_damage(error)
             kind = "undecodable" if kind == "bad-chunk" else kind
             what = f"{len(rows)} messages cannot be decoded: {text}"
             self._partial[c, span.index, id_] = Loss(kind, what, topic, span.start_ns, span.end_ns, len(rows))
@@ -534,7 +532,7 @@ class ColumnarLog(DriveLog):
         if decoder is not None and decoder.undecodable:
             key = (c, id_, span.index)
             seen = self._undecodable.get(key, np.empty(0, dtype=np.int64))
-            # Count by place in the channel: which other channels a block holds depends on what was asked for.
+            # Count by position in the channel: the other channels of a block depend on the request.
             places = np.searchsorted(block.rows[id_], decoder.undecodable)
             self._undecodable[key] = np.union1d(seen, places.astype(np.int64))
         return Columns(topic, block.log_time_ns[rows], block.publish_time_ns[rows], fields)
@@ -542,7 +540,7 @@ class ColumnarLog(DriveLog):
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """What is read of one topic: the resolved paths and a decoder a channel."""
+    """How a topic is read: the resolved paths and a decoder per channel."""
 
     selections: tuple[Selection, ...]
     decoders: Mapping[tuple[int, int], ChannelDecoder]
@@ -559,7 +557,7 @@ def _out_of_time(container: Container, spans: Sequence[Span]) -> Loss:
 
 
 def in_window(log_time_ns: IntArray, start_ns: int | None, end_ns: int | None) -> BoolArray | None:
-    """Tell which log times lie in [start, end); None: all of them."""
+    """Return a mask of the log times in [start, end); None if all are."""
     keep: BoolArray | None = None
     if start_ns is not None:
         keep = log_time_ns >= start_ns

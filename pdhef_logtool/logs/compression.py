@@ -1,15 +1,18 @@
-"""Undoing the compressions that recorders use, never further than a claim and a budget allow."""
+"""Decompression of chunks, messages and files, up to the declared size and the resource limits."""
 
 from __future__ import annotations
 
 import bz2
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from threading import local
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from pdhef_logtool.logs.budget import Budget, BudgetError, Meter
-from pdhef_logtool.logs.container import SpanDamageError
+import numpy as np
+
+from pdhef_logtool.logs.container import Block, SpanDamageError
+from pdhef_logtool.logs.resource_limits import LimitError, Meter, ResourceLimits
 
 if TYPE_CHECKING:
     import zstandard
@@ -18,11 +21,11 @@ _Bytes: TypeAlias = bytes | memoryview
 _OF_THREAD = local()
 _BLOCK_BYTES = 1 << 20
 _FRAME_HEAD_BYTES = 18
-#: A decompressed copy leaves this much of the disk to others.
+#: Free disk space that a decompressed copy leaves.
 _DISK_RESERVE_BYTES = 256 << 20
 
 
-def decompress(compression: str, stored: _Bytes, size: int, budget: Budget) -> bytes:
+def decompress(compression: str, stored: _Bytes, size: int, limits: ResourceLimits) -> bytes:
     """Decompress a chunk that claims ``size`` bytes.
 
     Parameters
@@ -31,17 +34,17 @@ def decompress(compression: str, stored: _Bytes, size: int, budget: Budget) -> b
 
     Raises
     ------
-    SpanDamageError : unknown, damaged, or of another size. BudgetError : the claim is above the budget.
+    SpanDamageError : unknown, damaged, or of another size. LimitError : the declared size is above a limit.
     """
     length = memoryview(stored).nbytes
     if compression in ("", "none"):
-        budget.check("chunk_bytes", length, "a chunk")
+        limits.check("chunk_bytes", length, "a chunk")
         content = bytes(stored)
     else:
         unpack = _UNPACK.get(compression)
         if unpack is None:
             raise SpanDamageError(f"unknown compression {compression!r}")
-        budget.check_unpacked(size, length, "a compressed chunk")
+        limits.check_unpacked(size, length, "a compressed chunk")
         try:
             content = unpack(stored, size)
         except (OSError, RuntimeError, EOFError, ValueError, OverflowError, MemoryError) as error:
@@ -52,15 +55,27 @@ def decompress(compression: str, stored: _Bytes, size: int, budget: Budget) -> b
     return content
 
 
-def decompress_message(stored: _Bytes, budget: Budget) -> bytes:
+def decompress_messages(block: Block, limits: ResourceLimits) -> Block:
+    """Decompress the messages of a block, each a zstd frame; errors as of :func:`decompress`."""
+    payloads: list[bytes] = []
+    size = 0
+    for start, n in zip(block.offset.tolist(), block.length.tolist(), strict=True):
+        payloads.append(decompress_message(block.buffer[start : start + n], limits))
+        size += len(payloads[-1])
+        limits.check("chunk_bytes", size, "compressed messages")
+    length = np.array([len(p) for p in payloads], dtype=np.int64)
+    return replace(block, buffer=b"".join(payloads), offset=np.cumsum(length) - length, length=length)
+
+
+def decompress_message(stored: _Bytes, limits: ResourceLimits) -> bytes:
     """Decompress a message that is a zstd frame; errors as of :func:`decompress`."""
     import zstandard
 
     try:
         size = zstandard.frame_content_size(stored)
-        limit = budget.chunk_bytes if size < 0 else size
+        limit = limits.chunk_bytes if size < 0 else size
         if size > 0:
-            budget.check_unpacked(size, memoryview(stored).nbytes, "a compressed message")
+            limits.check_unpacked(size, memoryview(stored).nbytes, "a compressed message")
         return _zstd_decompressor().decompress(stored, max_output_size=limit)
     except (zstandard.ZstdError, OverflowError, MemoryError) as error:
         raise SpanDamageError(f"a compressed message is damaged: {error}") from error
@@ -72,7 +87,7 @@ def decompress_file(source: Path, target: Path, meter: Meter) -> str:
 
     import zstandard
 
-    allowed = max(_BLOCK_BYTES, meter.budget.chunk_ratio * source.stat().st_size)
+    allowed = max(_BLOCK_BYTES, meter.limits.chunk_ratio * source.stat().st_size)
     free = shutil.disk_usage(target.parent).free - _DISK_RESERVE_BYTES
     written = 0
     with source.open("rb") as packed, target.open("wb") as unpacked:
@@ -83,7 +98,7 @@ def decompress_file(source: Path, target: Path, meter: Meter) -> str:
             try:
                 meter.check()
                 block = reader.read(_BLOCK_BYTES)
-            except BudgetError as error:
+            except LimitError as error:
                 return error.got
             except zstandard.ZstdError as error:
                 return f"the compressed file is damaged: {error}"
@@ -91,7 +106,7 @@ def decompress_file(source: Path, target: Path, meter: Meter) -> str:
                 return "the compressed file ends early" if written < claimed else ""
             written += len(block)
             if written > allowed:
-                return f"the file decompresses to more than {allowed} bytes, above the budget (--set budget=FACTOR)"
+                return f"the file decompresses to more than {allowed} bytes, above the limit (--set budget=FACTOR)"
             if written > free:
                 return "the disk has no room for the decompressed file (set TMPDIR to another)"
             unpacked.write(block)
@@ -109,13 +124,13 @@ def _zstd(stored: _Bytes, size: int) -> bytes:
 
 
 def _zstd_decompressor() -> zstandard.ZstdDecompressor:
-    """Return the one of this thread: it is no small thing to make, and serves one call at a time."""
+    """Return the decompressor of this thread: it is slow to make and not thread-safe."""
     import zstandard
 
     if not hasattr(_OF_THREAD, "zstd"):
         _OF_THREAD.zstd = zstandard.ZstdDecompressor()
-    found: zstandard.ZstdDecompressor = _OF_THREAD.zstd
-    return found
+    decompressor: zstandard.ZstdDecompressor = _OF_THREAD.zstd
+    return decompressor
 
 
 def _lz4(stored: _Bytes, size: int) -> bytes:
@@ -129,7 +144,7 @@ def _bz2(stored: _Bytes, size: int) -> bytes:
 
 
 def _in_turn(stored: _Bytes, size: int, decompressor: Callable[[], Any]) -> bytes:
-    """Decompress one stream after another to at most a byte more than ``size``."""
+    """Decompress concatenated streams to at most ``size`` + 1 bytes."""
     parts: list[bytes] = []
     missing = size + 1
     rest = bytes(stored)

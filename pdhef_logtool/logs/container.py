@@ -1,35 +1,37 @@
-"""What every container format reduces to: channels, spans of messages, and blocks of undecoded messages."""
+"""Common interface of container formats: channels, spans of messages, and blocks of undecoded messages."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+from mcap.records import Metadata
 
-from pdhef_logtool.logs.budget import BudgetError, Meter
 from pdhef_logtool.logs.byte_account import ByteAccount
 from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, SourceError
 from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import IntArray, Loss
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.log_file import LogFile
 
-# What the files of each format begin with.
+# First bytes of the files of each format.
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
 SQLITE_MAGIC = b"SQLite format 3\0"
-#: Log times above this (unsigned in the file) cannot be held in int64 and are set to it.
+#: Log times above this (unsigned in the file) do not fit int64 and are set to it.
 MAX_TIME_NS = int(np.iinfo(np.int64).max) - 1
 #: Kind of the note that a checksum of a file was not verified, as not all that it covers was read.
 UNVERIFIED = "unverified"
-_LOSSES_OF_A_KIND = 20  # of one file; what comes behind them is told as one
+_LOSSES_OF_A_KIND = 20  # of one file; further ones become one loss
 _IDS_TOLD = 5
 _TOLD_CHARACTERS = 300
 _RECORDS_A_CHECK = 256  # of the time that a walk takes
@@ -58,7 +60,7 @@ class Span:
     """A run of messages that is read as a whole: an MCAP or bag chunk, a run of unchunked records, a page of rows.
 
     ``start_ns`` and ``end_ns`` bound the log times as [start, end). ``counts`` gives messages by channel id.
-    ``ordered``: the log times of each channel are known not to step back in file order; False: nobody looked.
+    ``ordered``: the log times of each channel are known not to step back in file order; False: unknown.
     """
 
     index: int
@@ -67,6 +69,10 @@ class Span:
     counts: Mapping[int, int]
     ordered: bool = False
 
+    def overlaps(self, start_ns: int | None, end_ns: int | None) -> bool:
+        """Return whether some of its time is in [start, end); None: without limit."""
+        return (start_ns is None or self.end_ns > start_ns) and (end_ns is None or self.start_ns < end_ns)
+
 
 @dataclass(frozen=True, eq=False)
 class Block:
@@ -74,7 +80,7 @@ class Block:
 
     Attributes
     ----------
-    buffer : bytes that hold all payloads.
+    buffer : bytes that contain all payloads.
     channel, log_time_ns, publish_time_ns, sequence, offset, length : int64 [N]; message i is
         ``buffer[offset[i]:offset[i] + length[i]]``.
     """
@@ -91,9 +97,13 @@ class Block:
         """Return the number of messages."""
         return int(self.channel.shape[0])
 
+    def message(self, row: int) -> bytes:
+        """Return the payload of a message."""
+        return bytes(self.buffer[self.offset[row] : self.offset[row] + self.length[row]])
+
     @property
     def nbytes(self) -> int:
-        """Memory that it takes."""
+        """Its memory."""
         columns = self.channel, self.log_time_ns, self.publish_time_ns, self.sequence, self.offset, self.length
         return memoryview(self.buffer).nbytes + sum(c.nbytes for c in columns)
 
@@ -108,7 +118,7 @@ class Block:
         ordered = self.channel[order]
         firsts = [0, *(np.flatnonzero(ordered[1:] != ordered[:-1]) + 1).tolist()]
         ends = [*firsts[1:], len(self)]
-        return {int(ordered[at]): order[at:end] for at, end in zip(firsts, ends, strict=True)}
+        return {int(ordered[first]): order[first:end] for first, end in zip(firsts, ends, strict=True)}
 
     @property
     def counts(self) -> dict[int, int]:
@@ -124,10 +134,10 @@ class Block:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawChunk:
-    """A chunk that another file holds, to be written as it is.
+    """A chunk of another file, to be written as it is.
 
-    Whoever makes one has decompressed it and checked its CRC, and knows that the channels it holds or declares have
-    the same ids and the same definitions in the file that is written.
+    Its maker has decompressed it, checked its CRC, and made sure that its channels have the same ids and definitions in
+    the file that is written.
 
     Attributes
     ----------
@@ -162,19 +172,11 @@ class Attachment:
 
 
 @dataclass(frozen=True, slots=True)
-class MetadataRecord:
-    """A named record of key-value pairs inside a log."""
-
-    name: str
-    values: Mapping[str, str]
-
-
-@dataclass(frozen=True, slots=True)
 class Wanted:
-    """Of which topics messages will be read, and of which log times [start, end); None: of all.
+    """Topics and log times [start, end) that will be read; None: all.
 
-    A hint that changes no byte of what is read: where reading is far, an index is believed for all else, if the file
-    has more than ``above_bytes``.
+    A hint that does not change the result: of a remote file with more than ``above_bytes``, the other chunks are taken
+    from the index.
     """
 
     topics: frozenset[str] | None = None
@@ -183,55 +185,63 @@ class Wanted:
     above_bytes: int = 0
 
     def has(self, topics: Iterable[str], first_ns: int, last_ns: int) -> bool:
-        """Tell whether something that holds messages of these topics and log times is wanted."""
+        """Return whether messages of these topics and log times are wanted."""
         inside = (self.start_ns is None or last_ns >= self.start_ns) and (self.end_ns is None or first_ns < self.end_ns)
         return inside and (self.topics is None or not self.topics.isdisjoint(topics))
 
 
-#: What all of a log is read for.
+#: Of a log that is read as a whole.
 EVERYTHING = Wanted()
 
 
 class SpanDamageError(Exception):
-    """A span cannot be decoded; caught inside this package and turned into a loss."""
+    """A span cannot be decoded. This package catches it and reports a loss."""
 
 
-def told(error: Exception) -> tuple[str, str]:
-    """Return the kind of loss that an error makes, and what to tell of it: the one boundary's words.
+def describe_damage(error: Exception) -> tuple[str, str]:
+    """Return kind and text of the loss that an error causes.
 
-    A log whose place fails is not damaged: that error goes on.
+    A log that cannot be reached is not damaged: a :class:`SourceError` is raised again.
     """
     if isinstance(error, SourceError):
         raise error
-    if isinstance(error, BudgetError):
+    if isinstance(error, LimitError):
         return "over-budget", f"expected {error.expected}, got {error.got} ({error.where}); {error.remedy}"
     text = str(error) if isinstance(error, SpanDamageError | CutError) else f"{type(error).__name__}: {error}"
     return "bad-chunk", " ".join(text.split())[:_TOLD_CHARACTERS]
 
 
+def count_text(count: int | None) -> str:
+    """Return a number of messages in words."""
+    return f"{count} messages" if count else "an unknown number of messages"
+
+
 class Container(ABC):
-    """One open file of a log. Opening it fills what stands below.
+    """One open file of a log. Opening it fills these attributes.
 
     Attributes
     ----------
     path : the file as the user named it.
     channels : by their id in this file. spans : in file order. lost : damage found while the file was opened.
     undeclared : messages by span that are not in its counts, as no record declares their channels.
-    meter : what reading may cost. account : where the file's bytes went; the spans' are told by who loads them.
+    meter : resource limits. account : byte ledger of the file; its user adds the spans that it loads.
     form : ``mcap``, ``rosbag1`` or ``sqlite3``.
     selective : whether a load can leave out the payloads of unwanted channels.
     profile : MCAP profile that a copy should carry. distro : ROS distribution that the file names; empty if none.
     remedy : what to do about a file that is none of this format.
-    far : whether reading costs a journey. by_index : whether a sound index names all messages.
+    zstd_messages : whether each message is a zstd frame. whole_chunks : whether chunks can be copied as they are.
+    is_remote : whether each read is a network request. by_index : whether a sound index names all messages.
     """
 
     form = ""
     selective = False
-    far = False
+    is_remote = False
     by_index = False
     profile = "ros2"
     distro = ""
     remedy = ""
+    zstd_messages = False
+    whole_chunks = False
 
     def __init__(self, path: LogPlace, size: int, meter: Meter | None = None) -> None:
         self.path = path
@@ -241,19 +251,20 @@ class Container(ABC):
         self.undeclared: dict[int, int] = {}
         self.meter = meter or Meter()
         self.account = ByteAccount(size)
+        self._closing = ExitStack()
         self._losses: dict[str, int] = {}  # how many of a kind
-        self._folded: dict[str, int] = {}  # where in ``lost`` those behind the first ones stand
+        self._folded: dict[str, int] = {}  # index in ``lost`` of the loss that sums up further ones
 
     @abstractmethod
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
-        """Read a span's messages (of the channels in ``want`` at least); whatever it raises is the loss of the span."""
+        """Read a span's messages (at least of the channels in ``want``); any error is a loss of the span."""
 
     @abstractmethod
     def extent(self, span: Span) -> tuple[int, int]:
         """Return the bytes [start, end) of a span, by which :attr:`account` counts it."""
 
     def times(self, span: Span) -> tuple[IntArray, IntArray]:
-        """Return channels and log times of a span's messages [N], a channel's in file order, as cheaply as it goes.
+        """Return channels and log times of a span's messages [N], each channel's in file order.
 
         Raises
         ------
@@ -262,21 +273,41 @@ class Container(ABC):
         block = self.load(span)
         return block.channel, block.log_time_ns
 
+    def raw_chunk(self, span: Span, block: Block, kept: frozenset[int]) -> RawChunk | None:
+        """Return the chunk that a block was read from, to be written to another file as it is.
+
+        Parameters
+        ----------
+        span, block : the span, and what :meth:`load` returned, so that the chunk is known to be sound.
+        kept : channels that have the same id and definition in the other file.
+
+        Returns
+        -------
+        The chunk; None if these messages are in none, or if it contains or declares anything that the other file does
+        not.
+        """
+        del span, block, kept
+        return None
+
     def attachments(self) -> Iterator[Attachment]:
         """Read the attachments; a damaged one is among the losses and left out."""
         yield from ()
 
-    def metadata_records(self) -> Iterator[MetadataRecord]:
+    def metadata_records(self) -> Iterator[Metadata]:
         """Read the metadata records; a damaged one is among the losses and left out."""
         yield from ()
 
-    def expect(self, spans: Iterable[Span]) -> None:
-        """Take note of spans that will be loaded soon, in this order."""
+    def prefetch(self, spans: Iterable[Span]) -> None:
+        """Prepare to load spans, in this order."""
         del spans
 
-    @abstractmethod
+    def on_close(self, callback: Callable[[], None]) -> None:
+        """Call something when the container is closed; the last added comes first."""
+        self._closing.callback(callback)
+
     def close(self) -> None:
         """Release the file."""
+        self._closing.close()
 
     def no_log(self, expected: str, got: str) -> LogError:
         """Return the error for a file that cannot be opened."""
@@ -285,7 +316,7 @@ class Container(ABC):
     def lose(
         self, kind: str, what: str, start_ns: int | None = None, end_ns: int | None = None, count: int | None = None
     ) -> None:
-        """Note damage of this file; from the 21st of a kind on they are told as one."""
+        """Note damage of this file; the 21st and later losses of a kind become one."""
         n = self._losses[kind] = self._losses.get(kind, 0) + 1
         more = n - _LOSSES_OF_A_KIND
         if more <= 0:
@@ -300,7 +331,7 @@ class Container(ABC):
             self.lost[self._folded[kind]] = Loss(kind, text, str(self.path), old.start_ns, end_ns, total)
 
     def drop_undeclared(self, called: str) -> None:
-        """Take the messages of channels that the file does not declare out of the spans' counts, with a loss each."""
+        """Remove the messages of undeclared channels from the spans' counts, with a loss per span."""
         for i, span in enumerate(self.spans):
             unknown = {c: n for c, n in span.counts.items() if c not in self.channels}
             if unknown:
@@ -310,8 +341,8 @@ class Container(ABC):
                 self.lose("unknown-channel", what, span.start_ns, span.end_ns, count)
                 self.account.lose_share(self.extent(span), count / sum(span.counts.values()))
                 self.undeclared[i] = count
-                known = {c: n for c, n in span.counts.items() if c not in unknown}
-                self.spans[i] = Span(span.index, span.start_ns, span.end_ns, known, span.ordered)
+                declared = {c: n for c, n in span.counts.items() if c not in unknown}
+                self.spans[i] = replace(span, counts=declared)
 
 
 class FileContainer(Container):
@@ -322,7 +353,7 @@ class FileContainer(Container):
     path : file to read, or its bytes wherever they lie.
     shown_path : what to call it in messages (a decompressed copy has another name than its source).
     undeclared : messages by span that are not in its counts, as no record declares their channels.
-    meter : what reading may cost; None = the default budget.
+    meter : resource limits; None: the default.
 
     Raises
     ------
@@ -336,11 +367,13 @@ class FileContainer(Container):
         self.source = path if isinstance(path, ByteSource) else LocalFile(path, shown_path)
         shown = shown_path or (Path() if isinstance(path, ByteSource) else path)
         super().__init__(shown, self.source.size, meter)
-        self.at = len(self.magic)  # where the walk is
+        self.on_close(self.source.close)
+        self.position = len(self.magic)  # of the walk
+        self.chunks: list[Any] = []  # by index of the span
         try:
-            if self.source.size < self.at or self.source.read(0, self.at) != self.magic:
+            if self.source.size < self.position or self.source.read(0, self.position) != self.magic:
                 raise self.no_log(self.magic_text, "other content")
-            self.account.decode(0, self.at)
+            self.account.decode(0, self.position)
             with self.meter.running(self.source.size):
                 self._open()
         except BaseException:
@@ -357,11 +390,11 @@ class FileContainer(Container):
         try:
             self._walk()
         except Exception as error:
-            if isinstance(error, PdhefError) and not isinstance(error, BudgetError):
+            if isinstance(error, PdhefError) and not isinstance(error, LimitError):
                 raise
-            kind, text = told(error)
-            self.lose(kind, f"what follows byte {self.at} of {self.source.size} is lost: {text}", self.last_ns())
-            self.account.lose(self.at, self.source.size)
+            kind, text = describe_damage(error)
+            self.lose(kind, f"what follows byte {self.position} of {self.source.size} is lost: {text}", self.last_ns())
+            self.account.lose(self.position, self.source.size)
             self.account.cut = True
         self._finish()
 
@@ -369,9 +402,48 @@ class FileContainer(Container):
         """End of the last span so far; None before the first."""
         return self.spans[-1].end_ns if self.spans else None
 
+    def add_span(self, chunk: Any, span: Span) -> None:
+        """Add a span and its chunk at the end."""
+        self.chunks.append(chunk)
+        self.spans.append(replace(span, index=len(self.spans)))
+
+    def add_content(
+        self, chunk: Any, extent: tuple[int, int], claimed: Span | None, read: Callable[[], Block]
+    ) -> Block | None:
+        """Add a chunk by its content; return None if it is damaged, which is a loss.
+
+        Parameters
+        ----------
+        chunk : with ``start`` and ``end`` of its bytes. extent : bytes that are lost with it. read : decodes it.
+        claimed : times and counts by its header and index, if these are known.
+        """
+        try:
+            block = read()
+        except Exception as error:  # noqa: BLE001 (the boundary)
+            kind, text = describe_damage(error)
+            count = sum(claimed.counts.values()) or None if claimed else None
+            what = f"{count_text(count)} lost in the chunk at byte {chunk.start}: {text}"
+            start_ns, end_ns = (claimed.start_ns, claimed.end_ns) if claimed else (self.last_ns(), None)
+            self.lose(kind, what, start_ns, end_ns, count)
+            self.account.lose(*extent)
+            return None
+        if len(block):
+            first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
+            self.add_span(chunk, Span(0, first, last + 1, block.counts, block.ordered))
+        else:
+            self.account.decode(chunk.start, chunk.end)
+        return block
+
+    def lose_end(self, offset: int) -> None:
+        """Note that the file ends inside a record."""
+        what = f"the file ends inside a record at byte {offset} of {self.source.size}; what follows is gone"
+        self.lose("truncated", what, self.last_ns())
+        self.account.lose(offset, self.source.size)
+        self.account.cut = True
+
     def lose_record(self, start: int, end: int, error: Exception) -> None:
         """Note that the record in bytes [start, end) cannot be read: the boundary of the walk."""
-        kind, text = told(error)
+        kind, text = describe_damage(error)
         kind = "bad-record" if kind == "bad-chunk" else kind
         self.lose(kind, f"the record at byte {start} is malformed: {text}")
         self.account.lose(start, end)
@@ -381,21 +453,17 @@ class FileContainer(Container):
         """Find channels, spans and losses, keeping :attr:`at` up to date."""
 
     def _places(self) -> Iterator[int]:
-        """Yield where the walk is, up to the file's end, looking at the time that it takes now and then."""
+        """Yield the position of the walk up to the file's end; check the time limit now and then."""
         n = 0
-        while self.at < self.source.size:
+        while self.position < self.source.size:
             n += 1
             if n % _RECORDS_A_CHECK == 0:
                 self.meter.check()
-            yield self.at
+            yield self.position
 
     @abstractmethod
     def _finish(self) -> None:
-        """Close what the walk left open, and check what only the whole file tells."""
-
-    def close(self) -> None:
-        """Release the file."""
-        self.source.close()
+        """Finish open records and check the file as a whole."""
 
 
 def block_from_lists(buffer: bytes | memoryview, *columns: Sequence[int]) -> Block:

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget, BudgetError
 from pdhef_logtool.logs.container import Block, ChannelRecord
 from pdhef_logtool.logs.definitions import SHIPPED, Definitions
 from pdhef_logtool.logs.message_schema import (
@@ -39,13 +38,14 @@ from pdhef_logtool.logs.message_schema import (
     ros_schema,
     value_at,
 )
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError, ResourceLimits
 from pdhef_logtool.logs.wire_layout import LayoutReader, NoLayoutError, WireLayout, layout_of_message
 from pdhef_logtool.records.signals import IntArray
 
-#: Stands in a time column where the message lacks the time (NaN of int64).
+#: Value of a time column if the message has no time (NaN of int64).
 NO_TIME_NS = int(np.iinfo(np.int64).min)
 _LAYOUTS_PER_CHANNEL = 8
-#: Columns of an array are as many as its longest value has: at most so many cells, or columns where values are many.
+#: An array has as many columns as its longest value: at most this many cells, or columns if there are many values.
 _CELLS = 1 << 26
 _COLUMNS = 64
 
@@ -54,7 +54,7 @@ def channel_schema(
     channel: ChannelRecord,
     distro: str = "",
     example: bytes | None = None,
-    budget: Budget = DEFAULT_BUDGET,
+    limits: ResourceLimits = DEFAULT_LIMITS,
     definitions: Definitions = SHIPPED,
 ) -> MessageSchema:
     """Parse the schema of a channel.
@@ -64,7 +64,7 @@ def channel_schema(
     channel : channel to decode.
     distro : ROS distribution for types without a definition.
     example : first message, for JSON without a schema.
-    budget : what the schema may cost.
+    limits : resource limits of the schema.
     definitions : of ROS types that neither the channel nor the distribution has.
 
     Raises
@@ -79,20 +79,20 @@ def channel_schema(
         if not channel.type_name:
             raise NoSchemaError("no type name")
         return ros_schema(
-            channel.type_name, channel.schema_encoding, text, channel.encoding, distro, budget, definitions
+            channel.type_name, channel.schema_encoding, text, channel.encoding, distro, limits, definitions
         )
     if channel.encoding == "json":
         if channel.schema_encoding == "jsonschema" and channel.schema_data.strip():
-            return json_schema(channel.type_name, channel.schema_data.decode("utf-8", errors="replace"), budget)
+            return json_schema(channel.type_name, channel.schema_data.decode("utf-8", errors="replace"), limits)
         if example is not None:
-            return json_schema_of_message(channel.type_name, example, budget)
+            return json_schema_of_message(channel.type_name, example, limits)
         raise NoSchemaError("JSON without a schema and without a message")
     if channel.encoding == "protobuf":
         if channel.schema_encoding != "protobuf":
             raise NoSchemaError(f"protobuf messages with a {channel.schema_encoding!r} schema")
         from pdhef_logtool.logs.protobuf_schema import protobuf_schema
 
-        return protobuf_schema(channel.schema_name, channel.schema_data, budget)
+        return protobuf_schema(channel.schema_name, channel.schema_data, limits)
     raise NoSchemaError(f"messages encoded as {channel.encoding!r} are not decoded")
 
 
@@ -100,7 +100,7 @@ def channel_schema(
 class ChannelDecoder:
     """Decodes the messages of one channel for one set of paths.
 
-    ``undecodable`` holds the rows of the last block whose payload does not fit their type (their fields are NaN).
+    ``undecodable`` are the rows of the last block whose payload does not fit their type (their fields are NaN).
     """
 
     schema: MessageSchema
@@ -125,7 +125,7 @@ class ChannelDecoder:
             back = np.argsort(order)
             return {path: column[back] for path, column in columns.items()}
         joined = {s.path: concatenate_columns([part[s.path] for _, part in partial]) for s in self.selections}
-        back = np.argsort(np.concatenate([at for at, _ in partial]), kind="stable")
+        back = np.argsort(np.concatenate([part_rows for part_rows, _ in partial]), kind="stable")
         return {path: column[back] for path, column in joined.items()}
 
     def _read_records(
@@ -139,9 +139,9 @@ class ChannelDecoder:
             if tried == len(self._layouts):
                 if tried >= _LAYOUTS_PER_CHANNEL:
                     break
-                at, n = int(offset[left[0]]), int(length[left[0]])
+                message = block.message(rows[left[0]])
                 try:
-                    layout = layout_of_message(self.schema.root, self.schema.wire, bytes(block.buffer[at : at + n]))
+                    layout = layout_of_message(self.schema.root, self.schema.wire, message)
                     self._check_widths(layout, len(rows))
                 except NoLayoutError:
                     no_layout.append(left[:1])
@@ -158,9 +158,9 @@ class ChannelDecoder:
 
     def _check_widths(self, layout: WireLayout, n: int) -> None:
         """Refuse a layout one of whose arrays has too many elements for N rows of columns."""
-        most = min(self.schema.budget.array_width, _most_columns(n))
-        found = (layout.leaves.get(s.components[0]) for s in self.selections if s.shape == "array")
-        if any((leaf.count or 0) > most for leaf in found if leaf is not None):
+        most = min(self.schema.limits.array_width, _most_columns(n))
+        selected = (layout.leaves.get(s.components[0]) for s in self.selections if s.shape == "array")
+        if any((leaf.count or 0) > most for leaf in selected if leaf is not None):
             raise NoLayoutError("an array is too wide for columns")
 
     def _read_layout(
@@ -195,9 +195,9 @@ class ChannelDecoder:
         decode = self.single_decoder()
         getters = [(s.path, self._getter(s)) for s in self.selections]
         values: dict[str, list[object]] = {s.path: [] for s in self.selections}
-        most = min(self.schema.budget.array_width, _most_columns(len(rows)))
-        for row, at, n in zip(rows.tolist(), block.offset[rows].tolist(), block.length[rows].tolist(), strict=True):
-            message = decode(bytes(block.buffer[at : at + n]))
+        most = min(self.schema.limits.array_width, _most_columns(len(rows)))
+        for row, start, n in zip(rows.tolist(), block.offset[rows].tolist(), block.length[rows].tolist(), strict=True):
+            message = decode(bytes(block.buffer[start : start + n]))
             if message is None:
                 self.undecodable.append(row)
             for path, get in getters:
@@ -247,7 +247,7 @@ def _tolerant(decode: Callable[[bytes], object], schema: MessageSchema) -> Calla
     def tolerant(data: bytes) -> object:
         try:
             return decode(data) if len(data) <= most else None
-        except Exception:  # noqa: BLE001 (somebody else's bytes and somebody else's decoder)
+        except Exception:  # noqa: BLE001 (third-party data and decoder)
             return None
 
     return tolerant
@@ -256,10 +256,10 @@ def _tolerant(decode: Callable[[bytes], object], schema: MessageSchema) -> Calla
 def _affordable_bytes(schema: MessageSchema) -> float:
     """Return the bytes of a message whose objects fit a memory: one of a byte or two takes a hundred."""
     if schema.wire == "protobuf":
-        return schema.budget.chunk_bytes / 4
+        return schema.limits.chunk_bytes / 4
     if schema.wire == "json":
-        return schema.budget.chunk_bytes / 16
-    return schema.budget.chunk_bytes / 128 * _bytes_an_object(schema.root)
+        return schema.limits.chunk_bytes / 16
+    return schema.limits.chunk_bytes / 128 * _bytes_an_object(schema.root)
 
 
 def _bytes_an_object(node: Node) -> float:
@@ -286,7 +286,7 @@ def _least_size(node: Node) -> tuple[int, int]:
 
 
 def _most_columns(rows: int) -> int:
-    """Return how many columns so many rows may have."""
+    """Return the largest number of columns for a number of rows."""
     return max(_COLUMNS, _CELLS // max(rows, 1))
 
 
@@ -295,7 +295,7 @@ def concatenate_columns(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
     Raises
     ------
-    BudgetError : some arrays are so wide, and the others so many, that they would fill the memory.
+    LimitError : the arrays are too wide and too many for the memory.
     """
     if len(parts) == 1:
         return parts[0]
@@ -305,7 +305,7 @@ def concatenate_columns(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
         return np.concatenate(filled)
     rows = sum(p.shape[0] for p in filled)
     if width > _most_columns(rows):
-        raise BudgetError(
+        raise LimitError(
             expected=f"at most {_most_columns(rows)} elements in an array of {rows} messages",
             got=str(width),
             where="an array as columns",
@@ -339,17 +339,17 @@ def missing_column(selection: Selection, n: int) -> NDArray[Any]:
 
 
 def _record_column(layout: LayoutReader, parts: Sequence[NDArray[Any]], n: int, selection: Selection) -> NDArray[Any]:
-    found = [layout.values(parts, n, steps) for steps in selection.components]
+    values = [layout.values(parts, n, steps) for steps in selection.components]
     if selection.shape == "time":
-        seconds, nanoseconds = found
+        seconds, nanoseconds = values
         if seconds is None or nanoseconds is None:
             return np.full(n, NO_TIME_NS, dtype=np.int64)
         return seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
     if selection.shape == "vector":
-        return np.column_stack([np.full(n, np.nan) if f is None else f.astype(np.float64) for f in found])
-    if found[0] is None:
+        return np.column_stack([np.full(n, np.nan) if f is None else f.astype(np.float64) for f in values])
+    if values[0] is None:
         return missing_column(selection, n)
-    return found[0].astype(np.float64)
+    return values[0].astype(np.float64)
 
 
 def _single_value(message: object, selection: Selection) -> object:

@@ -1,4 +1,4 @@
-"""Message definitions for logs that hold none: the user's, those of an installed ROS, and a few that are shipped."""
+"""Message definitions for logs without any: the user's, those of an installed ROS, and a few that are shipped."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOST_FILES = 50_000
 MOST_BYTES = 1 << 20
 #: A type name may come from a log, and becomes a path.
 _TYPE_NAME = re.compile(r"([A-Za-z]\w*)/msg/([A-Za-z]\w*)", re.ASCII)
-#: Where ROS 2 and ROS 1 say that their packages are, and where they are without a word.
+#: Environment variables with the packages of ROS 2 and ROS 1, and the default folders.
 _PREFIXES, _SOURCES = ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"), "ROS_PACKAGE_PATH"
 _USUAL = (Path("/usr/local"), Path("/usr"))
 
@@ -55,10 +55,10 @@ class Definitions:
 
     def installed(self, type_name: str) -> Path | None:
         """Return the file of a type that only an installed ROS or a sourced workspace defines."""
-        found = _TYPE_NAME.fullmatch(type_name)
-        if found is None or type_name in self.files or found[2] in self.files or shipped_definition(type_name):
+        match = _TYPE_NAME.fullmatch(type_name)
+        if match is None or type_name in self.files or match[2] in self.files or shipped_definition(type_name):
             return None
-        return next((path for path in self._places(found[1], found[2]) if path.is_file()), None)
+        return next((path for path in self._places(match[1], match[2]) if path.is_file()), None)
 
     def _places(self, package: str, name: str) -> Iterator[Path]:
         file = Path("msg", f"{name}.msg")
@@ -71,7 +71,7 @@ class Definitions:
             yield from sorted(source.glob(f"*/{package}/{file.as_posix()}"))
 
 
-#: What there is without anything of the user's or the machine's.
+#: Shipped definitions only, without those of the user and the machine.
 SHIPPED = Definitions()
 
 
@@ -90,11 +90,11 @@ def read_definitions(place: Path | str | None) -> Definitions:
     """Find the definitions in a folder of ``.msg`` files, of packages, in a workspace, a zip file or a wheel.
 
     ``PACKAGE/msg/Name.msg`` and ``PACKAGE/Name.msg`` are ``PACKAGE/msg/Name``; a file that lies in the folder itself
-    stands for its name in any package. None gives those shipped and installed.
+    defines its name in any package. None: only shipped and installed definitions.
 
     Raises
     ------
-    UsageError : It is neither folder nor archive, or holds no definition.
+    UsageError : It is neither folder nor archive, or contains no definition.
     """
     prefixes = os.pathsep.join(os.environ.get(name, "") for name in _PREFIXES)
     machine = _of_machine(prefixes, os.environ.get(_SOURCES, ""))
@@ -111,7 +111,7 @@ def read_definitions(place: Path | str | None) -> Definitions:
     if not files:
         there = place.is_dir() or archive is not None
         raise UsageError(
-            expected="a folder, zip file or wheel that holds .msg files, packages or a workspace",
+            expected="a folder, zip file or wheel with .msg files, packages or a workspace",
             got="one without any" if there else "neither folder nor archive",
             where=str(place),
             remedy="give the package's source, or /opt/ros/DISTRO/share of the machine that recorded",
@@ -126,7 +126,7 @@ def _named(paths: Iterable[Path], root: Path, *, in_archive: bool = False) -> di
         if number >= MOST_FILES:
             break
         above = path.parent.parent if path.parent.name == "msg" else path.parent
-        # A package's own folder may be given as well: package.xml tells it from a folder of files.
+        # The folder of a single package can be given: it contains a package.xml, a folder of files does not.
         if root in (path.parent, above) and (in_archive or not (above / "package.xml").is_file()):
             files.setdefault(path.stem, path)
         package = above.name if in_archive else above.resolve().name

@@ -1,4 +1,4 @@
-"""Which logs a command line means, and the name each of them has in tables and output folders."""
+"""Find the logs that a command line names, and give each a name for tables and output folders."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pdhef_logtool.logs.formats import COMPRESSED_SUFFIXES, ROSBAG2_METADATA, lo
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.records.errors import LogError, UsageError
 
-#: Stems are folder names on whatever system the outputs go to.
+#: Stems are folder names on any system.
 _STEM_BYTES = 100
 _NOT_IN_NAMES = frozenset('<>:"/\\|?*')
 _DEVICE = re.compile(r"CON|PRN|AUX|NUL|CONIN\$|CONOUT\$|(COM|LPT)[0-9¹²³]", re.IGNORECASE)
@@ -32,7 +32,7 @@ class LogInput:
     """A log and its ``stem``: unique in a run, fit for a folder name on any system, equal to ``log`` in the tables.
 
     The stem is the log's name; where that is none for a folder, or another log's too, hash digits end it.
-    ``span_s``: only this slice of it, in seconds from its start; it goes before a slice that holds for all logs.
+    ``span_s``: only this slice of it, in seconds from its start; it takes precedence over a slice for all logs.
     """
 
     path: LogPlace
@@ -41,16 +41,16 @@ class LogInput:
 
     @property
     def local(self) -> Path | None:
-        """The file or folder of this machine; None for a log that lies elsewhere."""
+        """The file or folder on this machine; None for a remote log."""
         return self.path if isinstance(self.path, Path) else None
 
     @property
     def folder(self) -> Path | None:
-        """What holds it on this machine; None for a log that lies elsewhere, beside which nothing is looked at."""
+        """Its folder on this machine; None for a remote log, beside which nothing is searched."""
         return self.path.parent if isinstance(self.path, Path) else None
 
 
-#: A log or several, as people name them, or as a command has found and cut them.
+#: A log or several, as users name them, or as :func:`find_logs` returned them.
 Logs: TypeAlias = "str | LogPlace | Sequence[str | LogPlace] | Sequence[LogInput]"
 
 
@@ -59,14 +59,14 @@ def find_logs(arguments: Logs, *, private_redirects: bool = False) -> list[LogIn
 
     A file or rosbag2 folder that is named outright is taken as it is, whether it is readable or not. Folders, and
     ``s3://bucket/prefix/``, are searched for logs by suffix; a rosbag2 folder of this machine counts as one log. Any
-    other URL is one log. ``@list.txt`` stands for the lines of a file. ``private_redirects`` as for
+    other URL is one log. ``@list.txt`` means the lines of a file. ``private_redirects`` as for
     :class:`~pdhef_logtool.logs.remote_place.RemotePlace`.
 
     Raises
     ------
-    UsageError : An argument stands for no log at all. LogError : A store cannot be searched.
+    UsageError : An argument names no log. LogError : A store cannot be searched.
     """
-    found: dict[str, LogPlace] = {}
+    logs: dict[str, LogPlace] = {}
     several = [arguments] if isinstance(arguments, str | Path | RemotePlace) else arguments
     if already := [a for a in several if isinstance(a, LogInput)]:
         return already
@@ -78,11 +78,11 @@ def find_logs(arguments: Logs, *, private_redirects: bool = False) -> list[LogIn
                 expected=f"at least one log ({', '.join(log_suffixes())} or a rosbag2 folder)",
                 got="none",
                 where=str(place_of(argument)),
-                remedy="name a log, a folder that holds some, or a glob pattern in quotes",
+                remedy="name a log, a folder with logs, or a glob pattern in quotes",
             )
         for place in places:
-            found.setdefault(place.identity if isinstance(place, RemotePlace) else os.path.realpath(place), place)
-    return _with_stems(list(found.values()))
+            logs.setdefault(place.identity if isinstance(place, RemotePlace) else os.path.realpath(place), place)
+    return _with_stems(list(logs.values()))
 
 
 def with_free_stem(log: LogInput, taken: Container[str]) -> LogInput:
@@ -95,7 +95,7 @@ def with_free_stem(log: LogInput, taken: Container[str]) -> LogInput:
 
 
 def one_place(argument: str, *, private_redirects: bool = False) -> LogPlace:
-    """Return the place that an argument names outright; ``@list.txt`` may stand for it.
+    """Return the place that an argument, or the one line of ``@list.txt``, names.
 
     ``private_redirects`` as for :class:`~pdhef_logtool.logs.remote_place.RemotePlace`.
 
@@ -110,7 +110,7 @@ def one_place(argument: str, *, private_redirects: bool = False) -> LogPlace:
 
 
 def _lines(argument: str) -> Iterator[str]:
-    """Yield what an argument stands for: itself, or the lines of the file that it names by ``@``."""
+    """Yield an argument, or the lines of the file that it names by ``@``."""
     listed = Path(argument[1:])
     if not argument.startswith("@") or Path(argument).exists() or not listed.is_file():
         yield argument
@@ -124,14 +124,14 @@ def _lines(argument: str) -> Iterator[str]:
 
 
 def folders_of(inputs: Sequence[LogInput]) -> list[str]:
-    """Return the folder of each log below the one that holds all of them, ``car/day``; empty for those right in it."""
+    """Return the folder of each log below their common folder, ``car/day``; empty for those directly in it."""
     folders = [_parts(i.path)[:-1] for i in inputs]
     n = len(_common(folders))
     return ["/".join(folder[n:]) for folder in folders]
 
 
 def identity_of(log: LogInput) -> str:
-    """Return what a log is known by wherever it lies and whatever it is called: its content's sha256.
+    """Return the identity of a log, independent of its path: the sha256 of its content.
 
     Of an object on a server, which is not fetched for this, it is that of its URL, size and ETag (or, where the server
     gives none, time of modification).
@@ -210,15 +210,15 @@ def _search_store(prefix: RemotePlace) -> list[RemotePlace]:
 
 
 def _matches(pattern: str) -> list[Path]:
-    """Return what a glob pattern stands for; ``**`` enters no folder by a link, which could lead round for ever."""
+    """Return the matches of a glob pattern; ``**`` does not follow links to folders, which could form a loop."""
     if "**" not in Path(pattern).parts:
         return [Path(name) for name in sorted(glob.glob(pattern))]  # noqa: PTH207 (the pattern may be absolute)
     parts = Path(pattern).parts
     first = next(i for i, part in enumerate(parts) if glob.has_magic(part))
     root = Path(*parts[:first])
     below = str(Path(*(part if part == "**" else re.sub(r"\*\*+", "*", part) for part in parts[first:])))
-    found = (p for p in root.glob(below) if not any(x.startswith(".") for x in p.relative_to(root).parts))
-    return sorted(found, key=str)
+    paths = (p for p in root.glob(below) if not any(x.startswith(".") for x in p.relative_to(root).parts))
+    return sorted(paths, key=str)
 
 
 def _search(folder: Path, visited: set[str]) -> Iterator[Path]:

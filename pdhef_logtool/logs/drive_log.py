@@ -12,20 +12,20 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.occupied_time import OccupiedTime
+from pdhef_logtool.logs.recording_span import RecordingSpan
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import IntArray, Loss
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.columnar_log import ColumnarLog
-    from pdhef_logtool.logs.slim_log import SlimLog
+    from pdhef_logtool.logs.reduced_log import ReducedLog
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,31 +60,6 @@ class Columns:
         return int(self.log_time_ns.shape[0])
 
 
-class LogIndex(Protocol):
-    """What a sound index tells of a log before its messages are read."""
-
-    @property
-    def far(self) -> bool:
-        """Whether each read costs a network request."""
-
-    @property
-    def size(self) -> int:
-        """Bytes of all files."""
-
-    @property
-    def looked_at(self) -> tuple[int, int]:
-        """Number of chunks that were read, and of all chunks."""
-
-    def index_times(self, start_ns: int, end_ns: int) -> dict[str, IntArray]:
-        """Return each topic's log times in [start, end), ascending."""
-
-    def beside(self, topics: Collection[str]) -> frozenset[str]:
-        """Return the topics whose messages all lie in chunks that hold one of these: they cost no further read."""
-
-    def expect(self, topics: Collection[str], spans_ns: Sequence[tuple[int, int]]) -> None:
-        """Prepare to read these topics in [start, end) of each span."""
-
-
 class DriveLog(ABC):
     """A readable log. Instances come from :func:`pdhef_logtool.logs.open_log.open_log`.
 
@@ -104,24 +79,24 @@ class DriveLog(ABC):
 
     @property
     @abstractmethod
-    def occupied(self) -> OccupiedTime:
-        """When the log was recorded; what was recorded at other times is never read."""
+    def recording_span(self) -> RecordingSpan:
+        """When the log was recorded; messages of other times are never read."""
 
     @property
     @abstractmethod
     def lost(self) -> tuple[Loss, ...]:
-        """What could not be read, as far as is known by now (complete after a full read)."""
+        """Losses so far (complete after a full read)."""
 
     @property
     @abstractmethod
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:
-        """Where the bytes of each file went, as far as is known by now."""
+        """Byte ledger of each file so far."""
 
     @abstractmethod
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
         """Return the scalar leaves of a topic; empty where none is known.
 
-        ``quiet`` only looks: a schema that does not parse is no loss then.
+        With ``quiet`` a schema that does not parse is not reported as a loss.
         """
 
     @abstractmethod
@@ -136,8 +111,8 @@ class DriveLog(ABC):
     ) -> dict[str, Columns]:
         """Read the requested fields of messages with log time in [start, end). No other topic is decoded.
 
-        ``quiet`` only looks: messages that do not decode are no loss then. ``stamps`` are further topics, of which
-        only the times are read.
+        With ``quiet`` messages that do not decode are not reported as a loss. ``stamps`` are further topics; only their
+        times are read.
 
         Raises
         ------
@@ -151,12 +126,12 @@ class DriveLog(ABC):
     @property
     def start_ns(self) -> int:
         """First log time that counts; 0 for a log without messages."""
-        return self.occupied.start_ns
+        return self.recording_span.start_ns
 
     @property
     def end_ns(self) -> int:
         """Last log time that counts + 1 (intervals are [start, end)); 0 for a log without messages."""
-        return self.occupied.end_ns
+        return self.recording_span.end_ns
 
     @property
     def messages(self) -> ColumnarLog | None:
@@ -164,31 +139,31 @@ class DriveLog(ABC):
         return None
 
     @property
-    def index(self) -> LogIndex | None:
-        """What an index tells; None: there is none, or none that is sound."""
+    def index(self) -> ColumnarLog | None:
+        """The log's index; None if there is none, or an inconsistent one."""
         return None
 
     @property
-    def slim(self) -> SlimLog | None:
-        """The log as a slim log, with the record of its source; None: it is a source itself."""
+    def reduced(self) -> ReducedLog | None:
+        """The log as a reduced log, with the record of its source; None if it is a complete log."""
         return None
 
     def metadata(self) -> dict[str, str]:
-        """Return what the log says of itself by ``key`` and ``record.key``."""
+        """Return the metadata of the log by ``key`` and ``record.key``."""
         return {}
 
     def unreadable(self, topic: str) -> str:
-        """Return why no field of a topic is known; empty where one is."""
+        """Return why a topic has no readable fields; empty if it has some."""
         del topic
         return ""
 
     def borrowed(self, topic: str) -> tuple[Path, ...]:
-        """Return the files of an installed ROS that a topic's type is read by, as the log does not define it."""
+        """Return the files of an installed ROS that define a topic's type, if the log does not define it."""
         del topic
         return ()
 
     def first_messages(self, topic: str, most: int) -> list[object]:
-        """Return the first messages of a topic whole, with their texts; what does not decode is left out.
+        """Return the first messages of a topic, decoded with texts; messages that do not decode are left out.
 
         ``value_at`` of ``message_schema`` reads places in them.
         """
@@ -204,12 +179,12 @@ def nearest(name: str, names: Sequence[str], expected: str, where: object) -> Ma
 
 
 def windows(
-    start_ns: int, end_ns: int, length_ns: int, occupied: OccupiedTime | None = None
+    start_ns: int, end_ns: int, length_ns: int, recording_span: RecordingSpan | None = None
 ) -> Iterator[tuple[int, int]]:
     """Cut [start, end) into consecutive windows of at most ``length_ns``; those in a silence are left out."""
-    at = start_ns
-    for begin, end in ((start_ns, end_ns),) if occupied is None else occupied.intervals:
-        at += max(0, (begin - at) // length_ns) * length_ns
-        while at < min(end, end_ns):
-            yield at, min(at + length_ns, end_ns)
-            at += length_ns
+    window_ns = start_ns
+    for begin, end in ((start_ns, end_ns),) if recording_span is None else recording_span.intervals:
+        window_ns += max(0, (begin - window_ns) // length_ns) * length_ns
+        while window_ns < min(end, end_ns):
+            yield window_ns, min(window_ns + length_ns, end_ns)
+            window_ns += length_ns

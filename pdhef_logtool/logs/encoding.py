@@ -32,7 +32,7 @@ class CdrEncoder:
     ----------
     topic, type_name : topic and ROS 2 type.
     definition : ros2msg text with all contained types.
-    constants : what every message holds, by path: a text, a number, or an array's values. Unset texts and sequences
+    constants : constant fields of every message, by path: a text, a number, or an array. Unset texts and sequences
         are empty, unset numbers are zero.
 
     Raises
@@ -110,7 +110,7 @@ class CdrEncoder:
         return MappingError(expected=expected, got=got, where=f"{self.topic}.{path}")
 
     def _layout(self, widths: Mapping[str, int]) -> tuple[WireLayout, bytes]:
-        """Return the layout for these array widths and the message that holds just the constants."""
+        """Return the layout for these array widths and a message with only the constants."""
         lengths: dict[Steps, int] = {}
         for path, width in widths.items():
             selection = self._selections[path]
@@ -121,8 +121,8 @@ class CdrEncoder:
 
             def length_of(steps: Sequence[Step], offset: int, is_text: bool) -> int:
                 del offset
-                at = tuple(steps)
-                return len(self._texts.get(at, b"")) + 1 if is_text else lengths.get(at, 0)
+                place = tuple(steps)
+                return len(self._texts.get(place, b"")) + 1 if is_text else lengths.get(place, 0)
 
             try:
                 layout = build_layout(self.schema.root, "cdr", length_of)
@@ -134,7 +134,7 @@ class CdrEncoder:
     def _template(self, layout: WireLayout) -> bytes:
         message = bytearray(layout.size)
         message[1] = 1  # little-endian CDR
-        for offset, length in layout.guards:
+        for offset, length in layout.lengths:
             struct.pack_into("<I", message, offset, length)
         for steps, (offset, _) in layout.texts.items():
             text = self._texts.get(steps, b"")
@@ -166,7 +166,7 @@ class CdrEncoder:
     ) -> None:
         leaf = leaf_at(layout, steps)
         if leaf is None:
-            raise self._misfit(path, "an element that the message holds", "an index outside its sequence")
+            raise self._misfit(path, "an element of the message", "an index outside its sequence")
         if values.ndim != (1 if leaf.count is None else 2) or (
             leaf.count is not None and values.shape[1] != leaf.count
         ):

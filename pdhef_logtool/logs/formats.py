@@ -1,6 +1,6 @@
-"""The formats of logs: one entry says how files of a format are recognised and how they are opened.
+"""The formats of logs: an entry defines how files of a format are recognised and opened.
 
-A package adds formats by entry points of the group ``pdhef.log_formats``, each of which is a :class:`LogFormat`.
+A package adds formats by entry points of the group ``pdhef.log_formats``; each is a :class:`LogFormat`.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class LogFormat:
     needs_suffix: bool = False
 
     def recognises(self, head: bytes, name: str) -> bool:
-        """Tell by the first bytes and the name whether a file is of this format."""
+        """Return, by the first bytes and the name, whether a file is of this format."""
         if self.needs_suffix or not self.magic:
             return head.startswith(self.magic) and name.lower().endswith(self.suffixes)
         return head.startswith(self.magic)
@@ -68,8 +68,8 @@ FORMATS = (
 
 @cache
 def _of_other_packages() -> tuple[LogFormat, ...]:
-    found = sorted(entry_points(group=GROUP), key=lambda entry: entry.name)
-    return tuple(entry.load() for entry in found)
+    entries = sorted(entry_points(group=GROUP), key=lambda entry: entry.name)
+    return tuple(entry.load() for entry in entries)
 
 
 def _every_format() -> Iterator[LogFormat]:

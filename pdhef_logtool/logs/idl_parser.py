@@ -13,8 +13,8 @@ from rosbags.typesys.idl import IDLParser
 class _QuickParser(IDLParser):
     """Parses every rule once a place, where the plain one takes a hundred times as long for each bracket.
 
-    Products and shifts are refused: a few of them, each of the one before, are a number that fills the memory, and the
-    texts that ROS makes hold none.
+    Products and shifts are refused: a few nested ones give a number that fills the memory, and the texts that ROS
+    generates contain none.
     """
 
     def __init__(self, text: str) -> None:

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pdhef_logtool.logs.budget import Meter
 from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.logs.resource_limits import Meter
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +26,3 @@ class LogFile:
     meter: Meter
     release: Callable[[], None] = lambda: None
     cut: str = ""
-
-    @property
-    def is_copy(self) -> bool:
-        """Whether it is not the file itself."""
-        return self.path != self.place

@@ -1,7 +1,7 @@
-"""The summary of an MCAP as an index: where its chunks lie and what they hold, without walking the file.
+"""The summary of an MCAP as an index: extents and contents of its chunks, without walking the file.
 
-For places where every read is a journey. An index is a claim: it is taken only if it is whole, if its sums agree with
-the file's statistics, and if it tells of nothing unusual in time; otherwise the file is walked like any other.
+For remote files, where every read is a request. An index is used only if it is complete, if its sums agree with the
+file's statistics, and if its times are those of a sound recording; otherwise the file is walked like any other.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 
 from pdhef_logtool.logs.byte_source import ByteSource, CutError
 from pdhef_logtool.logs.container import MAX_TIME_NS, MCAP_MAGIC
-from pdhef_logtool.logs.occupied_time import SILENCE_NS, STEP_BACK_NS
+from pdhef_logtool.logs.recording_span import SILENCE_NS, STEP_BACK_NS
 
 #: One request brings the summary of a drive of several minutes; what is missing of a longer one comes with a second.
 TAIL_BYTES = 256 << 10
@@ -34,9 +34,9 @@ _INDEX_BYTES, _PAIR_BYTES = 15, 16  # of a message index, and of each message in
 
 @dataclass(frozen=True, slots=True)
 class IndexedChunk:
-    """A chunk record in bytes [at, end), its message indexes up to ``index_end``; times as the record has them."""
+    """A chunk record in bytes [start, end), its message indexes up to ``index_end``; times as the record has them."""
 
-    at: int
+    start: int
     end: int
     index_end: int
     first_ns: int
@@ -46,7 +46,7 @@ class IndexedChunk:
 
 @dataclass(frozen=True, slots=True)
 class McapIndex:
-    """What a summary tells: schema and channel records, chunks and attachments [at, end) in file order."""
+    """Content of a summary: schema and channel records, chunks and attachments [start, end) in file order."""
 
     schemas: tuple[bytes, ...]
     channels: tuple[bytes, ...]
@@ -55,10 +55,10 @@ class McapIndex:
 
 
 def read_index(source: ByteSource) -> McapIndex | None:
-    """Read the summary of an MCAP from its end; None if there is none that can be believed."""
+    """Read the summary of an MCAP from its end; None if there is none that can be used."""
     try:
-        found = _summary(source)
-        return None if found is None else _index(*found)
+        section = _summary(source)
+        return None if section is None else _index(*section)
     except (struct.error, ValueError, IndexError, CutError):
         return None
 
@@ -70,14 +70,14 @@ def _summary(source: ByteSource) -> tuple[bytes, int] | None:
     if foot <= len(MCAP_MAGIC):
         return None
     tail = max(0, size - TAIL_BYTES)
-    source.expect([(tail, size)])
+    source.prefetch([(tail, size)])
     end = source.read(foot, size - foot)
     opcode, length, start, _, crc = FOOTER.unpack_from(end)
     if opcode != Opcode.FOOTER or length != FOOTER.size - 9 or end[FOOTER.size :] != MCAP_MAGIC:
         return None
     if not 0 < start < foot or foot - start > _MOST_SUMMARY_BYTES:
         return None
-    source.expect([(start, size)])
+    source.prefetch([(start, size)])
     summary = source.read(start, foot - start)
     if crc and zlib.crc32(end[: FOOTER.size - 4], zlib.crc32(summary)) != crc:
         return None
@@ -85,13 +85,13 @@ def _summary(source: ByteSource) -> tuple[bytes, int] | None:
 
 
 def _records(summary: bytes) -> Iterator[tuple[int, bytes]]:
-    at = 0
-    while at < len(summary):
-        opcode, length = RECORD.unpack_from(summary, at)
-        if at + 9 + length > len(summary):
+    offset = 0
+    while offset < len(summary):
+        opcode, length = RECORD.unpack_from(summary, offset)
+        if offset + 9 + length > len(summary):
             raise ValueError("a cut record")
-        yield opcode, summary[at + 9 : at + 9 + length]
-        at += 9 + length
+        yield opcode, summary[offset + 9 : offset + 9 + length]
+        offset += 9 + length
 
 
 def _index(summary: bytes, start: int) -> McapIndex | None:
@@ -106,14 +106,14 @@ def _index(summary: bytes, start: int) -> McapIndex | None:
         elif opcode == Opcode.CHUNK_INDEX:
             chunks.append(_chunk(record))
         elif opcode == Opcode.ATTACHMENT_INDEX:
-            at, length = _EXTENT.unpack_from(record)
-            attachments.append((at, at + length))
+            begin, length = _EXTENT.unpack_from(record)
+            attachments.append((begin, begin + length))
         elif opcode == Opcode.STATISTICS:
             total, _, _, files, _, n, _, _, size = _STATISTICS.unpack_from(record)
             entries = np.frombuffer(record, _COUNTS, size // _COUNTS.itemsize, _STATISTICS.size)
             claimed = Counter(dict(zip(entries["id"].tolist(), entries["n"].tolist(), strict=True)))
             counted = total, n, files
-    chunks.sort(key=lambda chunk: chunk.at)
+    chunks.sort(key=lambda chunk: chunk.start)
     attachments.sort()
     held: Counter[int] = Counter()
     for chunk in chunks:
@@ -127,10 +127,10 @@ def _index(summary: bytes, start: int) -> McapIndex | None:
 
 def _chunk(record: bytes) -> IndexedChunk:
     """Read a chunk index; how many messages each channel has follows from where the message indexes lie."""
-    first, last, at, length, size = _CHUNK_INDEX.unpack_from(record)
+    first, last, start, length, size = _CHUNK_INDEX.unpack_from(record)
     offsets = np.frombuffer(record, _OFFSETS, size // _OFFSETS.itemsize, _CHUNK_INDEX.size)
     (index_size,) = struct.unpack_from("<Q", record, _CHUNK_INDEX.size + size)
-    end, index_end = at + length, at + length + index_size
+    end, index_end = start + length, start + length + index_size
     order = np.argsort(offsets["at"], kind="stable")
     begins = offsets["at"][order].tolist()
     counts: dict[int, int] = {}
@@ -142,18 +142,18 @@ def _chunk(record: bytes) -> IndexedChunk:
             counts[id_] = n
     if not counts or begins[0] != end:
         raise ValueError("a chunk without message indexes")
-    return IndexedChunk(at, end, index_end, first, last, counts)
+    return IndexedChunk(start, end, index_end, first, last, counts)
 
 
 def _apart(chunks: list[IndexedChunk], attachments: list[tuple[int, int]], limit: int) -> bool:
-    """Tell whether no two records overlap, and all end before the summary."""
-    extents = sorted([*((c.at, c.index_end) for c in chunks), *attachments])
+    """Return whether no two records overlap, and all end before the summary."""
+    extents = sorted([*((c.start, c.index_end) for c in chunks), *attachments])
     ends = [len(MCAP_MAGIC), *(end for _, end in extents)]
-    return all(at >= end for (at, _), end in zip(extents, ends, strict=False)) and max(ends) <= limit
+    return all(start >= end for (start, _), end in zip(extents, ends, strict=False)) and max(ends) <= limit
 
 
 def _in_order(chunks: list[IndexedChunk]) -> bool:
-    """Tell whether the chunks' times are those of a sound recording: whatever is not is looked at by walking."""
+    """Return whether the chunks' times are those of a sound recording; any other file is walked."""
     newest: dict[int, int] = {}
     for chunk in chunks:
         if not 0 <= chunk.last_ns - chunk.first_ns < SILENCE_NS or chunk.last_ns >= MAX_TIME_NS:

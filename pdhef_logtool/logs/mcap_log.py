@@ -1,8 +1,8 @@
 """MCAP files as a container: one walk over the record headers, chunks decoded one at a time, every CRC checked.
 
-The walk visits every top-level record by its length and trusts no index, so that a file without a summary, with
-channels that only its chunks declare, with chunks that no index names, or with a cut end reads like any other. Where
-reading is far, chunks of which nothing is wanted are taken from the index, if it can be believed.
+The walk visits every top-level record by its length and uses no index, so that a file without a summary, with
+channels that only its chunks declare, with chunks that no index names, or with a cut end reads like any other. Of a
+remote file, chunks that are not wanted are taken from the index, if it is consistent.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from io import BytesIO
 from itertools import accumulate
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -27,7 +27,6 @@ from mcap.records import Attachment as AttachmentRecord
 from mcap.records import Channel, Metadata, Schema
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.budget import BudgetError, Meter
 from pdhef_logtool.logs.byte_source import ByteSource
 from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.container import (
@@ -39,16 +38,16 @@ from pdhef_logtool.logs.container import (
     Block,
     ChannelRecord,
     FileContainer,
-    MetadataRecord,
     RawChunk,
     Span,
     SpanDamageError,
     Wanted,
     block_from_lists,
-    told,
+    describe_damage,
 )
 from pdhef_logtool.logs.mcap_index import FOOTER, RECORD, IndexedChunk, read_index
 from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.logs.type_names import ros2_type_name
 from pdhef_logtool.records.signals import IntArray, Loss
 
@@ -81,7 +80,7 @@ _SUMMARY_ONLY = frozenset(
     )
 )
 _FIRST_PRIVATE = 0x80  # what is neither known nor private is no record of the format
-#: What stands before the payload of a message record.
+#: Head of a message record, before its payload.
 MESSAGE_HEAD = np.dtype(
     [("op", "u1"), ("size", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
@@ -89,9 +88,9 @@ MESSAGE_HEAD = np.dtype(
 
 @dataclass(frozen=True, slots=True)
 class _Extent:
-    """Bytes [at, end) of a chunk record or a run of message records; message indexes follow up to ``index_end``."""
+    """Bytes [start, end) of a chunk record or a run of message records; message indexes follow up to ``index_end``."""
 
-    at: int
+    start: int
     end: int
     is_chunk: bool
     index_end: int
@@ -104,6 +103,8 @@ class McapContainer(FileContainer):
     magic = MCAP_MAGIC
     magic_text = "the MCAP magic bytes"
     remedy = "is it an MCAP 1.0 recording?"
+    whole_chunks = True
+    chunks: list[_Extent]
 
     def __init__(
         self,
@@ -117,11 +118,10 @@ class McapContainer(FileContainer):
         self.library = ""
         self._schemas: dict[int, Schema] = {}
         self._raw_channels: dict[int, Channel] = {}
-        self._extents: list[_Extent] = []
         self._attachment_at: list[tuple[int, int]] = []
         self._metadata_at: list[tuple[int, int]] = []
-        self._index_believed = False
-        self._misled = False  # whether an index named other messages than are there
+        self._index_used = False
+        self._index_wrong = False  # whether an index named other messages than are there
         self._indexed: list[int] | None = None  # where the chunks lie that the summary names
         self._walked = _Walk(self)
         super().__init__(path, shown_path, meter)
@@ -129,79 +129,79 @@ class McapContainer(FileContainer):
     def _walk(self) -> None:
         source, size, walk = self.source, self.source.size, self._walked
         header_seen = False
-        believed = self._believed() if source.far else {}
-        for at in self._places():
-            if at in believed:
-                self.at = walk.believe(believed[at])
+        skippable = self._skippable() if source.is_remote else {}
+        for offset in self._places():
+            if offset in skippable:
+                self.position = walk.add_indexed(skippable[offset])
                 continue
-            if size - at == len(MCAP_MAGIC) and source.read(at, len(MCAP_MAGIC)) == MCAP_MAGIC:
-                self.account.decode(at, size)
+            if size - offset == len(MCAP_MAGIC) and source.read(offset, len(MCAP_MAGIC)) == MCAP_MAGIC:
+                self.account.decode(offset, size)
                 walk.closed = True
                 return
-            opcode, length = RECORD.unpack(source.read(at, 9)) if at + 9 <= size else (0, 0)
-            end = at + 9 + length
+            opcode, length = RECORD.unpack(source.read(offset, 9)) if offset + 9 <= size else (0, 0)
+            end = offset + 9 + length
             if end > size or opcode == 0:
                 if not header_seen:
                     raise self.no_log("a complete header record", "none, or one that runs past the end of the file")
-                resume = self._next_indexed_chunk(at)
+                resume = self._next_indexed_chunk(offset)
                 if resume is None:
-                    walk.cut(at)
+                    walk.cut(offset)
                     return
-                walk.skipped(at, resume)
-                self.at = resume
+                walk.skipped(offset, resume)
+                self.position = resume
                 continue
             if not header_seen:
                 if opcode != _OP_HEADER:
                     raise self.no_log("a header record after the magic bytes", "none")
-                self._read_header(at, length)
+                self._read_header(offset, length)
                 header_seen = True
             elif opcode == _OP_MESSAGE:
-                end = walk.messages(at)
+                end = walk.messages(offset)
             else:
                 try:
-                    walk.record(opcode, at, end)
-                except Exception as error:  # noqa: BLE001 (whatever a record does, the next one is read)
-                    self.lose_record(at, end, error)
-            self.at = end
+                    walk.record(opcode, offset, end)
+                except Exception as error:  # noqa: BLE001 (the next record is read in any case)
+                    self.lose_record(offset, end, error)
+            self.position = end
         if not header_seen:
             raise self.no_log("a header record after the magic bytes", "none")
 
     def _finish(self) -> None:
         self._walked.finish()
-        self.far = self.source.far
-        chunked = bool(self._extents) and all(extent.is_chunk for extent in self._extents)
-        known = self._index_believed if self.far else self._walked.statistics is not None
-        self.by_index = chunked and known and not self._misled and all(x.kind == UNVERIFIED for x in self.lost)
+        self.is_remote = self.source.is_remote
+        chunked = bool(self.chunks) and all(extent.is_chunk for extent in self.chunks)
+        indexed = self._index_used if self.is_remote else self._walked.statistics is not None
+        self.by_index = chunked and indexed and not self._index_wrong and all(x.kind == UNVERIFIED for x in self.lost)
 
-    def _believed(self) -> dict[int, IndexedChunk | tuple[int, int]]:
+    def _skippable(self) -> dict[int, IndexedChunk | tuple[int, int]]:
         """Return the chunks and attachments that are not wanted by their place, and have all else fetched."""
         everything = self._wanted == EVERYTHING or self.source.size <= self._wanted.above_bytes
         index = None if everything else read_index(self.source)
-        found: dict[int, IndexedChunk | tuple[int, int]] = {}
+        unwanted: dict[int, IndexedChunk | tuple[int, int]] = {}
         try:
             for schema in index.schemas if index else ():
                 self.add_schema(schema)
             for channel in index.channels if index else ():
                 self.add_channel(channel)
-        except Exception as error:  # noqa: BLE001 (the walk tells what is wrong)
-            told(error)
+        except Exception as error:  # noqa: BLE001 (the walk reports the damage)
+            describe_damage(error)
             self._schemas.clear()
             self._raw_channels.clear()
             index = None
         if index is not None:
-            self._index_believed = True
+            self._index_used = True
             topics = {id_: channel.topic for id_, channel in self._raw_channels.items()}
             for chunk in index.chunks:
                 if not self._wanted.has([topics[id_] for id_ in chunk.counts], chunk.first_ns, chunk.last_ns):
-                    found[chunk.at] = chunk
-            found |= {extent[0]: extent for extent in index.attachments}
-        ends = {at: (x.index_end if isinstance(x, IndexedChunk) else x[1]) for at, x in found.items()}
-        self.source.expect(zip([0, *ends.values()], [*ends, self.source.size], strict=True))
-        return found
+                    unwanted[chunk.start] = chunk
+            unwanted |= {extent[0]: extent for extent in index.attachments}
+        ends = {start: (x.index_end if isinstance(x, IndexedChunk) else x[1]) for start, x in unwanted.items()}
+        self.source.prefetch(zip([0, *ends.values()], [*ends, self.source.size], strict=True))
+        return unwanted
 
-    def _read_header(self, at: int, length: int) -> None:
-        self.meter.budget.check("metadata_bytes", length, "the header record")
-        payload = self.source.read(at + 9, length)
+    def _read_header(self, offset: int, length: int) -> None:
+        self.meter.limits.check("metadata_bytes", length, "the header record")
+        payload = self.source.read(offset + 9, length)
         try:
             (n,) = _U32.unpack_from(payload, 0)
             (m,) = _U32.unpack_from(payload, 4 + n)
@@ -211,43 +211,43 @@ class McapContainer(FileContainer):
             raise self.no_log("a header record with profile and library", "a malformed one") from error
         if 8 + n + m > length:
             raise self.no_log("a header record with profile and library", "a draft of the format before 1.0")
-        self.account.decode(at, at + 9 + length)
+        self.account.decode(offset, offset + 9 + length)
 
     def _next_indexed_chunk(self, after: int) -> int | None:
         """Return the first chunk behind a damaged place that the summary names, or None."""
         if self._indexed is None:
             self._indexed = self._indexed_chunks()
-        at = bisect_right(self._indexed, after)
-        return self._indexed[at] if at < len(self._indexed) else None
+        position = bisect_right(self._indexed, after)
+        return self._indexed[position] if position < len(self._indexed) else None
 
     def _indexed_chunks(self) -> list[int]:
         read, size = self.source.read, self.source.size
         foot = size - len(MCAP_MAGIC) - _FOOTER_BYTES
         if foot <= 0 or read(foot, 1)[0] != Opcode.FOOTER or read(size - len(MCAP_MAGIC), 8) != MCAP_MAGIC:
             return []
-        (at,) = _U64.unpack(read(foot + 9, 8))
-        found: list[int] = []
-        while at > 0 and at + 9 <= foot:
-            opcode, length = RECORD.unpack(read(at, 9))
-            if opcode == Opcode.CHUNK_INDEX and length >= 24 and at + 9 + length <= foot:
-                (offset,) = _U64.unpack(read(at + 9 + 16, 8))
-                if offset < foot and read(offset, 1)[0] == Opcode.CHUNK:
-                    found.append(offset)
-            at += 9 + length
-        return sorted(found)
+        (offset,) = _U64.unpack(read(foot + 9, 8))
+        chunks: list[int] = []
+        while offset > 0 and offset + 9 <= foot:
+            opcode, length = RECORD.unpack(read(offset, 9))
+            if opcode == Opcode.CHUNK_INDEX and length >= 24 and offset + 9 + length <= foot:
+                (chunk,) = _U64.unpack(read(offset + 9 + 16, 8))
+                if chunk < foot and read(chunk, 1)[0] == Opcode.CHUNK:
+                    chunks.append(chunk)
+            offset += 9 + length
+        return sorted(chunks)
 
     def add_schema(self, payload: bytes) -> None:
-        """Take note of a schema record."""
-        self.meter.budget.check("metadata_bytes", len(payload), "a schema record")
+        """Add a schema record."""
+        self.meter.limits.check("metadata_bytes", len(payload), "a schema record")
         schema = Schema.read(ReadDataStream(BytesIO(payload)))
         self._schemas.setdefault(schema.id, schema)
 
     def add_channel(self, payload: bytes) -> None:
-        """Take note of a channel record."""
-        self.meter.budget.check("metadata_bytes", len(payload), "a channel record")
+        """Add a channel record."""
+        self.meter.limits.check("metadata_bytes", len(payload), "a channel record")
         channel = Channel.read(ReadDataStream(BytesIO(payload)))
         if channel.id not in self._raw_channels:
-            self.meter.budget.check("channels", len(self._raw_channels) + 1, f"channel {channel.id}")
+            self.meter.limits.check("channels", len(self._raw_channels) + 1, f"channel {channel.id}")
             self._raw_channels[channel.id] = channel
 
     def resolve_channels(self) -> None:
@@ -271,66 +271,66 @@ class McapContainer(FileContainer):
 
     def extent(self, span: Span) -> tuple[int, int]:
         """Return the bytes of the span's record or records."""
-        extent = self._extents[span.index]
-        return extent.at, extent.end
+        extent = self.chunks[span.index]
+        return extent.start, extent.end
 
-    def expect(self, spans: Iterable[Span]) -> None:
+    def prefetch(self, spans: Iterable[Span]) -> None:
         """See :class:`~pdhef_logtool.logs.container.Container`."""
-        if self.source.far:
-            extents = (self._extents[span.index] for span in spans)
-            self.source.expect((extent.at, extent.index_end) for extent in extents)
+        if self.source.is_remote:
+            extents = (self.chunks[span.index] for span in spans)
+            self.source.prefetch((extent.start, extent.index_end) for extent in extents)
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         """Decode one span."""
         del want
-        extent = self._extents[span.index]
-        budget = self.meter.budget
+        extent = self.chunks[span.index]
+        limits = self.meter.limits
         if not extent.is_chunk:
-            budget.check("chunk_bytes", extent.end - extent.at, "messages without a chunk")
-            return self._scan(self.source.read(extent.at, extent.end - extent.at))
-        record = self.source.read(extent.at, extent.index_end - extent.at)
-        content = self.chunk_content(record, extent.end - extent.at)
-        if _chunk_head(record, extent.end - extent.at)[1]:  # its message indexes are held against its content
-            self.account.verify(extent.at, extent.index_end)
-        block = _indexed_messages(content, record, extent.end - extent.at)
+            limits.check("chunk_bytes", extent.end - extent.start, "messages without a chunk")
+            return self._scan(self.source.read(extent.start, extent.end - extent.start))
+        record = self.source.read(extent.start, extent.index_end - extent.start)
+        content = self.chunk_content(record, extent.end - extent.start)
+        if _chunk_head(record, extent.end - extent.start)[1]:  # its message indexes are held against its content
+            self.account.verify(extent.start, extent.index_end)
+        block = _indexed_messages(content, record, extent.end - extent.start)
         block = self._scan(content) if block is None else block
-        budget.check_messages(len(block), extent.end - extent.at)
+        limits.check_messages(len(block), extent.end - extent.start)
         return block
 
     def chunk_content(self, record: bytes, end: int) -> bytes:
         """Decompress the chunk record that is the first ``end`` bytes, and check its CRC."""
-        size, crc, compression, at, stored = _chunk_head(record, end)
-        content = decompress(compression, memoryview(record)[at : at + stored], size, self.meter.budget)
+        size, crc, compression, start, stored = _chunk_head(record, end)
+        content = decompress(compression, memoryview(record)[start : start + stored], size, self.meter.limits)
         if crc and zlib.crc32(content) != crc:
             raise SpanDamageError("its CRC does not match")
         return content
 
     def _scan(self, content: bytes, declare: bool = False) -> Block:
-        """Walk the records of a chunk's content; notes the schemas and channels it declares if told to."""
+        """Walk the records of a chunk's content; with ``declare``, add the schemas and channels in it."""
         offsets = array("q")
-        at, size = 0, len(content)
-        while at < size:
-            if at + 9 > size:
+        offset, size = 0, len(content)
+        while offset < size:
+            if offset + 9 > size:
                 raise SpanDamageError("its last record is cut")
-            opcode, length = RECORD.unpack_from(content, at)
-            end = at + 9 + length
+            opcode, length = RECORD.unpack_from(content, offset)
+            end = offset + 9 + length
             if end > size:
                 raise SpanDamageError("its last record is cut")
             if opcode == _OP_MESSAGE:
                 if length < 22:
                     raise SpanDamageError("a message record is too short")
                 if len(offsets) % _MESSAGES_A_CHECK == 0:
-                    self.meter.budget.check("chunk_messages", len(offsets), "a chunk")
+                    self.meter.limits.check("chunk_messages", len(offsets), "a chunk")
                     self.meter.check()
-                offsets.append(at)
+                offsets.append(offset)
             elif declare and opcode in _DECLARATIONS:
                 try:
-                    (self.add_schema if opcode == _OP_SCHEMA else self.add_channel)(content[at + 9 : end])
-                except BudgetError as error:
-                    self.lose(*told(error))
+                    (self.add_schema if opcode == _OP_SCHEMA else self.add_channel)(content[offset + 9 : end])
+                except LimitError as error:
+                    self.lose(*describe_damage(error))
             elif opcode < _FIRST_PRIVATE and opcode not in _DECLARATIONS:
-                raise SpanDamageError(f"it holds a record of kind {opcode}, which no chunk may")
-            at = end
+                raise SpanDamageError(f"it contains a record of kind {opcode}, which no chunk may")
+            offset = end
         if not offsets:
             return block_from_lists(content, *[()] * 6)
         block = _gather_messages(content, np.array(offsets, dtype=np.int64))
@@ -339,33 +339,22 @@ class McapContainer(FileContainer):
         return block
 
     def raw_chunk(self, span: Span, block: Block, kept: frozenset[int]) -> RawChunk | None:
-        """Return the chunk that a block was read from, to be written to another file as it is.
-
-        Parameters
-        ----------
-        span, block : the span, and what :meth:`load` gave, so that the chunk is known to be sound.
-        kept : channels that have the same id and definition in the other file.
-
-        Returns
-        -------
-        The chunk; None if these messages are in none, or if it holds or declares anything that the other file has
-        not.
-        """
-        extent = self._extents[span.index]
+        """See :class:`~pdhef_logtool.logs.container.Container`."""
+        extent = self.chunks[span.index]
         if not extent.is_chunk or not len(block) or not kept.issuperset(np.unique(block.channel).tolist()):
             return None
         if max(int(block.log_time_ns.max()), int(block.publish_time_ns.max())) >= MAX_TIME_NS:
-            return None  # the index could not hold the time that the message has
+            return None  # the time does not fit the index
         content = bytes(block.buffer)
         head = block.offset - MESSAGE_HEAD.itemsize
         others = _records_between(content, np.append(0, block.offset + block.length), np.append(head, len(content)))
-        if others is None or not all(self._is_known(op, content[at:end], kept) for op, at, end in others):
+        if others is None or not all(self._is_known(op, content[start:end], kept) for op, start, end in others):
             return None
-        record = self.source.read(extent.at, extent.end - extent.at)
-        size, crc, compression, at, length = _chunk_head(record, len(record))
+        record = self.source.read(extent.start, extent.end - extent.start)
+        size, crc, compression, start, length = _chunk_head(record, len(record))
         return RawChunk(
             compression=compression,
-            stored=record[at : at + length],
+            stored=record[start : start + length],
             size=size,
             crc=crc or zlib.crc32(content),
             channel=block.channel,
@@ -374,7 +363,7 @@ class McapContainer(FileContainer):
         )
 
     def _is_known(self, opcode: int, payload: bytes, kept: frozenset[int]) -> bool:
-        """Tell whether a record of a chunk declares only what the kept channels are declared as in this file."""
+        """Return whether a record of a chunk declares only what the kept channels are declared as in this file."""
         try:
             if opcode == Opcode.CHANNEL:
                 channel = Channel.read(ReadDataStream(BytesIO(payload)))
@@ -389,7 +378,7 @@ class McapContainer(FileContainer):
 
     def times(self, span: Span) -> tuple[IntArray, IntArray]:
         """Return a span's channels and log times; a chunk's from its message indexes, where it has them."""
-        extent = self._extents[span.index]
+        extent = self.chunks[span.index]
         indexes = _message_indexes(self.source.read(extent.end, extent.index_end - extent.end), 0)
         if not indexes:
             return super().times(span)
@@ -400,32 +389,39 @@ class McapContainer(FileContainer):
     def crc(self, start: int, end: int) -> int:
         """Return the CRC-32 of bytes [start, end)."""
         crc: int = 0
-        for at in range(start, end, _CRC_BLOCK_BYTES):
-            crc = zlib.crc32(self.source.read(at, min(_CRC_BLOCK_BYTES, end - at)), crc)
+        for offset in range(start, end, _CRC_BLOCK_BYTES):
+            crc = zlib.crc32(self.source.read(offset, min(_CRC_BLOCK_BYTES, end - offset)), crc)
         return crc
 
     def attachments(self) -> Iterator[Attachment]:
         """Read the attachments; a damaged one is among the losses and left out."""
-        for start, end in self._attachment_at:
+        for record in self._sound_records(self._attachment_at, AttachmentRecord):
+            yield Attachment(record.name, record.media_type, record.data, record.log_time, record.create_time)
+
+    def metadata_records(self) -> Iterator[Metadata]:
+        """Read the metadata records; a damaged one is among the losses and left out."""
+        yield from self._sound_records(self._metadata_at, Metadata)
+
+    def _sound_records(self, extents: Iterable[tuple[int, int]], kind: Any) -> Iterator[Any]:
+        for start, end in extents:
             try:
-                payload = self.source.read(start + 9, end - start - 9)
-                record = AttachmentRecord.read(ReadDataStream(BytesIO(payload)))
+                record = kind.read(ReadDataStream(BytesIO(self.source.read(start + 9, end - start - 9))))
             except Exception as error:  # noqa: BLE001 (the boundary)
                 self.lose_record(start, end, error)
                 continue
             self.account.decode(start, end)
-            yield Attachment(record.name, record.media_type, record.data, record.log_time, record.create_time)
+            yield record
 
-    def note_attachment(self, at: int, end: int) -> None:
-        """Take note of an attachment record, checking its CRC without holding it."""
+    def note_attachment(self, start: int, end: int) -> None:
+        """Add an attachment record; check its CRC block by block."""
         source = self.source
-        place = at + 9 + 16  # behind both times
+        place = start + 9 + 16  # behind both times
         name = ""
         for width in (_U32, _U32):  # name and media type
             (n,) = width.unpack(source.read(place, 4))
             if place + 4 + n > end:
                 raise SpanDamageError("it runs past its end")
-            self.meter.budget.check("metadata_bytes", n, "an attachment's name")
+            self.meter.limits.check("metadata_bytes", n, "an attachment's name")
             text = source.read(place + 4, n).decode()
             name, place = name or text, place + 4 + n
         (n,) = _U64.unpack(source.read(place, 8))
@@ -433,92 +429,64 @@ class McapContainer(FileContainer):
         if place + 4 > end:
             raise SpanDamageError("it runs past its end")
         (crc,) = _U32.unpack(source.read(place, 4))
-        if crc and self.crc(at + 9, place) != crc:
+        if crc and self.crc(start + 9, place) != crc:
             self.lose("bad-attachment", f"attachment {name!r} has a wrong CRC", count=1)
-            self.account.lose(at, end)
+            self.account.lose(start, end)
             return
         if crc:
-            self.account.verify(at, end)
-        self.add_attachment(at, end)
+            self.account.verify(start, end)
+        self.add_attachment(start, end)
 
-    def add_attachment(self, at: int, end: int) -> None:
-        """Take note of an attachment record."""
-        self._attachment_at.append((at, end))
+    def add_attachment(self, start: int, end: int) -> None:
+        """Add an attachment record."""
+        self._attachment_at.append((start, end))
 
-    def metadata_records(self) -> Iterator[MetadataRecord]:
-        """Read the metadata records; a damaged one is among the losses and left out."""
-        for start, end in self._metadata_at:
-            try:
-                record = self.read_metadata(start, end)
-            except Exception as error:  # noqa: BLE001 (the boundary)
-                self.lose_record(start, end, error)
-                continue
-            self.account.decode(start, end)
-            yield MetadataRecord(record.name, dict(record.metadata))
-
-    def read_metadata(self, at: int, end: int) -> Metadata:
-        """Read a metadata record."""
-        self.meter.budget.check("metadata_bytes", end - at, "a metadata record")
-        metadata: Metadata = Metadata.read(ReadDataStream(BytesIO(self.source.read(at + 9, end - at - 9))))
-        return metadata
-
-    def note_metadata(self, at: int, end: int) -> None:
-        """Take note of a metadata record that can be read."""
-        self.read_metadata(at, end)
-        self._metadata_at.append((at, end))
+    def note_metadata(self, start: int, end: int) -> None:
+        """Add a metadata record that can be read."""
+        self.meter.limits.check("metadata_bytes", end - start, "a metadata record")
+        Metadata.read(ReadDataStream(BytesIO(self.source.read(start + 9, end - start - 9))))
+        self._metadata_at.append((start, end))
 
     def open_chunk(self, extent: _Extent, claimed: Span) -> None:
-        """Add a chunk by its content, which alone tells its channels or its messages; losing it if it is damaged.
+        """Add a chunk by its content, if its channels or messages are not in an index; a damaged chunk is a loss.
 
         Parameters
         ----------
-        claimed : log times of its header; counts of its message indexes, empty where these cannot be trusted.
+        claimed : log times of its header; counts of its message indexes, empty if these are inconsistent.
         """
-        try:
-            record = self.source.read(extent.at, extent.end - extent.at)
+
+        def read() -> Block:
+            record = self.source.read(extent.start, extent.end - extent.start)
             block = self._scan(self.chunk_content(record, len(record)), declare=True)
-            self.meter.budget.check_messages(len(block), len(record))
-        except Exception as error:  # noqa: BLE001 (the boundary)
-            kind, text = told(error)
-            count = sum(claimed.counts.values()) or None
-            gone = f"{count} messages" if count else "an unknown number of messages"
-            what = f"{gone} lost in the chunk at byte {extent.at}: {text}"
-            self.lose(kind, what, claimed.start_ns, claimed.end_ns, count)
-            self.account.lose(extent.at, extent.index_end)
+            self.meter.limits.check_messages(len(block), len(record))
+            return block
+
+        block = self.add_content(extent, (extent.start, extent.index_end), claimed, read)
+        if block is None:
             return
         held = block.counts
         missing = sum(max(n - held.get(id_, 0), 0) for id_, n in claimed.counts.items())
         if missing:
-            what = f"{missing} messages that the index names are not in the chunk at byte {extent.at}"
+            what = f"{missing} messages that the index names are not in the chunk at byte {extent.start}"
             self.lose("missing-messages", what, claimed.start_ns, claimed.end_ns, missing)
             self.account.lose(extent.end, extent.index_end)
-        if not len(block):
-            self.account.decode(extent.at, extent.end)
-            return
-        first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
-        self._misled |= (claimed.start_ns, claimed.end_ns, claimed.counts) != (first, last + 1, held)
-        self.add_span(extent, Span(0, first, last + 1, held, block.ordered))
-
-    def add_span(self, extent: _Extent, span: Span) -> None:
-        """Add a span at the end."""
-        self._extents.append(extent)
-        self.spans.append(replace(span, index=len(self.spans)))
+        if len(block):
+            self._index_wrong |= self.spans[-1] != replace(claimed, index=len(self.spans) - 1, ordered=block.ordered)
 
     def check_statistics(self, total: int, by_channel: Mapping[int, int]) -> None:
-        """Hold what the walk found against the file's statistics.
+        """Compare the counts of the walk with the file's statistics.
 
-        An index can hide messages; the statistics are believed in nothing, but where they name others than the
-        indexes, every chunk is opened.
+        An index can hide messages: if the statistics differ from the indexes, every chunk is opened.
         """
-        found: Counter[int] = Counter()
+        counts: Counter[int] = Counter()
         for span in self.spans:
-            found.update(span.counts)
-        if self.lost or (found.total() == total and (not by_channel or found == Counter(by_channel))):
+            counts.update(span.counts)
+        if self.lost or (counts.total() == total and (not by_channel or counts == Counter(by_channel))):
             return
-        self._misled = True
-        spans, extents = self.spans[:], self._extents[:]
+        self._index_wrong = True
+        spans, extents = self.spans[:], self.chunks[:]
         self.spans.clear()
-        self._extents.clear()
+        self.chunks.clear()
         for extent, span in zip(extents, spans, strict=True):
             if extent.is_chunk:
                 self.open_chunk(extent, span)
@@ -526,7 +494,7 @@ class McapContainer(FileContainer):
                 self.add_span(extent, span)
         held = sum(sum(span.counts.values()) for span in self.spans)
         if held < total and not self.lost:
-            what = f"the file's statistics name {total} messages, of which {held} are there"
+            what = f"the file's statistics name {total} messages, {held} of them are there"
             self.lose("missing-messages", what, count=total - held)
             self.account.lose(*self._walked.statistics_at)
 
@@ -537,7 +505,6 @@ class _Walk:
     def __init__(self, container: McapContainer) -> None:
         self.of = container
         self.closed = False
-        self.cut_off = False
         self.data_end: tuple[int, int] | None = None  # extent of the record
         self.data_crc = 0
         self.footer: tuple[int, int] | None = None  # extent of the record
@@ -555,11 +522,11 @@ class _Walk:
         self.statistics: tuple[int, dict[int, int]] | None = None
         self.statistics_at = (0, 0)
 
-    def record(self, opcode: int, at: int, end: int) -> None:
+    def record(self, opcode: int, start: int, end: int) -> None:
         """Handle one complete record that is no message."""
         of, source = self.of, self.of.source
         if opcode == _OP_MESSAGE_INDEX:
-            self._message_index(at, end)
+            self._message_index(start, end)
             return
         if self.chunk is not None and opcode == _FIRST_PRIVATE | _OP_MESSAGE_INDEX:
             self.index_sound = False  # an index with one wrong bit: what it named is found in the chunk
@@ -567,62 +534,62 @@ class _Walk:
         self._end_chunk()
         if opcode in _DECLARATIONS:
             # Stay inside a run: writers interleave declarations with the messages.
-            of.meter.budget.check("metadata_bytes", end - at, "a declaration")
-            (of.add_schema if opcode == _OP_SCHEMA else of.add_channel)(source.read(at + 9, end - at - 9))
-            of.account.decode(at, end)
+            of.meter.limits.check("metadata_bytes", end - start, "a declaration")
+            (of.add_schema if opcode == _OP_SCHEMA else of.add_channel)(source.read(start + 9, end - start - 9))
+            of.account.decode(start, end)
             return
         self._end_run()
         if opcode == _OP_CHUNK:
-            first, last, size, crc = _CHUNK.unpack(source.read(at + 9, _CHUNK.size))
+            first, last, size, crc = _CHUNK.unpack(source.read(start + 9, _CHUNK.size))
             self.bare_chunks |= bool(size and not crc)
-            self.chunk, self.index_end = (at, end), end
+            self.chunk, self.index_end = (start, end), end
             self.head = (min(first, MAX_TIME_NS), min(last, MAX_TIME_NS), size)
             self.index_counts, self.index_at, self.index_sound = Counter(), [], True
         elif opcode == Opcode.ATTACHMENT:
-            of.note_attachment(at, end)
+            of.note_attachment(start, end)
         elif opcode == Opcode.DATA_END:
-            self._data_end(at, end)
+            self._data_end(start, end)
         elif opcode == Opcode.METADATA:
-            of.note_metadata(at, end)
+            of.note_metadata(start, end)
         elif opcode == _OP_STATISTICS and self.data_end:
-            self._statistics(at, end)
+            self._statistics(start, end)
         elif opcode == Opcode.FOOTER and self.data_end:
-            self.footer = (at, end)
+            self.footer = (start, end)
         elif opcode < _FIRST_PRIVATE and (opcode not in _SUMMARY_ONLY or not self.data_end):
-            raise SpanDamageError(f"no record of kind {opcode} may stand here")
-        elif opcode - _FIRST_PRIVATE == _OP_CHUNK and self._is_chunk(at, end):
+            raise SpanDamageError(f"no record of kind {opcode} is allowed here")
+        elif opcode - _FIRST_PRIVATE == _OP_CHUNK and self._is_chunk(start, end):
             raise SpanDamageError("a chunk whose kind has one wrong bit, which makes it a private record")
 
-    def _is_chunk(self, at: int, end: int) -> bool:
-        """Tell whether a record of a private kind is laid out like a chunk."""
-        head = self.of.source.read(at, min(end - at, _CHUNK_HEAD_BYTES))
+    def _is_chunk(self, start: int, end: int) -> bool:
+        """Return whether a record of a private kind is laid out like a chunk."""
+        head = self.of.source.read(start, min(end - start, _CHUNK_HEAD_BYTES))
         if len(head) < _CHUNK_HEAD_BYTES:
             return False
         (n,) = _U32.unpack_from(head, 37)
-        return n <= 4 and bool(49 + n + _U64.unpack_from(head, 41 + n)[0] == end - at)
+        return n <= 4 and bool(49 + n + _U64.unpack_from(head, 41 + n)[0] == end - start)
 
-    def believe(self, known: IndexedChunk | tuple[int, int]) -> int:
-        """Take a chunk or an attachment as the index has it; returns where the next record begins."""
+    def add_indexed(self, indexed: IndexedChunk | tuple[int, int]) -> int:
+        """Add a chunk or an attachment by its entry in the index; return the start of the next record."""
         of = self.of
         self._end_chunk()
         self._end_run()
-        if not isinstance(known, IndexedChunk):
-            of.add_attachment(*known)
-            return known[1]
-        span = Span(0, known.first_ns, known.last_ns + 1, known.counts, ordered=True)
-        of.add_span(_Extent(known.at, known.end, True, known.index_end), span)
-        return known.index_end
+        if not isinstance(indexed, IndexedChunk):
+            of.add_attachment(*indexed)
+            return indexed[1]
+        span = Span(0, indexed.first_ns, indexed.last_ns + 1, indexed.counts, ordered=True)
+        of.add_span(_Extent(indexed.start, indexed.end, True, indexed.index_end), span)
+        return indexed.index_end
 
-    def messages(self, at: int) -> int:
-        """Take the message records from here on whose heads are read ahead; returns where the next record begins."""
+    def messages(self, offset: int) -> int:
+        """Add the message records from here on whose heads are read ahead; return the start of the next record."""
         of = self.of
         self._end_chunk()
         size = of.source.size
-        block, place = of.source.ahead(at, min(_MESSAGE_RECORD.size, size - at))
-        base = at - place
+        block, place = of.source.ahead(offset, min(_MESSAGE_RECORD.size, size - offset))
+        base = offset - place
         last = min(len(block), size - base) - _MESSAGE_RECORD.size
         unpack, counts = _MESSAGE_RECORD.unpack_from, self.run_counts
-        start = self.run[0] if self.run else at
+        start = self.run[0] if self.run else offset
         first_ns, last_ns = self.run_times if self.run else (MAX_TIME_NS, 0)
         first = place
         while place <= last and block[place] == _OP_MESSAGE:
@@ -641,39 +608,39 @@ class _Walk:
             if base + place - start >= _UNCHUNKED_RUN_BYTES:
                 break
         if place == first:  # not even the first one is a message
-            end = at + 9 + int(RECORD.unpack(of.source.read(at, 9))[1])
+            end = offset + 9 + int(RECORD.unpack(of.source.read(offset, 9))[1])
             self._end_run()
-            of.lose_record(at, end, SpanDamageError("a message record is too short"))
+            of.lose_record(offset, end, SpanDamageError("a message record is too short"))
             return end
         self.run, self.run_times = (start, base + place), (first_ns, last_ns)
         if base + place - start >= _UNCHUNKED_RUN_BYTES:
             self._end_run()
         return base + place
 
-    def _message_index(self, at: int, end: int) -> None:
-        """Take note of the messages that an index names, as far as it can be right."""
+    def _message_index(self, start: int, end: int) -> None:
+        """Add the messages that an index names, if it is consistent."""
         of = self.of
         if self.chunk is None:
             self._end_run()
             raise SpanDamageError("a message index without its chunk, whose messages are lost")
         self.index_end = end
         sound, self.index_sound = self.index_sound, False
-        block, place = of.source.ahead(at, min(end - at, _INDEX_HEAD.size))
+        block, place = of.source.ahead(start, min(end - start, _INDEX_HEAD.size))
         _, channel, n = _INDEX_HEAD.unpack_from(block, place)
-        if n % 16 or at + 15 + n > end or channel in self.index_counts:
+        if n % 16 or start + 15 + n > end or channel in self.index_counts:
             raise SpanDamageError(f"a message index that names {n / 16:.10g} messages of channel {channel}")
         if n:
             self.index_counts[channel] = n // 16
-            self.index_at.append((at + 15, at + 15 + n))
+            self.index_at.append((start + 15, start + 15 + n))
         self.index_sound = sound
-        of.account.decode(at, end)
+        of.account.decode(start, end)
 
     def _index_agrees(self) -> tuple[bool, bool]:
-        """Tell whether the chunk's indexes can be believed without opening it, and whether no channel steps back."""
+        """Return whether the chunk's indexes are consistent, and whether no channel steps back in time."""
         assert self.chunk is not None
         of, size, counts = self.of, self.head[2], self.index_counts
         held = counts.total() * MESSAGE_HEAD.itemsize
-        if not self.index_sound or not held or held > size or size > of.meter.budget.chunk_bytes:
+        if not self.index_sound or not held or held > size or size > of.meter.limits.chunk_bytes:
             return False, False
         if not counts.keys() <= of._raw_channels.keys():
             return False, False
@@ -688,32 +655,32 @@ class _Walk:
         span = min(int(some.min()), MAX_TIME_NS), min(int(some.max()), MAX_TIME_NS)
         return span == self.head[:2], ordered
 
-    def _data_end(self, at: int, end: int) -> None:
+    def _data_end(self, start: int, end: int) -> None:
         """Note the CRC of the data section."""
-        self.data_end = (at, end)
-        (self.data_crc,) = _U32.unpack(self.of.source.read(at + 9, 4))
-        self.of.account.decode(at, end)
+        self.data_end = (start, end)
+        (self.data_crc,) = _U32.unpack(self.of.source.read(start + 9, 4))
+        self.of.account.decode(start, end)
 
     def _check_data(self) -> None:
-        """Check the CRC of the data section where nothing else protects the messages, or tells of missing ones.
+        """Check the CRC of the data section if no other checksum or count protects the messages.
 
-        Where other damage was found already, it would tell nothing new.
+        If other damage is known already, the check would add nothing.
         """
         of = self.of
         if self.data_end is None or not self.data_crc or of.lost:
             return
-        in_chunks = all(extent.is_chunk for extent in of._extents)
+        in_chunks = all(extent.is_chunk for extent in of.chunks)
         if self.statistics is not None and in_chunks and not self.bare_chunks:
             return
-        if of._index_believed:
+        if of._index_used:
             what = "the CRC of the data section was not verified, as not all of the log was read"
             of.lost.append(Loss(UNVERIFIED, what, str(of.path), severity="note"))
         elif of.crc(0, self.data_end[0]) == self.data_crc:
             of.account.verify(0, self.data_end[1])
         else:
             what = (
-                "the CRC of the data section does not match: some messages are damaged or missing, and nothing tells "
-                "which; what can be decoded is used"
+                "the CRC of the data section does not match: some messages are damaged or missing, and it is "
+                "unknown which; the messages that decode are used"
             )
             of.lose("bad-data-crc", what)
             of.account.lose(*self.data_end)
@@ -723,23 +690,23 @@ class _Walk:
         of = self.of
         if self.data_end is None or self.footer is None or of.lost:
             return
-        at, end = self.footer
-        _, _, start, _, crc = FOOTER.unpack(of.source.read(at, FOOTER.size))
-        if not crc or not self.data_end[1] <= start <= at:
+        footer_start, end = self.footer
+        _, _, start, _, crc = FOOTER.unpack(of.source.read(footer_start, FOOTER.size))
+        if not crc or not self.data_end[1] <= start <= footer_start:
             return
-        if of.crc(start, at + FOOTER.size - 4) == crc:
+        if of.crc(start, footer_start + FOOTER.size - 4) == crc:
             of.account.verify(start, end)
         else:
             what = "the CRC of the summary does not match: its index is damaged, from which no message was read"
             of.lost.append(Loss("bad-summary-crc", what, str(of.path), severity="note"))
 
-    def _statistics(self, at: int, end: int) -> None:
+    def _statistics(self, start: int, end: int) -> None:
         """Note how many messages the file claims by channel."""
-        payload = self.of.source.read(at + 9, min(end - at - 9, 46 + 10 * (1 << 16)))
+        payload = self.of.source.read(start + 9, min(end - start - 9, 46 + 10 * (1 << 16)))
         (total,), (n,) = _U64.unpack_from(payload, 0), _U32.unpack_from(payload, 42)
         entries = np.frombuffer(payload, dtype=np.dtype([("id", "<u2"), ("n", "<u8")]), count=n // 10, offset=46)
         counts = {c: k for c, k in zip(entries["id"].tolist(), entries["n"].tolist(), strict=True) if k}
-        self.statistics, self.statistics_at = (total, counts), (at, end)
+        self.statistics, self.statistics_at = (total, counts), (start, end)
 
     def _end_run(self) -> None:
         if self.run is None:
@@ -750,7 +717,7 @@ class _Walk:
         self.run, self.run_counts, self.run_ordered = None, Counter(), True
 
     def _end_chunk(self, index_complete: bool = True) -> None:
-        """Close a chunk; open it now if only its content tells its channels or its messages."""
+        """Close a chunk; open it now if its channels or messages are only in its content."""
         if self.chunk is None:
             return
         first, last, size = self.head
@@ -763,28 +730,24 @@ class _Walk:
         else:
             self.of.open_chunk(extent, span)
 
-    def cut(self, at: int) -> None:
+    def cut(self, offset: int) -> None:
         """Note that the file ends inside a record."""
         of = self.of
         self._end_chunk(index_complete=False)
         self._end_run()
-        self.cut_off = True
-        what = f"the file ends inside a record at byte {at} of {of.source.size}; what follows is gone"
-        of.lose("truncated", what, of.last_ns())
-        of.account.lose(at, of.source.size)
-        of.account.cut = True
+        of.lose_end(offset)
 
-    def skipped(self, at: int, resume: int) -> None:
+    def skipped(self, start: int, resume: int) -> None:
         """Note that a damaged stretch was stepped over."""
         of = self.of
         self._end_chunk(index_complete=False)
         self._end_run()
-        what = f"bytes {at} to {resume} hold no readable record; reading resumes at the next chunk"
+        what = f"bytes {start} to {resume} contain no readable record; reading resumes at the next chunk"
         of.lose("bad-record", what, of.last_ns())
-        of.account.lose(at, resume)
+        of.account.lose(start, resume)
 
     def finish(self) -> None:
-        """Close what is open and check what only the whole file tells."""
+        """Finish open records and check the file as a whole."""
         of = self.of
         self._end_chunk(index_complete=self.closed)
         self._end_run()
@@ -819,22 +782,22 @@ def _chunk_head(record: bytes, end: int) -> tuple[int, int, str, int, int]:
     return size, crc, compression, 49 + n, stored
 
 
-def _message_indexes(record: bytes, at: int) -> list[tuple[int, UintArray, UintArray]] | None:
+def _message_indexes(record: bytes, offset: int) -> list[tuple[int, UintArray, UintArray]] | None:
     """Return channel, log times [N] and offsets [N] of each message index from a byte on; None if one is malformed."""
-    found: list[tuple[int, UintArray, UintArray]] = []
-    while at < len(record):
-        opcode, length, channel, n = _INDEX_RECORD.unpack_from(record, at)
+    indexes: list[tuple[int, UintArray, UintArray]] = []
+    while offset < len(record):
+        opcode, length, channel, n = _INDEX_RECORD.unpack_from(record, offset)
         if opcode != _OP_MESSAGE_INDEX or n % 16 or n + 6 > length:
             return None
-        pairs = np.frombuffer(record, dtype="<u8", count=n // 8, offset=at + 15)
-        found.append((channel, pairs[0::2], pairs[1::2]))
-        at += 9 + length
-    return found
+        pairs = np.frombuffer(record, dtype="<u8", count=n // 8, offset=offset + 15)
+        indexes.append((channel, pairs[0::2], pairs[1::2]))
+        offset += 9 + length
+    return indexes
 
 
-def _indexed_messages(content: bytes, record: bytes, at: int) -> Block | None:
+def _indexed_messages(content: bytes, record: bytes, index_start: int) -> Block | None:
     """Return a chunk's messages through its message indexes; None if these do not name all of them."""
-    indexes = _message_indexes(record, at)
+    indexes = _message_indexes(record, index_start)
     if not indexes:
         return None
     # Each channel's offsets ascend already, which the stable sort makes use of.
@@ -843,7 +806,7 @@ def _indexed_messages(content: bytes, record: bytes, at: int) -> Block | None:
 
 
 def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
-    """Read message headers at known ascending offsets; None if the content holds other messages than these."""
+    """Read message headers at known ascending offsets; None if the content has other messages than these."""
     n = len(content)
     if offset.size == 0 or offset[0] < 0 or offset[-1] + MESSAGE_HEAD.itemsize > n:
         return None
@@ -881,15 +844,15 @@ def _held_times(times: UintArray) -> IntArray:
 
 def _records_between(content: bytes, starts: IntArray, ends: IntArray) -> list[tuple[int, int, int]] | None:
     """Return opcode and extent of the records in the gaps [starts, ends); None if a gap is not filled by records."""
-    found: list[tuple[int, int, int]] = []
+    records: list[tuple[int, int, int]] = []
     gaps = np.flatnonzero(starts != ends)
-    for at, end in zip(starts[gaps].tolist(), ends[gaps].tolist(), strict=True):
-        while at < end:
-            if at + 9 > end:
+    for offset, end in zip(starts[gaps].tolist(), ends[gaps].tolist(), strict=True):
+        while offset < end:
+            if offset + 9 > end:
                 return None
-            opcode, length = RECORD.unpack_from(content, at)
-            found.append((opcode, at + 9, at + 9 + length))
-            at += 9 + length
-        if at != end:
+            opcode, length = RECORD.unpack_from(content, offset)
+            records.append((opcode, offset + 9, offset + 9 + length))
+            offset += 9 + length
+        if offset != end:
             return None
-    return found
+    return records

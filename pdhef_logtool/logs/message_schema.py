@@ -1,4 +1,4 @@
-"""Message types as trees of nodes, whatever text they were declared in, and dotted paths resolved against them."""
+"""Message types as trees of nodes, for all schema languages, and dotted paths resolved against them."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
 from pdhef_logtool.logs.definitions import SHIPPED, Definitions
-from pdhef_logtool.logs.schema_files import referenced
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
+from pdhef_logtool.logs.schema_files import referenced, with_contained_types
 from pdhef_logtool.records.errors import MappingError, PdhefError
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class Array:
 
 @dataclass(frozen=True, slots=True)
 class Unknown:
-    """A place that the schema leaves open; what stands there is found in the messages."""
+    """A place that the schema leaves open; its type follows from the messages."""
 
 
 Node: TypeAlias = Scalar | Struct | Array | Unknown
@@ -101,9 +101,9 @@ Node: TypeAlias = Scalar | Struct | Array | Unknown
 class MessageSchema:
     """A message type: its tree, and what its messages are decoded with.
 
-    ``wire`` is ``cdr``, ``ros1``, ``json`` or ``protobuf``; ``store`` holds the definitions of ROS types,
-    ``message_class`` is the class of a protobuf type; ``budget`` holds for its messages, too; ``borrowed`` are the
-    files of an installed ROS that it was read from, where the log holds no definition.
+    ``wire`` is ``cdr``, ``ros1``, ``json`` or ``protobuf``; ``store`` has the definitions of ROS types,
+    ``message_class`` is the class of a protobuf type; ``limits`` apply to its messages, too; ``borrowed`` are the files
+    of an installed ROS that it was read from, if the log contains no definition.
     """
 
     type_name: str
@@ -111,7 +111,7 @@ class MessageSchema:
     root: Node
     store: Typestore | None = None
     message_class: Any = None
-    budget: Budget = DEFAULT_BUDGET
+    limits: ResourceLimits = DEFAULT_LIMITS
     borrowed: tuple[Path, ...] = ()
 
 
@@ -121,7 +121,7 @@ class Selection:
 
     ``components`` are the places to read, as steps (member name or index): one for a scalar or an array, one a
     column for a vector, seconds and nanoseconds for a time; ``dynamic`` places are judged by their first value.
-    ``text`` is how an array of bytes is written where it stands as a text: ``hex``, ``base64`` or empty.
+    ``text`` is the encoding of an array of bytes that is a text: ``hex``, ``base64`` or empty.
     """
 
     path: str
@@ -134,21 +134,21 @@ class Selection:
 #: Endings of a path that read a text as the bytes that it encodes.
 TEXT_ENDINGS = {"|hex": "hex", "|base64": "base64"}
 
-#: Member that stands in a message type without members, and its description by rosbags.
+#: Member that message types without members get, and its description by rosbags.
 _FILLER = "structure_needs_at_least_one_member"
 _NO_MEMBERS = ((_FILLER, (1, ("uint8", 0))),)
 
 
 class SchemaError(Exception):
-    """A schema cannot be parsed; the topic stays countable, its fields are unknown."""
+    """A schema cannot be parsed; the messages of the topic are counted, its fields are unknown."""
 
 
 class NoSchemaError(SchemaError):
-    """A channel brings no schema of a kind that is read here; nothing of the recording is lost by that."""
+    """A channel has no schema of a supported kind; this is no loss."""
 
 
 class MissingDefinitionError(NoSchemaError):
-    """Neither the log nor what is known beside it defines a type."""
+    """No definition of a type is available."""
 
     def __init__(self, type_name: str) -> None:
         super().__init__(f"no definition of {type_name}")
@@ -157,12 +157,12 @@ class MissingDefinitionError(NoSchemaError):
 
 @contextmanager
 def parsing(what: str) -> Iterator[None]:
-    """Turn whatever escapes the parser of somebody else's text into a :class:`SchemaError`."""
+    """Turn any error of a parser into a :class:`SchemaError`."""
     try:
         yield
     except SchemaError:
         raise
-    except PdhefError as error:  # the budget's
+    except PdhefError as error:  # of the resource limits
         raise SchemaError(f"{what}: expected {error.expected}, got {error.got}; {error.remedy}") from error
     except RecursionError as error:
         raise SchemaError(f"{what}: nested too deeply") from error
@@ -172,17 +172,17 @@ def parsing(what: str) -> Iterator[None]:
 
 
 class Unfolding:
-    """Counts the places of a schema while its tree is built: a short text can describe an endless one."""
+    """Counts the places of a schema while its tree is built: a short text can describe an unlimited tree."""
 
-    def __init__(self, budget: Budget, what: str) -> None:
-        self.budget, self.what = budget, what
+    def __init__(self, limits: ResourceLimits, what: str) -> None:
+        self.limits, self.what = limits, what
         self.places = 0
 
     def enter(self, times: int, depth: int) -> None:
-        """Count a node that stands ``times`` times in the tree, below ``depth`` others; raises BudgetError."""
+        """Count a node that occurs ``times`` times in the tree, below ``depth`` others; raises LimitError."""
         self.places += times
-        self.budget.check("schema_leaves", self.places, self.what)
-        self.budget.check("schema_depth", depth, self.what)
+        self.limits.check("schema_leaves", self.places, self.what)
+        self.limits.check("schema_depth", depth, self.what)
 
 
 _CODES = {
@@ -210,7 +210,7 @@ def ros_schema(
     text: str,
     wire: str,
     distro: str = "",
-    budget: Budget = DEFAULT_BUDGET,
+    limits: ResourceLimits = DEFAULT_LIMITS,
     definitions: Definitions = SHIPPED,
 ) -> MessageSchema:
     """Parse a ROS message definition.
@@ -222,7 +222,7 @@ def ros_schema(
     text : concatenated definitions; empty takes the type from the distribution's own packages, else from definitions.
     wire : ``cdr`` or ``ros1``.
     distro : ROS distribution for a type without a text; the latest one if empty or unknown.
-    budget : what the schema may cost.
+    limits : resource limits of the schema.
     definitions : of types that neither the text nor the distribution has.
 
     Raises
@@ -235,8 +235,16 @@ def ros_schema(
 
     what = f"the definition of {type_name}"
     borrowed: tuple[Path, ...] = ()
+
+    def text_of(name: str) -> str:
+        text = definitions.text_of(name)
+        limits.check("schema_bytes", len(text) * _BYTES_OF_TEXT, f"the definition of {name}")
+        if not text.strip():
+            raise MissingDefinitionError(name)
+        return text
+
     with parsing(what):
-        budget.check("schema_bytes", len(text) * _BYTES_OF_TEXT, what)
+        limits.check("schema_bytes", len(text) * _BYTES_OF_TEXT, what)
         base = Stores.ROS1_NOETIC if wire == "ros1" else _store_of(distro)
         if text.strip():
             text = _SEPARATOR.sub("=" * 80, text)
@@ -244,20 +252,20 @@ def ros_schema(
             store = get_typestore(Stores.EMPTY)
             try:
                 if referenced(types) - set(types):  # a distribution's types take long to load
-                    types = _completed(types, get_typestore(base).fielddefs, definitions, budget)
+                    types = with_contained_types(types, get_typestore(base).fielddefs, text_of)
             except MissingDefinitionError as error:  # the log's own text is not whole: its messages are lost
                 raise SchemaError(str(error)) from error
-            root = _ros_root(types, type_name, budget)
+            root = _ros_root(types, type_name, limits)
             store.register(types)
         else:
             store = get_typestore(base)
             if type_name not in store.fielddefs:
-                types = _completed({}, store.fielddefs, definitions, budget, type_name)
+                types = with_contained_types({}, store.fielddefs, text_of, type_name)
                 files = (definitions.installed(name) for name in sorted(set(types) - set(store.fielddefs)))
                 borrowed = tuple(file for file in files if file is not None)
                 store.register(types)
-            root = _ros_root(store.fielddefs, type_name, budget)
-    return MessageSchema(type_name, wire, root, store, budget=budget, borrowed=borrowed)
+            root = _ros_root(store.fielddefs, type_name, limits)
+    return MessageSchema(type_name, wire, root, store, limits=limits, borrowed=borrowed)
 
 
 def _store_of(distro: str) -> Any:
@@ -266,35 +274,13 @@ def _store_of(distro: str) -> Any:
     return getattr(Stores, f"ROS2_{distro.upper()}", Stores.LATEST) if distro else Stores.LATEST
 
 
-def _completed(
-    types: Mapping[str, Any], known: Mapping[str, Any], definitions: Definitions, budget: Budget, wanted: str = ""
-) -> dict[str, Any]:
-    """Return the types with all that they contain: of the distribution, else of definitions; ``wanted`` is one more."""
-    from rosbags.typesys import get_types_from_msg
-
-    found = dict(types)
-    todo = ({wanted} if wanted else set()) | (referenced(types) - set(types))
-    while todo:
-        name = todo.pop()
-        if name in known:
-            found[name] = known[name]
-        else:
-            text = definitions.text_of(name)
-            budget.check("schema_bytes", len(text) * _BYTES_OF_TEXT, f"the definition of {name}")
-            if not text.strip():
-                raise MissingDefinitionError(name)
-            found |= get_types_from_msg(text, name)
-        todo |= referenced({name: found[name]}) - set(found)
-    return found
-
-
-def _ros_root(defs: Mapping[str, Any], type_name: str, budget: Budget) -> Struct:
+def _ros_root(defs: Mapping[str, Any], type_name: str, limits: ResourceLimits) -> Struct:
     if type_name not in defs:
         raise SchemaError(f"no definition of {type_name}")
     members = defs[type_name][1]
     if not members or [field for field, _ in members] == [_FILLER]:
         return Struct({})
-    return _ros_node(defs, type_name, (), 1, Unfolding(budget, f"the definition of {type_name}"))
+    return _ros_node(defs, type_name, (), 1, Unfolding(limits, f"the definition of {type_name}"))
 
 
 def _ros_node(defs: Mapping[str, Any], name: str, above: tuple[str, ...], times: int, unfolding: Unfolding) -> Struct:
@@ -333,14 +319,14 @@ def _listed(length: int | None) -> int:
     return length if length is not None and length <= LISTED_ELEMENTS else 1
 
 
-def json_schema(type_name: str, text: str, budget: Budget = DEFAULT_BUDGET) -> MessageSchema:
+def json_schema(type_name: str, text: str, limits: ResourceLimits = DEFAULT_LIMITS) -> MessageSchema:
     """Parse a JSON Schema; raises :class:`SchemaError`."""
     what = f"the JSON Schema of {type_name}"
     with parsing(what):
-        budget.check("schema_bytes", len(text), what)
+        limits.check("schema_bytes", len(text), what)
         document = json.loads(text)
-        root = _json_node(document, _Json(document, Unfolding(budget, what)), 1, (), 0)
-    return MessageSchema(type_name, "json", root, budget=budget)
+        root = _json_node(document, _Json(document, Unfolding(limits, what)), 1, (), 0)
+    return MessageSchema(type_name, "json", root, limits=limits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -351,22 +337,26 @@ class _Json:
     unfolding: Unfolding
 
 
+#: Scalars of JSON Schema by their type.
+_JSON_SCALARS: dict[object, Scalar] = {
+    "number": Scalar("number"),
+    "integer": Scalar("number"),
+    "boolean": Scalar("bool"),
+    "string": Scalar("string"),
+}
+
+
 def _json_node(schema: Any, whole: _Json, times: int, inside: tuple[str, ...], depth: int) -> Node:
-    """Return a schema's tree; ``inside`` holds the references that lead here: what contains itself is left open."""
-    if not isinstance(schema, dict) or depth > whole.unfolding.budget.schema_depth:
+    """Return a schema's tree; ``inside`` are the references that lead here: what contains itself is left open."""
+    if not isinstance(schema, dict) or depth > whole.unfolding.limits.schema_depth:
         return Unknown()
     whole.unfolding.enter(times, 0)
     reference = schema.get("$ref")
     if isinstance(reference, str) and reference.startswith("#/"):
         if reference in inside:
             return Unknown()
-        target: Any = whole.document
-        for part in reference[2:].split("/"):
-            target = target.get(part) if isinstance(target, dict) else None
-        return _json_node(target, whole, times, (*inside, reference), depth + 1)
-    declared = schema.get("type")
-    types = [t for t in declared if t != "null"] if isinstance(declared, list) else [declared]
-    kind = types[0] if len(types) == 1 else None
+        return _json_node(_referenced(whole.document, reference), whole, times, (*inside, reference), depth + 1)
+    kind = _json_type(schema.get("type"))
     if kind == "object" or (kind is None and "properties" in schema):
         properties = schema.get("properties")
         if not isinstance(properties, dict) or not properties:
@@ -376,22 +366,29 @@ def _json_node(schema: Any, whole: _Json, times: int, inside: tuple[str, ...], d
         least, most = schema.get("minItems"), schema.get("maxItems")
         length = least if isinstance(least, int) and least == most and least >= 0 else None
         return Array(_json_node(schema.get("items"), whole, times * _listed(length), inside, depth + 1), length)
-    if kind in ("number", "integer"):
-        return Scalar("number")
-    if kind == "boolean":
-        return Scalar("bool")
-    if kind == "string":
-        return Scalar("string")
-    return Unknown()
+    return _JSON_SCALARS.get(kind, Unknown())
 
 
-def json_schema_of_message(type_name: str, message: bytes, budget: Budget = DEFAULT_BUDGET) -> MessageSchema:
-    """Take the schema from a JSON message; raises :class:`SchemaError`."""
+def _referenced(document: Any, reference: str) -> Any:
+    """Return the part of a document that ``#/definitions/Name`` names; None where there is none."""
+    for part in reference[2:].split("/"):
+        document = document.get(part) if isinstance(document, dict) else None
+    return document
+
+
+def _json_type(declared: object) -> str | None:
+    """Return the type that a JSON Schema declares, null aside; None where it declares none or several."""
+    types = [t for t in declared if t != "null"] if isinstance(declared, list) else [declared]
+    return str(types[0]) if len(types) == 1 and types[0] is not None else None
+
+
+def json_schema_of_message(type_name: str, message: bytes, limits: ResourceLimits = DEFAULT_LIMITS) -> MessageSchema:
+    """Derive the schema from a JSON message; raises :class:`SchemaError`."""
     what = "the first message"
     with parsing(what):
-        budget.check("schema_bytes", len(message), what)
-        root = _example_node(json.loads(message), Unfolding(budget, what), 0)
-    return MessageSchema(type_name, "json", root, budget=budget)
+        limits.check("schema_bytes", len(message), what)
+        root = _example_node(json.loads(message), Unfolding(limits, what), 0)
+    return MessageSchema(type_name, "json", root, limits=limits)
 
 
 def _example_node(value: object, unfolding: Unfolding, depth: int) -> Node:
@@ -436,20 +433,20 @@ def parse_path(path: str) -> tuple[Step, ...]:
     MappingError : the text is no path.
     """
     steps: list[Step] = []
-    at, after_dot = 0, True
+    position, after_dot = 0, True
     text = path.removesuffix("[]")
-    while at < len(text):
-        found = _PART.match(text, at)
-        valid = found is not None and (found[0] != "." or not after_dot) and (not found[1] or after_dot)
-        if found is None or not valid or found[2] == "" or (found[2] is not None and after_dot):
+    while position < len(text):
+        match = _PART.match(text, position)
+        valid = match is not None and (match[0] != "." or not after_dot) and (not match[1] or after_dot)
+        if match is None or not valid or match[2] == "" or (match[2] is not None and after_dot):
             after_dot = True
             break
-        if found[1]:
-            steps.append(found[1])
-        elif found[2]:
-            steps.append(int(found[2]))
-        after_dot = found[0] == "."
-        at = found.end()
+        if match[1]:
+            steps.append(match[1])
+        elif match[2]:
+            steps.append(int(match[2]))
+        after_dot = match[0] == "."
+        position = match.end()
     if after_dot:
         raise MappingError(
             expected="a dotted path such as twist.linear.x or data[0]", got=repr(path), where="field path"
@@ -462,20 +459,17 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
 
     Raises
     ------
-    MappingError : the type has no such path, or it names what is no number; the nearest paths are named.
+    MappingError : the type has no such path, or it is no number; the message names similar paths.
     """
     ending = next((e for e in TEXT_ENDINGS if path.endswith(e)), "")
     steps = parse_path(path.removesuffix(ending))
-    node: Node = schema.root
+    node: Node | None = schema.root
     for step in steps:
         if isinstance(node, Unknown):
             return Selection(path, "dynamic", (steps,))
-        if isinstance(step, str) and isinstance(node, Struct) and step in node.members:
-            node = node.members[step]
-        elif isinstance(step, int) and isinstance(node, Array) and (node.length is None or step < node.length):
-            node = node.item
-        else:
-            raise _no_such_path(schema, topic, path)
+        node = _part(node, step)
+    if node is None:
+        raise _no_such_path(schema, topic, path)
     if ending:
         # Records of ROS messages are read without their texts.
         is_text = isinstance(node, Unknown) or (isinstance(node, Scalar) and node.kind == "string")
@@ -494,13 +488,7 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
             raise _no_number(schema, topic, path, "a text")
         return Selection(path, "scalar", (steps,))
     if isinstance(node, Array):
-        if isinstance(node.item, Unknown):
-            return Selection(path, "dynamic", (steps,))
-        if not isinstance(node.item, Scalar) or node.item.kind == "string":
-            raise _no_number(schema, topic, path, "an array of structs or texts")
-        if node.length is not None and node.length > schema.budget.array_width:
-            raise _no_number(schema, topic, path, f"an array of {node.length} elements, too many for columns")
-        return Selection(path, "array", (steps,), node.length)
+        return _select_array(node, schema, topic, path, steps)
     if node.time:
         return Selection(path, "time", tuple((*steps, part) for part in node.time))
     if node.vector:
@@ -508,12 +496,30 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
     raise _no_number(schema, topic, path, "a struct")
 
 
+def _part(node: Node | None, step: Step) -> Node | None:
+    """Return a member of a struct or an element of an array; None where there is none."""
+    if isinstance(node, Struct) and isinstance(step, str):
+        return node.members.get(step)
+    is_element = isinstance(node, Array) and isinstance(step, int) and (node.length is None or step < node.length)
+    return node.item if isinstance(node, Array) and is_element else None
+
+
+def _select_array(node: Array, schema: MessageSchema, topic: str, path: str, steps: tuple[Step, ...]) -> Selection:
+    if isinstance(node.item, Unknown):
+        return Selection(path, "dynamic", (steps,))
+    if not isinstance(node.item, Scalar) or node.item.kind == "string":
+        raise _no_number(schema, topic, path, "an array of structs or texts")
+    if node.length is not None and node.length > schema.limits.array_width:
+        raise _no_number(schema, topic, path, f"an array of {node.length} elements, too many for columns")
+    return Selection(path, "array", (steps,), node.length)
+
+
 def _no_such_path(schema: MessageSchema, topic: str, path: str) -> MappingError:
-    known = [leaf.path for leaf in leaves(schema.root)]
-    near = difflib.get_close_matches(path, known, n=3, cutoff=0.4)
+    paths = [leaf.path for leaf in leaves(schema.root)]
+    near = difflib.get_close_matches(path, paths, n=3, cutoff=0.4)
     if not near:
         last = path.rsplit(".", 1)[-1]
-        near = [p for p in known if p.rsplit(".", 1)[-1] == last][:3] or known[:3]
+        near = [p for p in paths if p.rsplit(".", 1)[-1] == last][:3] or paths[:3]
     return MappingError(
         expected=f"a field of {schema.type_name or 'the message'}",
         got=repr(path),
@@ -533,7 +539,7 @@ def _no_number(schema: MessageSchema, topic: str, path: str, what: str) -> Mappi
 
 
 def bytes_of_text(value: object, encoding: str) -> list[int] | None:
-    """Decode a text of ``hex`` or ``base64`` digits; None where it is no such text."""
+    """Decode a text of ``hex`` or ``base64`` digits; None for any other text."""
     if not isinstance(value, str):
         return None
     try:
@@ -546,7 +552,7 @@ def bytes_of_text(value: object, encoding: str) -> list[int] | None:
 
 
 def value_at(message: object, steps: Sequence[Step]) -> object:
-    """Follow steps through attributes, mappings and sequences; None where the message has no such place."""
+    """Follow steps through attributes, mappings and sequences; None where the message lacks one."""
     value: Any = message
     for step in steps:
         if value is None:

@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget, Meter
 from pdhef_logtool.logs.byte_source import require_regular
 from pdhef_logtool.logs.columnar_log import ColumnarLog
-from pdhef_logtool.logs.compression import decompress_file, decompress_message
+from pdhef_logtool.logs.compression import decompress_file
 from pdhef_logtool.logs.container import (
     EVERYTHING,
     MCAP_MAGIC,
-    Attachment,
-    Block,
     Container,
-    MetadataRecord,
-    Span,
     Wanted,
-    told,
+    describe_damage,
 )
 from pdhef_logtool.logs.definitions import read_definitions
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -37,41 +30,45 @@ from pdhef_logtool.logs.formats import (
     what_is_a_log,
 )
 from pdhef_logtool.logs.log_file import LogFile
+from pdhef_logtool.logs.reduced_log import ReducedLog, reduced_record
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
-from pdhef_logtool.logs.slim_log import SlimLog, slim_record
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, Meter, ResourceLimits
 from pdhef_logtool.records.errors import LogError, PdhefError
-from pdhef_logtool.records.signals import IntArray, Loss
+from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.storage.documents import read_text
 from pdhef_logtool.storage.files import scratch_folder
 
 _REMEDY = "give the recording itself"
-#: What a log of a container is called in reports, as a file and as a folder.
+#: Kinds of logs by container format, as a file and as a folder.
 _KINDS = {"mcap": "mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}
 _FOLDER_KINDS = {**_KINDS, "mcap": "rosbag2-mcap"}
 
 
 def open_log(
-    path: LogPlace | str, budget: Budget = DEFAULT_BUDGET, msgs: Path | str | None = None, wanted: Wanted = EVERYTHING
+    path: LogPlace | str,
+    limits: ResourceLimits = DEFAULT_LIMITS,
+    msgs: Path | str | None = None,
+    wanted: Wanted = EVERYTHING,
 ) -> DriveLog:
     """Open a log, recognised by its content.
 
     A file of one of the :mod:`~pdhef_logtool.logs.formats`, each also zstd-compressed; a rosbag2 folder with its
-    ``metadata.yaml`` (split files are one log), or a folder that holds exactly one such file. Each file also by its URL
-    (``https://``, ``s3://``). A slim log (:mod:`~pdhef_logtool.logs.slim_log`) reads like what it stands for.
+    ``metadata.yaml`` (split files are one log), or a folder with exactly one such file. Each file also by its URL
+    (``https://``, ``s3://``). A reduced log (:mod:`~pdhef_logtool.logs.reduced_log`) reads like its source.
 
     Parameters
     ----------
-    budget : what reading it may cost; what claims more is among the log's losses.
+    limits : resource limits of reading; what exceeds them is a loss.
     msgs : folder, zip file or wheel with definitions of types that the log does not define (:func:`read_definitions`).
-    wanted : what of a log that is far will be read.
+    wanted : what of a remote log will be read.
 
     Raises
     ------
     LogError : the path is missing, no regular file, or no log.
-    UsageError : ``msgs`` holds no definitions.
+    UsageError : ``msgs`` contains no definitions.
     """
     definitions = read_definitions(msgs)
-    log = _opened(place_of(path) if isinstance(path, str) else path, Meter(budget), wanted)
+    log = _opened(place_of(path) if isinstance(path, str) else path, Meter(limits), wanted)
     if log.messages is not None:
         log.messages.definitions = definitions
     return log
@@ -97,37 +94,39 @@ def _opened(path: LogPlace, meter: Meter, wanted: Wanted) -> DriveLog:
     except PdhefError:
         raise
     except Exception as error:
-        raise LogError(expected=what_is_a_log(), got=told(error)[1], where=str(path), remedy=_REMEDY) from error
+        raise LogError(
+            expected=what_is_a_log(), got=describe_damage(error)[1], where=str(path), remedy=_REMEDY
+        ) from error
     if isinstance(opened, DriveLog):
         return opened
     try:
-        record = slim_record(opened)
+        record = reduced_record(opened)
     except BaseException:
         opened.close()
         raise
     if record is not None:
-        return SlimLog(path, opened, record)
+        return ReducedLog(path, opened, record)
     return ColumnarLog(path, _KINDS[opened.form], [opened], distro=opened.distro)
 
 
-def log_metadata(path: LogPlace, budget: Budget = DEFAULT_BUDGET) -> dict[str, str]:
-    """Return what a log says of itself: MCAP metadata records by ``key`` and ``record.key``, rosbag2's ``custom_data``.
+def log_metadata(path: LogPlace, limits: ResourceLimits = DEFAULT_LIMITS) -> dict[str, str]:
+    """Return the metadata of a log: MCAP metadata records by ``key`` and ``record.key``, rosbag2's ``custom_data``.
 
     Raises
     ------
     LogError : as for :func:`open_log`.
     """
-    with closing(open_log(path, budget, wanted=Wanted(frozenset()))) as log:
+    with closing(open_log(path, limits, wanted=Wanted(frozenset()))) as log:
         return log.metadata()
 
 
 def is_log_folder(path: Path) -> bool:
-    """Tell whether a folder is one log (a rosbag2 folder) rather than a folder of logs."""
+    """Return whether a folder is one log (a rosbag2 folder) rather than a folder of logs."""
     return path.is_dir() and (path / ROSBAG2_METADATA).is_file()
 
 
 def looks_like_log(path: Path) -> bool:
-    """Tell by the first bytes and the name whether a file can be a log, without opening it further."""
+    """Return, by the first bytes and the name, whether a file can be a log, without opening it further."""
     if not path.is_file():
         return is_log_folder(path)
     with path.open("rb") as file:
@@ -174,12 +173,17 @@ def _head_of(path: Path) -> bytes:
 
 def _open_plain(file: LogFile) -> Container | DriveLog:
     head = _head_of(file.path)
-    found = recognised_format(head, file.path.name)
-    if found is None:
+    log_format = recognised_format(head, file.path.name)
+    if log_format is None:
         got = "a file that is none of these" if head else "an empty file"
         raise LogError(expected=what_is_a_log(), got=got, where=str(file.place), remedy=_REMEDY)
-    opened = found.open(file)
-    return _CopiedContainer(opened, file) if isinstance(opened, Container) and file.is_copy else opened
+    opened = log_format.open(file)
+    if isinstance(opened, Container) and file.path != file.place:
+        opened.on_close(file.release)
+        if file.cut:
+            opened.lose("truncated", file.cut)
+            opened.account.cut = True
+    return opened
 
 
 def _open_compressed(
@@ -213,11 +217,11 @@ def _open_folder(path: Path, meter: Meter) -> DriveLog:
     return ColumnarLog(path, _FOLDER_KINDS[opened.form], [opened], distro=opened.distro)
 
 
-def _read_metadata(path: Path, budget: Budget) -> Mapping[str, Any]:
+def _read_metadata(path: Path, limits: ResourceLimits) -> Mapping[str, Any]:
     from ruamel.yaml import YAML
 
     file = path / ROSBAG2_METADATA
-    budget.check("metadata_bytes", file.stat().st_size, str(file))
+    limits.check("metadata_bytes", file.stat().st_size, str(file))
     try:
         document = YAML(typ="safe").load(read_text(file))
         information = document["rosbag2_bagfile_information"]
@@ -238,7 +242,7 @@ def _read_metadata(path: Path, budget: Budget) -> Mapping[str, Any]:
 
 
 def _open_rosbag2_folder(path: Path, meter: Meter) -> ColumnarLog:
-    information = _read_metadata(path, meter.budget)
+    information = _read_metadata(path, meter.limits)
     per_message = _text(information.get("compression_mode")).lower() == "message"
     encodings = _declared_encodings(information)
     containers: list[Container] = []
@@ -261,10 +265,17 @@ def _open_rosbag2_folder(path: Path, meter: Meter) -> ColumnarLog:
                 lost.append(Loss("bad-file", f"expected {error.expected}, got {error.got}", str(file)))
                 continue
             except Exception as error:  # noqa: BLE001 (one file of several)
-                lost.append(Loss("bad-file", told(error)[1], str(file)))
+                lost.append(Loss("bad-file", describe_damage(error)[1], str(file)))
                 continue
             forms.add(container.form)
-            containers.append(_Rosbag2Container(container, per_message, encodings))
+            containers.append(container)
+            container.zstd_messages = per_message
+            # A topics table may name cdr by default where the recorder used another format: do not decode it as CDR.
+            named = {id_: encodings.get(c.topic, c.encoding) for id_, c in container.channels.items()}
+            container.whole_chunks &= not per_message and all(
+                c.encoding == named[c.id] for c in container.channels.values()
+            )
+            container.channels |= {id_: replace(c, encoding=named[id_]) for id_, c in container.channels.items()}
     except BaseException:
         for opened in containers:
             opened.close()
@@ -280,9 +291,9 @@ def _open_rosbag2_folder(path: Path, meter: Meter) -> ColumnarLog:
 
 
 def _storage_file(folder: Path, name: str) -> Path | None:
-    """Find a file that metadata.yaml names: as given, by its last part, or with the suffix of file compression.
+    """Find a file that metadata.yaml names: as given, by its name alone, or with the suffix of file compression.
 
-    A name that leads out of the folder counts by its last part only.
+    Of a name that leads out of the folder only the last component counts.
     """
     given = Path(name)
     inside = not given.is_absolute() and ".." not in given.parts
@@ -295,89 +306,15 @@ def _storage_file(folder: Path, name: str) -> Path | None:
 
 def _declared_encodings(information: Mapping[str, Any]) -> dict[str, str]:
     """Return the serialization format that metadata.yaml declares for each topic."""
-    found: dict[str, str] = {}
+    encodings: dict[str, str] = {}
     topics = information.get("topics_with_message_count")
     for entry in topics if isinstance(topics, list) else ():
         topic = entry.get("topic_metadata") if isinstance(entry, dict) else None
         if isinstance(topic, dict) and topic.get("serialization_format"):
-            found[_text(topic.get("name"))] = _text(topic["serialization_format"])
-    return found
+            encodings[_text(topic.get("name"))] = _text(topic["serialization_format"])
+    return encodings
 
 
 def _text(value: object) -> str:
-    """Return a scalar of a YAML document as a text: lists of lists of one anchor have no end when they are written."""
+    """Return a scalar of a YAML document as a text; lists with anchors can be endless and give an empty text."""
     return str(value) if isinstance(value, str | int | float) else ""
-
-
-class _Wrapped(Container):
-    """Passes everything to another container."""
-
-    def __init__(self, container: Container) -> None:
-        self.container = container
-        self.path, self.form, self.distro = container.path, container.form, container.distro
-        self.channels, self.spans, self.lost = container.channels, container.spans, container.lost
-        self.undeclared = container.undeclared
-        self.meter, self.account, self.selective = container.meter, container.account, container.selective
-        self.far, self.by_index = container.far, container.by_index
-
-    def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
-        return self.container.load(span, want)
-
-    def extent(self, span: Span) -> tuple[int, int]:
-        return self.container.extent(span)
-
-    def times(self, span: Span) -> tuple[IntArray, IntArray]:
-        return self.container.times(span)
-
-    def attachments(self) -> Iterator[Attachment]:
-        return self.container.attachments()
-
-    def metadata_records(self) -> Iterator[MetadataRecord]:
-        return self.container.metadata_records()
-
-    def expect(self, spans: Iterable[Span]) -> None:
-        self.container.expect(spans)
-
-    def close(self) -> None:
-        self.container.close()
-
-
-class _CopiedContainer(_Wrapped):
-    """A container of a copy, which is removed with it."""
-
-    def __init__(self, container: Container, file: LogFile) -> None:
-        super().__init__(container)
-        self._release = file.release
-        if file.cut:
-            self.container.lose("truncated", file.cut)
-            self.account.cut = True
-
-    def close(self) -> None:
-        super().close()
-        self._release()
-
-
-class _Rosbag2Container(_Wrapped):
-    """A file of a rosbag2 folder, read as the folder's metadata.yaml says: encodings, compression by message."""
-
-    def __init__(self, container: Container, per_message: bool, encodings: Mapping[str, str]) -> None:
-        super().__init__(container)
-        self._per_message = per_message
-        # A topics table may say cdr by default where the recorder used another format: do not decode it as CDR.
-        self.channels = {
-            id_: replace(c, encoding=encodings.get(c.topic, c.encoding)) for id_, c in container.channels.items()
-        }
-
-    def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
-        block = self.container.load(span, want)
-        if not self._per_message:
-            return block
-        payloads: list[bytes] = []
-        size = 0
-        for at, n in zip(block.offset.tolist(), block.length.tolist(), strict=True):
-            payloads.append(decompress_message(block.buffer[at : at + n], self.meter.budget))
-            size += len(payloads[-1])
-            self.meter.budget.check("chunk_bytes", size, "compressed messages")
-        length = np.array([len(p) for p in payloads], dtype=np.int64)
-        offset = np.cumsum(length) - length
-        return replace(block, buffer=b"".join(payloads), offset=offset, length=length)

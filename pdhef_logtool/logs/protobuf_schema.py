@@ -1,6 +1,6 @@
 """Protobuf message types from the descriptors that a log carries, and accessors compiled from dotted paths.
 
-A message without a value tells two cases apart, as the language does: a plain scalar of proto3 that is not on the wire
+Two cases of a missing value differ, as in the language: a plain scalar of proto3 that is not on the wire
 is its default (0), whereas an absent sub-message, an unset ``optional`` and the members of a ``oneof`` that are not the
 set one are absent (NaN). Maps and types that contain themselves have no place among columns and are left out.
 """
@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
-from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
 from pdhef_logtool.logs.message_schema import (
     Array,
     MessageSchema,
@@ -24,6 +23,7 @@ from pdhef_logtool.logs.message_schema import (
     Unfolding,
     parsing,
 )
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 
 #: Protobuf nests by reference, so that a small file can describe an endless tree.
 _MAX_DEPTH = 16
@@ -31,7 +31,7 @@ _WELL_KNOWN = "google/protobuf/"
 
 
 @lru_cache(maxsize=256)
-def protobuf_schema(type_name: str, data: bytes, budget: Budget = DEFAULT_BUDGET) -> MessageSchema:
+def protobuf_schema(type_name: str, data: bytes, limits: ResourceLimits = DEFAULT_LIMITS) -> MessageSchema:
     """Parse a serialized ``FileDescriptorSet``.
 
     Parameters
@@ -41,27 +41,27 @@ def protobuf_schema(type_name: str, data: bytes, budget: Budget = DEFAULT_BUDGET
 
     Raises
     ------
-    SchemaError : the set does not parse, lacks a file, does not hold the type, or costs too much.
+    SchemaError : the set does not parse, lacks a file or the type, or exceeds a resource limit.
     """
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
     what = f"the descriptors of {type_name}"
     with parsing(what):
-        budget.check("schema_bytes", len(data), what)
+        limits.check("schema_bytes", len(data), what)
         files = descriptor_pb2.FileDescriptorSet.FromString(data)
         pool = descriptor_pool.DescriptorPool()
         by_name = {file.name: file for file in files.file}
-        unfolding = Unfolding(budget, what)
+        unfolding = Unfolding(limits, what)
         unfolding.enter(len(by_name), 0)
         for name in _in_order(by_name):
             pool.AddSerializedFile(by_name[name].SerializeToString())
         try:
             descriptor = pool.FindMessageTypeByName(type_name.removeprefix("."))
         except KeyError as error:
-            raise SchemaError(f"the descriptors hold no message {type_name}") from error
+            raise SchemaError(f"the descriptors contain no message {type_name}") from error
         root = _message_node(descriptor, (), unfolding)
         message_class = message_factory.GetMessageClass(descriptor)
-    return MessageSchema(type_name, "protobuf", root, None, message_class, budget)
+    return MessageSchema(type_name, "protobuf", root, None, message_class, limits)
 
 
 def _in_order(files: dict[str, Any]) -> list[str]:
@@ -95,11 +95,11 @@ def _well_known_file(name: str, importer: str) -> Any:
     if name.startswith(_WELL_KNOWN) and name.endswith(".proto"):
         module = name.removeprefix(_WELL_KNOWN).removesuffix(".proto")
         try:
-            found = importlib.import_module(f"google.protobuf.{module}_pb2")
+            imported = importlib.import_module(f"google.protobuf.{module}_pb2")
         except ImportError:
             pass
         else:
-            return descriptor_pb2.FileDescriptorProto.FromString(found.DESCRIPTOR.serialized_pb)
+            return descriptor_pb2.FileDescriptorProto.FromString(imported.DESCRIPTOR.serialized_pb)
     raise SchemaError(f"{importer} imports {name}, which the descriptors lack")
 
 
@@ -171,7 +171,7 @@ def _compile_steps(descriptor: Any, steps: Sequence[Step]) -> Callable[[Any], ob
             plan[-1] = (name, optional, step)
             continue
         field = descriptor.fields_by_name[step]
-        # A default that the type declares (proto2) stands for an absent value.
+        # A default that the type declares (proto2) replaces an absent value.
         plan.append((step, field.has_presence and not field.has_default_value, -1))
         descriptor = field.message_type
     whole = bool(plan) and plan[-1][2] < 0 and field is not None and _is_array(field)
@@ -197,6 +197,6 @@ def _is_array(field: Any) -> bool:
 
 
 def _is_repeated(field: Any) -> bool:
-    # Releases up to 6.30 say it by the label only, which later ones deprecate.
-    known = getattr(field, "is_repeated", None)
-    return bool(field.label == field.LABEL_REPEATED) if known is None else bool(known)
+    # Releases up to 6.30 have the label only, which later ones deprecate.
+    is_repeated = getattr(field, "is_repeated", None)
+    return bool(field.label == field.LABEL_REPEATED) if is_repeated is None else bool(is_repeated)

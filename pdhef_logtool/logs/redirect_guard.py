@@ -1,7 +1,7 @@
-"""Where a web server may redirect a request for a log: to public addresses, and to other places of the same host.
+"""Check of redirects of web servers: to public addresses and within the same host only.
 
-A log's server is not trusted: a redirect could make this machine ask its own services, or those of its network. So the
-target of each redirect is checked, and once more the addresses that are connected to, as names can change in between.
+A log's server may be malicious: a redirect could make this machine send requests to itself or to its network. So the
+target of each redirect is checked, and also the addresses of each connection, as names can change in between.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class PrivateRedirectError(Exception):
 
 
 def is_public(address: str) -> bool:
-    """Tell whether an IP address is reached over the internet, and not only on this machine or its network."""
+    """Return whether an IP address is reached over the internet, and not only on this machine or its network."""
     ip = ipaddress.ip_address(address.partition("%")[0])
     if isinstance(ip, ipaddress.IPv6Address):
         inner = ip.ipv4_mapped or ip.sixtofour or (ip.teredo[1] if ip.teredo else None)
@@ -54,13 +54,13 @@ class RedirectGuard(AbstractResolver):
         self, host: str, port: int = 0, family: socket.AddressFamily = socket.AF_INET
     ) -> list[ResolveResult]:
         """Return the addresses of a host to connect to; raises PrivateRedirectError."""
-        found = await self._resolver.resolve(host, port, family)
-        public = all(is_public(one["host"]) for one in found)
+        addresses = await self._resolver.resolve(host, port, family)
+        public = all(is_public(address["host"]) for address in addresses)
         name = _host(host)
         if not public and (self._origin_was_public if name == self._origin else name not in self._proxies):
             raise PrivateRedirectError(name)
         self._origin_was_public |= public and name == self._origin
-        return found
+        return addresses
 
     async def check_redirect(self, _session: Any, _context: Any, redirect: Any) -> None:
         """Raise PrivateRedirectError for a redirect to another host that is not public."""
@@ -72,8 +72,8 @@ class RedirectGuard(AbstractResolver):
             addresses = [str(ipaddress.ip_address(host))]
         except ValueError:
             try:
-                addresses = [one["host"] for one in await self._resolver.resolve(host, 0, socket.AF_UNSPEC)]
-            except OSError:  # a proxy may know it; without one the request fails by itself
+                addresses = [address["host"] for address in await self._resolver.resolve(host, 0, socket.AF_UNSPEC)]
+            except OSError:  # a proxy may resolve it; without one the request fails
                 return
         if not all(map(is_public, addresses)):
             raise PrivateRedirectError(host)

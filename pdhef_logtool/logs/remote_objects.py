@@ -1,7 +1,7 @@
 """Objects on servers, asked for ranges of their bytes: HTTP by aiohttp, S3 by aiobotocore, both as fsspec sets them up.
 
-Each answer is held against what the object was when it was opened. Whether asking again helps is told by which of two
-errors is raised: :class:`TryAgainError`, or one that ends it.
+Each response is compared with the state of the object when it was opened. If a new request can help, the
+error is :class:`TryAgainError`; any other error is final.
 """
 
 from __future__ import annotations
@@ -13,16 +13,18 @@ from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from pdhef_logtool.logs.byte_source import ChangedError, SourceError
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.errors import UsageError
 
+T = TypeVar("T")
+
 _BLOCK_BYTES = 1 << 20
 #: Progress from which on a cut answer counts as none of the tries.
 _PROGRESS_BYTES = 64 << 10
-#: What a server says that will pass: too many requests, timeouts, restarts.
+#: Temporary status codes: too many requests, timeouts, restarts.
 _PASSING = frozenset({408, 425, 429, 500, 502, 503, 504, 520, 521, 522, 523, 524})
 _REFUSED = {401: "it asks who you are", 403: "it refuses access", 407: "the proxy asks who you are"}
 _CONTENT_RANGE = re.compile(r"bytes (?:(\d+)-(\d+)|\*)/(\d+|\*)")
@@ -30,7 +32,7 @@ _CONTENT_RANGE = re.compile(r"bytes (?:(\d+)-(\d+)|\*)/(\d+|\*)")
 
 @dataclass(frozen=True, slots=True)
 class Patience:
-    """How long a server is waited for: silence of a connection, tries of a range without progress, waits between."""
+    """Timeouts and retries: silence of a connection, tries of a range without progress, waits between tries."""
 
     connect_s: float = 15.0
     silence_s: float = 30.0
@@ -48,7 +50,7 @@ _LONG_RUN_SILENCES = 4
 
 
 class TryAgainError(Exception):
-    """The answer did not come whole; asking again may help. ``wait_s`` is what the server asks for, 0 without."""
+    """The response is incomplete; a new request may help. ``wait_s`` is the wait that the server asks for, else 0."""
 
     def __init__(self, what: str, wait_s: float = 0.0) -> None:
         super().__init__(what)
@@ -57,19 +59,19 @@ class TryAgainError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class ObjectState:
-    """What an object was when it was opened: bytes, and what the server calls this version of it (empty: nothing)."""
+    """State of an object when it was opened: bytes, and the server's names of this version (empty: none)."""
 
     size: int
     etag: str
     modified: str
 
 
-_EMPTY = ObjectState(0, "", "")
+EMPTY = ObjectState(0, "", "")
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """An answer on its way: the object's state, where its bytes begin, and the bytes. Size -1: known at the end."""
+    """A response in transfer: the object's state, the offset of its bytes, and the bytes. Size -1: known at the end."""
 
     state: ObjectState
     start: int
@@ -91,19 +93,19 @@ class RemoteObject(ABC):
 
     @abstractmethod
     def ask(self, start: int, end: int, pinned: ObjectState | None) -> AbstractAsyncContextManager[Answer]:
-        """Ask for bytes [start, end); with ``pinned`` only if the object still is what it was.
+        """Request bytes [start, end); with ``pinned`` only if the object is unchanged.
 
         Raises
         ------
-        TryAgainError : the server is busy, or does not answer. SourceError : it answers that there is no such thing.
+        TryAgainError : no response yet. SourceError : the object does not exist or is unreadable.
         """
 
     def error(self, got: str, remedy: str, expected: str = "an object that can be read") -> SourceError:
-        """Return the one line for what is wrong."""
+        """Return the error for this object."""
         return SourceError(expected=expected, got=got, where=str(self.place), remedy=remedy)
 
     def changed(self, what: str) -> ChangedError:
-        """Return the error for an object that is another one than was opened."""
+        """Return the error for an object that has changed since it was opened."""
         return ChangedError(
             expected="the object that was opened",
             got=f"another one ({what})",
@@ -112,7 +114,7 @@ class RemoteObject(ABC):
         )
 
     def refuse(self, status: int, wait_s: float) -> NoReturn:
-        """Raise what a status that brings no bytes means."""
+        """Raise the error of a status without content."""
         if status in _PASSING:
             raise TryAgainError(f"status {status}", wait_s)
         if status in (412, 416):
@@ -124,8 +126,8 @@ class RemoteObject(ABC):
             raise self.error("no such object", "check the URL")
         raise self.error(f"status {status}", "check the URL")
 
-    def hold_against(self, pinned: ObjectState | None, state: ObjectState) -> None:
-        """Raise the error for a changed object if two states are not of one."""
+    def require_unchanged(self, pinned: ObjectState | None, state: ObjectState) -> None:
+        """Raise the error for a changed object if two states differ."""
         if pinned is None:
             return
         for was, now, what in (
@@ -139,11 +141,11 @@ class RemoteObject(ABC):
 
 
 def remote_object(place: RemotePlace) -> RemoteObject:
-    """Return the object at a place; nothing is asked yet.
+    """Return the object at a place, without a request.
 
     Raises
     ------
-    UsageError : What it takes to ask is not installed.
+    UsageError : A required package is not installed.
     """
     return S3Object(place) if place.scheme == "s3" else HttpObject(place)
 
@@ -179,7 +181,7 @@ class HttpObject(RemoteObject):
         url = self.place.url
         try:
             session = await self._system.set_session()
-            # What is encoded already is sent as it stands: a signature may be of just these characters.
+            # An encoded URL is sent unchanged: a signature may depend on its characters.
             asked = yarl.URL(url, encoded=url.isascii() and url.isprintable() and " " not in url)
             async with session.get(asked, headers=headers) as response:
                 yield self._answer(response, start, end, pinned)
@@ -199,27 +201,27 @@ class HttpObject(RemoteObject):
             raise TryAgainError(f"silence of {PATIENCE.silence_s:g} s") from None
         except aiohttp.ClientPayloadError:
             raise TryAgainError("an answer that is cut") from None
-        except (aiohttp.ClientError, OSError) as error:  # without its text, which may hold the URL
+        except (aiohttp.ClientError, OSError) as error:  # without its text, which can contain the URL
             why = getattr(error, "strerror", None) or type(error).__name__
             raise TryAgainError(f"no connection ({why})") from None
 
     def _answer(self, response: Any, start: int, end: int, pinned: ObjectState | None) -> Answer:
         head: Mapping[str, str] = response.headers
         etag, modified = head.get("ETag", ""), head.get("Last-Modified", "")
-        found = _CONTENT_RANGE.fullmatch(head.get("Content-Range", "").strip())
-        if response.status == 416 and pinned is None and found is not None and found[3] == "0":
+        part = _CONTENT_RANGE.fullmatch(head.get("Content-Range", "").strip())
+        if response.status == 416 and pinned is None and part is not None and part[3] == "0":
             return Answer(ObjectState(0, etag, modified), 0, _nothing())
-        if response.status == 206 and found is not None and found[1] is not None and found[3] != "*":
-            state = ObjectState(int(found[3]), etag, modified)
-            self.hold_against(pinned, state)
-            if int(found[1]) != start or int(found[2]) >= end:
+        if response.status == 206 and part is not None and part[1] is not None and part[3] != "*":
+            state = ObjectState(int(part[3]), etag, modified)
+            self.require_unchanged(pinned, state)
+            if int(part[1]) != start or int(part[2]) >= end:
                 raise self.error("other bytes than were asked for", "the server does not give ranges: read a copy")
             return Answer(state, start, paced(response.content.iter_chunked(_BLOCK_BYTES)))
         if response.status == 200:  # the server gives no ranges: all of it comes
             if head.get("Content-Encoding", "identity") != "identity":
                 raise self.error("an answer that is compressed on its way", "read a copy")
             state = ObjectState(int(head.get("Content-Length", -1)), etag, modified)
-            self.hold_against(pinned, state)
+            self.require_unchanged(pinned, state)
             return Answer(state, 0, paced(response.content.iter_chunked(_BLOCK_BYTES)))
         if response.status == 206:
             raise self.error("a part of unknown size", "the server does not give ranges: read a copy")
@@ -235,31 +237,25 @@ class S3Object(RemoteObject):
     @asynccontextmanager
     async def ask(self, start: int, end: int, pinned: ObjectState | None) -> AsyncIterator[Answer]:
         """See :class:`RemoteObject`."""
+        from botocore.exceptions import ClientError
+
         asked: dict[str, str] = {"Bucket": self.place.host, "Key": self.place.key, "Range": f"bytes={start}-{end - 1}"}
         if pinned is not None and pinned.etag:
             asked["IfMatch"] = pinned.etag
         async with self.client() as client:
-            found = await self._found(client, asked, pinned)
-            if found is None:
-                yield Answer(_EMPTY, 0, _nothing())
+            try:
+                response = await client.get_object(**asked)
+            except ClientError as error:
+                if _status_of(error)[0] != 416 or pinned is not None:
+                    raise
+                yield Answer(EMPTY, 0, _nothing())  # an empty object, which has no range
                 return
-            async with found["Body"] as body:
-                yield self._answer(found, body, start, pinned)
-
-    async def _found(self, client: Any, asked: Mapping[str, str], pinned: ObjectState | None) -> Any:
-        """Return what the store answers; None for an empty object, which has no range."""
-        from botocore.exceptions import ClientError
-
-        try:
-            return await client.get_object(**asked)
-        except ClientError as error:
-            if _status_of(error)[0] == 416 and pinned is None:
-                return None
-            raise
+            async with response["Body"] as body:
+                yield self._answer(response, body, start, pinned)
 
     @asynccontextmanager
     async def client(self) -> AsyncIterator[Any]:
-        """Give the client for a bucket, whose errors become ours."""
+        """Yield the client of the bucket; convert its errors."""
         import aiohttp
         from botocore.exceptions import (
             BotoCoreError,
@@ -284,16 +280,16 @@ class S3Object(RemoteObject):
         except BotoCoreError as error:
             raise self.error(f"a request that cannot be made ({type(error).__name__})", "check the URL") from None
 
-    def _answer(self, found: Mapping[str, Any], body: Any, start: int, pinned: ObjectState | None) -> Answer:
-        modified = found.get("LastModified")
-        part = _CONTENT_RANGE.fullmatch(str(found.get("ContentRange", "")))
-        size = int(part[3]) if part is not None and part[3] != "*" else int(found["ContentLength"])
-        state = ObjectState(size, found.get("ETag", ""), "" if modified is None else modified.isoformat())
-        self.hold_against(pinned, state)
-        at = int(part[1]) if part is not None and part[1] is not None else 0
-        if part is not None and at != start:
+    def _answer(self, response: Mapping[str, Any], body: Any, start: int, pinned: ObjectState | None) -> Answer:
+        modified = response.get("LastModified")
+        part = _CONTENT_RANGE.fullmatch(str(response.get("ContentRange", "")))
+        size = int(part[3]) if part is not None and part[3] != "*" else int(response["ContentLength"])
+        state = ObjectState(size, response.get("ETag", ""), "" if modified is None else modified.isoformat())
+        self.require_unchanged(pinned, state)
+        first = int(part[1]) if part is not None and part[1] is not None else 0
+        if part is not None and first != start:
             raise self.error("other bytes than were asked for", "the store does not give ranges: read a copy")
-        return Answer(state, at, paced(body.iter_chunks(_BLOCK_BYTES)))
+        return Answer(state, first, paced(body.iter_chunks(_BLOCK_BYTES)))
 
 
 def keys_below(prefix: RemotePlace) -> list[str]:
@@ -301,7 +297,7 @@ def keys_below(prefix: RemotePlace) -> list[str]:
 
     Raises
     ------
-    SourceError : The store does not tell.
+    SourceError : The store does not list them.
     """
     store = S3Object(prefix)
 
@@ -313,26 +309,17 @@ def keys_below(prefix: RemotePlace) -> list[str]:
                 keys += [str(entry["Key"]) for entry in page.get("Contents", ())]
         return keys
 
-    async def in_turn() -> list[str]:
-        keys: list[str] = []
-
-        async def once() -> None:
-            keys[:] = await listed()
-
-        await try_in_turn(once, store)
-        return keys
-
-    return asyncio.run_coroutine_threadsafe(in_turn(), store.loop).result()
+    return asyncio.run_coroutine_threadsafe(try_in_turn(listed, store), store.loop).result()
 
 
 async def try_in_turn(
-    once: Callable[[], Awaitable[None]], remote: RemoteObject, place: Callable[[], int] = lambda: 0
-) -> None:
-    """Do something until it succeeds; give up after some tries in turn that brought nothing.
+    once: Callable[[], Awaitable[T]], remote: RemoteObject, place: Callable[[], int] = lambda: 0
+) -> T:
+    """Call a function until it succeeds and return its result; give up after several tries without progress.
 
     Parameters
     ----------
-    place : how many bytes have come by now.
+    place : returns the number of bytes received so far.
 
     Raises
     ------
@@ -341,7 +328,7 @@ async def try_in_turn(
     tries, reached = 0, place()
     while True:
         try:
-            await once()
+            return await once()
         except TryAgainError as error:
             tries += 1
             if place() - reached >= _PROGRESS_BYTES:
@@ -351,8 +338,6 @@ async def try_in_turn(
                 raise remote.error(got, "try again later", "a server that answers") from None
             wait_s = max(error.wait_s, PATIENCE.first_wait_s * 2 ** (tries - 1))
             await asyncio.sleep(min(wait_s, PATIENCE.most_wait_s))
-        else:
-            return
 
 
 def s3_system(place: RemotePlace) -> Any:
@@ -393,11 +378,11 @@ def _conditions(pinned: ObjectState | None) -> dict[str, str]:
 
 def _status_of(error: Any) -> tuple[int, float]:
     """Return status and seconds to wait of an S3 error."""
-    found = error.response.get("ResponseMetadata", {})
-    status, code = int(found.get("HTTPStatusCode") or 0), str(error.response.get("Error", {}).get("Code", ""))
+    metadata = error.response.get("ResponseMetadata", {})
+    status, code = int(metadata.get("HTTPStatusCode") or 0), str(error.response.get("Error", {}).get("Code", ""))
     if code in ("SlowDown", "RequestTimeout", "ThrottlingException", "RequestLimitExceeded"):
         status = 503
-    return status, _seconds(found.get("HTTPHeaders", {}).get("retry-after", ""))
+    return status, _seconds(metadata.get("HTTPHeaders", {}).get("retry-after", ""))
 
 
 def _seconds(text: str) -> float:

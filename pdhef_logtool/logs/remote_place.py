@@ -1,4 +1,4 @@
-"""Where a log lies that is not on this machine: a URL, and what of it may be shown."""
+"""Location of a remote log: a URL, and the part of it that may be printed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pdhef_logtool.records.errors import UsageError
 
 SCHEMES = ("s3", "http", "https")
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
-#: What gives access, or is made anew for each link, is no part of what an object is called.
+#: Query parameters that give access or differ for each link are no part of an object's name.
 _OF_ACCESS = re.compile(
     r"x-(amz|goog|ms|oss|cos)-.*|aws.*|google.*|signature|expires|policy|key-pair-id|sig|s[etprkv]|sk[a-z]+|"
     r".*(token|secret|password|credential|signature|auth|api[-_]?key).*",
@@ -23,7 +23,7 @@ _OF_ACCESS = re.compile(
 
 @dataclass(frozen=True, repr=False)
 class RemotePlace:
-    """An object on a server. As text it has neither user, password nor query: these may give access to it.
+    """An object on a server. Its text has no user, password or query, as these can give access.
 
     ``private_redirects``: whether its server may redirect to other hosts of this machine and its network.
     """
@@ -47,7 +47,7 @@ class RemotePlace:
 
     @property
     def key(self) -> str:
-        """What an object store calls it: all behind the bucket, as it stands there."""
+        """Key in an object store: the part behind the bucket, unchanged."""
         return self.url.split("://", 1)[1].partition("/")[2]
 
     @property
@@ -58,12 +58,12 @@ class RemotePlace:
 
     @property
     def name(self) -> str:
-        """Last part: what a file would be called."""
+        """Last component: the name as a file."""
         return self.parts[-1] if len(self.parts) > 1 else self.host
 
     @property
     def parent(self) -> str:
-        """All that stands before the name."""
+        """Everything before the name."""
         return "/".join(self.parts[:-1])
 
     @property
@@ -94,18 +94,18 @@ def place_of(argument: str, *, private_redirects: bool = False) -> LogPlace:
     ------
     UsageError : A URL that is none of ours.
     """
-    found = _URL.match(argument)
-    if found is None or Path(argument).exists():
+    match = _URL.match(argument)
+    if match is None or Path(argument).exists():
         return Path(argument)
     place = RemotePlace(argument, private_redirects)
     try:
-        known = place.scheme in SCHEMES and bool(place.host)
+        valid = place.scheme in SCHEMES and bool(place.host)
     except ValueError:  # a malformed server
-        known = False
-    if not known:
+        valid = False
+    if not valid:
         raise UsageError(
             expected=", ".join(f"{scheme}://" for scheme in SCHEMES) + " and a server or bucket",
-            got=f"{found[1]}://",
+            got=f"{match[1]}://",
             where=argument.split("?")[0].rpartition("@")[2],
             remedy="give such a URL, or a path of this machine",
         )

@@ -1,12 +1,13 @@
-"""Bytes of an object on a server: each is fetched once, into a file of this machine from which all reading is done.
+"""Bytes of an object on a server: each is fetched once, into a local file from which all reads are served.
 
-What is wanted is joined to ranges across gaps of at most 64 kB, of at most 8 MB each, several of which are under way at
-once. Nothing but blocks on their way is in memory. A cut range goes on where it was cut.
+Wanted bytes are joined to ranges of at most 8 MB across gaps of at most 64 kB, and several ranges are fetched in
+parallel. Only blocks in transfer are in memory. An interrupted range continues where it was cut.
 """
 
 from __future__ import annotations
 
 import asyncio
+import errno
 import hashlib
 import os
 import shutil
@@ -17,10 +18,11 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
-from typing import TypeAlias
+from typing import BinaryIO, TypeAlias
 
-from pdhef_logtool.logs.byte_source import ByteSource, ChangedError, SourceError
+from pdhef_logtool.logs.byte_source import ByteSource, ChangedError, SourceError, read_at
 from pdhef_logtool.logs.remote_objects import (
+    EMPTY,
     Answer,
     ObjectState,
     RemoteObject,
@@ -33,13 +35,13 @@ from pdhef_logtool.storage.files import scratch_folder
 
 Extent: TypeAlias = tuple[int, int]
 
-#: Fetching this many bytes that nobody asked for is cheaper than one request more.
+#: Fetching this many unwanted bytes is cheaper than another request.
 JOINED_GAP_BYTES = 64 << 10
 MOST_RANGE_BYTES = 8 << 20
 AT_ONCE = 4
-#: Enough to tell what an object is.
+#: Enough to recognise the format of an object.
 HEAD_BYTES = 4 << 10
-#: A scratch file leaves this much of the disk to others.
+#: Free disk space that a scratch file leaves.
 _DISK_RESERVE_BYTES = 256 << 20
 #: Objects that were closed stay for the next opening, so that no pass over the same log fetches it again.
 _KEPT_BYTES = 4 << 30
@@ -47,7 +49,6 @@ _KEPT_OBJECTS = 1000
 
 
 _AT_END = sys.maxsize
-_NOTHING = ObjectState(0, "", "")
 
 
 def join_ranges(extents: Iterable[Extent], held: Sequence[Extent] = ()) -> list[Extent]:
@@ -59,47 +60,23 @@ def join_ranges(extents: Iterable[Extent], held: Sequence[Extent] = ()) -> list[
             joined[-1] = (last[0], end)
         else:
             joined.append((start, end))
-    return [
-        (at, min(at + MOST_RANGE_BYTES, end)) for start, end in joined for at in range(start, end, MOST_RANGE_BYTES)
-    ]
+    step = MOST_RANGE_BYTES
+    return [(first, min(first + step, end)) for start, end in joined for first in range(start, end, step)]
 
 
 def without(extents: Iterable[Extent], held: Sequence[Extent]) -> list[Extent]:
-    """Return what of some extents is in none of others, ascending, neighbours joined."""
-    found: list[Extent] = []
+    """Return the parts of some extents that are in none of others, ascending, neighbours joined."""
+    missing: list[Extent] = []
     taken = sorted(held)
     for start, end in sorted(extents):
-        at = max(start, found[-1][1]) if found else start
-        for low, high in taken:
-            if high <= at:
-                continue
-            if low >= end:
-                break
-            if low > at:
-                _append(found, at, low)
-            at = max(at, high)
-        if at < end:
-            _append(found, at, end)
-    return found
-
-
-def _append(found: list[Extent], start: int, end: int) -> None:
-    if found and found[-1][1] == start:
-        found[-1] = (found[-1][0], end)
-    else:
-        found.append((start, end))
-
-
-def _insert(held: list[Extent], extent: Extent) -> None:
-    """Add an extent to others that are apart from it and each other, and ascend; neighbours are joined."""
-    at = bisect_right(held, extent)
-    start, end = extent
-    if at < len(held) and held[at][0] == end:
-        end = held.pop(at)[1]
-    if at > 0 and held[at - 1][1] == start:
-        at -= 1
-        start = held.pop(at)[0]
-    held.insert(at, (start, end))
+        position = max(start, missing[-1][1]) if missing else start
+        for low, high in (*taken, (end, end)):
+            stop = min(low, end)
+            if stop > position:
+                joined = missing and missing[-1][1] == position
+                missing.append((missing.pop()[0] if joined else position, stop))
+            position = max(position, high)
+    return missing
 
 
 def _any_in(held: Sequence[Extent], start: int, end: int) -> bool:
@@ -112,59 +89,59 @@ class RemoteSource(ByteSource):
     Parameters
     ----------
     head_bytes : that are fetched at once.
-    place : where it lies. What the object is (size, ETag, time of modification) is pinned now; that it became another
-        one ends any later read.
+    place : its URL. Its state (size, ETag, time of modification) is recorded now; any later read fails if it has
+        changed.
 
     Raises
     ------
-    SourceError : There is none, it may not be read, or the server does not answer.
-    UsageError : What it takes to ask is not installed.
+    SourceError : It does not exist, may not be read, or the server does not respond.
+    UsageError : A required package is not installed.
     """
 
-    far = True
+    is_remote = True
 
     def __init__(self, place: RemotePlace, head_bytes: int = HEAD_BYTES) -> None:
         self._spool = _acquire(place, head_bytes)
         self._closed = False
         self.place = place
         super().__init__(self._spool.state.size)
-        self.expect([(0, head_bytes)])
+        self.prefetch([(0, head_bytes)])
 
     @property
     def state(self) -> ObjectState:
-        """What the object was when it was opened."""
+        """State of the object when it was opened."""
         return self._spool.state
 
     @property
     def identity(self) -> str:
         """Hash of the URL without what gives access to it, of the size, and of ETag or time of modification."""
-        known = (self.place.identity, str(self.size), self.state.etag or self.state.modified)
-        return hashlib.sha256("\0".join(known).encode()).hexdigest()
+        parts = (self.place.identity, str(self.size), self.state.etag or self.state.modified)
+        return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
     @property
     def path(self) -> Path:
-        """The scratch file, of which what was fetched holds; all of it after :meth:`fetch_whole`."""
+        """The scratch file: fetched ranges are valid, all of it after :meth:`fetch_whole`."""
         return self._spool.path
 
     def fetch(self, offset: int, size: int) -> bytes:
         """See :class:`ByteSource`."""
         return self._spool.read(offset, min(offset + size, self.size))
 
-    def at_hand(self, offset: int, size: int) -> int:
+    def held_size(self, offset: int, size: int) -> int:
         """See :class:`ByteSource`."""
         return self._spool.held_to(offset, offset + size) - offset
 
-    def expect(self, extents: Iterable[Extent]) -> None:
+    def prefetch(self, extents: Iterable[Extent]) -> None:
         """See :class:`ByteSource`."""
         self._spool.order([(max(start, 0), min(end, self.size)) for start, end in extents])
 
     def fetch_whole(self) -> None:
-        """Have all of it in the scratch file."""
-        self.expect([(0, self.size)])
+        """Fetch the whole object into the scratch file."""
+        self.prefetch([(0, self.size)])
         self._spool.wait(0, self.size)
 
     def close(self) -> None:
-        """Release the scratch file, which stays for a while for who opens the same object again."""
+        """Release the scratch file, which is kept for some time in case the same object is opened again."""
         if not self._closed:
             self._closed = True
             _release(self._spool)
@@ -181,7 +158,7 @@ class _Spool:
 
     place: RemotePlace
     remote: RemoteObject
-    state: ObjectState = _NOTHING
+    state: ObjectState = EMPTY
     held: list[Extent] = field(default_factory=list)
     coming: list[tuple[Extent, Future[None]]] = field(default_factory=list)
     users: int = 0
@@ -190,25 +167,25 @@ class _Spool:
     def __post_init__(self) -> None:
         self._folder = scratch_folder()
         self.path = Path(self._folder.name) / (self.place.name.replace("/", "_")[-80:] or "log")
-        self._file = -1
+        self._file: BinaryIO | None = None
         self._lock = Lock()
         self._entering = Lock()
         self._at_once = asyncio.Semaphore(AT_ONCE)
         self._room = 0
 
     def enter(self, head_bytes: int) -> None:
-        """Open the scratch file; who is first pins what the object is, whoever comes later asks if it still is.
+        """Open the scratch file; the first user records the state of the object, later ones compare it.
 
         Raises
         ------
-        ChangedError : It is another one by now. SourceError : It cannot be asked for.
+        ChangedError : The object has changed. SourceError : It cannot be requested.
         """
         with self._entering:
-            if self._file >= 0:
+            if self._file is not None:
                 return
-            self._file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o600)
+            self._file = self.path.open("r+b" if self.path.exists() else "x+b", buffering=0)
             try:
-                if self.state is _NOTHING:
+                if self.state is EMPTY:
                     self._run(try_in_turn(lambda: self._first(head_bytes), self.remote)).result()
                 elif self.state.size:
                     self._run(try_in_turn(self._ask_again, self.remote)).result()
@@ -217,14 +194,14 @@ class _Spool:
                 raise
 
     def leave(self) -> None:
-        """Close the scratch file, when nobody uses it any more."""
+        """Close the scratch file, after its last use."""
         for _, future in self.coming:
             future.cancel()
         self.coming.clear()
         with self._lock:  # nothing that is still under way writes to what gets this number next
-            file, self._file = self._file, -1
-        if file >= 0:
-            os.close(file)
+            file, self._file = self._file, None
+        if file is not None:
+            file.close()
 
     async def _first(self, head_bytes: int) -> None:
         async with self.remote.ask(0, head_bytes, None) as answer:
@@ -268,7 +245,7 @@ class _Spool:
         with self._lock:
             if (extent, future) in self.coming:
                 self.coming.remove((extent, future))
-                _insert(self.held, extent)
+                self.held = without([*self.held, extent], ())
 
     def read(self, start: int, end: int) -> bytes:
         """Return bytes [start, end)."""
@@ -276,45 +253,47 @@ class _Spool:
             return b""
         if self.held_to(start, end) < end:
             self.wait(start, end)
-        return os.pread(self._file, end - start, start)
+        with self._lock:
+            assert self._file is not None
+            return read_at(self._file, start, end - start)
 
     def held_to(self, start: int, end: int) -> int:
         """Return up to where, at most to ``end``, bytes from ``start`` on are held; ``start``: none is."""
-        at = bisect_right(self.held, (start, _AT_END)) - 1
-        return min(self.held[at][1], end) if at >= 0 and self.held[at][1] > start else start
+        index = bisect_right(self.held, (start, _AT_END)) - 1
+        return min(self.held[index][1], end) if index >= 0 and self.held[index][1] > start else start
 
     async def _get(self, start: int, end: int) -> None:
         async with self._at_once:
-            at = start
+            position = start
 
             async def rest() -> None:
-                nonlocal at
-                async with self.remote.ask(at, end, self.state) as answer:
-                    if answer.start != at:
+                nonlocal position
+                async with self.remote.ask(position, end, self.state) as answer:
+                    if answer.start != position:
                         raise self.remote.error("all of it instead of a part", "the server stopped to give ranges")
                     written = 0
                     try:
                         async for block in answer.blocks:
-                            written += self._put(block[: end - at - written], at + written)
-                            if at + written >= end:
+                            written += self._put(block[: end - position - written], position + written)
+                            if position + written >= end:
                                 break
                     finally:
-                        at += written
-                if at < end:
+                        position += written
+                if position < end:
                     raise TryAgainError("an answer that is cut")
 
-            await try_in_turn(rest, self.remote, lambda: at)
+            await try_in_turn(rest, self.remote, lambda: position)
 
     async def _write(self, answer: Answer, size: int) -> int:
         """Write the blocks of a first answer, which may be all of the object; returns how many bytes came."""
-        at = 0
+        position = 0
         async for block in answer.blocks:
-            at += self._put(block, at)
-        if answer.start == 0 and size >= 0 and at > size:
-            raise self.remote.error("more bytes than it says it has", "read a copy")
-        return at
+            position += self._put(block, position)
+        if answer.start == 0 and size >= 0 and position > size:
+            raise self.remote.error("more bytes than its declared size", "read a copy")
+        return position
 
-    def _put(self, block: bytes, at: int) -> int:
+    def _put(self, block: bytes, offset: int) -> int:
         """Write a block, leaving some of the disk to others."""
         self._room -= len(block)
         if self._room < 0:
@@ -324,7 +303,10 @@ class _Spool:
             if self._room < 0:
                 raise OSError("the disk is full")
             with self._lock:
-                return os.pwrite(self._file, block, at)
+                if self._file is None:
+                    raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+                self._file.seek(offset)
+                return self._file.write(block)
         except OSError:
             raise self.remote.error("no room for its bytes on this disk", "set TMPDIR to another") from None
 
@@ -359,7 +341,7 @@ def _acquire(place: RemotePlace, head_bytes: int) -> _Spool:
             spool.users -= 1
             if not spool.users:
                 _forget(spool)
-        if isinstance(error, ChangedError) and spool.state is not _NOTHING:
+        if isinstance(error, ChangedError) and spool.state is not EMPTY:
             return _acquire(place, head_bytes)  # another one since it was closed: opening pins what it is now
         raise
     return spool

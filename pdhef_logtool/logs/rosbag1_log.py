@@ -10,12 +10,11 @@ import struct
 from array import array
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from pdhef_logtool.logs.budget import Meter
 from pdhef_logtool.logs.byte_source import ByteSource
 from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.container import (
@@ -26,9 +25,9 @@ from pdhef_logtool.logs.container import (
     Span,
     SpanDamageError,
     block_from_lists,
-    told,
 )
 from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.logs.resource_limits import Meter
 from pdhef_logtool.logs.type_names import ros2_type_name
 
 _OP_MESSAGE, _OP_BAG_HEADER, _OP_INDEX, _OP_CHUNK, _OP_CHUNK_INFO, _OP_CONNECTION = 2, 3, 4, 5, 6, 7
@@ -41,10 +40,10 @@ _MESSAGES_A_CHECK = 1 << 16
 
 @dataclass(slots=True)
 class _Chunk:
-    """A chunk record in bytes [at, end) and what its index records tell."""
+    """A chunk record in bytes [start, end) and the content of its index records."""
 
-    at: int
-    start: int  # of the stored bytes
+    start: int
+    stored_start: int  # of the compressed bytes
     end: int
     compression: str
     size: int
@@ -61,68 +60,67 @@ class Rosbag1Container(FileContainer):
     magic = ROSBAG1_MAGIC
     magic_text = "'#ROSBAG V2.0' at its start"
     remedy = "is it a ROS 1 bag?"
+    chunks: list[_Chunk]
 
     def __init__(self, path: Path | ByteSource, shown_path: LogPlace | None = None, meter: Meter | None = None) -> None:
-        self._chunks: list[_Chunk] = []
         self._found = 0
         self._pending: _Chunk | None = None  # the chunk whose index records are being read
         self._header: tuple[int, int] | None = None  # where the index begins, and how many chunks there are
-        self._infos: dict[int, Counter[int]] = {}  # counts by connection of the chunk at a byte, as the bag's end says
+        self._infos: dict[
+            int, Counter[int]
+        ] = {}  # counts by connection of the chunk at a byte, by the bag's index section
         super().__init__(path, shown_path, meter)
 
     def _walk(self) -> None:
         size = self.source.size
-        for at in self._places():
-            record = self._record_at(at)
+        for offset in self._places():
+            record = self._record_at(offset)
             if record is None:
                 index_at = self._header[0] if self._header else 0
-                padded_to = index_at if at < index_at <= size else size
-                if self._is_zero(at, padded_to):
-                    self.at = padded_to  # some writers pad with zeros behind the last chunk or the last record
+                padded_to = index_at if offset < index_at <= size else size
+                if self._is_zero(offset, padded_to):
+                    self.position = padded_to  # some writers pad with zeros behind the last chunk or the last record
                     continue
                 if self._header is None:
                     raise self.no_log("a complete bag header record", "a cut or malformed one")
                 self._close_chunk(complete=False)
-                what = f"the file ends inside a record at byte {at} of {size}; what follows is gone"
-                self.lose("truncated", what, self.last_ns())
-                self.account.lose(at, size)
-                self.account.cut = True
+                self.lose_end(offset)
                 return
             fields, start, end = record
             try:
-                self._take(fields, at, start, end)
-            except Exception as error:  # noqa: BLE001 (whatever a record does, the next one is read)
-                self.lose_record(at, end, error)
-            self.at = end
+                self._take(fields, offset, start, end)
+            except Exception as error:  # noqa: BLE001 (the next record is read in any case)
+                self.lose_record(offset, end, error)
+            self.position = end
 
-    def _take(self, fields: Mapping[str, bytes], at: int, start: int, end: int) -> None:
+    def _take(self, fields: Mapping[str, bytes], offset: int, start: int, end: int) -> None:
         """Handle one complete record."""
         op = _op(fields)
-        budget = self.meter.budget
+        limits = self.meter.limits
         if op == _OP_INDEX and self._pending is not None:
-            budget.check("metadata_bytes", end - start, "an index record")
+            limits.check("metadata_bytes", end - start, "an index record")
             self._index_record(self._pending, fields, self.source.read(start, end - start))
-            self.account.decode(at, end)
+            self.account.decode(offset, end)
             return
         self._close_chunk()
         if op == _OP_CHUNK:
             compression, (size,) = fields["compression"].decode(), _U32.unpack(fields["size"])
-            self._pending = _Chunk(at, start, end, compression, size)
+            self._pending = _Chunk(offset, start, end, compression, size)
             return
         if op == _OP_BAG_HEADER:
             self._header = (int.from_bytes(fields["index_pos"], "little"), _U32.unpack(fields["chunk_count"])[0])
         elif op == _OP_CONNECTION:
-            budget.check("metadata_bytes", end - start, "a connection record")
+            limits.check("metadata_bytes", end - start, "a connection record")
             self._add_connection(fields, self.source.read(start, end - start))
         elif op == _OP_CHUNK_INFO:
-            budget.check("metadata_bytes", end - start, "a chunk info record")
+            limits.check("metadata_bytes", end - start, "a chunk info record")
             pairs = np.frombuffer(self.source.read(start, end - start), dtype="<u4")
             counts = Counter(dict(zip(pairs[::2].tolist(), pairs[1::2].tolist(), strict=True)))
             self._infos[int.from_bytes(fields["chunk_pos"], "little")] = counts
             return
         else:
-            raise SpanDamageError(f"no record of kind {op} may stand here")
-        self.account.decode(at, end)
+            raise SpanDamageError(f"no record of kind {op} is allowed here")
+        self.account.decode(offset, end)
 
     def _finish(self) -> None:
         if self._header is None:
@@ -139,30 +137,30 @@ class Rosbag1Container(FileContainer):
         self.drop_undeclared("connections")
 
     def _check_infos(self, chunks: int) -> None:
-        """Open the chunks whose index records tell other counts than the bag's end, which could hide messages."""
-        found, spans = self._chunks, self.spans[:]
+        """Open the chunks whose index records differ from the bag's index section, as these could hide messages."""
+        chunks_read, spans = self.chunks, self.spans[:]
         missing = chunks - self._found
-        self._chunks = []
+        self.chunks = []
         self.spans.clear()
-        for chunk, span in zip(found, spans, strict=True):
-            if self._infos.get(chunk.at, chunk.counts) == chunk.counts:
-                self._add_span(chunk, span)
+        for chunk, span in zip(chunks_read, spans, strict=True):
+            if self._infos.get(chunk.start, chunk.counts) == chunk.counts:
+                self.add_span(chunk, span)
             else:
                 self._open_chunk(chunk)
         if missing > 0 and not self.lost:
-            self.lose("missing-messages", f"the bag's header names {chunks} chunks, of which {missing} are not there")
+            self.lose("missing-messages", f"the bag's header names {chunks} chunks, {missing} of them are not there")
             self.account.lose(0, len(self.magic))
 
-    def _record_at(self, at: int) -> tuple[dict[str, bytes], int, int] | None:
+    def _record_at(self, offset: int) -> tuple[dict[str, bytes], int, int] | None:
         """Return header fields and data extent of the record at a byte; None if it is cut or no record."""
         source, size = self.source, self.source.size
-        if at + 8 > size:
+        if offset + 8 > size:
             return None
-        (header,) = _U32.unpack(source.read(at, 4))
-        if header == 0 or at + 8 + header > size or header > self.meter.budget.metadata_bytes:
+        (header,) = _U32.unpack(source.read(offset, 4))
+        if header == 0 or offset + 8 + header > size or header > self.meter.limits.metadata_bytes:
             return None
-        text = source.read(at + 4, header + 4)
-        start = at + 8 + header
+        text = source.read(offset + 4, header + 4)
+        start = offset + 8 + header
         (length,) = _U32.unpack_from(text, header)
         if start + length > size:
             return None
@@ -173,12 +171,12 @@ class Rosbag1Container(FileContainer):
 
     def _is_zero(self, start: int, end: int) -> bool:
         return all(
-            not any(self.source.read(at, min(_ZERO_BLOCK_BYTES, end - at)))
-            for at in range(start, end, _ZERO_BLOCK_BYTES)
+            not any(self.source.read(offset, min(_ZERO_BLOCK_BYTES, end - offset)))
+            for offset in range(start, end, _ZERO_BLOCK_BYTES)
         )
 
     def _index_record(self, chunk: _Chunk, fields: Mapping[str, bytes], payload: bytes) -> None:
-        """Take note of the connection and the log times that an index record lists."""
+        """Add the connection and the log times of an index record."""
         (connection,), (count,) = _U32.unpack(fields["conn"]), _U32.unpack(fields["count"])
         words = np.frombuffer(payload, dtype="<u4", count=3 * count).reshape(count, 3).astype(np.int64)
         if count:
@@ -194,14 +192,14 @@ class Rosbag1Container(FileContainer):
         for span in self.spans:
             if not set(span.counts) <= set(self.channels):
                 with contextlib.suppress(Exception):  # a read of the span reports the damage
-                    self._decode(self._chunks[span.index], declare=True)
+                    self._decode(self.chunks[span.index], declare=True)
 
     def _add_connection(self, fields: Mapping[str, bytes], payload: bytes) -> None:
         inner = _header_fields(payload)
         id_ = _U32.unpack(fields["conn"])[0]
         if id_ in self.channels:
             return
-        self.meter.budget.check("channels", len(self.channels) + 1, f"connection {id_}")
+        self.meter.limits.check("channels", len(self.channels) + 1, f"connection {id_}")
         type_name = inner["type"].decode()
         metadata: dict[str, str] = {
             name: inner[name].decode("utf-8", errors="replace")
@@ -228,66 +226,50 @@ class Rosbag1Container(FileContainer):
         if not complete or not chunk.counts or chunk.counts.total() * _LEAST_MESSAGE_BYTES > chunk.size:
             self._open_chunk(chunk)
         else:
-            self._add_span(chunk, Span(0, chunk.first_ns, chunk.last_ns + 1, dict(chunk.counts), chunk.ordered))
-
-    def _add_span(self, chunk: _Chunk, span: Span) -> None:
-        self._chunks.append(chunk)
-        self.spans.append(replace(span, index=len(self.spans)))
+            self.add_span(chunk, Span(0, chunk.first_ns, chunk.last_ns + 1, dict(chunk.counts), chunk.ordered))
 
     def _open_chunk(self, chunk: _Chunk) -> None:
-        """Add a chunk by its content; lose it if it is damaged."""
-        try:
-            block = self._decode(chunk, declare=True)
-        except Exception as error:  # noqa: BLE001 (the boundary)
-            kind, text = told(error)
-            what = f"an unknown number of messages lost in the chunk at byte {chunk.at}: {text}"
-            self.lose(kind, what, self.last_ns())
-            self.account.lose(chunk.at, chunk.end)
-            return
-        if not len(block):
-            self.account.decode(chunk.at, chunk.end)
-            return
-        first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
-        self._add_span(chunk, Span(0, first, last + 1, block.counts))
+        """Add a chunk by its content; a damaged chunk is a loss."""
+        self.add_content(chunk, (chunk.start, chunk.end), None, lambda: self._decode(chunk, declare=True))
 
     def extent(self, span: Span) -> tuple[int, int]:
         """Return the bytes of the chunk's record."""
-        chunk = self._chunks[span.index]
-        return chunk.at, chunk.end
+        chunk = self.chunks[span.index]
+        return chunk.start, chunk.end
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         """Decode one chunk; see :class:`~pdhef_logtool.logs.container.Container`."""
         del want
-        return self._decode(self._chunks[span.index], declare=False)
+        return self._decode(self.chunks[span.index], declare=False)
 
     def _decode(self, chunk: _Chunk, declare: bool) -> Block:
-        self.meter.budget.check("chunk_bytes", chunk.end - chunk.start, "a chunk")
-        stored = self.source.read(chunk.start, chunk.end - chunk.start)
-        content = decompress(chunk.compression or "unnamed", stored, chunk.size, self.meter.budget)
+        self.meter.limits.check("chunk_bytes", chunk.end - chunk.stored_start, "a chunk")
+        stored = self.source.read(chunk.stored_start, chunk.end - chunk.stored_start)
+        content = decompress(chunk.compression or "unnamed", stored, chunk.size, self.meter.limits)
         channels, stamps, offsets, lengths = (array("q") for _ in range(4))
-        at, size = 0, len(content)
-        while at < size:
-            record = _record_in(content, at, size)
+        offset, size = 0, len(content)
+        while offset < size:
+            record = _record_in(content, offset, size)
             if record is None:
                 raise SpanDamageError("its last record is cut")
-            fields, begin, at = record
+            fields, begin, offset = record
             op = _op(fields)
             try:
                 if op == _OP_MESSAGE:
                     if len(stamps) % _MESSAGES_A_CHECK == 0:
-                        self.meter.budget.check("chunk_messages", len(stamps), "a chunk")
+                        self.meter.limits.check("chunk_messages", len(stamps), "a chunk")
                         self.meter.check()
                     channels.append(_U32.unpack(fields["conn"])[0])
                     stamps.append(_time_ns(fields["time"]))
                     offsets.append(begin)
-                    lengths.append(at - begin)
+                    lengths.append(offset - begin)
                 elif op != _OP_CONNECTION:
-                    raise SpanDamageError(f"it holds a record of kind {op}, which no chunk may")
+                    raise SpanDamageError(f"it contains a record of kind {op}, which no chunk may")
                 elif declare:
-                    self._add_connection(fields, content[begin:at])
+                    self._add_connection(fields, content[begin:offset])
             except (KeyError, struct.error, ValueError) as error:
                 raise SpanDamageError(f"a record is malformed: {error}") from error
-        self.meter.budget.check_messages(len(stamps), len(stored))
+        self.meter.limits.check_messages(len(stamps), len(stored))
         return block_from_lists(content, channels, stamps, stamps, [0] * len(stamps), offsets, lengths)
 
 
@@ -297,33 +279,33 @@ def _op(fields: Mapping[str, bytes]) -> int:
     return op[0] if len(op) == 1 else -1
 
 
-def _record_in(data: bytes, at: int, size: int) -> tuple[dict[str, bytes], int, int] | None:
+def _record_in(data: bytes, offset: int, size: int) -> tuple[dict[str, bytes], int, int] | None:
     """Return header fields and data extent of the record at a byte of a chunk; None if it is cut or no record."""
-    if at + 8 > size:
+    if offset + 8 > size:
         return None
-    (header,) = _U32.unpack_from(data, at)
-    if header == 0 or at + 8 + header > size:
+    (header,) = _U32.unpack_from(data, offset)
+    if header == 0 or offset + 8 + header > size:
         return None
-    start = at + 8 + header
+    start = offset + 8 + header
     (length,) = _U32.unpack_from(data, start - 4)
     if start + length > size:
         return None
     try:
-        return _header_fields(data[at + 4 : at + 4 + header]), start, start + length
+        return _header_fields(data[offset + 4 : offset + 4 + header]), start, start + length
     except (struct.error, ValueError):
         return None
 
 
 def _header_fields(text: bytes) -> dict[str, bytes]:
     fields: dict[str, bytes] = {}
-    at = 0
-    while at < len(text):
-        (length,) = _U32.unpack_from(text, at)
-        name, sign, value = text[at + 4 : at + 4 + length].partition(b"=")
-        if not sign or at + 4 + length > len(text):
+    offset = 0
+    while offset < len(text):
+        (length,) = _U32.unpack_from(text, offset)
+        name, sign, value = text[offset + 4 : offset + 4 + length].partition(b"=")
+        if not sign or offset + 4 + length > len(text):
             raise ValueError("a header field without '='")
         fields[name.decode("ascii", errors="replace")] = value
-        at += 4 + length
+        offset += 4 + length
     return fields
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-import tempfile
 from collections import Counter
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -13,7 +12,6 @@ from urllib.parse import quote
 
 import numpy as np
 
-from pdhef_logtool.logs.budget import BudgetError, Meter
 from pdhef_logtool.logs.byte_source import require_regular
 from pdhef_logtool.logs.container import (
     MAX_TIME_NS,
@@ -23,9 +21,10 @@ from pdhef_logtool.logs.container import (
     Span,
     SpanDamageError,
     block_from_lists,
-    told,
+    describe_damage,
 )
 from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.logs.type_names import ros2_type_name
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.storage.files import scratch_folder
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
 
 _PAGE_ROWS = 8192
 _PAGE_BYTES = 4 << 20
-_STEPS_A_CHECK = 100_000  # of the database's machine, between looks at the time
+_STEPS_A_CHECK = 100_000  # instructions of SQLite between checks of the time
 
 
 class SqliteContainer(Container):
@@ -62,12 +61,12 @@ class SqliteContainer(Container):
         super().__init__(shown_path or path, path.stat().st_size, meter)
         self._pages: list[tuple[int, int]] = []  # first and last row id
         self._ends: list[int] = []  # bytes of the rows up to the end of each page
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
-        self._late: BudgetError | None = None
+        self._late: LimitError | None = None
         self._db = self._connect(path)
+        self.on_close(self._db.close)
         try:
             self._db.text_factory = _text
-            self._db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(self.meter.budget.chunk_bytes, 2**31 - 1))
+            self._db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(self.meter.limits.chunk_bytes, 2**31 - 1))
             self._db.set_progress_handler(self._out_of_time, _STEPS_A_CHECK)
             for pragma in ("trusted_schema = OFF", "mmap_size = 0", "cell_size_check = ON"):
                 self._db.execute(f"PRAGMA {pragma}")
@@ -82,10 +81,10 @@ class SqliteContainer(Container):
             raise
 
     def _out_of_time(self) -> bool:
-        """Tell SQLite to stop: a query over a hostile database need not end."""
+        """Stop SQLite: a query over a hostile database need not end."""
         try:
             self.meter.check()
-        except BudgetError as error:
+        except LimitError as error:
             self._late = error
             return True
         return False
@@ -93,8 +92,9 @@ class SqliteContainer(Container):
     def _connect(self, path: Path) -> sqlite3.Connection:
         wal = path.with_name(path.name + "-wal")
         if wal.is_file() and wal.stat().st_size > 0:
-            self._folder = scratch_folder()
-            copy = Path(self._folder.name) / path.name
+            folder = scratch_folder()
+            self.on_close(folder.cleanup)
+            copy = Path(folder.name) / path.name
             shutil.copyfile(path, copy)
             shutil.copyfile(wal, copy.with_name(wal.name))
             return sqlite3.connect(f"file:{quote(str(copy))}", uri=True, check_same_thread=False)
@@ -122,7 +122,7 @@ class SqliteContainer(Container):
         extra = [c for c in ("offered_qos_profiles", "type_description_hash") if c in topic_columns]
         query = f"SELECT {', '.join(['id', 'name', 'type', 'serialization_format', *extra])} FROM topics ORDER BY id"  # noqa: S608
         for id_, name, type_name, encoding, *rest in self._db.execute(query):
-            self.meter.budget.check("channels", len(self.channels) + 1, f"topic {id_}")
+            self.meter.limits.check("channels", len(self.channels) + 1, f"topic {id_}")
             schema_encoding, text = definitions.get(type_name, ("", ""))
             self.channels[int(id_)] = ChannelRecord(
                 id=int(id_),
@@ -140,7 +140,7 @@ class SqliteContainer(Container):
         first = last = size = total = 0
         times: list[int] = []
         counts: Counter[int] = Counter()
-        unknown = found = 0
+        unknown = row_count = 0
 
         def close_page() -> None:
             if times:
@@ -153,7 +153,7 @@ class SqliteContainer(Container):
 
         try:
             for id_, topic, timestamp, length, kind in rows:
-                found += 1
+                row_count += 1
                 if topic not in self.channels or not isinstance(timestamp, int) or kind != "blob":
                     unknown += 1
                     continue
@@ -167,7 +167,7 @@ class SqliteContainer(Container):
                 if len(times) >= _PAGE_ROWS or size >= _PAGE_BYTES:
                     close_page()
         except sqlite3.Error as error:
-            what = f"the rows after id {last} cannot be read: {told(self._late or error)[1]}"
+            what = f"the rows after id {last} cannot be read: {describe_damage(self._late or error)[1]}"
             self.lose("over-budget" if self._late else "truncated", what, max(times) + 1 if times else None)
             self.account.lose(total, self.account.size)
             self.account.cut = True
@@ -175,12 +175,12 @@ class SqliteContainer(Container):
         if unknown:
             what = f"{unknown} messages of topics that the database does not name, or without a time or data"
             self.lose("unknown-channel", what, count=unknown)
-            self.account.lose(total, total + round(self.account.size * unknown / found))
+            self.account.lose(total, total + round(self.account.size * unknown / row_count))
         if not self.lost:
-            self._check_indexes(found)
+            self._check_indexes(row_count)
 
-    def _check_indexes(self, found: int) -> None:
-        """Hold the rows that were found against the indexes of the table: a damaged page can hide rows."""
+    def _check_indexes(self, row_count: int) -> None:
+        """Compare the rows that were read with the indexes of the table: a damaged page can hide rows."""
         names = [str(row[0]) for row in self._db.execute("SELECT name FROM pragma_index_list('messages')")]
         counts = [0]
         try:
@@ -193,9 +193,9 @@ class SqliteContainer(Container):
                 raise
             self.lose("bad-index", f"the index of the messages cannot be read: {error}")
             self.account.lose(self.account.size - 1, self.account.size)
-        missing = max(counts) - found
+        missing = max(counts) - row_count
         if missing > 0:
-            what = f"the index of the messages names {max(counts)} rows, of which {found} are there"
+            what = f"the index of the messages names {max(counts)} rows, {row_count} of them are there"
             self.lose("missing-messages", what, count=missing)
             end = self._ends[-1] if self._ends else 0
             self.account.lose(end, end + round(self.account.size * missing / max(counts)))
@@ -233,18 +233,11 @@ class SqliteContainer(Container):
         """Return channels and log times of one page."""
         query = "SELECT topic_id, timestamp FROM messages WHERE id BETWEEN ? AND ? ORDER BY id"
         try:
-            found = self._db.execute(query, self._pages[span.index])
-            rows = [(t, min(ns, MAX_TIME_NS)) for t, ns in found if isinstance(ns, int)]
+            cursor = self._db.execute(query, self._pages[span.index])
+            rows = [(t, min(ns, MAX_TIME_NS)) for t, ns in cursor if isinstance(ns, int)]
         except sqlite3.Error as error:
             raise SpanDamageError(str(error)) from error
         return np.array([t for t, _ in rows], dtype=np.int64), np.array([ns for _, ns in rows], dtype=np.int64)
-
-    def close(self) -> None:
-        """Release the file and the temporary copy."""
-        self._db.close()
-        if self._folder is not None:
-            self._folder.cleanup()
-            self._folder = None
 
 
 def _text(stored: bytes) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
@@ -49,13 +49,13 @@ def message_definition(type_name: str) -> str:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.LATEST)
-    own = schema_file(f"{type_name}.msg")
-    if own.is_file():
-        text = own.read_text(encoding="utf-8")
+    shipped = schema_file(f"{type_name}.msg")
+    if shipped.is_file():
+        text = shipped.read_text(encoding="utf-8")
         types = get_types_from_msg(text, type_name)
-        store.register({**types, **_shipped_parts(types, set(store.fielddefs))})
+        store.register(with_contained_types(types, store.fielddefs, shipped_definition))
         generated = store.generate_msgdef(type_name, ros_version=2)[0]
-        # Keep the comments of the own text: units stand there.
+        # Keep the comments of the shipped text: they contain the units.
         _, separator, rest = generated.partition(_MESSAGE_SEPARATOR)
         return text.rstrip("\n") + "\n" + separator + rest
     if type_name not in store.fielddefs:
@@ -63,17 +63,28 @@ def message_definition(type_name: str) -> str:
     return store.generate_msgdef(type_name, ros_version=2)[0]
 
 
-def _shipped_parts(types: Mapping[str, Any], known: set[str]) -> dict[str, Any]:
-    """Return the shipped types that others contain and nobody knows, at any depth."""
+def with_contained_types(
+    types: Mapping[str, Any], distributed: Mapping[str, Any], text_of: Callable[[str], str], wanted: str = ""
+) -> dict[str, Any]:
+    """Return types with all types that they contain, at any depth.
+
+    Parameters
+    ----------
+    distributed : types of a distribution. text_of : returns the definition of any other type.
+    wanted : name of a further type.
+    """
     from rosbags.typesys import get_types_from_msg
 
-    found: dict[str, Any] = {}
-    todo = referenced(types) - known - set(types)
+    completed = dict(types)
+    todo = ({wanted} if wanted else set()) | (referenced(types) - set(types))
     while todo:
         name = todo.pop()
-        found |= get_types_from_msg(shipped_definition(name), name)
-        todo |= referenced(found) - known - set(types) - set(found)
-    return found
+        if name in distributed:
+            completed[name] = distributed[name]
+        else:
+            completed |= get_types_from_msg(text_of(name), name)
+        todo |= referenced({name: completed[name]}) - set(completed)
+    return completed
 
 
 def referenced(types: Mapping[str, Any]) -> set[str]:

@@ -1,6 +1,6 @@
 """Lossless copies of a log's messages into an MCAP: ready bytes in log-time order, a few spans in memory at a time.
 
-Chunks of an MCAP whose channels are all kept are copied as they are, checked but not compressed anew.
+Chunks of an MCAP whose channels are all kept are copied as they are: checked, but not compressed again.
 
 MCAP sources keep schema, topic, encoding, channel metadata, both times, sequence and payload; attachments and metadata
 records come along. rosbag2 databases keep their CDR bytes and definitions. ROS 1 messages become ROS 2 CDR.
@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from mcap.records import Metadata
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog, in_window
-from pdhef_logtool.logs.container import Attachment, Block, ChannelRecord, MetadataRecord, RawChunk, Span
-from pdhef_logtool.logs.mcap_log import McapContainer
+from pdhef_logtool.logs.container import Attachment, Block, ChannelRecord, RawChunk, Span
 from pdhef_logtool.logs.message_schema import SchemaError, parsing, ros_schema
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
@@ -25,6 +25,7 @@ from pdhef_logtool.records.signals import Loss
 _LARGEST_ID = 0xFFFF
 #: Times of MCAP are unsigned; those that readers give are not.
 _UNSIGNED = (1 << 64) - 1
+_NEVER_NS = int(np.iinfo(np.int64).max)
 _HEADER = "std_msgs/msg/Header"
 
 #: Number of a channel in the log: file of the log, and channel id in that file.
@@ -33,12 +34,12 @@ _Key = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class SourceChannels:
-    """Where the channels of a log went in the copy.
+    """Channels of a log and of its copy.
 
     Attributes
     ----------
     ids : channel of the copy by file and channel of the source.
-    converters : turns a payload into what the copy holds; absent where bytes are kept.
+    converters : functions from payload to payload of the copy; absent where bytes are kept.
     numbered : ROS 1 channels whose messages begin with a header: its sequence number, which a ROS 2 header has not,
         becomes the message's.
     lost : channels and messages that cannot be copied.
@@ -71,7 +72,7 @@ def register_channels(
     converters: dict[_Key, Callable[[bytes], bytes | None]] = {}
     numbered: set[_Key] = set()
     lost: list[Loss] = []
-    known: dict[tuple[object, ...], int] = {}
+    ids_by_content: dict[tuple[object, ...], int] = {}
     verbatim: set[_Key] = set()
     places = _Places(log)
     for c, container in enumerate(log.containers):
@@ -98,10 +99,10 @@ def register_channels(
                 target.encoding,
                 tuple(sorted(target.metadata.items())),
             )
-            id_ = known.get(identity)
+            id_ = ids_by_content.get(identity)
             if id_ is None or id_ in same_file:  # two publishers of one file stay two channels
                 id_ = writer.add_channel(target, *places.of(c, target))
-                known[identity] = id_
+                ids_by_content[identity] = id_
             same_file.add(id_)
             ids[(c, channel.id)] = id_
             if target is channel and places.keeps(c, channel, id_):
@@ -110,10 +111,10 @@ def register_channels(
 
 
 class _Places:
-    """Which ids the channels and schemas of MCAP files get in the copy: their own where these are free."""
+    """Ids of the channels and schemas of MCAP files in the copy: unchanged if these are free."""
 
     def __init__(self, log: ColumnarLog) -> None:
-        self._files = {c: f for c, f in enumerate(log.containers) if isinstance(f, McapContainer)}
+        self._files = {c: f for c, f in enumerate(log.containers) if f.whole_chunks}
         used = [id_ for f in self._files.values() for id_ in f.channels]
         self._next_channel = max(used, default=0) + 1
         self._channels: dict[int, int] = {}  # schema id by channel id, both of the copy
@@ -140,21 +141,8 @@ class _Places:
         return channel.schema_id if fits else None
 
     def keeps(self, c: int, channel: ChannelRecord, id_: int) -> bool:
-        """Tell whether a channel has its own ids in the copy."""
+        """Return whether a channel keeps its ids in the copy."""
         return c in self._files and id_ == channel.id and self._channels.get(id_) == channel.schema_id
-
-
-def iterate_raw(
-    log: ColumnarLog, channels: SourceChannels, start_ns: int | None = None, end_ns: int | None = None
-) -> Iterator[RawMessage]:
-    """Yield the messages of a log with log time in [start, end) in log-time order, with the copy's channel ids.
-
-    Messages of equal log time come in file order. Spans that overlap in time are merged; no more of them are held
-    than overlap. Damaged spans are left out and reported by ``log.lost``.
-    """
-    for item in iterate_copy(log, channels, start_ns, end_ns, whole=False):
-        assert isinstance(item, RawMessage)
-        yield item
 
 
 def iterate_copy(
@@ -165,87 +153,85 @@ def iterate_copy(
     *,
     whole: bool = True,
 ) -> Iterator[RawMessage | RawChunk]:
-    """Yield what :func:`iterate_raw` does, but (when ``whole``) chunks that can be copied as they are as such.
+    """Yield the messages of a log with log time in [start, end) in log-time order, with the copy's channel ids.
 
-    These are sound chunks of MCAP files (a damaged one is left out and reported) that lie in the window and hold and
-    declare nothing but channels with their own ids. They come in order of their first log times, and where they
-    overlap in the order of the file.
+    Messages of equal log time come in file order. Spans that overlap in time are merged; only these are in memory.
+    Damaged spans are left out and reported by ``log.lost``.
+
+    When ``whole``, chunks that can be copied as they are come as such: sound chunks of MCAP files that lie in the
+    window and contain and declare only channels with unchanged ids. They come in order of their first log times, and
+    where they overlap in file order.
     """
-    kept = [frozenset(id_ for of, id_ in channels.verbatim if of == c) for c in range(len(log.containers))]
-    spans = [
-        (span.start_ns, c, span)
-        for c, container in enumerate(log.containers)
-        for span in container.spans
-        if (start_ns is None or span.end_ns > start_ns)
-        and (end_ns is None or span.start_ns < end_ns)
-        and (not span.counts or any((c, id_) in channels.ids for id_ in span.counts))
-    ]
-    spans.sort(key=lambda item: (item[0], item[1], item[2].index))
+    unchanged = [frozenset(id_ for of, id_ in channels.verbatim if of == c) for c in range(len(log.containers))]
+    spans = _spans_to_copy(log, channels, start_ns, end_ns)
     if whole:
-        spans = _in_file_order_where_overlapping(spans, kept)
+        spans = _in_file_order_where_overlapping(spans, unchanged)
     for c, container in enumerate(log.containers):
-        container.expect(span for _, of, span in spans if of == c)
-    open_spans: list[tuple[int, int, int, int, _Cursor]] = []  # next log time, file, span, row: order of ties
-    at = 0
-    while at < len(spans) or open_spans:
-        while at < len(spans) and (not open_spans or spans[at][0] <= open_spans[0][0]):
-            _, c, span = spans[at]
-            at += 1
+        container.prefetch(span for of, span in spans if of == c)
+    cursors: list[tuple[int, int, int, int, _Cursor]] = []  # next log time, file, span, row: order of ties
+    position = 0
+    while position < len(spans) or cursors:
+        while position < len(spans) and (not cursors or spans[position][1].start_ns <= cursors[0][0]):
+            c, span = spans[position]
+            position += 1
             block = log.load(c, span)
             if block is None:
                 continue
-            container = log.containers[c]
-            if whole and isinstance(container, McapContainer):
-                chunk = container.raw_chunk(span, block, kept[c])
-                if chunk is not None and in_window(block.log_time_ns, start_ns, end_ns) is None:
-                    yield chunk
-                    continue
-            cursor = _Cursor(block, start_ns, end_ns)
-            if cursor.rows:
-                heapq.heappush(open_spans, (cursor.time, c, span.index, 0, cursor))
-        if not open_spans:
-            continue
-        _, c, index, _, cursor = heapq.heappop(open_spans)
-        # Run on in this span for as long as no other one can come first.
-        limit = min(
-            open_spans[0][0] if open_spans else np.iinfo(np.int64).max,
-            spans[at][0] if at < len(spans) else np.iinfo(np.int64).max,
-        )
-        while True:
-            message = cursor.take(c, channels)
-            if message is not None:
-                yield message
-            if not cursor.rows:
-                break
-            if cursor.time >= limit:
-                heapq.heappush(open_spans, (cursor.time, c, index, cursor.taken, cursor))
-                break
+            inside = in_window(block.log_time_ns, start_ns, end_ns) is None
+            chunk = log.containers[c].raw_chunk(span, block, unchanged[c]) if whole and inside else None
+            if chunk is None:
+                _push(cursors, c, span.index, _Cursor(block, start_ns, end_ns))
+            else:
+                yield chunk
+        if cursors:
+            _, c, index, _, cursor = heapq.heappop(cursors)
+            # Continue in this span until another one can come first.
+            limit_ns = min(cursors[0][0] if cursors else _NEVER_NS, _start_ns(spans, position))
+            yield from cursor.take_until(limit_ns, c, channels)
+            _push(cursors, c, index, cursor)
+
+
+def _push(cursors: list[tuple[int, int, int, int, _Cursor]], c: int, index: int, cursor: _Cursor) -> None:
+    if cursor.remaining:
+        heapq.heappush(cursors, (cursor.time_ns, c, index, cursor.taken, cursor))
+
+
+def _start_ns(spans: Sequence[tuple[int, Span]], position: int) -> int:
+    return spans[position][1].start_ns if position < len(spans) else _NEVER_NS
+
+
+def _spans_to_copy(
+    log: ColumnarLog, channels: SourceChannels, start_ns: int | None, end_ns: int | None
+) -> list[tuple[int, Span]]:
+    """Return file and span of the spans that contain messages to be copied, by start, file and place."""
+    spans = [
+        (c, span)
+        for c, container in enumerate(log.containers)
+        for span in container.spans
+        if span.overlaps(start_ns, end_ns) and (not span.counts or any((c, id_) in channels.ids for id_ in span.counts))
+    ]
+    return sorted(spans, key=lambda item: (item[1].start_ns, item[0], item[1].index))
 
 
 def _in_file_order_where_overlapping(
-    spans: Sequence[tuple[int, int, Span]], kept: Sequence[frozenset[int]]
-) -> list[tuple[int, int, Span]]:
+    spans: Sequence[tuple[int, Span]], unchanged: Sequence[frozenset[int]]
+) -> list[tuple[int, Span]]:
     """Sort groups of overlapping spans that will all be copied as they are back to the order of the file.
 
     Readers give messages of equal log times in file order, which is then that of the source.
     """
-    ordered: list[tuple[int, int, Span]] = []
-    group: list[tuple[int, int, Span]] = []
+    groups: list[list[tuple[int, Span]]] = []
     end_ns = 0
-
-    def close() -> None:
-        if all(kept[c].issuperset(span.counts) for _, c, span in group):
-            group.sort(key=lambda item: (item[1], item[2].index))
-        ordered.extend(group)
-        group.clear()
-
-    for item in spans:
-        if group and item[0] >= end_ns:
-            close()
-        end_ns = max(end_ns, item[2].end_ns) if group else item[2].end_ns
-        group.append(item)
-    close()
-    return ordered
+    for c, span in spans:
+        if not groups or span.start_ns >= end_ns:
+            groups.append([])
+            end_ns = span.end_ns
+        end_ns = max(end_ns, span.end_ns)
+        groups[-1].append((c, span))
+    for group in groups:
+        if all(unchanged[c].issuperset(span.counts) for c, span in group):
+            group.sort(key=lambda item: (item[0], item[1].index))
+    return [item for group in groups for item in group]
 
 
 def iterate_attachments(log: ColumnarLog) -> Iterator[Attachment]:
@@ -254,7 +240,7 @@ def iterate_attachments(log: ColumnarLog) -> Iterator[Attachment]:
         yield from container.attachments()
 
 
-def iterate_metadata(log: ColumnarLog) -> Iterator[MetadataRecord]:
+def iterate_metadata(log: ColumnarLog) -> Iterator[Metadata]:
     """Yield the metadata records of a log."""
     for container in log.containers:
         yield from container.metadata_records()
@@ -273,39 +259,40 @@ class _Cursor:
         self._rows = list(zip(*(column[rows].tolist() for column in columns), strict=True))
 
     @property
-    def rows(self) -> int:
-        """Messages that are left."""
+    def remaining(self) -> int:
+        """Number of messages that are left."""
         return len(self._rows) - self.taken
 
     @property
-    def time(self) -> int:
+    def time_ns(self) -> int:
         """Log time of the next message."""
         return int(self._rows[self.taken][1])
 
-    def take(self, c: int, channels: SourceChannels) -> RawMessage | None:
-        """Return the next message; None if its channel or the message itself cannot be copied.
+    def take_until(self, limit_ns: int, c: int, channels: SourceChannels) -> Iterator[RawMessage]:
+        """Yield the next message, and those after it before a log time.
 
-        A database may hold times before 1970, which an MCAP file cannot.
+        Messages that cannot be copied are left out: those of other channels, and those before 1970, whose times an
+        MCAP file cannot contain.
         """
-        channel, log_time, publish_time, sequence, offset, length = self._rows[self.taken]
-        self.taken += 1
-        if log_time < 0:
-            return None
-        key = (c, channel)
-        id_ = channels.ids.get(key)
-        if id_ is None:
-            return None
-        data: bytes | None = bytes(self._buffer[offset : offset + length])
-        convert = channels.converters.get(key)
-        if convert is not None and data is not None:
-            if key in channels.numbered:
-                sequence = int.from_bytes(data[:4], "little")
-            data = convert(data)
-        return None if data is None else RawMessage(id_, log_time, publish_time & _UNSIGNED, sequence, data)
+        while True:
+            channel, log_time, publish_time, sequence, offset, length = self._rows[self.taken]
+            self.taken += 1
+            id_ = channels.ids.get((c, channel)) if log_time >= 0 else None
+            if id_ is not None:
+                data: bytes | None = bytes(self._buffer[offset : offset + length])
+                convert = channels.converters.get((c, channel))
+                if convert is not None and data is not None:
+                    if (c, channel) in channels.numbered:
+                        sequence = int.from_bytes(data[:4], "little")
+                    data = convert(data)
+                if data is not None:
+                    yield RawMessage(id_, log_time, publish_time & _UNSIGNED, sequence, data)
+            if not self.remaining or self.time_ns >= limit_ns:
+                return
 
 
 def _with_definition(channel: ChannelRecord) -> ChannelRecord:
-    """Give a channel of an old database the definition that its type has in the common packages, if any."""
+    """Return a channel of an old database with the definition of its type in the common packages, if any."""
     try:
         text = message_definition(channel.type_name)
     except KeyError:
@@ -339,7 +326,7 @@ def _as_ros2(channel: ChannelRecord) -> tuple[ChannelRecord, Callable[[bytes], b
     def convert(data: bytes) -> bytes | None:
         try:
             return bytes(source.ros1_to_cdr(data, name))
-        except Exception:  # noqa: BLE001 (somebody else's bytes and somebody else's converter)
+        except Exception:  # noqa: BLE001 (third-party data and converter)
             return None
 
     members = parsed.fielddefs[name][1]

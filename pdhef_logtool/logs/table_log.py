@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_account import ByteLedger
-from pdhef_logtool.logs.container import told
+from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, nearest
 from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.occupied_time import OccupiedTime, survey_stamps
+from pdhef_logtool.logs.recording_span import RecordingSpan, survey_stamps
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import IntArray, Loss
 
@@ -25,7 +25,7 @@ class Table:
 
     Attributes
     ----------
-    name : of the topic. type_name : what kind of source it is, where the file says so.
+    name : of the topic. type_name : kind of source, if the file contains it.
     stamps_ns : int64 [N], log time, ascending; derived by the format.
     fields : columns with their kinds and units; elements of an array are ``name[0]``, ``name[1]``, ...
     load : returns rows of a column by its path: numbers [N], for kind ``time`` int64 nanoseconds [N]; for the path of
@@ -70,9 +70,9 @@ class TableLog(DriveLog):
         if wrong:
             got = f"others: {', '.join(wrong)}"
             raise LogError(expected="tables of different names with ascending times", got=got, where=str(self.path))
-        self._occupied = survey_stamps({name: t.stamps_ns for name, t in self._tables.items()}, str(self.path))
+        self._recording_span = survey_stamps({name: t.stamps_ns for name, t in self._tables.items()}, str(self.path))
         cut = [Loss("truncated", file.cut, str(self.path))] if file.cut else []
-        self._lost = [*lost, *cut, *self._occupied.losses]
+        self._lost = [*lost, *cut, *self._recording_span.losses]
         self._unreadable: set[tuple[str, str]] = set()
         self._size = file.path.stat().st_size
 
@@ -82,13 +82,13 @@ class TableLog(DriveLog):
         return tuple(TopicInfo(t.name, t.type_name, self.kind, len(t.stamps_ns)) for t in self._tables.values())
 
     @property
-    def occupied(self) -> OccupiedTime:
+    def recording_span(self) -> RecordingSpan:
         """When the log was recorded."""
-        return self._occupied
+        return self._recording_span
 
     @property
     def lost(self) -> tuple[Loss, ...]:
-        """What could not be read, as far as is known by now."""
+        """Losses so far."""
         return tuple(self._lost)
 
     @property
@@ -132,24 +132,24 @@ class TableLog(DriveLog):
 
     def _columns(self, table: Table, paths: Sequence[str], window: tuple[int, int], quiet: bool) -> Columns:
         times = table.stamps_ns
-        spans = [(max(low, window[0]), min(high, window[1])) for low, high in self._occupied.intervals]
+        spans = [(max(low, window[0]), min(high, window[1])) for low, high in self._recording_span.intervals]
         rows = [slice(*np.searchsorted(times, span).tolist()) for span in spans if span[0] < span[1]]
         stamps = np.concatenate([np.empty(0, np.int64), *(times[r] for r in rows)])
         columns = {p: self._column(table, p, rows, len(stamps), quiet) for p in dict.fromkeys(paths)}
         return Columns(table.name, stamps, stamps, columns)
 
     def _column(self, table: Table, path: str, rows: Sequence[slice], n: int, quiet: bool) -> NDArray[Any]:
-        """Load rows of a column. The boundary: whatever escapes the format is the loss of the column."""
+        """Load rows of a column. Any error of the format is a loss of the column."""
         is_time = any(f.path == path and f.kind == "time" for f in table.fields)
         kind = np.dtype(np.int64 if is_time else np.float64)
         try:
             parts = [np.asarray(table.load(path, r)).astype(kind) for r in rows]
-            found = np.concatenate(parts) if parts else np.empty(0, kind)
-            if found.shape[0] != n:
-                raise ValueError(f"{found.shape[0]} values for {n} times")
+            values = np.concatenate(parts) if parts else np.empty(0, kind)
+            if values.shape[0] != n:
+                raise ValueError(f"{values.shape[0]} values for {n} times")
         except Exception as error:  # noqa: BLE001
             if not quiet and (table.name, path) not in self._unreadable:
                 self._unreadable.add((table.name, path))
-                self._lost.append(Loss("bad-column", f"{path} cannot be read: {told(error)[1]}", table.name))
+                self._lost.append(Loss("bad-column", f"{path} cannot be read: {describe_damage(error)[1]}", table.name))
             return np.zeros(n, kind) if is_time else np.full(n, np.nan)
-        return found
+        return values

@@ -47,23 +47,23 @@ class Leaf:
 
 @dataclass(frozen=True, slots=True)
 class WireLayout:
-    """Where every leaf of a message lies.
+    """Offsets of all leaves of a message.
 
     Attributes
     ----------
     size : bytes of one message, encapsulation header included.
     leaves : by their steps; arrays of primitives as one leaf.
-    guards : (offset, uint32) in wire order: lengths of strings and sequences, which hold for this layout only.
+    lengths : (offset, uint32) in wire order: lengths of strings and sequences, which identify this layout.
     texts : (offset, length without terminator) of every string, by its steps.
     """
 
     size: int
     leaves: Mapping[Steps, Leaf]
-    guards: tuple[tuple[int, int], ...]
+    lengths: tuple[tuple[int, int], ...]
     texts: Mapping[Steps, tuple[int, int]]
 
 
-#: Tells the length word of the string or sequence at these steps, whose length word lies at this offset.
+#: Returns the length of the string or sequence at these steps, whose length word is at this offset.
 LengthOf: TypeAlias = Callable[[Steps, int, bool], int]
 
 
@@ -86,7 +86,7 @@ def layout_of_message(root: Node, wire: str, message: bytes) -> WireLayout:
 
 
 def build_layout(root: Node, wire: str, length_of: LengthOf) -> WireLayout:
-    """Lay out a message type whose variable lengths ``length_of`` tells; raises :class:`NoLayoutError`."""
+    """Lay out a message type with the variable lengths of ``length_of``; raises :class:`NoLayoutError`."""
     return _Builder(wire, length_of, sys.maxsize).built(root)
 
 
@@ -94,36 +94,36 @@ class _Builder:
     def __init__(self, wire: str, length_of: LengthOf, end: int) -> None:
         self.aligned = wire == "cdr"
         self.origin = 4 if self.aligned else 0
-        self.at = self.origin
+        self.position = self.origin
         self.length_of = length_of
         self.end = end
         self.places = 0
         self.leaves: dict[Steps, Leaf] = {}
-        self.guards: list[tuple[int, int]] = []
+        self.lengths: list[tuple[int, int]] = []
         self.texts: dict[Steps, tuple[int, int]] = {}
 
     def built(self, root: Node) -> WireLayout:
         self.place(root, ())
-        if self.at > self.end:
+        if self.position > self.end:
             raise NoLayoutError("the message ends early")
-        return WireLayout(self.at, self.leaves, tuple(self.guards), self.texts)
+        return WireLayout(self.position, self.leaves, tuple(self.lengths), self.texts)
 
     def align(self, size: int) -> None:
         if self.aligned:
-            self.at += -(self.at - self.origin) % size
+            self.position += -(self.position - self.origin) % size
 
     def length_word(self, steps: Steps, is_text: bool) -> int:
         self.align(4)
-        length = self.length_of(steps, self.at, is_text)
-        self.guards.append((self.at, length))
-        self.at += 4
+        length = self.length_of(steps, self.position, is_text)
+        self.lengths.append((self.position, length))
+        self.position += 4
         return length
 
     def place(self, node: Node, steps: Steps) -> None:
         # Arrays in arrays multiply.
         self.places += 1
-        if self.at > self.end or self.places > _MOST_PLACES:
-            raise NoLayoutError("the message ends early" if self.at > self.end else "too many places")
+        if self.position > self.end or self.places > _MOST_PLACES:
+            raise NoLayoutError("the message ends early" if self.position > self.end else "too many places")
         if isinstance(node, Struct):
             for name, member in node.members.items():
                 self.place(member, (*steps, name))
@@ -141,8 +141,8 @@ class _Builder:
         if node.code:
             raise NoLayoutError("wide strings have no layout here")
         length = self.length_word(steps, True)
-        self.texts[steps] = (self.at, max(length - 1, 0) if self.aligned else length)
-        self.at += length
+        self.texts[steps] = (self.position, max(length - 1, 0) if self.aligned else length)
+        self.position += length
 
     def place_items(self, item: Node, steps: Steps, count: int) -> None:
         if isinstance(item, Scalar) and item.kind != "string":
@@ -157,15 +157,15 @@ class _Builder:
         dtype = np.dtype("<" + node.code)
         if count != 0:
             self.align(dtype.itemsize)
-        self.leaves[steps] = Leaf(self.at, dtype, count)
-        self.at += dtype.itemsize * (1 if count is None else count)
+        self.leaves[steps] = Leaf(self.position, dtype, count)
+        self.position += dtype.itemsize * (1 if count is None else count)
 
 
 class LayoutReader:
     """Reads chosen leaves of the messages that have one layout.
 
-    The places needed (leaves, and the guards that tell whether a message has the layout) are gathered in stretches:
-    one copy a stretch and message, whatever else the message holds.
+    The places needed (leaves, and the lengths that identify the layout) are gathered in stretches: one copy per stretch
+    and message.
 
     Parameters
     ----------
@@ -178,21 +178,21 @@ class LayoutReader:
         self._places: dict[Steps, tuple[int, str]] = {}
         self._stretches: list[_Stretch] = []
         self._empty: dict[Steps, np.dtype[Any]] = {}
-        found: list[tuple[int, np.dtype[Any], int | Steps]] = []
+        places: list[tuple[int, np.dtype[Any], int | Steps]] = []
         if wire == "cdr":
-            found.append((0, _CDR_HEAD, _LITTLE_ENDIAN_CDR))
-        found += [(offset, _WORD, expected) for offset, expected in layout.guards]
+            places.append((0, _CDR_HEAD, _LITTLE_ENDIAN_CDR))
+        places += [(offset, _WORD, expected) for offset, expected in layout.lengths]
         for steps in wanted:
             leaf = leaf_at(layout, steps)
             if leaf is not None and leaf.count == 0:
                 self._empty[steps] = leaf.dtype
             elif leaf is not None:
                 dtype = leaf.dtype if leaf.count is None else np.dtype((leaf.dtype, (leaf.count,)))
-                found.append((leaf.offset, dtype, steps))
-        found.sort(key=lambda place: place[0])
+                places.append((leaf.offset, dtype, steps))
+        places.sort(key=lambda place: place[0])
         group: list[tuple[int, np.dtype[Any], int | Steps]] = []
         end = 0
-        for place in found:
+        for place in places:
             if group and place[0] - end > _STRETCH_GAP_BYTES:
                 self._add(group)
                 group = []
@@ -212,18 +212,18 @@ class LayoutReader:
                 "itemsize": end - start,
             }
         )
-        guards = []
+        lengths = []
         for i, (_, _, what) in enumerate(group):
             if isinstance(what, int):
-                guards.append((f"f{i}", what))
+                lengths.append((f"f{i}", what))
             else:
                 self._places[what] = (len(self._stretches), f"f{i}")
-        self._stretches.append(_Stretch(start, np.dtype((np.void, end - start)), record, tuple(guards)))
+        self._stretches.append(_Stretch(start, np.dtype((np.void, end - start)), record, tuple(lengths)))
 
     def gather(
         self, buffer: bytes | memoryview, offset: NDArray[np.int64]
     ) -> tuple[NDArray[np.bool_] | None, list[NDArray[Any]]]:
-        """Gather the messages at these offsets [N], all of which hold ``size`` bytes.
+        """Gather the messages of ``size`` bytes at these offsets [N].
 
         Returns
         -------
@@ -238,7 +238,7 @@ class LayoutReader:
             view = np.ndarray((places,), dtype=stretch.plain, buffer=buffer, offset=stretch.start, strides=(1,))
             part = view[offset].view(stretch.record)
             parts.append(part)
-            for name, expected in stretch.guards:
+            for name, expected in stretch.lengths:
                 right = part[name] == expected
                 fits = right if fits is None else fits & right
         if fits is None or fits.all():
@@ -246,7 +246,7 @@ class LayoutReader:
         return fits, [part[fits] for part in parts]
 
     def values(self, parts: Sequence[NDArray[Any]], n: int, steps: Steps) -> NDArray[Any] | None:
-        """Return a leaf of N gathered messages, [N] or [N, k] in its own type; None where the layout has no such."""
+        """Return a leaf of N gathered messages, [N] or [N, k] in its own type; None if the layout lacks it."""
         place = self._places.get(steps)
         if place is not None:
             values: NDArray[Any] = parts[place[0]][place[1]]
@@ -261,7 +261,7 @@ class _Stretch:
     start: int
     plain: np.dtype[Any]
     record: np.dtype[Any]
-    guards: tuple[tuple[str, int], ...]
+    lengths: tuple[tuple[str, int], ...]
 
 
 def leaf_at(layout: WireLayout, steps: Steps) -> Leaf | None:

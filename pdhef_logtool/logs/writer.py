@@ -1,7 +1,7 @@
 """MCAP writing: ROS 2 topics from columns, other messages as ready bytes, merged by log time.
 
 Every file has zstd chunks, message indexes, statistics, a summary and CRCs: other readers need them. Channels and
-schemas stand before the first chunk that uses them and again in the summary.
+schemas are written before the first chunk that uses them and again in the summary.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
+    Chunk,
     ChunkIndex,
     DataEnd,
     Footer,
@@ -106,26 +107,26 @@ class _Merged:
         self.source: IntArray = np.repeat(np.arange(len(records)), each)[order]
         self.row: IntArray = (order - np.repeat(np.cumsum([0, *each])[:-1], each)[order]).astype(np.int64)
         self.ends: IntArray = np.cumsum(self.length)
-        self.at = 0
+        self.position = 0
 
     def take_until(self, until_ns: int | None) -> slice:
-        """Take what lies before a time (all that is left when None)."""
-        first, self.at = self.at, len(self.log_time_ns)
+        """Remove and return the records before a time (None: all)."""
+        first, self.position = self.position, len(self.log_time_ns)
         if until_ns is not None:
-            self.at = max(first, int(np.searchsorted(self.log_time_ns, until_ns, side="left")))
-        return slice(first, self.at)
+            self.position = max(first, int(np.searchsorted(self.log_time_ns, until_ns, side="left")))
+        return slice(first, self.position)
 
     def take_chunk(self) -> slice:
-        """Take one chunk full."""
-        first = self.at
+        """Remove and return the records of one chunk."""
+        first = self.position
         base = int(self.ends[first - 1]) if first else 0
-        self.at = max(int(np.searchsorted(self.ends, base + CHUNK_BYTES, side="right")), first + 1)
-        return slice(first, self.at)
+        self.position = max(int(np.searchsorted(self.ends, base + CHUNK_BYTES, side="right")), first + 1)
+        return slice(first, self.position)
 
     @property
     def next_ns(self) -> int | None:
         """Log time of the first record that is left."""
-        return int(self.log_time_ns[self.at]) if self.at < len(self.log_time_ns) else None
+        return int(self.log_time_ns[self.position]) if self.position < len(self.log_time_ns) else None
 
 
 class McapLogWriter:
@@ -188,7 +189,7 @@ class McapLogWriter:
         ----------
         topic : topic name.
         type_name : ROS 2 type, ``pkg/msg/Type``.
-        constants : what every message holds, by path (texts, numbers, arrays such as covariances).
+        constants : constant fields of every message, by path (texts, numbers, arrays such as covariances).
         definition : ros2msg text; the type's own from ``schemas/`` or the common ROS 2 packages when absent.
 
         Raises
@@ -246,7 +247,7 @@ class McapLogWriter:
         """Add a channel for :class:`RawMessage` and return its id; without name and encoding it has no schema.
 
         Ids are given out in ascending order unless named: a :class:`RawChunk` needs its channels and schemas under
-        the ids that it holds.
+        the ids that it contains.
 
         Raises
         ------
@@ -274,13 +275,13 @@ class McapLogWriter:
         key = (name, encoding, data)
         if id_ is None:
             id_ = self._schema_ids.get(key) or self._free_id(self._schemas)
-        known = self._schemas.get(id_)
-        if known is None:
-            known = Schema(id=id_, data=data, encoding=encoding, name=name)
-            self._schemas[id_] = known
+        schema = self._schemas.get(id_)
+        if schema is None:
+            schema = Schema(id=id_, data=data, encoding=encoding, name=name)
+            self._schemas[id_] = schema
             self._schema_ids.setdefault(key, id_)
-            self._emit_record(known)
-        elif (known.name, known.encoding, known.data) != key:
+            self._emit_record(schema)
+        elif (schema.name, schema.encoding, schema.data) != key:
             raise self._taken("schema", id_)
         return id_
 
@@ -371,13 +372,13 @@ class McapLogWriter:
         while first < len(log_time):
             base = int(ends[first - 1]) if first else 0
             last = max(int(np.searchsorted(ends, base + CHUNK_BYTES, side="right")), first + 1)
-            at = ends[first:last] - length[first:last] - base
+            start = ends[first:last] - length[first:last] - base
             content = np.empty(int(ends[last - 1]) - base, dtype=np.uint8)
             part_source, part_row = source[first:last], row[first:last]
             for i in np.unique(part_source).tolist():
                 mine = part_source == i
-                scatter(content, at[mine], part_row[mine], raw_bytes if i < 0 else merged.rows[i])
-            self.write_chunk(content.data, channel[first:last], log_time[first:last], at)
+                scatter(content, start[mine], part_row[mine], raw_bytes if i < 0 else merged.rows[i])
+            self.write_chunk(content.data, channel[first:last], log_time[first:last], start)
             first = last
 
     def write_chunk(
@@ -394,17 +395,16 @@ class McapLogWriter:
     def _emit_chunk(self, chunk: RawChunk) -> None:
         channel, log_time, offset, stored = chunk.channel, chunk.log_time_ns, chunk.offset, chunk.stored
         start_ns, end_ns = int(log_time.min()), int(log_time.max())
-        compression = chunk.compression.encode()
-        body = (
-            struct.pack("<QQQI", start_ns, end_ns, chunk.size, chunk.crc)
-            + struct.pack("<I", len(compression))
-            + compression
-            + struct.pack("<Q", len(stored))
+        chunk_start, chunk_length = self._emit_record(
+            Chunk(
+                compression=chunk.compression,
+                data=stored,
+                message_start_time=start_ns,
+                message_end_time=end_ns,
+                uncompressed_crc=chunk.crc,
+                uncompressed_size=chunk.size,
+            )
         )
-        chunk_at = self._at
-        self._emit(struct.pack("<BQ", Opcode.CHUNK, len(body) + len(stored)) + body)
-        self._emit(stored)
-        chunk_length = self._at - chunk_at
         index_at = self._at
         offsets: dict[int, int] = {}
         index = bytearray()
@@ -420,7 +420,7 @@ class McapLogWriter:
         self._emit(bytes(index))
         self._chunk_indexes.append(
             ChunkIndex(
-                chunk_start_offset=chunk_at,
+                chunk_start_offset=chunk_start,
                 chunk_length=chunk_length,
                 message_start_time=start_ns,
                 message_end_time=end_ns,
@@ -439,10 +439,10 @@ class McapLogWriter:
         record = Attachment(
             create_time=create_time_ns, log_time=log_time_ns, name=name, media_type=media_type, data=data
         )
-        at, length = self._emit_record(record)
+        start, length = self._emit_record(record)
         self._attachment_indexes.append(
             AttachmentIndex(
-                offset=at,
+                offset=start,
                 length=length,
                 create_time=create_time_ns,
                 log_time=log_time_ns,
@@ -454,8 +454,8 @@ class McapLogWriter:
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Add a record of key-value pairs."""
-        at, length = self._emit_record(Metadata(name=name, metadata=dict(values)))
-        self._metadata_indexes.append(MetadataIndex(offset=at, length=length, name=name))
+        start, length = self._emit_record(Metadata(name=name, metadata=dict(values)))
+        self._metadata_indexes.append(MetadataIndex(offset=start, length=length, name=name))
 
     def close(self) -> None:
         """Write the summary and give the file its name."""
@@ -541,13 +541,13 @@ class McapLogWriter:
         builder = RecordBuilder()
         record.write(builder)
         data: bytes = builder.end()  # type: ignore[no-untyped-call]
-        at = self._at
+        start = self._at
         self._emit(data)
-        return at, len(data)
+        return start, len(data)
 
 
 def scatter(
-    content: NDArray[np.uint8], at: IntArray, row: IntArray, source: NDArray[np.uint8] | Sequence[bytes]
+    content: NDArray[np.uint8], start: IntArray, row: IntArray, source: NDArray[np.uint8] | Sequence[bytes]
 ) -> None:
     """Copy records of ``source``, by their rows there, to their places in a chunk."""
     if isinstance(source, np.ndarray):
@@ -555,8 +555,8 @@ def scatter(
         record = np.dtype((np.void, size))
         # A view of a record at every byte: one indexed assignment copies them all.
         places = np.ndarray((len(content) - size + 1,), dtype=record, buffer=content.data, strides=(1,))
-        places[at] = source[row].view(record)[:, 0]
+        places[start] = source[row].view(record)[:, 0]
         return
-    for to, i in zip(at.tolist(), row.tolist(), strict=True):
+    for to, i in zip(start.tolist(), row.tolist(), strict=True):
         data = source[i]
         content[to : to + len(data)] = np.frombuffer(data, dtype=np.uint8)

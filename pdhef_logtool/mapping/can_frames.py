@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.occupied_time import OccupiedTime
+from pdhef_logtool.logs.recording_span import RecordingSpan
 from pdhef_logtool.mapping.records import CAN_PREFIX, CanSettings, SignalSource
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.errors import MappingError, MappingFileError
@@ -187,9 +187,9 @@ class CanSignalLog(DriveLog):
         return (*wanted.values(), *views)
 
     @property
-    def occupied(self) -> OccupiedTime:
+    def recording_span(self) -> RecordingSpan:
         """That of the log."""
-        return self._log.occupied
+        return self._log.recording_span
 
     @property
     def lost(self) -> tuple[Loss, ...]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.logs.slim_log import SlimLog
+from pdhef_logtool.logs.reduced_log import ReducedLog
 from pdhef_logtool.mapping.checking import check_mapping
 from pdhef_logtool.mapping.recognition import Ambiguity, AutoMapping, auto_map
 from pdhef_logtool.mapping.records import Mapping
@@ -45,7 +45,7 @@ class ChosenMapping:
         return tuple(f"dbc-{number}-{path.name}" for number, path in enumerate(dbc))
 
 
-def recorded_mapping(log: SlimLog, prefer_truth: Literal["perfect", "rtk"]) -> ChosenMapping:
+def recorded_mapping(log: ReducedLog, prefer_truth: Literal["perfect", "rtk"]) -> ChosenMapping:
     """Return the mapping of a reduced log.
 
     Raises
@@ -79,9 +79,9 @@ def recorded_mapping(log: SlimLog, prefer_truth: Literal["perfect", "rtk"]) -> C
 
 def recognise(log: DriveLog, *, prefer_truth: Literal["perfect", "rtk"]) -> AutoMapping:
     """Return what :func:`auto_map` recognises, or for a slim log what it was made with."""
-    if log.slim is None:
+    if log.reduced is None:
         return auto_map(log, prefer_truth=prefer_truth)
-    recorded = recorded_mapping(log.slim, prefer_truth)
+    recorded = recorded_mapping(log.reduced, prefer_truth)
     return AutoMapping(recorded.mapping, recorded.ambiguities, recorded.missing)
 
 
@@ -100,8 +100,8 @@ def choose_mapping(
         check_mapping(mapping, log)
         missing = tuple(n for n in ALIGNED_SIGNALS if n not in mapping.signals)
         return ChosenMapping(mapping, missing, prefer_truth, (), (*mapping.notes, *_borrowed(log, mapping)))
-    if log.slim is not None:
-        return recorded_mapping(log.slim, prefer_truth)
+    if log.reduced is not None:
+        return recorded_mapping(log.reduced, prefer_truth)
     auto = auto_map(log, prefer_truth=prefer_truth)
     if require_signals and not auto.mapping.signals:
         raise MappingError(

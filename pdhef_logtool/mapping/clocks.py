@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, windows
-from pdhef_logtool.logs.occupied_time import STEP_BACK_NS, steps_back
+from pdhef_logtool.logs.recording_span import STEP_BACK_NS, steps_back
 from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.checking import resolve_mapping, split_stamp
 from pdhef_logtool.mapping.records import RECORDER_STAMPS, Mapping, SignalSource
@@ -165,7 +165,7 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
     if doubtful and end_ns - start_ns > SURVEY_WHOLE_NS:
         topics = {source.read_topic for source in doubtful.values()}
         some = {topic: paths for topic, paths in requests.items() if topic in topics}
-        whole = _survey(log, doubtful, some, windows(start_ns, end_ns, SURVEY_WHOLE_NS, log.occupied))
+        whole = _survey(log, doubtful, some, windows(start_ns, end_ns, SURVEY_WHOLE_NS, log.recording_span))
     clocks = {}
     for key, source in wanted.items():
         raw, log_time, steps = (np.concatenate(column) for column in zip(*parts[key], strict=True))

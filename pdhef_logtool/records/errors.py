@@ -1,10 +1,10 @@
-"""One exception tree; every error says what was expected, what came, where, and what to do."""
+"""One exception tree; every error has the parts expected, got, where, and what to do."""
 
 from __future__ import annotations
 
 from functools import partial
 
-from pdhef_logtool.records.printable import shown
+from pdhef_logtool.records.printable import printable
 
 EXIT_OK = 0
 EXIT_FAILURE = 1
@@ -39,9 +39,9 @@ class PdhefError(Exception):
         return partial(type(self), **parts), ()
 
     def __str__(self) -> str:
-        """One line, without a traceback's noise and fit for a terminal, whatever its parts quote."""
+        """One line, without a traceback's noise and safe for a terminal, as its parts are escaped."""
         where, expected, got, remedy = (
-            shown(" ".join(str(part).split())) for part in (self.where, self.expected, self.got, self.remedy)
+            printable(" ".join(str(part).split())) for part in (self.where, self.expected, self.got, self.remedy)
         )
         return f"{where}: expected {expected}, got {got}" + (f"; {remedy}" if remedy else "")
 
@@ -57,7 +57,7 @@ class LogError(PdhefError):
 
 
 class MappingError(PdhefError):
-    """A log does not hold what is to be mapped, or what is asked of it."""
+    """A log does not contain a mapped or requested field."""
 
 
 class MappingFileError(MappingError):

@@ -1,4 +1,4 @@
-"""What became of every sample that a log holds of a mapped signal: used, or dropped for a named reason."""
+"""Account of every sample of a mapped signal in a log: used, or dropped for a named reason."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class SampleCount:
     ----------
     role, name : of the signal. source : ``/topic.field``. stamp : what gives its time, ``log_time`` where its own
         stamps cannot be used.
-    total : messages that the log holds on the topic. used, dropped : samples; together they are the total.
+    total : messages of the topic in the log. used, dropped : samples; together they are the total.
     """
 
     role: Role
@@ -46,13 +46,13 @@ class SampleCount:
 
 
 def damage(samples: Iterable[SampleCount]) -> list[Loss]:
-    """Return the losses of sources of which more than ``DAMAGED_SHARE`` was dropped; those of one kind are one."""
-    found: dict[str, list[SampleCount]] = {}
+    """Return the losses of sources that lost more than ``DAMAGED_SHARE``; those of the same kind become one."""
+    by_reason: dict[str, list[SampleCount]] = {}
     for s in samples:
         if s.damaged > DAMAGED_SHARE * s.total:
             why = ", ".join(f"{n} {reason}" for reason, n in sorted(s.dropped.items()) if reason in DAMAGE)
-            found.setdefault(f"{s.damaged} of {s.total} samples are not used ({why})", []).append(s)
+            by_reason.setdefault(f"{s.damaged} of {s.total} samples are not used ({why})", []).append(s)
     return [
         Loss("dropped-samples", what, ", ".join(dict.fromkeys(s.source for s in of)), count=sum(s.damaged for s in of))
-        for what, of in found.items()
+        for what, of in by_reason.items()
     ]

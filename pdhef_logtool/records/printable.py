@@ -1,7 +1,7 @@
-"""What comes from outside, as a person may see it: nothing in it moves a cursor, begins a line or turns text around.
+"""Escaping of text from input files: no control character moves the cursor, starts a line or reverses text.
 
-Names of topics, files, cars and whatever a document holds are somebody else's: a terminal escape in one would paint
-over a warning, a line break would forge one. Results and errors go through here on their way to a person, in one place.
+Names of topics, files and cars and the content of documents are third-party data: a terminal escape could hide a
+warning, a line break could fake one. All results and errors for users are escaped here.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ MOST_SIGNS = 1000
 _T = TypeVar("_T")
 
 
-def shown(text: object, most: int = MOST_SIGNS) -> str:
-    r"""Return a text in one line of at most so many signs; what cannot be printed stands as its escape, ``\x1b``."""
+def printable(text: object, most: int = MOST_SIGNS) -> str:
+    r"""Return a text as one line of at most ``most`` characters; unprintable ones are escaped, ``\x1b``."""
     line = str(text)
     if not line.isprintable():
         line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
@@ -29,36 +29,36 @@ def shown(text: object, most: int = MOST_SIGNS) -> str:
     return line
 
 
-def all_shown(value: _T) -> _T:
-    """Return a copy of a record, a document or a list of them in which every text is :func:`shown`."""
-    return _all_shown(value)  # type: ignore[no-any-return]
+def all_printable(value: _T) -> _T:
+    """Return a copy of a record, a document or a list of them in which every text is :func:`printable`."""
+    return _all_printable(value)  # type: ignore[no-any-return]
 
 
-def _all_shown(value: Any) -> Any:
+def _all_printable(value: Any) -> Any:
     if value is None or type(value) in (float, int, bool):  # in order of how many there are in a report
         return value
     if type(value) is str:
-        return shown(value)
+        return printable(value)
     if type(value) is dict:
-        return {_all_shown(k): _all_shown(v) for k, v in value.items()}
+        return {_all_printable(k): _all_printable(v) for k, v in value.items()}
     if type(value) is list:
-        return [_all_shown(v) for v in value]
+        return [_all_printable(v) for v in value]
     if isinstance(value, PurePath):
-        return type(value)(shown(value))
+        return type(value)(printable(value))
     if isinstance(value, Mapping):
-        return {_all_shown(k): _all_shown(v) for k, v in value.items()}
+        return {_all_printable(k): _all_printable(v) for k, v in value.items()}
     if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return type(value)(*map(_all_shown, value))
+        return type(value)(*map(_all_printable, value))
     if isinstance(value, list | tuple | set | frozenset):
-        return type(value)(map(_all_shown, value))
+        return type(value)(map(_all_printable, value))
     if is_dataclass(value) and not isinstance(value, type):
         record = copy.copy(value)
         for f in fields(value):
-            object.__setattr__(record, f.name, _all_shown(getattr(value, f.name)))
+            object.__setattr__(record, f.name, _all_printable(getattr(value, f.name)))
         return record
     return value
 
 
 def utf8(text: str) -> str:
-    r"""Return a text that UTF-8 can hold: bytes of a file name that is none stand as ``\udcff``."""
+    r"""Return a text that UTF-8 can encode: invalid bytes of a file name are escaped, ``\udcff``."""
     return text if text.isascii() else text.encode("utf-8", "backslashreplace").decode("utf-8")

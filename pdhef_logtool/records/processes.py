@@ -1,7 +1,8 @@
-"""Which process something belongs to: a name for this one, and whether that of another is still alive."""
+"""Names of processes: that of this process, and whether another one is still alive."""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import platform
@@ -9,19 +10,21 @@ import time
 from functools import cache
 from pathlib import Path
 
-#: What :func:`own_name` returns, as a regular expression.
+import psutil
+
+#: Result of :func:`process_name`, as a regular expression.
 NAME = r"[0-9a-f]{8}-\d+-\d+"
 #: Which worker of a command this process is, from 1; 0 in the command itself.
 worker_number = 0
 
 
-def own_name() -> str:
-    """Return host, process id and start time of this process as one word: no two processes ever share it."""
+def process_name() -> str:
+    """Return host, process id and start time of this process as one word, which is unique."""
     return f"{_host()}-{os.getpid()}-{_start(os.getpid()) or 0}"
 
 
 def is_alive(name: str) -> bool | None:
-    """Tell whether the process of an :func:`own_name` is alive; None for one of another host or container."""
+    """Return whether the process of an :func:`own_name` is alive; None for a process of another host or container."""
     host, pid, start = name.split("-")
     if host != _host():
         return None
@@ -51,26 +54,23 @@ def wait_for_end(pid: int, most_s: float = 5.0) -> None:
 def _has_ended(pid: int) -> bool:
     """Return whether a process is gone, or dead with its exit code not yet collected."""
     try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
+        return psutil.Process(pid).status() in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
+    except psutil.NoSuchProcess:
         return True
-    except (PermissionError, OverflowError):
+    except psutil.Error:
         return False
-    return _stat(pid)[:1] in (["Z"], ["X"])
 
 
 def _start(pid: int) -> int | None:
-    """Return when a process started, in the system's ticks; None where the system does not tell."""
+    """Return when a process started; None if this is unknown.
+
+    On Linux in ticks since the system started, which a change of the system's clock does not affect; elsewhere in
+    milliseconds since 1970.
+    """
     try:
-        return int(_stat(pid)[19])
-    except (ValueError, IndexError):
+        # The name of the program, in brackets, can contain any character.
+        return int(Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()[19])
+    except (OSError, ValueError, IndexError):
+        with contextlib.suppress(psutil.Error):
+            return int(1000.0 * psutil.Process(pid).create_time())
         return None
-
-
-def _stat(pid: int) -> list[str]:
-    """Return the fields of a process from its state on; none where the system does not tell."""
-    try:
-        # The name of the program, in brackets, may hold anything.
-        return Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].decode().split()
-    except OSError:
-        return []

@@ -1,6 +1,6 @@
-"""What is reported to be wrong with a_y or yaw rate: the bits of a track's ``reason``, and their names.
+"""Reported faults of a_y and yaw rate: the bits of a track's ``reason``, and their names.
 
-The bits stand in estimates.parquet and in ``pdhef_msgs/VehicleStateEstimate``: none may change its meaning.
+The bits are written to estimates.parquet and ``pdhef_msgs/VehicleStateEstimate``: none may change its meaning.
 """
 
 from __future__ import annotations

@@ -73,8 +73,8 @@ ALIGNED_SIGNALS = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m
 class Loss:
     """Something in the input that was not used, and why.
 
-    ``severity`` ``"lost"`` means data that the log should have held is gone (exit code 3);
-    ``"note"`` means something the reader of a report must know, with nothing gone.
+    ``severity`` ``"lost"`` means that data of the log are missing (exit code 3); ``"note"`` is information for the
+    reader of a report, with nothing missing.
     """
 
     kind: str  # short slug: "truncated", "bad-chunk", "nan", "duplicate-stamp", "gap", ...
@@ -92,7 +92,7 @@ class Channel:
 
     Attributes
     ----------
-    name : signal or truth name.
+    name : signal or ground truth name.
     unit : SI unit.
     source : ``topic`` and dotted field it came from, as ``/topic.field``.
     stamps_ns : int64 [N], measurement time (stamp − latency, in the log's clock), ascending and unique.
@@ -124,7 +124,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Signals:
-    """What an estimator may see, aligned on the IMU's stamps; holds no truth.
+    """Inputs of an estimator, aligned on the IMU's stamps; contains no ground truth.
 
     All columns have length N and NaN where the channel has no usable sample. ``speed_m_s`` and the columns of
     ``wheel_speed_m_s`` are finite only at the first stamp after a new sample (a measurement is used once);

@@ -11,7 +11,7 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 #: An output is not predicted further than this beyond the newest processed step; the stamp is then not valid.
 MAX_PREDICTION_S = 0.3
-#: A longer step between stamps is a gap: behind it every filter and every watch starts anew.
+#: A longer step between stamps is a gap: after it every filter and every monitor starts again.
 RESTART_GAP_S = 0.5
 
 
@@ -50,13 +50,13 @@ def _cut(column: Any, part: slice) -> Any:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Release:
-    """Which step stands at each scored stamp, [M]: ``arrived`` says whether there is one, ``at`` is 0 where not.
+    """Newest available step at each scored stamp, [M]: ``arrived`` is whether there is any, ``row`` is 0 if not.
 
     ``needed`` is the first step that a coming stamp may still ask for.
     """
 
     arrived: BoolArray
-    at: IntArray
+    row: IntArray
     needed: int
 
 
@@ -69,10 +69,10 @@ def released_steps(ready_ns: IntArray, stamps_ns: IntArray) -> IntArray:
 
 
 def release(ready_ns: IntArray, stamps_ns: IntArray) -> Release:
-    """Return what :func:`released_steps` says, ready to index the steps with; [0] where there are no stamps."""
+    """Return the result of :func:`released_steps`, ready to index the steps with; [0] where there are no stamps."""
     index = released_steps(ready_ns, stamps_ns)
-    at = np.maximum(index, 0)
-    return Release(index >= 0, at, int(at[-1]) if len(at) else 0)
+    row = np.maximum(index, 0)
+    return Release(index >= 0, row, int(row[-1]) if len(row) else 0)
 
 
 def step_durations_s(stamps_ns: IntArray, before_ns: int | None) -> FloatArray:
@@ -110,6 +110,6 @@ class Extrapolation:
 def extrapolation(steps_ns: IntArray, ready_ns: IntArray, valid: BoolArray, stamps_ns: IntArray) -> Extrapolation:
     """Choose the step for each scored stamp [M] from steps [K] with stamps, availability times and validity."""
     chosen = release(ready_ns, stamps_ns)
-    horizon_s = np.where(chosen.arrived, (stamps_ns - steps_ns[chosen.at]) * 1e-9, np.nan)
-    usable = (horizon_s <= MAX_PREDICTION_S) & valid[chosen.at]
-    return Extrapolation(chosen.at, chosen.arrived, horizon_s, usable)
+    horizon_s = np.where(chosen.arrived, (stamps_ns - steps_ns[chosen.row]) * 1e-9, np.nan)
+    usable = (horizon_s <= MAX_PREDICTION_S) & valid[chosen.row]
+    return Extrapolation(chosen.row, chosen.arrived, horizon_s, usable)

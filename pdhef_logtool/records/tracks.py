@@ -1,4 +1,4 @@
-"""The one record that estimates and truth share: a state track."""
+"""The state track, the record of estimates and ground truth."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ TRACK_COLUMNS = (
     "ay_bias_m_s2",
     "yaw_rate_bias_rad_s",
 )
-#: What a filter may estimate beside the motion.
+#: Quantities that a filter may estimate in addition to the motion.
 ESTIMATED_COLUMNS = TRACK_COLUMNS[-6:]
 #: Those that a source may not have at all.
 OPTIONAL_COLUMNS = ("mixture_weight", "reason", *ESTIMATED_COLUMNS)
@@ -47,11 +47,11 @@ OPTIONAL_COLUMNS = ("mixture_weight", "reason", *ESTIMATED_COLUMNS)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateTrack:
-    """Planar vehicle state over time, at the CG, ISO 8855, SI; an estimate or the truth.
+    """Planar vehicle state over time, at the CG, ISO 8855, SI; an estimate or the ground truth.
 
     Every float column has shape [N]; NaN means "not known". ``covariance`` is [N, 3, 3] over [v_x, v_y, r] or of
     length 0 when the source gives none. ``x_m``, ``y_m``, ``yaw_rad`` are in a local ENU frame.
-    ``valid`` is False where the source says that its state must not be used. ``diverged`` flags the stamps at
+    ``valid`` is False where the source marks its state as invalid. ``diverged`` flags the stamps at
     which the estimator itself reports divergence. ``nis`` has the degrees of freedom ``nis_dof`` at each stamp.
     ``mixture_weight`` (of all filters of an adaptive estimator but its first) and ``reason`` (bits of
     :mod:`pdhef_logtool.records.reasons`, what is reported of a_y and yaw rate) are [N], or of length 0 where the source
@@ -142,9 +142,9 @@ class StateTrack:
 
     @property
     def something_known(self) -> BoolArray:
-        """Where one of its quantities is known, [N]."""
-        known = np.isfinite(self.vx_m_s) | np.isfinite(self.vy_m_s) | np.isfinite(self.yaw_rate_rad_s)
-        return np.asarray(known | np.isfinite(self.sideslip_rad) | np.isfinite(self.ay_m_s2), dtype=np.bool_)
+        """Mask of the stamps with a known quantity, [N]."""
+        finite = np.isfinite(self.vx_m_s) | np.isfinite(self.vy_m_s) | np.isfinite(self.yaw_rate_rad_s)
+        return np.asarray(finite | np.isfinite(self.sideslip_rad) | np.isfinite(self.ay_m_s2), dtype=np.bool_)
 
     def with_pose(self, x_m: FloatArray, y_m: FloatArray, yaw_rad: FloatArray) -> StateTrack:
         """Return a copy with another pose."""

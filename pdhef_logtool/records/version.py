@@ -1,5 +1,5 @@
 """The version, where every floor may read it."""
 
 __version__ = "0.2.0"
-#: What files that we write say that they were written by.
+#: Writer name in our files.
 LIBRARY = f"pdhef-logtool {__version__}"

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.records.printable import all_shown
+from pdhef_logtool.records.printable import all_printable
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.reports.encoding import Grid, encode
 
@@ -249,7 +249,7 @@ def _of_figure(figure: Figure, blocks: _Blocks) -> dict[str, Any]:
             {
                 "label": _label(r.label),
                 "colour": r.colour,
-                "spans": [[round(s.start_s, 4), round(s.end_s, 4), all_shown(s.text[:200])] for s in r.spans],
+                "spans": [[round(s.start_s, 4), round(s.end_s, 4), all_printable(s.text[:200])] for s in r.spans],
             }
             for r in figure.rows
         ]
@@ -332,7 +332,7 @@ def _of_time(figure: TimeFigure, blocks: _Blocks) -> dict[str, Any]:
 
 def _label(text: str) -> str:
     cut = text if len(text) <= _LABEL_SIGNS else f"{text[: _LABEL_SIGNS - 1]}…"
-    return all_shown(cut)
+    return all_printable(cut)
 
 
 def _known(value: float) -> float | None:

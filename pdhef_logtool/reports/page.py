@@ -1,6 +1,6 @@
 """A whole HTML file from a template and figures: nothing in it is fetched, and nothing of a log in it can run.
 
-Texts go through jinja's escaping and :func:`~pdhef_logtool.records.printable.shown`, series are base64; the page's
+Texts go through jinja's escaping and :func:`~pdhef_logtool.records.printable.printable`, series are base64; the page's
 Content-Security-Policy allows its own scripts and its own style by their digests and forbids everything else.
 """
 
@@ -18,7 +18,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from pdhef_logtool.records.printable import shown
+from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.version import __version__
 from pdhef_logtool.reports.charts import Charts
 
@@ -94,7 +94,7 @@ def _place(charts: Charts, key: str) -> Markup:
     return Markup(
         '<figure class="figure" data-figure="{0}"><figcaption>{1}</figcaption><div class="legend"></div>'
         '<div class="canvas"></div></figure>'
-    ).format(key, shown(charts.figures[key].heading, _MOST_SIGNS))
+    ).format(key, printable(charts.figures[key].heading, _MOST_SIGNS))
 
 
 def _policy(scripts: list[str], style: str) -> Markup:
@@ -120,7 +120,7 @@ def _printed(value: Any) -> Any:
     if value is None:
         return DASH
     if isinstance(value, str) and not isinstance(value, Markup):
-        return shown(value, _MOST_SIGNS)
+        return printable(value, _MOST_SIGNS)
     return value
 
 

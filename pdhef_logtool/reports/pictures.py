@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.records.printable import shown
+from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.reports.charts import (
     BarsFigure,
@@ -61,7 +61,7 @@ def picture(figure: Figure, charts: Charts, label: str = "") -> bytes:
     axes.grid(color="#e3e6ea", linewidth=0.8)
     axes.set_axisbelow(True)
     _drawing(figure)(figure, axes, charts)
-    title = figure.heading if not label else f"{shown(label, 60)}: {figure.heading}"
+    title = figure.heading if not label else f"{printable(label, 60)}: {figure.heading}"
     axes.set_title(title.replace("$", r"\$"), loc="left", fontsize=10, fontweight="bold")
     canvas.tight_layout()
     file = io.BytesIO()
@@ -168,5 +168,5 @@ def _legend(axes: _Axes) -> None:
 
 def _plain(text: str) -> str:
     """Return a label in one line; a dollar begins no formula, an underscore hides nothing."""
-    line = shown(text, 60).replace("$", r"\$")
+    line = printable(text, 60).replace("$", r"\$")
     return f" {line}" if line.startswith("_") else line

@@ -150,7 +150,7 @@ class AnnotatedMcapSink(Sink):
                         self._writer.attachment(*astuple(attachment))
                 for record in iterate_metadata(self._source):
                     if record.name != METRICS_RECORD:
-                        self._writer.metadata(record.name, record.values)
+                        self._writer.metadata(record.name, record.metadata)
             self._writer.metadata(METRICS_RECORD, metrics_record(report))
             end_ns = int(report["log"]["end_ns"])
             text = json.dumps(jsonable(report), sort_keys=True, separators=(",", ":"), allow_nan=False)

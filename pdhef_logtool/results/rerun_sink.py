@@ -404,8 +404,16 @@ class _Outlet:
     def __init__(self, file: IO[bytes]) -> None:
         self.error: OSError | None = None
         self._file, self._dropped = file, False
-        self._from, self._to = os.pipe()
-        self.name = f"/dev/fd/{self._to}"
+        self._thread: threading.Thread | None = None
+        if Path("/dev/fd").exists():
+            self._from, self._to = os.pipe()
+            self.name = f"/dev/fd/{self._to}"
+            self._start_thread()
+        else:  # pipes have no names on Windows: Rerun writes the file itself
+            file.close()
+            self.name, self._to = file.name, -1
+
+    def _start_thread(self) -> None:
         self._thread = threading.Thread(target=self._carry, daemon=True)
         self._thread.start()
 
@@ -424,16 +432,17 @@ class _Outlet:
         if self.error is None:
             self.error = TimeoutError(errno.ETIMEDOUT, f"nothing could be written for {LONGEST_WAIT_S:g} s")
             self._dropped = True
-            self._thread = threading.Thread(target=self._carry, daemon=True)
-            self._thread.start()
+            if self._thread is not None:
+                self._start_thread()
 
     def close(self) -> None:
         """Wait until all is written that Rerun has sent, whose own end must be closed by then."""
         self.opened()
-        self._thread.join(LONGEST_WAIT_S)
-        if self._thread.is_alive():
-            self.give_up()
+        if self._thread is not None:
             self._thread.join(LONGEST_WAIT_S)
+            if self._thread.is_alive():
+                self.give_up()
+                self._thread.join(LONGEST_WAIT_S)
 
     def _carry(self) -> None:
         while data := os.read(self._from, 1 << 20):

@@ -17,7 +17,7 @@ from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.presets import preset_of
 from pdhef_logtool.estimators.table import Options, all_names, make_estimator
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
-from pdhef_logtool.workers.supervisor import Tell, supervise
+from pdhef_logtool.workers.supervisor import Tell, can_fork, supervise
 
 #: Parts that are no estimators: the filter of ``physics``, and what runs beside it over every drive.
 _FILTER, _CHECKS = "filter", "checks"
@@ -40,7 +40,7 @@ def compile_for(names: Sequence[str]) -> None:
 
     wanted = {*names, _CHECKS, *([_FILTER] if set(map(preset_of, names)) & set(_FILTERED) else [])}
     parts = [part for part, last in _LAST.items() if part in wanted and not cache.is_kept(last)]
-    if min(len(parts), _processors()) > 1 and cache.kept_in() is not None and hasattr(os, "fork"):
+    if min(len(parts), _processors()) > 1 and cache.kept_in() is not None and can_fork():
         with suppress(OSError, RuntimeError):  # the run compiles in its own process where no others can be started
             compile_parts(parts)
 
@@ -68,10 +68,8 @@ def compile_parts(parts: Sequence[str], work: Callable[[str, Tell], None] = comp
     from pdhef_logtool.compiled import cache
 
     cache.announce()
-    jobs = min(_processors(), len(parts)) if hasattr(os, "fork") else 1
     preload = ("pdhef_logtool.estimators.*", "pdhef_logtool.compiled.cache:be_silent", work.__module__)
-    for _ in supervise(work, parts, jobs=jobs, preload=preload):
-        pass
+    list(supervise(work, parts, jobs=min(_processors(), len(parts)), preload=preload))
 
 
 def _compile_filter() -> None:

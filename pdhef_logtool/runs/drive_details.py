@@ -17,7 +17,7 @@ from pdhef_logtool.evaluation.reasons import SensorFault, sensor_faults
 from pdhef_logtool.evaluation.segments import moving_mask
 from pdhef_logtool.evaluation.standing import standings
 from pdhef_logtool.evaluation.thresholds import Verdict
-from pdhef_logtool.records.printable import shown
+from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.run_report import DriveDetails
@@ -112,5 +112,5 @@ def _metadata(drive: Drive) -> dict[str, str]:
     """Return what the log says of itself by key, and by ``record.key`` where records differ, as far as it is short."""
     found = drive.log.metadata()
     found = {k: v for k, v in found.items() if k.partition(".")[2] not in found or found[k.partition(".")[2]] != v}
-    short = {shown(k, _MOST_SIGNS): v for k, v in sorted(found.items()) if len(v) <= _MOST_SIGNS}
-    return {k: shown(v) for k, v in [*short.items()][:_MOST_METADATA]}
+    short = {printable(k, _MOST_SIGNS): v for k, v in sorted(found.items()) if len(v) <= _MOST_SIGNS}
+    return {k: printable(v) for k, v in [*short.items()][:_MOST_METADATA]}

@@ -62,7 +62,7 @@ def read_estimate(
     matrices: list[FloatArray] = []
     losses: list[Loss] = []
     base = next(name for name in BASE_ORDER if name in mapping.signals)
-    for a, b in windows(start_ns, end_ns, round(window_s * 1e9), log.occupied):
+    for a, b in windows(start_ns, end_ns, round(window_s * 1e9), log.recording_span):
         columns = log.read(requests, a, b)
         for name, s in mapping.signals.items():
             topic = columns.get(s.read_topic)

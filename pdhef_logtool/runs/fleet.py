@@ -36,7 +36,7 @@ from pdhef_logtool.logs.discovery import (
 )
 from pdhef_logtool.mapping import Mapping, mapping_of
 from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, WorkerError
-from pdhef_logtool.records.processes import own_name
+from pdhef_logtool.records.processes import process_name
 from pdhef_logtool.results.opened_run import (
     JOURNAL_FILE,
     LOGS,
@@ -556,7 +556,7 @@ class _Fleet:
     lost: int = 0
     _current: dict[str, dict[str, Any]] | None = None
     _said: set[str] = field(default_factory=set)
-    _run: str = field(default_factory=lambda: f"{own_name()}-{next(_RUNS)}")
+    _run: str = field(default_factory=lambda: f"{process_name()}-{next(_RUNS)}")
     _quiet: bool = False
     _sound: dict[int, bool] = field(default_factory=dict)
 

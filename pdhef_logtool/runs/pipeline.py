@@ -67,7 +67,7 @@ from pdhef_logtool.runs.selection import PREFERRED, Contradiction, choose_main, 
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore
 from pdhef_logtool.storage.documents import file_sha256
-from pdhef_logtool.storage.outputs import OutputFolder, Transaction, check_no_input
+from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder, check_no_input
 
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
@@ -433,7 +433,7 @@ def _shown(main: MainFacts, ran: Sequence[str]) -> Shown:
 
 @contextmanager
 def _open_sinks(
-    change: Transaction, drive: Drive, config: RunConfig, car: Car, shown: Shown, output: Path
+    change: FolderTransaction, drive: Drive, config: RunConfig, car: Car, shown: Shown, output: Path
 ) -> Iterator[list[Sink]]:
     """Yield the outputs of a run that are fed window by window; on an exception they are aborted."""
     from pdhef_logtool.results.layouts import LayoutsSink
@@ -466,7 +466,7 @@ def _open_sinks(
 
 
 def _recording(  # positional: what `_open_sinks` takes
-    change: Transaction,
+    change: FolderTransaction,
     drive: Drive,
     config: RunConfig,
     car: Car,

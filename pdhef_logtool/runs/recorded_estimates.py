@@ -69,7 +69,7 @@ from pdhef_logtool.runs.pipeline import (
     write_verdicts,
 )
 from pdhef_logtool.runs.scoring import diverged_events, in_time, segment_events
-from pdhef_logtool.storage.outputs import OutputFolder, Transaction
+from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
@@ -312,7 +312,7 @@ def _same_column(estimate: FloatArray, truth: FloatArray) -> bool:
 
 
 def _write(
-    change: Transaction,
+    change: FolderTransaction,
     report: dict[str, Any],
     rows: Sequence[MetricRow],
     tracks: Sequence[StateTrack],
@@ -354,7 +354,7 @@ def read_truth(
     samples: dict[str, int] = {}
     counts: dict[tuple[Role, str], Counter[str]] = {}
     done_ns: int | None = None
-    ends = list(windows(plan.start_ns, plan.end_ns, round(window_s * 1e9), log.occupied))
+    ends = list(windows(plan.start_ns, plan.end_ns, round(window_s * 1e9), log.recording_span))
     for a, b in ends:
         if plan.truth is None:
             break

@@ -1,4 +1,4 @@
-"""Documents that people write: read as TOML or JSON, checked by a pydantic model, or refused in one line; and ours.
+"""Documents of users, read as TOML or JSON and checked by a pydantic model, and our own sealed documents.
 
 A document of our own contains the digest of its other entries (:func:`seal`), by which its reader notices any change.
 """
@@ -63,7 +63,7 @@ def read_sealed(
     Raises
     ------
     PdhefError
-        Of class ``error``: also a document that is not as it was written.
+        Of class ``error``: also a document that was changed since it was written.
     """
     document = read_json(path, what, error, remedy, max_bytes)
     if not is_sealed(document):
@@ -158,7 +158,7 @@ def validated(
 
 
 def checked(model: type[ModelT], raw: object, table: str, problems: list[str]) -> ModelT | None:
-    """Return the record of a parsed table that stands at ``table`` in its document; None adds to ``problems``."""
+    """Return the record of a parsed table at ``table`` in its document; None after adding to ``problems``."""
     from pydantic import BaseModel, ValidationError
     from pydantic_core import ArgsKwargs
 
@@ -175,30 +175,30 @@ def checked(model: type[ModelT], raw: object, table: str, problems: list[str]) -
     return record
 
 
-def unknown(name: str, known: Iterable[str], table: str = "") -> str:
-    """Return the problem of an entry that a table does not know, with the nearest that it knows."""
-    return f"{_at(table, name)}: {_unknown(name, known, table)}"
+def unknown(name: str, names: Iterable[str], table: str = "") -> str:
+    """Return the problem of an entry that a table does not have, with the most similar name."""
+    return f"{_at(table, name)}: {_unknown(name, names, table)}"
 
 
-def _unknown(name: str, known: Iterable[str], table: str) -> str:
-    known = tuple(known)
-    # The start of a name, such as "ay" of "ay_m_s2", is nearer than what happens to share its letters.
-    near = [k for k in known if name and k.startswith(name)] or get_close_matches(name, known, n=1, cutoff=0.4)
+def _unknown(name: str, names: Iterable[str], table: str) -> str:
+    names = tuple(names)
+    # The start of a name, such as "ay" of "ay_m_s2", is a better match than a name with similar letters.
+    near = [k for k in names if name and k.startswith(name)] or get_close_matches(name, names, n=1, cutoff=0.4)
     if near:
         return f"unknown, did you mean {_at(table, near[0])}?"
-    return "unknown" + (f", known are {', '.join(known)}" if 0 < len(known) <= 12 else "")
+    return "unknown" + (f", known are {', '.join(names)}" if 0 < len(names) <= 12 else "")
 
 
 def one_of(names: Iterable[str]) -> AfterValidator:
-    """Return the check that a text, a dict's key for instance, is one of ``names``; the nearest is told."""
+    """Return the check that a text, for instance a key, is one of ``names``; the error names the most similar one."""
     from pydantic import AfterValidator
     from pydantic_core import PydanticCustomError
 
-    known = tuple(names)
+    allowed = tuple(names)
 
     def check(name: str) -> str:
-        if name not in known:
-            raise PydanticCustomError("unknown_name", "should be one of {names}", {"names": known})
+        if name not in allowed:
+            raise PydanticCustomError("unknown_name", "should be one of {names}", {"names": allowed})
         return name
 
     return AfterValidator(check)
@@ -209,24 +209,24 @@ def _at(table: str, name: str) -> str:
 
 
 def _problems(error: ValidationError, model: type, raw: object, table: str) -> list[str]:
-    found: dict[str, list[str]] = {}
+    texts_by_entry: dict[str, list[str]] = {}
     for e in error.errors(include_url=False, include_input=False):
         place, value = _place(e["loc"], raw, missing=e["type"].startswith("missing"))
-        at = _at(table, ".".join(place))
+        entry = _at(table, ".".join(place))
         if e["type"] in ("extra_forbidden", "unexpected_keyword_argument", "unknown_name"):
-            known = e["ctx"]["names"] if e["type"] == "unknown_name" else _entries(model, place[:-1])
-            text = _unknown(place[-1], known, ".".join(p for p in (table, *place[:-1]) if p))
+            names = e["ctx"]["names"] if e["type"] == "unknown_name" else _entries(model, place[:-1])
+            text = _unknown(place[-1], names, ".".join(p for p in (table, *place[:-1]) if p))
         elif e["type"].startswith("missing"):
             text = "is missing"
         else:
             text = e["msg"].removeprefix("Value error, ")
             text = text.replace("Input should", "should").replace("an instance of Path", "a path")
             text = text.replace("a valid tuple", "a list")
-            # A table's problem says itself which entries it is about.
+            # The message of a table names its entries.
             text += f", got {value!r:.60}" if isinstance(value, str | int | float) else ""
-        found.setdefault(at, []).append(text)
+        texts_by_entry.setdefault(entry, []).append(text)
     # A union reports one message an alternative; together they are one problem.
-    return [f"{at}: {' or '.join(dict.fromkeys(texts))}" for at, texts in found.items()]
+    return [f"{entry}: {' or '.join(dict.fromkeys(texts))}" for entry, texts in texts_by_entry.items()]
 
 
 def _place(loc: tuple[int | str, ...], raw: object, *, missing: bool) -> tuple[list[str], object]:
@@ -244,19 +244,19 @@ def _place(loc: tuple[int | str, ...], raw: object, *, missing: bool) -> tuple[l
 
 
 def _entries(annotation: Any, place: Sequence[str]) -> tuple[str, ...]:
-    """Return the names that a model's table at a place knows."""
+    """Return the entry names of a model's table at a place."""
     fields = getattr(annotation, "__pydantic_fields__", None)
     if fields is not None:
         if not place:
             return tuple(fields)
         return _entries(fields[place[0]].annotation, place[1:]) if place[0] in fields else ()
-    # The items of a container stand one place deeper, the alternatives of a union at the same.
+    # The items of a container are one level deeper, the alternatives of a union on the same level.
     inner = place[1:] if get_origin(annotation) in (dict, list, tuple) else place
     return next((names for member in get_args(annotation) if (names := _entries(member, inner))), ())
 
 
 def jsonable(value: Any) -> Any:
-    """Turn records, mappings, sequences, numpy values and paths into what JSON holds; NaN and infinity become None.
+    """Turn records, mappings, sequences, numpy values and paths into JSON values; NaN and infinity become None.
 
     Raises
     ------
@@ -269,20 +269,16 @@ def jsonable(value: Any) -> Any:
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return {utf8(str(k)): jsonable(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, set | frozenset):
+        value = sorted(value)
+    if isinstance(value, Sequence):
         return [jsonable(v) for v in value]
     if isinstance(value, PurePath):
         return utf8(str(value))
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: jsonable(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, Mapping):
-        return {utf8(str(k)): jsonable(v) for k, v in value.items()}
-    if isinstance(value, set | frozenset):
-        return [jsonable(v) for v in sorted(value)]
-    if isinstance(value, Sequence):
-        return [jsonable(v) for v in value]
     import numpy as np
 
     if isinstance(value, np.generic | np.ndarray):
@@ -291,5 +287,5 @@ def jsonable(value: Any) -> Any:
 
 
 def digest(document: Any) -> str:
-    """Return the sha256 of a JSON-able value, whatever the order of its keys."""
+    """Return the sha256 of a JSON-able value; it does not depend on the order of keys."""
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""The file that appears only when it is complete, and the one line for a place that cannot be written."""
+"""Files that appear only when they are complete, and the error for a place that cannot be written."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from pathlib import Path
 from typing import IO, Literal, Self
 
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.processes import NAME, is_alive, own_name
+from pdhef_logtool.records.processes import NAME, is_alive, process_name
 
+WINDOWS = os.name == "nt"
 _PARTIAL = re.compile(rf"\..+\.({NAME})\.partial")
 _SCRATCH = re.compile(rf"pdhef-({NAME})-.+")
 #: Bytes of a name that leave room for what a temporary one adds; file systems take 255.
 _LONGEST_NAME = 200
-#: Folders in which this process has looked for what killed ones left.
+#: Folders in which this process has searched for files of killed processes.
 _swept: set[Path] = set()
 
-#: Errors that only writing has, whatever the code was doing.
+#: Errors that only writing can cause.
 OF_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 _REMEDIES = {
     errno.ENOSPC: "free some space or choose another place",
@@ -43,8 +44,8 @@ _REMEDIES = {
 class PendingFile:
     """A file that is written beside its target and takes the target's name when it is complete.
 
-    The temporary name holds that of the process, so that two never write to one file, and so that what a killed one
-    left is found and removed by the next that writes to the folder.
+    The temporary name contains the name of the process, so that two processes never write to the same file, and files
+    of killed processes are removed by the next process that writes to the folder.
 
     Raises
     ------
@@ -55,7 +56,7 @@ class PendingFile:
     def __init__(self, target: Path) -> None:
         self.target = target
         name = target.name if len(os.fsencode(target.name)) <= _LONGEST_NAME else _digest(target.name)
-        self.path = target.with_name(f".{name}.{own_name()}.partial")
+        self.path = target.with_name(f".{name}.{process_name()}.partial")
         with writing(target):
             target.parent.mkdir(parents=True, exist_ok=True)
             self._remove()
@@ -64,7 +65,7 @@ class PendingFile:
             sweep_files(target.parent)
 
     def commit(self) -> None:
-        """Give the written file its final name; it is on the disk before the name is."""
+        """Flush the file, then give it its final name."""
         try:
             with writing(self.target):
                 sync(self.path)
@@ -111,7 +112,7 @@ def write_bytes(target: Path, data: bytes) -> None:
 
 @contextlib.contextmanager
 def writing(target: Path) -> Iterator[None]:
-    """Turn what the system says of a place that cannot be written into an OutputError."""
+    """Turn errors of the system for a place that cannot be written into an OutputError."""
     try:
         yield
     except OSError as error:
@@ -130,7 +131,12 @@ def cannot_write(target: Path, error: OSError) -> OutputError:
 
 def sync(path: Path) -> None:
     """Wait until a file's content, or a folder's names, are on the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        descriptor = os.open(path, os.O_RDWR if WINDOWS else os.O_RDONLY)
+    except PermissionError:
+        if WINDOWS:
+            return  # it flushes neither folders nor read-only files
+        raise
     try:
         os.fsync(descriptor)
     except OSError as error:
@@ -142,27 +148,32 @@ def sync(path: Path) -> None:
 
 
 def sweep_files(folder: Path, *, held: bool = False) -> None:
-    """Remove what killed processes left of files in a folder.
+    """Remove incomplete files of killed processes from a folder.
 
-    ``held``: no other process of ours writes here, so that files of other hosts are left over too.
+    ``held``: no other process of ours writes here, so that files of other hosts are also left over.
     """
     with contextlib.suppress(OSError):
         for path in list(folder.iterdir()):
-            if found := _PARTIAL.fullmatch(path.name):
-                alive = is_alive(found[1])
+            if match := _PARTIAL.fullmatch(path.name):
+                alive = is_alive(match[1])
                 if alive is False or (held and alive is None):
                     with contextlib.suppress(OSError):
                         path.unlink()
 
 
 def scratch_folder() -> tempfile.TemporaryDirectory[str]:
-    """Return a new folder in the system's place for such; those of killed processes are removed."""
+    """Return a new temporary folder; those of killed processes are removed."""
     root = Path(tempfile.gettempdir())
     if root not in _swept:
         _swept.add(root)
         with contextlib.suppress(OSError):
             for path in list(root.iterdir()):
-                found = _SCRATCH.fullmatch(path.name)
-                if found and is_alive(found[1]) is False and path.stat().st_uid == os.getuid():
+                match = _SCRATCH.fullmatch(path.name)
+                if match and is_alive(match[1]) is False and _is_ours(path):
                     shutil.rmtree(path, ignore_errors=True)
-    return tempfile.TemporaryDirectory(prefix=f"pdhef-{own_name()}-")
+    return tempfile.TemporaryDirectory(prefix=f"pdhef-{process_name()}-")
+
+
+def _is_ours(path: Path) -> bool:
+    """Return whether a file belongs to this user; always where the temporary folder belongs to one user (Windows)."""
+    return not hasattr(os, "getuid") or path.stat().st_uid == os.getuid()

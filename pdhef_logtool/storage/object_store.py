@@ -1,7 +1,6 @@
-"""A folder of an object store, by fsspec: what is written to it appears whole or not at all.
+"""A folder of an object store, by fsspec: objects appear complete or not at all.
 
-Credentials are the environment's. What a store refuses or fails at is an OutputError, which names the URL without what
-gives access to it.
+Credentials come from the environment. Errors of a store are OutputErrors, which name the URL without credentials.
 """
 
 from __future__ import annotations
@@ -20,16 +19,16 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from pdhef_logtool.records.errors import OutputError, UsageError
-from pdhef_logtool.records.processes import is_alive, own_name
+from pdhef_logtool.records.processes import is_alive, process_name
 from pdhef_logtool.storage.files import scratch_folder
 from pdhef_logtool.storage.outputs import LOCK_FILE
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://.")
 #: Stores whose objects appear when they are complete; elsewhere a temporary name is used.
 _WHOLE = frozenset({"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "memory"})
-#: A lock that nobody has renewed for so long is left over. Stores refuse clocks that differ by more than 15 minutes.
+#: A lock that was not renewed for this time is left over. Stores refuse clocks that differ by more than 15 minutes.
 LEFT_OVER_S = 1800.0
-#: How S3 is asked again, by botocore with growing waits; a request that is not answered is given up.
+#: Timeouts and retries of S3, by botocore with growing waits.
 S3_CLIENT: dict[str, Any] = {
     "connect_timeout": 15.0,
     "read_timeout": 60.0,
@@ -41,11 +40,11 @@ _EXISTING = "make the bucket first, or check the URL"
 
 
 class HeldError(OutputError):
-    """Another command holds the folder."""
+    """The folder is locked by another command."""
 
 
 def is_url(place: Path | str) -> bool:
-    """Tell whether an output is a URL, and no folder of this machine."""
+    """Return whether an output is a URL rather than a local folder."""
     return isinstance(place, str) and _URL.match(place) is not None
 
 
@@ -57,13 +56,13 @@ class ObjectFolder:
 
     @property
     def shown(self) -> str:
-        """The URL as people and files are told of it: without user, password and query."""
+        """The URL for messages and files, without user, password and query."""
         parts = urlsplit(self.url)
         return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}".rstrip("/")
 
     @property
     def name(self) -> str:
-        """The last part of the URL."""
+        """The last component of the URL."""
         return self.shown.rpartition("/")[2]
 
     def names(self) -> list[str]:
@@ -71,9 +70,9 @@ class ObjectFolder:
         with self._asking():
             store, root = self._store()
             store.invalidate_cache()
-            found = store.find(root)
+            paths = store.find(root)
         # Some stores give paths a slash more than they take.
-        return sorted(path.lstrip("/").removeprefix(f"{root.lstrip('/')}/") for path in found)
+        return sorted(path.lstrip("/").removeprefix(f"{root.lstrip('/')}/") for path in paths)
 
     def get(self, name: str, to: Path) -> bool:
         """Copy an object to a file; False where there is none."""
@@ -83,7 +82,7 @@ class ObjectFolder:
                 store.get_file(f"{root}/{name}", str(to))
             except BaseException as error:
                 with suppress(OSError):
-                    to.unlink(missing_ok=True)  # or who looks for it finds a part of it
+                    to.unlink(missing_ok=True)  # a part of it must not be taken for the object
                 if isinstance(error, FileNotFoundError):
                     return False
                 raise
@@ -105,7 +104,7 @@ class ObjectFolder:
             if self._is_whole:
                 store.put_file(str(path), f"{root}/{name}")
                 return
-            partial = f"{root}/{name}.{own_name()}.partial"
+            partial = f"{root}/{name}.{process_name()}.partial"
             store.makedirs(partial.rpartition("/")[0], exist_ok=True)
             store.put_file(str(path), partial)
             store.mv(partial, f"{root}/{name}")
@@ -123,7 +122,7 @@ class ObjectFolder:
                 list(several.map(remove_one, gone))
 
     def acquire(self) -> None:
-        """Hold the folder by an object that is made only where there is none; raises OutputError if another does.
+        """Lock the folder by an object that is created only if there is none; raises OutputError if it is locked.
 
         That of a command that has ended here, or has not renewed it for long, is replaced.
         """
@@ -133,7 +132,7 @@ class ObjectFolder:
                 try:
                     if not self._is_whole:
                         store.makedirs(root, exist_ok=True)
-                    store.pipe_file(f"{root}/{LOCK_FILE}", own_name().encode(), mode="create")
+                    store.pipe_file(f"{root}/{LOCK_FILE}", process_name().encode(), mode="create")
                 except Exception:
                     holder = self._holder()
                     if holder is None:
@@ -146,18 +145,18 @@ class ObjectFolder:
         raise self._held(self._holder() or "")
 
     def renew(self) -> None:
-        """Say that the folder is still held; raises OutputError if it is not any more."""
+        """Renew the lock of the folder; raises OutputError if it is lost."""
         with self._asking():
             store, root = self._store()
             holder = self._holder()
-            if holder != own_name():
+            if holder != process_name():
                 raise self._held(holder or "")
-            store.pipe_file(f"{root}/{LOCK_FILE}", own_name().encode())
+            store.pipe_file(f"{root}/{LOCK_FILE}", process_name().encode())
 
     def release(self) -> None:
-        """Let go of the folder; harmless when it is not held."""
+        """Release the lock; harmless if there is none."""
         with suppress(OutputError), self._asking():
-            if self._holder() == own_name():
+            if self._holder() == process_name():
                 self.remove([LOCK_FILE])
 
     def _holder(self) -> str | None:
@@ -225,7 +224,7 @@ def _told(error: Exception) -> tuple[str, str]:
 
 
 def _first_line(error: Exception) -> str:
-    """Return what an error says, without what may give access."""
+    """Return the first line of an error, without credentials."""
     text = getattr(error, "strerror", None) or (error.args[0] if error.args else "") or type(error).__name__
     return str(text).partition("\n")[0].partition("?")[0][:200]
 
@@ -252,18 +251,18 @@ def _opened(url: str, _pid: int) -> tuple[Any, str]:
 
 
 class Mirror:
-    """A folder of this machine with what was asked for of an object folder; it goes with who holds it."""
+    """A local copy of requested objects of an object folder; it is removed with its owner."""
 
     def __init__(self, url: str) -> None:
         self.objects = ObjectFolder(url)
         scratch = scratch_folder()
         weakref.finalize(self, scratch.cleanup)
-        # The name of an output's folder stands in what is written there.
+        # Outputs contain the name of their folder.
         self.folder = Path(scratch.name) / (self.objects.name or "out")
         self.folder.mkdir()
 
     def fetch(self, name: str) -> Path | None:
-        """Return the file of an object, None where there is none; it is asked for once."""
+        """Return the local file of an object, fetched once; None if there is none."""
         path = self.folder / name
         if not path.is_file():
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,7 @@
-"""Where outputs go: a folder that one command at a time holds, and changes to it that happen whole or not at all.
+"""Output folders: locked by one command at a time, and changed completely or not at all.
 
-A change is written into a hidden folder beside what it replaces and takes its place by exchange: killed at any point,
-the old or the new stands whole under the name. What a killed command left is removed by the next one.
+A change is written into a hidden folder beside the folder that it replaces, then both are exchanged: if the command is
+killed at any point, the old or the new folder is complete. Remains of a killed command are removed by the next one.
 """
 
 from __future__ import annotations
@@ -13,18 +13,17 @@ import os
 import re
 import shutil
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Container, Iterable, Iterator
 from pathlib import Path
 from typing import Self
 
 from pdhef_logtool.records.errors import OutputError, UsageError
-from pdhef_logtool.records.processes import is_alive, own_name
-from pdhef_logtool.storage.files import OF_WRITING, cannot_write, open_new, sweep_files, sync, writing
+from pdhef_logtool.records.processes import is_alive, process_name
+from pdhef_logtool.storage.files import OF_WRITING, WINDOWS, cannot_write, open_new, sweep_files, sync, writing
 
 #: The hidden folder beside outputs in which changes are prepared: ``.pdhef/NAME/{new,old,scratch}``.
 WORK = ".pdhef"
-#: Stands for the kernel's lock where the file system has none.
+#: Lock file for file systems without the kernel's lock.
 LOCK_FILE = ".pdhef.lock"
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+:)/.")
 _NO_LOCK = (errno.EBADF, errno.EINVAL, errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EISDIR)
@@ -33,57 +32,20 @@ _POLL_S = 0.05
 _TRIES = 100
 
 
-class Transaction(ABC):
-    """A named set of files that replaces the set of that name whole, or not at all.
+class FolderTransaction:
+    """A folder that is replaced completely, or not at all; files that only the old one has are kept by a hard link.
 
     Files are written to the paths that :meth:`file` returns. Then either :meth:`commit` makes them the outputs, or
-    :meth:`discard` leaves what was there. As a context it commits at its end and discards on an exception.
-    """
+    :meth:`discard` keeps the old ones. As a context it commits at its end and discards on an exception.
 
-    #: A local folder for what is needed until then; gone afterwards.
-    scratch: Path
-    #: What a person is told of as the place of the outputs.
-    target: Path
-
-    @abstractmethod
-    def file(self, name: str) -> Path:
-        """Return where to write the file of a name."""
-
-    @abstractmethod
-    def commit(self) -> None:
-        """Make the files the outputs; raises OutputError, and what was there then stands as it was."""
-
-    @abstractmethod
-    def discard(self) -> None:
-        """Remove what was written; harmless after :meth:`commit` and when called twice."""
-
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        """Commit on success, discard on an exception; a full disk is an OutputError wherever it was noticed."""
-        if kind is None:
-            self.commit()
-            return
-        self.discard()
-        if isinstance(error, OutputError):
-            error.where = self._shown(error.where)
-        if isinstance(error, OSError) and error.errno in OF_WRITING:
-            raise cannot_write(self.target, error) from error
-
-    def _shown(self, where: str) -> str:
-        """Return the final name of a place that an error names."""
-        return where
-
-
-class FolderTransaction(Transaction):
-    """A folder that is replaced; files in the old one that the new one has not are kept by a second name (hard link).
+    Attributes
+    ----------
+    scratch : a local folder for temporary files, removed at the end. target : location of the outputs in messages.
 
     Parameters
     ----------
-    target : the folder, which the process must hold. keep : whether what the new one has not is kept.
-    stale : names of files that are not, as they tell of what is replaced.
+    target : the folder, which the process must have locked. keep : whether files that only the old one has are kept.
+    stale : names of files that are not kept, as they describe the old content.
 
     Raises
     ------
@@ -108,6 +70,22 @@ class FolderTransaction(Transaction):
             self.discard()
             raise
 
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        """Commit on success, discard on an exception; a full disk is an OutputError wherever it was noticed."""
+        if kind is None:
+            self.commit()
+            return
+        self.discard()
+        if isinstance(error, OutputError):
+            for folder in (self._new, self.scratch):
+                error.where = error.where.replace(str(folder), str(self.target))
+        if isinstance(error, OSError) and error.errno in OF_WRITING:
+            raise cannot_write(self.target, error) from error
+
     def _make(self) -> None:
         for left in reversed(range(_TRIES)):
             try:
@@ -122,13 +100,8 @@ class FolderTransaction(Transaction):
         """Return where to write the file of a name."""
         return self._new / name
 
-    def _shown(self, where: str) -> str:
-        for folder in (self._new, self.scratch):
-            where = where.replace(str(folder), str(self.target))
-        return where
-
     def commit(self) -> None:
-        """Put everything on the disk, take over what is kept, and exchange the folders."""
+        """Flush all files, link those that are kept, exchange the folders; raises OutputError, then nothing changes."""
         try:
             with writing(self.target):
                 shutil.rmtree(self.scratch)
@@ -143,7 +116,7 @@ class FolderTransaction(Transaction):
             self.discard()
 
     def discard(self) -> None:
-        """Remove what was written, or what was replaced."""
+        """Remove what was written, or what was replaced; harmless after :meth:`commit` and when called twice."""
         with contextlib.suppress(OSError):
             _repair(self._work, self._place)
         with contextlib.suppress(OSError):
@@ -151,16 +124,16 @@ class FolderTransaction(Transaction):
 
 
 class OutputFolder:
-    """A folder that this process holds, so that no other of ours writes to it; made when it is missing.
+    """A folder that this process locks, so that no other of ours writes to it; created if it is missing.
 
     Parameters
     ----------
-    path : the folder. parts : names of folders in it that hold outputs of their own.
+    path : the folder. parts : names of folders in it with outputs of their own.
 
     Raises
     ------
     OutputError
-        It cannot be made or is held by another command.
+        It cannot be created or is locked by another command.
     """
 
     def __init__(self, path: Path, parts: Iterable[str] = ()) -> None:
@@ -168,12 +141,12 @@ class OutputFolder:
         self._parts = tuple(parts)
         self._lock = FolderLock(path)
 
-    def begin(self, name: str, stale: Container[str] = ()) -> Transaction:
+    def begin(self, name: str, stale: Container[str] = ()) -> FolderTransaction:
         """Begin to replace a folder, such as ``logs/drive``, without its stale files; raises OutputError."""
         return FolderTransaction(self.path / name, stale=stale)
 
     def sweep(self) -> None:
-        """Remove what killed commands left here, and finish an exchange that one was killed in."""
+        """Remove remains of killed commands, and finish an interrupted exchange."""
         sweep_files(self.path, held=True)
         for part in (self.path / name for name in self._parts):
             with contextlib.suppress(OSError):
@@ -186,23 +159,23 @@ class OutputFolder:
                     sweep_files(folder, held=True)
 
     def __enter__(self) -> Self:
-        """Take hold of the folder and sweep it."""
+        """Lock the folder and sweep it."""
         self._lock.acquire()
         self.sweep()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Let go of it; what a request to end has kept from being cleaned up is swept."""
+        """Release the lock; after an interruption, sweep first."""
         if kind is not None:
             self.sweep()
         self._lock.release()
 
 
 class FolderLock:
-    """Holds a folder until it is released or this process ends, however it ends; the folder is made when missing.
+    """Lock of a folder until it is released or this process ends; the folder is created if it is missing.
 
-    The kernel's lock on the folder itself, which no child process inherits. Where the file system has none, a file in
-    the folder names the process, and counts for nothing once that is dead.
+    The kernel's lock on the folder itself, which no child process inherits. If the file system has none, or on Windows,
+    a file in the folder names the process; it is void when the process has ended.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -211,7 +184,7 @@ class FolderLock:
         self._file: Path | None = None
 
     def acquire(self, wait_s: float = 0.0) -> None:
-        """Take hold of the folder, after at most ``wait_s``; raises OutputError when another command holds it."""
+        """Lock the folder, after at most ``wait_s``; raises OutputError if another command has locked it."""
         end = time.monotonic() + wait_s
         while True:
             with writing(self._folder):
@@ -228,9 +201,9 @@ class FolderLock:
             time.sleep(_POLL_S)
 
     def hold_next(self, folder: Path) -> None:
-        """Hold a folder of ours as well that is about to take the place of the one that is held.
+        """Also lock a folder of ours that is about to replace the locked one.
 
-        Else whoever waits would take hold of it before this command has swept what it leaves.
+        Otherwise a waiting command would lock it before this command has swept it.
         """
         with writing(folder):
             if self._file is not None:
@@ -241,7 +214,7 @@ class FolderLock:
             _locked(descriptor)
 
     def release(self) -> None:
-        """Let go; harmless when it is not held."""
+        """Release the lock; harmless if there is none."""
         if self._file is not None:
             with contextlib.suppress(OSError):
                 self._file.unlink(missing_ok=True)
@@ -250,6 +223,8 @@ class FolderLock:
         self._file, self._descriptors = None, []
 
     def _try(self) -> bool:
+        if WINDOWS:  # which opens no folders
+            return self._try_file()
         descriptor = os.open(self._folder, os.O_RDONLY)
         try:
             if not _locked(descriptor):
@@ -267,10 +242,10 @@ class FolderLock:
         return True
 
     def _try_file(self) -> bool:
-        """Take the lock file, which appears with its content; one of a dead process is removed first."""
-        file, own = self._folder / LOCK_FILE, self._folder / f"{LOCK_FILE}.{own_name()}"
+        """Create the lock file, complete with its content; that of a dead process is removed first."""
+        file, prepared = self._folder / LOCK_FILE, self._folder / f"{LOCK_FILE}.{process_name()}"
         if (holder := _holder(file)) is not None and is_alive(holder) is False:
-            stale = self._folder / f"{LOCK_FILE}.{own_name()}.stale"
+            stale = self._folder / f"{LOCK_FILE}.{process_name()}.stale"
             with contextlib.suppress(FileNotFoundError):
                 file.rename(stale)
                 if _holder(stale) != holder:  # another took it in the meantime: it is theirs
@@ -278,13 +253,13 @@ class FolderLock:
                     return False
                 stale.unlink()
         try:
-            with open_new(own) as made:
-                made.write(own_name().encode())
-            os.link(own, file)
+            with open_new(prepared) as made:
+                made.write(process_name().encode())
+            os.link(prepared, file)
         except FileExistsError:
             return False
         finally:
-            own.unlink(missing_ok=True)
+            prepared.unlink(missing_ok=True)
         self._file = file
         return True
 
@@ -299,7 +274,7 @@ class FolderLock:
 
 def local_path(place: Path | str) -> Path:
     """Return an output's place on this machine; raises UsageError for a URL, which as a path has lost a slash."""
-    if (found := _URL.match(str(place))) and not Path(found[1]).exists():
+    if (match := _URL.match(str(place))) and not Path(match[1]).exists():
         raise UsageError(
             expected="a place on this machine",
             got=re.sub(":/+", "://", str(place), count=1),
@@ -320,16 +295,16 @@ def check_no_input(inputs: Iterable[Path | None], files: Iterable[Path], folders
     Raises
     ------
     UsageError
-        One is the other, by whatever name or link, or an input lies in a folder that would be replaced.
+        An output is an input, also by another name or link, or an input is in a folder that would be replaced.
     """
     read = {identity: path for given in inputs if given is not None for identity, path in _identities(given)}
     within = {i: path for path in read.values() for parent in _lineage(path) if (i := _identity(parent)) is not None}
-    for output, known in [*((f, read) for f in files), *((f, within) for f in folders)]:
+    for output, inputs_by_identity in [*((f, read) for f in files), *((f, within) for f in folders)]:
         identity = _identity(output)
-        if identity is not None and identity in known:
+        if identity is not None and identity in inputs_by_identity:
             raise UsageError(
                 expected="an output that is no input of the same command",
-                got=f"{output}, which would replace the input {known[identity]}",
+                got=f"{output}, which would replace the input {inputs_by_identity[identity]}",
                 where="output",
                 remedy="choose another output folder, or move the input first",
             )
@@ -337,17 +312,17 @@ def check_no_input(inputs: Iterable[Path | None], files: Iterable[Path], folders
 
 def _identities(path: Path) -> Iterator[tuple[tuple[int, int], Path]]:
     """Yield what identifies a file, or a folder and the files in it."""
-    for one in [path, *(p for p in path.iterdir() if p.is_file())] if path.is_dir() else [path]:
-        if (identity := _identity(one)) is not None:
-            yield identity, one
+    for member in [path, *(p for p in path.iterdir() if p.is_file())] if path.is_dir() else [path]:
+        if (identity := _identity(member)) is not None:
+            yield identity, member
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
     try:
-        found = path.stat()
+        status = path.stat()
     except (OSError, ValueError):
         return None
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino
 
 
 def _lineage(path: Path) -> Iterator[Path]:
@@ -387,21 +362,13 @@ def _repair(work: Path, place: Path) -> None:
         shutil.rmtree(work, ignore_errors=True)
 
 
-def _remove(path: Path) -> None:
-    with contextlib.suppress(OSError):
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink()
-
-
 def _sync_all(folder: Path) -> None:
     for path in [*(p for p in folder.rglob("*") if not p.is_symlink() and (p.is_file() or p.is_dir())), folder]:
         sync(path)
 
 
 def _take_over(old: Path, new: Path, stale: Container[str]) -> None:
-    """Give everything of the old folder that the new one has not, but for stale files, a second name there."""
+    """Link everything that only the old folder has, except stale files, into the new one."""
     for path in old.iterdir():
         to = new / path.name
         if path.name in stale or os.path.lexists(to):
@@ -417,27 +384,29 @@ def _take_over(old: Path, new: Path, stale: Container[str]) -> None:
 def _link(source: str | Path, target: str | Path) -> None:
     try:
         os.link(source, target)
-    except OSError:  # a file system without hard links, or somebody else's file
+    except OSError:  # a file system without hard links, or a file of another user
         shutil.copy2(source, target)
 
 
 def _take_place(new: Path, place: Path, old: Path) -> None:
-    """Give ``new`` the name of ``place``; what stood there is at ``new`` or gone to ``old`` afterwards."""
+    """Give ``new`` the name of ``place``; the former folder is at ``new`` or ``old`` afterwards."""
     if not os.path.lexists(place):
         new.rename(place)
     elif not _exchanged(new, place):
-        # A file system without exchange: for a moment nothing stands under the name; a kill then is repaired.
+        # A file system without exchange: for a moment the name does not exist; a kill at that moment is repaired.
         place.rename(old)
         new.rename(place)
 
 
-def _exchanged(one: Path, other: Path) -> bool:
+def _exchanged(path: Path, other: Path) -> bool:
     """Exchange two names at once where system and file system can (Linux renameat2); False where they cannot."""
+    if WINDOWS:
+        return False
     at_cwd, exchange = -100, 2
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if rename is None:
         return False
-    if rename(at_cwd, os.fsencode(one), at_cwd, os.fsencode(other), exchange) == 0:
+    if rename(at_cwd, os.fsencode(path), at_cwd, os.fsencode(other), exchange) == 0:
         return True
     if ctypes.get_errno() in (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP):
         return False

@@ -1,4 +1,4 @@
-"""The process that workers are forked from, and what a worker does: the other side of ``supervisor.py``.
+"""The fork server, from which workers are forked, and the loop of a worker: the counterpart of ``supervisor.py``.
 
 The server imports what the workers need and stays otherwise as it is: it has one thread and no open query, so that
 every fork of it is a whole process at the price of a fork.
@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.records import processes
-from pdhef_logtool.records.printable import shown
+from pdhef_logtool.records.printable import printable
 
 #: One thread a worker: what libraries read when they are loaded.
 ONE_THREAD = dict.fromkeys(
@@ -39,11 +39,11 @@ ONE_THREAD = dict.fromkeys(
     ),
     "1",
 )
-#: What the server is asked: a new worker (its socket comes along), or how the worker of a process id ended.
+#: Requests to the server: fork a worker (with its socket), or return the exit status of a worker.
 FORK, STATUS = b"fork", b"stat"
 _REQUEST = struct.Struct("<4sq")
 _HEAD = struct.Struct("<q")
-#: The same progress is told again after this many seconds at the earliest.
+#: Unchanged progress is reported again after this many seconds at the earliest.
 _TELL_EVERY_S = 0.1
 _LONGEST = 500
 
@@ -65,7 +65,7 @@ def receive(channel: socket.socket) -> Any:
 
 
 def split(buffer: bytearray) -> Iterator[Any]:
-    """Take the whole messages off the front of what came; what is not yet whole stays."""
+    """Remove and yield the complete messages at the front of a buffer."""
     while len(buffer) >= _HEAD.size:
         end = _HEAD.size + _HEAD.unpack_from(buffer)[0]
         if len(buffer) < end:
@@ -81,7 +81,7 @@ def ask(control: socket.socket, what: bytes, number: int, descriptors: Sequence[
 
 
 def serve(descriptor: int) -> None:
-    """Be the server, on the socket of this descriptor, until its other side closes; no worker outlives it."""
+    """Run the server on the socket of this descriptor until the other side closes; no worker outlives it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends
     control = socket.socket(fileno=descriptor)
     workers: set[int] = set()
@@ -108,7 +108,7 @@ def serve(descriptor: int) -> None:
 
 
 def _prepare(preload: Sequence[str]) -> tuple[str, bool]:
-    """Import modules, with ``.*`` all of a package, and call what stands after a colon.
+    """Import modules, with ``.*`` all of a package, and call the function after a colon.
 
     Returns what went wrong, and whether all is warm: nothing that was called has returned False.
     """
@@ -122,8 +122,8 @@ def _prepare(preload: Sequence[str]) -> tuple[str, bool]:
                     importlib.import_module(inner.name)
             if function:
                 warm &= getattr(loaded, function)() is not False
-        except Exception as error:  # noqa: BLE001 (told by the parent, whatever it is)
-            return f"{name}: {told_error(error)}", warm
+        except Exception as error:  # noqa: BLE001 (the parent reports any error)
+            return f"{name}: {describe_error(error)}", warm
     gc.collect()
     gc.freeze()  # so that collecting in a worker does not copy what all share
     return "", warm
@@ -161,9 +161,9 @@ def _say(channel: socket.socket, *message: Any) -> None:
 
 
 def _work(channel: socket.socket) -> None:
-    """Be a worker: take the function and its bound, then items; answer each with its result or what it raised."""
+    """Run a worker: receive the function and its memory limit, then items; reply to each with its result or error."""
     with contextlib.suppress(OSError):
-        # When the machine runs out of memory, a worker is to go and not who watches it.
+        # If the machine runs out of memory, the system must end a worker and not its supervisor.
         Path("/proc/self/oom_score_adj").write_text("500")
     with contextlib.suppress(_Gone, EOFError, OSError):
         _say(channel, "ready", os.getpid())
@@ -174,13 +174,13 @@ def _work(channel: socket.socket) -> None:
 
 
 def _answer(channel: socket.socket, work: bytes, item: bytes) -> tuple[str, ...] | tuple[str, bytes]:
-    told: tuple[str, float] = ("", 0.0)
+    reported: tuple[str, float] = ("", 0.0)
 
     def tell(text: str, share: float) -> None:
-        nonlocal told
+        nonlocal reported
         now = time.monotonic()
-        if text != told[0] or now - told[1] > _TELL_EVERY_S:
-            told = (text, now)
+        if text != reported[0] or now - reported[1] > _TELL_EVERY_S:
+            reported = (text, now)
             _say(channel, "tell", text, share)
 
     try:
@@ -189,12 +189,12 @@ def _answer(channel: socket.socket, work: bytes, item: bytes) -> tuple[str, ...]
         return ("memory",)
     except _Gone:
         raise
-    except BaseException as error:  # noqa: BLE001 (a worker outlives whatever an item raises)
-        return "failed", f"raised {told_error(error)}"
+    except BaseException as error:  # noqa: BLE001 (a worker survives any error of an item)
+        return "failed", f"raised {describe_error(error)}"
     try:
         return "done", pickle.dumps(result)
-    except Exception as error:  # noqa: BLE001 (whatever a pickler may raise)
-        return "failed", f"its result cannot be sent: {told_error(error)}"
+    except Exception as error:  # noqa: BLE001 (any error of a pickler)
+        return "failed", f"its result cannot be sent: {describe_error(error)}"
 
 
 @cache
@@ -203,7 +203,7 @@ def _function(packed: bytes) -> Callable[..., Any]:
 
 
 def _bound(more_bytes: int | None) -> None:
-    """Let no allocation take this process that much beyond what it has, however fast it comes; Linux keeps to it."""
+    """Limit the memory of this process to this much more than it has now (Linux)."""
     if more_bytes is None:
         return
     with contextlib.suppress(ImportError, OSError, ValueError, IndexError):
@@ -216,13 +216,13 @@ def _bound(more_bytes: int | None) -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (bound, bound))
 
 
-def told_error(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """Return an exception as one line."""
     try:
         text = " ".join(str(error).split())
-    except Exception:  # noqa: BLE001 (an exception that cannot even be told)
+    except Exception:  # noqa: BLE001 (an exception without a text)
         text = ""
-    return shown(f"{type(error).__name__}: {text}", _LONGEST) if text else type(error).__name__
+    return printable(f"{type(error).__name__}: {text}", _LONGEST) if text else type(error).__name__
 
 
 def _exactly(channel: socket.socket, count: int) -> bytes:

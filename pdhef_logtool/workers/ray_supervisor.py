@@ -1,7 +1,7 @@
-"""The same as ``supervisor.py`` on the machines of a Ray cluster.
+"""The supervisor of ``supervisor.py`` on the machines of a Ray cluster.
 
-A task is a worker under watch on whatever node Ray has chosen: what dies, falls silent or grows there is an outcome
-like any other, so that Ray has to repeat a task only where its node is lost, and does so as often as it takes.
+A task is a supervised worker on a node that Ray chooses: a worker that dies, hangs or exceeds its memory is an ordinary
+outcome, so that Ray repeats a task only if its node is lost.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.processes import own_name
-from pdhef_logtool.workers.fork_server import told_error
+from pdhef_logtool.records.processes import process_name
+from pdhef_logtool.workers.fork_server import describe_error
 from pdhef_logtool.workers.supervisor import Crew, Ended, Failure, Limits, Tell
 
 T = TypeVar("T")
@@ -28,7 +28,7 @@ R = TypeVar("R")
 
 #: Nodes that an item may lose: machines that are taken away at any time count as such.
 MAX_RETRIES = 1000
-#: Items that are with Ray for each of its processors: so many that none waits for the next.
+#: Items submitted to Ray per processor, so that no processor waits for the next one.
 _AHEAD = 2
 _LOOK_S = 5.0
 _CONNECT_S = 20.0
@@ -36,7 +36,7 @@ _CONNECT_S = 20.0
 
 @dataclass(frozen=True, slots=True)
 class _Orders:
-    """What a node is to do with items; ``run`` tells the orders of one run from those of others."""
+    """The work of a node; ``run`` identifies the run."""
 
     run: str
     work: Callable[[Any, Tell], Any]
@@ -65,7 +65,7 @@ def supervise_on_ray(
     ------
     UsageError : Ray is not installed, or there is no cluster.
     """
-    orders = _Orders(f"{own_name()}-{next(_RUNS)}", work, limits, tuple(preload))
+    orders = _Orders(f"{process_name()}-{next(_RUNS)}", work, limits, tuple(preload))
     with _connected(address) as ray:
         task = ray.remote(num_cpus=1, max_retries=MAX_RETRIES, retry_exceptions=False)(_end_on_node)
         waiting = enumerate(items)
@@ -118,14 +118,14 @@ def _connected(address: str) -> Iterator[Any]:
     except (ConnectionError, ValueError, RuntimeError, OSError) as error:
         raise UsageError(
             expected="the address of a Ray cluster",
-            got=f"{address} ({told_error(error).partition('. ')[0]})",
+            got=f"{address} ({describe_error(error).partition('. ')[0]})",
             where="--ray",
-            remedy="ray status tells whether it is up",
+            remedy="check the cluster with ray status",
         ) from None
     if main:
         signal.signal(signal.SIGTERM, was)  # Ray has put its own in its place
     with suppress(AttributeError):
-        # It prints on stdout, where results go, that a node was lost and that it goes on.
+        # It prints messages about lost nodes on stdout, where results go.
         ray._private.worker.print_to_stdstream = lambda *_, **__: None
     try:
         yield ray
@@ -134,7 +134,7 @@ def _connected(address: str) -> Iterator[Any]:
 
 
 def _check_reachable(address: str) -> None:
-    """Raise OSError where nobody listens: Ray itself would try for minutes."""
+    """Raise OSError if the port is closed: Ray itself would try for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdigit():
         socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT_S).close()
@@ -145,12 +145,12 @@ _crews: dict[str, Crew[Any, Any]] = {}
 
 
 def _end_on_node(orders: _Orders, item: Any) -> tuple[Any, Failure | None]:
-    """Do the work on an item in a worker beside this process, which lives as long as this one does its run's tasks."""
+    """Do the work on an item in a worker process, which is kept for further tasks of the run."""
     try:
         for ended in _crew(orders).each([item]):
             return ended.result, ended.failure
     except Exception as error:  # noqa: BLE001 (what a task raises, Ray would take for its own)
-        return None, Failure(f"raised {told_error(error)}")
+        return None, Failure(f"raised {describe_error(error)}")
     raise AssertionError("an item ends")
 
 

@@ -1,9 +1,9 @@
-"""Work on many items in processes of their own, under watch.
+"""Work on many items in supervised processes.
 
-A worker lives as long as the run and has one thread. What dies, falls silent or takes too much memory costs the item
-in flight only: that is tried once more when nothing else runs, in a new process, and then given up and told. Workers
-come from a fork server (``fork_server.py``), a pipe each; they end when their parent does, however that ends. A fork
-server that dies is restarted, a bounded number of times; its workers finish their items without it.
+A worker lives as long as the run and has one thread. A worker that dies, hangs or takes too much memory costs only the
+item in progress, which is repeated once alone in a new process, and then reported as failed. Workers come from a fork
+server (``fork_server.py``) with a socket each; they end with their parent. A fork server that dies is restarted a
+bounded number of times; its workers finish their items without it.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import contextlib
 import json
 import os
 import pickle
+import platform
 import selectors
 import signal
 import socket
@@ -20,41 +21,47 @@ import sys
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from types import TracebackType
 from typing import Generic, Self, TypeVar
 
+import psutil
+
 from pdhef_logtool.records.errors import UsageError, WorkerError
-from pdhef_logtool.records.printable import shown
+from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.processes import wait_for_end
-from pdhef_logtool.workers.fork_server import FORK, ONE_THREAD, STATUS, ask, receive, send, split, told_error
+from pdhef_logtool.workers.fork_server import FORK, ONE_THREAD, STATUS, ask, describe_error, receive, send, split
 
 T = TypeVar("T")
 R = TypeVar("R")
-#: Tells what an item is at, and its share from 0 to 1.
+#: Progress callback of an item: a text, and a share from 0 to 1.
 Tell = Callable[[str, float], None]
-#: Hears the same, with the number of the item.
+#: The same with the number of the item first.
 Progress = Callable[[int, str, float], None]
 
 _TICK_S = 0.05
-#: The most that one look at the workers counts as silence: more means that the parent itself was stopped or busy.
+#: Most silence that one poll of the workers counts: more means that the parent itself was stopped or busy.
 _LONGEST_TICK_S = 5.0
-#: No allocation brings a worker further beyond its bound than this, however fast; allocators reserve more than needed.
+#: A worker can exceed its limit by at most this much; allocators reserve more than they need.
 _RESERVED_BYTES = 2 << 30
 _TRIES = 2
-#: How often a fork server that died is replaced while the items of one list are worked on.
+#: Most restarts of the fork server per list of items.
 _RESTARTS = 3
-#: A worker that does not take an item within this time does not listen.
+#: Timeout for handing an item to a worker.
 _SEND_S = 60.0
+
+
+def can_fork() -> bool:
+    """Return whether workers can be forked; macOS has ``fork``, but its frameworks do not work after it."""
+    return hasattr(os, "fork") and platform.system() != "Darwin"
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What an item may take; None: as much as it likes.
+    """Limits of an item; None: unlimited.
 
     Parameters
     ----------
-    silence_s : between two words of progress.
+    silence_s : between two reports of progress.
     memory_bytes : of a worker's resident set.
     """
 
@@ -64,7 +71,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """Why there is no result: a line for people, the last progress that was told, and how often it was tried."""
+    """Why there is no result: a line for users, the last reported progress, and the number of tries."""
 
     reason: str
     last: str = ""
@@ -73,7 +80,7 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Ended(Generic[T, R]):
-    """How an item ended, with its number in the order of the items; with no ``failure`` it has a result."""
+    """Outcome of an item, with its number in the order of the items; without ``failure`` it has a result."""
 
     number: int
     item: T
@@ -93,28 +100,36 @@ def supervise(
 ) -> Generator[Ended[T, R], None, None]:
     """Do the work on every item and yield how each ended, in the order of ending.
 
-    Items are pulled as workers become free, and nothing of an item is kept once it has ended. With one job and no
-    limits all is done in this process.
+    Items are requested as workers become free, and an item is released when it has ended. With one job and no
+    limits all is done in this process; likewise, with a warning, on systems other than Linux.
 
     Parameters
     ----------
-    work : a function of a module; takes an item and what tells its progress, and returns something small.
+    work : a function of a module with an item and a progress callback as arguments; its result should be small.
     jobs : processes at once.
     preload : modules that the fork server imports: ``package.module``, ``package.*`` for all of a package, or
         ``package.module:function`` to call that too. ``pdhef_logtool.compiled.cache:load_kept`` behind others
         loads their compiled code. They must leave no thread behind that is needed, and run no query (polars) or tensor.
-    warn : called with a line for people whenever the fork server is restarted.
+    warn : called with a line for people whenever the fork server is restarted, or if there can be no worker processes.
 
     Raises
     ------
-    UsageError : fewer jobs than one, or more on a system that cannot fork.
+    UsageError : fewer jobs than one.
     WorkerError : the fork server died more often than it is restarted.
     """
     if jobs < 1:
         raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
     if jobs == 1 and limits == Limits():
         return _in_this_process(work, items, progress)
-    return _in_processes(work, items, jobs, limits, preload, progress, warn)
+    if not can_fork():
+        warn("worker processes need Linux: one process does all the work, without limits on memory and time")
+        return _in_this_process(work, items, progress)
+
+    def in_workers() -> Generator[Ended[T, R], None, None]:
+        with Crew[T, R](work, jobs=jobs, limits=limits, preload=preload, warn=warn) as crew:
+            yield from crew.each(items, progress)
+
+    return in_workers()
 
 
 def _in_this_process(
@@ -131,51 +146,36 @@ def _in_this_process(
         try:
             result = work(item, tell)
         except Exception as error:  # noqa: BLE001 (one item never stops the others)
-            yield Ended(number, item, failure=Failure(f"raised {told_error(error)}", last))
+            yield Ended(number, item, failure=Failure(f"raised {describe_error(error)}", last))
         else:
             yield Ended(number, item, result)
             del result
         del item
 
 
-def _in_processes(  # positional: the arguments of `supervise`, which checked them
-    work: Callable[[T, Tell], R],
-    items: Iterable[T],
-    jobs: int,
-    limits: Limits,
-    preload: Sequence[str],
-    progress: Progress,
-    warn: Callable[[str], None],
-) -> Generator[Ended[T, R], None, None]:
-    with Crew[T, R](work, jobs=jobs, limits=limits, preload=preload, warn=warn) as crew:
-        yield from crew.each(items, progress)
-
-
 @dataclass(slots=True)
 class _Attempt(Generic[T]):
     number: int
     item: T
-    place: int | None
     tries: int = 0
     last: str = ""
 
 
 @dataclass(slots=True)
 class _Worker(Generic[T]):
-    """A process as the parent knows it; ``pid`` is None until it has said that it is ready."""
+    """A worker process in the parent; ``pid`` is None until the worker is ready."""
 
     channel: socket.socket
     server: _Server
     attempt: _Attempt[T] | None
-    place: int | None
     pid: int | None = None
     silent_s: float = 0.0
     buffer: bytearray = field(default_factory=bytearray)
 
     def resident_bytes(self) -> int:
         try:
-            return int(Path(f"/proc/{self.pid}/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-        except (OSError, IndexError, ValueError):
+            return int(psutil.Process(self.pid).memory_info().rss)
+        except psutil.Error:
             return 0
 
     def end(self) -> str:
@@ -229,7 +229,7 @@ class _Server:
         return bool(warm)
 
     def is_dead(self) -> bool:
-        """Return whether its side of the socket is closed, which precedes the end of whatever it has in hand."""
+        """Return whether its side of the socket is closed, which precedes the end of its workers."""
         try:
             return not self._control.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
         except BlockingIOError:
@@ -273,10 +273,8 @@ class Crew(Generic[T, R]):
         preload: Sequence[str] = (),
         warn: Callable[[str], None] = lambda _text: None,
     ) -> None:
-        if not hasattr(os, "fork"):
-            raise UsageError(
-                expected="a system with fork", got=sys.platform, where="--jobs", remedy="--jobs 1, and no limits"
-            )
+        if not can_fork():
+            raise UsageError(expected="Linux, for worker processes", got=platform.system(), where="Ray node")
         most = limits.memory_bytes
         self._orders = (pickle.dumps(work), None if most is None else most + _RESERVED_BYTES)
         self._jobs, self._limits, self._preload = jobs, limits, preload
@@ -310,21 +308,13 @@ class Crew(Generic[T, R]):
         self,
         items: Iterable[T],
         progress: Progress = lambda _number, _text, _share: None,
-        *,
-        place: Callable[[T], int] | None = None,
     ) -> Generator[Ended[T, R], None, None]:
-        """Do the work on every item, as :func:`supervise` does.
-
-        Parameters
-        ----------
-        place : which worker an item is for, by a number below ``jobs``, for work that goes on from what an earlier
-            item has left in its process; that is gone when the process is lost.
-        """
+        """Do the work on every item, as :func:`supervise` does."""
         self._progress = progress
         self._deaths = 0
         self._returned.clear()
         lost: list[_Attempt[T]] = []
-        attempts = (_Attempt(n, item, place and place(item)) for n, item in enumerate(items))
+        attempts = (_Attempt(n, item) for n, item in enumerate(items))
         try:
             for attempt, ended in self._run(attempts, self._jobs):
                 if ended is None:
@@ -346,14 +336,14 @@ class Crew(Generic[T, R]):
             self._end(worker)
 
     def _run(self, attempts: Iterator[_Attempt[T]], jobs: int) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
-        """Try items, so many at once; yield how each ended, None if it was lost and may be tried again."""
+        """Try items, ``jobs`` at once; yield the outcome of each, None if it was lost and may be tried again."""
         since = time.monotonic()
         coming: _Attempt[T] | None = None
         while True:
-            # What the first item has compiled, the others find.
+            # The first item compiles alone; the others use its code.
             while self._busy() < (jobs if self._warm else 1):
                 coming = coming or (self._returned.pop() if self._returned else next(attempts, None))
-                if coming is None or self._is_taken(coming):
+                if coming is None:
                     break
                 attempt, coming = coming, None
                 yield from self._give(attempt)
@@ -369,17 +359,13 @@ class Crew(Generic[T, R]):
                 yield from self._hear(worker)
             yield from self._watch()
 
-    def _is_taken(self, attempt: _Attempt[T]) -> bool:
-        """Tell whether the worker that an item is for is at work."""
-        return attempt.place is not None and any(w.attempt and w.place == attempt.place for w in self._workers)
-
     def _busy(self) -> int:
         return sum(w.attempt is not None for w in self._workers)
 
     def _give(self, attempt: _Attempt[T]) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
         """Hand an item to a worker that is free, or to a new one; an item that cannot be sent ends here."""
         attempt.tries, attempt.last = attempt.tries + 1, ""
-        free = next((w for w in self._workers if w.attempt is None and w.place == attempt.place), None)
+        free = next((w for w in self._workers if w.attempt is None), None)
         if free is None:
             self._start(attempt)
         else:
@@ -393,7 +379,7 @@ class Crew(Generic[T, R]):
             while not (server := self._live_server()).fork(self._started, theirs):
                 pass
         ours.settimeout(_SEND_S)
-        worker = _Worker(ours, server, attempt, attempt.place)
+        worker = _Worker(ours, server, attempt)
         self._workers.append(worker)
         self._selector.register(ours, selectors.EVENT_READ, worker)
 
@@ -429,16 +415,16 @@ class Crew(Generic[T, R]):
         assert attempt is not None
         try:
             packed = pickle.dumps(attempt.item)
-        except Exception as error:  # noqa: BLE001 (whatever a pickler may raise)
+        except Exception as error:  # noqa: BLE001 (any error of a pickler)
             worker.attempt = None
-            yield attempt, _failed(attempt, f"it cannot be sent to a worker: {told_error(error)}")
+            yield attempt, _failed(attempt, f"it cannot be sent to a worker: {describe_error(error)}")
             return
         worker.silent_s = 0.0
-        with contextlib.suppress(OSError):  # a worker that is dead or does not listen is found by the watch
+        with contextlib.suppress(OSError):  # dead and hanging workers are handled by _watch
             send(worker.channel, packed)
 
     def _hear(self, worker: _Worker[T]) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
-        """Take what a worker says."""
+        """Handle the messages of a worker."""
         try:
             data = worker.channel.recv(1 << 16)
         except OSError:
@@ -501,11 +487,13 @@ class Crew(Generic[T, R]):
 
 
 def _failed(attempt: _Attempt[T], reason: str) -> Ended[T, R]:
-    return Ended(attempt.number, attempt.item, failure=Failure(shown(reason), shown(attempt.last), attempt.tries))
+    return Ended(
+        attempt.number, attempt.item, failure=Failure(printable(reason), printable(attempt.last), attempt.tries)
+    )
 
 
 def _opened(attempt: _Attempt[T], answer: bytes) -> Ended[T, R]:
     try:
         return Ended(attempt.number, attempt.item, pickle.loads(answer))  # noqa: S301 (from our own process)
-    except Exception as error:  # noqa: BLE001 (whatever a pickle may raise)
-        return _failed(attempt, f"its result cannot be read: {told_error(error)}")
+    except Exception as error:  # noqa: BLE001 (any error of a pickle)
+        return _failed(attempt, f"its result cannot be read: {describe_error(error)}")

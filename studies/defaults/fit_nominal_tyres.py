@@ -1,8 +1,8 @@
-"""Fit the nominal axle tyres to slow ramp steers of the truth vehicle on two roads; write the samples' vehicle files.
+"""Fit nominal axle tyres to slow ramp steers of the simulated vehicle; write the vehicle files of the samples.
 
     python -m studies.defaults.fit_nominal_tyres [sample_logs]
 
-The nominal model (docs/method.md#model) knows one slip angle an axle, from the mean steering angle and the motion of
+The nominal model (docs/method.md#model) has one slip angle per axle, from the mean steering angle and the motion of
 the CG. So load transfer, compliance and both wheels of an axle go into its magic formula. Forces follow from Newton and
 Euler as they would from measured accelerations: F_f = (l_r m a_y + I_z dr/dt) / (L cos d), F_r = m a_y - F_f cos d.
 
@@ -29,7 +29,7 @@ from truthsim.vehicle import Vehicle
 
 CAR = Vehicle()
 NOISE = SensorNoise()
-#: One file a road, with the same tyres: a vehicle file says the friction where no log does.
+#: One file a road, with the same tyres: the friction of a vehicle file applies to logs without friction.
 ROADS = {
     "vehicle.toml": ("truthsim saloon", 0.85),
     "vehicle_mu03.toml": ("truthsim saloon on a road of friction 0.3", 0.3),
@@ -80,10 +80,10 @@ def fit_axle(alpha: FloatArray, force: FloatArray, load_n: float) -> AxleFit:
     top = float(force.max())
     start = [10.0, 1.3, 1.01 * top, 0.0]
     bounds = ([3.0, 1.05, 1.0 * top, -2.0], [40.0, 1.7, max(load_n, 1.02 * top), 1.1])
-    found = least_squares(
+    solution = least_squares(
         lambda p: (magic_formula(alpha, *p) - force) / top, start, bounds=bounds, x_scale=[10.0, 1.0, top, 1.0]
     )
-    b, c, d, e = found.x
+    b, c, d, e = solution.x
     error = magic_formula(alpha, b, c, d, e) - force
     return AxleFit(b, c, d, 1.0 - float(np.exp(e)), float(np.sqrt(np.mean(error**2))), top)
 

@@ -2,7 +2,7 @@
 
     python -m studies.defaults.fit_physics [-o FOLDER] [--work out/fit-physics] [--jobs 2]
 
-Drives of 12.5 s as networks are trained on, with the friction told, on perfect truth. None is one of the paper's
+Drives of 12.5 s as networks are trained on, with the true friction, on exact ground truth. None is one of the paper's
 scenarios: those have a speed and a friction of their own. Everything else of the car stays: its vehicle file is right.
 """
 
@@ -48,10 +48,10 @@ def main(arguments: list[str] | None = None) -> int:
     def say(text: str, share: float) -> None:
         print(f"{100 * share:3.0f} % {text}", flush=True)
 
-    found, physics = find_physics(drives, car.own, progress=say)
-    # Smoothed it has the filter's noise: its network says most of what the model lacks.
+    result, physics = find_physics(drives, car.own, progress=say)
+    # Smoothed it has the filter's noise: its network predicts most of what the model lacks.
     physics = physics.model_copy(update={"smoothing": (1.0, 1.0)})
-    print(f"sideslip RMSE on what it was fitted to: {found.rms_deg:.4f} deg")
+    print(f"sideslip RMSE on what it was fitted to: {result.rms_deg:.4f} deg")
     for tried in physics.tried:
         print(f"{', '.join(tried.parts) or 'static'}: {tried.held_out_deg} {'taken' if tried.taken else ''}")
     part = Fit(physics_sha256=physics_sha256(car.own), values=FittedValues(), physics=physics, drives=tuple(learnt_on))

@@ -1,8 +1,8 @@
-"""Make the car that the package ships from nothing: simulate, fit, extract, train, tune, trust, calibrate.
+"""Make the car that the package ships from nothing: simulate, fit, extract, train, tune, evaluate, calibrate.
 
-    python -m studies.defaults.train_default [--seed 0] [-o FOLDER] [--work out/train-default] [--jobs 2]
+    python -m studies.defaults.train_default [--seed 0] [-o FOLDER] [--work out/train-default] [--steps STEP ...]
 
-Short drives of one simulated car whose vehicle file is right, with the friction told. ``physics`` is fitted on five
+Short drives of one simulated car whose vehicle file is right, with the true friction. ``physics`` is fitted on five
 minutes of other drives (:mod:`studies.defaults.fit_physics`), its noise with it; the residual network learns what it
 lacks. The direct network, the regression and the paper's network see the same drives, with the nominal model. Filter
 noise of all tuned estimators is chosen on validation drives in one search (stage noise). Seeds other than 0 train
@@ -17,7 +17,8 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -31,6 +32,7 @@ from pdhef_logtool.car.car import (
     UNSURE_FILE,
     VEHICLE_FILE,
 )
+from pdhef_logtool.car.toml_files import load_vehicle, vehicle_toml
 from pdhef_logtool.learning.network.fit import Recipe
 from pdhef_logtool.learning.network.train_command import dataset_for, train_on
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
@@ -48,8 +50,8 @@ OTHER_DRIVES = {"other_cars": 200, "evidence": 200}
 EPOCHS, BASELINE_EPOCHS = 66, 40
 PAPER_EPOCHS = 15
 TRIALS = 64
-#: Wrong frictions and vehicle files that the intervals allow for: no car is as its file says, a load alone makes this
-#: much; and those for an unsure car.
+#: Relative errors of friction and vehicle files that the intervals allow for: of a usual car (load alone causes such
+#: errors), and of a car that may have changed.
 USUAL_SPREAD, UNSURE_SPREAD = 0.08, 0.2
 MAPPING = """# Recognised types, and the friction that the simulator drove on.
 fill_recognised = true
@@ -58,6 +60,109 @@ fill_recognised = true
 topic = "/truth/perfect/state"
 field = "friction"
 """
+
+
+@dataclass(frozen=True, slots=True)
+class Training:
+    """Options of the command; the steps read and write these folders."""
+
+    car: Path
+    work: Path
+    seed: int
+    jobs: int
+    drives: int
+    epochs: int
+    trials: int
+
+    @property
+    def network(self) -> Path:
+        """Folder of the car's network."""
+        return self.car / NETWORK_FOLDER
+
+    @property
+    def of_car(self) -> tuple[object, ...]:
+        """Options that name the car and the mapping."""
+        return "--car", self.car, "--mapping", self.work / "mapping.toml"
+
+    @property
+    def with_network(self) -> tuple[object, ...]:
+        """The same with the network: the shipped one by its name, wherever the package is."""
+        return *self.of_car, "--network", SHIPPED if self.car.resolve() == HOME else self.network
+
+    @property
+    def validation(self) -> tuple[object, ...]:
+        """The validation drives, with car and network."""
+        return self.work / "one_car", "--split", "validation", *self.with_network
+
+
+def simulate(t: Training) -> None:
+    """Write the vehicle file, the mapping and the three sets of drives."""
+    t.work.mkdir(parents=True, exist_ok=True)
+    t.car.mkdir(parents=True, exist_ok=True)
+    text = vehicle_toml(load_vehicle(SAMPLE_VEHICLE), "Written by python -m studies.defaults.train_default.")
+    (t.car / VEHICLE_FILE).write_text(text, encoding="utf-8")
+    if t.seed:
+        for part in (FIT_FILE, NOISE_FILE):
+            shutil.copyfile(HOME / part, t.car / part)
+    (t.work / "mapping.toml").write_text(MAPPING, encoding="utf-8")
+    for name, (seed, vehicles) in SETS.items():
+        count = min(t.drives, OTHER_DRIVES.get(name, t.drives))
+        what = ["--count", count, "--seed", seed, "--vehicles", vehicles, "--jobs", t.jobs]
+        pdhef("simulate", "suite", *what, "-o", t.work / name)
+
+
+def fit(t: Training) -> None:
+    """Fit ``physics``, whose residual the network learns."""
+    fit_physics.main(["-o", str(t.car), "--work", str(t.work / "fit"), "--jobs", str(t.jobs)])
+
+
+def extract(t: Training) -> None:
+    """Extract residuals: the paper's network and the baselines have the nominal model, as the paper has it."""
+    for model in MODELS:
+        output = ("-o", t.work / model, "--filter", model, "--jobs", t.jobs, "--resume")
+        pdhef("extract", t.work / "one_car", *t.of_car, *output)
+
+
+def train(t: Training) -> None:
+    """Train the residual network, the baselines beside it, and the paper's network, on the same drives."""
+    how = ("--baselines", "--seed", t.seed, "--epochs", BASELINE_EPOCHS)
+    beside = _start("train", t.work / NOMINAL_MODEL, "-o", t.network, *how)
+    if t.jobs == 1:
+        _finish(beside)
+    torch.set_num_threads(1)  # small networks: a second thread brings nothing, a second process does
+    recipe = Recipe(seed=t.seed, epochs=t.epochs)
+
+    def epoch(text: str, _share: float) -> None:
+        print(text, flush=True)
+
+    train_on(dataset_for(t.work / PHYSICS_MODEL, PHYSICS_MODEL), t.network, recipe, progress=epoch)
+    paper = replace(recipe, feature_names=PAPER_FEATURES, hidden=128, dropout=0.2, epochs=PAPER_EPOCHS, odd=False)
+    train_on(dataset_for(t.work / NOMINAL_MODEL, NOMINAL_MODEL), t.network / PAPER_FOLDER, paper, progress=epoch)
+    _finish(beside)
+
+
+def noise(t: Training) -> None:
+    """Tune the noise of all tuned estimators alike, on validation drives."""
+    pdhef("learn", *t.validation, "--stages", "noise", "--trials", t.trials, "-o", t.car)
+
+
+def gain(t: Training) -> None:
+    """Evaluate on other drives how far the network helps on this car."""
+    pdhef("learn", t.work / "evidence", *t.with_network, "--stages", "gain", "--any-split", "-o", t.car)
+
+
+def intervals(t: Training) -> None:
+    """Calibrate the intervals: for a car that is nearly as in its file, and for a car that may have changed."""
+    for spread, place in ((USUAL_SPREAD, t.car), (UNSURE_SPREAD, t.work / "unsure")):
+        pdhef("learn", *t.validation, "--stages", "intervals", "--vary", spread, "-o", place)
+    shutil.copyfile(t.work / "unsure" / INTERVALS_FILE, t.car / UNSURE_FILE)
+
+
+STEPS: dict[str, Callable[[Training], None]] = {
+    step.__name__: step for step in (simulate, fit, extract, train, noise, gain, intervals)
+}
+#: Seeds other than 0 take these parts from the shipped car.
+ONLY_OF_SEED_0 = ("fit", "noise", "intervals")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -70,67 +175,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--drives", type=int, default=DRIVES, help="of each of the two sets")
     parser.add_argument("--epochs", type=int, default=EPOCHS)
     parser.add_argument("--trials", type=int, default=TRIALS, help="of each tuned estimator")
+    parser.add_argument("--steps", nargs="+", choices=STEPS, default=list(STEPS), help="default: all")
     given = parser.parse_args(arguments)
+    training = Training(given.output, given.work, given.seed, given.jobs, given.drives, given.epochs, given.trials)
     began = time.monotonic()
-
-    def say(text: str) -> None:
-        print(f"[{(time.monotonic() - began) / 60.0:5.1f} min] {text}", flush=True)
-
-    work, car = given.work, given.output
-    network = car / NETWORK_FOLDER
-    work.mkdir(parents=True, exist_ok=True)
-    if not (car / VEHICLE_FILE).is_file():
-        car.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(SAMPLE_VEHICLE, car / VEHICLE_FILE)
-        if given.seed:
-            for part in (FIT_FILE, NOISE_FILE):
-                shutil.copyfile(HOME / part, car / part)
-    mapping = work / "mapping.toml"
-    mapping.write_text(MAPPING, encoding="utf-8")
-    for name, (seed, vehicles) in SETS.items():
-        count = min(given.drives, OTHER_DRIVES.get(name, given.drives))
-        say(f"simulate {count} drives: {name}")
-        what = ["--count", count, "--seed", seed, "--vehicles", vehicles, "--jobs", given.jobs]
-        pdhef("simulate", "suite", *what, "-o", work / name)
-    if given.seed == 0:
-        say("fit physics, whose residual the network learns")
-        fit_physics.main(["-o", str(car), "--work", str(work / "fit"), "--jobs", str(given.jobs)])
-    say("extract")
-    told = ["--car", car, "--mapping", mapping]
-    # The paper's network and the baselines beside it have the nominal model, as the paper has it.
-    for model in MODELS:
-        output = ("-o", work / model, "--filter", model, "--jobs", given.jobs, "--resume")
-        pdhef("extract", work / "one_car", *told, *output)
-    say("train the residual network, and beside it the baselines on the same drives")
-    how = ("--baselines", "--seed", given.seed, "--epochs", BASELINE_EPOCHS)
-    beside = _start("train", work / NOMINAL_MODEL, "-o", network, *how)
-    if given.jobs == 1:
-        _finish(beside)
-    torch.set_num_threads(1)  # small networks: a second thread brings nothing, a second process does
-    recipe = Recipe(seed=given.seed, epochs=given.epochs)
-
-    def epoch(text: str, _share: float) -> None:
-        say(text)
-
-    train_on(dataset_for(work / PHYSICS_MODEL, PHYSICS_MODEL), network, recipe, progress=epoch)
-    say("train the paper's network on the same drives")
-    paper = replace(recipe, feature_names=PAPER_FEATURES, hidden=128, dropout=0.2, epochs=PAPER_EPOCHS, odd=False)
-    train_on(dataset_for(work / NOMINAL_MODEL, NOMINAL_MODEL), network / PAPER_FOLDER, paper, progress=epoch)
-    _finish(beside)
-    # The shipped network goes by its name, wherever the package lies.
-    told += ["--network", SHIPPED if car.resolve() == HOME else network]
-    validation = [work / "one_car", "--split", "validation", *told]
-    if given.seed == 0:
-        say("tune the noise of all tuned estimators alike, on validation drives")
-        pdhef("learn", *validation, "--stages", "noise", "--trials", given.trials, "-o", car)
-    say("evidence that the network helps on this car")
-    pdhef("learn", work / "evidence", *told, "--stages", "gain", "--any-split", "-o", car)
-    if given.seed == 0:
-        say("calibrate the intervals: for a car that is nearly as its file says, and for one that may have changed")
-        for spread, place in ((USUAL_SPREAD, car), (UNSURE_SPREAD, work / "unsure")):
-            pdhef("learn", *validation, "--stages", "intervals", "--vary", spread, "-o", place)
-        shutil.copyfile(work / "unsure" / INTERVALS_FILE, car / UNSURE_FILE)
-    say(f"done: {car}")
+    for name, step in STEPS.items():
+        if name in given.steps and not (given.seed and name in ONLY_OF_SEED_0):
+            print(f"[{(time.monotonic() - began) / 60.0:5.1f} min] {name}: {step.__doc__}", flush=True)
+            step(training)
     return 0
 
 

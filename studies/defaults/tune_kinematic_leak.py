@@ -1,4 +1,4 @@
-"""Tune the leak of the ``kinematic`` baseline by sideslip RMSE against the perfect truth of simulated drives.
+"""Tune the leak of the ``kinematic`` baseline by sideslip RMSE against the exact ground truth of simulated drives.
 
     python -m studies.defaults.tune_kinematic_leak
 
@@ -18,7 +18,7 @@ GRID_S = (0.2, 0.3, 0.4, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 14.0
 
 
 def rmse_by_manoeuvre(drives: list[TuningDrive], leak_s: float | None) -> dict[str, float]:
-    """Return the median RMSE of every manoeuvre in degrees; None stands for no sideslip at all."""
+    """Return the median RMSE of every manoeuvre in degrees; None: no sideslip."""
     estimator = None if leak_s is None else Kinematic(leak_s=leak_s)
     values: dict[str, list[float]] = {}
     for drive in drives:

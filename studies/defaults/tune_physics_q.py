@@ -1,4 +1,4 @@
-"""Find the process noise of a filter on physics by innovation likelihood, without any truth.
+"""Find the process noise of a filter on physics by innovation likelihood, without ground truth.
 
     python -m studies.defaults.tune_physics_q {phy-ukf,physics}
 
@@ -89,7 +89,7 @@ def log_likelihood(drives: list[TuningDrive], build: Build, q_std: Q) -> float:
 def search(score: Callable[[Q], float], start: Q, given: dict[str, float]) -> dict[str, Any]:
     """Run one Nelder-Mead on the logarithms, print and return what it found.
 
-    The values are rounded to two significant digits: the likelihood knows no more.
+    The values are rounded to two significant digits: the likelihood is no more precise.
     """
     low, high = np.log(LOWEST), np.log(HIGHEST)
 
@@ -98,9 +98,9 @@ def search(score: Callable[[Q], float], start: Q, given: dict[str, float]) -> di
         return -score(tuple(np.exp(inside).tolist())) + float(np.abs(log_q - inside).sum())
 
     simplex = np.log(start) + np.vstack([np.zeros(len(start)), 0.7 * np.eye(len(start))])
-    found = minimize(cost, np.log(start), method="Nelder-Mead", options={"initial_simplex": simplex, **given})
-    q_std = [float(f"{v:.2g}") for v in np.exp(found.x)]
-    value, evaluations = -float(found.fun), int(found.nfev)
+    result = minimize(cost, np.log(start), method="Nelder-Mead", options={"initial_simplex": simplex, **given})
+    q_std = [float(f"{v:.2g}") for v in np.exp(result.x)]
+    value, evaluations = -float(result.fun), int(result.nfev)
     print(f"{start} -> {q_std}   {value:.5f}   {evaluations}", flush=True)
     return {"start": list(start), "q_std": q_std, "log_likelihood": value, "evaluations": evaluations}
 
@@ -117,8 +117,8 @@ def main() -> None:
     def run(start: Q) -> dict[str, Any]:
         return search(lambda q: log_likelihood(drives, chosen.build, q), start, chosen.options)
 
-    def reached(found: dict[str, Any]) -> float:
-        return float(found["log_likelihood"])
+    def reached(result: dict[str, Any]) -> float:
+        return float(result["log_likelihood"])
 
     runs = [run(start) for start in chosen.starts]
     gained = np.isfinite(chosen.worthwhile)

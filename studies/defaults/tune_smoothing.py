@@ -1,4 +1,4 @@
-"""Tune by what the process noise of v_y and yaw rate is multiplied where a car is smoothed, before truth says better.
+"""Tune the factors on the process noise of v_y and yaw rate for smoothing of cars without ground truth.
 
     python -m studies.defaults.tune_smoothing
 
@@ -35,25 +35,25 @@ RESULT = Path(__file__).parent / "results" / "smoothing.json"
 WORSE = 1.05
 
 
-def cases(own: list[Simulated]) -> Iterator[tuple[str, Car, Simulated]]:
+def cases(of_car: list[Simulated]) -> Iterator[tuple[str, Car, Simulated]]:
     """Yield how the car of some drives was taught, the car, and a drive that it is smoothed on."""
-    for one in own:
-        file = make_wrong(one.file, *one.factors)
-        found = calibrate(one.drive.signals, file)
-        if not found.refused:
-            yield "self-calibrated", taken(one.drive.signals, file, found).calibrated_car, one
-    fits = fit_drives(own)
+    for simulated in of_car:
+        file = make_wrong(simulated.file, *simulated.factors)
+        calibration = calibrate(simulated.drive.signals, file)
+        if not calibration.refused:
+            yield "self-calibrated", taken(simulated.drive.signals, file, calibration).calibrated_car, simulated
+    fits = fit_drives(of_car)
     for fit in fits:
         car = identified(fit)
-        yield from (("identified", car, one) for one in own if one not in fits)
+        yield from (("identified", car, simulated) for simulated in of_car if simulated not in fits)
 
 
-def ratios(car: Car, one: Simulated) -> list[float]:
+def ratios(car: Car, simulated: Simulated) -> list[float]:
     """Return the smoothed RMSE over the filter's by pair of factors."""
     physics = of_car(car)
 
     def rmse(estimator: Estimator) -> float:
-        return root_mean_square(one.error(run_window(estimator, one.drive.signals)[0]))
+        return root_mean_square(simulated.error(run_window(estimator, simulated.drive.signals)[0]))
 
     filtered = rmse(AdaptivePhysics(physics))
     return [rmse(SmoothedPhysics(AdaptivePhysics(for_smoothing(physics, p)))) / filtered for p in PAIRS]
@@ -63,14 +63,16 @@ def main() -> None:
     """Try all pairs on all cases, print what comes of each, write the result."""
     options("defaults.tune_smoothing", __doc__).parse_args()
     drives = simulate(CARS, SEED, DRIVEN)
-    found: dict[str, list[list[float]]] = {}
+    ratios_by_kind: dict[str, list[list[float]]] = {}
     for car in range(CARS):
-        for taught, of, one in cases([d for d in drives if d.car == car]):
-            found.setdefault(taught, []).append(ratios(of, one))
+        for taught, of, simulated in cases([d for d in drives if d.car == car]):
+            ratios_by_kind.setdefault(taught, []).append(ratios(of, simulated))
     rows = []
     for i, (vy, rate) in enumerate(PAIRS):
-        means = {taught: float(np.exp(np.mean(np.log(some), axis=0)[i])) for taught, some in found.items()}
-        worse = {f"{taught}_worse": float(np.mean(np.array(some)[:, i] > WORSE)) for taught, some in found.items()}
+        means = {taught: float(np.exp(np.mean(np.log(some), axis=0)[i])) for taught, some in ratios_by_kind.items()}
+        worse = {
+            f"{taught}_worse": float(np.mean(np.array(some)[:, i] > WORSE)) for taught, some in ratios_by_kind.items()
+        }
         both = float(np.sqrt(np.prod(list(means.values()))))
         figures = {k: round(v, 4) for k, v in {"both": both, **means, **worse}.items()}
         rows.append({"vy_factor": vy, "yaw_rate_factor": rate, **figures})
@@ -81,7 +83,7 @@ def main() -> None:
         "made_by": "python -m studies.defaults.tune_smoothing",
         "criterion": "geometric mean over drives of the smoothed sideslip RMSE over the filter's, both kinds alike",
         "seed": SEED,
-        "drives": {taught: len(some) for taught, some in found.items()},
+        "drives": {taught: len(some) for taught, some in ratios_by_kind.items()},
         "chosen": best,
         "grid": rows,
     }

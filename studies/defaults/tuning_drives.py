@@ -1,7 +1,7 @@
 """Simulated drives on which the fixed baselines are tuned, and what those who tune on them share.
 
-A drive is aligned signals as from a log, and the perfect truth. None of their seeds is used for a sample log or for an
-evaluation drive. Results are written to ``studies/defaults/results``.
+A drive consists of aligned signals, as from a log, and the exact ground truth. No sample log or evaluation drive has
+one of their seeds. Results are written to ``studies/defaults/results``.
 """
 
 from __future__ import annotations
@@ -63,8 +63,10 @@ def tuning_drives() -> list[TuningDrive]:
             continue
         vehicle = nominal.model_copy(update={"friction": friction})
         signals = as_logged(drive, Car.of(vehicle)).signals
-        at = (signals.stamps_ns - drive.start_ns) * 1e-9
-        vx, vy = (np.interp(at, drive.times_s, drive.truth[k], left=np.nan, right=np.nan) for k in ("vx_m_s", "vy_m_s"))
+        time_s = (signals.stamps_ns - drive.start_ns) * 1e-9
+        vx, vy = (
+            np.interp(time_s, drive.times_s, drive.truth[k], left=np.nan, right=np.nan) for k in ("vx_m_s", "vy_m_s")
+        )
         moving = np.hypot(vx, vy) > vehicle.low_speed_blend_m_s
         sideslip = np.where(moving, np.arctan2(vy, vx), np.nan)
         drives.append(TuningDrive(manoeuvre, drive.command, vehicle, signals, sideslip))
@@ -72,7 +74,7 @@ def tuning_drives() -> list[TuningDrive]:
 
 
 def sideslip_rmse_deg(drive: TuningDrive, estimator: Estimator | None) -> float:
-    """Return the sideslip RMSE of a drive in degrees; None stands for no sideslip at all."""
+    """Return the sideslip RMSE of a drive in degrees; None: no sideslip."""
     error = drive.sideslip_rad
     if estimator is not None:
         track, _ = run_window(estimator, drive.signals)
@@ -80,9 +82,9 @@ def sideslip_rmse_deg(drive: TuningDrive, estimator: Estimator | None) -> float:
     return float(np.rad2deg(np.sqrt(np.nanmean(error**2))))
 
 
-def write_result(name: str, drives: list[TuningDrive], **found: Any) -> None:
+def write_result(name: str, drives: list[TuningDrive], **figures: Any) -> None:
     """Write ``results/NAME.json`` with the drives that it comes from."""
-    document = {**found, "first_seed": FIRST_SEED, "drives": [d.command for d in drives]}
+    document = {**figures, "first_seed": FIRST_SEED, "drives": [d.command for d in drives]}
     path = RESULTS / f"{name}.json"
     path.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     print(f"wrote {path.relative_to(ROOT)}")

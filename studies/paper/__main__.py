@@ -1,8 +1,8 @@
 """Run the paper's experiment and write ``docs/paper.md`` and its details in ``studies/results/paper``.
 
-    python -m studies.paper [--cars CAR ...] [-o DOCS] [--noise-seeds N]
+    python -m studies.paper [-o DOCS] [--noise-seeds N] [--render]
 
-Without ``--cars`` they are the shipped one (training seed 0), two more whose networks are of the same training with
+The cars are the shipped one (training seed 0), two more whose networks are of the same training with
 other seeds, and one that never saw a lane change or a sine sweep; what is not there yet is trained first
 (``python -m studies.defaults.train_default``).
 """
@@ -45,26 +45,32 @@ def default_cars() -> dict[int, Car]:
     return cars
 
 
-def named_cars(folders: list[str]) -> dict[int, Car]:
-    """Return cars by the training seed that their networks name, by their number where two name the same."""
-    cars = [Car.load(f) for f in folders]
-    seeds = [c.network.provenance.get("recipe", {}).get("seed", i) if c.network else i for i, c in enumerate(cars)]
-    return dict(zip(seeds if len(set(seeds)) == len(seeds) else range(len(seeds)), cars, strict=True))
+def render(results: Path, docs: Path) -> None:
+    """Write the page and its details from ``results.json`` and the figures of a folder."""
+    stored = json.loads((results / "results.json").read_text(encoding="utf-8"))
+    (docs / "paper").mkdir(parents=True, exist_ok=True)
+    for name in PAGE_FIGURES:
+        shutil.copyfile(results / name, docs / "paper" / name)
+    write(results / "details.md", write_details(stored, results))
+    write(docs / "paper.md", write_page(stored))
 
 
 def main() -> int:
     """Run what the command line asks for."""
     parser = options("paper", __doc__)
-    parser.add_argument("--cars", nargs="+", metavar="CAR", help="cars with networks, one a training seed")
     parser.add_argument("-o", "--output", type=Path, default=DOCS, metavar="DOCS", help="folder of paper.md")
     parser.add_argument("--results", type=Path, default=RESULTS / "paper", help="folder of the details")
     parser.add_argument("--noise-seeds", type=int, default=NOISE_SEEDS, metavar="N", help=f"{NOISE_SEEDS} by default")
+    parser.add_argument("--render", action="store_true", help="write the pages from stored results")
     arguments = parser.parse_args()
+    if arguments.render:
+        render(arguments.results, arguments.output)
+        return 0
     if arguments.noise_seeds < 1:
         parser.error("--noise-seeds needs at least one")
     try:
-        cars = named_cars(arguments.cars) if arguments.cars else default_cars()
-        withheld = None if arguments.cars else Withheld(counts(WORK), withheld_car(WORK, TRAINED / "car-withheld"))
+        cars = default_cars()
+        withheld = Withheld(counts(WORK), withheld_car(WORK, TRAINED / "car-withheld"))
         results = gather(
             cars,
             withheld=withheld,
@@ -74,19 +80,13 @@ def main() -> int:
     except PdhefError as error:
         print(error, file=sys.stderr)
         return 1
-    pictures = arguments.output / "paper"
-    for folder in (arguments.results, pictures):
-        folder.mkdir(parents=True, exist_ok=True)
-        for old in folder.glob("figure*.png"):  # one that is no longer drawn must not stay
-            old.unlink()
+    for old in arguments.results.glob("figure*.png"):  # of a former run
+        old.unlink()
+    arguments.results.mkdir(parents=True, exist_ok=True)
     draw(results, arguments.results)
-    for name in PAGE_FIGURES:
-        shutil.copyfile(arguments.results / name, pictures / name)
     text = json.dumps(document(results), indent=1, allow_nan=False)
-    details = write_details(results)
     write(arguments.results / "results.json", text + "\n")
-    write(arguments.results / "details.md", details)
-    write(arguments.output / "paper.md", write_page(details))
+    render(arguments.results, arguments.output)
     return 0
 
 

@@ -46,11 +46,6 @@ class Improvement:
         """Whether the whole interval lies above 0."""
         return bool(self.low > 0.0)
 
-    @property
-    def disproven(self) -> bool:
-        """Whether the whole interval lies below 0: the scheme is worse."""
-        return bool(self.high < 0.0)
-
 
 def _chosen(runs: Iterable[Run], scenario: str, scheme: str, figure: str) -> list[Run]:
     return [r for r in runs if r.scenario == scenario and r.scheme == scheme and figure in r.values]
@@ -66,11 +61,11 @@ def spread(experiment: Experiment, scenario: str, scheme: str, figure: str) -> S
 
 def _mean_squares(runs: list[Run], figure: str, training_seed: int | None = None) -> dict[int, float]:
     """Mean square error by noise seed, over the networks (or that of one network; schemes without take part as is)."""
-    found: dict[int, list[float]] = {}
+    squares_by_seed: dict[int, list[float]] = {}
     for run in runs:
         if training_seed is None or run.training_seed in (None, training_seed):
-            found.setdefault(run.noise_seed, []).append(run.values[figure] ** 2)
-    return {seed: float(np.mean(v)) for seed, v in found.items()}
+            squares_by_seed.setdefault(run.noise_seed, []).append(run.values[figure] ** 2)
+    return {seed: float(np.mean(v)) for seed, v in squares_by_seed.items()}
 
 
 def improvement(

@@ -2,7 +2,7 @@
 
 A drive is written as an MCAP file and read back by the tool's own path: recognised mapping, alignment, the estimators
 of the table on aligned signals, the metrics of :mod:`pdhef_logtool.evaluation.metrics`. Friction is known: the
-car is told that of the drive. Noise seeds change the sensors alone; training seeds change the network alone.
+car gets that of the drive. Noise seeds change the sensors alone; training seeds change the network alone.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ NOISE_SEEDS = 8
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """One manoeuvre of the paper at the catalogue's own speed and friction; ``faults`` as the command line has them."""
+    """One manoeuvre of the paper at its default speed and friction; ``faults`` as the command line has them."""
 
     name: str
     manoeuvre: str
@@ -136,12 +136,12 @@ FIGURES: dict[str, tuple[str, str, str, float]] = {
     "yaw_rate_lag_ms": ("yaw_rate_rad_s", "all", "lag_s", 1e3),
     "diverged": ("state", "all", "diverged", 1.0),
 }
-#: Largest |value| of the estimate over that of the truth, less 1: what the paper calls overshoot.
+#: Largest |value| of the estimate over that of the ground truth, minus 1: what the paper calls overshoot.
 OVERSHOOTS = {"sideslip_overshoot": "sideslip_rad", "ay_overshoot": "ay_m_s2"}
 
 
 def on_the_road(car: Car, friction: float) -> Car:
-    """Return a car that is told the friction of a drive."""
+    """Return a car with the friction of a drive."""
     return car.with_vehicle(car.vehicle.model_copy(update={"friction": friction}))
 
 
@@ -221,8 +221,8 @@ def run_experiment(
             first_drive = scenario.name not in drives
             drives.setdefault(scenario.name, drive)
             for seed, car in cars.items():
-                own = on_the_road(car, scenario.friction)
-                schemes, skipped = runnable(names, own, drive.whole.plan.alignment.available)
+                on_road = on_the_road(car, scenario.friction)
+                schemes, skipped = runnable(names, on_road, drive.whole.plan.alignment.available)
                 missing.update({s.name: s.reason for s in skipped})
                 for scheme in schemes:
                     by_network = bool(spec_of(scheme.name).network)

@@ -1,4 +1,4 @@
-"""The pictures of Figures 9 to 23 with our data, in the colours that estimators have everywhere."""
+"""The pictures of Figures 10 to 22 with our data, in the colours that estimators have everywhere."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ from pdhef_logtool.records.tracks import StateTrack
 from studies.paper import published
 from studies.paper.comparison import spread
 from studies.paper.experiment import BURST_S, GRAVITY_M_S2, A, B, Experiment
-from studies.paper.probes import RESIDUAL_ROWS, History, ResidualFit, TrustCurve
+from studies.paper.probes import RESIDUAL_ROWS, ResidualFit, TrustCurve
 from studies.paper.results import Results
 from studies.paper.schemes import DRAWN
-from studies.paper.step_time import StepTime
 from studies.pictures import STYLE, save, subplots
 
 COLOURS = {"truth": "#8c8c8c", **{s.name: f"#{s.colour:06x}" for s in SPECS}}
@@ -50,21 +49,6 @@ def _thin(name: str) -> dict[str, Any]:
 
 def _time_s(track: StateTrack) -> FloatArray:
     return np.asarray((track.stamps_ns - track.stamps_ns[0]) * 1e-9)
-
-
-def convergence(folder: Path, histories: Mapping[int, History]) -> None:
-    """Figure 9: loss over epochs, each training seed."""
-    fig, axes = subplots(1, 1, 7.4, 3.2, _STYLE)
-    ax = axes[0, 0]
-    for number, (seed, history) in enumerate(sorted(histories.items())):
-        shade = {"alpha": 1.0 if number == 0 else 0.45}
-        mark = {} if len(history.epoch) > 1 else {"marker": "o"}
-        ax.plot(history.epoch, history.train_loss, color="#0072B2", **shade, **mark, label=f"training, seed {seed}")
-        second = {"color": "#D55E00", "linestyle": DASHES["phy-ukf"], "label": f"validation, seed {seed}"}
-        ax.plot(history.epoch, history.validation_loss, **shade, **mark, **second)
-    ax.set(yscale="log", xlabel="epoch", ylabel="mean square error,\nshare of the residual's mean square")
-    ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    save(fig, folder / "figure09_convergence.png")
 
 
 def residuals(folder: Path, name: str, fit: ResidualFit, title: str) -> None:
@@ -121,8 +105,8 @@ def position(folder: Path, name: str, experiment: Experiment, scenario: str, sch
     axes[0, 0].plot(truth.x_m, truth.y_m, color=COLOURS["truth"], linewidth=3.0, label="truth")
     for scheme in schemes:
         track = experiment.tracks[scenario, scheme]
-        known = track.valid & np.isfinite(track.vx_m_s) & np.isfinite(track.vy_m_s) & np.isfinite(truth.x_m)
-        first = int(np.flatnonzero(known)[0])
+        finite = track.valid & np.isfinite(track.vx_m_s) & np.isfinite(track.vy_m_s) & np.isfinite(truth.x_m)
+        first = int(np.flatnonzero(finite)[0])
         start = (float(truth.x_m[first]), float(truth.y_m[first]), float(truth.yaw_rad[first]))
         part = slice(first, None)
         x, y, _ = dead_reckon(
@@ -213,29 +197,9 @@ def rmse_bars(folder: Path, experiment: Experiment, ran: Sequence[str], scenario
     save(fig, folder / "figure22_rmse.png")
 
 
-def step_time_bars(folder: Path, times: Mapping[str, StepTime]) -> None:
-    """Figure 23: processor time a step, beside the paper's and the 10 ms cycle."""
-    names = list(times)[::-1]
-    fig, axes = subplots(1, 1, 7.0, 0.9 + 0.26 * len(names), _STYLE)
-    ax = axes[0, 0]
-    for k, name in enumerate(names):
-        ax.barh(k, times[name].median_us, color=COLOURS[name], height=0.72)
-    for scheme, value in published.STEP_MS.items():
-        ax.axvline(1e3 * value, color=COLOURS[scheme], linestyle=":", linewidth=1.5, label=f"paper, {scheme}")
-    cycle = {"color": "#222222", "linestyle": "--", "linewidth": 1.2, "label": f"{published.CYCLE_MS:g} ms cycle"}
-    ax.axvline(1e3 * published.CYCLE_MS, **cycle)
-    ax.set(xscale="log", xlabel="processor time a step, µs (log scale)")
-    ax.set_yticks(range(len(names)), names)
-    ax.grid(axis="y", visible=False)
-    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.1)
-    save(fig, folder / "figure23_step_time.png")
-
-
 def draw(r: Results, folder: Path) -> None:
-    """Write the PNGs of Figures 9 to 23 into a folder, under the names that the page uses."""
+    """Write the PNGs of Figures 10 to 22 into a folder, under the names that the page uses."""
     schemes = [n for n in DRAWN if n in r.ran]
-    if r.histories:
-        convergence(folder, r.histories)
     seed = r.first_seed
     residuals(folder, "figure10_residual_fit", r.fits[A.name][0], f"scenario A, training seed {seed}")
     residuals(folder, "figure19_residual_verification", r.fits[B.name][0], f"scenario B, training seed {seed}")
@@ -248,4 +212,3 @@ def draw(r: Results, folder: Path) -> None:
     if any(r.curves.values()):
         trust(folder, {s: c for s, c in r.curves.items() if c})
     rmse_bars(folder, r.experiment, r.ran, (A.name, B.name))
-    step_time_bars(folder, r.times)

@@ -1,4 +1,4 @@
-"""What Figures 9, 10 and 19 to 21 look at: training history, residuals, adaptation of R, scheduling of β."""
+"""Quantities of Figures 10 and 19 to 21: residuals, adaptation of R, scheduling of the residual gain."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.evaluation.metrics.lag import lag_s
 from pdhef_logtool.learning.network.residuals import join_rows, residual_windows
-from pdhef_logtool.learning.network.train_command import HISTORY_FILE
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.service import NetworkService
 from studies.paper.experiment import GRAVITY_M_S2, Experiment, ReadDrive
@@ -20,34 +19,13 @@ RESIDUAL_ROWS = (("v_y", "m/s²"), ("yaw rate", "rad/s²"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class History:
-    """Losses by epoch."""
-
-    epoch: FloatArray
-    train_loss: FloatArray
-    validation_loss: FloatArray
-
-
-def read_history(car: Car) -> History | None:
-    """Return the training history of a car's network; None where it has none."""
-    import polars as pl
-
-    assert car.network_folder is not None
-    path = car.network_folder / HISTORY_FILE
-    if not path.is_file():
-        return None
-    table = pl.read_parquet(path)
-    return History(*(table[c].to_numpy().astype(np.float64) for c in ("epoch", "train_loss", "validation_loss")))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class ResidualFit:
     """Residual rates of a drive, rows as in ``RESIDUAL_ROWS``, at the samples that count.
 
     Attributes
     ----------
     time_s : [N]. target : [N, 2], what the nominal model misses at the true state with the measured steering.
-    output : [N, 2], what the network says. step_s : median step.
+    output : [N, 2], output of the network. step_s : median step.
     """
 
     time_s: FloatArray
@@ -102,7 +80,7 @@ class TrustCurve:
 
 
 def trust_curve(experiment: Experiment, scenario: str, scheme: str, bins: int = 12) -> TrustCurve | None:
-    """Return β of a scheme over the true |a_y|; None where the scheme did not run or has one trust throughout."""
+    """Return β of a scheme over the true |a_y|; None where the scheme did not run or has a constant gain."""
     track = experiment.tracks.get((scenario, scheme))
     if track is None:
         return None

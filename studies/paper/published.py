@@ -1,4 +1,4 @@
-"""What the paper says, with its section; the only figures in the page that are not computed here."""
+"""Published values, with their section; the only figures in the page that are not computed here."""
 
 from __future__ import annotations
 
@@ -14,22 +14,13 @@ RMSE = {
 PHY_RMSE = {("A", "yaw_rate_rad_s"): 0.068, ("A", "position_m"): 0.025, ("B", "sideslip_deg"): 0.26}
 #: "reduces the root mean square error by over 60 % compared to traditional observers" (abstract).
 IMPROVEMENT = 0.60
-#: "position ... 0.008 m (reduced by 60 %)" (section 5.5.1).
-POSITION_IMPROVEMENT = 0.60
 #: Milliseconds a step (section 5.5.2): Phy-UKF from "increased by about 2.1 ms".
 STEP_MS = {"phy-ukf": 1.9, "pd-hef": 4.0}
-CYCLE_MS = 10.0
 #: β from the linear region to the limit (section 5.4.3).
 TRUST = (0.1, 0.9)
-#: Table 2: large I_dyn, small E_ay.
-TRUST_BY_INTENSITY = 0.5
 #: Norm of R before and in the disturbance (section 5.4.2).
 R_NORM = (0.1, 3.5)
 #: Network output in rad/s (section 5.4.1).
 NETWORK_OUTPUT_RAD_S = (-0.03, 0.04)
-#: Losses of Figure 9 (section 5.2): training within about 150 epochs, validation.
-TRAIN_LOSS, TRAIN_LOSS_EPOCHS, VALIDATION_LOSS = 1e-3, 150, 0.05
-#: Open-loop offset of a_y in the sweep: "exceeding 80 %" (section 5.3).
-OPEN_LOOP_AY_OFFSET = 0.80
 #: Peak |a_y| of the double lane change (section 5.3.1), and its speed.
 DLC_PEAK_G, DLC_SPEED_KM_H = 0.7, 100.0

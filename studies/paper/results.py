@@ -25,12 +25,10 @@ from studies.paper.experiment import (
     run_experiment,
 )
 from studies.paper.probes import (
-    History,
     Inflation,
     ResidualFit,
     TrustCurve,
     inflation,
-    read_history,
     residual_fit,
     trust_curve,
 )
@@ -40,9 +38,9 @@ from studies.paper.withheld import Withheld
 from truthsim.suite import is_held_out
 
 SCENARIOS: tuple[Scenario, ...] = (A, B, BURST)
-#: Schemes whose trust or factor on R may move.
+#: Schemes with a variable gain or factor on R.
 ADAPTIVE = ("pd-hef-paper", "pd-hef")
-#: What improvements are about where nothing else is said.
+#: What improvements are about by default.
 FIGURE = "sideslip_deg"
 BASELINES = ("phy-ukf", "phy-ukf:tuned", "physics", "linear-regression", "pure-lstm", "pd-hef-paper")
 
@@ -54,14 +52,13 @@ class Results:
     Attributes
     ----------
     ran : schemes in the order of the tables.
-    cars, histories : by training seed. fits : residual fits by scenario, one a car.
+    cars : by training seed. fits : residual fits by scenario, one a car.
     curves : β over |a_y| by scenario and scheme. inflations : of R by scheme.
     without : A and B with the network that had no lane change and no sweep, None where there is none.
     """
 
     experiment: Experiment
     cars: Mapping[int, Car]
-    histories: Mapping[int, History]
     fits: Mapping[str, tuple[ResidualFit, ...]]
     curves: Mapping[str, Mapping[str, TrustCurve]]
     inflations: Mapping[str, Inflation]
@@ -113,7 +110,6 @@ def gather(
     cars : by the training seed of their networks; the first is the one that the pictures show.
     """
     experiment = run_experiment(cars, scenarios=SCENARIOS, noise_seeds=noise_seeds, progress=progress)
-    histories = {seed: h for seed, car in cars.items() if (h := read_history(car)) is not None}
     fits = {s.name: tuple(residual_fit(experiment.drives[s.name], c) for c in cars.values()) for s in (A, B)}
     curves = {s.name: {n: c for n in ADAPTIVE if (c := trust_curve(experiment, s.name, n)) is not None} for s in (A, B)}
     inflations = {n: i for n in ADAPTIVE if (i := inflation(experiment, n, BURST_S)) is not None}
@@ -125,7 +121,19 @@ def gather(
         progress("the network without lane changes and sweeps")
         seeds = {0: withheld.car}
         without = run_experiment(seeds, scenarios=(A, B), noise_seeds=noise_seeds, names=(HYBRID,))
-    return Results(experiment, cars, histories, fits, curves, inflations, times, withheld, without)
+    return Results(experiment, cars, fits, curves, inflations, times, withheld, without)
+
+
+def _withheld(r: Results) -> dict[str, Any] | None:
+    """Return the training drives, and gain limit and errors of the network that lacked some manoeuvres."""
+    if r.withheld is None or r.without is None:
+        return None
+    errors = {s.name: spread(r.without, s.name, HYBRID, FIGURE) for s in (A, B)}
+    return {
+        "drives": dict(r.withheld.drives),
+        "gain_limit": r.withheld.car.allowed_trust.cap,
+        "sideslip_deg": {name: None if s is None else asdict(s) for name, s in errors.items()},
+    }
 
 
 def _plain(value: Any) -> Any:
@@ -198,7 +206,7 @@ def document(results: Results) -> dict[str, Any]:
                 }
                 for s in SCENARIOS
             ],
-            "friction": "known: the vehicle file is told the friction of each drive",
+            "friction": "given: the vehicle file contains the friction of each drive",
             "vehicle": {"name": car.vehicle.name, "sha256": car.physics_sha256},
             "models": [
                 {"training_seed": seed, "sha256": n.sha256, "provenance": n.provenance}
@@ -209,6 +217,7 @@ def document(results: Results) -> dict[str, Any]:
             "network_schemes": sorted(n for n in r.ran if spec_of(n).network),
             "summary": summary,
             "improvements": gains,
+            "withheld": _withheld(r),
             "residuals": residuals,
             "trust": trust,
             "r_factor": {name: asdict(i) for name, i in r.inflations.items()},

@@ -14,7 +14,7 @@ SCHEMES: dict[str, str] = {
     "physics": "all parts that five other minutes of driving gave evidence for",
     "pure-lstm": "network alone, same inputs",
     "pd-hef-paper": "the paper's filter and adaptation, to the letter",
-    "pd-hef:fixed-r": "our hybrid filter, full trust, fixed R",
+    "pd-hef:fixed-r": "our hybrid filter, gain 1, fixed R",
     "pd-hef": "our hybrid filter with its adaptive mechanism",
 }
 

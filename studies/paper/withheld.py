@@ -39,7 +39,7 @@ def counts(work: Path) -> Counter[str]:
 
 
 def train_withheld(work: Path, output: Path) -> None:
-    """Train the shipped network's like without :data:`WITHHELD`, and find its trust on the drives of the shipped one's.
+    """Train a network without :data:`WITHHELD`, and determine its gain limit on the drives of the shipped network.
 
     Physics and noise are the shipped car's.
     """
@@ -50,8 +50,8 @@ def train_withheld(work: Path, output: Path) -> None:
     kept = tuple(d for d in data.drives if of[d.name] not in WITHHELD)
     network = output / NETWORK_FOLDER
     train_on(replace(data, drives=kept), network, Recipe(seed=0, epochs=EPOCHS))
-    told = ["--car", output, "--mapping", work / "mapping.toml", "--network", network]
-    pdhef("learn", work / "evidence", *told, "--stages", "gain", "--any-split", "-o", output)
+    of_car = ["--car", output, "--mapping", work / "mapping.toml", "--network", network]
+    pdhef("learn", work / "evidence", *of_car, "--stages", "gain", "--any-split", "-o", output)
 
 
 def withheld_car(work: Path, output: Path) -> Car:

@@ -2,8 +2,8 @@
 
     python -m studies.strangers [--only NAME ...] [--held-out] [--work out/strangers] [--out docs/third_party_logs.md]
 
-``--only`` takes parts of names, prints what the tool says of these logs, and writes no page. ``--held-out`` adds the
-layouts that were built last. Exit code 1: something is wrong and the tool did not say so.
+``--only`` takes parts of names, prints the messages of the tool for these logs, and writes no page. ``--held-out`` adds
+the layouts that were built last. Exit code 1: something is wrong and not reported.
 """
 
 from __future__ import annotations
@@ -19,12 +19,11 @@ from pathlib import Path
 from studies.pages import DOCS, RESULTS, ROOT, options, write
 from studies.strangers.answers import SHARED, answered_files, load_answers
 from studies.strangers.containers import write as write_log
-from studies.strangers.faults import faults
 from studies.strangers.layouts import layouts
+from studies.strangers.mountings import mountings
 from studies.strangers.page import OUTCOMES, Result, merged, page
 from studies.strangers.recordings import ITEMS, Recording
 from studies.strangers.scoring import Score, look, score_log
-from studies.strangers.vehicles import vehicle_layouts
 
 #: What layouts held out gave when they were run for the first time: those now held out, and those that were before.
 FIRST_RUN = RESULTS / "third_party_logs" / "held_out_first_run.json"
@@ -38,7 +37,7 @@ def result_of(score: Score, name: str, group: str, what: str, page_url: str = ""
     verdicts: dict[str, str] = {}
     doubted: list[str] = []
     for f in score.findings:
-        items[f.item] = f.verdict if f.verdict != "wrong" else "wrong, told" if f.told else "wrong, not told"
+        items[f.item] = f.verdict if f.verdict != "wrong" else "wrong, reported" if f.told else "wrong, not reported"
         if f.verdict == "wrong":
             wrong[f.item] = f.what
         if f.verdict == "right":
@@ -102,31 +101,28 @@ def first_run() -> str:
     """Return the figures of the first runs of layouts held out, where they are over."""
     said = ""
     for file, what in (
-        (FIRST_RUN, "layouts held out were built last"),
-        (FIRST_RUN_BEFORE, "layouts of vehicles, simulators and data sets were held out before them"),
+        (FIRST_RUN, "held-out layouts were built last"),
+        (FIRST_RUN_BEFORE, "layouts of vehicles, simulators and data sets were held out earlier"),
     ):
         if file.is_file():
             logs = json.loads(file.read_text(encoding="utf-8"))
             ends = Counter(outcome for log in logs.values() for outcome in log["items"].values())
             rest = ", ".join(f"{ends[outcome]} {outcome.replace(', ', ' and ')}" for outcome in OUTCOMES[:3])
             said += (
-                f"The {len(logs)} {what}. Run for the first time, {ends['right']} of their {ends.total()} items were "
+                f"The {len(logs)} {what}. In their first run, {ends['right']} of {ends.total()} items were "
                 f"right ({100.0 * ends['right'] / ends.total():.0f} %); {rest}.\n\n"
             )
-    return (
-        said
-        and f"{said}What the tables say of these layouts is a later run, after the causes of the first were mended.\n\n"
-    )
+    return said and f"{said}The tables contain a later run, after corrections of the causes.\n\n"
 
 
 def others_without_answers() -> str:
-    """Look through the recordings of ``reader_corpus`` that hold nothing of a car, and say what is mapped in them."""
+    """Return what is mapped in the recordings of ``reader_corpus`` without vehicle signals."""
     catalogue = SHARED / "reader_corpus" / "CATALOG.json"
     if not catalogue.is_file():
         return ""
     answered = answered_files()
     channels = {name for names in ITEMS.values() for name in names}
-    found, count = [], 0
+    mapped_files, count = [], 0
     for entry in json.loads(catalogue.read_text(encoding="utf-8")):
         file = f"reader_corpus/{entry['file']}"
         if entry["expected"] != "ok" or file in answered or "/conformance/" in file:
@@ -136,20 +132,15 @@ def others_without_answers() -> str:
         taken = {name: len(c) for name, c in mapped.items() if name in channels}
         if taken:
             most = max(taken.values())
-            found.append(f"`{entry['file']}` ({', '.join(sorted(taken))}; {most} samples at most)")
-    text = f"{count} further recordings of `reader_corpus` hold nothing of a car. "
-    return text + (f"Something is mapped in {'; '.join(found)}.\n" if found else "Nothing is mapped in them.\n")
+            mapped_files.append(f"`{entry['file']}` ({', '.join(sorted(taken))}; {most} samples at most)")
+    text = f"{count} further recordings of `reader_corpus` contain no vehicle signals. "
+    return text + (
+        f"Channels are mapped in {'; '.join(mapped_files)}.\n" if mapped_files else "No channel is mapped in them.\n"
+    )
 
 
 def _wanted(name: str, only: Sequence[str]) -> bool:
     return not only or any(part in name for part in only)
-
-
-def held_out() -> Iterator[Recording]:
-    """Yield the layouts that were built last; none as long as there are none."""
-    from studies.strangers.held_out import held_out_layouts
-
-    return held_out_layouts()
 
 
 def main() -> int:
@@ -162,7 +153,7 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, help="write the results as JSON, to compare with later")
     given = parser.parse_args()
     given.work.mkdir(parents=True, exist_ok=True)
-    made = chain(faults(), layouts(), vehicle_layouts(), held_out() if given.held_out else ())
+    made = chain(mountings(), layouts("fault", "layout"), layouts("held-out") if given.held_out else ())
     recordings = [r for r in made if _wanted(r.name, given.only)]
     kinds: dict[str, list[Result]] = {}
     for kind, result in chain(score_own(recordings, given.work), score_others(given.only)):
@@ -172,11 +163,11 @@ def main() -> int:
         for result in chain.from_iterable(kinds.values()):
             _show(result)
     else:
-        remark = first_run() + ("" if given.held_out else "The layouts held out were not run now.\n\n")
+        remark = first_run() + ("" if given.held_out else "Without the held-out layouts.\n\n")
         write(given.out, page(results, remark + others_without_answers()))
     if given.keep:
         write(given.keep, json.dumps({r.name: r.as_json() for r in results}, indent=1, sort_keys=True) + "\n")
-    return 1 if any(r.count("wrong, not told") for r in results) else 0
+    return 1 if any(r.count("wrong, not reported") for r in results) else 0
 
 
 def _show(result: Result) -> None:

@@ -55,12 +55,12 @@ def _tables() -> dict[str, dict[str, Any]]:
 
 
 def _sources(table: dict[str, Any]) -> dict[str, tuple[SignalSource, ...]]:
-    found = {}
+    sources_by_name = {}
     for name, given in table.items():
         if name not in ("allowed", "at_fault"):
             texts = given if isinstance(given, list) else [given]
-            found[name] = tuple(_source(name.removeprefix("truth."), text) for text in texts)
-    return found
+            sources_by_name[name] = tuple(_source(name.removeprefix("truth."), text) for text in texts)
+    return sources_by_name
 
 
 def _source(name: str, text: str) -> SignalSource:
@@ -72,11 +72,11 @@ def _source(name: str, text: str) -> SignalSource:
 
 
 def _read(path: Path, sources: dict[str, tuple[SignalSource, ...]]) -> dict[str, tuple[Series, ...]]:
-    found: dict[str, tuple[Series, ...]] = {}
+    sources_by_name: dict[str, tuple[Series, ...]] = {}
     for turn in range(max((len(s) for s in sources.values()), default=0)):
         here = {n: s[turn] for n, s in sources.items() if turn < len(s)}
         truth = {n.removeprefix("truth."): s for n, s in here.items() if n.startswith("truth.")}
         signals = {n: s for n, s in here.items() if not n.startswith("truth.")}
         for name, series in read_answers(path, SignalMapping(signals=signals, truth=truth)).items():
-            found[name] = (*found.get(name, ()), *series)
-    return found
+            sources_by_name[name] = (*sources_by_name.get(name, ()), *series)
+    return sources_by_name

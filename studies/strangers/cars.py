@@ -39,10 +39,10 @@ class Series:
         return Series(self.stamps_ns[::n], self.arrival_ns[::n], self.values[::n])
 
     def along(self, clock: Series) -> Series:
-        """Return it at another series' times: one message that holds several sensors."""
-        at, have = clock.stamps_ns * 1e-9, self.stamps_ns * 1e-9
+        """Return it at another series' times: one message with several sensors."""
+        clock_s, have = clock.stamps_ns * 1e-9, self.stamps_ns * 1e-9
         columns = self.values if self.values.ndim == 2 else self.values[:, None]
-        read = np.stack([np.interp(at - at[0], have - at[0], column) for column in columns.T], axis=1)
+        read = np.stack([np.interp(clock_s - clock_s[0], have - clock_s[0], column) for column in columns.T], axis=1)
         return Series(clock.stamps_ns, clock.arrival_ns, read if self.values.ndim == 2 else read[:, 0])
 
 

@@ -9,12 +9,12 @@ from typing import Any
 from studies.pages import table
 
 #: What can become of an item, the worst first.
-OUTCOMES = ("wrong, not told", "wrong, told", "missing", "right")
+OUTCOMES = ("wrong, not reported", "wrong, reported", "missing", "right")
 GROUPS = {
-    "fault": "something wrong or missing",
-    "layout": "layouts of others",
-    "held-out": "layouts held out",
-    "recording": "recordings of others",
+    "fault": "logs with a fault",
+    "layout": "published layouts",
+    "held-out": "held-out layouts",
+    "recording": "third-party recordings",
 }
 #: Groups whose logs are sound and excited, so that checks may neither fail nor stay undecided.
 SOUND = ("layout", "held-out")
@@ -27,8 +27,8 @@ Command: `make strangers`; `python -m studies.strangers --only NAME` shows one l
 **Scoring.** The expected values of each log are series in SI units and ISO 8855 axes. A mapped channel is right if
 its values agree (means of 0.25 s, within 4 % or the floor of the unit; accelerations up to a bias of 0.3 m/s²); field
 names do not count. Items: steering, a_x, a_y, yaw rate, speed, wheel speeds, and velocity and yaw rate of the ground
-truth. *Told* means that a failed or undecided check, or a doubt, names the wrong channel. Logs of one kind count as
-one, with the worst result of each item: the 24 mountings in steps of 90 degrees are one log. A cause counts as named
+truth. *Reported* means that a failed or undecided check, or a remark, names the wrong channel. Logs of one kind count
+as one, with the worst result of each item: the 24 mountings in steps of 90 degrees are one log. A cause counts as named
 if a message contains a word of it. Layouts have the fields, units and axes of their published definitions, without
 device status. The motion is that of truthsim: drives of three cars with noise, bias and delay of its usual sensors.
 """
@@ -41,9 +41,9 @@ class Result:
     Attributes
     ----------
     items : outcome by item, one of :data:`OUTCOMES`. wrong : what was taken in a wrong item's place.
-    silent : the wrong ones that nothing was said of, with their sources. doubted : right ones that a sentence doubts.
-    verdicts : by right item the worst that its checks say: ``failed``, ``undecided``, ``passed``, or ``none``.
-    alarms : failed checks on right channels that are not at fault. named : whether a planted cause is said.
+    silent : the wrong ones that are not reported, with their sources. doubted : right ones that a sentence doubts.
+    verdicts : by right item the worst verdict of its checks: ``failed``, ``undecided``, ``passed``, or ``none``.
+    alarms : failed checks on right channels that are not at fault. named : whether the cause is named.
     """
 
     name: str
@@ -101,9 +101,9 @@ def page(results: Sequence[Result], remark: str) -> str:
     ----------
     results : one a kind. remark : text below the score.
     """
-    own = [r for r in results if r.group in ("fault", "layout", "held-out")]
+    generated = [r for r in results if r.group in ("fault", "layout", "held-out")]
     others = [r for r in results if r.group == "recording"]
-    counts = f"{len(own)} of our own making and {len(others)} recordings of other people"
+    counts = f"{len(generated)} generated logs and {len(others)} third-party recordings"
     parts = [
         _INTRO.replace("<!-- counts -->", counts),
         "## Score\n",
@@ -115,7 +115,7 @@ def page(results: Sequence[Result], remark: str) -> str:
         rows = [r for r in results if r.group == group]
         if rows:
             parts += [f"## {title[0].upper()}{title[1:]}\n", _logs(rows)]
-    parts += ["## What is wrong, by name\n", _wrong(results)]
+    parts += ["## Wrong and questionable results\n", _wrong(results)]
     return "\n".join(parts).rstrip() + "\n"
 
 
@@ -126,8 +126,8 @@ def _score(results: Sequence[Result]) -> str:
         if here:
             rows.append(_score_row(title, here))
     total = [r for r in results if r.group != "held-out"]
-    rows.append(_score_row("all but those held out", total))
-    head = ["logs", "count", "items", "right", "missing", "wrong, told", "wrong, not told", "causes named"]
+    rows.append(_score_row("all except held-out layouts", total))
+    head = ["logs", "count", "items", "right", "missing", "wrong, reported", "wrong, not reported", "causes named"]
     return table(head, rows, right_from=1) + "\n"
 
 
@@ -144,8 +144,8 @@ def _score_row(title: str, rows: Sequence[Result]) -> list[str]:
         str(items),
         share(_sum(rows, "right"), items),
         str(_sum(rows, "missing")),
-        str(_sum(rows, "wrong, told")),
-        str(_sum(rows, "wrong, not told")),
+        str(_sum(rows, "wrong, reported")),
+        str(_sum(rows, "wrong, not reported")),
         f"{sum(planted)} of {len(planted)}" if planted else "–",
     ]
 
@@ -160,9 +160,9 @@ def _remarks(results: Sequence[Result]) -> str:
     counts = {verdict: right.count(verdict) for verdict in ("passed", "undecided", "failed", "none")}
     doubted = sum(len(r.doubted) for r in sound)
     return (
-        f"On sound and excited logs (the layouts) {len(right)} items are right. Of their checks all passed on "
-        f"{counts['passed']}, some stayed undecided on {counts['undecided']}, some failed on {counts['failed']}; "
-        f"{counts['none']} have no check. A sentence doubts {doubted} of the right ones.\n"
+        f"In the logs of published layouts (no fault, sufficient excitation) {len(right)} items are right. Checks of "
+        f"these items: all passed for {counts['passed']}, some undecided for {counts['undecided']}, some failed for "
+        f"{counts['failed']}, no check for {counts['none']}. A remark questions {doubted} of them.\n"
     )
 
 
@@ -173,16 +173,16 @@ def _logs(rows: Sequence[Result]) -> str:
         what = f"[{r.what}]({r.page})" if r.page else r.what
         return [r.name, what, f"{r.count('right')} of {r.present}", "; ".join(other), named]
 
-    return table(["log", "what", "right", "else", "cause named"], map(cells, rows)) + "\n"
+    return table(["log", "content", "right", "other", "cause named"], map(cells, rows)) + "\n"
 
 
 def _wrong(results: Sequence[Result]) -> str:
     lines = []
     checks: list[tuple[str, Callable[[Result], Iterable[str]]]] = [
-        ("wrong, not told", lambda r: r.silent),
-        ("failed check on what is right", lambda r: r.alarms),
+        ("wrong, not reported", lambda r: r.silent),
+        ("failed check on a right channel", lambda r: r.alarms),
         (
-            "undecided though right, sound and excited",
+            "undecided check on a right channel",
             lambda r: (i for i, v in r.verdicts.items() if v == "undecided" and r.group in SOUND),
         ),
         ("cause not named", lambda r: ("",) if r.named is False else ()),
@@ -190,4 +190,4 @@ def _wrong(results: Sequence[Result]) -> str:
     for title, of in checks:
         for r in results:
             lines += [f"- {r.name}: {title}{': ' + what if what else ''}" for what in of(r)]
-    return "\n".join(lines) + "\n" if lines else "Nothing.\n"
+    return "\n".join(lines) + "\n" if lines else "None.\n"

@@ -28,14 +28,14 @@ ITEMS: dict[str, tuple[str, ...]] = {
     "yaw rate": ("yaw_rate_rad_s",),
     "speed": ("speed_m_s",),
     "wheel speeds": tuple(f"wheel_speed_{w}_{unit}" for unit in ("m_s", "rad_s") for w in WHEELS),
-    "truth: velocity": (
+    "ground truth: velocity": (
         "truth.vx_m_s",
         "truth.vy_m_s",
         "truth.sideslip_rad",
         "truth.enu_velocity_m_s",
         "truth.ecef_velocity_m_s",
     ),
-    "truth: yaw rate": ("truth.yaw_rate_rad_s",),
+    "ground truth: yaw rate": ("truth.yaw_rate_rad_s",),
 }
 
 
@@ -48,9 +48,9 @@ class Recording:
     name : of the log; logs of one ``kind`` count as one.
     group : ``fault``, ``layout`` or ``held-out`` (built last, run once).
     what : one line for a person.
-    right : by channel (``truth.`` before those of the truth) what it must be, any of the series.
-    allowed : channels that may be mapped, and are not missed: an INS whose figures are no truth, a second source.
-    cause : pattern of what a message must say; empty where nothing is wrong.
+    right : by channel (``truth.`` before ground truth) what it must be, any of the series.
+    allowed : channels that may be mapped, and are not missed: an INS that is no ground truth, a second source.
+    cause : pattern of a message that names the cause; empty where nothing is wrong.
     at_fault : channels with the fault; of all others no check may fail.
     page : where the layout is documented.
     """
@@ -88,7 +88,7 @@ def answers(car: Car, *parts: str) -> dict[str, tuple[Series, ...]]:
     yaw_rates = (car.rate[2], car.yaw_rate)
     # All that goes for the speed: rims, the body's forward velocity, the speed over ground.
     speeds = (car.speed, car.body_velocity[0], car.ground_speed)
-    known: dict[str, dict[str, tuple[Series, ...]]] = {
+    by_part: dict[str, dict[str, tuple[Series, ...]]] = {
         "imu": {"ax_m_s2": (car.force[0],), "ay_m_s2": (car.force[1],), "yaw_rate_rad_s": yaw_rates},
         "yaw rate": {"yaw_rate_rad_s": yaw_rates},
         "steer": {"steer_rad": (car.steer,)},
@@ -104,7 +104,7 @@ def answers(car: Car, *parts: str) -> dict[str, tuple[Series, ...]]:
         },
         "truth rate": {"truth.yaw_rate_rad_s": yaw_rates},
     }
-    return {name: series for part in parts for name, series in known[part].items()}
+    return {name: series for part in parts for name, series in by_part[part].items()}
 
 
 def message(
@@ -156,16 +156,16 @@ def odometry(
 ) -> Topic:
     """Return GNSS/INS as ``nav_msgs/Odometry``; ``body`` and ``rate`` take the place of its velocity and yaw rate."""
     clock = (body or car.body_velocity).every(up_to)
-    at = car.position.every(up_to).values
+    position = car.position.every(up_to).values
     roll, pitch, yaw = car.attitude.every(up_to).values.T
     return message(
         name,
         "nav_msgs/msg/Odometry",
         clock,
         {
-            "pose.pose.position.x": at[:, 0],
-            "pose.pose.position.y": at[:, 1],
-            "pose.pose.position.z": at[:, 2],
+            "pose.pose.position.x": position[:, 0],
+            "pose.pose.position.y": position[:, 1],
+            "pose.pose.position.z": position[:, 2],
             "pose.pose.orientation": quaternion(roll, pitch, yaw),
             "twist.twist.linear.x": clock.values[:, 0],
             "twist.twist.linear.y": clock.values[:, 1],
@@ -193,7 +193,7 @@ def scalar(name: str, series: Series, type_name: str = "std_msgs/msg/Float32") -
 
 
 def road_car(car: Car, **replaced: Topic | None) -> tuple[Topic, ...]:
-    """Return IMU, steering, speed and GNSS/INS truth; a keyword of these names takes a topic's place, None drops it."""
+    """Return IMU, steering, speed and GNSS/INS ground truth; keywords replace a topic, None drops it."""
     usual: dict[str, Topic | None] = {
         "imu": imu(car.force, car.rate),
         "steering": steering(car.steer),

@@ -45,15 +45,15 @@ FLOORS: dict[str, float] = {
     "truth.yaw_rate_rad_s": 0.004,
 }
 WEAK_SHARE = 0.6
-#: A constant of so much (m/s²) is the bias of an accelerometer, which nothing tells from a tilt of two degrees.
+#: Largest constant (m/s²) that counts as accelerometer bias: it cannot be distinguished from a tilt of two degrees.
 BIAS_M_S2 = 0.3
-#: A share of right samples from which a channel counts as right: some logs hold invalid samples.
+#: A share of right samples from which a channel counts as right: some logs contain invalid samples.
 RIGHT_BINS = 0.95
 
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What the tool says of a log.
+    """Messages of the tool for a log.
 
     ``checks`` as in report.json (name, subject, verdict, evidence, remedy); ``doubts`` are its other sentences:
     ambiguities, notes, what is missing; ``suspects`` are the channels of warnings, where there are such.
@@ -99,11 +99,11 @@ class Score:
     told: Told
 
 
-# ------------------------------------------------------------------------------------------------ what the tool says
+# ------------------------------------------------------------------------------------------------ messages of the tool
 
 
 def look(path: Path) -> tuple[SignalMapping | None, Told, dict[str, Channel]]:
-    """Let the tool read a log on its own; return its mapping, what it says, and its channels."""
+    """Let the tool read a log on its own; return its mapping, its messages, and its channels."""
     try:
         with closing(open_log(path)) as log:
             return _look(log)
@@ -131,11 +131,11 @@ def _look(log: DriveLog) -> tuple[SignalMapping | None, Told, dict[str, Channel]
     more, refused_run = _checks_of_a_run(Path(str(log.path)))
     checks += [check for check in more if check["name"] not in {c["name"] for c in checks}]
     error = error or refused_run
-    told = Told(tuple(checks), tuple(dict.fromkeys(said)), error, suspects)
+    messages = Told(tuple(checks), tuple(dict.fromkeys(said)), error, suspects)
     clocks = fit_clocks(log, inspection.mapping, log.start_ns, log.end_ns)
     read = read_signals(log, inspection.mapping, clocks, log.start_ns, log.end_ns)
     channels = read.signals | {f"truth.{name}": channel for name, channel in read.truth.items()}
-    return inspection.mapping, told, channels
+    return inspection.mapping, messages, channels
 
 
 def _checks_of_a_run(path: Path) -> tuple[list[dict[str, Any]], str]:
@@ -170,7 +170,7 @@ def agrees(channel: Channel, right: Series, floor: float, bias: float = 0.0) -> 
     if count < 1:
         return False
     if np.median(np.diff(channel.stamps_ns)) > width and right.values.ndim == 1:
-        # A channel this slow holds samples, which are no means.
+        # A channel this slow contains samples, not means.
         got = channel.values[:, None]
         wanted = np.interp(channel.stamps_ns - start, right.stamps_ns - start, right.values)[:, None]
         count = len(channel)
@@ -186,9 +186,9 @@ def agrees(channel: Channel, right: Series, floor: float, bias: float = 0.0) -> 
     difference = got[both] - wanted[both]
     difference -= np.clip(np.median(difference), -bias, bias)
     apart = np.sqrt(np.mean(difference**2, axis=1))
-    # A few bins may hold invalid samples; the others must agree as a whole.
+    # A few bins may contain invalid samples; the others must agree as a whole.
     kept = np.sort(apart)[: int(np.ceil(RIGHT_BINS * apart.shape[0]))]
-    # Of a weak signal the floor is no more than a share: noise may stand in it, another sign may not.
+    # Of a weak signal the floor is no more than a share: noise is accepted, another sign is not.
     return bool(np.sqrt(np.mean(kept**2)) <= max(SHARE * rms, min(floor, WEAK_SHARE * rms)))
 
 
@@ -226,16 +226,16 @@ def score_log(
     cause: str = "",
     at_fault: Iterable[str] = (),
 ) -> Score:
-    """Let the tool map a log and hold what it took against the right answers.
+    """Let the tool map a log and compare the mapping with the right answers.
 
     Parameters
     ----------
     right : by channel, what it must be. A channel of :data:`ITEMS` that is neither here nor allowed is wrong.
     allowed : what may be mapped too, and is not missed where it is not.
-    cause : pattern of which some message must hold a part; empty where there is nothing to say.
+    cause : pattern that a message must match; empty without a cause.
     at_fault : channels whose checks may fail even where they were mapped rightly.
     """
-    mapping, told, channels = look(path)
+    mapping, messages, channels = look(path)
     sources = {} if mapping is None else _sources(mapping)
     fitting = {**(allowed or {}), **right}
     is_right = {
@@ -251,21 +251,21 @@ def score_log(
                 findings.append(Finding(item, "missing", True, frozenset(), ""))
             continue
         wrong = [n for n in mapped if not is_right[n]]
-        checked = frozenset(c["verdict"] for c in told.checks if c["subject"] in mapped)
+        checked = frozenset(c["verdict"] for c in messages.checks if c["subject"] in mapped)
         what = ", ".join(f"{n} = {sources[n]}" for n in (wrong or mapped) if n in sources)
         if wrong:
-            findings.append(Finding(item, "wrong", all(_is_told(n, sources, told) for n in wrong), checked, what))
+            findings.append(Finding(item, "wrong", all(_is_told(n, sources, messages) for n in wrong), checked, what))
         elif present:
-            doubted = any(_is_doubted(n, sources.get(n, ""), told) for n in mapped)
+            doubted = any(_is_doubted(n, sources.get(n, ""), messages) for n in mapped)
             findings.append(Finding(item, "right", True, checked, what, doubted))
     blamed = set(at_fault)
     false_alarms = tuple(
         f"{c['name']} ({c['subject']}): {c.get('evidence', '')}"
-        for c in told.checks
+        for c in messages.checks
         if c["verdict"] == "failed" and is_right.get(c["subject"], False) and c["subject"] not in blamed
     )
-    named = bool(re.search(cause, told.text, re.IGNORECASE)) if cause else None
-    return Score(tuple(findings), false_alarms, named, told)
+    named = bool(re.search(cause, messages.text, re.IGNORECASE)) if cause else None
+    return Score(tuple(findings), false_alarms, named, messages)
 
 
 def _sources(mapping: SignalMapping) -> dict[str, str]:
@@ -273,23 +273,23 @@ def _sources(mapping: SignalMapping) -> dict[str, str]:
     return {name: source.label for name, source in (mapping.signals | truth).items()}
 
 
-def _is_told(name: str, sources: Mapping[str, str], told: Told) -> bool:
+def _is_told(name: str, sources: Mapping[str, str], messages: Told) -> bool:
     """Return whether a check that did not pass is on the channel, or a doubt names it or its source."""
     subject = name.removeprefix("truth.")
-    if subject in told.suspects:
+    if subject in messages.suspects:
         return True
-    for check in told.checks:
+    for check in messages.checks:
         if check["verdict"] != "passed" and check["subject"] in (name, subject):
             return True
-    return _is_doubted(name, sources.get(name, ""), told)
+    return _is_doubted(name, sources.get(name, ""), messages)
 
 
 #: Words of a sentence that doubts what it names.
 _DOUBT = re.compile(r"doubt|took|is taken, but|waive|suspect|contradict|not sure|ambig|disagree|may be|might|perhaps")
 
 
-def _is_doubted(name: str, source: str, told: Told) -> bool:
+def _is_doubted(name: str, source: str, messages: Told) -> bool:
     """Return whether a sentence doubts a channel, by its name or the field or topic that it comes from."""
     topic = source.partition(".")[0]
     named = [part for part in (name.removeprefix("truth."), source, topic) if part]
-    return any(_DOUBT.search(d) and any(part in d for part in named) for d in told.doubts)
+    return any(_DOUBT.search(d) and any(part in d for part in named) for d in messages.doubts)

@@ -1,1 +1,1 @@
-"""Torture: damaged, hostile and odd input, kills, full disks; counts go to ``docs/reliability.md``."""
+"""Fuzz and fault-injection tests: damaged, hostile and unusual input, kills, full disks (docs/reliability.md)."""

@@ -1,9 +1,9 @@
-"""Torture, counted: ``docs/reliability.md``.
+"""Fuzz and fault-injection tests, counted: ``docs/reliability.md``.
 
     python -m studies.torture [--work out/torture] [--seed 1] [--logs 200000] [--configs 20000] [--kills 200]
                               [--hours 10] [--jobs 2] [--only mutations ...] [--out docs/reliability.md]
 
-Resumable: what stands in the work folder is not done again; remove it after a change of the code. Exit code 1:
+Resumable: results in the work folder are not computed again; remove it after a change of the code. Exit code 1:
 something ended as it should not.
 """
 
@@ -35,12 +35,12 @@ _THREE = ("--estimators", "zero,kinematic,phy-ukf")
 
 def mutations(work: Path, seed: int, jobs: int, logs: int, configs: int) -> dict[str, Any]:
     """Judge mutated logs and configurations."""
-    found = {}
+    collected = {}
     for name, make, count in (("logs", log_judge, logs), ("configurations", config_judge, configs)):
         begin = time.monotonic()
         tallies = run_cases(make(work, seed), count, work / f"{name}-{seed}.jsonl", jobs=jobs, tell=_say)
-        found[name] = {"seed": seed, "wall_s": time.monotonic() - begin, **_sum(tallies, count)}
-    return found
+        collected[name] = {"seed": seed, "wall_s": time.monotonic() - begin, **_sum(tallies, count)}
+    return collected
 
 
 def _sum(tallies: Iterable[Tally], count: int) -> dict[str, Any]:
@@ -59,7 +59,7 @@ def _sum(tallies: Iterable[Tally], count: int) -> dict[str, Any]:
 
 def one_by_one(part: str, work: Path, cases: Mapping[str, Callable[[Path], Verdict]]) -> list[dict[str, Any]]:
     """Judge the cases of a part, each in a folder of its own that goes with it."""
-    found = []
+    collected = []
     for i, (name, judge_case) in enumerate(cases.items()):
         folder = work / f"{part}-{i}"
         folder.mkdir(parents=True, exist_ok=True)
@@ -67,9 +67,9 @@ def one_by_one(part: str, work: Path, cases: Mapping[str, Callable[[Path], Verdi
             verdict = judge_case(folder)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
-        found.append({"name": name, "end": verdict.end, "problem": verdict.problem, **verdict.costs})
+        collected.append({"name": name, "end": verdict.end, "problem": verdict.problem, **verdict.costs})
         _say(f"{part}: {name}: {verdict.end}{verdict.problem and ', WRONG: ' + verdict.problem}")
-    return found
+    return collected
 
 
 def kills(work: Path, seed: int, count: int) -> dict[str, Any]:
@@ -103,7 +103,7 @@ def kills(work: Path, seed: int, count: int) -> dict[str, Any]:
 
 def hours(work: Path, most: float) -> list[dict[str, Any]]:
     """Measure the memory of ``inspect`` and of ``run`` with three estimators over an hour and over many."""
-    found = []
+    collected = []
     for length in (1.0, most):
         log = work / "hours.mcap"
         write_hours(log, length)
@@ -116,23 +116,23 @@ def hours(work: Path, most: float) -> list[dict[str, Any]]:
                 "s": process.wall_s,
                 "bytes": process.peak_bytes,
             }
-            found.append(entry)
+            collected.append(entry)
             _say(f"hours: {entry}")
         shutil.rmtree(work / "out", ignore_errors=True)
         log.unlink()
-    return found
+    return collected
 
 
 def shared_cases() -> list[dict[str, Any]]:
     """Inspect the cases that others keep, where they are at hand."""
-    found = []
+    collected = []
     for path in sorted(_SHARED.glob("*.mcap")) + sorted(_SHARED.glob("*.bag")):
         process = measured("inspect", str(path))
         late = process.wall_s > LIMIT_S or process.peak_bytes > LIMIT_BYTES or process.code not in (0, 1, 3)
-        found.append(
+        collected.append(
             {"name": path.name, "end": f"exit {process.code}", "s": process.wall_s, "problem": "wrong" if late else ""}
         )
-    return found
+    return collected
 
 
 def _say(text: str) -> None:
@@ -145,18 +145,18 @@ def _say(text: str) -> None:
 def blocks(results: dict[str, Any]) -> dict[str, str]:
     """Return the tables of the page by name."""
     lists = [name for name in ("bombs", "numerics", "places", "shared") if results.get(name)]
-    found: dict[str, str] = {name: _list(results[name]) for name in lists}
+    texts: dict[str, str] = {name: _list(results[name]) for name in lists}
     if done := results.get("mutations"):
-        found["mutations"] = _mutations(done)
+        texts["mutations"] = _mutations(done)
     if done := results.get("kills"):
         rows = [[end, str(n)] for end, n in done["ends"].items()]
         wrong = "; ".join(sorted(set(done["problems"]))) or "none"
         text = f"{done['count']} kills, seed {done['seed']}. Hidden paths left by the last: {done['left']}."
-        found["kills"] = f"{text} Faults found: {wrong}.\n\n{table(['ended', 'times'], rows, right_from=1)}"
+        texts["kills"] = f"{text} Faults found: {wrong}.\n\n{table(['ended', 'times'], rows, right_from=1)}"
     if done := results.get("hours"):
         rows = [[f"`{r['command']}`", f"{r['hours']:g}", str(r["code"]), *_costs(r)] for r in done]
-        found["hours"] = table(["command", "hours", "exit code", "s", "MiB"], rows, right_from=1)
-    return found
+        texts["hours"] = table(["command", "hours", "exit code", "s", "MiB"], rows, right_from=1)
+    return texts
 
 
 def _list(rows: list[dict[str, Any]]) -> str:
@@ -177,17 +177,17 @@ def _cell(text: str) -> str:
 _ENDS = ("exit 0", "exit 1", "exit 2", "exit 3", "internal error", "hang", "memory")
 
 
-def _mutations(found: dict[str, Any]) -> str:
+def _mutations(collected: dict[str, Any]) -> str:
     rows = []
-    for name, r in found.items():
+    for name, r in collected.items():
         ends: Counter[str] = Counter()
         for end, n in r["ends"].items():
             ends[end.partition(",")[0]] += n
-        known = [ends[k] for k in _ENDS]
-        counts = [f"{n:,}" for n in (r["count"], *known, r["count"] - sum(known))]
+        counted = [ends[k] for k in _ENDS]
+        counts = [f"{n:,}" for n in (r["count"], *counted, r["count"] - sum(counted))]
         rows.append([name, str(r["seed"]), *counts, f"{r['slowest_s']:.1f}", str(r["peak_bytes"] >> 20)])
     text = table(["what", "seed", "cases", *_ENDS, "other", "slowest s", "peak MiB"], rows, right_from=1)
-    wrong = [(name, *p) for name, r in found.items() for p in r["problems"]]
+    wrong = [(name, *p) for name, r in collected.items() for p in r["problems"]]
     if wrong:
         text += "\n\nWrong, by number:\n\n" + "\n".join(f"- {n} {i}: `{_cell(p)}`" for n, i, p in wrong[:40])
     return text
@@ -235,7 +235,7 @@ def main() -> int:
 
 
 def _wrong(result: Any) -> bool:
-    """Tell whether anything in a part's results ended as it should not."""
+    """Return whether anything in a part's results ended as it should not."""
     if isinstance(result, list):
         return any(r.get("problem") or r.get("code", 0) not in (0, 3) for r in result)
     return bool(result.get("problems")) or any(isinstance(r, dict) and r.get("problems") for r in result.values())

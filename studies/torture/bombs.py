@@ -14,13 +14,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from studies.torture.outside import measured
 from studies.torture.seeds import SEEDS, START_NS
 from studies.torture.workers import LIMIT_BYTES, LIMIT_S, Verdict, judge
 
 _MAGIC = b"\x89MCAP0\r\n"
-_LOST, _NO_LOG, _EITHER = (3,), (1,), (1, 3)
+_NO_LOG, _EITHER, _SOUND, _ANY = (1,), (1, 3), (0, 3), (0, 1, 3)
+_PAST_NS = START_NS - 315_360_000 * 10**9
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,23 +81,23 @@ def _typed(name: bytes, encoding: bytes, schema: bytes, wire: bytes, payload: by
 def _zeros_zstd(size: int) -> bytes:
     import zstandard
 
-    compressor = zstandard.ZstdCompressor(level=3).compressobj(size=size)
-    block = bytes(1 << 20)
-    return b"".join([*(compressor.compress(block) for _ in range(size >> 20)), compressor.flush()])
+    return _zeros(zstandard.ZstdCompressor(level=3).compressobj(size=size), size)
 
 
 def _zeros_lz4(size: int) -> bytes:
     import lz4.frame
 
     with lz4.frame.LZ4FrameCompressor() as compressor:
-        block = bytes(1 << 20)
-        parts = [compressor.begin(), *(compressor.compress(block) for _ in range(size >> 20)), compressor.flush()]
-    return b"".join(bytes(p) for p in parts)
+        return bytes(compressor.begin()) + _zeros(compressor, size)
 
 
 def _zeros_bz2(size: int) -> bytes:
-    compressor, block = bz2.BZ2Compressor(9), bytes(1 << 20)
-    return b"".join([*(compressor.compress(block) for _ in range(size >> 20)), compressor.flush()])
+    return _zeros(bz2.BZ2Compressor(9), size)
+
+
+def _zeros(compressor: Any, size: int) -> bytes:
+    block = bytes(1 << 20)
+    return b"".join([*(bytes(compressor.compress(block)) for _ in range(size >> 20)), bytes(compressor.flush())])
 
 
 def _bag_record(fields: dict[bytes, bytes], data: bytes) -> bytes:
@@ -113,7 +115,7 @@ def _bag_chunk(compression: bytes, stored: bytes, size: int) -> bytes:
 
 
 def _nested(levels: int) -> bytes:
-    """Return a ROS type whose every level holds ten of the next."""
+    """Return a ROS type with ten members of the next level in each level."""
     parts = [b"L0 a"]
     parts += [
         b"=" * 80 + b"\nMSG: p/L%d\n" % i + b"\n".join(b"L%d f%d" % (i + 1, k) for k in range(10))
@@ -126,8 +128,8 @@ def _json_references(levels: int) -> bytes:
     def kind(i: int) -> dict[str, object]:
         return {"type": "object", "properties": {f"p{k}": {"$ref": f"#/definitions/d{i + 1}"} for k in range(10)}}
 
-    own = {f"d{i}": kind(i) for i in range(levels)} | {f"d{levels}": {"type": "number"}}
-    return json.dumps({"type": "object", "$ref": "#/definitions/d0", "definitions": own}).encode()
+    definitions = {f"d{i}": kind(i) for i in range(levels)} | {f"d{levels}": {"type": "number"}}
+    return json.dumps({"type": "object", "$ref": "#/definitions/d0", "definitions": definitions}).encode()
 
 
 def _descriptors(levels: int, width: int) -> bytes:
@@ -232,121 +234,87 @@ def _made(name: str, codes: tuple[int, ...], content: Callable[[], bytes], suffi
 
 
 GIB = 1 << 30
-BOMBS = (
-    _made("zstd chunk of 4 GiB", _EITHER, lambda: _mcap(_chunk(b"zstd", _zeros_zstd(4 * GIB), 4 * GIB))),
-    _made(
-        "zstd chunk that claims 1000 bytes and holds 4 GiB",
-        _EITHER,
-        lambda: _mcap(_chunk(b"zstd", _zeros_zstd(4 * GIB), 1000)),
-    ),
-    _made("zstd chunk that claims 100 GB", _EITHER, lambda: _mcap(_chunk(b"zstd", _zeros_zstd(1 << 20), 10**11))),
-    _made("lz4 chunk of 2 GiB", _EITHER, lambda: _mcap(_chunk(b"lz4", _zeros_lz4(2 * GIB), 2 * GIB))),
-    _made(
-        "lz4 chunk that claims 1000 bytes and holds 2 GiB",
-        _EITHER,
-        lambda: _mcap(_chunk(b"lz4", _zeros_lz4(2 * GIB), 1000)),
-    ),
-    _made(
-        "bag: bz2 chunk that claims 1000 bytes and holds 3 GiB",
-        _EITHER,
-        lambda: _bag_chunk(b"bz2", _zeros_bz2(3 * GIB), 1000),
-        ".bag",
-    ),
-    _made(
-        "bag: lz4 chunk that claims 1000 bytes and holds 2 GiB",
-        _EITHER,
-        lambda: _bag_chunk(b"lz4", _zeros_lz4(2 * GIB), 1000),
-        ".bag",
-    ),
-    _made("whole file of 8 GiB as zstd", _EITHER, lambda: _zeros_zstd(8 * GIB), ".mcap.zst"),
-    _made("MCAP header and 4 GiB of zeros as zstd", _EITHER, lambda: _zeros_zstd(4 * GIB), ".mcap.zstd"),
-    _made("65,534 channels", (0, 1, 3), lambda: _many_channels(65_535)),
-    _made("an index that claims 268 million messages", (0, 1, 3), _claimed_counts),
-    _made(
-        "a message size near 2^63",
-        _EITHER,
-        lambda: _mcap(
-            _schema(1, b"a/B", b"ros2msg", _FLOAT), _channel(1, 1, b"/t", b"cdr"), _message(1, START_NS, b"", 2**63 - 8)
+_MEMBERS = b"=" * 80 + b"\nMSG: "
+
+
+def _chunks() -> tuple[Bomb, ...]:
+    """Return compressed chunks and files that unfold to gigabytes, or claim to."""
+
+    def mcap(name: str, compression: bytes, make: Callable[[int], bytes], size: int, claimed: int) -> Bomb:
+        return _made(name, _EITHER, lambda: _mcap(_chunk(compression, make(size), claimed)))
+
+    def bag(name: str, compression: bytes, make: Callable[[int], bytes], size: int) -> Bomb:
+        return _made(name, _EITHER, lambda: _bag_chunk(compression, make(size), 1000), ".bag")
+
+    return (
+        mcap("zstd chunk of 4 GiB", b"zstd", _zeros_zstd, 4 * GIB, 4 * GIB),
+        mcap("zstd chunk that claims 1000 bytes and contains 4 GiB", b"zstd", _zeros_zstd, 4 * GIB, 1000),
+        mcap("zstd chunk that claims 100 GB", b"zstd", _zeros_zstd, 1 << 20, 10**11),
+        mcap("lz4 chunk of 2 GiB", b"lz4", _zeros_lz4, 2 * GIB, 2 * GIB),
+        mcap("lz4 chunk that claims 1000 bytes and contains 2 GiB", b"lz4", _zeros_lz4, 2 * GIB, 1000),
+        bag("bag: bz2 chunk that claims 1000 bytes and contains 3 GiB", b"bz2", _zeros_bz2, 3 * GIB),
+        bag("bag: lz4 chunk that claims 1000 bytes and contains 2 GiB", b"lz4", _zeros_lz4, 2 * GIB),
+        _made("whole file of 8 GiB as zstd", _EITHER, lambda: _zeros_zstd(8 * GIB), ".mcap.zst"),
+        _made("MCAP header and 4 GiB of zeros as zstd", _EITHER, lambda: _zeros_zstd(4 * GIB), ".mcap.zstd"),
+    )
+
+
+def _declarations() -> tuple[Bomb, ...]:
+    """Return channels, types and messages whose declarations are large, endless or strange."""
+
+    def ros(name: str, codes: tuple[int, ...], type_name: bytes, text: bytes, data: bytes = bytes(64)) -> Bomb:
+        return _made(name, codes, lambda: _typed(type_name, b"ros2msg", text, b"cdr", data))
+
+    def json_(name: str, codes: tuple[int, ...], schema: bytes, data: bytes = b"{}") -> Bomb:
+        return _made(name, codes, lambda: _typed(b"S", b"jsonschema" if schema else b"", schema, b"json", data))
+
+    idl = b"module m {" * 500 + b"struct A { double x; };" + b"};" * 500
+    ends = (
+        _schema(1, b"a/B", b"ros2msg", _FLOAT),
+        _channel(1, 1, b"/t", b"cdr"),
+        _message(1, START_NS, b"", 2**63 - 8),
+    )
+    markup = "a topic that is markup, terminal codes and a forged line"
+    return (
+        _made("65,534 channels", _ANY, lambda: _many_channels(65_535)),
+        _made("an index that claims 268 million messages", _ANY, _claimed_counts),
+        _made("a message size near 2^63", _EITHER, lambda: _mcap(*ends)),
+        ros("ROS type of 10^12 leaves", _EITHER, b"p/msg/Root", _nested(12)),
+        ros("ROS type that contains itself", _EITHER, b"p/msg/A", b"A a\n" + _MEMBERS + b"p/A\nA a\n"),
+        ros("ROS array of 2^32", _ANY, b"p/msg/A", b"float64[4294967296] a\nfloat64 b\n"),
+        _made(
+            "ROS 1 sequence that claims 2^32 - 1",
+            _ANY,
+            lambda: _typed(b"p/A", b"ros1msg", b"float64[] a\n", b"ros1", b"\xff" * 8),
         ),
-    ),
-    _made(
-        "ROS type of 10^12 leaves", _EITHER, lambda: _typed(b"p/msg/Root", b"ros2msg", _nested(12), b"cdr", bytes(64))
-    ),
-    _made(
-        "ROS type that holds itself",
-        _EITHER,
-        lambda: _typed(b"p/msg/A", b"ros2msg", b"A a\n" + b"=" * 80 + b"\nMSG: p/A\nA a\n", b"cdr", bytes(64)),
-    ),
-    _made(
-        "ROS array of 2^32",
-        (0, 1, 3),
-        lambda: _typed(b"p/msg/A", b"ros2msg", b"float64[4294967296] a\nfloat64 b\n", b"cdr", bytes(64)),
-    ),
-    _made(
-        "ROS 1 sequence that claims 2^32 - 1",
-        (0, 1, 3),
-        lambda: _typed(b"p/A", b"ros1msg", b"float64[] a\n", b"ros1", b"\xff" * 8),
-    ),
-    _made(
-        "CDR sequence of structs that claims 2^32 - 1",
-        (0, 1, 3),
-        lambda: _typed(
+        ros(
+            "CDR sequence of structs that claims 2^32 - 1",
+            _ANY,
             b"p/msg/A",
-            b"ros2msg",
-            b"B[] a\n" + b"=" * 80 + b"\nMSG: p/B\nstring s\n",
-            b"cdr",
+            b"B[] a\n" + _MEMBERS + b"p/B\nstring s\n",
             b"\0\1\0\0" + b"\xff" * 8,
         ),
-    ),
-    _made(
-        "IDL of 500 modules",
-        (0, 1, 3),
-        lambda: _typed(
-            b"p/msg/A", b"ros2idl", b"module m {" * 500 + b"struct A { double x; };" + b"};" * 500, b"cdr", bytes(64)
+        _made("IDL of 500 modules", _ANY, lambda: _typed(b"p/msg/A", b"ros2idl", idl, b"cdr", bytes(64))),
+        json_("JSON schema of 10^12 leaves", _EITHER, _json_references(12)),
+        json_("JSON schema 5000 deep", _EITHER, b'{"properties":{"a":' * 5000 + b"{}" + b"}}" * 5000),
+        json_("JSON messages 900 deep, without a schema", _ANY, b"", b'{"a":' * 900 + b"1" + b"}" * 900),
+        json_("JSON number of a million digits", _ANY, b"", b'{"a": ' + b"9" * 1_000_000 + b"}"),
+        _made(
+            "protobuf type of 10^12 leaves",
+            _EITHER,
+            lambda: _typed(b"p.L0", b"protobuf", _descriptors(12, 10), b"protobuf", b""),
         ),
-    ),
-    _made(
-        "JSON schema of 10^12 leaves",
-        _EITHER,
-        lambda: _typed(b"S", b"jsonschema", _json_references(12), b"json", b"{}"),
-    ),
-    _made(
-        "JSON schema 5000 deep",
-        _EITHER,
-        lambda: _typed(b"S", b"jsonschema", b'{"properties":{"a":' * 5000 + b"{}" + b"}}" * 5000, b"json", b"{}"),
-    ),
-    _made(
-        "JSON messages 900 deep, without a schema",
-        (0, 1, 3),
-        lambda: _typed(b"S", b"", b"", b"json", b'{"a":' * 900 + b"1" + b"}" * 900),
-    ),
-    _made(
-        "JSON number of a million digits",
-        (0, 1, 3),
-        lambda: _typed(b"S", b"", b"", b"json", b'{"a": ' + b"9" * 1_000_000 + b"}"),
-    ),
-    _made(
-        "protobuf type of 10^12 leaves",
-        _EITHER,
-        lambda: _typed(b"p.L0", b"protobuf", _descriptors(12, 10), b"protobuf", b""),
-    ),
-    _made(
-        "a type name that is a path",
-        (0, 1, 3),
-        lambda: _typed(b"../../../pdhef_msgs/msg/VehicleStateEstimate", b"ros2msg", b"", b"cdr", bytes(64)),
-    ),
-    _made(
-        "a topic that is markup, terminal codes and a forged line",
-        (0, 1, 3),
-        lambda: _typed(b"std_msgs/msg/Float64", b"ros2msg", _FLOAT, b"cdr", _CDR, _ODD_NAME),
-    ),
-    _made("one message at time 0", (0, 3), lambda: _times(0)),
-    _made("one message at 2^64 - 1", (0, 3), lambda: _times(2**64 - 1)),
-    _made(
-        "a clock that jumps ten years",
-        (0, 3),
-        lambda: _times(*(START_NS - 315_360_000 * 10**9 + i * 10**7 for i in range(100))),
-    ),
+        ros("a type name that is a path", _ANY, b"../../../pdhef_msgs/msg/VehicleStateEstimate", b""),
+        _made(markup, _ANY, lambda: _typed(b"std_msgs/msg/Float64", b"ros2msg", _FLOAT, b"cdr", _CDR, _ODD_NAME)),
+        _made("one message at time 0", _SOUND, lambda: _times(0)),
+        _made("one message at 2^64 - 1", _SOUND, lambda: _times(2**64 - 1)),
+        _made("a clock that jumps ten years", _SOUND, lambda: _times(*(_PAST_NS + i * 10**7 for i in range(100)))),
+    )
+
+
+BOMBS = (
+    *_chunks(),
+    *_declarations(),
     Bomb("a FIFO", _fifo, _NO_LOG),
     Bomb("a device", _device, _NO_LOG),
     Bomb("two links to their own folder", _loops, (1, 2)),

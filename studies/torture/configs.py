@@ -26,25 +26,16 @@ window_s = 600.0
 friction = 0.9
 sensors = "full"
 """
+_IMU = {"name": "/imu/data", "type": "sensor_msgs/msg/Imu", "serialization_format": "cdr"}
 _METADATA = {
     "rosbag2_bagfile_information": {
-        "version": 9,
-        "storage_identifier": "sqlite3",
-        "duration": {"nanoseconds": 1180000000},
-        "starting_time": {"nanoseconds_since_epoch": 1767225600000000000},
-        "message_count": 240,
-        "topics_with_message_count": [
-            {
-                "topic_metadata": {"name": "/imu/data", "type": "sensor_msgs/msg/Imu", "serialization_format": "cdr"},
-                "message_count": 60,
-            }
-        ],
-        "compression_format": "",
-        "compression_mode": "",
-        "relative_file_paths": ["rosbag2.db3"],
+        "version": 9, "storage_identifier": "sqlite3", "duration": {"nanoseconds": 1180000000},
+        "starting_time": {"nanoseconds_since_epoch": 1767225600000000000}, "message_count": 240,
+        "topics_with_message_count": [{"topic_metadata": _IMU, "message_count": 60}],
+        "compression_format": "", "compression_mode": "", "relative_file_paths": ["rosbag2.db3"],
         "ros_distro": "jazzy",
     }
-}
+}  # fmt: skip
 _DEEP = 2000
 
 
@@ -84,7 +75,7 @@ def judge_config(work: Path, seed: int, log: Path, documents: dict[str, bytes], 
 
 
 def _arguments(name: str, content: bytes, log: Path, folder: Path) -> list[str]:
-    """Write the document where its reader looks for it; return the command that reads it."""
+    """Write the document where its reader expects it; return the command that reads it."""
     run = ["run", str(log), "-o", str(folder / "out"), "--annotate", "none"]
     some = ["--estimators", "zero,kinematic,phy-ukf"]
     path = folder / Path(name).name
@@ -122,7 +113,7 @@ def damage_document(name: str, content: bytes, rng: random.Random) -> bytes:
         for _ in range(rng.choice((1, 1, 2, 3))):
             _damage_entry(document, rng)
         return _dumped(document, toml, lines)
-    except (ValueError, TypeError, RecursionError):  # what the format, or its writer, cannot say
+    except (ValueError, TypeError, RecursionError):  # what the format, or its writer, cannot express
         return damage_bytes(content, rng)
 
 
@@ -147,9 +138,9 @@ def _damage_entry(document: Any, rng: random.Random) -> None:
         case 1 if isinstance(holder, dict):
             holder[rng.choice((key + "x", key[:-1], key.upper(), "", "a.b", "\n", "é"))] = holder.pop(key)
         case 2:
-            other, at = rng.choice(places)
-            if at in other if isinstance(other, dict) else at < len(other):
-                holder[key] = copy.deepcopy(other[at])
+            other, place = rng.choice(places)
+            if place in other if isinstance(other, dict) else place < len(other):
+                holder[key] = copy.deepcopy(other[place])
         case 3:
             times = rng.choice((1, 2, 1000))  # once only a thousand: writing two million entries is not ours to time
             holder[key] = [holder[key]] * (times if len(places) < 1000 else min(times, 2))

@@ -1,4 +1,4 @@
-"""Ends ``pdhef run`` at any moment and tells what it left: for the tests here, and for longer torture."""
+"""Ends ``pdhef run`` at any moment and reports what it left."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-#: Content that holds the time at which it was recorded, so that two runs never give the same bytes.
+#: Content with the time of recording, so that two runs never give the same bytes.
 TIMED = (".rrd",)
 #: What a whole file has near its end.
 ENDS = {".mcap": b"\x89MCAP0\r\n", ".rrd": b"RRF2FOOT"}
@@ -108,7 +108,7 @@ def kill_many(
 
 def faults(output: Path) -> list[str]:
     """Return what under final names is not whole, in words; empty after any kill."""
-    found = []
+    problems = []
     for path in sorted(p for p in output.rglob("*") if p.is_file() and not hidden(p, output)):
         try:
             if path.suffix == ".json":
@@ -116,22 +116,22 @@ def faults(output: Path) -> list[str]:
             elif path.suffix == ".parquet":
                 pq.ParquetFile(path).read()
             elif any(end not in path.read_bytes()[-64:] for suffix, end in ENDS.items() if suffix == path.suffix):
-                found.append(f"{path.name}: cut")
+                problems.append(f"{path.name}: cut")
         except (OSError, ValueError) as error:
-            found.append(f"{path.name}: {error}")
+            problems.append(f"{path.name}: {error}")
     for folder in (output / "logs").glob("[!.]*"):
         names = {p.name for p in folder.iterdir()}
         if not {"estimates.parquet", "metrics.parquet", "recording.rrd", "report.json"} <= names:
-            found.append(f"{folder.name}: only {', '.join(sorted(names))}")
+            problems.append(f"{folder.name}: only {', '.join(sorted(names))}")
     run = output / "run.json"
     if run.is_file():
         logs = json.loads(run.read_text(encoding="utf-8"))["logs"]
-        found += [f"run.json names {e['log']}" for e in logs if not (output / "logs" / e["log"]).is_dir()]
-    return found
+        problems += [f"run.json names {e['log']}" for e in logs if not (output / "logs" / e["log"]).is_dir()]
+    return problems
 
 
 def hidden(path: Path, output: Path) -> bool:
-    """Tell whether a path lies under a hidden name, where commands prepare what they write."""
+    """Return whether a path lies under a hidden name, where commands prepare what they write."""
     return any(part.startswith(".") for part in path.relative_to(output).parts)
 
 

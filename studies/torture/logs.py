@@ -13,7 +13,7 @@ from studies.torture.workers import Verdict, command, judge
 
 RUN_EVERY = 100
 _RUN = ("--car", "saloon", "--estimators", "zero,kinematic,phy-ukf")
-#: Containers in which a checksum stands over every message: a message may not go without a loss.
+#: Containers in which a checksum covers every message: a message may not go without a loss.
 _CHECKED = ("zstd.mcap", "lz4.mcap", "plain.mcap", "unchunked.mcap", "noindex.mcap", "json.mcap", "protobuf.mcap")
 
 

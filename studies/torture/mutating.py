@@ -17,47 +17,15 @@ from pathlib import PurePath
 
 #: Numbers at which arithmetic, allocation and time go wrong.
 EDGES = (
-    0,
-    1,
-    2,
-    7,
-    255,
-    256,
-    0x7FFF,
-    0x8000,
-    0xFFFF,
-    2**31 - 1,
-    2**31,
-    2**32 - 1,
-    2**32,
-    2**62,
-    2**63 - 1,
-    2**63,
+    0, 1, 2, 7, 255, 256, 0x7FFF, 0x8000, 0xFFFF, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**62, 2**63 - 1, 2**63,
     2**64 - 1,
-)
+)  # fmt: skip
 #: Texts that turn into paths, markup, terminal codes, forged lines, recursion.
 TEXTS = (
-    b"",
-    b"..",
-    b"/",
-    b"../../../etc/passwd",
-    b"/wheels[/red]",
-    b"[bold]x[/]",
-    b"\x1b[2J\x1b[31mwarning",
-    b"a\nwarning: b",
-    b"\0",
-    b"\xff\xfe",
-    b"\xed\xa0\x80",
-    "\u202etxt.mcap".encode(),
-    b"a" * 5000,
-    b"$(id)",
-    b"</script>",
-    b"%s%n",
-    b"../../odd/msg/T",
-    b"sensor_msgs/msg/Imu",
-    b"nav_msgs/msg/Odometry",
-    b"std_msgs/String",
-)
+    b"", b"..", b"/", b"../../../etc/passwd", b"/wheels[/red]", b"[bold]x[/]", b"\x1b[2J\x1b[31mwarning",
+    b"a\nwarning: b", b"\0", b"\xff\xfe", b"\xed\xa0\x80", "\u202etxt.mcap".encode(), b"a" * 5000, b"$(id)",
+    b"</script>", b"%s%n", b"../../odd/msg/T", b"sensor_msgs/msg/Imu", b"nav_msgs/msg/Odometry", b"std_msgs/String",
+)  # fmt: skip
 SCHEMAS = (
     b"float64[4294967296] x\n",
     b"float64[99999999999999999999] x\n",
@@ -96,39 +64,41 @@ def damage_bytes(content: bytes, rng: random.Random) -> bytes:
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
         if not data:
             break
-        at = _place(len(data), rng)
+        offset = _place(len(data), rng)
         match rng.randrange(7):
             case 0 | 1:
-                data[at] ^= 1 << rng.randrange(8)
+                data[offset] ^= 1 << rng.randrange(8)
             case 2:
-                _overwrite(data, at, rng)
+                _overwrite(data, offset, rng)
             case 3:
-                del data[at : len(data) if rng.random() < 0.5 else at + rng.randrange(1, 400)]
+                del data[offset : len(data) if rng.random() < 0.5 else offset + rng.randrange(1, 400)]
             case 4:
-                data[at:at] = rng.randbytes(rng.randrange(1, 64))
+                data[offset:offset] = rng.randbytes(rng.randrange(1, 64))
             case 5:
-                part = data[at : at + rng.randrange(1, 2000)]
+                part = data[offset : offset + rng.randrange(1, 2000)]
                 to = _place(len(data), rng)
                 data[to:to] = part
             case _:
                 n = rng.randrange(1, 300)
-                data[at : at + n] = bytes([rng.choice((0, 255, 32))]) * min(n, len(data) - at)
+                data[offset : offset + n] = bytes([rng.choice((0, 255, 32))]) * min(n, len(data) - offset)
     return bytes(data)
 
 
 def _place(size: int, rng: random.Random) -> int:
-    """Return a byte: anywhere, or near either end, where what decides most stands."""
+    """Return a byte: anywhere, or near either end, where the most critical bytes are."""
     near = min(size, 400)
     return rng.choice((rng.randrange(size), rng.randrange(near), size - 1 - rng.randrange(near)))
 
 
-def _overwrite(data: bytearray, at: int, rng: random.Random) -> None:
+def _overwrite(data: bytearray, offset: int, rng: random.Random) -> None:
     """Write a number of 1, 2, 4 or 8 bytes."""
     width = rng.choice((1, 2, 4, 4, 8, 8))
     value = rng.choice(EDGES) % (1 << (8 * width))
-    if rng.random() < 0.3 and at + width <= len(data):
-        value = (int.from_bytes(data[at : at + width], "little") + rng.choice((-1, 1, 7, -128))) % (1 << (8 * width))
-    data[at : at + width] = value.to_bytes(width, "little")
+    if rng.random() < 0.3 and offset + width <= len(data):
+        value = (int.from_bytes(data[offset : offset + width], "little") + rng.choice((-1, 1, 7, -128))) % (
+            1 << (8 * width)
+        )
+    data[offset : offset + width] = value.to_bytes(width, "little")
 
 
 def _damage_payload(payload: bytes, rng: random.Random) -> bytes:
@@ -144,17 +114,17 @@ def _damage_payload(payload: bytes, rng: random.Random) -> bytes:
 
 
 def _with_text(payload: bytes, rng: random.Random) -> bytes:
-    """Put a hostile text in the place of one that stands in the record behind its length."""
+    """Put a hostile text in the place of one in the record, after its length."""
     places = []
-    for at in range(min(len(payload) - 4, 400)):
-        (n,) = struct.unpack_from("<I", payload, at)
-        if 0 < n <= len(payload) - at - 4 and payload[at + 4 : at + 8].isascii():
-            places.append((at, n))
+    for offset in range(min(len(payload) - 4, 400)):
+        (n,) = struct.unpack_from("<I", payload, offset)
+        if 0 < n <= len(payload) - offset - 4 and payload[offset + 4 : offset + 8].isascii():
+            places.append((offset, n))
     if not places:
         return payload
-    at, n = rng.choice(places[:8])
+    offset, n = rng.choice(places[:8])
     text = rng.choice(SCHEMAS if n > 60 and rng.random() < 0.7 else TEXTS)
-    return payload[:at] + struct.pack("<I", len(text)) + text + payload[at + 4 + n :]
+    return payload[:offset] + struct.pack("<I", len(text)) + text + payload[offset + 4 + n :]
 
 
 # ------------------------------------------------------------------------------------------------ MCAP
@@ -182,11 +152,11 @@ def damage_mcap(content: bytes, rng: random.Random) -> bytes:
 
 
 def _mcap_records(body: bytes) -> list[tuple[int, bytes]]:
-    records, at = [], 0
-    while at + 9 <= len(body):
-        op, n = struct.unpack_from("<BQ", body, at)
-        records.append((op, body[at + 9 : at + 9 + n]))
-        at += 9 + n
+    records, offset = [], 0
+    while offset + 9 <= len(body):
+        op, n = struct.unpack_from("<BQ", body, offset)
+        records.append((op, body[offset + 9 : offset + 9 + n]))
+        offset += 9 + n
     return records
 
 
@@ -214,7 +184,7 @@ def _damage_chunk(payload: bytes, rng: random.Random) -> bytes:
         (n,) = struct.unpack_from("<I", payload, 28)
         compression = payload[32 : 32 + n]
         inner = _mcap_records(_unpacked(compression, payload[40 + n :], size))
-    except Exception:  # noqa: BLE001 (what an earlier fault left, whatever its decompressor calls it)
+    except Exception:  # noqa: BLE001 (what an earlier fault left, with any exception of the decompressor)
         return damage_bytes(payload, rng)
     if inner:
         _damage_list(inner, rng)
@@ -276,7 +246,7 @@ class BagRecord:
 
 
 def damage_bag(content: bytes, rng: random.Random) -> bytes:
-    """Change header fields and data of records, inside chunks as well; chunks are compressed anew."""
+    """Change header fields and data of records, inside chunks as well; chunks are compressed again."""
     head = content.index(b"\n") + 1
     records = _bag_records(content[head:])
     for record in records:
@@ -290,19 +260,19 @@ def damage_bag(content: bytes, rng: random.Random) -> bytes:
 
 
 def _bag_records(body: bytes) -> list[BagRecord]:
-    records, at = [], 0
-    while at + 8 <= len(body):
-        (n,) = struct.unpack_from("<I", body, at)
-        header, at = body[at + 4 : at + 4 + n], at + 4 + n
-        (m,) = struct.unpack_from("<I", body, at)
+    records, offset = [], 0
+    while offset + 8 <= len(body):
+        (n,) = struct.unpack_from("<I", body, offset)
+        header, offset = body[offset + 4 : offset + 4 + n], offset + 4 + n
+        (m,) = struct.unpack_from("<I", body, offset)
         fields, inside = [], 0
         while inside + 4 <= len(header):
             (k,) = struct.unpack_from("<I", header, inside)
             name, _, value = header[inside + 4 : inside + 4 + k].partition(b"=")
             fields.append((name, value))
             inside += 4 + k
-        records.append(BagRecord(fields, body[at + 4 : at + 4 + m]))
-        at += 4 + m
+        records.append(BagRecord(fields, body[offset + 4 : offset + 4 + m]))
+        offset += 4 + m
     return records
 
 

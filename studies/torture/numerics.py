@@ -57,11 +57,11 @@ def read_samples(path: Path) -> Drive:
         columns = log.read({topic: [stamp, *paths] for topic, (_, stamp, paths) in _TOPICS.items()})
     finally:
         log.close()
-    found = {}
+    samples_by_topic = {}
     for topic, (_, stamp, paths) in _TOPICS.items():
         read = columns[topic]
-        found[topic] = Samples(read.log_time_ns, read.fields[stamp], {p: read.fields[p] for p in paths})
-    return found
+        samples_by_topic[topic] = Samples(read.log_time_ns, read.fields[stamp], {p: read.fields[p] for p in paths})
+    return samples_by_topic
 
 
 def write_samples(path: Path, drives: Iterable[Drive]) -> None:
@@ -79,7 +79,7 @@ def write_samples(path: Path, drives: Iterable[Drive]) -> None:
 
 
 def _sensors(change: Callable[[Samples, np.random.Generator], Samples]) -> Callable[[Drive], Drive]:
-    """Make a change of one topic's samples one of all topics but the truth."""
+    """Make a change of one topic's samples one of all topics except the ground truth."""
 
     def changed(drive: Drive) -> Drive:
         rng = np.random.default_rng(7)

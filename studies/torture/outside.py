@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from studies.pages import ROOT
 from studies.torture.workers import LIMIT_BYTES, Ended
 
-#: Harms nobody's machine, whatever a case does; what a case may take is checked against what it took.
+#: Protects the machine from any case; what a case may take is checked against what it took.
 _HARD_LIMIT_BYTES = 8 << 30
 
 
@@ -66,8 +66,8 @@ def measured(*arguments: str, limit_s: float = 60.0, **options: object) -> Proce
     # A child's peak begins with that of the process which starts it: one above the limit would put it on the child.
     inherited = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
     peak = usage.ru_maxrss << 10
-    told = peak > inherited or inherited < LIMIT_BYTES
-    return Process(process.returncode, texts[0], texts[1], wall_s, peak if told else 0, late.is_set())
+    is_known = peak > inherited or inherited < LIMIT_BYTES
+    return Process(process.returncode, texts[0], texts[1], wall_s, peak if is_known else 0, late.is_set())
 
 
 def _limit() -> None:

@@ -100,12 +100,12 @@ def shrinking_file(work: Path) -> Verdict:
 
 
 def _opened(files: Path) -> set[str]:
-    """Return what the descriptors below a folder of ``/proc`` stand for."""
-    found = set()
+    """Return what the descriptors below a folder of ``/proc`` refer to."""
+    targets = set()
     for file in files.iterdir():
         with contextlib.suppress(OSError):
-            found.add(str(file.readlink()))
-    return found
+            targets.add(str(file.readlink()))
+    return targets
 
 
 def output_is_input(work: Path) -> Verdict:

@@ -35,15 +35,15 @@ class Message:
 
 
 def messages() -> list[Message]:
-    """Return a car that turns: IMU, odometry as truth, and a type of nobody's."""
+    """Return a car that turns: IMU, odometry as ground truth, and an unknown type."""
     store = _store("LATEST")
     types = store.types
     steering_type, speed_type = _OWN
-    found = []
+    written = []
     for i in range(int(_RATE_HZ * _SECONDS)):
-        at, t = START_NS + i * 1_000_000_000 // _RATE_HZ, i / _RATE_HZ
+        stamp_ns, t = START_NS + i * 1_000_000_000 // _RATE_HZ, i / _RATE_HZ
         rate, speed = 0.3 * np.sin(3.0 * t), 15.0
-        stamp = types["builtin_interfaces/msg/Time"](sec=at // 10**9, nanosec=at % 10**9)
+        stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
         header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="base")
         vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
         zeros9, zeros36 = np.zeros(9), np.zeros(36)
@@ -60,15 +60,20 @@ def messages() -> list[Message]:
         odometry = types["nav_msgs/msg/Odometry"](header, "base", pose, twist)
         steering = 0.02 * np.sin(3.0 * t)
         angle = types[steering_type](steering, np.full(4, speed), np.arange(i % 5, dtype=np.uint8), "ok")
-        plain = {"stamp": {"sec": at // 10**9, "nsec": at % 10**9}, "speed": speed, "rate": rate, "wheels": [speed] * 4}
+        plain = {
+            "stamp": {"sec": stamp_ns // 10**9, "nsec": stamp_ns % 10**9},
+            "speed": speed,
+            "rate": rate,
+            "wheels": [speed] * 4,
+        }
         for topic, name, message in (
             ("/imu/data", "sensor_msgs/msg/Imu", imu),
             ("/rtk/odometry", "nav_msgs/msg/Odometry", odometry),
             ("/vehicle/steering", steering_type, angle),
             ("/vehicle/speed", speed_type, types[speed_type](header, speed)),
         ):
-            found.append(Message(topic, name, at, bytes(store.serialize_cdr(message, name)), plain))
-    return found
+            written.append(Message(topic, name, stamp_ns, bytes(store.serialize_cdr(message, name)), plain))
+    return written
 
 
 def _store(release: str) -> Any:

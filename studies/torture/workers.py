@@ -1,4 +1,4 @@
-"""Cases in forked processes under watch: what hangs or grows is killed and told; nothing is done twice."""
+"""Cases in monitored processes: what hangs or grows is killed and reported; no case is repeated."""
 
 from __future__ import annotations
 
@@ -90,8 +90,8 @@ def judge(ended: Ended, allowed: Sequence[int] = (0, 1, 2, 3)) -> Verdict:
         return Verdict(end, f"exit code {ended.code}: {ended.err[-500:]}")
     if ended.code in (1, 2) and not last.startswith("pdhef"):
         return Verdict(end, f"no line of an error: {ended.err[-500:]!r}")
-    if found := _CONTROL.search(ended.out + ended.err):
-        around = (ended.out + ended.err)[max(0, found.start() - 60) : found.end() + 20]
+    if control := _CONTROL.search(ended.out + ended.err):
+        around = (ended.out + ended.err)[max(0, control.start() - 60) : control.end() + 20]
         return Verdict(end, f"a control character in the output: {around!r}")
     return Verdict(end)
 
@@ -104,7 +104,7 @@ def run_cases(
     jobs: int = 2,
     tell: Callable[[str], None] = print,
 ) -> list[Tally]:
-    """Judge the cases 0 to ``count`` - 1 in blocks, each in a forked process; none that the journal holds again."""
+    """Judge the cases 0 to ``count`` - 1 in blocks, each in a forked process; none that is in the journal already."""
     done = {t.first: t for t in read_journal(journal)}
     left = [range(a, min(a + BLOCK, count)) for a in range(0, count, BLOCK) if a not in done]
     journal.parent.mkdir(parents=True, exist_ok=True)
@@ -158,7 +158,7 @@ class _Block:
         theirs.close()
 
     def watch(self) -> bool:
-        """Take what the process says; kill it if it takes too much; return whether the block is done."""
+        """Read the messages of the process; kill it if it takes too much; return whether the block is done."""
         try:
             while self.pipe.poll():
                 number, end, problem = self.pipe.recv()
@@ -204,7 +204,7 @@ def _work(judge_case: Callable[[int], Verdict], cases: range, pipe: Connection) 
     for number in cases:
         try:
             verdict = judge_case(number)
-        except BaseException:  # noqa: BLE001 (a case that this harness cannot judge is a problem to be told)
+        except BaseException:  # noqa: BLE001 (a case that this harness cannot judge is reported as a problem)
             verdict = Verdict("no verdict", traceback.format_exc()[-3000:])
         pipe.send((number, verdict.end, verdict.problem))
 

@@ -15,9 +15,9 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
 from pdhef_logtool.drive.windows import DriveWindow
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.logs.budget import Budget
 from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.resource_limits import ResourceLimits
 from pdhef_logtool.mapping import Mapping, SignalSource, read_signals
 from pdhef_logtool.records.errors import EstimatorError, MappingError, UsageError
 from pdhef_logtool.records.signals import Signals, join_signals
@@ -130,7 +130,7 @@ def test_bounds_and_ends(sample_logs_dir: Path, car: Car, monkeypatch: pytest.Mo
     closed: list[str] = []
     open_log = reading.open_log
 
-    def watched_log(path: Path, budget: Budget, msgs: Path | None = None, **_: object) -> DriveLog:
+    def watched_log(path: Path, budget: ResourceLimits, msgs: Path | None = None, **_: object) -> DriveLog:
         log = open_log(path, budget)
         close = log.close
         monkeypatch.setattr(type(log), "close", lambda _self: closed.append(path.name) or close())

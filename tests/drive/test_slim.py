@@ -25,8 +25,8 @@ from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.drive.slim import slim_log
 from pdhef_logtool.logs.discovery import LogInput, hash_log
 from pdhef_logtool.logs.open_log import log_metadata, open_log
-from pdhef_logtool.logs.slim_copy import write_record
-from pdhef_logtool.logs.slim_log import SlimLog
+from pdhef_logtool.logs.reduced_copy import write_record
+from pdhef_logtool.logs.reduced_log import ReducedLog
 from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.mapping import Mapping, load_mapping
 from pdhef_logtool.records.errors import LogError, MappingError
@@ -61,7 +61,7 @@ def _facts(path: Path, mapping: Mapping | None, options: ReadOptions) -> dict[st
         }
 
 
-def _same(source: Path, tmp_path: Path, mapping: Mapping | None = None, options: ReadOptions = AS_IT_IS) -> SlimLog:
+def _same(source: Path, tmp_path: Path, mapping: Mapping | None = None, options: ReadOptions = AS_IT_IS) -> ReducedLog:
     """Make a slim log, hold all that is read of it against the source, and return it closed."""
     target = tmp_path / "slim" / "drive.mcap"
     expected = _facts(source, mapping, options)
@@ -71,7 +71,7 @@ def _same(source: Path, tmp_path: Path, mapping: Mapping | None = None, options:
     for key, value in expected.items():
         assert repr(got[key]) == repr(value), key
     with closing(open_log(moved)) as log:
-        assert isinstance(log, SlimLog)
+        assert isinstance(log, ReducedLog)
         return log
 
 
@@ -182,7 +182,7 @@ def test_a_slim_sample_log_reads_like_its_source(name: str, tmp_path: Path) -> N
         assert (log.record.signals_sha256, log.record.truth_sha256) == (drive.signals_sha256, drive.truth_sha256)
 
 
-def _holds_a_topic_a_chunk(slim: SlimLog) -> None:
+def _holds_a_topic_a_chunk(slim: ReducedLog) -> None:
     """Hold a slim log of faults.mcap against what is to be kept of it: mapped topics, apart from each other."""
     container = slim.containers[0]
     assert all(len(span.counts) == 1 for span in container.spans)
@@ -289,7 +289,7 @@ def test_definitions_of_the_user_go_into_the_slim_log(tmp_path: Path) -> None:
 def test_a_damaged_slim_log_tells_its_own_losses_besides(tmp_path: Path) -> None:
     slim_log(LogInput(DLC, "drive"), tmp_path / "s.mcap", None, AS_IT_IS)
     with closing(open_log(tmp_path / "s.mcap")) as log:
-        assert isinstance(log, SlimLog)
+        assert isinstance(log, ReducedLog)
         start, end = log.containers[0].extent(log.containers[0].spans[-1])  # the first one holds all of the IMU
     data = bytearray((tmp_path / "s.mcap").read_bytes())
     data[(start + end) // 2] ^= 0x40
@@ -299,11 +299,11 @@ def test_a_damaged_slim_log_tells_its_own_losses_besides(tmp_path: Path) -> None
 
 
 @pytest.fixture(scope="module")
-def slim_dlc(tmp_path_factory: pytest.TempPathFactory) -> SlimLog:
+def slim_dlc(tmp_path_factory: pytest.TempPathFactory) -> ReducedLog:
     target = tmp_path_factory.mktemp("slim") / "dlc.mcap"
     slim_log(LogInput(DLC, "drive"), target, None, AS_IT_IS)
     with closing(open_log(target)) as log:
-        assert isinstance(log, SlimLog)
+        assert isinstance(log, ReducedLog)
         return log
 
 
@@ -317,7 +317,7 @@ def slim_dlc(tmp_path_factory: pytest.TempPathFactory) -> SlimLog:
     ],
 )
 def test_a_record_that_cannot_be_is_one_clear_line(
-    tmp_path: Path, slim_dlc: SlimLog, changed: dict[str, Any], said: str
+    tmp_path: Path, slim_dlc: ReducedLog, changed: dict[str, Any], said: str
 ) -> None:
     record = replace(slim_dlc.record, **changed)
     with McapLogWriter(tmp_path / "bad.mcap") as writer:

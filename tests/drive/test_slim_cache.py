@@ -16,7 +16,7 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.drive.slim_cache import SlimCache
 from pdhef_logtool.logs.discovery import LogInput, identity_of
-from pdhef_logtool.logs.slim_log import is_whole
+from pdhef_logtool.logs.reduced_log import is_whole
 from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.workers.supervisor import Tell, supervise

@@ -75,7 +75,7 @@ def test_a_flipped_bit_that_only_the_crc_of_the_data_shows_is_a_loss(tmp_path: P
     log = open_log(path)
     values = log.read({"/t": ["a", "b", "c"]})["/t"].fields
     assert [(loss.kind, loss.severity) for loss in log.lost] == [("bad-data-crc", "lost")]
-    assert "nothing tells which" in log.lost[0].what
+    assert "it is unknown which" in log.lost[0].what
     np.testing.assert_array_equal(values["b"], 0.5 * np.arange(N))  # what can be read is read
     (ledger,) = log.byte_ledgers
     assert ledger.lost > 0

@@ -19,11 +19,11 @@ import pytest
 from pdhef_logtool import Car, ReadOptions, estimate, inspect_log, read_drive
 from pdhef_logtool.drive.slim import slim_log
 from pdhef_logtool.logs import formats
-from pdhef_logtool.logs.budget import Meter
 from pdhef_logtool.logs.discovery import LogInput, find_logs
 from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.resource_limits import Meter
 from pdhef_logtool.logs.table_log import Table, TableLog
 from pdhef_logtool.records.errors import LogError, MappingError, PdhefError
 

@@ -15,11 +15,11 @@ import pytest
 import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
 
-from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget, BudgetError, Meter
 from pdhef_logtool.logs.compression import decompress, decompress_message
 from pdhef_logtool.logs.container import SpanDamageError
 from pdhef_logtool.logs.discovery import find_logs, hash_log
 from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError, Meter, ResourceLimits
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.inspection import inspect_log
@@ -59,7 +59,7 @@ def _records(data: bytes) -> list[tuple[int, int, int]]:
     return found
 
 
-def _outcome(path: Path, budget: Budget = DEFAULT_BUDGET) -> tuple[int, tuple[Loss, ...], int]:
+def _outcome(path: Path, budget: ResourceLimits = DEFAULT_LIMITS) -> tuple[int, tuple[Loss, ...], int]:
     """Return how many messages are read, what is lost, and how many messages the topics then claim."""
     log = open_log(path, budget)
     try:
@@ -177,27 +177,27 @@ def test_decompression_stops_where_the_claim_ends(compression: str, monkeypatch:
         "bz2": bz2.compress,
     }
     stored = pack[compression](content)
-    assert decompress(compression, stored, 5000, DEFAULT_BUDGET) == content
+    assert decompress(compression, stored, 5000, DEFAULT_LIMITS) == content
     for size in (4999, 5001, 0):
         with pytest.raises(SpanDamageError):
-            decompress(compression, stored, size, DEFAULT_BUDGET)
+            decompress(compression, stored, size, DEFAULT_LIMITS)
     with pytest.raises(SpanDamageError):
-        decompress(compression, stored[:-10], 5000, DEFAULT_BUDGET)
-    with pytest.raises(BudgetError, match="--set budget"):
-        decompress(compression, stored, 5000, Budget(chunk_bytes=4999))
+        decompress(compression, stored[:-10], 5000, DEFAULT_LIMITS)
+    with pytest.raises(LimitError, match="--set budget"):
+        decompress(compression, stored, 5000, ResourceLimits(chunk_bytes=4999))
     # By ratio: a hundred kilobytes of nothing may not become gigabytes, whatever is claimed.
-    with pytest.raises(BudgetError, match="chunk ratio"):
-        decompress(compression, stored, 200 << 20, DEFAULT_BUDGET)
-    with pytest.raises(BudgetError):
-        decompress_message(zstandard.ZstdCompressor().compress(bytes(8 << 20)), Budget(chunk_bytes=1 << 20))
+    with pytest.raises(LimitError, match="chunk ratio"):
+        decompress(compression, stored, 200 << 20, DEFAULT_LIMITS)
+    with pytest.raises(LimitError):
+        decompress_message(zstandard.ZstdCompressor().compress(bytes(8 << 20)), ResourceLimits(chunk_bytes=1 << 20))
 
 
 def test_a_file_that_unpacks_to_too_much_gives_its_beginning(tmp_path: Path) -> None:
     plain = _write(tmp_path / "a.mcap").read_bytes()
     path = tmp_path / "a.mcap.zst"
     path.write_bytes(zstandard.ZstdCompressor().compress(plain + bytes(64 << 20)))
-    log = open_log(path, Budget(chunk_ratio=100))
-    assert [loss.what for loss in log.lost if "above the budget" in loss.what]
+    log = open_log(path, ResourceLimits(chunk_ratio=100))
+    assert [loss.what for loss in log.lost if "above the limit" in loss.what]
     log.close()
 
 
@@ -216,7 +216,7 @@ def test_too_many_channels_cost_the_surplus_and_end(tmp_path: Path) -> None:
             channel = writer.register_channel(f"/t{i}", "json", 0)
             writer.add_message(channel, T0 + i, b"{}", T0 + i)
         writer.finish()
-    read, lost, claimed = _outcome(path, Budget(channels=300))
+    read, lost, claimed = _outcome(path, ResourceLimits(channels=300))
     assert read == claimed == 300
     assert {"over-budget", "unknown-channel"} <= {loss.kind for loss in lost}
     assert len(lost) < 60  # and not one for each of them
@@ -243,8 +243,8 @@ def test_a_channel_that_nothing_declares_in_a_log_whose_clock_is_set_back(tmp_pa
 def test_a_log_that_takes_too_long_loses_its_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = _write(tmp_path / "a.mcap")
     now = [0.0]
-    monkeypatch.setattr("pdhef_logtool.logs.budget.time.thread_time", lambda: now[0])
-    log = open_log(path, Budget(seconds=10.0, seconds_per_mib=0.0))
+    monkeypatch.setattr("pdhef_logtool.logs.resource_limits.time.thread_time", lambda: now[0])
+    log = open_log(path, ResourceLimits(seconds=10.0, seconds_per_mib=0.0))
     container = log.containers[0]  # type: ignore[attr-defined]
     load = container.load
 
@@ -264,15 +264,15 @@ def test_a_log_that_takes_too_long_loses_its_rest(tmp_path: Path, monkeypatch: p
 
 def test_a_sound_log_can_be_read_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    monkeypatch.setattr("pdhef_logtool.logs.budget.time.thread_time", lambda: now[0])
-    meter = Meter(Budget(seconds=1.0, seconds_per_mib=2.0))
+    monkeypatch.setattr("pdhef_logtool.logs.resource_limits.time.thread_time", lambda: now[0])
+    meter = Meter(ResourceLimits(seconds=1.0, seconds_per_mib=2.0))
     for _ in range(100):
         with meter.running(1 << 20):
             now[0] += 1.9
         meter.check()
     with meter.running():
         now[0] += 20.0
-    with pytest.raises(BudgetError, match="longer than"):
+    with pytest.raises(LimitError, match="longer than"):
         meter.check()
 
 
@@ -398,5 +398,5 @@ def test_more_messages_than_their_bytes_can_hold_are_refused(tmp_path: Path) -> 
         content = record * count
         stored = zstandard.ZstdCompressor().compress(content)
         path = _mcap_of_chunk(tmp_path / "a.mcap", len(content), b"zstd", stored)
-        assert {loss.kind for loss in _outcome(path, Budget(chunk_ratio=100_000))[1]} == kinds
-    assert _outcome(path, Budget(chunk_ratio=100_000).times(100))[1][0].kind == "unknown-channel"
+        assert {loss.kind for loss in _outcome(path, ResourceLimits(chunk_ratio=100_000))[1]} == kinds
+    assert _outcome(path, ResourceLimits(chunk_ratio=100_000).times(100))[1][0].kind == "unknown-channel"

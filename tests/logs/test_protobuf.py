@@ -205,7 +205,7 @@ def test_a_payload_that_is_no_message_is_counted_and_nan(tmp_path: Path) -> None
     ("schema", "encoding", "says"),
     [
         (b"\x0a\xff", "protobuf", "cannot be parsed"),
-        (b"", "protobuf", "hold no message car.State"),
+        (b"", "protobuf", "contain no message car.State"),
         (_files().SerializeToString(), "proto", "'proto' schema"),
         (descriptor_pb2.FileDescriptorSet(file=[{"name": "a", "dependency": ["b"]}]).SerializeToString(), "protobuf",
          "a imports b"),

@@ -104,7 +104,7 @@ def test_windows_together_give_what_one_read_gives(shared_dir: Path) -> None:
         whole = log.read({topic: [field]})[topic]
         parts = [
             log.read({topic: [field]}, a, b)[topic]
-            for a, b in windows(log.start_ns, log.end_ns, 7_000_000_000, log.occupied)
+            for a, b in windows(log.start_ns, log.end_ns, 7_000_000_000, log.recording_span)
         ]
         np.testing.assert_array_equal(np.concatenate([p.log_time_ns for p in parts]), whole.log_time_ns)
         np.testing.assert_array_equal(np.concatenate([p.fields[field] for p in parts]), whole.fields[field])

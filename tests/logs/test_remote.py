@@ -109,7 +109,7 @@ def test_any_split_of_ranges_gives_the_same_bytes(reads: list[tuple[int, int]], 
     with serving(x=data) as server:
         source = RemoteSource(_place(server, "x"))
         try:
-            source.expect([(at, at + n) for at, n in reads if order.random() < 0.5])
+            source.prefetch([(at, at + n) for at, n in reads if order.random() < 0.5])
             order.shuffle(reads)
             for at, n in reads:
                 assert source.fetch(at, n) == data[at : at + n]

@@ -15,7 +15,6 @@ from pdhef_logtool.logs.source_copy import (
     iterate_attachments,
     iterate_copy,
     iterate_metadata,
-    iterate_raw,
     register_channels,
     source_profile,
 )
@@ -31,11 +30,11 @@ def _copy(source: Path, target: Path, whole: bool = False) -> None:
     with McapLogWriter(target, profile=source_profile(log)) as writer:
         channels = register_channels(writer, log)
         assert channels.lost == ()
-        writer.write([], (iterate_copy if whole else iterate_raw)(log, channels))
+        writer.write([], iterate_copy(log, channels, whole=whole))
         for a in iterate_attachments(log):
             writer.attachment(a.name, a.media_type, a.data, a.log_time_ns, a.create_time_ns)
         for m in iterate_metadata(log):
-            writer.metadata(m.name, m.values)
+            writer.metadata(m.name, m.metadata)
     log.close()
 
 
@@ -192,8 +191,8 @@ def test_a_window_gives_the_messages_of_that_window(shared_dir: Path, tmp_path: 
     with McapLogWriter(tmp_path / "x.mcap") as writer:
         channels = register_channels(writer, log)
         start, end = log.start_ns + 20 * 10**9, log.start_ns + 50 * 10**9
-        whole = [m for m in iterate_raw(log, channels) if start <= m.log_time_ns < end]
-        assert list(iterate_raw(log, channels, start, end)) == whole
+        whole = [m for m in iterate_copy(log, channels, whole=False) if start <= m.log_time_ns < end]
+        assert list(iterate_copy(log, channels, start, end, whole=False)) == whole
         assert len(whole) > 10_000
     log.close()
 

@@ -255,7 +255,8 @@ def test_windows_joined_are_the_whole(seed: int, length: int, device: bool) -> N
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
     whole = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
     parts = [
-        read_signals(log, mapping, clocks, s, e) for s, e in windows(log.start_ns, log.end_ns, length, log.occupied)
+        read_signals(log, mapping, clocks, s, e)
+        for s, e in windows(log.start_ns, log.end_ns, length, log.recording_span)
     ]
     for name, channel in whole.signals.items():
         assert_same(join_channels([p.signals[name] for p in parts]), channel)

@@ -52,7 +52,7 @@ def test_race_car_in_windows(shared_dir: Path) -> None:
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
     parts = [
         read_signals(log, mapping, clocks, s, e)
-        for s, e in windows(log.start_ns, log.end_ns, 77_777_777_777, log.occupied)
+        for s, e in windows(log.start_ns, log.end_ns, 77_777_777_777, log.recording_span)
     ]
     for name, channel in whole.signals.items():
         joined = join_channels([p.signals[name] for p in parts])

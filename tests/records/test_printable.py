@@ -14,7 +14,7 @@ from mcap.writer import Writer
 
 from pdhef_logtool.cli import console
 from pdhef_logtool.records.errors import LogError, PdhefError
-from pdhef_logtool.records.printable import all_shown, shown, utf8
+from pdhef_logtool.records.printable import all_printable, printable, utf8
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.inspection import inspect_log, render_inspection
 from pdhef_logtool.storage.documents import jsonable
@@ -25,7 +25,7 @@ _HOSTILE = "\x1b[31m\nwarning: forged\r\x9b2J\u202e\u2066\u200f\x00\x7f\u2028\ud
 
 @given(_ANY, st.integers(10, 60))
 def test_what_is_shown_is_one_printable_line_of_limited_length(text: str, most: int) -> None:
-    line = shown(text, most)
+    line = printable(text, most)
     assert line.isprintable()
     assert len(line) <= most
     line.encode()
@@ -57,10 +57,10 @@ def test_records_are_shown_whole() -> None:
         facts: dict[str, object]
         path: Path
 
-    seen = all_shown(Record((Loss("a", _HOSTILE, "\n"),), {"\x1b": [_HOSTILE, 1, None]}, Path("a\nb")))
-    assert seen.losses[0].what == shown(_HOSTILE)
+    seen = all_printable(Record((Loss("a", _HOSTILE, "\n"),), {"\x1b": [_HOSTILE, 1, None]}, Path("a\nb")))
+    assert seen.losses[0].what == printable(_HOSTILE)
     assert seen.losses[0].where == "\\n"
-    assert seen.facts == {"\\x1b": [shown(_HOSTILE), 1, None]}
+    assert seen.facts == {"\\x1b": [printable(_HOSTILE), 1, None]}
     assert seen.path == Path("a\\nb")
 
 
@@ -102,6 +102,6 @@ def test_an_inspection_of_hostile_names_is_plain(
 
 def test_numbers_and_nothing_stay_what_they_are() -> None:
     given = {"a": [1, 2.5, None, True, float("inf")], "b": ({"c\x1b": "d\n"},)}
-    found = all_shown(given)
+    found = all_printable(given)
     assert repr(found) == repr({"a": [1, 2.5, None, True, float("inf")], "b": ({"c\\x1b": "d\\n"},)})
     assert found["a"] is not given["a"]

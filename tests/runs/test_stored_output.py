@@ -198,7 +198,7 @@ def test_one_command_at_a_time_holds_the_place(tmp_path: Path, memory: Any, monk
     monkeypatch.setattr(object_store, "LEFT_OVER_S", -1.0)
     run(logs, URL)
     monkeypatch.undo()
-    memory.pipe_file(lock, object_store.own_name().rpartition("-")[0].encode() + b"-1")  # a process that has ended
+    memory.pipe_file(lock, object_store.process_name().rpartition("-")[0].encode() + b"-1")  # a process that has ended
     run(logs, URL)
     assert timedelta(seconds=LEFT_OVER_S) > timedelta(minutes=15)
     assert datetime.now(UTC) - memory.modified(f"/fleet/out/{JOURNAL_FILE}") < timedelta(seconds=60)

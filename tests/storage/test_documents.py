@@ -283,6 +283,11 @@ def test_the_nearest_name_is_told() -> None:
         (LOADERS[3], "mass = 1440.0", "mass: unknown, did you mean mass_kg?"),
         (LOADERS[3], "[sensors]\nay_std = 1.0", "sensors.ay_std: unknown, did you mean sensors.ay_std_m_s2?"),
         (LOADERS[3], "[tyres.front]\nD = 1.0", "tyres.front.D: unknown, did you mean tyres.front.D_n?"),
+        (
+            LOADERS[5],
+            "[filter.physics]\nq_sdt = [0.1, 0.1, 0.1]",
+            "filter.physics.q_sdt: unknown, did you mean filter.physics.q_std?",
+        ),
     ],
 )
 def test_misspelt_entries_are_told_with_the_nearest_name(loader: Loader, line: str, said: str, tmp_path: Path) -> None:

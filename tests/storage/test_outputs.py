@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from pdhef_logtool.records.errors import OutputError, UsageError
-from pdhef_logtool.records.processes import is_alive, own_name
+from pdhef_logtool.records.processes import is_alive, process_name
 from pdhef_logtool.storage import outputs
 from pdhef_logtool.storage.files import PendingFile, scratch_folder, write_bytes
 from pdhef_logtool.storage.outputs import LOCK_FILE, FolderLock, FolderTransaction, OutputFolder, check_no_input
@@ -285,8 +285,8 @@ def test_a_lock_is_on_the_folder_that_has_the_name_now(tmp_path: Path) -> None:
 
 
 def test_processes_are_known_by_host_number_and_start() -> None:
-    assert is_alive(own_name()) is True
-    host, pid, start = own_name().split("-")
+    assert is_alive(process_name()) is True
+    host, pid, start = process_name().split("-")
     assert is_alive(f"{host}-{pid}-{int(start) + 1}") is False  # the number was given to another one since
     assert is_alive(f"00000000-{pid}-{start}") is None
     with subprocess.Popen([sys.executable, "-c", ""]) as child:
@@ -295,10 +295,10 @@ def test_processes_are_known_by_host_number_and_start() -> None:
 
 
 def test_what_killed_processes_left_is_swept_and_what_others_own_is_not(tmp_path: Path) -> None:
-    host, pid, start = own_name().split("-")
+    host, pid, start = process_name().split("-")
     dead, foreign = f"{host}-{pid}-{int(start) + 1}", "00000000-1-1"
     mine = {"notes.partial": "mine", ".notes.partial": "mine", "logs/x/.vimrc": "mine", "logs/x/a.part": "mine"}
-    alive = {f".run.json.{own_name()}.partial": "half"}
+    alive = {f".run.json.{process_name()}.partial": "half"}
     make(tmp_path, mine | alive)
     make(tmp_path, {f".run.json.{dead}.partial": "", f"logs/x/.report.json.{foreign}.partial": ""})
     make(tmp_path / "logs" / ".pdhef" / "y" / "new", {"report.json": ""})

@@ -15,13 +15,11 @@ from studies.strangers.__main__ import result_of, score_recording
 from studies.strangers.answers import Answer, load_answers
 from studies.strangers.cars import Series, drive
 from studies.strangers.containers import write
-from studies.strangers.faults import faults, right_angles, units_and_signs
-from studies.strangers.held_out import held_out_layouts
-from studies.strangers.layouts import autoware, layouts, vbox
+from studies.strangers.layouts import layout, layouts
+from studies.strangers.mountings import mountings, right_angles
 from studies.strangers.page import Result, merged, page
 from studies.strangers.recordings import ITEMS, answers, imu, road_car, scalar
 from studies.strangers.scoring import Finding, Score, Told, agrees, bias_of, score_log
-from studies.strangers.vehicles import vehicle_layouts
 
 _NS = np.arange(0, 20_000_000_000, 10_000_000, dtype=np.int64)
 _WAVE = np.sin(2.0 * np.pi * 0.2 * _NS * 1e-9)
@@ -108,11 +106,11 @@ def test_an_accelerometer_may_have_a_bias_and_no_tilt() -> None:
 
 @pytest.mark.slow
 def test_a_sound_log_is_right_and_a_wrong_one_is_not(tmp_path: Path) -> None:
-    sound = score_recording(autoware(), tmp_path)
+    sound = score_recording(layout("autoware"), tmp_path)
     assert set(sound.items.values()) == {"right"}
     assert not list(tmp_path.iterdir())
     car = drive("short")
-    turned = replace(autoware(), topics=road_car(car, truth=None), right=answers(car, "steer", "speed"))
+    turned = replace(layout("autoware"), topics=road_car(car, truth=None), right=answers(car, "steer", "speed"))
     absent = score_recording(turned, tmp_path)  # what is mapped and stands in no answer is wrong
     assert absent.items["yaw rate"].startswith("wrong")
 
@@ -120,9 +118,9 @@ def test_a_sound_log_is_right_and_a_wrong_one_is_not(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["yaw-rate-deg", "steering-sign"])
 def test_wrong_units_and_signs_are_corrected_or_told(name: str, tmp_path: Path) -> None:
-    (recording,) = (r for r in units_and_signs() if r.name == name)
+    recording = layout(name)
     result = score_recording(recording, tmp_path)
-    assert result.count("wrong, not told") == 0
+    assert result.count("wrong, not reported") == 0
     assert result.named is not False
 
 
@@ -133,11 +131,11 @@ def test_told_means_that_a_check_or_a_doubt_is_on_the_channel() -> None:
         Finding("ax", "right", True, frozenset(), "y"),
     )
     result = result_of(Score(findings, ("alarm",), None, told), "n", "fault", "w")
-    assert result.items == {"ay": "wrong, told", "ax": "right"}
+    assert result.items == {"ay": "wrong, reported", "ax": "right"}
     assert result.verdicts == {"ax": "none"}
-    worse = replace(result, items={"ay": "wrong, not told", "ax": "missing"}, silent=("ay",))
+    worse = replace(result, items={"ay": "wrong, not reported", "ax": "missing"}, silent=("ay",))
     both = merged([result, worse])
-    assert both.items == {"ay": "wrong, not told", "ax": "missing"}
+    assert both.items == {"ay": "wrong, not reported", "ax": "missing"}
 
 
 def test_an_undecided_check_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,8 +155,8 @@ def test_an_undecided_check_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.slow
 def test_forty_kinds_with_distinct_names_and_pages() -> None:
-    last = [*held_out_layouts()]
-    own = [*faults(), *layouts(), *vehicle_layouts(), *last]
+    last = [*layouts("held-out")]
+    own = [*mountings(), *layouts()]
     assert len({r.name for r in own}) == len(own)
     assert len({r.counted_as for r in own}) >= 40
     assert len(last) == 10
@@ -169,20 +167,20 @@ def test_forty_kinds_with_distinct_names_and_pages() -> None:
 
 def test_the_page_says_what_is_wrong() -> None:
     rows = [
-        Result("a", "fault", "w", "", {"ay": "wrong, not told"}, silent=("ay (ay_m_s2 = /x.y)",), named=False),
+        Result("a", "fault", "w", "", {"ay": "wrong, not reported"}, silent=("ay (ay_m_s2 = /x.y)",), named=False),
         Result("b", "layout", "w", "https://x", {"ax": "right"}, verdicts={"ax": "passed"}),
     ]
     text = page(rows, "")
-    assert "- a: wrong, not told: ay (ay_m_s2 = /x.y)" in text
+    assert "- a: wrong, not reported: ay (ay_m_s2 = /x.y)" in text
     assert "- a: cause not named" in text
     assert "[w](https://x)" in text
-    assert "all passed on 1, some stayed undecided on 0, some failed on 0" in text
+    assert "all passed for 1, some undecided for 0, some failed for 0, no check for 0" in text
 
 
 def test_a_log_without_type_names_is_still_scored(tmp_path: Path) -> None:
-    result = score_recording(vbox(), tmp_path)
+    result = score_recording(layout("vbox"), tmp_path)
     assert set(result.items) >= {"ax", "ay", "yaw rate", "speed"}
-    assert result.count("wrong, not told") == 0
+    assert result.count("wrong, not reported") == 0
 
 
 _QUICK = ("data/drives/comma2k19_segment.mcap", "data/drives/lunda_v40", "data/drives/revs_250lm_a.mcap")

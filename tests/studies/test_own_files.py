@@ -1,4 +1,4 @@
-"""Damaged files of our own, with a fixed seed: ``studies/torture/own_files.py``."""
+"""Damaged outputs of runs, with a fixed seed: ``own_files.py``."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-
-from studies.torture.own_files import numbers, own_file_judge
+from own_files import numbers, own_file_judge
 
 CASES = 36
 
 
 @pytest.mark.slow
-def test_damaged_files_of_our_own_are_told_and_made_good(tmp_path: Path) -> None:
+def test_damaged_outputs_are_reported_and_recomputed(tmp_path: Path) -> None:
     judge_number = own_file_judge(tmp_path, 1)
     found = {number: judge_number(number) for number in numbers(CASES)}
     assert {number: verdict.problem for number, verdict in found.items() if verdict.problem} == {}

@@ -87,7 +87,6 @@ def test_improvement_is_that_of_pooled_errors_and_pairs_the_noise_seeds() -> Non
     assert mixed.value == pytest.approx(expected)
     assert mixed.low < mixed.value < mixed.high
     assert not mixed.proven
-    assert not mixed.disproven
 
 
 def test_improvement_shows_the_range_over_networks() -> None:
@@ -104,7 +103,6 @@ def test_one_noise_seed_proves_nothing() -> None:
     assert gain is not None
     assert math.isnan(gain.low)
     assert not gain.proven
-    assert not gain.disproven
 
 
 def test_numbers_have_three_digits_and_no_powers() -> None:
@@ -112,7 +110,7 @@ def test_numbers_have_three_digits_and_no_powers() -> None:
     for value in 10.0 ** rng.uniform(-6.0, 5.0, 200) * rng.choice([-1.0, 1.0], 200):
         text = number(float(value))
         assert "e" not in text
-        assert float(text) == pytest.approx(value, rel=0.0051)
+        assert float(text.replace("−", "-")) == pytest.approx(value, rel=0.0051)
     assert number(0.0336) == "0.0336"
     assert percent(-0.005) == "−0.5 %"
     assert number(math.nan) == "unknown"

@@ -33,27 +33,6 @@ def test_errors_of_constant_size_have_no_spread_and_differ_by_their_difference()
     assert lines[3] == "| other | 0.300 [0.300, 0.300] | 50 % | -0.200 [-0.200, -0.200] | – | – |"
 
 
-def test_a_finished_stage_is_taken_as_long_as_nothing_changed_that_it_rests_on(tmp_path: Path):
-    stamps = np.arange(5, dtype=np.int64)
-    rows = [row("a", np.array([0.1, math.nan, 0.3, 0.4, 0.5]), stamps, half=0.35), row("b", np.zeros(5), stamps)]
-    called = []
-
-    def work() -> tuple[list[real.Row], str]:
-        called.append(1)
-        return rows, "a remark"
-
-    first, _ = real.Finished(tmp_path / "case", "one").stage("learnt", work)
-    again, remark = real.Finished(tmp_path / "case", "one").stage("learnt", work)
-    assert (len(called), remark) == (1, "a remark")
-    for have, want in zip(again, first, strict=True):
-        assert have.errors.name == want.errors.name
-        np.testing.assert_array_equal(have.errors.error, want.errors.error)
-        np.testing.assert_array_equal(have.width, want.width)
-        assert (have.errors.inside is None) == (want.errors.inside is None)
-    real.Finished(tmp_path / "case", "other").stage("learnt", work)
-    assert len(called) == 2
-
-
 def test_looks_are_counted_on_from_what_was_before_and_the_same_figures_count_once(tmp_path: Path):
     case, file = real.CASES[0], tmp_path / "real" / real.LOOKS_FILE
     before = real.LOOKS_BEFORE + real.LOOKS_BEFORE_PUBLISHED[case.name]

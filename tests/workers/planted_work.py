@@ -143,14 +143,6 @@ def _wait(value: str, tell: Tell) -> str:
     return value
 
 
-held: list[str] = []
-
-
-def _hold(value: str, _tell: Tell) -> tuple[int, list[str]]:
-    held.append(value)
-    return os.getpid(), held
-
-
 def _alone(value: str, tell: Tell) -> int:
     """Be lost the first time; the second time return how many workers there are."""
     _kill_once(value, tell)
@@ -175,6 +167,5 @@ _FAULTS = {
     "odd": lambda _value, _tell: Odd(),
     "unreadable": lambda _value, _tell: Unreadable(),
     "alone": _alone,
-    "hold": _hold,
     "wait": _wait,
 }

@@ -213,18 +213,6 @@ def test_an_item_whose_worker_was_never_started_has_not_been_tried() -> None:
         assert ended.failure == Failure(REASONS["kill"], "at kill", 2)
 
 
-def test_items_of_a_place_go_to_its_worker_as_long_as_it_lives() -> None:
-    items = [("hold", str(i)) for i in range(6)]
-    with Crew(planted, jobs=3, preload=PRELOAD) as crew:
-        for turn in (1, 2):
-            ended = sorted(crew.each(items, place=lambda item: int(item[1]) % 3), key=lambda e: e.number)
-            assert [e.result[1] for e in ended[3:]] == [[str(i), str(i + 3)] * turn for i in range(3)]  # type: ignore[index]
-        next(crew.each([("hang", ""), ("well", "")], place=lambda item: int(item[0] == "well")))
-        # What was left at work is gone with what it held; the others are not.
-        ended = sorted(crew.each(items[:3], place=lambda item: int(item[1])), key=lambda e: e.number)
-        assert [len(e.result[1]) for e in ended] == [1, 5, 5]  # type: ignore[index]
-
-
 @pytest.mark.slow
 def test_the_first_item_compiles_alone() -> None:
     items = [("slowly", "a"), ("well", "b"), ("well", "c")]

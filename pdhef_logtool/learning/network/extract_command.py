@@ -346,7 +346,7 @@ def _check_apart(entries: Sequence[Mapping[str, Any]]) -> None:
 
 def _extract_all(work: Sequence[_Job], jobs: int, progress: Progress, warn: Tell) -> tuple[DriveResult, ...]:
     by_log: dict[str, DriveResult] = {}
-    for done, result in enumerate(_run_jobs(work, jobs, progress), start=1):
+    for done, result in enumerate(_run_jobs(work, jobs, progress, warn), start=1):
         by_log[result.record.name] = result
         tell_drive(result.record, warn)
         progress(result.record.name, done / len(work))
@@ -423,7 +423,7 @@ def _car(path: Path | None) -> Car:
     return Car.load(path, network=NO_MODEL, intervals=NO_INTERVALS)
 
 
-def _run_jobs(work: Sequence[_Job], jobs: int, progress: Progress) -> Iterator[DriveResult]:
+def _run_jobs(work: Sequence[_Job], jobs: int, progress: Progress, warn: Tell) -> Iterator[DriveResult]:
     """Yield one result a job, in any order; a process that dies costs its own drive only."""
     if len(work) == 1:
         yield _extract(work[0], partial(progress, work[0].log_input.stem))
@@ -435,7 +435,8 @@ def _run_jobs(work: Sequence[_Job], jobs: int, progress: Progress) -> Iterator[D
         progress(name, sum(shares.values()) / len(work))
 
     preload = (__name__, *FILTERS)
-    with closing(supervise(_extract_guarded, work, jobs=min(jobs, len(work)), preload=preload, progress=told)) as ends:
+    ends = supervise(_extract_guarded, work, jobs=min(jobs, len(work)), preload=preload, progress=told, warn=warn)
+    with closing(ends):
         for ended in ends:
             shares[ended.number] = 1.0
             yield ended.result or _failure(ended.item, ended.failure.reason if ended.failure else "")

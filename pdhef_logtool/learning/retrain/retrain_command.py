@@ -304,7 +304,8 @@ def _look(  # positional: what reading takes, where it is remembered, and how it
         progress(f"reading {text}", (number + share) / len(new) / 8.0)
 
     records = dict[str, DriveRecord]()
-    for ended in supervise(_read_log, new, jobs=jobs, preload=("pdhef_logtool.drive.reading", *FILTERS), progress=tell):
+    preload = ("pdhef_logtool.drive.reading", *FILTERS)
+    for ended in supervise(_read_log, new, jobs=jobs, preload=preload, progress=tell, warn=say):
         log_input, seen = ended.item.log_input, ended.result
         if seen is None:
             reason = "it could not be read" if ended.failure is None else ended.failure.reason

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.text import Text
 
-from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 from pdhef_logtool.mapping.evidence import PIECE_NS, Pieces, Seen
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import FloatArray
@@ -71,7 +71,11 @@ class FieldsOfLog:
 
 
 def fields_of_log(
-    path: LogPlace | str, topic: str | None = None, *, budget: Budget = DEFAULT_BUDGET, msgs: Path | str | None = None
+    path: LogPlace | str,
+    topic: str | None = None,
+    *,
+    budget: ResourceLimits = DEFAULT_LIMITS,
+    msgs: Path | str | None = None,
 ) -> FieldsOfLog:
     """Return the numeric fields of a topic, or of all, over a few pieces of the log.
 

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pdhef_logtool.logs.byte_account import checksum_text
-from pdhef_logtool.logs.occupied_time import shown_time
+from pdhef_logtool.logs.recording_span import shown_time
 from pdhef_logtool.mapping.candidates import Candidate
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS
 from pdhef_logtool.runs.inspection.report import Inspection, SignalReport, TopicReport

@@ -16,13 +16,14 @@ import numpy as np
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_proposals
-from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
 from pdhef_logtool.logs.byte_account import checksummed_share
+from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import Wanted
-from pdhef_logtool.logs.drive_log import DriveLog, LogIndex, TopicInfo, windows
+from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo, windows
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 from pdhef_logtool.mapping import (
     Ambiguity,
     ClockModel,
@@ -231,7 +232,7 @@ def inspect_log(
     mapping: Mapping | Path | str | None = None,
     *,
     prefer_truth: Literal["perfect", "rtk"] = "perfect",
-    budget: Budget = DEFAULT_BUDGET,
+    budget: ResourceLimits = DEFAULT_LIMITS,
     msgs: Path | str | None = None,
     whole: bool = False,
 ) -> Inspection:
@@ -252,14 +253,13 @@ def inspect_log(
         with closing(open_log(path, budget, msgs, Wanted(frozenset(), above_bytes=WHOLE_BYTES))) as log:
             index = log.index
             # Most of a shorter one is read anyway.
-            long = index is not None and (index.far or log.end_ns - log.start_ns > 2 * WINDOW_NS)
+            long = index is not None and (index.is_remote or log.end_ns - log.start_ns > 2 * WINDOW_NS)
             if index is not None and not (long and index.size > WHOLE_BYTES):
                 index = None
             partial = inspect_drive_log(log, mapping, prefer_truth=prefer_truth, index=index)
             damaged = any(loss.severity == "lost" for loss in log.lost)
-            if partial.sample is None or not (
-                damaged or partial.sample.chunks > MOST_SAMPLED * partial.sample.of_chunks
-            ):
+            sample = partial.sample
+            if sample is None or not (damaged or sample.chunks > MOST_SAMPLED * sample.of_chunks):
                 return partial
     with closing(open_log(path, budget, msgs)) as log:
         return inspect_drive_log(log, mapping, prefer_truth=prefer_truth)
@@ -270,7 +270,7 @@ def inspect_drive_log(
     given: Mapping | None = None,
     *,
     prefer_truth: Literal["perfect", "rtk"] = "perfect",
-    index: LogIndex | None = None,
+    index: ColumnarLog | None = None,
 ) -> Inspection:
     """Do what :func:`inspect_log` does with a log that is open already; with its ``index`` a sample of it is read."""
     ambiguities: tuple[Ambiguity, ...] = ()
@@ -283,7 +283,8 @@ def inspect_drive_log(
         mapping = given
     mapping = resolve_mapping(log, mapping)
     head = (log.start_ns, min(log.end_ns, log.start_ns + WINDOW_NS))
-    look = _whole_look(log) if index is None else _sample_look(log, index, mapping, head)
+    whole = _Look(windows(log.start_ns, log.end_ns, WINDOW_NS, log.recording_span), tuple(t.name for t in log.topics))
+    look = whole if index is None else _sample_look(log, index, mapping, head)
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
     looked_at = survey_log(log, mapping, clocks, head)
     mapping = looked_at.mapping
@@ -324,7 +325,7 @@ def _read_windows(
     gathered: dict[tuple[str, str], _Gathered] = {}
     losses: list[tuple[Loss, ...]] = []
     if look.by_index is not None:
-        for start, end in windows(log.start_ns, log.end_ns, WINDOW_NS, log.occupied):
+        for start, end in windows(log.start_ns, log.end_ns, WINDOW_NS, log.recording_span):
             for name, times in look.by_index.index_times(start, end).items():
                 steps[name].add(times)
     for start, end in look.windows:
@@ -357,24 +358,19 @@ class _Look:
 
     windows: Iterable[tuple[int, int]]
     stamps: tuple[str, ...]
-    by_index: LogIndex | None = None
+    by_index: ColumnarLog | None = None
     sample: Callable[[], Sample] | None = None
 
 
-def _whole_look(log: DriveLog) -> _Look:
-    return _Look(windows(log.start_ns, log.end_ns, WINDOW_NS, log.occupied), tuple(t.name for t in log.topics))
-
-
-def _sample_look(log: DriveLog, index: LogIndex, mapping: Mapping, head: tuple[int, int]) -> _Look:
+def _sample_look(log: DriveLog, index: ColumnarLog, mapping: Mapping, head: tuple[int, int]) -> _Look:
     """Look at what the clocks are fitted to, evenly over the log. With the head, which is checked, it is expected."""
     mapped = {source.topic for source in mapping.sources()}
     spread = survey_windows(log.start_ns, log.end_ns) if log.end_ns > head[1] else [head]
-    index.expect(mapped, [head, *spread])
+    index.prefetch(mapped, [head, *spread])
 
-    def sample() -> Sample:
-        return Sample(*index.looked_at, times="sample" if index.far else "index")
-
-    return _Look(spread, tuple(sorted(index.beside(mapped))), None if index.far else index, sample)
+    times: Literal["sample", "index"] = "sample" if index.is_remote else "index"
+    covered = tuple(sorted(index.covered_topics(mapped)))
+    return _Look(spread, covered, None if index.is_remote else index, lambda: Sample(*index.chunks_read, times=times))
 
 
 # ---------------------------------------------------------------------------------------------- gathering

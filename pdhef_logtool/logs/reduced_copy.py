@@ -1,4 +1,4 @@
-"""Writing of slim logs: some topics of a log as they are, each in chunks of its own, and the record of the source."""
+"""Writing of reduced logs: some topics of a log as they are, each in separate chunks, and the record of the source."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import Block, ChannelRecord
 from pdhef_logtool.logs.mcap_log import MESSAGE_HEAD
 from pdhef_logtool.logs.message_schema import MessageSchema, parsing
-from pdhef_logtool.logs.slim_log import RECORD_ENTRY, RECORD_NAME, SlimRecord
+from pdhef_logtool.logs.reduced_log import RECORD_ENTRY, RECORD_NAME, ReducedRecord
 from pdhef_logtool.logs.writer import CHUNK_BYTES, McapLogWriter, scatter
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import IntArray
@@ -21,21 +21,21 @@ from pdhef_logtool.records.signals import IntArray
 _BEFORE_DATA = 22
 
 
-def write_record(writer: McapLogWriter, record: SlimRecord) -> None:
-    """Write the record that makes a file a slim log."""
+def write_record(writer: McapLogWriter, record: ReducedRecord) -> None:
+    """Write the record that marks a file as a reduced log."""
     from pydantic import TypeAdapter
 
-    writer.metadata(RECORD_NAME, {RECORD_ENTRY: TypeAdapter(SlimRecord).dump_json(record).decode()})
+    writer.metadata(RECORD_NAME, {RECORD_ENTRY: TypeAdapter(ReducedRecord).dump_json(record).decode()})
 
 
 def copy_topics(writer: McapLogWriter, log: ColumnarLog, topics: Collection[str]) -> None:
     """Write the messages of some topics as they are, a chunk holding one topic's, each topic's in the log's order.
 
-    Messages whose times were recorded before are left out: which they are would not be known any more.
+    Messages whose times were recorded before are left out, as they could not be recognised in the copy.
 
     Raises
     ------
-    LogError : the log is of a time before 1970, which an MCAP cannot hold.
+    LogError : the log is of a time before 1970, which an MCAP cannot represent.
     """
     if log.start_ns < 0:
         raise LogError(expected="log times from 1970 on", got=f"{log.start_ns} ns", where=str(log.path))
@@ -57,9 +57,9 @@ def copy_topics(writer: McapLogWriter, log: ColumnarLog, topics: Collection[str]
                 for id_ in of_topic:
                     rows = block.rows.get(id_, np.empty(0, np.int64))
                     times = block.log_time_ns[rows]
-                    left_out = log.occupied.recorded_before(topic, c, span, times)
+                    left_out = log.recording_span.recorded_before(topic, c, span, times)
                     chunk.add(block, rows[~left_out & (times >= 0)], ids[id_])
-                # Which of two channels comes first at equal times hangs on what is read together.
+                # The order of two channels at equal times depends on what is read together.
                 if chunk.size >= CHUNK_BYTES or len(of_topic) > 1:
                     chunk.write(writer)
     for chunk in pending.values():
@@ -74,7 +74,7 @@ class _Pending:
     _parts: list[tuple[bytes, IntArray, IntArray, IntArray]] = field(default_factory=list)
 
     def add(self, block: Block, rows: IntArray, channel_id: int) -> None:
-        """Take messages [K] of a block, to be written under a channel's id."""
+        """Add messages [K] of a block, to be written under a channel's id."""
         if not rows.size:
             return
         content, offset = _records(block, rows, channel_id)
@@ -97,7 +97,7 @@ def _records(block: Block, rows: IntArray, channel_id: int) -> tuple[bytes, IntA
     head_size = MESSAGE_HEAD.itemsize
     length = block.length[rows]
     size = length + head_size
-    at = np.cumsum(size) - size
+    start = np.cumsum(size) - size
     head = np.zeros(rows.shape[0], dtype=MESSAGE_HEAD)
     head["op"], head["size"], head["channel"] = int(Opcode.MESSAGE), length + _BEFORE_DATA, channel_id
     head["sequence"] = block.sequence[rows].astype(np.uint32)
@@ -112,8 +112,8 @@ def _records(block: Block, rows: IntArray, channel_id: int) -> tuple[bytes, IntA
         if n:
             places = np.ndarray((source.shape[0] - n + 1,), dtype=(np.void, n), buffer=source.data, strides=(1,))
             records[:, head_size:] = places[block.offset[rows[mine]]].view(np.uint8).reshape(-1, n)
-        scatter(content, at[mine], np.arange(mine.shape[0]), records)
-    return content.tobytes(), at
+        scatter(content, start[mine], np.arange(mine.shape[0]), records)
+    return content.tobytes(), start
 
 
 def _add_channel(writer: McapLogWriter, log: ColumnarLog, c: int, channel: ChannelRecord) -> int:

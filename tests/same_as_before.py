@@ -1,6 +1,6 @@
 """Bit for bit as before: estimates, figures and messages of the tree at hand against those of an older commit.
 
-    python -m studies.same_as_before COMMIT [--work out/same] [--keep]
+    python tests/same_as_before.py COMMIT [--work out/same] [--keep]
 
 Both trees run the same logs on this machine, with the same interpreter and libraries: the sample logs, and where
 ``../shared`` is there the recorded 250 LM, whole and damaged. Compared are the columns of estimates.parquet, the values
@@ -10,6 +10,7 @@ of metrics.parquet, and payloads and stamps of every topic below ``/pdhef``. A d
 
 from __future__ import annotations
 
+import argparse
 import os
 import subprocess
 import sys
@@ -21,7 +22,9 @@ import numpy as np
 import polars as pl
 
 from pdhef_logtool.results.mcap_sink import topic_of
-from studies.pages import DRIVES, ROOT, options
+
+ROOT = Path(__file__).resolve().parents[1]
+DRIVES = ROOT.parent / "shared" / "data" / "drives"
 
 _REFERENCE = ["--car", "tests/reference/vehicles/revs_250lm.toml"]
 _MAPPING = ["--mapping", "tests/reference/mappings/revs_250lm.toml"]
@@ -91,7 +94,7 @@ MENDED: dict[tuple[str, str, str], str] = {}
 
 def main(arguments: list[str] | None = None) -> int:
     """Run both trees and compare; 0 if nothing differs but what is mended."""
-    parser = options("same_as_before", __doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("commit", help="to compare with")
     parser.add_argument("--work", type=Path, default=Path("out/same"), help="both trees' outputs")
     parser.add_argument("--keep", action="store_true", help="take the older tree's outputs as they are there")

@@ -1,8 +1,8 @@
-"""A slim log: the topics that a run reads of a log, in one small MCAP that stands for it.
+"""A reduced log: the topics that a run reads of a log, in one small MCAP that replaces it.
 
-Messages are kept as they were recorded, byte for byte, so that whatever is computed of them is the same bit for bit.
-What is known of the source beyond its messages stands in a record beside them: when it was recorded, what it lost, what
-else it held, and which mapping was used. Each chunk holds one topic, so that reading a topic costs its own bytes alone.
+Messages are kept byte for byte, so that all results are bit-equal. A metadata record describes the source: when it was
+recorded, its losses, its other topics, and the mapping that was used. Each chunk contains one topic, so that reading a
+topic reads no other bytes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pdhef_logtool.logs.container import MAX_TIME_NS, MCAP_MAGIC, Container
 from pdhef_logtool.logs.drive_log import TopicInfo
 from pdhef_logtool.logs.mcap_index import FOOTER
 from pdhef_logtool.logs.mcap_log import McapContainer
-from pdhef_logtool.logs.occupied_time import OccupiedTime
+from pdhef_logtool.logs.recording_span import RecordingSpan
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
@@ -38,21 +38,21 @@ _DATA_END = struct.Struct("<BQI")
 _LONGEST_NS = 366 * 86_400_000_000_000
 #: Losses that come up again when the kept messages are read.
 _FOUND_AGAIN = frozenset({"undecodable", "bad-schema"})
-_EXPECTED = f"a slim log of format {FORMAT}"
+_EXPECTED = f"a reduced log of format {FORMAT}"
 _REMEDY = "delete it; pdhef run LOG --cache DIR writes it again"
 
 
 @dataclass(frozen=True, slots=True)
-class SlimRecord:
-    """What a slim log knows of its source beside the messages.
+class ReducedRecord:
+    """Description of the source of a reduced log.
 
     Attributes
     ----------
-    file, kind, identity : the source's name, container, and what it is known by. tool : version that made this.
+    file, kind, identity : name, format and identity of the source. tool : version that wrote this.
     distro : ROS distribution of types that the source does not define.
-    intervals, left_out : of its :class:`OccupiedTime`. topics : all of them with their messages, kept or not.
-    losses, byte_ledgers : complete, as a run of the whole source tells them.
-    metadata : what the source says of itself. mapped : the mapping as the floor above has written it.
+    intervals, left_out : of its :class:`RecordingSpan`. topics : all of them with their messages, kept or not.
+    losses, byte_ledgers : complete, as after a run of the whole source.
+    metadata : of the source. mapped : the mapping, as the package ``drive`` writes it.
     signals_sha256, truth_sha256 : hashes of the mapped channels.
     """
 
@@ -73,18 +73,18 @@ class SlimRecord:
     truth_sha256: str | None
 
 
-class SlimLog(ColumnarLog):
-    """Reads like the log that it stands for; a topic that was not kept is there with its messages, but without fields.
+class ReducedLog(ColumnarLog):
+    """Reads like its source; a topic that was not kept has its number of messages, but no fields.
 
     Attributes
     ----------
-    record : what is known of the source.
+    record : description of the source.
     """
 
-    def __init__(self, path: LogPlace, container: Container, record: SlimRecord) -> None:
+    def __init__(self, path: LogPlace, container: Container, record: ReducedRecord) -> None:
         super().__init__(path, record.kind, [container], distro=record.distro)
         self.record = record
-        self._occupied = OccupiedTime(record.intervals, left_out=record.left_out)
+        self._recording_span = RecordingSpan(record.intervals, left_out=record.left_out)
         self._extracted: tempfile.TemporaryDirectory[str] | None = None
 
     @property
@@ -93,12 +93,12 @@ class SlimLog(ColumnarLog):
         return None
 
     @property
-    def slim(self) -> SlimLog:
+    def reduced(self) -> ReducedLog:
         """The log itself."""
         return self
 
     def metadata(self) -> dict[str, str]:
-        """Return what the source says of itself."""
+        """Return the metadata of the source."""
         return dict(self.record.metadata)
 
     @property
@@ -108,23 +108,23 @@ class SlimLog(ColumnarLog):
 
     @property
     def lost(self) -> tuple[Loss, ...]:
-        """What of the source could not be read, and what of this file cannot."""
+        """Losses of the source and of this file."""
         return (*self.record.losses, *(x for x in super().lost if x.kind not in _FOUND_AGAIN))
 
     @property
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:
-        """Where the bytes of each file of the source went."""
+        """Byte ledger of each file of the source."""
         return self.record.byte_ledgers
 
     def attached(self, name: str) -> Path:
         """Return a file that was attached, to be read until the log is closed; raises LogError where there is none."""
-        found = next((a for c in self.containers for a in c.attachments() if a.name == name), None)
-        if found is None:
+        attachment = next((a for c in self.containers for a in c.attachments() if a.name == name), None)
+        if attachment is None:
             raise LogError(expected=_EXPECTED, got=f"none with its {name}", where=str(self.path), remedy=_REMEDY)
         if self._extracted is None:
             self._extracted = scratch_folder()
         path = Path(self._extracted.name) / Path(name).name
-        write_bytes(path, found.data)
+        write_bytes(path, attachment.data)
         return path
 
     def close(self) -> None:
@@ -134,8 +134,8 @@ class SlimLog(ColumnarLog):
             self._extracted.cleanup()
 
 
-def slim_record(container: Container) -> SlimRecord | None:
-    """Return the record of a slim log; None for any other file.
+def reduced_record(container: Container) -> ReducedRecord | None:
+    """Return the record of a reduced log; None for any other file.
 
     Raises
     ------
@@ -143,13 +143,13 @@ def slim_record(container: Container) -> SlimRecord | None:
     """
     if not isinstance(container, McapContainer) or not container.library.startswith(LIBRARY.partition(" ")[0]):
         return None
-    text = next((m.values.get(RECORD_ENTRY) for m in container.metadata_records() if m.name == RECORD_NAME), None)
+    text = next((m.metadata.get(RECORD_ENTRY) for m in container.metadata_records() if m.name == RECORD_NAME), None)
     if text is None:
         return None
     from pydantic import TypeAdapter, ValidationError
 
     try:
-        record = TypeAdapter(SlimRecord).validate_json(text)
+        record = TypeAdapter(ReducedRecord).validate_json(text)
     except ValidationError as error:
         got = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()[:3])
         raise LogError(expected=_EXPECTED, got=got, where=str(container.path), remedy=_REMEDY) from error
@@ -164,7 +164,7 @@ def slim_record(container: Container) -> SlimRecord | None:
 
 
 def is_whole(path: Path) -> bool:
-    """Tell by its checksums whether a file that our writer wrote is as it was written."""
+    """Return, by its checksums, whether a file that our writer wrote is as it was written."""
     data = path.read_bytes()
     foot = len(data) - FOOTER.size - len(MCAP_MAGIC)
     if foot < _DATA_END.size or not data.endswith(MCAP_MAGIC):

@@ -1,8 +1,7 @@
-"""What a log may cost before its claims count as damage: one object through all readers of untrusted input.
+"""Resource limits of reading a log, for all readers of untrusted input; exceeding one counts as damage.
 
-A recording is somebody else's file: a hundred bytes can claim gigabytes, a short schema can unfold without end. Each
-limit lies far above what recorders write and far below what harms a machine; one factor raises them all
-(``--set budget=FACTOR``).
+A hundred bytes of a third-party file can declare gigabytes, and a short schema can unfold without end. Each limit is
+far above what recorders write and far below what harms a machine; one factor raises all (``--set budget=FACTOR``).
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ _MIB = 1 << 20
 _FEW_MESSAGES = 1 << 16
 
 
-class BudgetError(LogError):
-    """Input claims more than it may cost; inside a log it becomes a loss at its place."""
+class LimitError(LogError):
+    """Input exceeds a resource limit; inside a log this is a loss."""
 
 
 @dataclass(frozen=True, slots=True)
-class Budget:
+class ResourceLimits:
     """Limits for one log.
 
     Attributes
@@ -37,7 +36,7 @@ class Budget:
     schema_bytes : text or descriptors of one schema. schema_leaves : scalar places of an unfolded schema.
     schema_depth : structs inside one another, also of a JSON message.
     array_width : elements of an array that become columns.
-    seconds, seconds_per_mib : processor time that reading may take, whatever is read and by what is read.
+    seconds, seconds_per_mib : processor time of reading: a constant part, and a part per MiB read.
     """
 
     chunk_bytes: int = 256 << 20
@@ -53,16 +52,16 @@ class Budget:
     seconds: float = 5.0
     seconds_per_mib: float = 20.0
 
-    def times(self, factor: float) -> Budget:
-        """Return the budget with every limit raised by a factor."""
+    def times(self, factor: float) -> ResourceLimits:
+        """Return limits that are higher by a factor."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Budget(**{name: type(value)(value * factor) for name, value in values.items()})
+        return ResourceLimits(**{name: type(value)(value * factor) for name, value in values.items()})
 
     def check(self, limit: str, amount: float, what: str) -> None:
-        """Raise :class:`BudgetError` if an amount is above the limit of this name; ``what`` claims it."""
+        """Raise :class:`LimitError` if an amount is above the limit of this name; ``what`` claims it."""
         allowed = getattr(self, limit)
         if amount > allowed:
-            raise BudgetError(
+            raise LimitError(
                 expected=f"at most {allowed:.10g} {limit.replace('_', ' ')}",
                 got=f"{amount:.10g}",
                 where=what,
@@ -70,43 +69,43 @@ class Budget:
             )
 
     def check_unpacked(self, size: int, stored: int, what: str) -> None:
-        """Raise :class:`BudgetError` if ``stored`` bytes may not become, or claim to become, ``size`` bytes."""
+        """Raise :class:`LimitError` if ``stored`` bytes may not become, or claim to become, ``size`` bytes."""
         self.check("chunk_bytes", size, what)
         if size > _MIB:
             self.check("chunk_ratio", size / max(stored, 1), what)
 
     def check_messages(self, count: int, stored: int) -> None:
-        """Raise :class:`BudgetError` if ``stored`` bytes may not hold so many messages."""
+        """Raise :class:`LimitError` if ``stored`` bytes may not contain so many messages."""
         self.check("chunk_messages", count, "a chunk")
         if count > _FEW_MESSAGES:
             self.check("messages_per_byte", count / max(stored, 1), "a chunk")
 
 
-DEFAULT_BUDGET = Budget()
+DEFAULT_LIMITS = ResourceLimits()
 
 
 class Meter:
-    """Processor time that reading one log took, against what its budget allows for the bytes read so far.
+    """Processor time of reading one log, with the limit for the bytes read so far.
 
-    What is read again counts again on both sides, so that a sound log can be read for ever.
+    Repeated reads count again in time and in bytes, so that a sound log can be read any number of times.
     """
 
-    def __init__(self, budget: Budget = DEFAULT_BUDGET) -> None:
-        self.budget = budget
+    def __init__(self, limits: ResourceLimits = DEFAULT_LIMITS) -> None:
+        self.limits = limits
         self._seconds = 0.0
         self._bytes = 0
         self._since: float | None = None
 
     @property
     def allowed_s(self) -> float:
-        """Seconds that may have been spent by now."""
-        return self.budget.seconds + self.budget.seconds_per_mib * self._bytes / _MIB
+        """Time limit for the bytes read so far, in seconds."""
+        return self.limits.seconds + self.limits.seconds_per_mib * self._bytes / _MIB
 
     def check(self) -> None:
-        """Raise :class:`BudgetError` if reading has taken too long."""
+        """Raise :class:`LimitError` if reading has taken too long."""
         spent = self._seconds + (0.0 if self._since is None else time.thread_time() - self._since)
         if spent > self.allowed_s:
-            raise BudgetError(
+            raise LimitError(
                 expected="a log that is read in time",
                 got=f"reading took longer than {self.allowed_s:.3g} s",
                 where=f"{self._bytes} bytes read",

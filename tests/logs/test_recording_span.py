@@ -12,16 +12,16 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from pdhef_logtool.logs.drive_log import windows
-from pdhef_logtool.logs.occupied_time import (
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.recording_span import (
     EPOCH_NS,
     SILENCE_NS,
-    OccupiedTime,
+    RecordingSpan,
     find_epochs,
     recorded_twice,
     shown_time,
     steps_back,
 )
-from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.signals import IntArray
 
 S = 1_000_000_000
@@ -112,11 +112,11 @@ def test_what_is_left_never_interleaves_two_passes(steps: list[tuple[int, int]],
 
 
 def test_windows_keep_their_borders_and_leave_silences_out() -> None:
-    occupied = OccupiedTime(((100, 130), (1000, 1011), (1015, 1030)))
+    occupied = RecordingSpan(((100, 130), (1000, 1011), (1015, 1030)))
     whole = list(windows(100, 1030, 20))
     some = list(windows(100, 1030, 20, occupied))
     assert some == [w for w in whole if any(w[0] < b and a < w[1] for a, b in occupied.intervals)]
-    assert list(windows(100, 1030, 20, OccupiedTime(((100, 1030),)))) == whole
+    assert list(windows(100, 1030, 20, RecordingSpan(((100, 1030),)))) == whole
     assert list(windows(200, 900, 20, occupied)) == []
     assert list(windows(110, 120, 20, occupied)) == [(110, 120)]
 

@@ -1,15 +1,15 @@
-"""When a log was recorded: found before anything is read in windows, from spans, and from stamps where a span is torn.
+"""The recording span of a log: determined before windows are read, from spans, and from stamps where spans are wide.
 
-Log times are a recorder's claim. One message at time 0 makes a log 56 years long; a clock that is set after boot tears
-a recording in two; a clock that is set back records the same times twice. So three questions come first:
+Log times depend on the recorder's clock. One message at time 0 makes a log 56 years long; a clock that is set after
+boot splits a recording in two; a clock that is set back records the same times twice. So three cases are removed:
 
-* *Strays*: a few messages that lie far from all others are left out.
-* *Epochs*: stretches too far apart for a pause. The one with most messages is kept, the others are left out.
-* *Steps back*: where a topic's time falls back in file order, the order in the file is the truth of order. What was
-  recorded after the step is left out for as long as its times were recorded before, and ``BREAK_NS`` around, so that
-  two passes are never interleaved and the break shows as a gap.
+* *Outlier stamps*: a few messages that are far from all others are left out.
+* *Clock resets*: stretches that are too far apart for a pause. The stretch with most messages is kept.
+* *Steps back*: if a topic's time falls back in file order, the order in the file is the right one. Messages after the
+  step are left out while their times were recorded before, and ``BREAK_NS`` around, so that two passes are never
+  interleaved and the break is a gap.
 
-On a sound log nothing is left out, and its first and last log time are what they were.
+Of a sound log nothing is left out, and its first and last log time do not change.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
 #: A longer silence ends a stretch. Shorter ones cost no window of their own.
 SILENCE_NS = 600_000_000_000
-#: A stretch of no more messages than this is stray: no drive, and nothing that an estimate could be made of.
-STRAY_MESSAGES = 3
-#: Nobody drives on in the same log after a longer pause; clocks that are set jump by months and years.
+#: A stretch with at most this many messages is an outlier: too short for any estimate.
+OUTLIER_MESSAGES = 3
+#: No drive continues in the same log after a longer pause; clocks that are set jump by months and years.
 EPOCH_NS = 86_400_000_000_000
 #: Recorders with several threads write up to a second out of order; a clock that is set back falls further...
 STEP_BACK_NS = 1_000_000_000
-#: ... for at least this many messages, behind the middle one of as many before, where wrong times stand alone.
+#: ... for at least this many messages, behind the median of as many before; single wrong times are no step.
 STEP_BACK_MESSAGES = 5
-#: Left out beside times that were recorded twice: nothing says how much time really passed at the step.
+#: Left out beside times that were recorded twice: the true duration of the step is unknown.
 BREAK_NS = 1_000_000_000
 #: Below this share of a log's messages what is left out is a note, above it is a loss.
 NOTED_SHARE = 0.01
@@ -63,7 +63,7 @@ class Cut:
 
 
 @dataclass(frozen=True, slots=True)
-class OccupiedTime:
+class RecordingSpan:
     """The log times that count.
 
     Attributes
@@ -88,7 +88,7 @@ class OccupiedTime:
         return self.intervals[-1][1] if self.intervals else 0
 
     def unused(self, topic: str, c: int, span: Span, log_time_ns: IntArray) -> BoolArray | None:
-        """Tell which of a topic's messages in a span (all of them, in file order) are left out; None: none of them.
+        """Return which of a topic's messages in a span (all of them, in file order) are left out; None: none of them.
 
         To be asked where anything is ``left_out`` at all.
         """
@@ -96,7 +96,7 @@ class OccupiedTime:
         return unused if unused.any() else None
 
     def recorded_before(self, topic: str, c: int, span: Span, log_time_ns: IntArray) -> BoolArray:
-        """Tell which of a topic's messages in a span (all of them, in file order) have times of an earlier pass."""
+        """Return which of a topic's messages in a span (all of them, in file order) have times of an earlier pass."""
         return _cut_out(log_time_ns, topic, (c, span.index), self.cuts)
 
 
@@ -107,8 +107,8 @@ def find_epochs(
 
     Returns
     -------
-    intervals : [start, end) that are kept, ascending. kept, stray : bool [K], by piece; what is neither is of another
-        epoch.
+    intervals : [start, end) that are kept, ascending. kept, outlier : bool [K], by piece; a piece that is neither
+        belongs to another clock reset.
     """
     n = start_ns.shape[0]
     if n == 0:
@@ -118,17 +118,17 @@ def find_epochs(
     size = np.bincount(stretch, weights=count[order])
     first = np.flatnonzero(np.diff(stretch, prepend=-1))
     begin, end = start_ns[order][first], np.maximum.reduceat(end_ns[order], first)
-    solid = np.flatnonzero(size > STRAY_MESSAGES)
+    solid = np.flatnonzero(size > OUTLIER_MESSAGES)
     if solid.size == 0:  # a handful of messages: the largest stretch is the log
         solid = np.array([int(np.argmax(size))])
     epoch = _groups(begin[solid], end[solid], EPOCH_NS)
     weight = np.bincount(epoch, weights=size[solid])
     best = int(np.flatnonzero(weight == weight.max())[-1])  # of equals the last: its clock was set
     chosen = solid[epoch == best]
-    kept, stray = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+    kept, outlier = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
     kept[order] = np.isin(stretch, chosen)
-    stray[order] = ~np.isin(stretch, solid)
-    return [(int(begin[s]), int(end[s])) for s in chosen], kept, stray
+    outlier[order] = ~np.isin(stretch, solid)
+    return [(int(begin[s]), int(end[s])) for s in chosen], kept, outlier
 
 
 def steps_back(times_ns: IntArray) -> IntArray:
@@ -150,17 +150,17 @@ def recorded_twice(times_ns: IntArray) -> list[tuple[int, int, int]]:
     """
     begins = np.concatenate([[0], np.flatnonzero(np.diff(times_ns) < -STEP_BACK_NS) + 1])
     low, high = np.minimum.reduceat(times_ns, begins), np.maximum.reduceat(times_ns, begins)
-    found: list[tuple[int, int, int]] = []
+    repeated: list[tuple[int, int, int]] = []
     earlier: list[tuple[int, int]] = []
     for place, a, b in zip(begins.tolist(), low.tolist(), high.tolist(), strict=True):
         twice = [(x, y) for x, y in earlier if min(y, b) - max(x, a) > 0]
-        found += [(place, x - BREAK_NS, y + BREAK_NS) for x, y in twice]
+        repeated += [(place, x - BREAK_NS, y + BREAK_NS) for x, y in twice]
         apart = [(x, y) for x, y in earlier if (x, y) not in twice]
         earlier = [*apart, (min([a, *(x for x, _ in twice)]), max([b, *(y for _, y in twice)]))]
-    return found
+    return repeated
 
 
-def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> OccupiedTime:
+def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> RecordingSpan:
     """Find the times of a log; only the stamps of spans that are torn or out of order are looked at.
 
     Parameters
@@ -175,25 +175,25 @@ def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> Occ
         place = (c, span.index)
         if not any(place >= cut.place[:2] and _touches(span, cut) for cut in cuts):
             continue
-        found = times(c, span)
-        for id_, own in _by_channel(found) if found is not None else ():
+        stamps = times(c, span)
+        for id_, channel_times in _by_channel(stamps) if stamps is not None else ():
             topic = containers[c].channels[id_].topic
-            again = own[_inside(own, intervals) & _cut_out(own, topic, place, cuts)]
+            again = channel_times[_inside(channel_times, intervals) & _cut_out(channel_times, topic, place, cuts)]
             if again.size:
                 left_out.setdefault(topic, Counter())[TIME_JUMP] += again.size
                 twice.append(again)
     if twice:
         all_of_it = np.concatenate(twice)
         losses.append(_loss(TIME_JUMP, where, all_of_it, all_of_it + 1, all_of_it.size, total))
-    return OccupiedTime(tuple(intervals), tuple(cuts), left_out, tuple(losses))
+    return RecordingSpan(tuple(intervals), tuple(cuts), left_out, tuple(losses))
 
 
-def survey_stamps(stamps_ns: Mapping[str, IntArray], where: str) -> OccupiedTime:
+def survey_stamps(stamps_ns: Mapping[str, IntArray], where: str) -> RecordingSpan:
     """Find the times of a log from all log times [N] of each topic; ``where`` as for :func:`survey`."""
     none = Span(0, 0, 0, {})
     look = [_Looked(0, none, {0: t}, (np.zeros(len(s), np.int64), s)) for t, s in stamps_ns.items() if len(s)]
     intervals, left_out, losses, _ = _kept_epoch(look, where)
-    return OccupiedTime(tuple(intervals), left_out=left_out, losses=tuple(losses))
+    return RecordingSpan(tuple(intervals), left_out=left_out, losses=tuple(losses))
 
 
 def _kept_epoch(
@@ -202,11 +202,11 @@ def _kept_epoch(
     """Return the intervals that are kept, the messages left out by topic and reason, their losses, and all messages."""
     pieces = [piece for of in look for piece in of.pieces()]
     start, end, count = (np.array([p[i] for p in pieces], dtype=np.int64) for i in (0, 1, 2))
-    intervals, kept, stray = find_epochs(start, end, count)
+    intervals, kept, outlier = find_epochs(start, end, count)
     left_out: dict[str, Counter[str]] = {}
     losses = []
     total = int(count.sum())
-    for reason, which in ((OUTLIER, stray), (OTHER_EPOCH, ~kept & ~stray)):
+    for reason, which in ((OUTLIER, outlier), (OTHER_EPOCH, ~kept & ~outlier)):
         for i in np.flatnonzero(which).tolist():
             for topic, n in pieces[i][3].items():
                 left_out.setdefault(topic, Counter())[reason] += n
@@ -221,22 +221,22 @@ def _kept_epoch(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Looked:
-    """A span, and its channels and times where these had to be looked at and say more than the span does."""
+    """A span, with its channels and times if these were read because the bounds of the span are not enough."""
 
     c: int
     span: Span
     topics: Mapping[int, str]
-    found: tuple[IntArray, IntArray] | None = None
+    stamps: tuple[IntArray, IntArray] | None = None
 
     def pieces(self) -> Iterator[tuple[int, int, int, Mapping[str, int]]]:
         """Yield start, end, messages, and messages by topic; one piece a stretch."""
-        if self.found is None:
+        if self.stamps is None:
             counts: Counter[str] = Counter()
             for id_, messages in self.span.counts.items():
                 counts[self.topics[id_]] += messages
             yield self.span.start_ns, self.span.end_ns, sum(counts.values()), counts
             return
-        channel, times = self.found
+        channel, times = self.stamps
         order = np.argsort(times, kind="stable")
         stretch = _groups(times[order], times[order], SILENCE_NS)
         for rows in np.split(order, np.flatnonzero(np.diff(stretch)) + 1):
@@ -248,35 +248,35 @@ class _Looked:
 
     def last_ns(self, id_: int) -> int:
         """Return the last time of a channel, 0 without any."""
-        return self.span.end_ns - 1 if self.found is None else int(self.of_channel(id_).max(initial=0))
+        return self.span.end_ns - 1 if self.stamps is None else int(self.of_channel(id_).max(initial=0))
 
     def of_channel(self, id_: int) -> IntArray:
-        """Return the times of a channel in file order; of a span in order its bounds stand for them."""
-        if self.found is None:
+        """Return the times of a channel in file order; of an ordered span its bounds."""
+        if self.stamps is None:
             return np.array([self.span.start_ns, self.span.end_ns - 1])
-        channel, times = self.found
+        channel, times = self.stamps
         return np.asarray(times[channel == id_], dtype=np.int64)
 
 
 def _look(containers: Sequence[Container], times: SpanTimes) -> list[_Looked]:
-    """Return all spans in file order, with their times where the span does not tell when its messages are."""
+    """Return all spans in file order, with their times if the bounds of a span are not enough."""
     looked: list[_Looked] = []
     newest: dict[str, int] = {}
     for c, container in enumerate(containers):
         topics = {id_: channel.topic for id_, channel in container.channels.items()}
         for span in container.spans:
             if not span.counts:
-                continue  # nothing of it is of a channel that is known; its times are nobody's
+                continue  # it has no message of a declared channel
             lasts = span.end_ns - span.start_ns
             behind = any(span.start_ns < newest.get(topics[id_], 0) - STEP_BACK_NS for id_ in span.counts)
             of = _Looked(c, span, topics)
             if lasts <= 0 or lasts > SILENCE_NS or behind or (lasts > STEP_BACK_NS and not span.ordered):
-                found = times(c, span)
-                if found is None:
+                stamps = times(c, span)
+                if stamps is None:
                     continue  # damaged: nothing of it can be read
-                disorder = any((np.diff(own) < -STEP_BACK_NS).any() for _, own in _by_channel(found))
-                if found[0].size and (lasts <= 0 or lasts > SILENCE_NS or behind or disorder):
-                    of = _Looked(c, span, topics, found)
+                disorder = any((np.diff(times_ns) < -STEP_BACK_NS).any() for _, times_ns in _by_channel(stamps))
+                if stamps[0].size and (lasts <= 0 or lasts > SILENCE_NS or behind or disorder):
+                    of = _Looked(c, span, topics, stamps)
             for id_ in span.counts:
                 newest[topics[id_]] = max(newest.get(topics[id_], 0), of.last_ns(id_))
             looked.append(of)
@@ -285,27 +285,27 @@ def _look(containers: Sequence[Container], times: SpanTimes) -> list[_Looked]:
 
 def _cuts(looked: Sequence[_Looked], intervals: Sequence[tuple[int, int]]) -> list[Cut]:
     """Return what was recorded twice, of all topics, if the time of one of them clearly stepped back."""
-    if all(of.found is None for of in looked):
+    if all(of.stamps is None for of in looked):
         return []
     sequences: dict[str, tuple[IntArray, list[tuple[int, int, int, int]]]] = {}
     parts: dict[str, list[tuple[IntArray, int, int]]] = {}
     for of in looked:
         for id_ in of.span.counts:
-            own = of.of_channel(id_)
-            inside = _inside(own, intervals)
-            if inside.any():  # what is left out anyway stands for its neighbour, so that rows keep their places
-                last = np.maximum.accumulate(np.where(inside, np.arange(own.shape[0]), -1))
-                own = own[np.where(last >= 0, last, int(np.argmax(inside)))]
-                parts.setdefault(of.topics[id_], []).append((own, of.c, of.span.index))
+            channel_times = of.of_channel(id_)
+            inside = _inside(channel_times, intervals)
+            if inside.any():  # left-out rows take the time of a neighbour, so that rows keep their places
+                last = np.maximum.accumulate(np.where(inside, np.arange(channel_times.shape[0]), -1))
+                channel_times = channel_times[np.where(last >= 0, last, int(np.argmax(inside)))]
+                parts.setdefault(of.topics[id_], []).append((channel_times, of.c, of.span.index))
     for topic, those in parts.items():
-        at = np.cumsum([0, *(own.shape[0] for own, _, _ in those)]).tolist()
-        places = [(a, b, c, index) for a, b, (_, c, index) in zip(at[:-1], at[1:], those, strict=True)]
-        sequences[topic] = np.concatenate([own for own, _, _ in those]), places
-    if not any(steps_back(own).size for own, _ in sequences.values()):
+        bounds = np.cumsum([0, *(channel_times.shape[0] for channel_times, _, _ in those)]).tolist()
+        places = [(a, b, c, index) for a, b, (_, c, index) in zip(bounds[:-1], bounds[1:], those, strict=True)]
+        sequences[topic] = np.concatenate([channel_times for channel_times, _, _ in those]), places
+    if not any(steps_back(channel_times).size for channel_times, _ in sequences.values()):
         return []
     cuts = []
-    for topic, (own, places) in sequences.items():
-        for place, low, high in recorded_twice(own):
+    for topic, (channel_times, places) in sequences.items():
+        for place, low, high in recorded_twice(channel_times):
             c, index, row = next((c, index, place - a) for a, b, c, index in places if a <= place < b)
             cuts.append(Cut(topic, (c, index, row), low, high))
     return cuts
@@ -332,7 +332,7 @@ def _inside(times_ns: IntArray, intervals: Sequence[tuple[int, int]]) -> BoolArr
 
 
 def _cut_out(times_ns: IntArray, topic: str, place: tuple[int, int], cuts: Iterable[Cut]) -> BoolArray:
-    """Tell which of a topic's messages in the span of a place, file and span, the cuts leave out."""
+    """Return which of a topic's messages in the span of a place, file and span, the cuts leave out."""
     left_out = np.zeros(times_ns.shape[0], np.bool_)
     for cut in cuts:
         if cut.topic == topic and place >= cut.place[:2]:
@@ -342,8 +342,8 @@ def _cut_out(times_ns: IntArray, topic: str, place: tuple[int, int], cuts: Itera
     return left_out
 
 
-def _by_channel(found: tuple[IntArray, IntArray]) -> Iterable[tuple[int, IntArray]]:
-    channel, times = found
+def _by_channel(stamps: tuple[IntArray, IntArray]) -> Iterable[tuple[int, IntArray]]:
+    channel, times = stamps
     return ((int(id_), times[channel == id_]) for id_ in np.unique(channel))
 
 
@@ -361,7 +361,7 @@ def _loss(reason: str, where: str, start_ns: IntArray, end_ns: IntArray, count: 
 
 
 def shown_time(ns: int) -> str:
-    """Return a time of the log's clock in UTC to the second, whatever it is."""
+    """Return any time of the log's clock in UTC to the second."""
     try:
         return (datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=ns // 10**9)).strftime("%Y-%m-%d %H:%M:%S UTC")
     except (OverflowError, ValueError):

@@ -11,11 +11,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
-from pdhef_logtool.logs.budget import DEFAULT_BUDGET
 from pdhef_logtool.logs.container import Block, ChannelRecord
 from pdhef_logtool.logs.decoding import ChannelDecoder, channel_schema
 from pdhef_logtool.logs.message_schema import MessageSchema, NoSchemaError, SchemaError, leaves, resolve
 from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.records.errors import MappingError
 
@@ -100,11 +100,11 @@ def test_a_schema_that_costs_too_much_is_refused_in_time(case: str) -> None:
     assert time.process_time() - started < 5.0
 
 
-def test_a_higher_budget_reads_what_is_sound_and_large() -> None:
+def test_higher_limits_read_what_is_sound_and_large() -> None:
     channel = ChannelRecord(1, "/t", "p/msg/A", "cdr", "A", "ros2msg", b"string[4000] x\n")
     with pytest.raises(SchemaError, match="--set budget"):
         channel_schema(channel)
-    assert len(list(leaves(channel_schema(channel, budget=DEFAULT_BUDGET.times(2.0)).root))) == 1
+    assert len(list(leaves(channel_schema(channel, limits=DEFAULT_LIMITS.times(2.0)).root))) == 1
 
 
 def test_a_schema_that_refers_to_itself_is_open_there() -> None:

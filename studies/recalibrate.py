@@ -1,0 +1,182 @@
+"""Regenerate everything that is derived from the sources: shipped vehicle files, cars, networks, evidence pages.
+
+    python -m studies.recalibrate [--list] [--only STAGE ...]
+
+The stages run in the order of ``recalibrate.toml``. A stage is skipped if the command and the digest of its inputs are
+those of its last completion and its outputs exist. After a failure or an interruption, the same command continues with
+the stage that was not completed; if its inputs have changed since, its work folders are deleted first. Comments,
+docstrings and the layout of pages (``studies.pages``, ``studies.pictures``) do not count as inputs. Constants that were
+chosen once (``studies/defaults/tune_*.py``) stay. The stamp files are in ``out/recalibrate``.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pdhef_logtool.storage.documents import digest
+from studies.pages import ROOT, options, table
+
+STAMPS = Path("out") / "recalibrate"
+TABLE = Path(__file__).with_suffix(".toml")
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One command, with paths as in the table (``recalibrate.toml``)."""
+
+    name: str
+    command: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    duration: str = "not measured"
+    work: tuple[str, ...] = ()
+
+
+def load_stages(file: Path = TABLE) -> tuple[Stage, ...]:
+    """Return the stages of a table, with the sets of its inputs expanded."""
+    document = tomllib.loads(file.read_text(encoding="utf-8"))
+    sets = document.pop("sets", {})
+
+    def expanded(patterns: Sequence[str]) -> Iterator[str]:
+        for pattern in patterns:
+            yield from expanded(sets[pattern[1:]]) if pattern.startswith("@") else (pattern,)
+
+    return tuple(
+        Stage(
+            name,
+            entry["command"],
+            tuple(expanded(entry["inputs"])),
+            tuple(entry["outputs"]),
+            entry.get("duration", "not measured"),
+            tuple(entry.get("work", ())),
+        )
+        for name, entry in document.items()
+    )
+
+
+def input_digest(root: Path, inputs: Sequence[str]) -> str:
+    """Return the digest of all input files; one that is missing counts as such."""
+    return digest([[pattern, [list(entry) for entry in _entries(root, pattern)]] for pattern in inputs])
+
+
+def _entries(root: Path, pattern: str) -> Iterator[tuple[str, str]]:
+    for path in sorted(root.glob(pattern)):
+        files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+        for file in files:
+            if "__pycache__" not in file.parts:
+                yield os.path.relpath(file, root), _content(root, file)
+
+
+def _content(root: Path, file: Path) -> str:
+    """Return the size of a file outside the repository, and the digest of one inside."""
+    state = file.stat()
+    if not file.resolve().is_relative_to(root.resolve()):
+        return str(state.st_size)
+    return _file_digest(file, state.st_mtime_ns, state.st_size)
+
+
+@cache
+def _file_digest(file: Path, _mtime_ns: int, _size: int) -> str:
+    if file.suffix != ".py":
+        return digest(file.read_bytes().hex())
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
+            node.body = node.body[1:]
+    return digest(ast.dump(tree))
+
+
+class Recalibration:
+    """Stages of a repository with their stamps."""
+
+    def __init__(self, root: Path, stages: Sequence[Stage]) -> None:
+        self.root, self.stages = root, stages
+
+    def stamp(self, stage: Stage) -> dict[str, Any]:
+        """Return command, inputs and duration of the last start of a stage; empty before the first."""
+        file = self.root / STAMPS / f"{stage.name}.json"
+        return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+
+    def is_complete(self, stage: Stage) -> bool:
+        """Return whether nothing changed since the last completion."""
+        stamp = self.stamp(stage)
+        now = {"command": stage.command, "inputs": input_digest(self.root, stage.inputs)}
+        same = all(stamp.get(key) == value for key, value in now.items())
+        return same and "duration_s" in stamp and all((self.root / o).exists() for o in stage.outputs)
+
+    def run(self, only: Sequence[str] = ()) -> int:
+        """Run the stages that are not complete, up to the first that fails; return its exit code, or 0."""
+        for stage in self.stages:
+            if only and stage.name not in only:
+                continue
+            if self.is_complete(stage):
+                print(f"{stage.name}: unchanged", flush=True)
+            elif code := self._run(stage):
+                print(f"{stage.name} failed with exit code {code}; the same command continues here", file=sys.stderr)
+                return code
+        return 0
+
+    def _run(self, stage: Stage) -> int:
+        begun = {"command": stage.command, "inputs": input_digest(self.root, stage.inputs)}
+        before = self.stamp(stage)
+        if {key: before.get(key) for key in begun} != begun:
+            for folder in stage.work:
+                shutil.rmtree(self.root / folder, ignore_errors=True)
+        self._write(stage, begun)
+        print(f"{stage.name}: {stage.command}", flush=True)
+        start = time.monotonic()
+        words = [sys.executable if word == "python" else word for word in shlex.split(stage.command)]
+        ended = subprocess.run(words, cwd=self.root, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=False)
+        if ended.returncode:
+            return ended.returncode
+        missing = [o for o in stage.outputs if not (self.root / o).exists()]
+        if missing:
+            print(f"{stage.name}: expected {', '.join(missing)}, got no such file", file=sys.stderr)
+            return 1
+        self._write(stage, {**begun, "duration_s": round(time.monotonic() - start, 1)})
+        return 0
+
+    def _write(self, stage: Stage, stamp: dict[str, Any]) -> None:
+        file = self.root / STAMPS / f"{stage.name}.json"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(stamp, indent=1) + "\n", encoding="utf-8")
+
+    def listed(self) -> str:
+        """Return a table of the stages: duration as stated and of the last completion here, state and command."""
+        body = []
+        for stage in self.stages:
+            last = self.stamp(stage).get("duration_s")
+            here = "–" if last is None else f"{last:g} s"
+            body.append([stage.name, stage.duration, here, "no" if self.is_complete(stage) else "yes", stage.command])
+        return table(["stage", "duration", "last here", "to do", "command"], body)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """List or run the stages."""
+    parser = options("recalibrate", __doc__)
+    parser.add_argument("--list", action="store_true", help="print the stages and run none")
+    stages = load_stages()
+    parser.add_argument("--only", nargs="+", choices=[s.name for s in stages], metavar="STAGE", help="run these alone")
+    given = parser.parse_args(arguments)
+    recalibration = Recalibration(ROOT, stages)
+    if given.list:
+        print(recalibration.listed())
+        return 0
+    return recalibration.run(given.only or ())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

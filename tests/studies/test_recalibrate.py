@@ -1,0 +1,111 @@
+"""Stages of ``make recalibrate`` with small commands: order, skipping, continuing after a failure, changed inputs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from studies.pages import ROOT
+from studies.recalibrate import Recalibration, Stage, load_stages
+
+#: Joins its inputs into its output and logs the call; fails while a file ``broken`` exists.
+JOIN = """
+import sys
+from pathlib import Path
+output, *inputs = sys.argv[1:]
+with Path("calls").open("a") as calls:
+    calls.write(output + " ")
+Path("work").mkdir(exist_ok=True)
+if output == "b" and Path("broken").exists():
+    sys.exit(7)
+Path(output).write_text("".join(Path(i).read_text().split("#")[0].strip() for i in inputs))
+"""
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Recalibration:
+    (tmp_path / "join.py").write_text(JOIN)
+    (tmp_path / "source.py").write_text("x = 1\n")
+    (tmp_path / "other").write_text("o")
+    stages = (
+        Stage("first", "python join.py a source.py", ("source.py",), ("a",)),
+        Stage("second", "python join.py b a other", ("a", "other"), ("b",), work=("work",)),
+        Stage("third", "python join.py c b", ("b",), ("c",)),
+    )
+    return Recalibration(tmp_path, stages)
+
+
+def calls(project: Recalibration) -> str:
+    file = project.root / "calls"
+    text = file.read_text() if file.is_file() else ""
+    file.unlink(missing_ok=True)
+    return text.strip()
+
+
+def test_stages_run_in_order_once(project: Recalibration) -> None:
+    assert project.run() == 0
+    assert calls(project) == "a b c"
+    assert project.run() == 0
+    assert calls(project) == ""
+
+
+def test_a_failed_stage_ends_the_run_and_the_next_run_continues_with_it(project: Recalibration) -> None:
+    (project.root / "broken").touch()
+    assert project.run() == 7
+    assert calls(project) == "a b"
+    kept = project.root / "work" / "kept"
+    kept.touch()
+    (project.root / "broken").unlink()
+    assert project.run() == 0
+    assert calls(project) == "b c"
+    assert kept.exists()  # same inputs: the work of the failed stage is continued
+
+
+def test_a_changed_input_runs_the_dependents_again_and_deletes_their_work(project: Recalibration) -> None:
+    project.run()
+    calls(project)
+    stale = project.root / "work" / "stale"
+    stale.touch()
+    (project.root / "other").write_text("p")
+    project.run()
+    assert calls(project) == "b c"
+    assert not stale.exists()
+    (project.root / "source.py").write_text('"""About."""\nx = 1  # a comment\n')
+    project.run()
+    assert calls(project) == ""
+    (project.root / "c").unlink()
+    project.run()
+    assert calls(project) == "c"
+
+
+def test_another_command_runs_again_and_an_equal_output_ends_the_chain(project: Recalibration) -> None:
+    project.run()
+    calls(project)
+    first = Stage("first", "python join.py a source.py other", ("source.py",), ("a",))
+    Recalibration(project.root, (first, *project.stages[1:])).run(["first"])
+    assert calls(project) == "a"
+    (project.root / "source.py").write_text("x = 1 \n")
+    project.run()
+    assert calls(project) == "a"
+
+
+def test_a_command_without_its_output_fails(project: Recalibration) -> None:
+    stage = Stage("none", "python join.py d other", ("other",), ("absent",))
+    assert Recalibration(project.root, (stage,)).run() == 1
+
+
+def test_no_stage_of_the_project_needs_the_output_of_a_later_one() -> None:
+    stages = load_stages()
+    for i, stage in enumerate(stages):
+        assert not {o for s in stages[i + 1 :] for o in s.outputs} & set(stage.inputs)
+        assert not any(i.startswith("@") for i in stage.inputs)
+        files = [p for p in stage.inputs if p.startswith(("studies", "benchmarks", "pdhef_logtool/", "truthsim"))]
+        assert all(list(ROOT.glob(p)) for p in files)
+
+
+def test_the_list_states_the_duration_of_each_stage(project: Recalibration) -> None:
+    project.run(["first"])
+    rows = project.listed().splitlines()[2:]
+    assert [row.split(" | ")[3] for row in rows] == ["no", "yes", "yes"]
+    assert all("not measured" in row for row in rows)

@@ -1,0 +1,71 @@
+"""Windows and macOS: what they do not have, no command with one process needs."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pdhef_logtool.records.processes import is_alive, process_name
+from pdhef_logtool.workers import supervisor
+from pdhef_logtool.workers.supervisor import Limits, supervise
+from tests.workers.planted_work import planted
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def without_posix(*arguments: object, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run a command in a process without what Windows does not have, and with its encoding of streams."""
+    words = [sys.executable, ROOT / "tests/without_posix.py", *arguments]
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "cp1252", "PDHEF_TRACEBACK": "1"}
+    return subprocess.run(words, cwd=folder, env=env, capture_output=True, encoding="cp1252", check=False)
+
+
+@pytest.mark.slow
+def test_inspect_and_run_need_no_posix(tmp_path: Path) -> None:
+    log = ROOT / "sample_logs/dlc.mcap"
+    inspected = without_posix("inspect", log, folder=tmp_path)
+    assert inspected.returncode == 0, inspected.stderr
+    assert "steer_rad" in inspected.stdout
+    for _ in range(2):  # the second run replaces the folders of the first
+        ran = without_posix("run", log, "--car", "saloon", "-o", "out", folder=tmp_path)
+        assert ran.returncode == 0, ran.stderr
+    names = {path.name for path in (tmp_path / "out/logs/dlc").iterdir()}
+    assert {"report.json", "report.html", "annotated.mcap", "recording.rrd", "estimates.parquet"} <= names
+    assert json.loads((tmp_path / "out/run.json").read_text(encoding="utf-8"))
+    assert [path.name for path in tmp_path.rglob(".*")] == []
+
+
+@pytest.mark.slow
+def test_several_logs_run_in_one_process_with_one_warning(tmp_path: Path) -> None:
+    logs = [ROOT / "sample_logs" / name for name in ("dlc.mcap", "step_rosbag2")]
+    ran = without_posix(
+        "run", *logs, "--car", "saloon", "--jobs", "2", "--keep", "metrics", "-o", "out", folder=tmp_path
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stderr.count("worker processes need Linux: one process does all the work") == 1
+    assert len(json.loads((tmp_path / "out/run.json").read_text(encoding="utf-8"))["logs"]) == 2
+
+
+def test_items_end_in_this_process_where_no_workers_can_be_forked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(supervisor, "can_fork", lambda: False)
+    warned: list[str] = []
+    items = [("where", ""), ("raise", ""), ("where", "")]
+    ended = list(supervise(planted, items, jobs=2, limits=Limits(60.0), warn=warned.append))
+    assert [e.failure is None for e in ended] == [True, False, True]
+    assert {e.result[0] for e in ended if e.result} == {os.getpid()}  # type: ignore[index]
+    assert len(warned) == 1
+
+
+def test_processes_are_known_by_their_start_without_proc(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unreadable(_path: Path) -> bytes:
+        raise FileNotFoundError
+
+    monkeypatch.setattr(Path, "read_bytes", unreadable)
+    host, pid, start = process_name().split("-")
+    assert is_alive(process_name()) is True
+    assert is_alive(f"{host}-{pid}-{int(start) + 1}") is False
