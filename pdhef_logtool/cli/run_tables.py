@@ -408,11 +408,10 @@ def _joint_table(reports: Sequence[_Report]) -> Table:
 
 def _look_at(report: _Report, inside: float | None, main: str) -> str:
     """Return what of a log a person should look at, in a few words; ``main`` where the logs' main estimators differ."""
-    stands_in = report["answer"]["stands_in"]
     failed = sum(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks") or [])
     scored = any(m["signal"] == "sideslip_rad" and m["metric"] == "rmse" for m in report["metrics"])
     found = [
-        f"by {stands_in}" if stands_in else f"by {main}" if main else "",
+        f"by {main}" if main else "",
         f"{failed} check{'s' * (failed > 1)} failed" if failed else "",
         "input lost" if any(x["severity"] == "lost" for x in report["losses"]) else "",
         "no truth" if not report["truth"]["available"] else "" if scored else "not scored",

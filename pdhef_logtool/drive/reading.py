@@ -11,7 +11,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.friction import FrictionSource, friction_source
 from pdhef_logtool.drive.options import ReadOptions, time_slice
-from pdhef_logtool.drive.setup import LogUntil, Setup, load_setup
+from pdhef_logtool.drive.setup import CLOCK_START_S, LogUntil, Setup, is_device_clock, load_setup
 from pdhef_logtool.drive.windows import DrivePlan, DriveReader, DriveWindow, plan_drive, setup_of
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.container import Wanted
@@ -126,6 +126,21 @@ class Drive:
     def available(self) -> frozenset[str]:
         """Aligned signals that the log provides."""
         return self.plan.alignment.available
+
+    @property
+    def setup_source(self) -> str:
+        """Where mounting, units, delays and clocks come from: ``log``, ``first seconds`` or ``file``."""
+        if self.options.setup is not None:
+            return "file"
+        return "log" if self.options.setup_from_s is None else "first seconds"
+
+    @property
+    def causal_from_s(self) -> float | None:
+        """Seconds from the start of the slice from which on the set-up depends on nothing later; None: on all of it."""
+        if self.options.setup is not None:
+            device = any(map(is_device_clock, self.plan.clocks.values()))
+            return CLOCK_START_S if device else 0.0
+        return self.options.setup_from_s
 
     @property
     def not_causal(self) -> str:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 #: Folder of a log's outputs within those of a run, the figures of all logs, and what lies in a log's folder.
 LOGS = "logs"
 METRICS_FILE = "metrics.parquet"
-REPORT_FILE = "report.json"
+REPORT_FILE, SETUP_FILE = "report.json", "setup.toml"
 #: What a run of several logs has done, a line a drive; and the folder of the figures of each, by run and car.
 JOURNAL_FILE = "journal.jsonl"
 PARTS = "metrics"

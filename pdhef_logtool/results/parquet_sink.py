@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,8 @@ _PARTS_AT_ONCE = 256
 _LATER_COLUMNS = ("diverged", *OPTIONAL_COLUMNS)
 _LATER_METRIC_COLUMNS = ("algorithm",)
 _ESTIMATES, _METRICS = "estimates.parquet", "metrics.parquet"
+#: Name under which the selected estimate stands in estimates.parquet a second time.
+SELECTED = "selected"
 _AGAIN = "run the log again"
 _FLAGS = ("valid", "diverged")
 _STD_COLUMNS = ("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s")
@@ -138,13 +141,15 @@ class EstimatesSink(Sink):
     ----------
     path : where the finished file stands.
     rows_a_group : rows of one row group.
+    selected : estimator whose track is written a second time, as :data:`SELECTED`.
 
     Raises
     ------
     OutputError : When the file cannot be written.
     """
 
-    def __init__(self, path: Path, rows_a_group: int = ROWS_A_GROUP) -> None:
+    def __init__(self, path: Path, rows_a_group: int = ROWS_A_GROUP, *, selected: str = "") -> None:
+        self._selected = selected
         schema = arrow_schema("estimates.parquet.json")
         split = {f.name: "BYTE_STREAM_SPLIT" for f in schema if pa.types.is_floating(f.type)}
         encodings = {**split, "stamp_ns": "DELTA_BINARY_PACKED"}
@@ -153,6 +158,8 @@ class EstimatesSink(Sink):
     def append(self, track: StateTrack) -> None:
         """Take one track of this window; [N] rows."""
         self._file.append(track.name, track_table(track, as_written=True))
+        if track.name == self._selected:
+            self._file.append(SELECTED, track_table(replace(track, name=SELECTED), as_written=True))
 
     def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:  # noqa: ARG002
         """Write what waits and give the file its name; the report is not part of this file."""
@@ -178,12 +185,12 @@ def track_table(track: StateTrack, *, as_written: bool = False) -> pa.Table:
 
 
 def list_estimators(path: Path) -> tuple[str, ...]:
-    """Return the names of the tracks in an estimates.parquet, in order of their first row group."""
+    """Return the names of the tracks in an estimates.parquet, by their row groups; the selected one is a copy."""
     names: dict[str, None] = {}
     with _open(path, _ESTIMATES) as file:
         for group in range(file.num_row_groups):
             names.update(dict.fromkeys(_estimators_of(file, group)))
-    return tuple(names)
+    return tuple(name for name in names if name != SELECTED)
 
 
 def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None) -> StateTrack:

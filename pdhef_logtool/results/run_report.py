@@ -34,6 +34,7 @@ from pdhef_logtool.storage.files import write_bytes
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from pdhef_logtool.car.assumed_values import AssumedValue
     from pdhef_logtool.evaluation.thresholds import Verdict
 
 #: Columns of a figure in the report.
@@ -172,6 +173,8 @@ class ReportFacts:
     truth: TruthFacts
     vehicle_file: str | None = None
     vehicle_proven: bool = False
+    assumed: Sequence[AssumedValue] = ()
+    setup: Mapping[str, Any] | None = None
     low_speed_m_s: float | None = None
     friction: FrictionFacts | None = None
     calibration: Mapping[str, Any] | None = None
@@ -267,6 +270,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
             "sha256": facts.vehicle_sha256,
             "file": facts.vehicle_file,
             "proven": facts.vehicle_proven,
+            "assumed": list(facts.assumed),
             "low_speed_blend_m_s": facts.low_speed_m_s,
         },
         "estimators": [
@@ -287,6 +291,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
             **jsonable(facts.truth),
             "not_independent": sorted(facts.truth.not_independent),
         },
+        "setup": facts.setup,
         "friction": facts.friction,
         "self_calibration": facts.calibration,
         "metrics": [{name: getattr(m, name) for name in _METRIC_COLUMNS} for m in facts.metrics],
@@ -303,6 +308,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
         "versions": dict(facts.versions),
     }
     document = {key: jsonable(value) for key, value in document.items()}
+    document["selected_estimate"] = None if facts.main is None else facts.main.name
     document["answer"] = None if facts.main is None else answer_of(document, facts.main)
     if facts.main is not None and (details := facts.details) is not None:
         document |= _detailed(details)

@@ -40,8 +40,7 @@ class MainFacts:
     Attributes
     ----------
     name : of it. chosen_by : evidence of the car's driving, d2, or the order of the estimators. why : in words.
-    distrusted : whether d2 spoke against the one that would have been it. stands_in : what then runs under its name,
-        None for itself.
+    distrusted : whether d2 spoke against the preferred one.
     naive : what an estimate is worth anything against, None if it did not run. shown : what a person is shown; all that
         ran where the estimators were ``named``.
     """
@@ -50,7 +49,6 @@ class MainFacts:
     chosen_by: Literal["evidence", "d2", "order"]
     why: str
     distrusted: bool
-    stands_in: str | None
     naive: str | None
     shown: Sequence[str]
     named: bool
@@ -74,7 +72,6 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
         "chosen_by": main.chosen_by,
         "why": main.why,
         "distrusted": main.distrusted,
-        "stands_in": main.stands_in,
         "naive": main.naive,
         "shown": list(main.shown),
         "named": main.named,

@@ -15,10 +15,11 @@ from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.friction import FrictionSource
 from pdhef_logtool.drive.reading import Drive, lost_texts
+from pdhef_logtool.drive.setup import setup_toml
+from pdhef_logtool.drive.windows import setup_of
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.causality_check import CausalityCheck
-from pdhef_logtool.estimators.fallback import Fallback
 from pdhef_logtool.estimators.intervals import TrackCalibrator
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, Skipped, all_specs, runnable
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
@@ -40,6 +41,7 @@ from pdhef_logtool.results.opened_run import (
     PAGE_FILE,
     RECORDING_FILE,
     REPORT_FILE,
+    SETUP_FILE,
     OpenedLog,
 )
 from pdhef_logtool.results.run_report import (
@@ -63,10 +65,11 @@ from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, Shown, Si
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 from pdhef_logtool.runs.scoring import evaluate, in_time
-from pdhef_logtool.runs.selection import PREFERRED, Contradiction, choose_main, contradiction, default_names
+from pdhef_logtool.runs.selection import choose_main, contradiction, default_names
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore
 from pdhef_logtool.storage.documents import file_sha256
+from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder, check_no_input
 
 if TYPE_CHECKING:
@@ -83,6 +86,7 @@ Progress = Callable[[str, float], None]
 FEW_LOGS = 50
 #: What a run writes into a log's folder.
 LOG_FILES = (
+    SETUP_FILE,
     "annotated.mcap",
     "foxglove.json",
     "plotjuggler.xml",
@@ -94,7 +98,7 @@ LOG_FILES = (
 )
 
 #: What of an earlier run's goes where a drive's new files have it not.
-STALE_FILES = (PAGE_FILE, METRICS_FILE, ESTIMATES_FILE, RECORDING_FILE)
+STALE_FILES = (SETUP_FILE, PAGE_FILE, METRICS_FILE, ESTIMATES_FILE, RECORDING_FILE)
 
 _SILENT = "{} has no valid row although the car moves"
 _NO_COPY = "annotated.mcap holds our topics only: a log of kind {} has no messages to copy"
@@ -268,13 +272,7 @@ def run_log(
         ready, skipped = _choose_estimators(drive, config, car)
         prepare([e.name for e in ready])
         job = _Job(drive, car, calibration, ready, skipped, tuple(thresholds or ()))
-        try:
-            # What driving with truth showed of a car is worth more than d2, and its estimate stays causal.
-            unproven = config.calibrate != "off" and not drive.car.has_evidence
-            result = _run_estimators(job, outputs, config, progress, falls_back=unproven)
-        except _FallBackError as found:
-            job = replace(job, ready=_with_fallback(ready, found.contradiction))
-            result = _run_estimators(job, outputs, config, progress, falls_back=False)
+        result = _run_estimators(job, outputs, config, progress)
     progress(result.outcome.log, 1.0)
     return result
 
@@ -291,25 +289,8 @@ class _Job:
     thresholds: Sequence[Threshold]
 
 
-class _FallBackError(Exception):
-    """The default estimate is much worse than a simple one: nothing of the run stays."""
-
-    def __init__(self, contradiction: Contradiction) -> None:
-        super().__init__(contradiction.text)
-        self.contradiction = contradiction
-
-
-def _with_fallback(ready: Sequence[Estimator], found: Contradiction) -> list[Estimator]:
-    """Return the estimators with the best simple one as fallback under the name of the preferred one."""
-    best = next(e for e in ready if e.name == found.best)
-    reason = f"not causal: {found.text}; {found.best} stands in its place"
-    return [Fallback(best, e.name, reason) if e.name == PREFERRED else e for e in ready]
-
-
-def _run_estimators(
-    job: _Job, outputs: OutputFolder, config: RunConfig, progress: Progress, *, falls_back: bool
-) -> LogResult:
-    """Estimate, score and write one drive; raises _FallBackError, before anything stays, where it is asked to."""
+def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, progress: Progress) -> LogResult:
+    """Estimate, score and write one drive."""
     from pdhef_logtool.evaluation.thresholds import check_thresholds
     from pdhef_logtool.runs.drive_details import drive_details
 
@@ -328,8 +309,6 @@ def _run_estimators(
             found = replace(found, events=sorted([*found.events, *observable], key=in_time))
         if against := contradiction(found.rows):
             drive.notes.append(f"WARNING: {against.text}")  # the answer's words say what comes of it
-            if falls_back:
-                raise _FallBackError(against)
         main = choose_main(ready, found.rows, proven=drive.car.has_evidence, named=config.estimators is not None)
         limits = check_thresholds(job.thresholds, found.rows, log=drive.name)
         details = drive_details(drive, ready, main.name, store.read, signals, limits, brief=config.kept != "full")
@@ -373,6 +352,8 @@ def _run_estimators(
             from pdhef_logtool.results.parquet_sink import write_metrics
 
             write_metrics(change.file(METRICS_FILE), rows)
+        head = f"Mounting, units, delays and clocks of {drive.name}, for pdhef run --setup."
+        write_bytes(change.file(SETUP_FILE), setup_toml(setup_of(drive.plan), head).encode())
         write_json(change.file(REPORT_FILE), report, brief=config.kept == "metrics")
     outcome = replace(
         outcome_of(drive, losses),
@@ -444,7 +425,7 @@ def _open_sinks(
     colours = {s.name: s.colour for s in all_specs()}
     try:
         if config.kept != "metrics":
-            sinks.append(EstimatesSink(change.file(ESTIMATES_FILE)))
+            sinks.append(EstimatesSink(change.file(ESTIMATES_FILE), selected=shown.main))
         if config.annotation != "none":
             source = drive.log if config.annotation == "full" else None
             if source is not None and source.messages is None:
@@ -597,6 +578,12 @@ def report_facts(
         vehicle_sha256=car.physics_sha256,
         vehicle_file=car.file_name,
         vehicle_proven=car.has_evidence,
+        assumed=drive.car.assumed,
+        setup={
+            "source": drive.setup_source,
+            "decided_s": plan.decided_s,
+            "causal_from_s": drive.causal_from_s,
+        },
         low_speed_m_s=car.vehicle.low_speed_blend_m_s,
         estimators=list(estimators),
         truth=TruthFacts(

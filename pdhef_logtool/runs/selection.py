@@ -12,17 +12,16 @@ from typing import TYPE_CHECKING, Literal
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.fallback import Fallback
 from pdhef_logtool.estimators.table import all_names, spec_of
 from pdhef_logtool.results.selected_estimate import MainFacts
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
 
-#: The preferred estimator, and those it is checked against. ``kinematic`` is not among them: it integrates the
-#: residual that d2 measures.
+#: The preferred estimator, and those it is checked against: models that explain the yaw rate by the steering. ``zero``
+#: agrees with an accelerometer near the rear axle, and ``kinematic`` integrates the residual that d2 measures.
 PREFERRED = "pd-hef"
-SIMPLE = ("zero", "open-loop", "open-loop:calibrated", "phy-ukf", "physics")
+SIMPLE = ("open-loop", "open-loop:calibrated", "phy-ukf", "physics")
 #: On simulated drives with right and wrong files every estimate beyond 1.05 times the least d2 had at least 1.7 times
 #: its sideslip error (docs/calibration.md).
 FACTOR = 1.2
@@ -91,11 +90,8 @@ def choose_main(ran: Sequence[Estimator], rows: Iterable[MetricRow], *, proven: 
     others = [n for n in names if n not in (*_BEST_FIRST, *_LAST)]
     name = next(n for n in (*_BEST_FIRST, *others, *_LAST) if n in names)
     against = None if proven else contradiction(rows, name)
-    stands_in = next((e.estimator.name for e in ran if isinstance(e, Fallback) and e.name == name), None)
     chosen_by: Literal["evidence", "d2", "order"]
-    if stands_in is not None:
-        chosen_by, why = "d2", f"{name} contradicts the sensors, {stands_in} stands in its place"
-    elif against is not None:
+    if against is not None:
         chosen_by, why = "d2", f"{name} contradicts the sensors more than {against.best} does"
         name = against.best
     elif proven:
@@ -108,8 +104,7 @@ def choose_main(ran: Sequence[Estimator], rows: Iterable[MetricRow], *, proven: 
         name=name,
         chosen_by=chosen_by,
         why=why,
-        distrusted=stands_in is not None or against is not None,
-        stands_in=stands_in,
+        distrusted=against is not None,
         naive=NAIVE if NAIVE in names else None,
         shown=names if named else [n for n in dict.fromkeys((name, PHYSICS, NAIVE)) if n in names],
         named=named,

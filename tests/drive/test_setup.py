@@ -15,8 +15,10 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.drive.setup import LogUntil, Setup, load_setup, setup_toml
 from pdhef_logtool.drive.windows import setup_of
+from pdhef_logtool.estimators.table import spec_of
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.runs.frames import estimate
 
 CHANGE_S = 30.0
 
@@ -90,6 +92,32 @@ def test_with_a_set_up_the_future_changes_nothing_that_came_before(
     assert all(same) == (how != "whole log")  # mounting and delays of a whole log look at all of it
     later = np.array_equal(changed.ay_m_s2[-500:], -as_recorded.ay_m_s2[-500:], equal_nan=True)
     assert later == (how != "whole log")
+
+
+@pytest.mark.slow
+def test_no_causal_estimate_depends_on_the_future(road: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of every estimator, with the set-up of the first seconds."""
+    options = ReadOptions(setup_from_s=CHANGE_S - 5.0, end="60")
+
+    def estimates() -> dict[str, Any]:
+        with read_drive(road, Car.load("saloon"), options=options) as drive:
+            tracks = estimate(drive, ["all"]).tracks
+        return {name: track for name, track in tracks.items() if name != "truth"}
+
+    as_recorded = estimates()
+    really_open = reading.open_log
+
+    def opened(*args: Any, **more: Any) -> Any:
+        log = really_open(*args, **more)
+        return ChangedLater(log, log.start_ns + round(CHANGE_S * 1e9))
+
+    monkeypatch.setattr(reading, "open_log", opened)
+    changed = estimates()
+    assert len(changed) > 8
+    for name, track in as_recorded.items():
+        rows = track.stamps_ns < track.stamps_ns[0] + (CHANGE_S - 3.0) * 1e9
+        same = np.array_equal(track.sideslip_rad[rows], changed[name].sideslip_rad[rows], equal_nan=True)
+        assert same == spec_of(name).causal, name
 
 
 def test_a_set_up_is_read_back_as_it_was_written(road: Path, tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.parts import FilterNoise, IntervalEntry, Intervals
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
-from pdhef_logtool.estimators.fallback import Fallback
 from pdhef_logtool.estimators.intervals import make_inflation
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter, physics_filter
@@ -186,17 +185,15 @@ def test_without_d2_its_own_interval_counts_as_it_is(signals: Signals) -> None:
 
 
 def test_intervals_of_other_driving_are_not_taken(signals: Signals) -> None:
-    """Neither for a calibrated car, nor for what stands in for another estimator there."""
     estimator = make_estimator("physics", with_band())
     assert isinstance(estimator, SelfCalibrated)
     inflation = make_inflation((9.0,) * 9, (9.0,) * 3)
     algorithms = map(resolve, (estimator, estimator.estimator))
     entries = tuple(IntervalEntry(estimator="e", algorithm=a, inflation=inflation) for a in algorithms)
     intervals = Intervals(car="c", physics_sha256="ab" * 32, roll_gradient_rad_per_m_s2=0.0, entries=entries)
-    for one in (estimator, Fallback(estimator, "pd-hef", "why")):
-        track, _ = run_window(one, signals)
-        applied = calibrator(replace(with_band(), intervals=intervals), [one])
-        without = calibrator(with_band(), [one]).add(track, signals)
-        np.testing.assert_array_equal(applied.add(track, signals).sideslip_std_rad, without.sideslip_std_rad)
-        assert (without.sideslip_std_rad != track.sideslip_std_rad).any()
-        assert applied.notes(one.name) == ("intervals: own, parameters and d2",)
+    track, _ = run_window(estimator, signals)
+    applied = calibrator(replace(with_band(), intervals=intervals), [estimator])
+    without = calibrator(with_band(), [estimator]).add(track, signals)
+    np.testing.assert_array_equal(applied.add(track, signals).sideslip_std_rad, without.sideslip_std_rad)
+    assert (without.sideslip_std_rad != track.sideslip_std_rad).any()
+    assert applied.notes(estimator.name) == ("intervals: own, parameters and d2",)

@@ -246,7 +246,7 @@ def test_two_jobs_that_are_killed_and_go_on_leave_what_one_job_leaves(
     assert run_logs(logs, two, config, jobs=2, resume=True).exit_code == 0
     assert contents(one) == contents(two)
     folder = two / "logs/dlc"
-    assert {p.name for p in folder.iterdir()} == {"estimates.parquet", "metrics.parquet", "report.json"}
+    assert {p.name for p in folder.iterdir()} == {"estimates.parquet", "metrics.parquet", "report.json", "setup.toml"}
 
 
 @pytest.mark.slow
@@ -260,7 +260,7 @@ def test_metrics_alone_leave_a_short_report_by_the_schema(sample_logs_dir: Path,
     result = run_logs(logs, tmp_path, config, full_worst=1)
     worst = "step"
     report = tmp_path / "logs/dlc/report.json"
-    assert [p.name for p in report.parent.iterdir()] == ["report.json"]
+    assert {p.name for p in report.parent.iterdir()} == {"report.json", "setup.toml"}
     assert report.stat().st_size < 20_000
     jsonschema.validate(json.loads(report.read_text()), load_schema("report.schema.json"))
     jsonschema.validate(json.loads((tmp_path / "run.json").read_text()), load_schema("run.schema.json"))
