@@ -50,7 +50,7 @@ def test_rows_of_the_condition_table(tmp_path: Path) -> None:
         *("simulate", "conditions", "-o", str(tmp_path), "--drives", "1", "--rows", "gyro-dead,friction-unknown")
     )
     assert made.returncode == 0, made.stderr
-    assert "gyro-dead" in made.stdout and "the estimator is told no friction" in made.stdout
+    assert "gyro-dead" in made.stdout and "friction not given" in made.stdout
     assert sorted(p.name for p in tmp_path.iterdir()) == ["gyro-dead", "in-domain", "manifest.json"]
 
 
