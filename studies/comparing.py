@@ -22,8 +22,10 @@ import numpy as np
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.results.opened_run import METRICS_FILE
 from pdhef_logtool.results.paired_change import paired_change
 from pdhef_logtool.results.parquet_sink import write_metrics
+from pdhef_logtool.storage.documents import file_sha256, seal
 from studies.pages import DOCS, options, table, write
 
 LIMIT, PLANTED, SPREAD = 0.05, 0.10, 0.2
@@ -81,14 +83,15 @@ def make_run(folder: Path, drives: int) -> int:
         }
         for i, label in enumerate(labels)
     ]
-    document = {"format": "pdhef.run", "version": 1, "config": {}, "model": None, "versions": {}, "logs": logs}
-    (folder / "run.json").write_text(json.dumps(document, indent=2))
     rows = [
         MetricRow(label, estimator, signal, segment, metric, float(value), "rad", 1000)
         for label in labels
         for value, (estimator, signal, segment, metric) in zip(rng.random(_PER_DRIVE), _names(), strict=True)
     ]
-    write_metrics(folder / "metrics.parquet", rows)
+    write_metrics(folder / METRICS_FILE, rows)
+    files = {METRICS_FILE: file_sha256(folder / METRICS_FILE)}
+    document = {"format": "pdhef.run", "version": 1, "config": {}, "model": None, "versions": {}, "logs": logs}
+    (folder / "run.json").write_text(json.dumps(seal({**document, "files": files}), indent=2))
     return len(rows)
 
 

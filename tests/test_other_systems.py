@@ -19,10 +19,10 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def without_posix(*arguments: object, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run a command in a process without what Windows does not have, and with its encoding of streams."""
+    """Run a command in a process without what Windows does not have, and with streams in ASCII."""
     words = [sys.executable, ROOT / "tests/without_posix.py", *arguments]
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "cp1252", "PDHEF_TRACEBACK": "1"}
-    return subprocess.run(words, cwd=folder, env=env, capture_output=True, encoding="cp1252", check=False)
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "ascii", "PDHEF_TRACEBACK": "1"}
+    return subprocess.run(words, cwd=folder, env=env, capture_output=True, encoding="ascii", check=False)
 
 
 @pytest.mark.slow

@@ -116,18 +116,18 @@ class LocalFile(ByteSource):
     def fetch(self, offset: int, size: int) -> bytes:
         """Read up to ``size`` bytes at an offset; several threads may read."""
         with self._lock:
-            return read_at(self._file, offset, size)
+            return read_at(self._file, offset, size, self.size)
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
 
-def read_at(file: BinaryIO, offset: int, size: int) -> bytes:
-    """Read up to ``size`` bytes at an offset of an unbuffered file; fewer only at its end."""
+def read_at(file: BinaryIO, offset: int, size: int, end: int) -> bytes:
+    """Read up to ``size`` bytes at an offset of an unbuffered file with ``end`` bytes; fewer only at its end."""
     file.seek(offset)
     data = file.read(size)
-    if not 0 < len(data) < size:
+    if not 0 < len(data) < size or offset + len(data) >= end:
         return data
     parts = [data]
     while part := file.read(size - sum(map(len, parts))):  # the system reads at most 2 GiB at a time

@@ -255,7 +255,7 @@ class _Spool:
             self.wait(start, end)
         with self._lock:
             assert self._file is not None
-            return read_at(self._file, start, end - start)
+            return read_at(self._file, start, end - start, end)
 
     def held_to(self, start: int, end: int) -> int:
         """Return up to where, at most to ``end``, bytes from ``start`` on are held; ``start``: none is."""

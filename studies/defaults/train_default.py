@@ -76,8 +76,13 @@ class Training:
 
     @property
     def network(self) -> Path:
-        """Folder of the car's network."""
-        return self.car / NETWORK_FOLDER
+        """Folder of the trained network: of the shipped car its own; ``pdhef learn`` copies others into the car."""
+        return self.car / NETWORK_FOLDER if self.is_shipped else self.work / f"network-{self.seed}"
+
+    @property
+    def is_shipped(self) -> bool:
+        """Whether the car is that of the package."""
+        return self.car.resolve() == HOME.resolve()
 
     @property
     def of_car(self) -> tuple[object, ...]:
@@ -87,7 +92,7 @@ class Training:
     @property
     def with_network(self) -> tuple[object, ...]:
         """The same with the network: the shipped one by its name, wherever the package is."""
-        return *self.of_car, "--network", SHIPPED if self.car.resolve() == HOME else self.network
+        return *self.of_car, "--network", SHIPPED if self.is_shipped else self.network
 
     @property
     def validation(self) -> tuple[object, ...]:

@@ -142,6 +142,19 @@ sideslip errors in degrees:
 """
 
 
+def _adaptation(d: Document) -> Iterator[tuple[str, ...]]:
+    """Yield the same of the adaptive mechanism."""
+    for scheme, r in d["r_factor"].items():
+        paper = number(published.R_NORM[1] / published.R_NORM[0])
+        yield "20", f"factor on R of a_y in the noise burst, `{scheme}`", paper, number(r["within"] / r["before"])
+        yield "20", f"the same interval without a burst, `{scheme}`", "–", number(r["without_burst"])
+    for scenario, curves in d["trust"].items():
+        for scheme, c in curves.items():
+            here = f"{number(c['median'][0])} … {number(c['median'][-1])}"
+            low, high = published.TRUST
+            yield "21", f"residual gain at low and high a_y in {scenario}, `{scheme}`", f"{low:g} … {high:g}", here
+
+
 def _compared(d: Document) -> Iterator[tuple[str, ...]]:
     """Yield figure, quantity, value of the paper and value here."""
     for paper_scheme, scheme, values in (
@@ -164,15 +177,7 @@ def _compared(d: Document) -> Iterator[tuple[str, ...]]:
         theirs = " … ".join(f"{v:g}".replace("-", "−") for v in published.NETWORK_OUTPUT_RAD_S)
         here = f"{number(low)} … {number(high)}"
         yield figure, f"network output in {scenario}: yaw rate per step, rad/s", theirs, here
-    for scheme, r in d["r_factor"].items():
-        paper = number(published.R_NORM[1] / published.R_NORM[0])
-        yield "20", f"factor on R of a_y in the noise burst, `{scheme}`", paper, number(r["within"] / r["before"])
-        yield "20", f"the same interval without a burst, `{scheme}`", "–", number(r["without_burst"])
-    for scenario, curves in d["trust"].items():
-        for scheme, c in curves.items():
-            here = f"{number(c['median'][0])} … {number(c['median'][-1])}"
-            low, high = published.TRUST
-            yield "21", f"residual gain at low and high a_y in {scenario}, `{scheme}`", f"{low:g} … {high:g}", here
+    yield from _adaptation(d)
     for gain in d["improvements"]:
         if (gain["baseline"], gain["figure"]) == ("phy-ukf", "sideslip_deg") and gain["scenario"] in "AB":
             text = f"reduction of the sideslip RMSE against Phy-UKF in {gain['scenario']}"
@@ -181,6 +186,17 @@ def _compared(d: Document) -> Iterator[tuple[str, ...]]:
     if {HYBRID, "phy-ukf"} <= times.keys():
         theirs = number(published.STEP_MS["pd-hef"] / published.STEP_MS["phy-ukf"])
         yield "23", "step time of PD-HEF over Phy-UKF", theirs, number(times[HYBRID] / times["phy-ukf"])
+
+
+def _notes(d: Document) -> str:
+    """Return remarks on the published values."""
+    noise, speed_m_s, duration_s = SensorNoise(), d["scenarios"][0]["speed_km_h"] / 3.6, d["drives"][0]["duration_s"]
+    drift_m = 0.5 * speed_m_s * noise.yaw_rate_bias_rad_s * duration_s**2
+    return f"""- The published position errors are not possible by dead reckoning with this gyro: its 1-sigma bias of
+  {noise.yaw_rate_bias_rad_s:g} rad/s alone results in {number(drift_m)} m after {number(duration_s)} s.
+- The published yaw-rate errors in A are higher than those of the gyro itself (`zero:no-lateral`).
+- An increment of 0.04 rad/s per step of 10 ms is a yaw acceleration of 4 rad/s², above that of the manoeuvre.
+- The published step times are those of MATLAB; the step times here are those of compiled code over a whole log."""
 
 
 def write_details(d: Document, folder: Path) -> str:
@@ -199,8 +215,6 @@ def write_details(d: Document, folder: Path) -> str:
         for n, t in d["step_time_us"].items()
     ]
     pictures = "\n\n".join(f"![{f.stem}]({f.name})" for f in sorted(folder.glob("figure*.png")))
-    noise, speed_m_s, duration_s = SensorNoise(), d["scenarios"][0]["speed_km_h"] / 3.6, d["drives"][0]["duration_s"]
-    drift_m = 0.5 * speed_m_s * noise.yaw_rate_bias_rad_s * duration_s**2
     return f"""# Details of the paper's experiment
 
 Command: `make paper` (`python -m studies.paper`). `results.json` contains the numbers.
@@ -235,11 +249,7 @@ with different sensor errors. The figures do not apply to other manoeuvres.
 
 {table(("figure", "quantity", "paper", "here"), list(_compared(d)))}
 
-- The published position errors are not possible by dead reckoning with a gyro of this class: its 1-sigma bias of
-  {noise.yaw_rate_bias_rad_s:g} rad/s alone results in {number(drift_m)} m after {number(duration_s)} s.
-- The published yaw-rate errors in A are higher than those of the gyro itself (`zero:no-lateral`).
-- An increment of 0.04 rad/s per step of 10 ms is a yaw acceleration of 4 rad/s², above that of the manoeuvre.
-- The published step times are those of MATLAB; the step times here are those of compiled code over a whole log.
+{_notes(d)}
 
 Processor time per step on scenario B:
 

@@ -8,7 +8,7 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pdhef_logtool.car.car import FIT_FILE, NETWORK_FILE, NETWORK_FOLDER, NOISE_FILE, VEHICLE_FILE, Car
+from pdhef_logtool.car.car import FIT_FILE, NETWORK_FILE, NOISE_FILE, VEHICLE_FILE, Car
 from pdhef_logtool.learning.network.fit import Recipe
 from pdhef_logtool.learning.network.train_command import dataset_for, train_on
 from pdhef_logtool.residual_model.bundle import PHYSICS_MODEL
@@ -48,7 +48,7 @@ def train_withheld(work: Path, output: Path) -> None:
         shutil.copyfile(HOME / part, output / part)
     of, data = manoeuvres(work), dataset_for(work / PHYSICS_MODEL, PHYSICS_MODEL)
     kept = tuple(d for d in data.drives if of[d.name] not in WITHHELD)
-    network = output / NETWORK_FOLDER
+    network = output.with_name(f"{output.name}-network")  # learn copies it into the car
     train_on(replace(data, drives=kept), network, Recipe(seed=0, epochs=EPOCHS))
     of_car = ["--car", output, "--mapping", work / "mapping.toml", "--network", network]
     pdhef("learn", work / "evidence", *of_car, "--stages", "gain", "--any-split", "-o", output)

@@ -374,7 +374,7 @@ def test_a_process_that_dies_costs_its_own_drive_only(monkeypatch: pytest.Monkey
             yield Ended(number, item, None if lost else extract_command._failure(item, "fine"), lost)
 
     monkeypatch.setattr(extract_command, "supervise", supervise_)
-    found = extract_command._run_jobs([_job(name) for name in "abc"], 2, lambda *_: None)
+    found = extract_command._run_jobs([_job(name) for name in "abc"], 2, lambda *_: None, print)
     assert sorted((r.record.name, r.record.left_out) for r in found) == [
         ("a", "fine"), ("b", "the worker was killed (signal 9)"), ("c", "fine"),
     ]  # fmt: skip
@@ -387,7 +387,7 @@ def test_progress_of_several_drives_at_once_adds_up(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(extract_command, "_extract", extract)
     told: list[tuple[str, float]] = []
-    list(extract_command._run_jobs([_job("a"), _job("b")], 1, lambda *what: told.append(what)))
+    list(extract_command._run_jobs([_job("a"), _job("b")], 1, lambda *what: told.append(what), print))
     assert told == [("a", 0.25), ("b", 0.75)]
 
 
@@ -397,12 +397,12 @@ def test_an_error_of_one_log_is_a_reason_and_of_the_only_log_an_error(monkeypatc
         raise ModelError(expected="x", got="y", where=name) if name == "a" else KeyError("k")
 
     monkeypatch.setattr(extract_command, "_extract", fail)
-    found = list(extract_command._run_jobs([_job("a"), _job("b")], 1, lambda *_: None))
+    found = list(extract_command._run_jobs([_job("a"), _job("b")], 1, lambda *_: None, print))
     assert "expected x" in found[0].record.left_out
     assert found[1].record.left_out == "internal error, KeyError: 'k'"
     assert (found[0].record.file, found[0].entry, found[0].kept) == ("a.mcap", None, False)
     with pytest.raises(ModelError):
-        list(extract_command._run_jobs([_job("a")], 4, lambda *_: None))
+        list(extract_command._run_jobs([_job("a")], 4, lambda *_: None, print))
 
 
 def test_an_empty_split_is_told_and_a_default_car_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

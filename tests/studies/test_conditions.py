@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -131,3 +132,11 @@ def test_told_and_bins(made, car):
         told(drive, {"weather": "rain"})
     masks = bin_masks(drive)
     assert (sum(masks[b].astype(int) for b in ("low", "middle", "high")) == 1).all()
+
+
+def test_the_stored_page_is_that_of_the_stored_results(tmp_path: Path):
+    results = tmp_path / "results"
+    shutil.copytree(conditions.RESULTS / "conditions", results)
+    assert conditions.main(["--render", "--results", str(results), "--out", str(tmp_path)]) == 0
+    for made, stored in (("conditions.md", conditions.DOCS), ("results/tables.md", conditions.RESULTS / "conditions")):
+        assert (tmp_path / made).read_bytes() == (stored / Path(made).name).read_bytes()

@@ -5,6 +5,7 @@ The bounds stand above what the full run measures (docs/paper.md); a change that
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
@@ -12,9 +13,10 @@ import pytest
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
+from studies.pages import DOCS, RESULTS
 from studies.paper.comparison import improvement, spread
 from studies.paper.experiment import FIRST_NOISE_SEED, A, B, Experiment, Run, run_experiment
-from studies.paper.page import number, percent
+from studies.paper.page import number, percent, write_details, write_page
 
 pytestmark = pytest.mark.slow
 
@@ -103,6 +105,13 @@ def test_one_noise_seed_proves_nothing() -> None:
     assert gain is not None
     assert math.isnan(gain.low)
     assert not gain.proven
+
+
+def test_the_pages_are_those_of_the_stored_results() -> None:
+    folder = RESULTS / "paper"
+    stored = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+    assert write_page(stored) == (DOCS / "paper.md").read_text(encoding="utf-8")
+    assert write_details(stored, folder) == (folder / "details.md").read_text(encoding="utf-8")
 
 
 def test_numbers_have_three_digits_and_no_powers() -> None:
