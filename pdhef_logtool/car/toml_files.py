@@ -57,7 +57,7 @@ def read_vehicle_file(path: Path) -> VehicleFile:
 
 
 def vehicle_of_entries(raw: Mapping[str, Any], *, where: str) -> VehicleFile:
-    """Return what the entries of a vehicle.toml say; raises VehicleError as :func:`read_vehicle_file`."""
+    """Return the vehicle of the entries of a vehicle.toml; raises VehicleError as :func:`read_vehicle_file`."""
     entries, assumed = completed(raw)
     expected = "the entries of vehicle.toml"
     file = validated(VehicleEntries, entries, where, VehicleError, expected=expected, remedy=REMEDY)

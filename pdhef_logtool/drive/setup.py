@@ -21,14 +21,14 @@ from pdhef_logtool.mapping.records import CanSettings, SignalSource
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.storage.documents import jsonable, read_toml
 
-#: A device clock starts anew with each log: its offset is that of the messages of this long.
+#: The offset of a device clock changes between logs: it is estimated from the messages of this duration.
 CLOCK_START_S = 1.0
 _REMEDY = "give the setup.toml of a run of the same car and recorder"
 
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What holds for all of a drive.
+    """Decisions that are constant over a drive.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Setup:
 
 
 class LogUntil:
-    """A log as far as it was recorded at some time: what looks at all of it looks at no later sample."""
+    """A log up to a time: no later sample can be read."""
 
     def __init__(self, log: DriveLog, end_ns: int) -> None:
         self._log, self.end_ns = log, min(end_ns, log.end_ns)
@@ -123,7 +123,7 @@ def is_device_clock(clock: ClockModel) -> bool:
 
 
 def _plain(record: Any) -> Any:
-    """Return a record as TOML holds it: no entry that is None, NaN as nan."""
+    """Return a record as TOML values: without entries that are None, NaN as nan."""
     if hasattr(record, "__dataclass_fields__"):
         entries = {f.name: getattr(record, f.name) for f in fields(record)}
         return {k: _plain(v) for k, v in entries.items() if v is not None}

@@ -33,7 +33,7 @@ _PARTS_AT_ONCE = 256
 _LATER_COLUMNS = ("diverged", *OPTIONAL_COLUMNS)
 _LATER_METRIC_COLUMNS = ("algorithm",)
 _ESTIMATES, _METRICS = "estimates.parquet", "metrics.parquet"
-#: Name under which the selected estimate stands in estimates.parquet a second time.
+#: Name of the copy of the selected estimate in estimates.parquet.
 SELECTED = "selected"
 _AGAIN = "run the log again"
 _FLAGS = ("valid", "diverged")

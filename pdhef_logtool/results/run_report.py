@@ -308,12 +308,18 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
         "versions": dict(facts.versions),
     }
     document = {key: jsonable(value) for key, value in document.items()}
-    document["selected_estimate"] = None if facts.main is None else facts.main.name
-    document["answer"] = None if facts.main is None else answer_of(document, facts.main)
-    if facts.main is not None and (details := facts.details) is not None:
-        document |= _detailed(details)
-        document["verdicts"] = verdicts_of(document, facts.main.name, details.standings, details.limits)
-    return document
+    return document | _selected(document, facts.main, facts.details)
+
+
+def _selected(document: Mapping[str, Any], main: MainFacts | None, details: DriveDetails | None) -> dict[str, Any]:
+    """Return the selected estimate, its sentences, and the keys that only a run writes."""
+    if main is None:
+        return {"selected_estimate": None, "answer": None}
+    chosen: dict[str, Any] = {"selected_estimate": main.name, "answer": answer_of(document, main)}
+    if details is None:
+        return chosen
+    chosen |= _detailed(details)
+    return chosen | {"verdicts": verdicts_of(document | chosen, main.name, details.standings, details.limits)}
 
 
 def _detailed(details: DriveDetails) -> dict[str, Any]:

@@ -40,7 +40,7 @@ class MainFacts:
     Attributes
     ----------
     name : of it. chosen_by : evidence of the car's driving, d2, or the order of the estimators. why : in words.
-    distrusted : whether d2 spoke against the preferred one.
+    distrusted : whether the lateral consistency contradicts the preferred one.
     naive : what an estimate is worth anything against, None if it did not run. shown : what a person is shown; all that
         ran where the estimators were ``named``.
     """

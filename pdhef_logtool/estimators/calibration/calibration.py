@@ -79,8 +79,8 @@ SUPERELEVATION_STD = 0.2
 #: with the lag, and the bank takes up what roads do to a_y; what the model leaves of a_y is no white sensor noise.
 PARTS, AY_STD = ("lag", "bank"), 1.0
 #: A stiffness that is less well known is not exported to other logs (sd of its logarithm), nor an understeer gradient
-#: that no car has, rad/(m/s²): a little oversteer to 7 degrees per g. The log itself uses what its driving says; the
-#: rest stays at its prior and widens the interval.
+#: that no car has, rad/(m/s²): a little oversteer to 7 degrees per g. The log itself uses every
+#: calibration; parameters that are not excited stay at their prior and widen the interval.
 LEAST_KNOWN_EXPORTED, PLAUSIBLE_UNDERSTEER = 0.15, (-2e-3, 12e-3)
 #: Least driving above the lowest speed.
 LEAST_S = 4.0
@@ -280,7 +280,7 @@ def self_calibrate(
 
 
 def _with_refusal(found: SelfCalibration) -> SelfCalibration:
-    """Return a calibration, refused where it says too little of the car for other logs."""
+    """Return a calibration, refused if it is too uncertain for other logs."""
     gradient = found.vehicle.understeer_gradient_rad_per_m_s2(found.vehicle.assumed_friction)
     low, high = PLAUSIBLE_UNDERSTEER
     why = ""
