@@ -319,7 +319,7 @@ def _selected(document: Mapping[str, Any], main: MainFacts | None, details: Driv
     if details is None:
         return chosen
     chosen |= _detailed(details)
-    return chosen | {"verdicts": verdicts_of(document | chosen, main.name, details.standings, details.limits)}
+    return chosen | {"verdicts": verdicts_of({**document, **chosen}, main.name, details.standings, details.limits)}
 
 
 def _detailed(details: DriveDetails) -> dict[str, Any]:
