@@ -55,8 +55,7 @@ drive that has the lowest residual.
 {d2}
 
 Above {factor:g} times the lowest residual of {simple}, `pdhef run` warns that `pd-hef` contradicts the sensors. For a
-car without validation data it selects the fallback estimate with the lowest residual, unless `--calibrate off` requests
-causal estimates.
+car without validation data it selects the vehicle model with the lowest residual.
 
 ## Published vehicle files of real cars
 
