@@ -24,8 +24,8 @@ from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 
 #: What drives the vehicle model; a filter uses a_y and yaw rate where the log has them.
 _INPUTS = frozenset({"steer_rad", "speed_m_s"})
-#: What the features of a network are made of.
-_FEATURES = _INPUTS | {"ay_m_s2", "yaw_rate_rad_s"}
+#: What the features of a network and the evidence of learning are made of.
+FEATURES: frozenset[str] = _INPUTS | {"ay_m_s2", "yaw_rate_rad_s"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ SPECS: tuple[Spec, ...] = (
     Spec(
         "linear-regression",
         "sideslip linear in the network's features, low-passed at 2 Hz (needs a network with baselines)",
-        "linear_regression:build", _FEATURES, 0xDDCC77, network="linear_regression",
+        "linear_regression:build", FEATURES, 0xDDCC77, network="linear_regression",
     ),
     Spec(
         "phy-ukf", "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",
@@ -147,7 +147,7 @@ SPECS: tuple[Spec, ...] = (
     ),
     Spec(
         "pure-lstm", "a network that says v_y itself, from the same inputs, no filter (needs a network with baselines)",
-        "direct_network:build", _FEATURES, 0xAA4499, network="pure_lstm",
+        "direct_network:build", FEATURES, 0xAA4499, network="pure_lstm",
     ),
     Spec(
         "pd-hef", "physics plus what its network says that it lacks, as far as the car's evidence lets it",
@@ -168,7 +168,7 @@ SPECS: tuple[Spec, ...] = (
     ),
     Spec(
         "pd-hef-paper", "the paper's hybrid filter with its adaptive mechanism, to the letter (needs its network)",
-        "hybrid_paper:build", _FEATURES, 0xCC6677, network="paper",
+        "hybrid_paper:build", FEATURES, 0xCC6677, network="paper",
     ),
 )  # fmt: skip
 

@@ -116,7 +116,11 @@ def test_the_report_says_the_cap_and_why(
         (file / "vehicle.toml").write_text(text)
         (file / "network.toml").write_text(part_toml(trust, "Written by a test."))
         config = RunConfig(
-            car=file, network=tmp_path / "model", estimators=("pd-hef", "pd-hef:gain=1"), annotate="none"
+            car=file,
+            network=tmp_path / "model",
+            estimators=("pd-hef", "pd-hef:gain=1"),
+            annotate="none",
+            calibrate="off",
         )
         result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / f"out{cap}", config)
         report = json.loads((tmp_path / f"out{cap}" / "logs" / "dlc" / "report.json").read_text())

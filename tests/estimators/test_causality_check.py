@@ -194,7 +194,7 @@ def test_a_run_leaves_out_what_looks_ahead_says_why_and_ends_with_3(
     assert any("peeks" in text and "causality check" in text for text in result.results[0].outcome.lost)
     assert {r.estimator for r in result.results[0].rows} & {"zero", "honest", "peeks"} == {"zero", "honest"}
     rows = pl.read_parquet(tmp_path / "a/logs/dlc/estimates.parquet")
-    assert set(rows["estimator"].unique()) == {"zero", "honest", "truth"}
+    assert set(rows["estimator"].unique()) == {"zero", "honest", "selected", "truth"}
     sound = _run(tmp_path / "b", sample_logs_dir, "zero", "honest")
     assert sound.exit_code == EXIT_OK
     assert rows.equals(pl.read_parquet(tmp_path / "b/logs/dlc/estimates.parquet"))

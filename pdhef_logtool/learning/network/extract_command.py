@@ -25,7 +25,7 @@ from pdhef_logtool.drive.windows import DrivePlan, DriveWindow
 from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter
-from pdhef_logtool.estimators.table import FILTERS, spec_of
+from pdhef_logtool.estimators.table import FEATURES, FILTERS
 from pdhef_logtool.learning.drives import (
     DriveRecord,
     drives_document,
@@ -592,7 +592,7 @@ def _check_plan(plan: DrivePlan, job: _Job) -> None:
             where=where,
             remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
         )
-    missing = sorted(spec_of("phy-ukf").needs - plan.alignment.available)
+    missing = sorted(FEATURES - plan.alignment.available)
     if missing:
         raise EstimatorError(
             expected="the signals of the physics filter",

@@ -10,7 +10,7 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import MAX_BYTES, Drive, WholeDrive, too_big
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.table import SPECS, Options, spec_of
+from pdhef_logtool.estimators.table import FEATURES, SPECS, Options, spec_of
 from pdhef_logtool.learning.drives import DriveRecord, load_drive
 from pdhef_logtool.learning.noise.search import DriveError, drive_error
 from pdhef_logtool.logs.discovery import LogInput
@@ -70,7 +70,7 @@ class Bench:
         """
 
         def lacking(drive: Drive) -> str:
-            missing = {name: sorted(spec_of(name).needs - drive.available) for name in self._names}
+            missing = {name: sorted(FEATURES - drive.available) for name in self._names}
             return "; ".join(f"{name} needs {', '.join(what)}" for name, what in missing.items() if what)
 
         record, drive = load_drive(

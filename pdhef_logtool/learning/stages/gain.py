@@ -14,7 +14,7 @@ from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.drive.reading import Drive, WholeDrive
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.table import Options, spec_of
+from pdhef_logtool.estimators.table import FEATURES, Options, spec_of
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.drives import GAIN, DriveRecord, drives_document, load_drive, no_drive, record_head
 from pdhef_logtool.learning.evidence.trust import (
@@ -65,7 +65,7 @@ def find_gain(task: Task) -> StageOutput:
         raise UsageError(expected="a network", got=got, where="--network", remedy="give a folder of pdhef train")
 
     def lacking(drive: Drive) -> str:
-        missing = sorted(spec_of("pd-hef").needs - drive.available)
+        missing = sorted(FEATURES - drive.available)
         return f"pd-hef needs {', '.join(missing)}" if missing else ""
 
     def read(log: LogInput) -> tuple[DriveRecord, BlockErrors | None]:
