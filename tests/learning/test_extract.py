@@ -478,7 +478,7 @@ def _children(pid: int) -> list[int]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="looks for processes in /proc")
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.fleet)])
 def test_a_command_that_is_ended_takes_its_processes_with_it(
     dataset: ExtractResult, sample_logs_dir: Path, tmp_path: Path, number: int
 ) -> None:

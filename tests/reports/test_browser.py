@@ -136,6 +136,7 @@ def test_an_error_of_one_sample_is_seen_unzoomed_and_named(browser, tmp_path):
     assert "1000.000 s" in browser.value("document.querySelector('button.jump').textContent")
 
 
+@pytest.mark.fleet
 def test_an_hour_of_fourteen_tracks_is_small_and_quick(browser, tmp_path):
     file = page_of(write_run(tmp_path, drive_tracks(3600.0, NAMES)))
     assert file.stat().st_size < 8_000_000

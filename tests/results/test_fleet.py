@@ -211,6 +211,7 @@ def test_folders_part_drives(run: Run) -> None:
     assert found["folder 2"] == [("golf/friday", 2), ("golf/monday", 2), ("not told", 2)]
 
 
+@pytest.mark.fleet
 @pytest.mark.slow
 def test_ten_thousand_drives_are_read_while_one_waits(run: Run) -> None:
     rng = np.random.default_rng(3)

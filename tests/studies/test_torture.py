@@ -27,6 +27,7 @@ def _quiet(_text: str) -> None:
     """Say nothing."""
 
 
+@pytest.mark.fleet
 @pytest.mark.slow
 def test_mutants_do_no_harm(tmp_path: Path) -> None:
     """In a process of its own: what the tests hold in memory is not the mutants'."""
@@ -94,6 +95,7 @@ def _case(folder: Path, number: int) -> Verdict:
     return Verdict("exit 0")
 
 
+@pytest.mark.fleet
 @pytest.mark.slow
 def test_what_dies_hangs_or_grows_is_told_and_the_rest_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("studies.torture.workers.LIMIT_S", 5.0)
