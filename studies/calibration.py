@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from pdhef_logtool.estimators.calibration.calibration import LEAST_KNOWN, LEAST_KNOWN_EXPORTED, VARIED
+from pdhef_logtool.estimators.calibration.calibration import LARGEST_SHARE, LEAST_KNOWN_EXPORTED, VARIED
 from pdhef_logtool.estimators.posterior_band import OWN_SHARE as IDENTIFIED_SHARE
 from pdhef_logtool.estimators.self_calibrated import D2_SHARE, OWN_SHARE
 from pdhef_logtool.runs.selection import FACTOR, SIMPLE
@@ -34,9 +34,8 @@ are medians. The last column contains the median ratio and the 10 % and 90 % qua
 
 {simulated}
 
-A calibration is refused if the posterior of a cornering stiffness is wider than ± {least} (± {exported} if it is
-written to a car), if the understeer gradient is implausible, or if the lateral kinematic consistency of `physics`
-becomes {factor:g} times worse.
+A calibration is refused if it leaves more than {largest} of the yaw rate or of the lateral acceleration, or, if it is
+written to a car, if the posterior of a cornering stiffness is wider than ± {exported}.
 
 ## 95 % confidence intervals of self-calibrated cars
 
@@ -117,7 +116,7 @@ def settings() -> dict[str, object]:
         "seed": SELF_SEED,
         "low": self_calibration.WRONG[0],
         "high": self_calibration.WRONG[1],
-        "least": f"{100 * LEAST_KNOWN:.0f} %",
+        "largest": f"{100 * LARGEST_SHARE:.0f} %",
         "exported": f"{100 * LEAST_KNOWN_EXPORTED:.0f} %",
         "own": OWN_SHARE,
         "varied": VARIED,

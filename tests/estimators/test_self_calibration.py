@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from reference_car import FRICTION, Drive, cut, drive, keep, with_noise
 
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
-from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, drift_share, self_calibrate
-from pdhef_logtool.estimators.calibration.driving import LEAST_SPEED_M_S, STEP_S, Driving, DrivingReader
+from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
+from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving, DrivingReader
 from pdhef_logtool.records.signals import Signals
 
 RIGHT = default_vehicle()
@@ -82,43 +82,69 @@ def test_biases_offset_and_gain_of_the_sensors_are_found() -> None:
         assert abs(by[name].value - true) < 3.0 * by[name].sd, name
 
 
-def test_the_calibrated_vehicle_reads_its_signals_with_what_was_found() -> None:
+@pytest.mark.parametrize("metres", [-1.71, 0.0, 1.0])
+def test_the_position_of_the_accelerometer_is_found(metres: float) -> None:
+    """The first one is at the rear axle, where v_y is small and a_y alone agrees with no sideslip at all."""
+    signals = with_noise(wide().signals, 7)
+    turning = np.gradient(wide().r, signals.stamps_ns * 1e-9)
+    moved = replace(signals, ay_m_s2=signals.ay_m_s2 + metres * turning)
+    by = {p.name: p for p in found(moved, RIGHT).parameters}
+    position = by["lever of a_y"]
+    assert position.excited
+    assert abs(position.value - metres) < 1.96 * position.sd
+
+
+def test_a_wrong_steering_gain_is_found() -> None:
+    signals = with_noise(wide().signals, 8)
+    by = {p.name: p for p in found(replace(signals, steer_rad=1.1 * signals.steer_rad), RIGHT).parameters}
+    ratio = by["steering ratio"]
+    assert abs(math.log(ratio.value / (1.1 * RIGHT.steering_ratio))) < 1.96 * ratio.sd
+
+
+def test_slow_driving_calibrates_and_very_slow_driving_is_refused() -> None:
+    file = wrong(0.6, 0.6).model_copy(update={"relaxation_length_m": 0.1})  # the forces of this car do not lag
+    slow = found(with_noise(drive(sweep(0.08), 60.0, speed=7.0).signals, 9), file)
+    assert not slow.refused
+    for error, sd in stiffness_errors(slow):
+        assert abs(error) < 1.96 * sd
+    walking = found(drive(sweep(0.02), 20.0, speed=RIGHT.low_speed_blend_m_s - 1.0).signals, RIGHT)
+    assert "0 s above" in walking.refused
+    short = found(drive(sweep(0.02), 4.0).signals, RIGHT)
+    assert "are needed" in short.refused
+    assert short.vehicle is RIGHT
+
+
+def test_what_straight_driving_does_not_excite_keeps_its_prior() -> None:
+    straight = found(with_noise(drive(lambda _t: 0.0, 60.0).signals, 5), RIGHT)
+    assert not straight.refused
+    for p in straight.parameters:
+        if p.name.endswith("cornering stiffness"):
+            assert not p.excited
+            assert p.value == pytest.approx(p.prior, rel=0.1)
+    assert "not excited: front cornering stiffness" in straight.text
+
+
+def test_steering_that_does_not_explain_the_yaw_rate_is_refused() -> None:
     signals = wide().signals
-    calibration = found(replace(signals, steer_rad=signals.steer_rad + 0.005), RIGHT)
-    assert calibration.vehicle.steer_offset_rad == pytest.approx(0.005, abs=1e-3)
-    assert calibration.vehicle.physics.names == ("lag", "bank")
-    assert calibration.vehicle.mass_kg == RIGHT.mass_kg
-    assert calibration.own is RIGHT
+    assert "of the yaw rate" in found(replace(signals, steer_rad=-2.0 * signals.steer_rad), RIGHT).refused
 
 
 @pytest.mark.slow
 def test_a_file_that_contradicts_the_drive_is_told() -> None:
     slow = drive(sweep(0.01), 40.0).signals
     agrees, contradicts = (self_calibrate([driving(slow, v)], v).understeer for v in (RIGHT, wrong(2.0, 0.6)))
-    assert agrees is not None and agrees.known and not agrees.contradicts
+    assert agrees is not None and not agrees.contradicts
     assert contradicts is not None and contradicts.contradicts
     assert "contradicts" in contradicts.text
 
 
-def test_too_little_or_too_slow_driving_is_refused() -> None:
-    short = found(drive(sweep(0.02), 8.0).signals, RIGHT)
-    assert "are needed" in short.refused
-    assert short.vehicle is RIGHT
-    slow = found(drive(sweep(0.02), 20.0, speed=LEAST_SPEED_M_S - 1.0).signals, RIGHT)
-    assert "0 s above" in slow.refused
-
-
-@pytest.mark.slow
-def test_straight_driving_leaves_the_file_as_it_stands() -> None:
-    straight = found(with_noise(drive(lambda _t: 0.0, 60.0).signals, 5), RIGHT)
-    assert "cornering stiffness" in straight.refused
-    assert "not calibrated" in straight.text
-
-
-def test_a_drift_is_refused() -> None:
+def test_the_calibrated_vehicle_reads_its_signals_with_what_was_found() -> None:
     signals = wide().signals
-    against = replace(signals, steer_rad=-2.0 * signals.steer_rad)
-    assert found(against, RIGHT).refused
+    calibration = found(replace(signals, steer_rad=signals.steer_rad + 0.005), RIGHT)
+    assert calibration.vehicle.steer_offset_rad == pytest.approx(0.005, abs=1e-3)
+    assert calibration.vehicle.physics.names == ("lag", "roll")
+    assert calibration.vehicle.mass_kg == RIGHT.mass_kg
+    assert calibration.own is RIGHT
 
 
 def test_windows_change_no_bit() -> None:
@@ -156,18 +182,8 @@ def test_any_losses_give_a_grid_whose_stretches_are_whole(seed: int, share: floa
     d = driving(replace(signals, ay_m_s2=lost), RIGHT)
     for a, b in d.stretches:
         assert np.isfinite(d.columns[:, a:b]).all()
-        assert (d.columns[1, a:b] > LEAST_SPEED_M_S).all()
+        assert (d.columns[1, a:b] > RIGHT.low_speed_blend_m_s).all()
     assert (np.diff(d.stretches.ravel()) > 0).all()
-
-
-def test_a_fast_slalom_is_no_drift_and_a_held_counter_steer_is() -> None:
-    """In a fast slalom the yaw rate follows late, so that the steering is often against it."""
-    late = drive(lambda t: 0.02 * math.sin(2.0 * math.pi * t), 20.0).signals
-    late = replace(late, steer_rad=np.roll(late.steer_rad, -25))
-    assert drift_share([driving(late, RIGHT)], RIGHT) == 0.0
-    held = drive(lambda _t: 0.02, 20.0).signals
-    assert drift_share([driving(held, RIGHT)], RIGHT) == 0.0
-    assert drift_share([driving(replace(held, steer_rad=-2.0 * held.steer_rad), RIGHT)], RIGHT) > 0.9
 
 
 def test_the_vehicles_of_the_band_spread_as_the_posterior_does() -> None:
@@ -191,4 +207,4 @@ def test_less_driving_spreads_them_wider() -> None:
         return sum(math.log(v.cornering_stiffness_n_per_rad(False, v.assumed_friction) / at) ** 2 for v in of.varied)
 
     signals = with_noise(wide().signals, 3)
-    assert spread(cut(signals, 0, 2000)) > 1.5 * spread(signals)
+    assert spread(cut(signals, 0, 2000)) > 1.2 * spread(signals)

@@ -15,7 +15,6 @@ import pytest
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Tell, read_drive
-from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping
@@ -23,7 +22,7 @@ from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.runs import selection
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, checked, read_driving, self_calibrated
+from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, read_driving
 
 pytestmark = pytest.mark.slow
 
@@ -112,7 +111,7 @@ def test_no_truth_is_read(sample_logs_dir: Path, wrong_car: Path) -> None:
 
 
 def test_a_short_log_is_refused_and_the_file_stays(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
-    report = run(sample_logs_dir / "sweep.mcap", wrong_car, tmp_path)
+    report = run(sample_logs_dir / "sweep.mcap", wrong_car, tmp_path, end="4")
     assert "are needed" in report["self_calibration"]["refused"]
     told = {e["name"]: e for e in report["estimators"]}
     assert told["open-loop:calibrated"]["outcome"] == "skipped"
@@ -166,23 +165,3 @@ def test_a_car_with_evidence_keeps_its_estimate_and_is_warned_of(
     report = run(sample_logs_dir / "sweep.mcap", car, tmp_path, estimators=("zero", "pd-hef"), end=None)
     assert all(e["causal"] for e in report["estimators"])
     assert any("WARNING" in w for w in report["warnings"])
-
-
-def test_a_calibration_that_contradicts_the_sensors_more_than_the_file_is_refused(
-    sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(selection, "FACTOR", 1.1)
-    car = Car.load(sample_logs_dir / "vehicle.toml")
-    with read_drive(sample_logs_dir / "sweep.mcap", car) as drive:
-        good = self_calibrate([read_driving(drive)] * 2, car.vehicle)  # twice, so that it is long enough
-        assert not good.refused
-        kept = checked(drive, good)
-        assert kept is not None
-        assert not kept.refused
-        assert np.isnan(kept.driven_d2_m_s)  # eight seconds are too few for it
-        loose = car.vehicle.tyres.rear.model_copy(update={"B": 1.0})
-        tyres = car.vehicle.tyres.model_copy(update={"rear": loose})
-        bad = checked(drive, replace(good, vehicle=car.vehicle.model_copy(update={"tyres": tyres})))
-        assert bad is not None
-        assert "contradicts the sensors more" in bad.refused
-        assert self_calibrated(drive, bad) is car

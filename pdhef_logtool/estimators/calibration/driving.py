@@ -11,20 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.calibration.single_track import AY, FRICTION, SLOW_TURN, SPEED, STEER, YAW_RATE
+from pdhef_logtool.estimators.calibration.single_track import AY, FRICTION, SPEED, STEER, YAW_RATE
 from pdhef_logtool.estimators.speed_slip import SlipState, believable
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, join_signals
 
 #: Step of the grid. The model follows 4 Hz, and the lag of a tyre at 40 m/s is 12 ms, which its step takes exactly.
 STEP_S = 0.02
-#: Below this speed bends are narrow, and what they say of the rear axle is wrong (docs/method.md#self-calibration).
-LEAST_SPEED_M_S = 10.0
-#: A shorter stretch has hardly settled. Missing samples are bridged for so long; of the speed, which is slow, longer.
-LEAST_STRETCH_S, BRIDGED_S, SPEED_BRIDGED_S = 6.0, 0.15, 0.6
+#: Shortest stretch. Gaps of this length are interpolated; longer ones of the speed, which is slow.
+LEAST_STRETCH_S, BRIDGED_S, SPEED_BRIDGED_S = 2.0, 0.3, 0.6
 
-_COLUMNS = 6
-#: A road is banked for its bends, over more than this of them.
-SLOW_S = 2.0
+_COLUMNS = 5
 _PAUSE_CELLS = 100
 
 
@@ -34,9 +30,8 @@ class Driving:
 
     Attributes
     ----------
-    columns : float64 [6, N], steering, speed, yaw rate, a_y and friction on the grid, as ``read_with`` reads them, and
-        v_x r without what is fast.
-    stretches : int64 [k, 2], [first, last) of each stretch without a gap, above :data:`LEAST_SPEED_M_S`.
+    columns : float64 [5, N], steering, speed, yaw rate, a_y and friction on the grid, as ``read_with`` reads them.
+    stretches : int64 [k, 2], [first, last) of each stretch without a gap above the vehicle's low-speed limit.
     """
 
     columns: FloatArray
@@ -89,9 +84,7 @@ class DrivingReader:
         columns[FRICTION] = np.where(np.isfinite(columns[FRICTION]), columns[FRICTION], self._vehicle.assumed_friction)
         for row, bridged_s in ((STEER, BRIDGED_S), (YAW_RATE, BRIDGED_S), (AY, BRIDGED_S), (SPEED, SPEED_BRIDGED_S)):
             columns[row] = _bridged(columns[row], round(bridged_s / STEP_S))
-        stretches = _stretches(columns[:SLOW_TURN])
-        columns[SLOW_TURN] = smoothed(columns[SPEED] * columns[YAW_RATE], stretches, SLOW_S)
-        return Driving(columns, stretches, self._vehicle)
+        return Driving(columns, _stretches(columns, self._vehicle.low_speed_blend_m_s), self._vehicle)
 
     def _take(self, signals: Signals, cell: NDArray[np.int64]) -> None:
         if not len(signals):
@@ -126,21 +119,9 @@ def _bridged(values: FloatArray, most: int) -> FloatArray:
     return np.where(np.isfinite(values) | (gap <= most), filled, np.nan)
 
 
-def _stretches(columns: FloatArray) -> IntArray:
-    """Return [first, last) of each stretch that is known, fast and long enough."""
-    good = np.isfinite(columns).all(axis=0) & (columns[SPEED] > LEAST_SPEED_M_S)
+def _stretches(columns: FloatArray, least_speed_m_s: float) -> IntArray:
+    """Return [first, last) of each stretch that is complete, fast and long enough."""
+    good = np.isfinite(columns).all(axis=0) & (columns[SPEED] > least_speed_m_s)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]])))
     spans = edges.reshape(-1, 2).astype(np.int64)
     return spans[spans[:, 1] - spans[:, 0] >= round(LEAST_STRETCH_S / STEP_S)]
-
-
-def smoothed(column: FloatArray, stretches: IntArray, over_s: float) -> FloatArray:
-    """Return the mean of a column [N] around each sample of a stretch, NaN outside."""
-    half = round(0.5 * over_s / STEP_S)
-    out = np.full(column.size, np.nan)
-    for a, b in stretches:
-        total = np.concatenate([[0.0], np.cumsum(column[a:b])])
-        at = np.arange(b - a)
-        low, high = np.maximum(at - half, 0), np.minimum(at + half + 1, b - a)
-        out[a:b] = (total[high] - total[low]) / (high - low)
-    return out
