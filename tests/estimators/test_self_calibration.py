@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from reference_car import FRICTION, Drive, cut, drive, keep, with_noise
 
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.estimators.calibration import calibration as rules
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving, DrivingReader
 from pdhef_logtool.records.signals import Signals
@@ -122,6 +123,11 @@ def test_what_straight_driving_does_not_excite_keeps_its_prior() -> None:
             assert not p.excited
             assert p.value == pytest.approx(p.prior, rel=0.1)
     assert "not excited: front cornering stiffness" in straight.text
+
+
+def test_a_car_that_slides_all_the_time_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rules, "SLIDING_RAD", 0.001)
+    assert "the rear axle slides in" in found(wide().signals, RIGHT).refused
 
 
 def test_steering_that_does_not_explain_the_yaw_rate_is_refused() -> None:

@@ -77,7 +77,7 @@ def test_calibrated_estimators_are_not_causal_and_say_so_and_the_others_keep_the
 
 
 def test_a_wrong_file_is_mended(calibrated: Path) -> None:
-    assert rmse(calibrated, "physics") < 0.6 * rmse(calibrated, "phy-ukf")
+    assert rmse(calibrated, "physics") < 0.65 * rmse(calibrated, "phy-ukf")
 
 
 def test_off_is_the_file_as_it_stands_and_causal(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
@@ -162,6 +162,6 @@ def test_a_car_with_evidence_keeps_its_estimate_and_is_warned_of(
         pytest.skip("no network is shipped, without which there is no pd-hef")
     monkeypatch.setattr(selection, "FACTOR", 0.0)
     car = sample_logs_dir / "vehicle.toml"
-    report = run(sample_logs_dir / "sweep.mcap", car, tmp_path, estimators=("zero", "pd-hef"), end=None)
+    report = run(sample_logs_dir / "sweep.mcap", car, tmp_path, estimators=("phy-ukf", "pd-hef"), end=None)
     assert all(e["causal"] for e in report["estimators"])
     assert any("WARNING" in w for w in report["warnings"])

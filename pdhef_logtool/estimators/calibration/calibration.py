@@ -38,12 +38,13 @@ LEAST_S = 5.0
 #: A fit is refused if it leaves more than this share of the RMS of yaw rate or of a_y, and more than this many
 #: ``ERROR_STD``: sign or topic of a signal may be wrong, or the car spins.
 LARGEST_SHARE, LARGEST_ERROR = 0.5, 1.0
+#: A fit is refused if the rear axle slides for so long and in so large a share of the driving: beyond this slip angle
+#: longitudinal slip, which the model lacks, decides the lateral force.
+SLIDING_RAD, SLIDING_S, SLIDING_SHARE = math.radians(8.0), 10.0, 0.2
 #: Largest standard deviation of the logarithm of a cornering stiffness that is written to a car.
 LEAST_KNOWN_EXPORTED = 0.25
 #: Directions of the posterior that an interval follows, at most.
 VARIED = 5
-#: A parameter is excited by the drive if its standard deviation is below this share of the prior's.
-EXCITED_SHARE = 0.5
 #: Smallest difference of understeer gradients that is reported as a contradiction, rad/(m/s²).
 LEAST_CONTRADICTION = 1.5e-3
 
@@ -62,8 +63,8 @@ class Calibrated:
 
     @property
     def excited(self) -> bool:
-        """Whether the drive says more of it than the prior."""
-        return self.sd < EXCITED_SHARE * self.prior_sd
+        """Whether its standard deviation is below half the prior's."""
+        return self.sd < 0.5 * self.prior_sd
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,7 +221,8 @@ def self_calibrate(
         len(drives),
         tuple(problem.vehicle(theta, digits=6) for theta in varied),
     )
-    return replace(found, refused=_refusal(found, drives, least_known))
+    sliding = float(np.mean(np.abs(problem.rear_slip(fit.theta)) > SLIDING_RAD))
+    return replace(found, refused=_refusal(found, drives, sliding, least_known))
 
 
 def _understeer(problem: JointProblem, fit: Fit, own: VehicleParameters) -> Understeer:
@@ -235,13 +237,18 @@ def _understeer(problem: JointProblem, fit: Fit, own: VehicleParameters) -> Unde
     return Understeer(file, centre, math.sqrt(float(slope @ fit.covariance @ slope)))
 
 
-def _refusal(found: SelfCalibration, drives: Sequence[Driving], least_known: float) -> str:
-    """Return why a fit is not used: it explains too little of yaw rate or a_y, or leaves the stiffness open."""
+def _refusal(found: SelfCalibration, drives: Sequence[Driving], sliding: float, least_known: float) -> str:
+    """Return why a fit is not used: it explains too little, the car slides, or the stiffness remains open.
+
+    ``sliding`` : share of the driving in which the rear axle slides.
+    """
     for name, column, row in (("yaw rate", YAW_RATE, OF_RATE), ("lateral acceleration", AY, OF_AY)):
         measured = np.concatenate([d.columns[column][counted(d)] for d in drives])
         share = found.rms[row] / max(float(np.sqrt(np.mean(measured**2))), 1e-9)
         if share > LARGEST_SHARE and found.rms[row] > LARGEST_ERROR * ERROR_STD[row]:
             return f"the model leaves {share:.0%} of the {name}, at most {LARGEST_SHARE:.0%} is plausible"
+    if sliding > SLIDING_SHARE and sliding * found.seconds > SLIDING_S:
+        return f"the rear axle slides in {sliding:.0%} of the driving"
     if found.stiffness_sd > least_known:
         return (
             f"the driving leaves the cornering stiffness at ± {found.stiffness_sd:.0%}, ± {least_known:.0%} is needed"

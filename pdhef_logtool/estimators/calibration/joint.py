@@ -30,6 +30,7 @@ from pdhef_logtool.estimators.calibration.single_track import (
     OF_AY,
     OF_RATE,
     SPEED,
+    YAW_RATE,
     TrackParameters,
     errors,
     low_pass,
@@ -40,10 +41,9 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray
 CUTOFF_HZ = 4.0
 #: Standard deviation of the errors of yaw rate (rad/s) and a_y (m/s²); larger errors count linearly.
 ERROR_STD = (0.02, 0.3)
-#: Driving that counts as one independent sample of each channel.
-CORRELATION_S = 1.0
-#: Start of each stretch that does not count: the initial state is a guess.
-SETTLE_S = 1.0
+#: Driving that counts as one independent sample of each channel; start of each stretch that does not count, because the
+#: initial state is a guess.
+CORRELATION_S, SETTLE_S = 1.0, 1.0
 #: Errors are kept every so many steps of the grid: 12.5 Hz, three times the cutoff.
 KEPT_STEPS = 4
 #: Model error that all of a drive has in common, as a share of each prior's standard deviation: with it 95 % of the
@@ -119,7 +119,7 @@ def parameters_of(own: VehicleParameters) -> tuple[Parameter, ...]:
         _factor(INERTIA, "kg m^2", own.yaw_inertia_kg_m2, 0.2, 2.0),
         _factor(RELAXATION, "m", own.relaxation_length_m or 0.5, 0.4, 4.0),
         _around(STEER_OFFSET, "rad", own.steer_offset_rad, 0.01, 0.05),
-        _factor(STEER_RATIO, "1", own.steering_ratio, 0.05, 1.3),
+        _factor(STEER_RATIO, "1", own.steering_ratio, 0.05, 1.2),
         _around(STEER_DELAY, "s", 0.0, 0.02, 0.1),
         _around(AY_GAIN, "1", 1.0 + GRAVITY_M_S2 * gradient, 0.05, 0.15),
         _around(AY_BIAS, "m/s^2", sensors.ay_bias_m_s2, 0.2, 1.5),
@@ -186,6 +186,12 @@ class JointProblem:
         self._errors(self._track(theta))
         parts = zip(self._drives, self._out, self._kept, strict=True)
         return np.concatenate([out[2, k] / d.columns[SPEED, k] for d, out, k in parts])
+
+    def rear_slip(self, theta: FloatArray) -> FloatArray:
+        """Return (l_r r − v_y) / v_x of the model and the gyro, of all samples that count [K]."""
+        drives = zip(self._drives, self._kept, strict=True)
+        turning = np.concatenate([d.columns[YAW_RATE, k] / d.columns[SPEED, k] for d, k in drives])
+        return self._own.cg_to_rear_axle_m * turning - self.sideslip(theta)
 
     def values(self, theta: FloatArray, *, digits: int = 17) -> dict[str, float]:
         """Return the parameters by name."""
