@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from pdhef_logtool.estimators.calibration.calibration import LARGEST_SHARE, LEAST_KNOWN_EXPORTED, VARIED
+from pdhef_logtool.estimators.calibration.calibration import LARGEST_SHARE, VARIED
 from pdhef_logtool.estimators.posterior_band import OWN_SHARE as IDENTIFIED_SHARE
 from pdhef_logtool.estimators.self_calibrated import D2_SHARE, OWN_SHARE
 from pdhef_logtool.runs.selection import FACTOR, SIMPLE
@@ -34,8 +34,8 @@ are medians. The last column contains the median ratio and the 10 % and 90 % qua
 
 {simulated}
 
-A calibration is refused if it leaves more than {largest} of the yaw rate or of the lateral acceleration, or, if it is
-written to a car, if the posterior of a cornering stiffness is wider than ± {exported}.
+A calibration is refused if it leaves more than {largest} of the yaw rate or of the lateral acceleration, if the car
+slides, or, if it is written to a car, if the driving does not excite both cornering stiffnesses.
 
 ## 95 % confidence intervals of self-calibrated cars
 
@@ -117,7 +117,6 @@ def settings() -> dict[str, object]:
         "low": self_calibration.WRONG[0],
         "high": self_calibration.WRONG[1],
         "largest": f"{100 * LARGEST_SHARE:.0f} %",
-        "exported": f"{100 * LEAST_KNOWN_EXPORTED:.0f} %",
         "own": OWN_SHARE,
         "varied": VARIED,
         "share": D2_SHARE,

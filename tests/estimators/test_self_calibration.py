@@ -176,7 +176,8 @@ def test_a_pool_knows_more_than_each_of_its_logs() -> None:
     logs = [driving(with_noise(cut(wide().signals, a, a + 2000), a), RIGHT) for a in (0, 2000, 4000)]
     alone, pool = self_calibrate(logs[:1], RIGHT), self_calibrate(logs, RIGHT)
     assert pool.logs == 3
-    assert pool.stiffness_sd < alone.stiffness_sd
+    for (_, together), (_, single) in zip(stiffness_errors(pool), stiffness_errors(alone), strict=True):
+        assert together < single
 
 
 @settings(max_examples=15, deadline=None)

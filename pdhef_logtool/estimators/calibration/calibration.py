@@ -41,8 +41,6 @@ LARGEST_SHARE, LARGEST_ERROR = 0.5, 1.0
 #: A fit is refused if the rear axle slides for so long and in so large a share of the driving: beyond this slip angle
 #: longitudinal slip, which the model lacks, decides the lateral force.
 SLIDING_RAD, SLIDING_S, SLIDING_SHARE = math.radians(8.0), 10.0, 0.2
-#: Largest standard deviation of the logarithm of a cornering stiffness that is written to a car.
-LEAST_KNOWN_EXPORTED = 0.25
 #: Directions of the posterior that an interval follows, at most.
 VARIED = 5
 #: Smallest difference of understeer gradients that is reported as a contradiction, rad/(m/s²).
@@ -115,11 +113,6 @@ class SelfCalibration:
     driven_d2_m_s: float = math.nan
 
     @property
-    def stiffness_sd(self) -> float:
-        """The larger posterior sd of the logarithm of a cornering stiffness; infinite without a fit."""
-        return max((p.sd for p in self.parameters if p.name in (FRONT_STIFFNESS, REAR_STIFFNESS)), default=math.inf)
-
-    @property
     def noise(self) -> FilterNoise:
         """The noise of ``physics`` that belongs to it."""
         return FilterNoise(r_std={"ay_m_s2": max(AY_STD, self.own.sensors.ay_std_m_s2)})
@@ -185,14 +178,14 @@ def self_calibrate(
     drives: Sequence[Driving],
     own: VehicleParameters,
     *,
-    least_known: float = math.inf,
+    exported: bool = False,
     progress: Callable[[float], None] = lambda _share: None,
 ) -> SelfCalibration:
     """Calibrate a car on the driving of its logs, which were read with ``own``.
 
     Parameters
     ----------
-    least_known : largest sd of the logarithm of a cornering stiffness that is no refusal.
+    exported : whether it is written to a car, for which the driving must excite both cornering stiffnesses.
     """
     drives = [d for d in drives if len(d.stretches)]
     seconds = sum(d.seconds for d in drives)
@@ -222,7 +215,7 @@ def self_calibrate(
         tuple(problem.vehicle(theta, digits=6) for theta in varied),
     )
     sliding = float(np.mean(np.abs(problem.rear_slip(fit.theta)) > SLIDING_RAD))
-    return replace(found, refused=_refusal(found, drives, sliding, least_known))
+    return replace(found, refused=_refusal(found, drives, sliding, exported=exported))
 
 
 def _understeer(problem: JointProblem, fit: Fit, own: VehicleParameters) -> Understeer:
@@ -237,7 +230,7 @@ def _understeer(problem: JointProblem, fit: Fit, own: VehicleParameters) -> Unde
     return Understeer(file, centre, math.sqrt(float(slope @ fit.covariance @ slope)))
 
 
-def _refusal(found: SelfCalibration, drives: Sequence[Driving], sliding: float, least_known: float) -> str:
+def _refusal(found: SelfCalibration, drives: Sequence[Driving], sliding: float, *, exported: bool) -> str:
     """Return why a fit is not used: it explains too little, the car slides, or the stiffness remains open.
 
     ``sliding`` : share of the driving in which the rear axle slides.
@@ -249,8 +242,7 @@ def _refusal(found: SelfCalibration, drives: Sequence[Driving], sliding: float, 
             return f"the model leaves {share:.0%} of the {name}, at most {LARGEST_SHARE:.0%} is plausible"
     if sliding > SLIDING_SHARE and sliding * found.seconds > SLIDING_S:
         return f"the rear axle slides in {sliding:.0%} of the driving"
-    if found.stiffness_sd > least_known:
-        return (
-            f"the driving leaves the cornering stiffness at ± {found.stiffness_sd:.0%}, ± {least_known:.0%} is needed"
-        )
+    idle = [p.name for p in found.parameters if p.name in (FRONT_STIFFNESS, REAR_STIFFNESS) and not p.excited]
+    if exported and idle:
+        return f"the driving does not excite the {' and the '.join(idle)}"
     return ""

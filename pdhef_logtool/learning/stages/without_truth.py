@@ -14,7 +14,7 @@ from pdhef_logtool.car.parts import Fit, FittedPhysics, FittedValues, LearntOn, 
 from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.drive.cached import read_cached
-from pdhef_logtool.estimators.calibration.calibration import LEAST_KNOWN_EXPORTED, SelfCalibration, self_calibrate
+from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import Driving
 from pdhef_logtool.learning.drives import IDENTIFY, DriveRecord, record_of
 from pdhef_logtool.learning.split import TRAINING
@@ -54,7 +54,7 @@ def identify_without_truth(task: Task) -> StageOutput:
     calibration = self_calibrate(
         drives,
         start,
-        least_known=LEAST_KNOWN_EXPORTED,
+        exported=True,
         progress=lambda share: task.progress("fitting to the sensors", 0.8 + 0.2 * share),
     )
     if calibration.refused:
