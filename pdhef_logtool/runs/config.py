@@ -79,8 +79,8 @@ class RunConfig:
     network : network folder, ``default``, ``many-cars`` or ``none``; None = the car's.
     intervals : intervals file, ``none``, or ``unsure`` (wide intervals, for a car that may have changed); None = the
         car's.
-    calibrate : calibration of a car without validation data, without ground truth: per ``log``, on the ``pool`` of all
-        logs, or ``off``.
+    calibrate : calibration of a car without validation data, without ground truth: per ``log``, ``online`` on what the
+        log has shown so far (causal), on the ``pool`` of all logs, or ``off``.
     waived : names of checks whose failure is ignored.
     cache : folder or URL of reduced logs, which replace logs that were read before. Results do not depend on it.
     cache_max_gb : maximum cache size in GB; least recently used entries are evicted.
@@ -108,7 +108,7 @@ class RunConfig:
     thresholds: File | None = None
     network: File | None = None
     intervals: File | None = None
-    calibrate: Literal["off", "log", "pool"] = "log"
+    calibrate: Literal["off", "online", "log", "pool"] = "log"
     waived: Names = ()
     cache: Annotated[str, BeforeValidator(lambda v: str(v) if isinstance(v, Path) else v)] | None = None
     cache_max_gb: Annotated[float, Field(gt=0)] | None = None

@@ -39,8 +39,10 @@ def calibrate_drive(drive: Drive, config: RunConfig) -> SelfCalibration | None:
     """Return what a drive says of its car; None where nobody asks or the log lacks a sensor for it."""
     if config.calibrate == "off" or not _asked(config, drive.car) or lacking(drive):
         return None
-    from pdhef_logtool.estimators.calibration.calibration import self_calibrate
+    from pdhef_logtool.estimators.calibration.calibration import calibrate_online, self_calibrate
 
+    if config.calibrate == "online":
+        return calibrate_online(read_driving(drive), drive.car.vehicle)
     return self_calibrate([read_driving(drive)], drive.car.vehicle)
 
 
@@ -80,7 +82,7 @@ def read_driving(drive: Drive) -> Driving:
 
 def checked(drive: Drive, calibration: SelfCalibration | None) -> SelfCalibration | None:
     """Return a calibration with the part of d2 of ``physics`` on it that correlates with the driving."""
-    if calibration is None or calibration.refused:
+    if calibration is None or calibration.refused or calibration.earlier:
         return calibration
     alone = self_calibrated(drive, replace(calibration, varied=()))  # d2 needs no interval
     sensors = log_sensors(drive.car.vehicle, calibration)
@@ -108,16 +110,22 @@ def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
     """Return the car of a drive with what was found, unless it was refused."""
     if calibration is None or calibration.refused:
         return drive.car
-    note = "not causal: its car was calibrated on the whole log, without truth"
-    found = WithoutTruth(
-        calibration.vehicle,
-        calibration.noise,
-        told_friction=_told(drive),
-        note=note,
-        varied=calibration.varied,
-        driven_d2_m_s=calibration.driven_d2_m_s,
-    )
-    return replace(drive.car, self_calibrated=found)
+    online = "its car is calibrated on what the log has shown so far, without ground truth"
+    note = online if calibration.earlier else "not causal: car calibrated on the whole log, without ground truth"
+
+    def applied(stage: SelfCalibration) -> WithoutTruth:
+        return WithoutTruth(
+            stage.vehicle,
+            stage.noise,
+            told_friction=_told(drive),
+            note=note,
+            varied=stage.varied,
+            driven_d2_m_s=stage.driven_d2_m_s,
+            since_ns=stage.since_ns,
+            earlier=tuple(map(applied, stage.earlier)),
+        )
+
+    return replace(drive.car, self_calibrated=applied(calibration))
 
 
 def log_sensors(vehicle: VehicleParameters, calibration: SelfCalibration | None) -> SensorErrors:

@@ -150,7 +150,7 @@ def test_the_calibrated_vehicle_reads_its_signals_with_what_was_found() -> None:
     assert calibration.vehicle.steer_offset_rad == pytest.approx(0.005, abs=1e-3)
     assert calibration.vehicle.physics.names == ("lag", "roll")
     assert calibration.vehicle.mass_kg == RIGHT.mass_kg
-    assert calibration.own is RIGHT
+    assert calibration.vehicle_file is RIGHT
 
 
 def test_windows_change_no_bit() -> None:

@@ -165,3 +165,14 @@ def test_a_car_with_evidence_keeps_its_estimate_and_is_warned_of(
     report = run(sample_logs_dir / "sweep.mcap", car, tmp_path, estimators=("phy-ukf", "pd-hef"), end=None)
     assert all(e["causal"] for e in report["estimators"])
     assert any("WARNING" in w for w in report["warnings"])
+
+
+def test_a_calibration_on_line_stays_causal_and_says_so(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
+    report = run(sample_logs_dir / "road.mcap", wrong_car, tmp_path, calibrate="online", estimators=NAMES)
+    jsonschema.validate(report, load_schema("report.schema.json"))
+    told = {e["name"]: e for e in report["estimators"]}
+    assert told["physics"]["causal"]
+    assert told["physics"]["outcome"] == "ran"  # the causality check of the run has found nothing
+    assert any("shown so far" in note for note in told["physics"]["notes"])
+    assert report["self_calibration"]["online"]
+    assert told["physics"]["intervals"] == ["intervals: own and parameters"]

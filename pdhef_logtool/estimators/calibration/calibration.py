@@ -1,4 +1,4 @@
-"""Calibration of a car by its logs without ground truth: what the fit of :mod:`~.joint` says of it.
+"""Calibration of a car by its logs without ground truth: results of the fit of :mod:`~.joint`.
 
 See docs/method.md#self-calibration.
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.estimators.calibration.driving import Driving
+from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
 from pdhef_logtool.estimators.calibration.joint import (
     DERIVATIVE_STEP,
     ERROR_STD,
@@ -26,6 +26,7 @@ from pdhef_logtool.estimators.calibration.joint import (
     Fit,
     JointProblem,
     counted,
+    prior_vehicle,
     varied_parameters,
 )
 from pdhef_logtool.estimators.calibration.single_track import AY, OF_AY, OF_RATE, YAW_RATE
@@ -33,8 +34,9 @@ from pdhef_logtool.records.signals import FloatArray
 
 #: Standard deviation of a_y in ``physics`` on a calibrated car, m/s²: the model's error, not the sensor's noise.
 AY_STD = 1.0
-#: Least driving above the low-speed limit.
-LEAST_S = 5.0
+#: Least driving above the low-speed limit; on line, growth of the driving from one calibration to the next, and the
+#: delay after which it applies, for gaps before its last sample may be interpolated.
+LEAST_S, ONLINE_GROWTH, ONLINE_DELAY_NS = 5.0, 1.5, 1_000_000_000
 #: A fit is refused if it leaves more than this share of the RMS of yaw rate or of a_y, and more than this many
 #: ``ERROR_STD``: sign or topic of a signal may be wrong, or the car spins.
 LARGEST_SHARE, LARGEST_ERROR = 0.5, 1.0
@@ -88,19 +90,20 @@ class Understeer:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SelfCalibration:
-    """What the driving of a log, or of a pool of logs, says of its car without ground truth.
+    """Calibration of a car on the driving of a log, or of a pool of logs, without ground truth.
 
     Attributes
     ----------
-    own : the file. vehicle : the file with the fitted parameters, whether or not the fit is refused.
+    vehicle_file : the file. vehicle : the file with the fitted parameters, whether or not the fit is refused.
     refused : why the file stays as it is; empty if it does not.
     rms : of yaw rate, rad/s, and a_y, m/s², that the model leaves; of_file : that the file's leaves.
     seconds : of driving that counted. logs : in the pool.
     varied : the vehicle one posterior 1-sigma away in each of the directions that move its sideslip most.
     driven_d2_m_s : d2 of ``physics`` on it as far as it correlates with the driving, NaN without a run.
+    since_ns, earlier : of a calibration on line: from when on it applies, and what applied before, in time order.
     """
 
-    own: VehicleParameters
+    vehicle_file: VehicleParameters
     vehicle: VehicleParameters
     parameters: tuple[Calibrated, ...]
     understeer: Understeer | None
@@ -111,11 +114,13 @@ class SelfCalibration:
     logs: int
     varied: tuple[VehicleParameters, ...] = ()
     driven_d2_m_s: float = math.nan
+    since_ns: int = 0
+    earlier: tuple[SelfCalibration, ...] = ()
 
     @property
     def noise(self) -> FilterNoise:
         """The noise of ``physics`` that belongs to it."""
-        return FilterNoise(r_std={"ay_m_s2": max(AY_STD, self.own.sensors.ay_std_m_s2)})
+        return FilterNoise(r_std={"ay_m_s2": max(AY_STD, self.vehicle_file.sensors.ay_std_m_s2)})
 
     @property
     def text(self) -> str:
@@ -123,9 +128,9 @@ class SelfCalibration:
         if self.refused:
             return f"not calibrated, the vehicle file is used: {self.refused}"
         by = {p.name: p for p in self.parameters}
-        mu = self.own.assumed_friction
+        mu = self.vehicle_file.assumed_friction
         share = [
-            f"{axle} stiffness {by[name].value / self.own.cornering_stiffness_n_per_rad(front, mu) - 1.0:+.0%}"
+            f"{axle} stiffness {by[name].value / self.vehicle_file.cornering_stiffness_n_per_rad(front, mu) - 1.0:+.0%}"
             f" ± {by[name].sd:.0%}"
             for axle, name, front in (("front", FRONT_STIFFNESS, True), ("rear", REAR_STIFFNESS, False))
         ]
@@ -166,7 +171,8 @@ class SelfCalibration:
                 "drive_sd_rad_per_m_s2": u.drive_sd,
                 "contradicts": u.contradicts,
             },
-            "friction_fixed_at": self.own.assumed_friction,
+            "online": bool(self.earlier),
+            "friction_fixed_at": self.vehicle_file.assumed_friction,
             "yaw_rate_rms_rad_s": self.rms[OF_RATE],
             "ay_rms_m_s2": self.rms[OF_AY],
             "file_yaw_rate_rms_rad_s": self.of_file[OF_RATE],
@@ -176,12 +182,12 @@ class SelfCalibration:
 
 def self_calibrate(
     drives: Sequence[Driving],
-    own: VehicleParameters,
+    vehicle_file: VehicleParameters,
     *,
     exported: bool = False,
     progress: Callable[[float], None] = lambda _share: None,
 ) -> SelfCalibration:
-    """Calibrate a car on the driving of its logs, which were read with ``own``.
+    """Calibrate a car on the driving of its logs, which were read with ``vehicle_file``.
 
     Parameters
     ----------
@@ -190,9 +196,11 @@ def self_calibrate(
     drives = [d for d in drives if len(d.stretches)]
     seconds = sum(d.seconds for d in drives)
     if seconds < LEAST_S:
-        why = f"{seconds:.0f} s above {own.low_speed_blend_m_s:g} m/s, {LEAST_S:g} are needed"
-        return SelfCalibration(own, own, (), None, why, (math.nan,) * 2, (math.nan,) * 2, seconds, len(drives))
-    problem = JointProblem(drives, own)
+        why = f"{seconds:.0f} s above {vehicle_file.low_speed_blend_m_s:g} m/s, {LEAST_S:g} are needed"
+        return SelfCalibration(
+            vehicle_file, vehicle_file, (), None, why, (math.nan,) * 2, (math.nan,) * 2, seconds, len(drives)
+        )
+    problem = JointProblem(drives, vehicle_file)
     fit = problem.solve()
     progress(1.0)
     std = np.sqrt(np.diag(fit.covariance))
@@ -202,11 +210,11 @@ def self_calibrate(
     )
     root = np.asarray(np.linalg.cholesky(fit.covariance), dtype=np.float64)
     varied = varied_parameters(fit.theta, root, problem.sideslip, VARIED)
-    found = SelfCalibration(
-        own,
+    calibration = SelfCalibration(
+        vehicle_file,
         problem.vehicle(fit.theta, digits=6),
         parameters,
-        _understeer(problem, fit, own),
+        _understeer(problem, fit, vehicle_file),
         "",
         problem.rms(fit.theta),
         problem.rms_of_file(),
@@ -215,10 +223,33 @@ def self_calibrate(
         tuple(problem.vehicle(theta, digits=6) for theta in varied),
     )
     sliding = float(np.mean(np.abs(problem.rear_slip(fit.theta)) > SLIDING_RAD))
-    return replace(found, refused=_refusal(found, drives, sliding, exported=exported))
+    return replace(calibration, refused=_refusal(calibration, drives, sliding, exported=exported))
 
 
-def _understeer(problem: JointProblem, fit: Fit, own: VehicleParameters) -> Understeer:
+def calibrate_online(driving: Driving, vehicle_file: VehicleParameters) -> SelfCalibration:
+    """Calibrate a car again and again as its log goes on; before the first calibration it has the prior means.
+
+    Each calibration takes half as much driving again as the one before it, so that all take three times as long as the
+    last one.
+    """
+    inside = np.zeros(driving.columns.shape[1])
+    for first, last in driving.stretches:
+        inside[first:last] = STEP_S
+    driven, needed = np.cumsum(inside), LEAST_S
+    start = SelfCalibration(
+        vehicle_file, prior_vehicle(vehicle_file), (), None, "", (math.nan,) * 2, (math.nan,) * 2, 0.0, 1
+    )
+    stages = [start]
+    while driven.size and needed < driven[-1]:
+        count = int(np.searchsorted(driven, needed)) + 1
+        calibration = self_calibrate([driving.until(count)], vehicle_file)
+        if not calibration.refused:
+            stages.append(replace(calibration, since_ns=int(driving.stamps_ns[count - 1]) + ONLINE_DELAY_NS))
+        needed *= ONLINE_GROWTH
+    return replace(stages[-1], earlier=tuple(stages[:-1]))
+
+
+def _understeer(problem: JointProblem, fit: Fit, vehicle_file: VehicleParameters) -> Understeer:
     def gradient(theta: FloatArray) -> float:
         vehicle = problem.vehicle(theta)
         return vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction)
@@ -226,7 +257,7 @@ def _understeer(problem: JointProblem, fit: Fit, own: VehicleParameters) -> Unde
     centre = gradient(fit.theta)
     steps = DERIVATIVE_STEP * np.eye(fit.theta.size)
     slope = np.array([gradient(fit.theta + step) - centre for step in steps]) / DERIVATIVE_STEP
-    file = own.understeer_gradient_rad_per_m_s2(own.assumed_friction)
+    file = vehicle_file.understeer_gradient_rad_per_m_s2(vehicle_file.assumed_friction)
     return Understeer(file, centre, math.sqrt(float(slope @ fit.covariance @ slope)))
 
 

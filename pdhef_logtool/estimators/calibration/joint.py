@@ -94,36 +94,36 @@ def _around(name: str, unit: str, mean: float, std: float, most: float) -> Param
     return Parameter(name, unit, mean, std, mean - most, mean + most)
 
 
-def _stiffness(own: VehicleParameters, name: str, *, front: bool) -> Parameter:
+def _stiffness(vehicle_file: VehicleParameters, name: str, *, front: bool) -> Parameter:
     """Return a cornering stiffness whose prior combines the file's value with that of any car."""
     of_file, of_usual = FILE_STIFFNESS_STD**-2, USUAL_STIFFNESS_STD**-2
-    file = own.cornering_stiffness_n_per_rad(front, own.assumed_friction)
-    usual = USUAL_STIFFNESS[0 if front else 1] * own.axle_load_n(front)
+    file = vehicle_file.cornering_stiffness_n_per_rad(front, vehicle_file.assumed_friction)
+    usual = USUAL_STIFFNESS[0 if front else 1] * vehicle_file.axle_load_n(front)
     mean = math.exp((of_file * math.log(file) + of_usual * math.log(usual)) / (of_file + of_usual))
     return _factor(name, "N/rad", mean, (of_file + of_usual) ** -0.5, 5.0)
 
 
-def parameters_of(own: VehicleParameters) -> tuple[Parameter, ...]:
+def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
     """Return the parameters of a fit about a vehicle file.
 
     Stiffness in published files differs from the driven car's by up to a factor of two; steering gains by −15 to +18 %
     because of compliance, toe and wrong ratios. An accelerometer may be at either axle.
     """
-    sensors = own.sensors
-    gradient = own.roll_gradient_rad_per_m_s2 or USUAL_ROLL_GRADIENT
-    reach = 0.4 * own.wheelbase_m
+    sensors = vehicle_file.sensors
+    gradient = vehicle_file.roll_gradient_rad_per_m_s2 or USUAL_ROLL_GRADIENT
+    reach = 0.4 * vehicle_file.wheelbase_m
     return (
-        _stiffness(own, FRONT_STIFFNESS, front=True),
-        _stiffness(own, REAR_STIFFNESS, front=False),
+        _stiffness(vehicle_file, FRONT_STIFFNESS, front=True),
+        _stiffness(vehicle_file, REAR_STIFFNESS, front=False),
         _factor(PEAK, "1", 1.0, 0.2, 2.0),
-        _factor(INERTIA, "kg m^2", own.yaw_inertia_kg_m2, 0.2, 2.0),
-        _factor(RELAXATION, "m", own.relaxation_length_m or 0.5, 0.4, 4.0),
-        _around(STEER_OFFSET, "rad", own.steer_offset_rad, 0.01, 0.05),
-        _factor(STEER_RATIO, "1", own.steering_ratio, 0.05, 1.2),
+        _factor(INERTIA, "kg m^2", vehicle_file.yaw_inertia_kg_m2, 0.2, 2.0),
+        _factor(RELAXATION, "m", vehicle_file.relaxation_length_m or 0.5, 0.4, 4.0),
+        _around(STEER_OFFSET, "rad", vehicle_file.steer_offset_rad, 0.01, 0.05),
+        _factor(STEER_RATIO, "1", vehicle_file.steering_ratio, 0.05, 1.2),
         _around(STEER_DELAY, "s", 0.0, 0.02, 0.1),
         _around(AY_GAIN, "1", 1.0 + GRAVITY_M_S2 * gradient, 0.05, 0.15),
         _around(AY_BIAS, "m/s^2", sensors.ay_bias_m_s2, 0.2, 1.5),
-        _around(IMU_X, "m", own.imu_position_m[0], reach, 3.0 * reach),
+        _around(IMU_X, "m", vehicle_file.imu_position_m[0], reach, 3.0 * reach),
         _around(RATE_BIAS, "rad/s", sensors.yaw_rate_bias_rad_s, 0.005, 0.05),
     )
 
@@ -137,11 +137,11 @@ class Fit:
 
 
 class JointProblem:
-    """The fit of one car to the driving of its logs, which were read with ``own``."""
+    """The fit of one car to the driving of its logs, which were read with ``vehicle_file``."""
 
-    def __init__(self, drives: Sequence[Driving], own: VehicleParameters) -> None:
-        self.parameters = parameters_of(own)
-        self._drives, self._own = drives, own
+    def __init__(self, drives: Sequence[Driving], vehicle_file: VehicleParameters) -> None:
+        self.parameters = parameters_of(vehicle_file)
+        self._drives, self._file = drives, vehicle_file
         self._filter = low_pass(CUTOFF_HZ, STEP_S)
         self._kept = [np.flatnonzero(counted(d))[::KEPT_STEPS] for d in drives]
         self._out = [np.full((3, d.columns.shape[1]), np.nan) for d in drives]
@@ -157,7 +157,7 @@ class JointProblem:
     def solve(self) -> Fit:
         """Return the parameters of the lowest cost."""
         start = np.zeros(len(self.parameters))
-        found, _ = descend(
+        descent, _ = descend(
             self.errors_of,
             self._cost,
             self._residuals,
@@ -167,7 +167,7 @@ class JointProblem:
             derivative_step=DERIVATIVE_STEP,
             max_step=MAX_STEP,
         )
-        return Fit(found.theta, self._covariance(found.theta))
+        return Fit(descent.theta, self._covariance(descent.theta))
 
     def errors_of(self, theta: FloatArray) -> FloatArray:
         """Return errors over ``ERROR_STD`` [2, K]."""
@@ -179,7 +179,7 @@ class JointProblem:
 
     def rms_of_file(self) -> tuple[float, float]:
         """Return the RMS error of yaw rate and a_y of the vehicle file."""
-        return _rms(self._errors(track_of(self._own, self._own)))
+        return _rms(self._errors(track_of(self._file, self._file)))
 
     def sideslip(self, theta: FloatArray) -> FloatArray:
         """Return the model's v_y / v_x of all samples that count [K]."""
@@ -191,7 +191,7 @@ class JointProblem:
         """Return (l_r r − v_y) / v_x of the model and the gyro, of all samples that count [K]."""
         drives = zip(self._drives, self._kept, strict=True)
         turning = np.concatenate([d.columns[YAW_RATE, k] / d.columns[SPEED, k] for d, k in drives])
-        return self._own.cg_to_rear_axle_m * turning - self.sideslip(theta)
+        return self._file.cg_to_rear_axle_m * turning - self.sideslip(theta)
 
     def values(self, theta: FloatArray, *, digits: int = 17) -> dict[str, float]:
         """Return the parameters by name."""
@@ -200,10 +200,10 @@ class JointProblem:
 
     def vehicle(self, theta: FloatArray, *, digits: int = 17) -> VehicleParameters:
         """Return the vehicle file with the parameters; friction is the file's, the peak force takes the rest."""
-        return _vehicle_with(self._own, self.values(theta, digits=digits), digits)
+        return _vehicle_with(self._file, self.values(theta, digits=digits), digits)
 
     def _track(self, theta: FloatArray) -> TrackParameters:
-        return track_of(self.vehicle(theta), self._own, self.values(theta)[STEER_DELAY])
+        return track_of(self.vehicle(theta), self._file, self.values(theta)[STEER_DELAY])
 
     def _errors(self, p: TrackParameters) -> FloatArray:
         for d, out, differences in zip(self._drives, self._out, self._differences, strict=True):
@@ -249,19 +249,19 @@ def _rms(scaled: FloatArray) -> tuple[float, float]:
     return float(rms[OF_RATE]), float(rms[OF_AY])
 
 
-def _vehicle_with(own: VehicleParameters, values: Mapping[str, float], digits: int) -> VehicleParameters:
+def _vehicle_with(vehicle_file: VehicleParameters, values: Mapping[str, float], digits: int) -> VehicleParameters:
     def rounded(value: float) -> float:
         return float(f"{value:.{digits}g}")
 
-    mu = own.assumed_friction
+    mu = vehicle_file.assumed_friction
 
     def tyre(front: bool, stiffness: str) -> AxleTyre:
-        peak = values[PEAK] * own.magic_formula(front, mu)[2]
+        peak = values[PEAK] * vehicle_file.magic_formula(front, mu)[2]
         b = rounded(values[stiffness] / (STIFFNESS_TYRE_SHAPE * peak))
         return AxleTyre(B=b, C=STIFFNESS_TYRE_SHAPE, D_n=rounded(peak / mu), E=0.0, reference_friction=mu)
 
     biases = {"ay_bias_m_s2": values[AY_BIAS], "yaw_rate_bias_rad_s": values[RATE_BIAS]}
-    return own.model_copy(
+    return vehicle_file.model_copy(
         update={
             "tyres": Tyres(front=tyre(True, FRONT_STIFFNESS), rear=tyre(False, REAR_STIFFNESS)),
             "yaw_inertia_kg_m2": values[INERTIA],
@@ -269,18 +269,25 @@ def _vehicle_with(own: VehicleParameters, values: Mapping[str, float], digits: i
             "steering_ratio": values[STEER_RATIO],
             "roll_gradient_rad_per_m_s2": rounded((values[AY_GAIN] - 1.0) / GRAVITY_M_S2),
             "friction": mu,
-            "sensors": own.sensors.model_copy(update=biases),
-            "imu_position_m": (values[IMU_X], *own.imu_position_m[1:]),
+            "sensors": vehicle_file.sensors.model_copy(update=biases),
+            "imu_position_m": (values[IMU_X], *vehicle_file.imu_position_m[1:]),
             "relaxation_length_m": values[RELAXATION],
-            "physics": own.physics.model_copy(update=dict.fromkeys(PARTS, True)),
+            "physics": vehicle_file.physics.model_copy(update=dict.fromkeys(PARTS, True)),
         }
     )
 
 
-def track_of(vehicle: VehicleParameters, own: VehicleParameters, steer_delay_s: float = 0.0) -> TrackParameters:
-    """Return the model of a vehicle for signals that were read with ``own``."""
+def prior_vehicle(vehicle_file: VehicleParameters) -> VehicleParameters:
+    """Return the vehicle file with every parameter at its prior mean."""
+    return _vehicle_with(vehicle_file, {p.name: p.value(0.0) for p in parameters_of(vehicle_file)}, 6)
+
+
+def track_of(
+    vehicle: VehicleParameters, vehicle_file: VehicleParameters, steer_delay_s: float = 0.0
+) -> TrackParameters:
+    """Return the model of a vehicle for signals that were read with ``vehicle_file``."""
     mu, mass = vehicle.assumed_friction, vehicle.mass_kg
-    gain = own.steering_ratio / vehicle.steering_ratio
+    gain = vehicle_file.steering_ratio / vehicle.steering_ratio
     return TrackParameters(
         front_m=vehicle.cg_to_front_axle_m,
         rear_m=vehicle.cg_to_rear_axle_m,
@@ -294,10 +301,10 @@ def track_of(vehicle: VehicleParameters, own: VehicleParameters, steer_delay_s: 
         relaxation_m=max(vehicle.relaxation_length_m, 0.01),
         ay_gain=1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2,
         imu_x_m=vehicle.imu_position_m[0],
-        ay_bias=vehicle.sensors.ay_bias_m_s2 - own.sensors.ay_bias_m_s2,
-        rate_bias=vehicle.sensors.yaw_rate_bias_rad_s - own.sensors.yaw_rate_bias_rad_s,
+        ay_bias=vehicle.sensors.ay_bias_m_s2 - vehicle_file.sensors.ay_bias_m_s2,
+        rate_bias=vehicle.sensors.yaw_rate_bias_rad_s - vehicle_file.sensors.yaw_rate_bias_rad_s,
         steer_gain=gain,
-        steer_added=gain * own.steer_offset_rad - vehicle.steer_offset_rad,
+        steer_added=gain * vehicle_file.steer_offset_rad - vehicle.steer_offset_rad,
         steer_delay=steer_delay_s / STEP_S,
     )
 
