@@ -76,7 +76,8 @@ class WithoutTruth:
     ``told_friction`` : whether the signals' friction is one that the calibration knew too; an estimate, made with the
     file as it stands, is none. ``noise`` : of ``physics``. ``note`` : what a reader of the report must know.
     ``varied`` : the vehicle one posterior 1-sigma away, in directions that are independent. ``driven_d2_m_s`` : d2 of
-    ``physics`` on the log as far as it goes with the driving, NaN where that cannot be told.
+    ``physics`` on the log as far as it goes with the driving, NaN where that cannot be told. ``earlier`` : what applied
+    before, in time order, where the log calibrates its car as it goes on; each applies from its ``since_ns``.
     """
 
     vehicle: VehicleParameters
@@ -85,6 +86,8 @@ class WithoutTruth:
     note: str
     varied: tuple[VehicleParameters, ...] = ()
     driven_d2_m_s: float = math.nan
+    since_ns: int = 0
+    earlier: tuple[WithoutTruth, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

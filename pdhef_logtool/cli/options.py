@@ -135,7 +135,7 @@ _OPTIONS: dict[str, Any] = {
     "calibrate": Annotated[
         _Text,
         Option(
-            help="Calibration of a car without validation data, without ground truth: per log, pool (all logs) or off.",
+            help="Calibration without ground truth of a car without validation data: log, online, pool or off.",
             rich_help_panel=ESTIMATION,
         ),
     ],

@@ -15,6 +15,7 @@ from typing import Literal
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
 from pdhef_logtool.estimators.presets import Options as Options
 from pdhef_logtool.estimators.presets import check_options, options_of, preset_of
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED, SelfCalibrated
@@ -96,8 +97,13 @@ class Spec:
         if car.self_calibrated is None or (self.name != OPEN_LOOP and preset_of(self.name) not in SELF_CALIBRATED):
             estimator: Estimator = build(self.name, car, options)
             return estimator
-        estimator = build(self.name, car.calibrated_car, options)
-        return SelfCalibrated(estimator, car.self_calibrated, car.vehicle)
+        calibration = car.self_calibrated
+        online = bool(calibration.earlier) and self.causal
+        stages = []
+        for stage in (*calibration.earlier, calibration) if online else (calibration,):
+            calibrated = replace(car, self_calibrated=stage).calibrated_car
+            stages.append(SelfCalibrated(build(self.name, calibrated, options), stage, car.vehicle))
+        return OnlineCalibrated(tuple(stages)) if online else stages[0]
 
 
 #: Estimators of other packages: each entry point names a :class:`Spec`.

@@ -208,12 +208,14 @@ def _assumed(report: Report, main: MainFacts) -> list[str]:
     own = next(e for e in report["estimators"] if e["name"] == main.name)
     modelled = own["algorithm"] is not None and own["algorithm"]["physics_sha256"] is not None
     calibration = report["self_calibration"]
-    calibrated = calibration is not None and modelled and not calibration["refused"] and not own["causal"]
+    used = calibration is not None and not calibration["refused"]
+    calibrated = modelled and used and (calibration.get("online", False) or not own["causal"])
     if not modelled:
         said = [f"no vehicle model ({main.name} needs none)"]
     elif calibrated:
         where = "this log" if calibration["logs"] == 1 else f"{calibration['logs']} logs"
-        said = [_car(vehicle), f"calibrated on {where} without ground truth, therefore not causal"]
+        therefore = "as it goes on" if own["causal"] else "therefore not causal"
+        said = [_car(vehicle), f"calibrated on {where} without ground truth, {therefore}"]
     elif vehicle["file"] is None:
         said = [_car(vehicle)]
     else:

@@ -79,8 +79,8 @@ class RunConfig:
     network : network folder, ``default``, ``many-cars`` or ``none``; None = the car's.
     intervals : intervals file, ``none``, or ``unsure`` (wide intervals, for a car that may have changed); None = the
         car's.
-    calibrate : calibration of a car without validation data, without ground truth: per ``log``, on the ``pool`` of all
-        logs, or ``off``.
+    calibrate : calibration of a car without validation data, without ground truth: per ``log``, ``online`` on what the
+        log has shown so far (causal), on the ``pool`` of all logs, or ``off``.
     waived : names of checks whose failure is ignored.
     setup : setup.toml of another run of the same car and recorder, from which mounting, units, delays and clocks are
         taken; None = decided on the log.
@@ -112,7 +112,7 @@ class RunConfig:
     thresholds: File | None = None
     network: File | None = None
     intervals: File | None = None
-    calibrate: Literal["off", "log", "pool"] = "log"
+    calibrate: Literal["off", "online", "log", "pool"] = "log"
     waived: Names = ()
     setup: File | None = None
     setup_from_s: Annotated[float, Field(ge=1)] | None = None

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
 from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
 from pdhef_logtool.evaluation.blocks import row_blocks
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, join_signals
@@ -85,7 +86,7 @@ def sample_drive(signals: Signals, truth: StateTrack | None, weight: FloatArray)
 
 def bare_filter(estimator: Estimator, signals: Signals) -> tuple[Estimator, Signals]:
     """Return what runs under stand-in and self-calibration, and what it is given of a drive's signals."""
-    while isinstance(estimator, SelfCalibrated):
+    while isinstance(estimator, SelfCalibrated | OnlineCalibrated):
         if isinstance(estimator, SelfCalibrated):
             signals = estimator.given(signals)
         estimator = estimator.estimator

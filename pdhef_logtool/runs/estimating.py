@@ -16,6 +16,7 @@ from pdhef_logtool.estimators.base import Estimator, look_ahead_of
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.intervals import TrackCalibrator
 from pdhef_logtool.estimators.latency_compensation import WindowState, run_window
+from pdhef_logtool.estimators.online_calibrated import OnlineBand, OnlineCalibrated
 from pdhef_logtool.estimators.presets import preset_of
 from pdhef_logtool.estimators.self_calibrated import SELF_CALIBRATED, CalibratedBand
 from pdhef_logtool.records.geometry import DeadReckoner
@@ -99,12 +100,15 @@ def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
 
     algorithms, own, posterior = {}, {}, {}
     band = posterior_band(car, use_speed=all(resolve(e).use_speed for e in estimators))
-    calibrated = None if car.self_calibrated is None else CalibratedBand(car.self_calibrated, car.vehicle)
+    of_log = car.self_calibrated
+    calibrated = None if of_log is None else CalibratedBand(of_log, car.vehicle)
+    online = None if of_log is None else OnlineBand((*of_log.earlier, of_log), car.vehicle)
     for estimator in estimators:
         if note := getattr(estimator, "intervals_note", ""):
             own[estimator.name] = note
-            if calibrated is not None:
-                posterior[estimator.name] = calibrated.add
+            applies = online if isinstance(estimator, OnlineCalibrated) else calibrated
+            if applies is not None:
+                posterior[estimator.name] = applies.add
             continue
         other = getattr(estimator, "calibrated_as", None)
         algorithms[estimator.name] = [resolve(e) for e in (estimator, other) if e is not None]

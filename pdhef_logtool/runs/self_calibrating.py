@@ -5,10 +5,9 @@ See docs/method.md#self-calibration.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,7 +23,6 @@ from pdhef_logtool.estimators.table import ALL_ESTIMATORS, make_estimator
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.errors import PdhefError
-from pdhef_logtool.runs import selection
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
@@ -41,8 +39,10 @@ def calibrate_drive(drive: Drive, config: RunConfig) -> SelfCalibration | None:
     """Return what a drive says of its car; None where nobody asks or the log lacks a sensor for it."""
     if config.calibrate == "off" or not _asked(config, drive.car) or lacking(drive):
         return None
-    from pdhef_logtool.estimators.calibration.calibration import self_calibrate
+    from pdhef_logtool.estimators.calibration.calibration import calibrate_online, self_calibrate
 
+    if config.calibrate == "online":
+        return calibrate_online(read_driving(drive), drive.car.vehicle)
     return self_calibrate([read_driving(drive)], drive.car.vehicle)
 
 
@@ -81,65 +81,51 @@ def read_driving(drive: Drive) -> Driving:
 
 
 def checked(drive: Drive, calibration: SelfCalibration | None) -> SelfCalibration | None:
-    """Return a calibration with its d2, refused where that of ``physics`` on it exceeds that on the file.
-
-    The factor is that of the guard; on simulated drives with right and wrong files d2 never rose by more than 1 %.
-    """
-    if calibration is None or calibration.refused:
+    """Return a calibration with the part of d2 of ``physics`` on it that correlates with the driving."""
+    if calibration is None or calibration.refused or calibration.earlier:
         return calibration
-    from pdhef_logtool.estimators.physics_filter import of_car
-
-    alone = self_calibrated(drive, replace(calibration, varied=()))  # d2 asks for no interval
-    estimators = (of_car(drive.car), make_estimator("physics", alone))
-    (file, _), (found, driven) = _d2_of(drive, estimators, log_sensors(drive.car.vehicle, calibration))
-    calibration = replace(calibration, driven_d2_m_s=driven)
-    if not found > selection.FACTOR * file:
-        return calibration
-    why = f"physics contradicts the sensors more on it than on the file, d2 is {found:.3g} against {file:.3g} m/s"
-    return replace(calibration, refused=why)
+    alone = self_calibrated(drive, replace(calibration, varied=()))  # d2 needs no interval
+    sensors = log_sensors(drive.car.vehicle, calibration)
+    return replace(calibration, driven_d2_m_s=_driven_d2_of(drive, make_estimator("physics", alone), sensors))
 
 
-def _d2_of(drive: Drive, estimators: Sequence[Estimator], sensors: SensorErrors) -> list[tuple[float, float]]:
-    """Return d2 of estimators over a drive, and its part that goes with the driving, window by window, in m/s.
+def _driven_d2_of(drive: Drive, estimator: Estimator, sensors: SensorErrors) -> float:
+    """Return the part of d2 of an estimator over a drive that correlates with the driving, in m/s; NaN if unknown.
 
-    The windows have a fixed length. NaN where it cannot be told.
+    The windows have a fixed length, so that the length of the run's windows does not change it.
     """
-    from pdhef_logtool.evaluation.metrics import ALL
-    from pdhef_logtool.evaluation.metrics.d2 import d2_rows, driven_d2, driving_products
+    from pdhef_logtool.evaluation.metrics.d2 import driven_d2, driving_products
 
-    slow = drive.car.vehicle.low_speed_blend_m_s
-    carries: list[Any] = [None] * len(estimators)
-    squares, counts = [0.0] * len(estimators), [0] * len(estimators)
-    products, seconds = [np.zeros((4, 4)) for _ in estimators], [0.0] * len(estimators)
+    slow, carry = drive.car.vehicle.low_speed_blend_m_s, None
+    products, seconds = np.zeros((4, 4)), 0.0
     for window in drive.windows(fill_friction=_told(drive), window_s=_WINDOW_S):
-        signals = window.signals
-        whole = {ALL: np.ones(len(signals), dtype=np.bool_)}
-        for i, estimator in enumerate(estimators):
-            track, carries[i] = run_window(estimator, signals, carries[i], None)
-            for row in d2_rows([track], signals, whole, log="", low_speed_m_s=slow, sensors=sensors):
-                squares[i] += row.value**2 * row.n
-                counts[i] += row.n
-            more, lasted = driving_products(track, signals, low_speed_m_s=slow, sensors=sensors)
-            products[i] += more
-            seconds[i] += lasted
-    whole_d2 = (math.sqrt(total / n) if n else math.nan for total, n in zip(squares, counts, strict=True))
-    return list(zip(whole_d2, map(driven_d2, products, seconds), strict=True))
+        track, carry = run_window(estimator, window.signals, carry, None)
+        more, lasted = driving_products(track, window.signals, low_speed_m_s=slow, sensors=sensors)
+        products += more
+        seconds += lasted
+    return driven_d2(products, seconds)
 
 
 def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
     """Return the car of a drive with what was found, unless it was refused."""
     if calibration is None or calibration.refused:
         return drive.car
-    note = "not causal: its car was calibrated on the whole log, without truth"
-    found = WithoutTruth(
-        calibration.vehicle,
-        calibration.noise,
-        told_friction=_told(drive),
-        note=note,
-        varied=calibration.varied,
-        driven_d2_m_s=calibration.driven_d2_m_s,
-    )
-    return replace(drive.car, self_calibrated=found)
+    online = "its car is calibrated on what the log has shown so far, without ground truth"
+    note = online if calibration.earlier else "not causal: car calibrated on the whole log, without ground truth"
+
+    def applied(stage: SelfCalibration) -> WithoutTruth:
+        return WithoutTruth(
+            stage.vehicle,
+            stage.noise,
+            told_friction=_told(drive),
+            note=note,
+            varied=stage.varied,
+            driven_d2_m_s=stage.driven_d2_m_s,
+            since_ns=stage.since_ns,
+            earlier=tuple(map(applied, stage.earlier)),
+        )
+
+    return replace(drive.car, self_calibrated=applied(calibration))
 
 
 def log_sensors(vehicle: VehicleParameters, calibration: SelfCalibration | None) -> SensorErrors:
@@ -147,18 +133,18 @@ def log_sensors(vehicle: VehicleParameters, calibration: SelfCalibration | None)
 
     What is refused for its tyres is no worse for its sensors.
     """
+    from pdhef_logtool.estimators.calibration.joint import AY_BIAS, AY_GAIN, IMU_X, RATE_BIAS
     from pdhef_logtool.evaluation.metrics.metric import SensorErrors
 
     if calibration is None or not calibration.parameters:
         gain = 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2
         return SensorErrors(ay_gain=gain, lever_m=vehicle.imu_position_m[0])
-    found = {p.name: p.value for p in calibration.parameters}
+    fitted = {p.name: p.value for p in calibration.parameters}
     return SensorErrors(
-        ay_bias_m_s2=found["a_y bias"] - vehicle.sensors.ay_bias_m_s2,
-        yaw_rate_bias_rad_s=found["yaw rate bias"] - vehicle.sensors.yaw_rate_bias_rad_s,
-        ay_gain=found["roll gain"],
-        lever_m=found["lever of a_y"],
-        superelevation=found["superelevation"],
+        ay_bias_m_s2=fitted[AY_BIAS] - vehicle.sensors.ay_bias_m_s2,
+        yaw_rate_bias_rad_s=fitted[RATE_BIAS] - vehicle.sensors.yaw_rate_bias_rad_s,
+        ay_gain=fitted[AY_GAIN],
+        lever_m=fitted[IMU_X],
     )
 
 

@@ -20,12 +20,12 @@ STAMPS = 1_700_000_000_000_000_000 + np.round(T * 1e9).astype(np.int64)
 EVERYTHING = {"all": np.ones(T.size, bool)}
 SPEED, RATE, VY = 20.0 + 0.0 * T, 0.1 * np.sin(0.5 * T), 0.4 * np.sin(0.8 * T)
 VY_RATE, YAW_ACCELERATION = 0.32 * np.cos(0.8 * T), 0.05 * np.cos(0.5 * T)
-SENSORS = SensorErrors(ay_bias_m_s2=0.2, yaw_rate_bias_rad_s=0.003, ay_gain=1.08, lever_m=0.7, superelevation=0.25)
+SENSORS = SensorErrors(ay_bias_m_s2=0.2, yaw_rate_bias_rad_s=0.003, ay_gain=1.08, lever_m=0.7)
 
 
 def signals(sensors: SensorErrors) -> Signals:
     """Return what such sensors read of the motion above."""
-    felt = VY_RATE + (1.0 - sensors.superelevation) * SPEED * RATE
+    felt = VY_RATE + SPEED * RATE
     ay = sensors.ay_gain * felt + sensors.lever_m * YAW_ACCELERATION + sensors.ay_bias_m_s2
     return Signals(
         stamps_ns=STAMPS,
@@ -85,7 +85,7 @@ def test_the_true_lateral_velocity_contradicts_nothing_once_the_sensors_are_know
     assert row.n == T.size - 200 - 4  # two seconds before the first, and no speed behind the last sample
 
 
-@pytest.mark.parametrize("entry", ["ay_bias_m_s2", "yaw_rate_bias_rad_s", "ay_gain", "lever_m", "superelevation"])
+@pytest.mark.parametrize("entry", ["ay_bias_m_s2", "yaw_rate_bias_rad_s", "ay_gain", "lever_m"])
 def test_each_entry_of_the_sensors_counts(entry: str) -> None:
     plain = getattr(SensorErrors(), entry)
     assert d2(signals(SENSORS), VY, replace(SENSORS, **{entry: plain})).value > 0.01

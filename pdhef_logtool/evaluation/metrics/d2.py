@@ -88,14 +88,14 @@ class _Driven:
 
     Attributes
     ----------
-    turn : v_x r as far as no bank carries it, [N] in m/s².
+    turn : v_x r, [N] in m/s².
     """
 
     def __init__(self, signals: Signals, low_speed_m_s: float, sensors: SensorErrors) -> None:
         t = signals.stamps_ns
         speed = carried_speed(signals)
         rate = signals.yaw_rate_rad_s - sensors.yaw_rate_bias_rad_s
-        self.turn = (1.0 - sensors.superelevation) * speed * rate
+        self.turn = speed * rate
         rising = (signals.ay_m_s2 - sensors.ay_bias_m_s2) / sensors.ay_gain - self.turn
         self._fast = speed > low_speed_m_s
         self._of_lever = sensors.lever_m / sensors.ay_gain * rate
@@ -126,7 +126,7 @@ METRICS = (
         "d2",
         "d2",
         "signal `vy_m_s`: RMS of the change of the estimated v_y over 2 s minus the integral of a_y − v_x r, above the "
-        "low-speed blend; a_y without bias, roll gain, lever arm and bank as the log has them; large with a wrong "
+        "low-speed blend; a_y without bias, roll gain and lever arm as the log has them; large with a wrong "
         "model. `kinematic` integrates the same, so that its d2 shows nothing",
         OfDrive(_rows),
         best="lower",

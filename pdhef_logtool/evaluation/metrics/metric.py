@@ -156,14 +156,13 @@ class SensorErrors:
     Attributes
     ----------
     ay_bias_m_s2, yaw_rate_bias_rad_s : reading minus true value. ay_gain : of a_y, by body roll. lever_m : position of
-        the accelerometer ahead of the centre of gravity. superelevation : share of v_x r that the road's bank carries.
+        the accelerometer ahead of the centre of gravity.
     """
 
     ay_bias_m_s2: float = 0.0
     yaw_rate_bias_rad_s: float = 0.0
     ay_gain: float = 1.0
     lever_m: float = 0.0
-    superelevation: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

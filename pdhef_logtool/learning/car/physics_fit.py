@@ -26,7 +26,8 @@ from pdhef_logtool.car.descent import descend
 from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, TriedParts
 from pdhef_logtool.car.prior import Prior
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
-from pdhef_logtool.estimators.calibration.calibration import varied_parameters
+from pdhef_logtool.estimators.calibration.calibration import VARIED
+from pdhef_logtool.estimators.calibration.joint import varied_parameters
 from pdhef_logtool.estimators.filter_base import PosteriorSteps
 from pdhef_logtool.estimators.physics_filter import PHYSICS_Q_STD, physics_filter
 from pdhef_logtool.learning.car.axle_forces import (
@@ -286,7 +287,7 @@ def varied_vehicles(
     def errors(theta: FloatArray) -> FloatArray:
         return np.concatenate([d.error for d in drive_errors(drives, start, vehicle(theta), found.noise)])
 
-    return tuple(vehicle(theta, digits=6) for theta in varied_parameters(found.theta, root, errors))
+    return tuple(vehicle(theta, digits=6) for theta in varied_parameters(found.theta, root, errors, VARIED))
 
 
 def fit_cost(found: Sequence[DriveError], theta: FloatArray) -> float:

@@ -68,7 +68,7 @@ def identify_without_truth(task: Task) -> StageOutput:
 
 def fit_part(calibration: SelfCalibration, drives: Sequence[LearntOn]) -> Fit:
     """Return the calibration as a part of a car; ``physics`` has the same values, and its own noise."""
-    own, vehicle = calibration.own, calibration.vehicle
+    own, vehicle = calibration.vehicle_file, calibration.vehicle
     return Fit(
         physics_sha256=physics_sha256(own),
         values=FittedValues.between(own, vehicle),

@@ -1,0 +1,324 @@
+"""Joint fit of tyres, steering and sensors to the driving of logs, without ground truth.
+
+See docs/method.md#self-calibration.
+
+The model of :mod:`~.single_track` is fitted to yaw rate and a_y by output error. In normalised parameters θ (distance
+from the prior mean in prior standard deviations) the cost is
+
+    Σ_channels Σ_k (Δt / T) 2 (√(1 + (e_k / σ)²) − 1) + |θ|²
+
+with errors e after a zero-phase low pass, so that T = 1 s of driving counts as one sample. Friction and peak force are
+observable as a product only: friction stays at the file's value, the peak force is fitted.
+
+The covariance of θ has three parts: the curvature of the cost, the spread of the cost's gradient between blocks of the
+drives (sandwich estimator, White 1982), which includes model error that changes within a drive, and the model error
+that all of a drive has in common, estimated on simulated cars (:data:`SHARED_SHARE`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdhef_logtool.car.descent import descend
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, STIFFNESS_TYRE_SHAPE, AxleTyre, Tyres, VehicleParameters
+from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
+from pdhef_logtool.estimators.calibration.single_track import (
+    OF_AY,
+    OF_RATE,
+    SPEED,
+    YAW_RATE,
+    TrackParameters,
+    errors,
+    low_pass,
+)
+from pdhef_logtool.records.signals import BoolArray, FloatArray
+
+#: Model and sensors are compared below this frequency.
+CUTOFF_HZ = 4.0
+#: Standard deviation of the errors of yaw rate (rad/s) and a_y (m/s²); larger errors count linearly.
+ERROR_STD = (0.02, 0.3)
+#: Driving that counts as one independent sample of each channel; start of each stretch that does not count, because the
+#: initial state is a guess.
+CORRELATION_S, SETTLE_S = 1.0, 1.0
+#: Errors are kept every so many steps of the grid: 12.5 Hz, three times the cutoff.
+KEPT_STEPS = 4
+#: Model error that all of a drive has in common, as a share of each prior's standard deviation: with it 95 % of the
+#: differences between drives of one simulated car are within 1.96 standard deviations.
+SHARED_SHARE = 0.2
+#: Length of the blocks whose gradients are compared: longer than a bend, so that blocks are nearly independent.
+BLOCK_S = 3.0
+ITERATIONS, DERIVATIVE_STEP, MAX_STEP, LEAST_GAIN = 40, 0.02, 1.0, 1e-3
+#: Parts of ``physics`` on a calibrated car; on simulated cars with wrong files the lowest sideslip error.
+PARTS = ("lag", "roll")
+#: Cornering stiffness over axle load of any car, 1/rad, front and rear, and the standard deviations of the logarithm
+#: about it and about the file's value.
+USUAL_STIFFNESS, USUAL_STIFFNESS_STD, FILE_STIFFNESS_STD = (14.0, 15.0), 0.4, 0.5
+#: Usual share of gravity in a_y by body roll, rad/(m/s²), where the file has none (3 degrees per g).
+USUAL_ROLL_GRADIENT = 0.005
+
+FRONT_STIFFNESS, REAR_STIFFNESS = "front cornering stiffness", "rear cornering stiffness"
+PEAK, INERTIA, RELAXATION = "peak force over the file's", "yaw inertia", "relaxation length"
+STEER_OFFSET, STEER_RATIO, STEER_DELAY = "steering offset", "steering ratio", "steering delay"
+AY_GAIN, AY_BIAS, IMU_X, RATE_BIAS = "roll gain", "a_y bias", "lever of a_y", "yaw rate bias"
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """Prior of a fitted parameter: normal with ``mean`` and ``std`` (of the logarithm if ``log``), within a range."""
+
+    name: str
+    unit: str
+    mean: float
+    std: float
+    low: float
+    high: float
+    log: bool = False
+
+    def value(self, theta: float) -> float:
+        """Return the parameter at a normalised distance from the prior mean, within its range."""
+        free = self.mean * math.exp(self.std * theta) if self.log else self.mean + self.std * theta
+        return min(max(free, self.low), self.high)
+
+
+def _factor(name: str, unit: str, mean: float, std: float, most: float) -> Parameter:
+    """Return a parameter with a logarithmic prior, between 1 / ``most`` and ``most`` times its mean."""
+    return Parameter(name, unit, mean, std, mean / most, mean * most, log=True)
+
+
+def _around(name: str, unit: str, mean: float, std: float, most: float) -> Parameter:
+    """Return a parameter with a normal prior, at most ``most`` away from its mean."""
+    return Parameter(name, unit, mean, std, mean - most, mean + most)
+
+
+def _stiffness(vehicle_file: VehicleParameters, name: str, *, front: bool) -> Parameter:
+    """Return a cornering stiffness whose prior combines the file's value with that of any car."""
+    of_file, of_usual = FILE_STIFFNESS_STD**-2, USUAL_STIFFNESS_STD**-2
+    file = vehicle_file.cornering_stiffness_n_per_rad(front, vehicle_file.assumed_friction)
+    usual = USUAL_STIFFNESS[0 if front else 1] * vehicle_file.axle_load_n(front)
+    mean = math.exp((of_file * math.log(file) + of_usual * math.log(usual)) / (of_file + of_usual))
+    return _factor(name, "N/rad", mean, (of_file + of_usual) ** -0.5, 5.0)
+
+
+def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
+    """Return the parameters of a fit about a vehicle file.
+
+    Stiffness in published files differs from the driven car's by up to a factor of two; steering gains by −15 to +18 %
+    because of compliance, toe and wrong ratios. An accelerometer may be at either axle.
+    """
+    sensors = vehicle_file.sensors
+    gradient = vehicle_file.roll_gradient_rad_per_m_s2 or USUAL_ROLL_GRADIENT
+    reach = 0.4 * vehicle_file.wheelbase_m
+    return (
+        _stiffness(vehicle_file, FRONT_STIFFNESS, front=True),
+        _stiffness(vehicle_file, REAR_STIFFNESS, front=False),
+        _factor(PEAK, "1", 1.0, 0.2, 2.0),
+        _factor(INERTIA, "kg m^2", vehicle_file.yaw_inertia_kg_m2, 0.2, 2.0),
+        _factor(RELAXATION, "m", vehicle_file.relaxation_length_m or 0.5, 0.4, 4.0),
+        _around(STEER_OFFSET, "rad", vehicle_file.steer_offset_rad, 0.01, 0.05),
+        _factor(STEER_RATIO, "1", vehicle_file.steering_ratio, 0.05, 1.2),
+        _around(STEER_DELAY, "s", 0.0, 0.02, 0.1),
+        _around(AY_GAIN, "1", 1.0 + GRAVITY_M_S2 * gradient, 0.05, 0.15),
+        _around(AY_BIAS, "m/s^2", sensors.ay_bias_m_s2, 0.2, 1.5),
+        _around(IMU_X, "m", vehicle_file.imu_position_m[0], reach, 3.0 * reach),
+        _around(RATE_BIAS, "rad/s", sensors.yaw_rate_bias_rad_s, 0.005, 0.05),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """Result of a fit: θ [n] and its covariance [n, n]."""
+
+    theta: FloatArray
+    covariance: FloatArray
+
+
+class JointProblem:
+    """The fit of one car to the driving of its logs, which were read with ``vehicle_file``."""
+
+    def __init__(self, drives: Sequence[Driving], vehicle_file: VehicleParameters) -> None:
+        self.parameters = parameters_of(vehicle_file)
+        self._drives, self._file = drives, vehicle_file
+        self._filter = low_pass(CUTOFF_HZ, STEP_S)
+        self._kept = [np.flatnonzero(counted(d))[::KEPT_STEPS] for d in drives]
+        self._out = [np.full((3, d.columns.shape[1]), np.nan) for d in drives]
+        self._differences = [np.full((2, d.columns.shape[1]), np.nan) for d in drives]
+        blocks, first = [], 0
+        for kept in self._kept:
+            block = (kept * STEP_S // BLOCK_S).astype(np.int64) + first
+            first = int(block[-1]) + 1 if block.size else first
+            blocks.append(block)
+        self._block = np.unique(np.concatenate(blocks), return_inverse=True)[1]
+        self._weight = math.sqrt(KEPT_STEPS * STEP_S / CORRELATION_S)
+
+    def solve(self) -> Fit:
+        """Return the parameters of the lowest cost."""
+        start = np.zeros(len(self.parameters))
+        descent, _ = descend(
+            self.errors_of,
+            self._cost,
+            self._residuals,
+            start,
+            iterations=ITERATIONS,
+            least_gain=lambda _: LEAST_GAIN,
+            derivative_step=DERIVATIVE_STEP,
+            max_step=MAX_STEP,
+        )
+        return Fit(descent.theta, self._covariance(descent.theta))
+
+    def errors_of(self, theta: FloatArray) -> FloatArray:
+        """Return errors over ``ERROR_STD`` [2, K]."""
+        return self._errors(self._track(theta))
+
+    def rms(self, theta: FloatArray) -> tuple[float, float]:
+        """Return the RMS error of yaw rate and a_y."""
+        return _rms(self.errors_of(theta))
+
+    def rms_of_file(self) -> tuple[float, float]:
+        """Return the RMS error of yaw rate and a_y of the vehicle file."""
+        return _rms(self._errors(track_of(self._file, self._file)))
+
+    def sideslip(self, theta: FloatArray) -> FloatArray:
+        """Return the model's v_y / v_x of all samples that count [K]."""
+        self._errors(self._track(theta))
+        parts = zip(self._drives, self._out, self._kept, strict=True)
+        return np.concatenate([out[2, k] / d.columns[SPEED, k] for d, out, k in parts])
+
+    def rear_slip(self, theta: FloatArray) -> FloatArray:
+        """Return (l_r r − v_y) / v_x of the model and the gyro, of all samples that count [K]."""
+        drives = zip(self._drives, self._kept, strict=True)
+        turning = np.concatenate([d.columns[YAW_RATE, k] / d.columns[SPEED, k] for d, k in drives])
+        return self._file.cg_to_rear_axle_m * turning - self.sideslip(theta)
+
+    def values(self, theta: FloatArray, *, digits: int = 17) -> dict[str, float]:
+        """Return the parameters by name."""
+        pairs = zip(self.parameters, theta, strict=True)
+        return {p.name: float(f"{p.value(float(t)):.{digits}g}") for p, t in pairs}
+
+    def vehicle(self, theta: FloatArray, *, digits: int = 17) -> VehicleParameters:
+        """Return the vehicle file with the parameters; friction is the file's, the peak force takes the rest."""
+        return _vehicle_with(self._file, self.values(theta, digits=digits), digits)
+
+    def _track(self, theta: FloatArray) -> TrackParameters:
+        return track_of(self.vehicle(theta), self._file, self.values(theta)[STEER_DELAY])
+
+    def _errors(self, p: TrackParameters) -> FloatArray:
+        for d, out, differences in zip(self._drives, self._out, self._differences, strict=True):
+            errors(d.columns, d.stretches, STEP_S, p, self._filter, out, differences)
+        parts = [e[:, k] for e, k in zip(self._differences, self._kept, strict=True)]
+        return np.asarray(np.concatenate(parts, axis=1) / np.array(ERROR_STD)[:, None], dtype=np.float64)
+
+    def _cost(self, scaled: FloatArray, theta: FloatArray) -> float:
+        robust = 2.0 * (np.sqrt(1.0 + scaled**2) - 1.0)
+        return float(self._weight**2 * np.sum(robust) + theta @ theta)
+
+    def _residuals(self, scaled: FloatArray, centre: FloatArray) -> FloatArray:
+        """Return residuals [2 K] with the weights that soft L1 gives to the errors ``centre``."""
+        return np.asarray(self._weight * scaled / (1.0 + centre**2) ** 0.25, dtype=np.float64).ravel()
+
+    def _covariance(self, theta: FloatArray) -> FloatArray:
+        centre = self.errors_of(theta)
+        residuals = self._residuals(centre, centre)
+        jacobian = np.empty((residuals.size, theta.size))
+        for i in range(theta.size):
+            moved = theta.copy()
+            moved[i] += DERIVATIVE_STEP
+            jacobian[:, i] = (self._residuals(self.errors_of(moved), centre) - residuals) / DERIVATIVE_STEP
+        inverse = np.linalg.inv(jacobian.T @ jacobian + np.eye(theta.size))
+        block, blocks = np.tile(self._block, 2), int(self._block.max()) + 1
+        gradients = np.zeros((blocks, theta.size))
+        np.add.at(gradients, block, jacobian * residuals[:, None])
+        spread = gradients.T @ gradients * (blocks / max(blocks - 1, 1))
+        shared = SHARED_SHARE**2 * np.eye(theta.size)
+        return np.asarray(inverse + inverse @ spread @ inverse + shared, dtype=np.float64)
+
+
+def counted(drive: Driving) -> BoolArray:
+    """Return which samples [N] of a drive count: those of its stretches without their start."""
+    inside = np.zeros(drive.columns.shape[1], dtype=np.bool_)
+    for first, last in drive.stretches:
+        inside[first + round(SETTLE_S / STEP_S) : last] = True
+    return inside
+
+
+def _rms(scaled: FloatArray) -> tuple[float, float]:
+    rms = np.sqrt(np.mean(scaled**2, axis=1)) * np.array(ERROR_STD)
+    return float(rms[OF_RATE]), float(rms[OF_AY])
+
+
+def _vehicle_with(vehicle_file: VehicleParameters, values: Mapping[str, float], digits: int) -> VehicleParameters:
+    def rounded(value: float) -> float:
+        return float(f"{value:.{digits}g}")
+
+    mu = vehicle_file.assumed_friction
+
+    def tyre(front: bool, stiffness: str) -> AxleTyre:
+        peak = values[PEAK] * vehicle_file.magic_formula(front, mu)[2]
+        b = rounded(values[stiffness] / (STIFFNESS_TYRE_SHAPE * peak))
+        return AxleTyre(B=b, C=STIFFNESS_TYRE_SHAPE, D_n=rounded(peak / mu), E=0.0, reference_friction=mu)
+
+    biases = {"ay_bias_m_s2": values[AY_BIAS], "yaw_rate_bias_rad_s": values[RATE_BIAS]}
+    return vehicle_file.model_copy(
+        update={
+            "tyres": Tyres(front=tyre(True, FRONT_STIFFNESS), rear=tyre(False, REAR_STIFFNESS)),
+            "yaw_inertia_kg_m2": values[INERTIA],
+            "steer_offset_rad": values[STEER_OFFSET],
+            "steering_ratio": values[STEER_RATIO],
+            "roll_gradient_rad_per_m_s2": rounded((values[AY_GAIN] - 1.0) / GRAVITY_M_S2),
+            "friction": mu,
+            "sensors": vehicle_file.sensors.model_copy(update=biases),
+            "imu_position_m": (values[IMU_X], *vehicle_file.imu_position_m[1:]),
+            "relaxation_length_m": values[RELAXATION],
+            "physics": vehicle_file.physics.model_copy(update=dict.fromkeys(PARTS, True)),
+        }
+    )
+
+
+def prior_vehicle(vehicle_file: VehicleParameters) -> VehicleParameters:
+    """Return the vehicle file with every parameter at its prior mean."""
+    return _vehicle_with(vehicle_file, {p.name: p.value(0.0) for p in parameters_of(vehicle_file)}, 6)
+
+
+def track_of(
+    vehicle: VehicleParameters, vehicle_file: VehicleParameters, steer_delay_s: float = 0.0
+) -> TrackParameters:
+    """Return the model of a vehicle for signals that were read with ``vehicle_file``."""
+    mu, mass = vehicle.assumed_friction, vehicle.mass_kg
+    gain = vehicle_file.steering_ratio / vehicle.steering_ratio
+    return TrackParameters(
+        front_m=vehicle.cg_to_front_axle_m,
+        rear_m=vehicle.cg_to_rear_axle_m,
+        mass_over_inertia=mass / vehicle.yaw_inertia_kg_m2,
+        front_stiffness=vehicle.cornering_stiffness_n_per_rad(True, mu) / mass,
+        rear_stiffness=vehicle.cornering_stiffness_n_per_rad(False, mu) / mass,
+        front_peak=vehicle.magic_formula(True, mu)[2] / mass,
+        rear_peak=vehicle.magic_formula(False, mu)[2] / mass,
+        shape=STIFFNESS_TYRE_SHAPE,
+        friction=mu,
+        relaxation_m=max(vehicle.relaxation_length_m, 0.01),
+        ay_gain=1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2,
+        imu_x_m=vehicle.imu_position_m[0],
+        ay_bias=vehicle.sensors.ay_bias_m_s2 - vehicle_file.sensors.ay_bias_m_s2,
+        rate_bias=vehicle.sensors.yaw_rate_bias_rad_s - vehicle_file.sensors.yaw_rate_bias_rad_s,
+        steer_gain=gain,
+        steer_added=gain * vehicle_file.steer_offset_rad - vehicle.steer_offset_rad,
+        steer_delay=steer_delay_s / STEP_S,
+    )
+
+
+def varied_parameters(
+    theta: FloatArray, root: FloatArray, sideslip: Callable[[FloatArray], FloatArray], most: int
+) -> list[FloatArray]:
+    """Return parameters 1-sigma away from θ [n] along the directions of their posterior that move the sideslip most.
+
+    ``root`` [n, m]: its product with its transpose is the posterior's covariance. ``sideslip`` of parameters, or errors
+    of it, [K]. The directions, at most ``most`` and the largest first, are uncorrelated in the posterior and in their
+    effect on the sideslip.
+    """
+    centre = sideslip(theta)
+    moved = np.stack([sideslip(theta + step) - centre for step in root.T])
+    _, axes = np.linalg.eigh(moved @ moved.T)
+    return [theta + step for step in (root @ axes[:, ::-1][:, :most]).T]

@@ -1,0 +1,116 @@
+"""Estimators on a car that is calibrated again and again while the log goes on (docs/method.md#self-calibration).
+
+Each stage is the estimator on the vehicle that the log had shown by then. A stage begins at its own stamp with the
+state of the stage before it, and nothing at a stamp depends on a later one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.car.car import WithoutTruth
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.estimators.base import predict_track
+from pdhef_logtool.estimators.self_calibrated import CalibratedBand, SelfCalibrated
+from pdhef_logtool.records.signals import IntArray, Signals
+from pdhef_logtool.records.steps import Extrapolation, StepColumns
+from pdhef_logtool.records.tracks import StateTrack, concatenate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StagedSteps(StepColumns):
+    """Steps of the estimator [K], and the stage that each comes from, [K]."""
+
+    steps: Any
+    stage: IntArray
+
+    @property
+    def valid(self) -> Any:
+        """Whether there is an estimate, [K]."""
+        return self.steps.valid
+
+
+def _spans(stage: IntArray) -> Iterator[tuple[int, int, int]]:
+    """Yield stage, first and last + 1 of each run of equal stages."""
+    edges = np.flatnonzero(np.diff(stage)) + 1
+    for first, last in zip([0, *edges], [*edges, len(stage)], strict=True):
+        yield int(stage[first]), int(first), int(last)
+
+
+def _stage_of(stamps_ns: IntArray, stages: Sequence[WithoutTruth]) -> IntArray:
+    """Return the stage of each stamp [N]; the first begins with the log."""
+    return np.searchsorted([s.since_ns for s in stages[1:]], stamps_ns, side="right").astype(np.int64)
+
+
+@dataclass(frozen=True)
+class OnlineCalibrated:
+    """An estimator on the vehicle that the log has shown so far; ``stages`` in time order, at least two."""
+
+    algorithm = "online-calibrated"
+    version = 1
+    options = ("estimator",)
+
+    stages: tuple[SelfCalibrated, ...]
+    causal: bool = True
+    intervals_note: str = "intervals: own and parameters"
+
+    @property
+    def estimator(self) -> SelfCalibrated:
+        """The last stage, whose algorithm is that of all."""
+        return self.stages[-1]
+
+    @property
+    def name(self) -> str:
+        """That of the estimator."""
+        return self.estimator.name
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes of the report."""
+        return self.estimator.notes
+
+    def run(self, signals: Signals, state: Any | None) -> tuple[StagedSteps, Any]:
+        """Process one window (see :class:`~.base.Estimator`)."""
+        stage = _stage_of(signals.stamps_ns, [s.calibration for s in self.stages])
+        if not len(signals):
+            steps, state = self.stages[0].run(signals, state)
+            return StagedSteps(steps, stage), state
+        joined: Any = None
+        for number, first, last in _spans(stage):
+            steps, state = self.stages[number].run(signals.rows(first, last), state)
+            joined = steps if joined is None else joined.joined(steps)
+        return StagedSteps(joined, stage), state
+
+    def predict(self, steps: StagedSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
+        """Extrapolate each step by the model of its stage."""
+        if not len(stamps_ns):
+            return predict_track(self.stages[0], steps.steps, ahead, stamps_ns)
+        parts = []
+        for number, first, last in _spans(steps.stage[ahead.step]):
+            rows = slice(first, last)
+            part = Extrapolation(ahead.step[rows], ahead.arrived[rows], ahead.horizon_s[rows], ahead.usable[rows])
+            parts.append(predict_track(self.stages[number], steps.steps, part, stamps_ns[rows]))
+        return concatenate(parts)
+
+
+@dataclass(slots=True)
+class OnlineBand:
+    """The interval of :class:`~.self_calibrated.CalibratedBand`, of each stage for its part of the log."""
+
+    stages: Sequence[WithoutTruth]
+    read_with: VehicleParameters
+    _bands: dict[int, CalibratedBand] = field(default_factory=dict)
+
+    def add(self, track: StateTrack, signals: Signals) -> StateTrack:
+        """Return the next window of a track [N] with wider 1-sigmas of sideslip and v_y."""
+        if not len(signals):
+            return track
+        parts = []
+        for number, first, last in _spans(_stage_of(signals.stamps_ns, self.stages)):
+            band = self._bands.setdefault(number, CalibratedBand(self.stages[number], self.read_with))
+            parts.append(band.add(track.rows(first, last), signals.rows(first, last)))
+        return replace(concatenate(parts), name=track.name)
