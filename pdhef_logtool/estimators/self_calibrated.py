@@ -5,11 +5,11 @@ What a whole log says of its car is known only at its end: none of them is causa
 Their variance of sideslip is their own, what the parameters leave open, and what the sensors contradict
 (docs/method.md#intervals):
 
-    s² = (k_o s_own)² + (Σ_i (v_y,i − v_y)² + (k_d d2)²) / v_x²,
+    s² = s_own² + (Σ_i (2 (v_y,i − v_y))² + (d2 / 2)²) / v_x²,
 
 where v_y,i is that of the physics filter on the vehicle one posterior 1-sigma away in direction i, and d2 is that of
-the whole log as far as it goes with the driving. Their own counts less, for the noise of a calibrated car takes in what
-the model leaves of a_y; where d2 cannot be told it counts as it is. That of v_y is the same sum as a velocity.
+the whole log as far as it goes with the driving. The posterior is doubled, for the directions are only the five that
+move the sideslip most. That of v_y is the same sum as a velocity.
 Estimates themselves do not change.
 """
 
@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 SELF_CALIBRATED = frozenset({"physics", "pd-hef", "pd-hef-smoothed"})
 #: The open-loop model on the calibrated vehicle.
 OPEN_LOOP = "open-loop:calibrated"
-#: k_o and k_d above, chosen on 16 simulated cars with wrong files, whose parameters' posterior held as it is.
-OWN_SHARE, D2_SHARE = 0.25, 0.5
+#: Factors of the posterior and of d2 above.
+POSTERIOR_SHARE, D2_SHARE = 2.0, 0.5
 
 
 @dataclass(slots=True)
@@ -64,7 +64,8 @@ class CalibratedBand:
         known = math.isfinite(d2)
         contradicted = np.full(len(track), D2_SHARE * d2 if known else 0.0)
         slow = found.vehicle.low_speed_blend_m_s
-        return widened(track, self._vy, contradicted, slow, own_share=OWN_SHARE if known else 1.0)
+        away = [self._vy[0] + POSTERIOR_SHARE * (vy - self._vy[0]) for vy in self._vy] if self._vy else []
+        return widened(track, away, contradicted, slow, own_share=1.0)
 
     @property
     def _filters(self) -> tuple[PhysicsFilter, ...]:

@@ -16,7 +16,13 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.intervals import make_inflation
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter, physics_filter
-from pdhef_logtool.estimators.self_calibrated import D2_SHARE, OPEN_LOOP, OWN_SHARE, SELF_CALIBRATED, SelfCalibrated
+from pdhef_logtool.estimators.self_calibrated import (
+    D2_SHARE,
+    OPEN_LOOP,
+    POSTERIOR_SHARE,
+    SELF_CALIBRATED,
+    SelfCalibrated,
+)
 from pdhef_logtool.estimators.table import SPECS, all_names, make_estimator
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import Signals
@@ -170,8 +176,8 @@ def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
     read = [corrected_anew(signals, OWN, v) for v in (FOUND, *found.varied)]
     filters = [physics_filter(v, NOISE) for v in (FOUND, *found.varied)]
     middle, *others = (run_window(f, s)[0].vy_m_s for f, s in zip(filters, read, strict=True))
-    away = sum((vy - middle) ** 2 for vy in others)
-    expected = (OWN_SHARE * plain.vy_std_m_s) ** 2 + away
+    away = sum((POSTERIOR_SHARE * (vy - middle)) ** 2 for vy in others)
+    expected = plain.vy_std_m_s**2 + away
     fast = plain.vx_m_s > OWN.low_speed_blend_m_s
     np.testing.assert_allclose(alone.vy_std_m_s[fast] ** 2, expected[fast], rtol=1e-9)
     np.testing.assert_allclose((both.vy_std_m_s**2 - alone.vy_std_m_s**2)[fast], (0.1 * D2_SHARE) ** 2, rtol=1e-6)

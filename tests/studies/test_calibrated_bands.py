@@ -10,7 +10,7 @@ from studies import self_calibration as study
 
 @pytest.mark.slow
 def test_the_bands_of_calibrated_cars_hold_and_are_no_wider_than_they_must() -> None:
-    """On cars that nothing was chosen on; a perfect band of normal errors is 3.92 times their rms wide."""
+    """On cars that nothing was chosen on; the interval of normal errors is 3.92 times as wide as their rms."""
     bands = []
     for one in study.simulate(6, 1357, study.DRIVEN[:1]):
         wrong = study.make_wrong(one.file, *one.factors)
@@ -18,6 +18,6 @@ def test_the_bands_of_calibrated_cars_hold_and_are_no_wider_than_they_must() -> 
         assert not found.refused
         bands.append(study.band_of(one.drive, study.taken(one.drive.signals, wrong, found)))
     coverage, width = np.array(bands).T
-    assert np.mean(coverage) > 0.85  # docs/calibration.md: 93 % of a hundred; the mean of six varies by 4 %
+    assert np.mean(coverage) > 0.9
     assert np.min(coverage) > 0.7
-    assert np.median(width) < 5.5
+    assert np.median(width) < 11.0  # the model error of real cars is included, which these hardly have
