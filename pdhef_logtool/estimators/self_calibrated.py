@@ -61,11 +61,9 @@ class CalibratedBand:
             self._window, self._vy = signals, [t.vy_m_s for t, _ in runs]
             self._states = tuple(state for _, state in runs)
         d2 = found.driven_d2_m_s
-        known = math.isfinite(d2)
-        contradicted = np.full(len(track), D2_SHARE * d2 if known else 0.0)
-        slow = found.vehicle.low_speed_blend_m_s
+        contradicted = np.full(len(track), D2_SHARE * d2 if math.isfinite(d2) else 0.0)
         away = [self._vy[0] + POSTERIOR_SHARE * (vy - self._vy[0]) for vy in self._vy] if self._vy else []
-        return widened(track, away, contradicted, slow, own_share=1.0)
+        return widened(track, away, contradicted, found.vehicle.low_speed_blend_m_s, own_share=1.0)
 
     @property
     def _filters(self) -> tuple[PhysicsFilter, ...]:
