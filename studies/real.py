@@ -37,6 +37,7 @@ from pdhef_logtool.learning.drives import IDENTIFY, LearnSettings
 from pdhef_logtool.learning.engine import learn
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.errors import PdhefError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator
@@ -223,7 +224,7 @@ def trained_car(case: Case, network: Path, trials: int) -> tuple[list[Row], str]
         car = Path(name) / "car"
         say(f"{case.name}: learn")
         try:
-            learned = learn([str(DRIVES / case.fit.log)], car, settings, warn=say)
+            learned = learn([str(DRIVES / case.fit.log)], car, settings, reporter=Reporter(warn=say))
         except PdhefError as error:
             return [], f"The car could not be trained: expected {error.expected}, got {error.got}."
         rows = scored(case, "learn", Car.load(car), ("physics", "pd-hef", "pd-hef-smoothed"))

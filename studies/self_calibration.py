@@ -29,6 +29,7 @@ from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, signal_error
 from pdhef_logtool.evaluation.metrics.d2 import d2_rows, driven_d2, driving_products
 from pdhef_logtool.records.errors import PdhefError, SimulationError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.config import RunConfig
@@ -303,7 +304,7 @@ def published_run(name: str, log: str) -> tuple[dict[str, tuple[float, float]], 
             annotate="none",
             estimators=estimators,
         )
-        result = run_logs([str(DRIVES / log)], Path(folder) / "out", config, warn=say)
+        result = run_logs([str(DRIVES / log)], Path(folder) / "out", config, reporter=Reporter(warn=say))
     report = json.loads(json.dumps(result.results[0].report))
     whole = {(m["estimator"], m["signal"], m["metric"]): m["value"] for m in report["metrics"] if m["segment"] == ALL}
     figures = {}

@@ -14,6 +14,7 @@ import typer
 from pdhef_logtool.cli import stopping
 from pdhef_logtool.records.errors import EXIT_OK
 from pdhef_logtool.records.printable import all_printable, printable
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.storage.documents import jsonable
 
 if TYPE_CHECKING:
@@ -132,13 +133,13 @@ def _progress_lines() -> Callable[[str, float], None]:
 
 
 @contextmanager
-def progress() -> Iterator[Callable[[str, float], None]]:
-    """Yield ``update(text, share)``: a bar on a terminal's stderr, lines with ``--verbose``, nothing elsewhere.
+def reporter() -> Iterator[Reporter]:
+    """Yield a reporter on stderr; its progress is a bar on a terminal, lines with ``--verbose``, nothing elsewhere.
 
-    It raises :class:`~.stopping.Stopped` after a request to end.
+    Its progress raises :class:`~.stopping.Stopped` after a request to end.
     """
     if _quiet or _verbose or not sys.stderr.isatty():
-        yield _progress_lines()
+        yield Reporter(_progress_lines(), warn, say)
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -151,4 +152,4 @@ def progress() -> Iterator[Callable[[str, float], None]]:
             stopping.check()
             bar.update(task, description=printable(text), completed=share)
 
-        yield update
+        yield Reporter(update, warn, say)

@@ -87,8 +87,8 @@ def learn(
         any_split=any_split,
         without_truth=without_truth,
     )
-    with console.progress() as bar:
-        result = run_stages(logs, output, settings, fresh=fresh, progress=bar, warn=console.warn, say=console.say)
+    with console.reporter() as reporter:
+        result = run_stages(logs, output, settings, fresh=fresh, reporter=reporter)
     console.finish(result, learning_tables.render_learning, as_json)
 
 
@@ -145,8 +145,8 @@ def extract(
         where=where,
         per_cell_s=per_cell,
     )
-    with console.progress() as bar:
-        result = write_residuals(logs, output, settings, jobs=jobs, resume=resume, progress=bar, warn=console.warn)
+    with console.reporter() as reporter:
+        result = write_residuals(logs, output, settings, jobs=jobs, resume=resume, reporter=reporter)
     console.finish(result, learning_tables.render_extraction, as_json)
 
 
@@ -178,12 +178,14 @@ def train(
 
         if init is not None:
             raise UsageError(expected="--baselines or --init", got="both", where="train")
-        with console.progress() as bar:
-            both = run_baselines(dataset, output, paper=paper, seed=seed, epochs=epochs, device=device, progress=bar)
+        with console.reporter() as reporter:
+            both = run_baselines(
+                dataset, output, paper=paper, seed=seed, epochs=epochs, device=device, progress=reporter.progress
+            )
         console.finish(both, learning_tables.render_baselines, as_json)
-    with console.progress() as bar:
+    with console.reporter() as reporter:
         result = run_training(
-            dataset, output, init=init, paper=paper, seed=seed, epochs=epochs, device=device, progress=bar
+            dataset, output, init=init, paper=paper, seed=seed, epochs=epochs, device=device, progress=reporter.progress
         )
     console.finish(result, learning_tables.render_training, as_json)
 
@@ -226,6 +228,6 @@ def retrain(
 
     asked = DEFAULT_GATE if gate is None else load_gate(gate)
     settings = RetrainSettings(config=config, seed=seed, init=init, epochs=epochs, gate=asked, strict=strict)
-    with console.progress() as bar:
-        result = train_again(logs, output, settings, jobs=jobs, progress=bar, warn=console.warn, say=console.say)
+    with console.reporter() as reporter:
+        result = train_again(logs, output, settings, jobs=jobs, reporter=reporter)
     console.finish(result, learning_tables.render_retraining, as_json)

@@ -44,8 +44,8 @@ def report(
     from pdhef_logtool.storage.outputs import OutputFolder
 
     open_run(output)  # before the folder is held, which would make it where it is missing
-    with OutputFolder(output, (LOGS,)), console.progress() as bar:
-        result = write_pages(open_run(output), bar, png=png, by=by or ())
+    with OutputFolder(output, (LOGS,)), console.reporter() as reporter:
+        result = write_pages(open_run(output), reporter.progress, png=png, by=by or ())
     console.show(result, _render, as_json)
     for line in result.wrong:
         console.warn(line)

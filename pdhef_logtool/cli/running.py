@@ -109,26 +109,11 @@ def run(  # positional: one an option of the command line
 ) -> None:
     """Run estimators on logs, score them, write reports and annotated logs."""
     del list_estimators
-    from pdhef_logtool.runs.fleet import limits_of, run_logs
+    from pdhef_logtool.runs.fleet import Schedule, run_logs
 
-    with console.progress() as bar:
-        result = run_logs(
-            logs,
-            output,
-            config,
-            jobs=jobs,
-            ray=ray,
-            resume=resume,
-            retry=retry,
-            only=only or (),
-            limits=limits_of(config.log_timeout_s, config.max_memory_mb),
-            full_worst=config.full_worst,
-            junit=junit,
-            report=report,
-            progress=bar,
-            warn=console.warn,
-            say=console.say,
-        )
+    schedule = Schedule(jobs, ray, resume, retry, only or ())
+    with console.reporter() as reporter:
+        result = run_logs(logs, output, config, schedule=schedule, junit=junit, report=report, reporter=reporter)
     _finish(result, as_json)
 
 
@@ -175,7 +160,7 @@ def metrics(
     """Score an estimate that the log contains, with the metrics of pdhef run."""
     from pdhef_logtool.runs.recorded_estimates import score_log
 
-    with console.progress() as bar:
+    with console.reporter() as reporter:
         result = score_log(
             log,
             config,
@@ -184,8 +169,7 @@ def metrics(
             name=name,
             output=output,
             junit=junit,
-            progress=bar,
-            warn=console.warn,
+            reporter=reporter,
         )
     _finish(result, as_json)
 

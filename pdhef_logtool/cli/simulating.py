@@ -124,9 +124,15 @@ def suite(
     """Simulate a training set of drives."""
     from truthsim.suite import write_suite
 
-    with console.progress() as bar:
+    with console.reporter() as report:
         manifest = write_suite(
-            output, count=count, seed=seed, vehicles=vehicles, duration_s=duration_s, processes=jobs, progress=bar
+            output,
+            count=count,
+            seed=seed,
+            vehicles=vehicles,
+            duration_s=duration_s,
+            processes=jobs,
+            progress=report.progress,
         )
     told = ("splits", "written", "dropped_draws")
     _tell_of_set(manifest, output, told, console.print_json if as_json else console.print_facts)
@@ -152,8 +158,10 @@ def conditions(
     from truthsim.conditions import write_conditions
 
     names = None if rows is None else options.split_names(rows)
-    with console.progress() as bar:
-        manifest = write_conditions(output, drives=drives, seed=seed, rows=names, processes=jobs, progress=bar)
+    with console.reporter() as report:
+        manifest = write_conditions(
+            output, drives=drives, seed=seed, rows=names, processes=jobs, progress=report.progress
+        )
     _tell_of_set(manifest, output, ("rows",), console.print_json if as_json else _print_rows)
 
 

@@ -56,10 +56,11 @@ from pdhef_logtool.learning.stages.identify import identify
 from pdhef_logtool.learning.stages.intervals import fit_intervals
 from pdhef_logtool.learning.stages.network import train_network
 from pdhef_logtool.learning.stages.noise import tune
-from pdhef_logtool.learning.stages.task import Progress, StageOutput, Task
+from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.logs.discovery import LogInput, Logs, hash_log
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import EstimatorError, ModelError, UsageError
+from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import MANY_CARS, NO_MODEL
 from pdhef_logtool.residual_model.torch_extra import check_torch
@@ -165,7 +166,6 @@ class _Call:
     logs: Mapping[LogPlace, str]
     work: Path
     basis: str
-    say: Tell
 
 
 def learn(
@@ -174,16 +174,15 @@ def learn(
     settings: LearnSettings,
     *,
     fresh: bool = False,
-    progress: Progress = lambda _text, _share: None,
-    warn: Tell = lambda _text: None,
-    say: Tell = lambda _text: None,
+    reporter: Reporter = SILENT,
 ) -> LearnResult:
     """Run stages on drives and write the car to the folder ``output``.
 
     Parameters
     ----------
     arguments : logs, folders, glob patterns.
-    fresh : forget the results of an earlier call with this output. say : receives each stage with the time it took.
+    fresh : forget the results of an earlier call with this output.
+    reporter : its notes are the stages, each with its duration.
 
     Raises
     ------
@@ -201,7 +200,7 @@ def learn(
         )
     if NETWORK in order and str(config.network) != NO_MODEL:
         check_torch(f"; --network {NO_MODEL} trains none")
-    car = _open(settings, warn)
+    car = _open(settings, reporter.warn)
     check_output(car, output)
     inputs, set_splits = choose_drives(arguments, settings)
     read = [*(i.local for i in inputs), *(path for path in config.files if path != config.car)]
@@ -213,14 +212,13 @@ def learn(
         mapping=open_mapping(config),
         set_splits=set_splits,
         estimators=config.estimators,
-        progress=progress,
-        warn=warn,
+        reporter=reporter,
     )
     if len(order) == 1 and order != (NETWORK,):
         result = _learn_alone(task, output)
     else:
-        result = _learn_in_turn(task, inputs, output, fresh=fresh, say=say)
-    progress("done", 1.0)
+        result = _learn_in_turn(task, inputs, output, fresh=fresh)
+    reporter.progress("done", 1.0)
     return result
 
 
@@ -247,7 +245,7 @@ def _learn_alone(task: Task, output: Path) -> LearnResult:
     return LearnResult(output, stage.records, (result,), {})
 
 
-def _learn_in_turn(task: Task, inputs: Sequence[LogInput], output: Path, *, fresh: bool, say: Tell) -> LearnResult:
+def _learn_in_turn(task: Task, inputs: Sequence[LogInput], output: Path, *, fresh: bool) -> LearnResult:
     """Split the driving, run the stages one after the other and score the test part."""
     settings, given = task.settings, task.car
     records, times = _read(inputs, task)
@@ -267,7 +265,7 @@ def _learn_in_turn(task: Task, inputs: Sequence[LogInput], output: Path, *, fres
         start = _begin(work, given, settings, fresh=fresh)
         basis = digest(_basis(task, start, records))
         logs = {i.path: r.sha256 for i, r in zip(inputs, records, strict=True)}
-        call = _Call(task, logs, work, basis, say)
+        call = _Call(task, logs, work, basis)
         stages, car = _run_stages(call, start)
         kept = [s.name for s in stages if s.status == KEPT]
         ends = _cached(call, len(stages) + 1, "end", kept, lambda _: _end(call, start, car, stages))
@@ -364,7 +362,7 @@ def _cached(
     call: _Call, number: int, name: str, kept: Sequence[str], work: Callable[[Path], dict[str, Any]]
 ) -> dict[str, Any]:
     """Return the result of a stage; it depends on the inputs of the call and on the stages that are ``kept``."""
-    stages = Stages(call.work, _shown, call.say, call.task.progress)
+    stages = Stages(call.work, _shown, call.task.reporter)
     return stages.do(number, name, [call.basis, list(kept)], _share(call, number), work)
 
 
@@ -419,8 +417,7 @@ def _stage_task(call: _Call, number: int, name: str, before: Path, folder: Path)
         settings=settings,
         estimators=call.task.estimators or ESTIMATORS.get(name),
         work=folder,
-        progress=lambda text, share: call.task.progress(f"{name}: {text}", first + share * span),
-        warn=lambda _text: None,
+        reporter=Reporter(lambda text, share: call.task.reporter.progress(f"{name}: {text}", first + share * span)),
     )
 
 
@@ -435,7 +432,7 @@ def _run_stage(call: _Call, number: int, name: str, before: Path, folder: Path) 
             raise  # without it there is nothing to give
         return {"status": NOT_DONE, "text": str(error), "before": None, "after": None, "figures": {}}
     update_car(task.car, folder / CAR, output.change)
-    task.progress("scoring the validation part", 1.0)
+    task.reporter.progress("scoring the validation part", 1.0)
     old, new = (_validation_errors(call, car) for car in (before, folder / CAR))
     (was, now), gains = _compare(old, new)
     unsure = name in MUST_GAIN and not _still_sure(old, new)
@@ -507,12 +504,12 @@ def _confirmed(old: Errors, new: Errors) -> bool:
 def _end(call: _Call, start: Path, car: Path, stages: Sequence[StageResult]) -> dict[str, Any]:
     """Score the test part once, and return what more driving would be worth."""
     task = call.task
-    task.progress("scoring the test part, once", _share(call, len(stages) + 1))
+    task.reporter.progress("scoring the test part, once", _share(call, len(stages) + 1))
     curve = None
     if IDENTIFY in task.settings.order:
-        curve = learning_curve(task.split, car, task.mapping, _slice_options(task), task.progress)
+        curve = learning_curve(task.split, car, task.mapping, _slice_options(task), task.reporter.progress)
     spans = [[call.logs[s.path], *(s.span_s or ())] for s in task.split.parts[TEST]]
-    count = count_evaluations(call.work / EVALUATIONS_FILE, spans, call.say)
+    count = count_evaluations(call.work / EVALUATIONS_FILE, spans, call.task.reporter.note)
     tables = {part: table_of(task, start, car, part) for part in (VALIDATION, TEST)}
     figures = {s.name: s.figures for s in stages if s.status == KEPT}
     return {

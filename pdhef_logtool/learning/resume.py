@@ -11,6 +11,7 @@ from typing import Any
 
 from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES
 from pdhef_logtool.results.run_report import json_bytes
 from pdhef_logtool.storage.documents import digest, read_sealed, seal
@@ -26,8 +27,7 @@ class Stages:
 
     folder: Path
     shown: Callable[[dict[str, Any]], str]
-    say: Tell
-    progress: Callable[[str, float], None]
+    reporter: Reporter
 
     def do(
         self, number: int, name: str, basis: Any, share: float, work: Callable[[Path], dict[str, Any]]
@@ -40,19 +40,19 @@ class Stages:
         work : runs the stage in a folder, which then appears whole or not at all as ``NUMBER-NAME``.
         """
         key, folder = digest([name, basis]), self.place(number, name)
-        document = read_own(folder / STAGE_FILE, self.say)
+        document = read_own(folder / STAGE_FILE, self.reporter.note)
         if document is not None and document["basis"] == key:
-            self.say(f"{name}: {document['shown']} (from an earlier call)")
+            self.reporter.note(f"{name}: {document['shown']} (from an earlier call)")
             return dict(document["result"])
         began = time.monotonic()
-        self.progress(name, share)
+        self.reporter.progress(name, share)
         with writing(folder), FolderTransaction(folder, keep=False) as transaction:
             result = work(transaction.file("."))
             shown = self.shown(result)
             write_bytes(
                 transaction.file(STAGE_FILE), json_bytes(seal({"basis": key, "shown": shown, "result": result}))
             )
-        self.say(f"{name}: {shown} ({time.monotonic() - began:.0f} s)")
+        self.reporter.note(f"{name}: {shown} ({time.monotonic() - began:.0f} s)")
         as_read: dict[str, Any] = json.loads(json_bytes(result))
         return as_read
 

@@ -33,6 +33,7 @@ from pdhef_logtool.records.errors import (
     UsageError,
 )
 from pdhef_logtool.records.ledger import SampleCount
+from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
 from pdhef_logtool.results.opened_run import (
     ESTIMATES_FILE,
@@ -78,9 +79,6 @@ if TYPE_CHECKING:
     from pdhef_logtool.evaluation.thresholds import Threshold, Verdict
     from pdhef_logtool.results.selected_estimate import MainFacts
     from pdhef_logtool.storage.object_store import Mirror
-
-#: ``update(text, share)`` with share in [0, 1].
-Progress = Callable[[str, float], None]
 
 #: Up to so many logs each is told of by itself, and everything is kept.
 FEW_LOGS = 50
@@ -249,8 +247,7 @@ def run_log(
     pool: SelfCalibration | None = None,
     thresholds: Sequence[Threshold] | None = None,
     prepare: Callable[[Sequence[str]], None] = lambda _names: None,
-    progress: Progress = lambda _text, _share: None,
-    warn: Callable[[str], None] = lambda _text: None,
+    reporter: Reporter = SILENT,
 ) -> LogResult:
     """Run one log and replace its folder ``logs/<stem>`` of the outputs.
 
@@ -265,15 +262,15 @@ def run_log(
     PdhefError
         Nothing of the log can be used; nothing is then left under a final name.
     """
-    progress(log_input.stem, 0.0)
-    with read_cached(log_input, car, mapping, config.read_options, warn) as drive:
+    reporter.progress(log_input.stem, 0.0)
+    with read_cached(log_input, car, mapping, config.read_options, reporter.warn) as drive:
         calibration = checked(drive, pool if pool is not None else calibrate_drive(drive, config))
         car = self_calibrated(drive, calibration)
         ready, skipped = _choose_estimators(drive, config, car)
         prepare([e.name for e in ready])
         job = _Job(drive, car, calibration, ready, skipped, tuple(thresholds or ()))
-        result = _run_estimators(job, outputs, config, progress)
-    progress(result.outcome.log, 1.0)
+        result = _run_estimators(job, outputs, config, reporter)
+    reporter.progress(result.outcome.log, 1.0)
     return result
 
 
@@ -289,7 +286,7 @@ class _Job:
     thresholds: Sequence[Threshold]
 
 
-def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, progress: Progress) -> LogResult:
+def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporter: Reporter) -> LogResult:
     """Estimate, score and write one drive."""
     from pdhef_logtool.evaluation.thresholds import check_thresholds
     from pdhef_logtool.runs.drive_details import drive_details
@@ -300,7 +297,7 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, progres
     with outputs.begin(log_place(drive.name), stale=STALE_FILES) as change, ExitStack() as opened:
         store = opened.enter_context(TrackStore(change.scratch / "tracks"))
         causality = CausalityCheck()
-        signals = _estimate(drive, ready, intervals, store, progress, causality)
+        signals = _estimate(drive, ready, intervals, store, reporter, causality)
         ready = _without_failed(drive, ready, causality.failed)
         sensors = log_sensors(drive.car.vehicle, job.calibration)
         found = evaluate(drive, [e.name for e in ready], store.read, signals, sensors)
@@ -482,7 +479,7 @@ def _estimate(
     estimators: Sequence[Estimator],
     intervals: TrackCalibrator,
     store: TrackStore,
-    progress: Progress,
+    reporter: Reporter,
     causality: CausalityCheck,
 ) -> Signals:
     """Run all estimators over the drive into the store; return the drive's signals for segments."""
@@ -494,8 +491,8 @@ def _estimate(
             store.append_drawn(window.drawn_truth)
         for track in window.tracks:
             store.append(track, drawn=True)
-        progress(drive.name, 0.8 * window.share_done)
-    progress(drive.name, 0.8)
+        reporter.progress(drive.name, 0.8 * window.share_done)
+    reporter.progress(drive.name, 0.8)
     return store.signals()
 
 

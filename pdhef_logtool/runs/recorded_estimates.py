@@ -35,6 +35,7 @@ from pdhef_logtool.mapping import check_mapping, join_channels, mapping_of, merg
 from pdhef_logtool.mapping.estimates import EstimateSource, choose_estimates, sources_of
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.ledger import Role, damage
+from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import (
     ALIGNED_SIGNALS,
     TRUTH_UNITS,
@@ -56,7 +57,6 @@ from pdhef_logtool.runs.estimate_channels import RecordedEstimate, gap_ns, read_
 from pdhef_logtool.runs.estimating import DeadReckoning, first_pose
 from pdhef_logtool.runs.pipeline import (
     LogResult,
-    Progress,
     RunResult,
     check_places,
     files_of,
@@ -87,8 +87,7 @@ def score_log(
     name: str | None = None,
     output: Path | None = None,
     junit: Path | None = None,
-    progress: Progress = lambda _text, _share: None,
-    warn: Tell = lambda _text: None,
+    reporter: Reporter = SILENT,
 ) -> RunResult:
     """Score recorded estimates of one log against its truth; same figures, tables and report as a run.
 
@@ -110,15 +109,15 @@ def score_log(
     thresholds = read_thresholds(config, junit)
     if config.car is None:
         slow = car.vehicle.low_speed_blend_m_s
-        warn(
+        reporter.warn(
             f"no --car: the truth is taken to be measured at the centre of gravity, sideslip is scored above "
             f"{slow:g} m/s, and segments are cut at friction {car.vehicle.assumed_friction:g}"
         )
     check_places([log_input], output, config, mapping, junit)
-    scoring = _Scoring(config, car, warn, estimates, truth, name)
+    scoring = _Scoring(config, car, reporter, estimates, truth, name)
     with nullcontext() if output is None else OutputFolder(output, (LOGS,)) as outputs:
         with scoring.read(log_input, mapping) as drive:
-            result = judge(scoring.score(drive, outputs, progress), thresholds)
+            result = judge(scoring.score(drive, outputs), thresholds)
         if output is not None:
             document = _config_document(config, drive, scoring.estimates)
             write_run(output, document, result)
@@ -141,7 +140,7 @@ class _Scoring:
 
     config: RunConfig
     car: Car
-    warn: Tell
+    reporter: Reporter
     asked: Sequence[str]
     truth: Sequence[str]
     name: str | None
@@ -176,20 +175,22 @@ class _Scoring:
             return chosen
 
         options = replace(self.config.read_options, friction=None)
-        return read_drive(log_input, self.car, mapping, options, tell=self.warn, adjust=choose, require_sensors=False)
+        return read_drive(
+            log_input, self.car, mapping, options, tell=self.reporter.warn, adjust=choose, require_sensors=False
+        )
 
-    def score(self, drive: Drive, outputs: OutputFolder | None, progress: Progress) -> LogResult:
+    def score(self, drive: Drive, outputs: OutputFolder | None) -> LogResult:
         """Read, compare and, with a folder, write."""
         plan = drive.plan
-        progress(drive.name, 0.1)
+        self.reporter.progress(drive.name, 0.1)
         recorded, losses = self._read_estimates(drive)
-        progress(drive.name, 0.3)
+        self.reporter.progress(drive.name, 0.3)
         truth, truth_losses, samples, counts = read_truth(drive.log, plan, drive.options.window_s)
         ledger = sample_ledger(drive.log, plan, counts)
-        progress(drive.name, 0.6)
+        self.reporter.progress(drive.name, 0.6)
         signals = _read_sensors(drive)
         all_losses = merge_losses([drive.losses, losses, truth_losses, damage(ledger)])
-        progress(drive.name, 0.8)
+        self.reporter.progress(drive.name, 0.8)
         scored_ns = np.unique(np.concatenate([r.track.stamps_ns for r in recorded]))
         plan = self._with_dependence(plan, recorded)
         rows, dependent = self._figures(drive, plan, recorded, truth, signals)
@@ -219,7 +220,7 @@ class _Scoring:
             with outputs.begin(log_place(drive.name), stale=(PAGE_FILE,)) as change:
                 _write(change, report, rows, [written, *(r.track for r in recorded)], plan)
             folder = change.target
-        progress(drive.name, 1.0)
+        self.reporter.progress(drive.name, 1.0)
         files = {} if folder is None else files_of(folder)
         return LogResult(replace(outcome_of(drive, all_losses), files=files), folder, report, tuple(rows))
 

@@ -9,22 +9,20 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.results.opened_run import JOURNAL_FILE, LOGS, METRICS_FILE, PAGE_FILE, PARTS, REPORT_FILE
 from pdhef_logtool.runs.pipeline import STALE_FILES
+from pdhef_logtool.runs.working import DriveEnd, DriveTask, Work
 from pdhef_logtool.storage.files import open_new, scratch_folder
 from pdhef_logtool.storage.object_store import HeldError, Mirror, ObjectFolder
 from pdhef_logtool.workers.supervisor import Tell
-
-if TYPE_CHECKING:
-    from pdhef_logtool.runs.fleet import DriveEnd, DriveTask
 
 #: The journal is put this often, or less often where putting it takes more than a twentieth of the time.
 EVERY_S = 30.0
@@ -40,9 +38,7 @@ class StoredEnd:
     files: dict[str, bytes]
 
 
-def stored_drive(
-    objects: ObjectFolder, work: Callable[[DriveTask, Tell], DriveEnd], task: DriveTask, tell: Tell
-) -> StoredEnd | OutputError:
+def stored_drive(objects: ObjectFolder, work: Work, task: DriveTask, tell: Tell) -> StoredEnd | OutputError:
     """Do a drive's work and put its files into the store; what the store refuses is returned, for it ends the run."""
     with scratch_folder() as scratch:
         folder = Path(scratch) / task.output.name
@@ -54,7 +50,7 @@ def stored_drive(
         try:
             if report in names:
                 stale = {f"{here}/{name}" for name in STALE_FILES}.difference(names)
-                objects.remove(sorted({report, *stale}.intersection(task.there)))
+                objects.remove(sorted({report, *stale}.intersection(task.stored)))
             for name in names:
                 tell(f"{task.log.stem}: puts {Path(name).name}", 1.0)
                 objects.put(name, folder / name)

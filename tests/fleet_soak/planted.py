@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from pdhef_logtool.runs.fleet import DriveEnd, DriveTask, run_drive
+from pdhef_logtool.runs.working import DriveEnd, DriveTask, run_drive
 from pdhef_logtool.workers.supervisor import Tell
 from tests.runs.stub_drives import stub_drive
 

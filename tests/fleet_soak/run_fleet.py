@@ -13,8 +13,9 @@ import sys
 import time
 from pathlib import Path
 
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.fleet import run_logs
+from pdhef_logtool.runs.fleet import Schedule, run_logs
 from pdhef_logtool.workers.supervisor import Limits
 from tests.fleet_soak.planted import MEASURES, measured_drive, measured_stub, rss_bytes
 
@@ -38,13 +39,10 @@ def main() -> int:
         given.logs,
         given.output,
         RunConfig(car=Path("saloon")),
-        jobs=given.jobs,
-        resume=given.resume,
-        limits=Limits(given.silence, 3_000_000_000),
+        schedule=Schedule(given.jobs, resume=given.resume, limits=Limits(given.silence, 3_000_000_000)),
         report=not given.stub,
         work=measured_stub if given.stub else measured_drive,
-        progress=lambda _text, _share: memory.append(rss_bytes()),
-        say=said.append,
+        reporter=Reporter(lambda _text, _share: memory.append(rss_bytes()), note=said.append),
     )
     found = {
         "exit_code": result.exit_code,

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.learning.drives import LearnSettings
 from pdhef_logtool.learning.engine import LearnResult, learn
 from pdhef_logtool.logs.discovery import Logs
+from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.runs.config import RunConfig
 
 
@@ -18,8 +18,8 @@ def run_stage(
     output: Path | str,
     config: RunConfig,
     *,
-    warn: Callable[[str], None] = lambda _text: None,
+    reporter: Reporter = SILENT,
     **settings: Any,
 ) -> LearnResult:
     """Run one stage on logs and write the car to ``output``."""
-    return learn(logs, output, LearnSettings(config=config, stages=(stage,), **settings), warn=warn)
+    return learn(logs, output, LearnSettings(config=config, stages=(stage,), **settings), reporter=reporter)

@@ -32,6 +32,7 @@ from pdhef_logtool.learning.evidence.calibrate import (
 )
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
@@ -307,7 +308,7 @@ def calibration(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory)
     folder = tmp_path_factory.mktemp("calibration")
     logs = [str(sample_logs_dir / f"{n}.mcap") for n in ("dlc", "step", "fishhook", "sweep", "road", "no_truth")]
     told: list[str] = []
-    result = learn(logs, folder / "mycar", _settings(sample_logs_dir), warn=told.append)
+    result = learn(logs, folder / "mycar", _settings(sample_logs_dir), reporter=Reporter(warn=told.append))
     assert result.exit_code == 3
     assert [d.name for d in result.left_out] == ["no_truth"]
     assert [r.counts for r in result.drives] == [

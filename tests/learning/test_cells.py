@@ -28,6 +28,7 @@ from pdhef_logtool.learning.network.dataset import MANIFEST, read_dataset
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
 from pdhef_logtool.learning.network.train_command import LEAD_STEPS, gap_free_runs, weights_of
 from pdhef_logtool.records.errors import OutputError, UsageError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.storage.documents import seal
@@ -111,7 +112,7 @@ def test_extract_chooses_leaves_copies_out_and_older_sets_still_open(sample_logs
         shutil.copy(sample_logs_dir / "dlc.mcap", tmp_path / f"{name}.mcap")
     told: list[str] = []
     asked = ExtractSettings(RunConfig(), split="train", where="vx_m_s > 10", per_cell_s=2.0)
-    result = extract([str(log), str(tmp_path / "b.mcap")], out, asked, warn=told.append)
+    result = extract([str(log), str(tmp_path / "b.mcap")], out, asked, reporter=Reporter(warn=told.append))
     assert "b is left out: it holds the same signals as a" in told and result.exit_code == 0
     assert result.manifest["duplicates"] == [{"log": "b", "file": "b.mcap", "of": "a"}]
     assert [p.name for p in out.rglob("*.parquet")] == ["part-a.parquet"]

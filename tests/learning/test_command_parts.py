@@ -44,6 +44,7 @@ from pdhef_logtool.learning.stages.noise import Tuned
 from pdhef_logtool.learning.stages.task import Task
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.runs.config import RunConfig
@@ -342,7 +343,7 @@ def test_calibrate_tells_its_progress_and_whom_it_leaves_out(tmp_path: Path, mon
     told: list[tuple[str, float]] = []
     warned: list[str] = []
     settings = LearnSettings(config=SALOON, stages=("intervals",), spread=0.1, seed=4)
-    result = learn(arguments, tmp_path / "car", settings, progress=lambda *x: told.append(x), warn=warned.append)
+    result = learn(arguments, tmp_path / "car", settings, reporter=Reporter(lambda *x: told.append(x), warned.append))
     shares = {f"reading {n}": 0.9 * i / 6 for i, n in enumerate("abcdef")}
     assert dict(told) == pytest.approx(shares | {"fitting phy-ukf": 0.9, "fitting kinematic": 0.95, "done": 1.0})
     assert [s for _, s in told] == sorted(s for _, s in told)
@@ -398,7 +399,7 @@ def test_trust_tells_its_progress_warns_and_keeps_its_evidence(
     (folder / "manifest.json").write_text(json.dumps({"drives": [{"file": "b.mcap", "split": "test"}]}))
     told: list[tuple[str, float]] = []
     warned: list[str] = []
-    result = learn(arguments, tmp_path / "car", shipped, progress=lambda *x: told.append(x), warn=warned.append)
+    result = learn(arguments, tmp_path / "car", shipped, reporter=Reporter(lambda *x: told.append(x), warned.append))
     shares = (0.0, pytest.approx(1 / 3), pytest.approx(2 / 3), 1.0)
     assert told == list(zip(("reading a", "reading b", "reading c", "done"), shares, strict=True))
     missing = "pd-hef needs ay_m_s2, steer_rad, yaw_rate_rad_s"
@@ -426,7 +427,7 @@ def test_trust_tells_its_progress_warns_and_keeps_its_evidence(
         "unconfirmed_cap": 0.5, "level": 0.95, "resamples": 4000,
     }  # fmt: skip
     monkeypatch.setattr(gain, "errors_by_trust", lambda *_, **__: replace(blocks, lost=0))
-    learn(arguments[:1], tmp_path / "other", shipped, warn=warned.append)
+    learn(arguments[:1], tmp_path / "other", shipped, reporter=Reporter(warn=warned.append))
     assert len(warned) == 2
 
 
@@ -490,7 +491,7 @@ def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkey
     warned: list[str] = []
     config = replace(SALOON, estimators=("phy-ukf:tuned", "physics"))
     settings = LearnSettings(config=config, stages=("noise",), trials=6, seed=1)
-    result = learn(arguments, tmp_path / "car", settings, progress=lambda *x: told.append(x), warn=warned.append)
+    result = learn(arguments, tmp_path / "car", settings, reporter=Reporter(lambda *x: told.append(x), warned.append))
     assert dict(told) == pytest.approx(
         {f"reading {n}": 0.2 * i / 3 for i, n in enumerate("abc")}
         | {f"trial {i} of 6": 0.2 + 0.8 * i / 6 for i in range(1, 7)}
@@ -601,8 +602,7 @@ def test_extract_tells_its_progress(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         arguments,
         tmp_path / "out",
         extract_command.ExtractSettings(SALOON),
-        progress=lambda *x: told.append(x),
-        warn=warned.append,
+        reporter=Reporter(lambda *x: told.append(x), warned.append),
     )
     assert told == [("a", 0.25), ("a", 0.5), ("b", 0.75), ("b", 1.0)]
     assert warned == ["a is left out: it is no log", "b is left out: it is no log"]

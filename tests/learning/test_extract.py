@@ -26,6 +26,7 @@ from pdhef_logtool.learning.network.dataset import MANIFEST, SPLITS, read_datase
 from pdhef_logtool.learning.network.extract_command import ExtractResult, ExtractSettings, choose_split, extract
 from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.records.errors import LogError, OutputError, UsageError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.storage.documents import is_sealed, seal
@@ -325,7 +326,7 @@ def test_one_bad_log_stops_no_other(sample_logs_dir: Path, tmp_path: Path) -> No
     shutil.copy(sample_logs_dir / "dlc.mcap", logs / "good.mcap")
     (logs / "bad.mcap").write_bytes(b"this is no log")
     told: list[str] = []
-    result = extract([str(logs)], tmp_path / "out", ExtractSettings(RunConfig()), warn=told.append)
+    result = extract([str(logs)], tmp_path / "out", ExtractSettings(RunConfig()), reporter=Reporter(warn=told.append))
     assert result.exit_code == 3
     jsonschema.validate(result.manifest, SCHEMA)
     assert [f["log"] for f in result.manifest["failed"]] == ["bad"]

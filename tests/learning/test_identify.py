@@ -22,6 +22,7 @@ from pdhef_logtool.learning.car.fit_data import GUARD_S, FitDrive, split_drive
 from pdhef_logtool.learning.car.identify import _projected_levenberg_marquardt, fit_car
 from pdhef_logtool.learning.stages import identify as stage
 from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.runs.config import RunConfig
@@ -286,5 +287,11 @@ def test_projected_steps_find_the_bounded_minimum_also_from_a_start_at_the_bound
 def test_command_says_which_truth_it_took(sample_logs_dir: Path, tmp_path: Path) -> None:
     said: list[str] = []
     with pytest.raises(EstimatorError):
-        run_stage("identify", [str(sample_logs_dir / "dlc.mcap")], tmp_path / "car", RunConfig(), warn=said.append)
+        run_stage(
+            "identify",
+            [str(sample_logs_dir / "dlc.mcap")],
+            tmp_path / "car",
+            RunConfig(),
+            reporter=Reporter(warn=said.append),
+        )
     assert any(text.startswith("dlc: ") and "/rtk/odometry" in text for text in said)

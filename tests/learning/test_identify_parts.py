@@ -40,6 +40,7 @@ from pdhef_logtool.learning.engine import learn
 from pdhef_logtool.learning.stages import identify as stage
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.runs.config import RunConfig
 
@@ -628,7 +629,9 @@ def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
     told: list[tuple[str, float]] = []
     warned: list[str] = []
     settings = LearnSettings(config=RunConfig(), stages=("identify",), holdout=0.1)
-    result = learn([str(folder)], tmp_path / "car", settings, progress=lambda *x: told.append(x), warn=warned.append)
+    result = learn(
+        [str(folder)], tmp_path / "car", settings, reporter=Reporter(lambda *x: told.append(x), warned.append)
+    )
     shares = {"reading a": 0.0, "reading b": 0.2 / 3, "reading c": 0.4 / 3, "fitting": 0.6, "done": 1.0}
     assert dict(told) == pytest.approx(shares)
     assert warned == [

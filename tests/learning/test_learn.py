@@ -45,6 +45,7 @@ from pdhef_logtool.learning.split import (
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.runs.config import RunConfig
 
 ROUNDING_S = 2e-3
@@ -350,7 +351,7 @@ def test_stages_that_raise_the_error_are_undone_and_a_rerun_continues_to_the_sam
     done.clear()
     monkeypatch.setattr(engine, "score_slices", lambda *_: pytest.fail("scored more than once"))
     said: list[str] = []
-    learn(logs, halted, settings, say=said.append)
+    learn(logs, halted, settings, reporter=Reporter(note=said.append))
     assert not done and all("from an earlier call" in line for line in said) and _content(halted) == _content(whole)
 
 
@@ -419,7 +420,10 @@ def test_a_minute_of_driving_gives_a_car_that_says_what_it_could_not_learn(
     config = RunConfig(car=guess, start="210", end="270")
     said: list[str] = []
     result = learn(
-        [str(sample_logs_dir / "road.mcap")], tmp_path / "car", LearnSettings(config=config), say=said.append
+        [str(sample_logs_dir / "road.mcap")],
+        tmp_path / "car",
+        LearnSettings(config=config),
+        reporter=Reporter(note=said.append),
     )
     by_name = {s.name: s for s in result.stages}
     assert tuple(by_name) == STAGES and by_name["identify"].status == "kept"

@@ -12,6 +12,7 @@ import pytest
 
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
 from pdhef_logtool.records.errors import EXIT_PARTIAL
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from tests.learning.stage_run import run_stage
@@ -33,14 +34,16 @@ def _losses_by_command(
 
     tuned = replace(physics, estimators=("phy-ukf:tuned",))
     commands = {
-        "identify": lambda tell: run_stage("identify", logs, out / "1", config, holdout=0.0, warn=tell),
-        "extract": lambda tell: extract(logs, out / "2", ExtractSettings(physics), warn=tell),
-        "noise": lambda tell: run_stage("noise", logs, out / "3", tuned, trials=4, warn=tell),
-        "gain": lambda tell: run_stage("gain", logs, out / "4", config, warn=tell),
-        "intervals": lambda tell: run_stage(
-            "intervals", [*logs, *map(str, others)], out / "5", physics, spread=0.0, warn=tell
+        "identify": lambda tell: run_stage(
+            "identify", logs, out / "1", config, holdout=0.0, reporter=Reporter(warn=tell)
         ),
-        "run": lambda tell: run_logs(logs, out / "6", replace(physics, annotate="none"), warn=tell),
+        "extract": lambda tell: extract(logs, out / "2", ExtractSettings(physics), reporter=Reporter(warn=tell)),
+        "noise": lambda tell: run_stage("noise", logs, out / "3", tuned, trials=4, reporter=Reporter(warn=tell)),
+        "gain": lambda tell: run_stage("gain", logs, out / "4", config, reporter=Reporter(warn=tell)),
+        "intervals": lambda tell: run_stage(
+            "intervals", [*logs, *map(str, others)], out / "5", physics, spread=0.0, reporter=Reporter(warn=tell)
+        ),
+        "run": lambda tell: run_logs(logs, out / "6", replace(physics, annotate="none"), reporter=Reporter(warn=tell)),
     }
     for name, command in commands.items():
         told: list[str] = []

@@ -45,6 +45,7 @@ from pdhef_logtool.learning.network.train_command import gap_free_runs, make_rec
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.errors import EstimatorError, ModelError, OutputError, UsageError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES, NOMINAL_FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
@@ -374,7 +375,7 @@ def test_a_process_that_dies_costs_its_own_drive_only(monkeypatch: pytest.Monkey
             yield Ended(number, item, None if lost else extract_command._failure(item, "fine"), lost)
 
     monkeypatch.setattr(extract_command, "supervise", supervise_)
-    found = extract_command._run_jobs([_job(name) for name in "abc"], 2, lambda *_: None, print)
+    found = extract_command._run_jobs([_job(name) for name in "abc"], 2, Reporter(warn=print))
     assert sorted((r.record.name, r.record.left_out) for r in found) == [
         ("a", "fine"), ("b", "the worker was killed (signal 9)"), ("c", "fine"),
     ]  # fmt: skip
@@ -387,7 +388,7 @@ def test_progress_of_several_drives_at_once_adds_up(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(extract_command, "_extract", extract)
     told: list[tuple[str, float]] = []
-    list(extract_command._run_jobs([_job("a"), _job("b")], 1, lambda *what: told.append(what), print))
+    list(extract_command._run_jobs([_job("a"), _job("b")], 1, Reporter(lambda *what: told.append(what), print)))
     assert told == [("a", 0.25), ("b", 0.75)]
 
 
@@ -397,12 +398,12 @@ def test_an_error_of_one_log_is_a_reason_and_of_the_only_log_an_error(monkeypatc
         raise ModelError(expected="x", got="y", where=name) if name == "a" else KeyError("k")
 
     monkeypatch.setattr(extract_command, "_extract", fail)
-    found = list(extract_command._run_jobs([_job("a"), _job("b")], 1, lambda *_: None, print))
+    found = list(extract_command._run_jobs([_job("a"), _job("b")], 1, Reporter(warn=print)))
     assert "expected x" in found[0].record.left_out
     assert found[1].record.left_out == "internal error, KeyError: 'k'"
     assert (found[0].record.file, found[0].entry, found[0].kept) == ("a.mcap", None, False)
     with pytest.raises(ModelError):
-        list(extract_command._run_jobs([_job("a")], 4, lambda *_: None, print))
+        list(extract_command._run_jobs([_job("a")], 4, Reporter(warn=print)))
 
 
 def test_an_empty_split_is_told_and_a_default_car_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -421,7 +422,7 @@ def test_an_empty_split_is_told_and_a_default_car_is(tmp_path: Path, monkeypatch
     monkeypatch.setattr(extract_command, "_extract", one)
     warned: list[str] = []
     settings = ExtractSettings(RunConfig())
-    result = extract_command.extract([str(tmp_path)], tmp_path / "out", settings, warn=warned.append)
+    result = extract_command.extract([str(tmp_path)], tmp_path / "out", settings, reporter=Reporter(warn=warned.append))
     assert warned == [
         "no --car: residuals are those of the default sedan",
         "no drive fell to validation: with few drives choose with --split, or another --seed",
@@ -430,7 +431,7 @@ def test_an_empty_split_is_told_and_a_default_car_is(tmp_path: Path, monkeypatch
     assert [v["name"] for v in result.manifest["vehicles"]] == ["sedan"]
     warned.clear()
     chosen = replace(settings, split="train", config=RunConfig(car=Path("saloon")))
-    extract_command.extract([str(tmp_path)], tmp_path / "out", chosen, warn=warned.append)
+    extract_command.extract([str(tmp_path)], tmp_path / "out", chosen, reporter=Reporter(warn=warned.append))
     assert warned == []
     with pytest.raises(UsageError, match="--jobs"):
         extract_command.extract([str(tmp_path)], tmp_path / "new", settings, jobs=0)

@@ -12,6 +12,7 @@ import torch
 
 from pdhef_logtool.car.car import Car, read_history
 from pdhef_logtool.learning.stages import identify
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
@@ -90,7 +91,7 @@ class Commands:
         """Return what a run says of the car's parts, and what its intervals are made of, by estimator."""
         told: list[str] = []
         config = RunConfig(car=self.car, estimators=("physics", "pd-hef"), annotate="none", end="+3s")
-        result = run_logs([log], out, config, warn=told.append)
+        result = run_logs([log], out, config, reporter=Reporter(warn=told.append))
         report = result.results[0].report
         assert report is not None
         return [t for t in told if "pdhef " in t], {e["name"]: e["intervals"] for e in report["estimators"]}

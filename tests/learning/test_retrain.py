@@ -29,6 +29,7 @@ from pdhef_logtool.learning.retrain.retrain_command import (
     retrain,
 )
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EstimatorError, OutputError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.reports import comparison
 from pdhef_logtool.runs.config import RunConfig
 
@@ -69,7 +70,7 @@ def test_parts_have_what_they_need_first_and_then_their_share() -> None:
 
 def test_a_stage_is_done_once_for_a_basis_and_stands_whole_or_not_at_all(tmp_path: Path) -> None:
     said: list[str] = []
-    stages = Stages(tmp_path, lambda found: f"came to {found['n']}", said.append, lambda *_: None)
+    stages = Stages(tmp_path, lambda found: f"came to {found['n']}", Reporter(note=said.append))
     done: list[int] = []
 
     def work(folder: Path) -> dict[str, Any]:
@@ -151,7 +152,7 @@ class Fleet:
         self.told.clear()
         wanted = RetrainSettings(config=RunConfig(car=Path("saloon")), **asked)
         logs, out = [str(self.folder / "logs")], self.folder / "out"
-        return retrain(logs, out, wanted, say=self.said.append, warn=self.told.append)
+        return retrain(logs, out, wanted, reporter=Reporter(warn=self.told.append, note=self.said.append))
 
 
 @pytest.fixture

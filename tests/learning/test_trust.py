@@ -38,6 +38,7 @@ from pdhef_logtool.learning.evidence.trust import (
 from pdhef_logtool.learning.stages.gain import errors_by_trust, seen_by_identification
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
@@ -284,7 +285,7 @@ def test_the_file_is_the_one_that_was_given_but_for_the_network(sample_logs_dir:
     options = replace(options, config=replace(options.config, car=source))
     logs = [str(sample_logs_dir / f"{n}.mcap") for n in ("dlc", "step", "no_truth")]
     told: list[str] = []
-    result = learn(logs, tmp_path / "trusted", options, warn=told.append)
+    result = learn(logs, tmp_path / "trusted", options, reporter=Reporter(warn=told.append))
     assert result.exit_code == 3
     assert any(line.startswith("no_truth is left out") for line in told)
     before, after = Car.load(source), Car.load(tmp_path / "trusted", network=tmp_path / "model")

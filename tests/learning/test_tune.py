@@ -36,6 +36,7 @@ from pdhef_logtool.learning.noise.search import (
     sobol_points,
 )
 from pdhef_logtool.records.errors import EstimatorError, LogError, UsageError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
@@ -291,7 +292,10 @@ def test_a_drive_without_truth_is_left_out_and_told(sample_logs_dir: Path, tmp_p
     logs = [str(sample_logs_dir / "dlc.mcap"), str(sample_logs_dir / "no_truth.mcap")]
     told: list[str] = []
     result = learn(
-        logs, tmp_path / "car", _settings(sample_logs_dir, split=None, names=("phy-ukf:tuned",)), warn=told.append
+        logs,
+        tmp_path / "car",
+        _settings(sample_logs_dir, split=None, names=("phy-ukf:tuned",)),
+        reporter=Reporter(warn=told.append),
     )
     assert result.exit_code == 3
     assert [d.name for d in result.left_out] == ["no_truth"]

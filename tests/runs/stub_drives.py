@@ -12,8 +12,9 @@ from pdhef_logtool.logs.discovery import identity_of
 from pdhef_logtool.results.parquet_sink import write_metrics
 from pdhef_logtool.results.run_report import CarFacts, LogOutcome, write_json
 from pdhef_logtool.runs.cars import RunCars, car_record
-from pdhef_logtool.runs.fleet import DriveEnd, DriveTask, digest_of, outputs_digest
+from pdhef_logtool.runs.journal import digest_of, outputs_digest
 from pdhef_logtool.runs.pipeline import files_of
+from pdhef_logtool.runs.working import DriveEnd, DriveTask
 from pdhef_logtool.storage.files import PendingFile
 from pdhef_logtool.workers.supervisor import Tell
 

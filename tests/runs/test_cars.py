@@ -13,6 +13,7 @@ import pytest
 from pdhef_logtool.logs.discovery import LogInput, find_logs
 from pdhef_logtool.logs.open_log import log_metadata
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.runs.cars import RunCars
 from pdhef_logtool.runs.config import RunConfig, load_config
@@ -125,7 +126,7 @@ def test_a_run_says_which_car_each_log_had_and_one_without_stops_no_other(fleet:
     shutil.copy(fleet / "fleet/golf/day/golf_1.mcap", fleet / "fleet/lost.mcap")
     config = RunConfig(cars=fleet / "cars.toml", annotate="none", estimators=("zero",))
     said: list[str] = []
-    result = run_logs([str(fleet / "fleet")], fleet / "out", config, warn=said.append)
+    result = run_logs([str(fleet / "fleet")], fleet / "out", config, reporter=Reporter(warn=said.append))
     assert result.exit_code == 3
     run = json.loads((fleet / "out/run.json").read_text())
     jsonschema.validate(run, load_schema("run.schema.json"))

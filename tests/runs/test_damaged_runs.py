@@ -15,8 +15,8 @@ from pdhef_logtool.cli import running
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.results.run_report import LogOutcome
-from pdhef_logtool.runs.fleet import DriveEnd
 from pdhef_logtool.runs.journal import Journal
+from pdhef_logtool.runs.working import DriveEnd
 from pdhef_logtool.storage.documents import seal
 from studies.torture.workers import Ended, command
 from tests.runs.stub_drives import stub_drive

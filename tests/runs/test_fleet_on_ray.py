@@ -15,7 +15,8 @@ import pytest
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.results.opened_run import METRICS_FILE, open_run
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.fleet import _on_node, run_logs
+from pdhef_logtool.runs.fleet import Schedule, run_logs
+from pdhef_logtool.runs.working import run_on_node
 from pdhef_logtool.workers.supervisor import Limits
 from tests.runs.stub_drives import stub_drive, waiting_drive
 from tests.runs.test_fleet_runs import named_logs
@@ -62,7 +63,7 @@ def test_a_fleet_on_three_nodes_one_of_which_goes_equals_one_here(
         work = partial(waiting_drive, tmp_path)
         # Folders are named as from here: nodes work in the same one.
         run = partial(run_logs, ["logs"], config=RunConfig(keep="metrics"), report=False)
-        result = run(output=Path("out"), ray=cluster.address, work=work)
+        result = run(output=Path("out"), schedule=Schedule(ray=cluster.address), work=work)
         killer.join()
     assert lost, "a node went while its drive was worked on"
     assert result.exit_code == 0
@@ -82,9 +83,9 @@ def test_a_fleet_on_a_cluster_whose_output_is_in_a_store_equals_one_here(
     logs = named_logs(tmp_path / "logs", *(f"drive_{i}" for i in range(6)))
     run = partial(run_logs, [str(logs)], config=RunConfig(keep="metrics"), report=False, work=stub_drive)
     with s3_store() as store, cluster_of_one() as cluster:
-        assert run(output=f"{store.url}/out", ray=cluster.address).exit_code == 0
+        assert run(output=f"{store.url}/out", schedule=Schedule(ray=cluster.address)).exit_code == 0
         named_logs(logs, "later")
-        assert run(output=f"{store.url}/out", ray=cluster.address, resume=True).exit_code == 0
+        assert run(output=f"{store.url}/out", schedule=Schedule(ray=cluster.address, resume=True)).exit_code == 0
         found = store.objects("out")
     run(output=tmp_path / "out")
     timed = ("run.json", "journal.jsonl")
@@ -92,7 +93,7 @@ def test_a_fleet_on_a_cluster_whose_output_is_in_a_store_equals_one_here(
 
 
 def test_an_output_that_a_node_does_not_see_is_told(tmp_path: Path) -> None:
-    told = _on_node(stub_drive, tmp_path, tmp_path / ".nodes-x", None, lambda *_: None)  # type: ignore[arg-type]
+    told = run_on_node(stub_drive, tmp_path, tmp_path / ".nodes-x", None, lambda *_: None)  # type: ignore[arg-type]
     assert isinstance(told, OutputError)
     assert "a folder that all nodes of the cluster see" in str(told)
 
@@ -100,5 +101,11 @@ def test_an_output_that_a_node_does_not_see_is_told(tmp_path: Path) -> None:
 def test_without_ray_or_a_cluster_there_is_one_line(tmp_path: Path) -> None:
     logs = named_logs(tmp_path / "logs", "a", "b")
     with pytest.raises(UsageError, match="--ray: expected"):
-        run_logs([str(logs)], tmp_path / "out", RunConfig(), ray="127.0.0.1:1", work=stub_drive, limits=Limits())
+        run_logs(
+            [str(logs)],
+            tmp_path / "out",
+            RunConfig(),
+            schedule=Schedule(ray="127.0.0.1:1", limits=Limits()),
+            work=stub_drive,
+        )
     assert not list((tmp_path / "out").glob(".nodes-*"))

@@ -7,6 +7,7 @@ import os
 import shutil
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,14 @@ import polars as pl
 import pytest
 
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.results.opened_run import JOURNAL_FILE, open_run
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.results.summary import summarise
 from pdhef_logtool.runs import fleet
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.fleet import DriveEnd, DriveTask, run_logs
+from pdhef_logtool.runs.fleet import Schedule, run_logs
+from pdhef_logtool.runs.working import DriveEnd, DriveTask
 from pdhef_logtool.workers.supervisor import Limits, Tell
 from tests.fleet_soak.planted import planted_stub
 from tests.runs.stub_drives import stub_drive
@@ -51,8 +54,13 @@ class Counted:
 
 def run(folder: Path | list[str], output: Path, config: RunConfig | None = None, **options: Any) -> Any:
     arguments = folder if isinstance(folder, list) else [str(folder)]
-    options = {"work": stub_drive, "report": False, "limits": Limits(), **options}
-    return run_logs(arguments, output, config or RunConfig(), **options)
+    names = ("jobs", "ray", "resume", "retry", "only")
+    schedule = Schedule(**{n: options.pop(n) for n in names if n in options}, limits=options.pop("limits", Limits()))
+    silent = Reporter()
+    warn, note = options.pop("warn", silent.warn), options.pop("say", silent.note)
+    config = replace(config or RunConfig(), full_worst=options.pop("full_worst", None))
+    options = {"work": stub_drive, "report": False, "schedule": schedule, **options}
+    return run_logs(arguments, output, config, reporter=Reporter(warn=warn, note=note), **options)
 
 
 def test_what_is_done_is_not_done_again_and_a_folder_added_later_runs_alone(tmp_path: Path) -> None:
@@ -104,7 +112,7 @@ def test_resuming_reads_no_log_again(tmp_path: Path, monkeypatch: pytest.MonkeyP
     def read(_: object) -> str:
         raise AssertionError("a log was read to be known again")
 
-    monkeypatch.setattr("pdhef_logtool.runs.fleet.identity_of", read)
+    monkeypatch.setattr("pdhef_logtool.runs.working.identity_of", read)
     work = Counted()
     run(logs, out, resume=True, work=work)
     assert work.asked == []
@@ -242,8 +250,8 @@ def test_two_jobs_that_are_killed_and_go_on_leave_what_one_job_leaves(
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(fleet, "_PRELOAD", ("pdhef_logtool.runs.*",))  # compiled code is for those that get on
-        run_logs(logs, two, config, jobs=2, progress=killed)
-    assert run_logs(logs, two, config, jobs=2, resume=True).exit_code == 0
+        run_logs(logs, two, config, schedule=Schedule(jobs=2), reporter=Reporter(killed))
+    assert run_logs(logs, two, config, schedule=Schedule(jobs=2, resume=True)).exit_code == 0
     assert contents(one) == contents(two)
     folder = two / "logs/dlc"
     assert {p.name for p in folder.iterdir()} == {"estimates.parquet", "metrics.parquet", "report.json", "setup.toml"}
@@ -257,7 +265,7 @@ def test_metrics_alone_leave_a_short_report_by_the_schema(sample_logs_dir: Path,
 
     logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")]
     config = RunConfig(car=Path("saloon"), keep="metrics", end="4")
-    result = run_logs(logs, tmp_path, config, full_worst=1)
+    result = run_logs(logs, tmp_path, replace(config, full_worst=1))
     worst = "step"
     report = tmp_path / "logs/dlc/report.json"
     assert {p.name for p in report.parent.iterdir()} == {"report.json", "setup.toml"}

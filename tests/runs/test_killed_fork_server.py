@@ -15,7 +15,8 @@ import pytest
 from pdhef_logtool.records.errors import WorkerError
 from pdhef_logtool.runs import fleet
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.fleet import DriveEnd, DriveTask, run_logs
+from pdhef_logtool.runs.fleet import run_logs
+from pdhef_logtool.runs.working import DriveEnd, DriveTask
 from pdhef_logtool.storage.files import PendingFile
 from pdhef_logtool.workers.supervisor import Limits, Tell
 from tests.runs.stub_drives import stub_drive

@@ -15,6 +15,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
 from pdhef_logtool.estimators.table import SPECS, all_names
 from pdhef_logtool.records.errors import EstimatorError, LogError, MappingError, UsageError, VehicleError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.runs import pipeline
 from pdhef_logtool.runs.config import RunConfig
@@ -240,7 +241,7 @@ def test_one_bad_log_does_not_stop_the_others(sample_logs_dir: Path, tmp_path: P
     said: list[str] = []
     arguments = [str(bad), str(sample_logs_dir / "dlc.mcap")]
     config = _config(sample_logs_dir, estimators=("zero",))
-    result = run_logs(arguments, tmp_path / "out", config, warn=said.append)
+    result = run_logs(arguments, tmp_path / "out", config, reporter=Reporter(warn=said.append))
     assert result.exit_code == 3
     run = json.loads((tmp_path / "out/run.json").read_text())
     outcomes = [o["outcome"] for o in run["logs"]]
@@ -353,7 +354,7 @@ def test_a_part_that_is_not_used_is_told(sample_logs_dir: Path, tmp_path: Path) 
         (car / "vehicle.toml").write_text(changed)
         said: list[str] = []
         config = _config(sample_logs_dir, car=car, estimators=("open-loop",), end="3")
-        run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / name, config, warn=said.append)
+        run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / name, config, reporter=Reporter(warn=said.append))
         assert (
             "fit.toml is not used: vehicle.toml has changed since; pdhef learn --stages identify makes it anew" in said
         ) == (name == "other")

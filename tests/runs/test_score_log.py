@@ -17,6 +17,7 @@ from mcap.writer import Writer
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import MappingError, UsageError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
@@ -273,7 +274,9 @@ def test_other_stamps_than_the_truths_without_any_imu(tmp_path: Path) -> None:
         {"/ins/odometry": at_truth, "/mine": at_estimate},
     )
     said: list[str] = []
-    result = score_log(str(tmp_path / "line.mcap"), RunConfig(), estimates=["/mine"], warn=said.append)
+    result = score_log(
+        str(tmp_path / "line.mcap"), RunConfig(), estimates=["/mine"], reporter=Reporter(warn=said.append)
+    )
     report = result.results[0].report
     assert report is not None
     assert _value(report, "vx_m_s", "rmse") == pytest.approx(0.05, rel=1e-6)

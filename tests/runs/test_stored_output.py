@@ -15,7 +15,7 @@ import pytest
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.results.opened_run import JOURNAL_FILE, METRICS_FILE, open_run
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.fleet import DriveEnd, DriveTask
+from pdhef_logtool.runs.working import DriveEnd, DriveTask
 from pdhef_logtool.storage import object_store
 from pdhef_logtool.storage.object_store import LEFT_OVER_S, HeldError, ObjectFolder
 from pdhef_logtool.storage.outputs import LOCK_FILE

@@ -63,6 +63,7 @@ from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
+from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, NOMINAL_MODEL, PHYSICS_MODEL
 from pdhef_logtool.results.run_report import tool_versions
@@ -226,8 +227,7 @@ def extract(
     jobs: int = 1,
     resume: bool = False,
     splits: Mapping[str, str] | None = None,
-    progress: Progress = lambda _text, _share: None,
-    warn: Tell = lambda _text: None,
+    reporter: Reporter = SILENT,
 ) -> ExtractResult:
     """Write the residual dataset of logs with truth to a folder.
 
@@ -251,7 +251,7 @@ def extract(
     _check_counts(jobs, settings)
     inputs = find_logs(arguments, private_redirects=settings.config.allow_private_redirects)
     mapping = open_mapping(settings.config)
-    work = list(_plan_jobs(inputs, output, settings, mapping, resume, warn))
+    work = list(_plan_jobs(inputs, output, settings, mapping, resume, reporter.warn))
     if splits is not None:
         work = [replace(job, listed_split=splits[job.log_input.stem]) for job in work]
     before = _earlier(output, settings)
@@ -269,7 +269,7 @@ def extract(
         else:
             with writing(output):
                 (output / MANIFEST).unlink(missing_ok=True)
-        results = _without_copies(_extract_all(work, jobs, progress, warn), warn)
+        results = _without_copies(_extract_all(work, jobs, reporter), reporter.warn)
         for job in work:
             sha, vehicle = job.physics
             vehicles[sha] = vehicle_entry(sha, vehicle, identified=job.car.fitted_physics is not None)
@@ -278,7 +278,7 @@ def extract(
             remove_unnamed(output, manifest)
     empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
     if empty and manifest["drives"] and splits is None and settings.split is None:
-        warn(f"no drive fell to {' and '.join(empty)}: with few drives choose with --split, or another --seed")
+        reporter.warn(f"no drive fell to {' and '.join(empty)}: with few drives choose with --split, or another --seed")
     return ExtractResult(output, manifest, results)
 
 
@@ -344,12 +344,12 @@ def _check_apart(entries: Sequence[Mapping[str, Any]]) -> None:
                 )
 
 
-def _extract_all(work: Sequence[_Job], jobs: int, progress: Progress, warn: Tell) -> tuple[DriveResult, ...]:
+def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[DriveResult, ...]:
     by_log: dict[str, DriveResult] = {}
-    for done, result in enumerate(_run_jobs(work, jobs, progress, warn), start=1):
+    for done, result in enumerate(_run_jobs(work, jobs, reporter), start=1):
         by_log[result.record.name] = result
-        tell_drive(result.record, warn)
-        progress(result.record.name, done / len(work))
+        tell_drive(result.record, reporter.warn)
+        reporter.progress(result.record.name, done / len(work))
     return tuple(by_log[job.log_input.stem] for job in work)
 
 
@@ -423,19 +423,21 @@ def _car(path: Path | None) -> Car:
     return Car.load(path, network=NO_MODEL, intervals=NO_INTERVALS)
 
 
-def _run_jobs(work: Sequence[_Job], jobs: int, progress: Progress, warn: Tell) -> Iterator[DriveResult]:
+def _run_jobs(work: Sequence[_Job], jobs: int, reporter: Reporter) -> Iterator[DriveResult]:
     """Yield one result a job, in any order; a process that dies costs its own drive only."""
     if len(work) == 1:
-        yield _extract(work[0], partial(progress, work[0].log_input.stem))
+        yield _extract(work[0], partial(reporter.progress, work[0].log_input.stem))
         return
     shares: dict[int, float] = {}
 
     def told(number: int, name: str, share: float) -> None:
         shares[number] = share
-        progress(name, sum(shares.values()) / len(work))
+        reporter.progress(name, sum(shares.values()) / len(work))
 
     preload = (__name__, *FILTERS)
-    ends = supervise(_extract_guarded, work, jobs=min(jobs, len(work)), preload=preload, progress=told, warn=warn)
+    ends = supervise(
+        _extract_guarded, work, jobs=min(jobs, len(work)), preload=preload, progress=told, warn=reporter.warn
+    )
     with closing(ends):
         for ended in ends:
             shares[ended.number] = 1.0

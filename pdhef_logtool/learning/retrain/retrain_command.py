@@ -56,6 +56,7 @@ from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.errors import EXIT_GATE, EstimatorError, OutputError, PdhefError
+from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.residual_model.bundle import MANY_CARS, NO_MODEL, open_model
 from pdhef_logtool.residual_model.torch_extra import check_torch
 from pdhef_logtool.results.comparing import compare_runs
@@ -63,7 +64,7 @@ from pdhef_logtool.results.gate import Figure, Gate
 from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES, open_run
 from pdhef_logtool.results.run_report import json_bytes
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.fleet import run_logs
+from pdhef_logtool.runs.fleet import Schedule, run_logs
 from pdhef_logtool.storage.documents import digest, read_sealed, seal
 from pdhef_logtool.storage.files import write_bytes, writing
 from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder, check_no_input
@@ -175,7 +176,7 @@ class _Retraining:
         return self.stages.do(number, name, basis, number / 8.0, work)
 
     def step(self, number: int, text: str, share: float) -> None:
-        self.stages.progress(text, (number + share) / 8.0)
+        self.stages.reporter.progress(text, (number + share) / 8.0)
 
 
 def retrain(
@@ -184,16 +185,14 @@ def retrain(
     settings: RetrainSettings,
     *,
     jobs: int = 1,
-    progress: Progress = lambda _text, _share: None,
-    warn: Tell = lambda _text: None,
-    say: Tell = lambda _text: None,
+    reporter: Reporter = SILENT,
 ) -> RetrainResult:
     """Fine-tune the network of a car on logs with ground truth, and compare the car with it to the car as it is.
 
     Parameters
     ----------
     arguments : logs, folders, glob patterns. jobs : processes that read and extract; changes nothing that is written.
-    say : receives each stage with the time it took.
+    reporter : its notes are the stages, each with its duration.
 
     Raises
     ------
@@ -206,7 +205,7 @@ def retrain(
     """
     check_torch()
     config = settings.config
-    car = open_car(config, warn)
+    car = open_car(config, reporter.warn)
     inputs = find_logs(arguments, private_redirects=config.allow_private_redirects)
     read = [*(i.local for i in inputs), *config.files]
     check_no_input(read, [], [output / name for name in (WORK, ACCEPTED, REJECTED)])
@@ -214,18 +213,18 @@ def retrain(
     with OutputFolder(output, (WORK, ACCEPTED, REJECTED)):
         with writing(work):
             work.mkdir(exist_ok=True)
-        stages = Stages(work, lambda found: str(found["shown"]), say, progress)
+        stages = Stages(work, lambda found: str(found["shown"]), reporter)
         hashes = {i.stem: identity_of(i) for i in inputs}
         car_sha256 = None if car.source is None else hash_log(car.source)
         basis = digest([record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=config), car), car_sha256])
-        records, signals = _look(inputs, hashes, car, config, work / SEEN_FILE, basis, jobs, progress, say)
+        records, signals = _look(inputs, hashes, car, config, work / SEEN_FILE, basis, jobs, reporter)
         records, drives = _roles(inputs, records, signals, car, settings, work)
         told = set[str]()
 
         def once(text: str) -> None:
             if text not in told:
                 told.add(text)
-                warn(text)
+                reporter.warn(text)
 
         for record in records:
             tell_drive(record, once)
@@ -237,7 +236,7 @@ def retrain(
         counts = {role: len(drives[role]) for role in SHARES}
         document = {**document, "drives_by_role": counts, "judged": len(judged)}
         folder = _publish(this, output, name, document)
-    progress("done", 1.0)
+    reporter.progress("done", 1.0)
     return RetrainResult(folder, tuple(records), document)
 
 
@@ -290,22 +289,21 @@ def _look(  # positional: what reading takes, where it is remembered, and how it
     file: Path,
     basis: str,
     jobs: int,
-    progress: Progress,
-    say: Tell,
+    reporter: Reporter,
 ) -> tuple[list[DriveRecord], list[str | None]]:
     """Return a record of every log and the hash of its signals; what earlier calls have read is not read again."""
     mapping = open_mapping(config)
     basis = digest([basis, repr(mapping)])
-    document = read_own(file, say)
+    document = read_own(file, reporter.note)
     known: dict[str, Any] = document["logs"] if document is not None and document["basis"] == basis else {}
     new = [_Log(i, car, mapping, config) for i in inputs if hashes[i.stem] not in known]
 
     def tell(number: int, text: str, share: float) -> None:
-        progress(f"reading {text}", (number + share) / len(new) / 8.0)
+        reporter.progress(f"reading {text}", (number + share) / len(new) / 8.0)
 
     records = dict[str, DriveRecord]()
     preload = ("pdhef_logtool.drive.reading", *FILTERS)
-    for ended in supervise(_read_log, new, jobs=jobs, preload=preload, progress=tell, warn=say):
+    for ended in supervise(_read_log, new, jobs=jobs, preload=preload, progress=tell, warn=reporter.note):
         log_input, seen = ended.item.log_input, ended.result
         if seen is None:
             reason = "it could not be read" if ended.failure is None else ended.failure.reason
@@ -443,8 +441,7 @@ def _extract(this: _Retraining) -> dict[str, Any]:
         jobs=this.jobs,
         resume=True,
         splits=splits,
-        progress=lambda text, share: this.step(1, text, share),
-        warn=this.warn,
+        reporter=Reporter(lambda text, share: this.step(1, text, share), this.warn),
     )
     found = result.manifest
     rows = {split: found["splits"][split]["usable_rows"] for split in (TRAIN, STOP)}
@@ -496,7 +493,7 @@ def _stage(
         split=Split.undivided(this.drives[role]),
         mapping=open_mapping(config),
         estimators=config.estimators,
-        progress=lambda text, share: this.step(number, text, share),
+        reporter=Reporter(lambda text, share: this.step(number, text, share)),
     )
     output = run(task)
     update_car(car, folder / CAR_FOLDER, output.change)
@@ -529,9 +526,9 @@ def _run(this: _Retraining, number: int, folder: Path, car: Path | None, network
         logs,
         folder / "run",
         config,
-        jobs=this.jobs,
+        schedule=Schedule(jobs=this.jobs),
         report=False,
-        progress=lambda text, share: this.step(number, text, share),
+        reporter=Reporter(lambda text, share: this.step(number, text, share)),
     )
     return {"shown": f"{len(logs)} drives of the gate", "exit_code": result.exit_code}
 

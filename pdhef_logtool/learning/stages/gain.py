@@ -77,10 +77,10 @@ def find_gain(task: Task) -> StageOutput:
     if not drives:
         raise no_drive("a true sideslip and the signals of pd-hef", GAIN)
     for text in seen_by_identification(car, drives):
-        task.warn(text)
+        task.reporter.warn(text)
     together = join_blocks(scored)
     if together.lost:
-        task.warn(f"{together.lost} stamps without an estimate at some gain above 0 are counted against it")
+        task.reporter.warn(f"{together.lost} stamps without an estimate at some gain above 0 are counted against it")
     decision = decide_cap(together, seed=task.settings.seed)
     shipped = car.network_name in SHIPPED_FOLDERS
     part = Trust(

@@ -52,16 +52,20 @@ def identify(task: Task) -> StageOutput:
     # On the training part alone: nothing may be taken from what is held out.
     proposals = sensors_of(fit, start)
     for proposal in proposals:
-        task.warn(f"{proposal.subject}: {proposal.evidence}; the fit removes it ({', '.join(proposal.entries)})")
+        task.reporter.warn(
+            f"{proposal.subject}: {proposal.evidence}; the fit removes it ({', '.join(proposal.entries)})"
+        )
     _, with_sensors = apply_proposals(proposals, Mapping(), start)
     if with_sensors.sensors.yaw_rate_delay_s != start.sensors.yaw_rate_delay_s:
-        records, fit, held_out = _read(replace(task, warn=lambda _text: None), with_sensors)
+        records, fit, held_out = _read(
+            replace(task, reporter=replace(task.reporter, warn=lambda _text: None)), with_sensors
+        )
     identification = fit_car(
         fit,
         held_out,
         with_sensors,
         steering_wheel=any(drive.steering_wheel for drive in fit),
-        progress=lambda text, share: task.progress(text, 0.2 + 0.8 * share),
+        progress=lambda text, share: task.reporter.progress(text, 0.2 + 0.8 * share),
     )
     used = (r for r in records if not r.left_out)
     drives = tuple(

@@ -66,7 +66,9 @@ def fit_intervals(task: Task) -> StageOutput:
     if len(logs) < MIN_DRIVES:
         raise _too_few(len(logs))
     if task.car.network is not None and "train" in task.set_splits.values():
-        task.warn("drives of split train: a network is better there than in service, and its intervals too narrow")
+        task.reporter.warn(
+            "drives of split train: a network is better there than in service, and its intervals too narrow"
+        )
     numbers = itertools.count()
     records, ran = task.read(logs, lambda log: _run_drive(log, next(numbers), task), RUNNING)
     names: dict[str, tuple[str, Algorithm]] = {}
@@ -77,11 +79,11 @@ def fit_intervals(task: Task) -> StageOutput:
     entries: list[IntervalEntry] = []
     for number, (identity, parts) in enumerate(samples.items()):
         name, algorithm = names[identity]
-        task.progress(f"fitting {name}", RUNNING + (1.0 - RUNNING) * number / len(samples))
+        task.reporter.progress(f"fitting {name}", RUNNING + (1.0 - RUNNING) * number / len(samples))
         joined = join_samples(parts)
         count = int(np.unique(joined.drive[~joined.wrong]).size)
         if count < MIN_DRIVES:
-            task.warn(f"{name} is not calibrated: it has {count} drives, at least {MIN_DRIVES} are needed")
+            task.reporter.warn(f"{name} is not calibrated: it has {count} drives, at least {MIN_DRIVES} are needed")
             continue
         entries.append(_entry(name, algorithm, fit_inflation(joined)))
     if not entries:

@@ -39,7 +39,9 @@ def train_network(task: Task) -> StageOutput:
         )
     config = replace(task.settings.config, network=None)
     work = task.work / "training"
-    train_on_parts({"train": (learns, config), "validation": (stops, config)}, work, init, progress=task.progress)
+    train_on_parts(
+        {"train": (learns, config), "validation": (stops, config)}, work, init, progress=task.reporter.progress
+    )
     network = work / "model"
     settings = replace(task.settings, config=replace(config, network=network))
     output = find_gain(replace(task, car=Car.load(config.car, network=network), settings=settings))

@@ -79,7 +79,9 @@ def tune(task: Task) -> StageOutput:
     before = bench.score({n: car.noise[n] for n in names if n in car.noise})
 
     def after_trial(trial: int) -> None:
-        task.progress(f"trial {trial} of {settings.trials}", READING + (1.0 - READING) * trial / settings.trials)
+        task.reporter.progress(
+            f"trial {trial} of {settings.trials}", READING + (1.0 - READING) * trial / settings.trials
+        )
 
     def evaluate(points: Mapping[str, tuple[float, ...]]) -> dict[str, Score]:
         errors = bench.score({n: filter_tuning(values) for n, values in points.items()})
@@ -90,7 +92,7 @@ def tune(task: Task) -> StageOutput:
     tuned = [Tuned(n, score_drives(before[n]) if n in before else None, trials[n], tuple(errors[n])) for n in names]
     notes = _notes(tuned)
     for note in notes:
-        task.warn(note)
+        task.reporter.warn(note)
     figures = {"estimators": _figures(tuned), "notes": notes}
     return StageOutput(_change(task, tuned, records), records, _text(tuned), figures)
 

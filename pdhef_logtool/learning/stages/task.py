@@ -10,11 +10,11 @@ from typing import Any, TypeVar
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.store import Change
 from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.learning.drives import DriveRecord, LearnSettings, tell_drive
 from pdhef_logtool.learning.split import Split
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
+from pdhef_logtool.records.reporter import SILENT, Reporter
 
 _Read = TypeVar("_Read")
 Progress = Callable[[str, float], None]
@@ -40,8 +40,7 @@ class Task:
     set_splits: Mapping[str, str] = field(default_factory=dict)
     estimators: tuple[str, ...] | None = None
     work: Path = Path()
-    progress: Progress = lambda _text, _share: None
-    warn: Tell = lambda _text: None
+    reporter: Reporter = SILENT
 
     @property
     def options(self) -> ReadOptions:
@@ -57,10 +56,10 @@ class Task:
         """
         records, drives = [], list[_Read]()
         for number, log in enumerate(logs):
-            self.progress(f"reading {log.stem}", share * number / len(logs))
+            self.reporter.progress(f"reading {log.stem}", share * number / len(logs))
             record, drive = read(log)
             records.append(replace(record, split=self.set_splits.get(log.stem)))
-            tell_drive(records[-1], self.warn)
+            tell_drive(records[-1], self.reporter.warn)
             if drive is not None:
                 drives.append(drive)
         return tuple(records), drives

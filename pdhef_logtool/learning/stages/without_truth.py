@@ -55,7 +55,7 @@ def identify_without_truth(task: Task) -> StageOutput:
         drives,
         start,
         exported=True,
-        progress=lambda share: task.progress("fitting to the sensors", 0.8 + 0.2 * share),
+        progress=lambda share: task.reporter.progress("fitting to the sensors", 0.8 + 0.2 * share),
     )
     if calibration.refused:
         raise _refused(calibration.refused, "logs with bends and lane changes that calibrate the car")

@@ -1,0 +1,33 @@
+"""What a command reports while it works: progress, warnings and notes, each as a line for users."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+def _ignore_line(_text: str) -> None:
+    pass
+
+
+def _ignore_progress(_text: str, _share: float) -> None:
+    pass
+
+
+@dataclass(frozen=True, slots=True)
+class Reporter:
+    """Receiver of a command's lines; the default one ignores them.
+
+    Attributes
+    ----------
+    progress : called with a text and the share that is done, in [0, 1].
+    warn : called with a warning. note : called with a line of information.
+    """
+
+    progress: Callable[[str, float], None] = _ignore_progress
+    warn: Callable[[str], None] = _ignore_line
+    note: Callable[[str], None] = _ignore_line
+
+
+#: Ignores all lines.
+SILENT = Reporter()

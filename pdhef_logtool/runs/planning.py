@@ -1,0 +1,297 @@
+"""The plan of a run of several logs: their labels, the settings, and which drives are done already."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from pdhef_logtool.logs.discovery import LogInput, as_taken, hash_log, with_free_stem
+from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.records.errors import PdhefError, UsageError
+from pdhef_logtool.records.reporter import Reporter
+from pdhef_logtool.results.opened_run import REPORT_FILE
+from pdhef_logtool.results.run_report import tool_versions
+from pdhef_logtool.runs.cars import RunCars, car_record
+from pdhef_logtool.runs.config import Keep, RunConfig
+from pdhef_logtool.runs.journal import Entry, Journal, Place, changes, digest_of, outputs_digest
+from pdhef_logtool.runs.pipeline import log_place
+from pdhef_logtool.runs.self_calibrating import calibrate_pool
+from pdhef_logtool.runs.working import log_identity
+
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
+
+#: Each choice keeps the files of the choices before it, too.
+_KEPT = ("metrics", "estimates", "full")
+#: Settings that change no result and no kept file, or that are compared by themselves.
+_NO_SETTING = frozenset(
+    {
+        "keep",
+        "annotate",
+        "cache",
+        "cache_max_gb",
+        "allow_private_redirects",
+        "window_s",
+        "car",
+        "cars",
+        "network",
+        "intervals",
+    }
+)
+_FILES = ("mapping", "msgs", "thresholds", "cars")
+_READERS = 16
+_REPEATED = "they are tried again"
+_DAMAGED = "their outputs are damaged"
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedLog:
+    """A log under its label; ``moved``: the journal has it under another path."""
+
+    log: LogInput
+    place: Place
+    identity: str | None = None
+    moved: bool = False
+
+
+def plan_logs(inputs: Sequence[LogInput], journal: Journal, *, twice: bool, reporter: Reporter) -> list[PlannedLog]:
+    """Return the logs of a run with their labels, without logs of equal content unless ``twice``.
+
+    A log whose path, size and time are in the journal is not read; a new one only if another log has its size.
+    """
+    places = [Place.of(log) for log in inputs]
+    sizes = Counter(place.bytes for place in places)
+    planned: dict[int, PlannedLog] = {}
+    owner: dict[str, str] = {}
+    claimed: set[str] = set()
+
+    def claim(number: int, one: PlannedLog) -> None:
+        planned[number] = one
+        claimed.add(one.log.stem)
+        if one.identity is not None:
+            owner.setdefault(one.identity, one.log.path.name)
+
+    later: list[tuple[int, str | None]] = []
+    for number, (log, place) in enumerate(zip(inputs, places, strict=True)):
+        label, identity = (place.is_local and journal.known(place)) or ("", None)
+        if label and label not in claimed:
+            claim(number, PlannedLog(replace(log, stem=label), place, identity))
+        else:
+            later.append((number, identity))
+    unknown = [n for n, identity in later if identity is None and _may_be_known(places[n], journal, sizes)]
+    identities = dict(later) | dict(zip(unknown, _identities([inputs[n] for n in unknown]), strict=True))
+    taken = {as_taken(label) for label in journal.entries}
+    for number, identity in identities.items():
+        log, place = inputs[number], places[number]
+        labels = [] if identity is None else journal.labels_of(identity)
+        free = next((label for label in labels if label not in claimed), None)
+        if identity in owner and not twice:
+            reporter.warn(f"{log.path.name} holds what {owner[identity]} holds: the drive is run once")
+        elif free is not None:
+            claim(number, PlannedLog(replace(log, stem=free), place, identity, moved=True))
+        elif (was := journal.label_at(place)) is not None and was not in claimed:
+            claim(number, PlannedLog(replace(log, stem=was), place, identity))  # another content: it is run again
+        else:
+            new = with_free_stem(log, taken)
+            taken.add(as_taken(new.stem))
+            claim(number, PlannedLog(new, place, identity))
+    return [planned[number] for number in sorted(planned)]
+
+
+def _may_be_known(place: Place, journal: Journal, sizes: Counter[int]) -> bool:
+    """Return whether a log of an unknown path may have the content of another log."""
+    return journal.may_know(place) or (place.is_local and sizes[place.bytes] > 1)
+
+
+def _identities(logs: Sequence[LogInput]) -> list[str | None]:
+    """Return the identities of logs, several at a time because servers wait."""
+    with ThreadPoolExecutor(_READERS) as readers:
+        return list(readers.map(log_identity, logs))
+
+
+def calibrate_pools(
+    planned: Sequence[PlannedLog], cars: RunCars, mapping: Mapping | None, config: RunConfig
+) -> dict[str, SelfCalibration | None]:
+    """Return the calibration of each car from all its logs, by label; empty without ``--calibrate pool``."""
+    if config.calibrate != "pool":
+        return {}
+    logs: dict[int, tuple[Car, list[LogInput]]] = {}
+    for one in planned:
+        with suppress(Exception):  # the run reports the reason
+            car = cars.of_log(one.log)
+            logs.setdefault(id(car), (car, []))[1].append(one.log)
+    pools = {key: calibrate_pool(of, car, mapping, config) for key, (car, of) in logs.items()}
+    return {log.stem: pools[key] for key, (_, of) in logs.items() for log in of}
+
+
+def settings_of(config: RunConfig, pools: dict[str, SelfCalibration | None]) -> dict[str, str]:
+    """Return, as texts, what decides the content of a drive's files, beside the log and its car."""
+    settings = {
+        f"--{key.replace('_', '-')}": ",".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
+        for key, value in asdict(config).items()
+        if key not in _NO_SETTING and key not in _FILES and value is not None
+    }
+    for key in _FILES:
+        path = getattr(config, key)
+        if path is not None:
+            settings[f"--{key}"] = hash_log(path) if path.exists() else str(path)
+    settings["--annotate"] = config.annotate or "none named"
+    settings |= {f"version of {name}": version for name, version in tool_versions().items()}
+    if pools:
+        settings["the pool's calibration"] = digest_of([p and p.to_dict() for p in pools.values()])
+    return settings
+
+
+@dataclass(slots=True, eq=False)
+class Plan:
+    """The logs of a run, their settings, and what the journal in the output folder has of them."""
+
+    output: Path
+    journal: Journal
+    logs: Sequence[PlannedLog]
+    settings: dict[str, str]
+    cars: RunCars
+    _current_cars: dict[str, dict[str, Any]] | None = None
+    _sound: dict[int, bool] = field(default_factory=dict)
+    setting: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.setting = digest_of(self.settings)
+
+    @classmethod
+    def of(
+        cls, output: Path, journal: Journal, logs: Sequence[PlannedLog], settings: dict[str, str], cars: RunCars,
+        only: Sequence[str],
+    ) -> Self:  # fmt: skip
+        """Return a plan; raises UsageError if ``only`` names no log or the settings differ from the folder's run."""
+        plan = cls(output, journal, logs, settings, cars)
+        if only:
+            plan._check_only(only)
+        return plan
+
+    def begin(self) -> None:
+        """Begin the journal with the settings and the new places of logs."""
+        self.journal.begin()
+        self.journal.add_setting(self.setting, self.settings)
+        for one in self.logs:
+            if one.moved:
+                self.journal.add_place(one.log.stem, one.place, one.identity or "")
+
+    def entry(self, one: PlannedLog) -> Entry | None:
+        """Return the journal's entry of a log if it is done, whatever files were kept."""
+        entry = self.journal.entries.get(one.log.stem)
+        if entry is None or self._reason(one, "metrics", retry=False) not in (None, _REPEATED):
+            return None
+        return entry
+
+    @property
+    def done(self) -> int:
+        """Number of logs that are done."""
+        return sum(self.entry(p) is not None for p in self.logs)
+
+    def pending(self, names: Sequence[str] | None, keep: Keep, retry: bool, note: Reporter) -> list[PlannedLog]:
+        """Return the logs to process, of all or of those named, and report why logs are repeated or left out."""
+        chosen = [p for p in self.logs if names is None or p.log.stem in set(names)]
+        reasons = {p.log.stem: self._reason(p, keep, retry) for p in chosen}
+        if names is None and self.journal.entries:
+            self._report(chosen, [r for r in reasons.values() if r], retry, note)
+        elif damaged := sum(self._reason(p, "metrics", retry=False) == _DAMAGED for p in self.logs if p not in chosen):
+            note.note(f"{damaged} other drives are left out of the run until --resume: {_DAMAGED}")
+        return [p for p in chosen if reasons[p.log.stem] is not None]
+
+    def worst(self, count: int) -> list[str]:
+        """Return the labels of the scored drives whose selected estimates have the largest sideslip errors."""
+        entries = [e for p in self.logs if (e := self.entry(p)) is not None and e.error_rad is not None]
+        return [e.label for e in sorted(entries, key=lambda e: (-(e.error_rad or 0.0), e.label))[:count]]
+
+    def add_car(self, record: dict[str, Any]) -> str:
+        """Write a car's record into the journal; return its digest."""
+        digest: str = record["digest"]
+        self.journal.add_car(digest, record)
+        self.cars_of_run()[digest] = record
+        return digest
+
+    def cars_of_run(self) -> dict[str, dict[str, Any]]:
+        """Return the records of the run's present cars by digest, without cars that cannot be read."""
+        if self._current_cars is None:
+            self._current_cars, cars = {}, replace(self.cars, warn=lambda _: None)
+            for path in cars.paths:
+                with suppress(PdhefError):
+                    record = car_record(cars.read(path))
+                    self._current_cars[digest_of(record["parts"])] = record
+        return self._current_cars
+
+    def _check_only(self, names: Sequence[str]) -> None:
+        labels = {p.log.stem for p in self.logs}
+        if missing := [name for name in names if name not in labels]:
+            near = ", ".join(sorted(labels)[:10]) + (" and more" if len(labels) > 10 else "")
+            raise UsageError(expected=f"the name of a log ({near})", got=missing[0], where="--only")
+        for one in self.logs:
+            entry = self.journal.entries.get(one.log.stem)
+            if entry is not None and (why := [*self._changes(entry)]):
+                raise UsageError(
+                    expected="the settings of the run in the folder",
+                    got=", ".join(why),
+                    where="--only",
+                    remedy="--resume runs its logs anew",
+                )
+
+    def _reason(self, one: PlannedLog, keep: str, retry: bool) -> str | None:
+        """Return why a log is to be run, empty for a new one; None if it is done."""
+        entry = self.journal.entries.get(one.log.stem)
+        if entry is None:
+            return ""
+        if entry.quarantined:
+            return _REPEATED if retry else None
+        if entry.place != one.place and entry.identity != one.identity:
+            return "their logs have changed"
+        if why := [*self._changes(entry)]:
+            return ", ".join(why)
+        if entry.failed:
+            return _REPEATED if retry or entry.again else None
+        if _KEPT.index(entry.keep) < _KEPT.index(keep):
+            return f"{keep} is to be kept of them"
+        folder = self.output / log_place(entry.label)
+        if not (folder / REPORT_FILE).is_file() or entry.part is None or not (self.output / entry.part).is_file():
+            return "their outputs are gone"
+        return None if self._is_sound(entry) else _DAMAGED
+
+    def _is_sound(self, entry: Entry) -> bool:
+        """Return whether report and figures of a drive are unchanged; read once per line of the journal."""
+        if entry.outputs is None:
+            return True
+        if entry.at not in self._sound:
+            paths = self.output / log_place(entry.label) / REPORT_FILE, self.output / str(entry.part)
+            try:
+                self._sound[entry.at] = outputs_digest(*paths) == entry.outputs
+            except OSError:
+                self._sound[entry.at] = False
+        return self._sound[entry.at]
+
+    def _changes(self, entry: Entry) -> Iterator[str]:
+        """Yield as texts which settings and car of a drive have changed."""
+        if entry.setting != self.setting:
+            yield from changes(self.journal.settings.get(entry.setting, {}), self.settings)
+        if entry.car is not None and entry.car not in self.cars_of_run():
+            old = self.journal.cars.get(entry.car, {})
+            new = next((c for c in self.cars_of_run().values() if c["name"] == old.get("name")), {})
+            yield from [*changes(old.get("parts", {}), new.get("parts", {}))] if new else ["another car"]
+
+    def _report(self, chosen: Sequence[PlannedLog], reasons: Sequence[str], retry: bool, reporter: Reporter) -> None:
+        """Report which drives of an earlier run are kept, repeated or left out."""
+        for why, count in Counter(reasons).most_common():
+            reporter.note(f"{count} of {len(chosen)} drives are run anew: {why}")
+        entries = [e for p in chosen if (e := self.journal.entries.get(p.log.stem)) is not None]
+        quarantined = sum(e.quarantined for e in entries)
+        if quarantined and not retry:
+            reporter.note(f"{quarantined} logs that took their worker along are not tried again; --retry does")
+        if other := len(self.journal.entries) - len(entries):
+            reporter.note(
+                f"{other} drives in the output are of logs that are not named now: they are left out of the run"
+            )

@@ -1,0 +1,120 @@
+"""The files of a whole run, written from the journal and the drives' files: metrics.parquet, run.json, pages."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pdhef_logtool.logs.discovery import RUN_FILE, folders_of
+from pdhef_logtool.records.reporter import Reporter
+from pdhef_logtool.results.opened_run import METRICS_FILE, PAGE_FILE, PARTS, open_run
+from pdhef_logtool.results.run_report import build_run, run_versions, write_json
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.journal import Entry, Journal
+from pdhef_logtool.runs.pipeline import FEW_LOGS, LogResult, judge, log_place
+from pdhef_logtool.runs.planning import Plan
+from pdhef_logtool.storage.documents import file_sha256
+
+if TYPE_CHECKING:
+    from pdhef_logtool.evaluation.thresholds import Threshold
+
+
+def collect(plan: Plan, config: RunConfig, thresholds: Sequence[Threshold] | None) -> list[LogResult]:
+    """Write metrics.parquet and run.json of all drives that are done; return their results in the order of the plan."""
+    from pdhef_logtool.results.parquet_sink import join_metrics
+
+    output = plan.output
+    folders = folders_of([p.log for p in plan.logs])
+    entries = [(e, f) for p, f in zip(plan.logs, folders, strict=True) if (e := plan.entry(p)) is not None]
+    remaining = len(plan.logs) - len(entries)
+    if not entries and remaining:
+        return []
+    results = [judge(_result(plan, entry, folder), thresholds) for entry, folder in entries]
+    metrics = output / METRICS_FILE
+    join_metrics(metrics, [r.figures_file for r in results if r.figures_file is not None])
+    cars = plan.journal.cars | plan.cars_of_run()  # the journal's line of a car may be damaged
+    networks = {
+        None if (network := cars[e.car]["network"]) is None else (network[0], network[1])
+        for e, _ in entries
+        if e.car is not None
+    }
+    only = networks.pop() if len(networks) == 1 else None
+    network = None if only is None else {"name": only[0], "sha256": only[1]}
+    files, outcomes = {METRICS_FILE: file_sha256(metrics)}, [r.outcome for r in results]
+    write_json(output / RUN_FILE, build_run(run_versions(), config.to_dict(), network, outcomes, remaining, files))
+    if remaining:
+        (output / PAGE_FILE).unlink(missing_ok=True)  # it shows other drives
+    return results
+
+
+def _result(plan: Plan, entry: Entry, folder: str) -> LogResult:
+    outcome = replace(plan.journal.outcome(entry), folder=folder)
+    part = None if entry.part is None else plan.output / entry.part
+    output = None if part is None else plan.output / log_place(entry.label)
+    return LogResult(outcome, output, figures=None, figures_file=part, failed_checks=entry.failed_checks)
+
+
+def write_run_pages(output: Path, report: bool, labels: Collection[str] | None, reporter: Reporter) -> None:
+    """Write the page of the run and those of the named logs (None: all); without ``report``, remove all pages."""
+    from pdhef_logtool.reports.pages import remove_pages, write_pages
+
+    run = open_run(output)
+    if not report:
+        return remove_pages(run)
+    logs = None if labels is None else [log for log in run.logs if log.label in labels]
+    for line in write_pages(run, lambda text, _: reporter.progress(text, 1.0), logs=logs).wrong:
+        reporter.warn(line)
+    return None
+
+
+@dataclass(slots=True)
+class FleetProgress:
+    """Progress of several logs as one line: the present log of a few, or the count and rate of many."""
+
+    progress: Callable[[str, float], None]
+    count: int
+    ended: int = 0
+    failed: int = 0
+    _shares: dict[int, float] = field(default_factory=dict)
+    _since: float = field(default_factory=time.monotonic)
+
+    def update(self, number: int, text: str, share: float) -> None:
+        """Take the progress of one log."""
+        self._shares[number] = min(share, 1.0)
+        done = (self.ended + sum(self._shares.values())) / self.count
+        if self.count <= FEW_LOGS:
+            self.progress(text, done)
+            return
+        rate = self.ended / max(time.monotonic() - self._since, 1e-9)
+        failed = f", {self.failed} failed" if self.failed else ""
+        speed = f", {rate:.1f}/s" if self.ended else ""
+        self.progress(f"{self.ended} of {self.count}{failed}{speed}", done)
+
+    def end(self, number: int) -> None:
+        """Take the end of one log."""
+        self._shares.pop(number, None)
+        self.ended += 1
+        if self.count > FEW_LOGS:
+            self.update(number, "", 0.0)
+
+
+def sweep_parts(journal: Journal, output: Path) -> None:
+    """Remove figure files that no drive of the journal has, and the remains of killed workers."""
+    kept = {entry.part for entry in journal.entries.values()}
+    root = output / PARTS
+    for path in list(itertools.chain(root.rglob("*.parquet"), root.rglob(".*.partial"))):
+        if path.relative_to(output).as_posix() not in kept:
+            remove_part(output, path.relative_to(output).as_posix())
+
+
+def remove_part(output: Path, part: str) -> None:
+    """Remove a file of figures and the folders that this leaves empty."""
+    with suppress(OSError):
+        (output / part).unlink(missing_ok=True)
+        for folder in itertools.islice((output / part).parents, 3):
+            folder.rmdir()

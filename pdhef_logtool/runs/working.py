@@ -1,0 +1,182 @@
+"""The work on one drive of a run: :func:`run_drive` writes the drive's files and returns a small record."""
+
+from __future__ import annotations
+
+import math
+import os
+import platform
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pdhef_logtool.car.parts import car_folder
+from pdhef_logtool.logs.discovery import LogInput, identity_of
+from pdhef_logtool.mapping import Mapping, mapping_of
+from pdhef_logtool.records.errors import OutputError, PdhefError
+from pdhef_logtool.records.reporter import Reporter
+from pdhef_logtool.results.opened_run import PARTS, REPORT_FILE, OpenedLog
+from pdhef_logtool.results.run_report import LogOutcome
+from pdhef_logtool.runs.cars import RunCars, car_record
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.journal import digest_of, outputs_digest
+from pdhef_logtool.runs.pipeline import LogResult, log_place, run_log
+from pdhef_logtool.storage.outputs import OutputFolder
+from pdhef_logtool.workers.supervisor import Tell
+
+if TYPE_CHECKING:
+    from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
+    from pdhef_logtool.evaluation.thresholds import Threshold
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveTask:
+    """One drive to process.
+
+    Attributes
+    ----------
+    log : the log with its label in the run. output : folder of the run.
+    setting : digest of the settings that the drive is run with.
+    pool : calibration of the car from all logs of the run. page : whether the drive's page is written.
+    run : name of this run in its process, the key of cars that were read. stored : names of the drive's stored files.
+    """
+
+    log: LogInput
+    output: Path
+    config: RunConfig
+    setting: str
+    thresholds: tuple[Threshold, ...] | None
+    pool: SelfCalibration | None
+    page: bool
+    run: str
+    stored: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveEnd:
+    """How a drive ended; small, because it crosses from a worker's process.
+
+    Attributes
+    ----------
+    identity : identity of the log's content. car : :func:`~.cars.car_record`. part, error_rad : as in the journal.
+    warned : lines for users. again : whether a failed drive may succeed next time. outputs : as in the journal.
+    """
+
+    outcome: LogOutcome
+    identity: str | None
+    car: dict[str, Any] | None = None
+    part: str | None = None
+    failed_checks: int = 0
+    error_rad: float | None = None
+    warned: tuple[str, ...] = ()
+    again: bool = False
+    outputs: str | None = None
+
+
+Work = Callable[[DriveTask, Tell], DriveEnd]
+
+
+def run_drive(task: DriveTask, tell: Tell) -> DriveEnd:
+    """Run one drive, write its files, and return how it ended; raises only what ends the process."""
+    warned: list[str] = []
+    try:
+        return _run_drive(task, tell, warned)
+    except MemoryError:
+        raise  # the supervisor reports it
+    except Exception as error:  # noqa: BLE001 (one bad log never stops the others, whatever is wrong with it)
+        expected = isinstance(error, PdhefError)
+        reason = str(error) if expected else f"internal error, {type(error).__name__}: {error}"
+        outcome = LogOutcome(log=task.log.stem, file=task.log.path.name, sha256=None, failed=reason)
+        again = not expected or isinstance(error, OutputError)
+        return DriveEnd(outcome, log_identity(task.log), warned=tuple(warned), again=again)
+
+
+def run_on_node(
+    work: Callable[[DriveTask, Tell], Any], here: Path, mark: Path | None, task: DriveTask, tell: Tell
+) -> Any:
+    """Process a drive on a node of a cluster, in the folder that the run was started in if the node has it.
+
+    ``mark``: a file by which the node recognises the output folder; None if it does not need to see the folder.
+    """
+    if mark is not None and not mark.is_file():
+        return OutputError(
+            expected="a folder that all nodes of the cluster see under this path",
+            got=f"another one, or none, on {platform.node()}",
+            where=str(mark.parent),
+            remedy="choose one on a shared file system, or a URL, with -o",
+        )
+    with suppress(OSError):
+        os.chdir(here)
+    return work(task, tell)
+
+
+def log_identity(log: LogInput) -> str | None:
+    """Return the identity of a log's content, None if the log cannot be read."""
+    try:
+        return _identity_of_slice(log, identity_of(log))
+    except (PdhefError, OSError):
+        return None  # the run reports the reason
+
+
+def _identity_of_slice(log: LogInput, identity: str) -> str:
+    return identity if log.span_s is None else f"{identity} {log.span_s}"
+
+
+def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
+    from pdhef_logtool.results.parquet_sink import write_metrics
+
+    cars, mapping = _cars_and_mapping(task)
+    cars = replace(cars, warn=warned.append)
+    car = cars.of_log(task.log)
+    outputs = OutputFolder(task.output)  # locked by the run
+    result = run_log(
+        task.log, outputs, task.config, car, mapping,
+        pool=task.pool, thresholds=task.thresholds, reporter=Reporter(progress=tell, warn=warned.append),
+    )  # fmt: skip
+    record = car_record(car)
+    place = car_folder(car.vehicle.name, car.physics_sha256)
+    part = f"{PARTS}/run={task.setting}/{place}/part-{digest_of(task.log.stem)}.parquet"
+    write_metrics(task.output / part, result.rows)
+    if task.page:
+        warned += _write_page(task.output, result.outcome)
+    return DriveEnd(
+        result.outcome,
+        _identity_of_slice(task.log, str(result.outcome.sha256)),
+        {"digest": digest_of(record["parts"]), **record},
+        part,
+        result.failed_checks,
+        _sideslip_error_rad(result),
+        tuple(warned),
+        outputs=outputs_digest(task.output / log_place(task.log.stem) / REPORT_FILE, task.output / part),
+    )
+
+
+def _sideslip_error_rad(result: LogResult) -> float | None:
+    """Return the sideslip RMSE of the selected estimate, None if no independent ground truth scores it."""
+    wanted = (result.outcome.main, "sideslip_rad", "all", "rmse")
+    rows = (r for r in result.rows if (r.estimator, r.signal, r.segment, r.metric) == wanted)
+    return next((r.value for r in rows if r.independent and math.isfinite(r.value)), None)
+
+
+def _write_page(output: Path, outcome: LogOutcome) -> list[str]:
+    """Write the page of a drive; return warnings."""
+    from pdhef_logtool.reports.pages import write_drive_page
+
+    entry = {"main": outcome.main, "files": outcome.files}
+    log = OpenedLog(outcome.log, outcome.outcome, output / log_place(outcome.log), entry)
+    wrong = write_drive_page(log).wrong
+    return [f"no page of {outcome.log}: {wrong}"] if wrong else []
+
+
+#: Cars and mapping of the run that this process works for, by the run's name.
+_opened: dict[str, tuple[RunCars, Mapping | None]] = {}
+
+
+def _cars_and_mapping(task: DriveTask) -> tuple[RunCars, Mapping | None]:
+    """Return cars and mapping of a task, read once per run."""
+    if task.run not in _opened:
+        _opened.clear()
+        config = task.config
+        _opened[task.run] = RunCars.of(config, lambda _: None), mapping_of(config.mapping)
+    return _opened[task.run]
