@@ -10,6 +10,7 @@ import numpy as np
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.estimators.filter_base import sideslip_std
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, windows
+from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import SignalSource, clock_key, fit_clocks, resolve_mapping
 from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, request_source, si_values
@@ -81,14 +82,7 @@ def read_estimate(
     for name, s in mapping.signals.items():
         channels[name], kept[name] = _ordered(name, s, parts[name])
     stamps_ns = channels[base].stamps_ns
-    if not any(np.isfinite(channels[name].values).any() for name in BASE_ORDER if name in channels):
-        wanted = ", ".join(s.label for n, s in mapping.signals.items() if n in BASE_ORDER)
-        raise MappingError(
-            expected="numbers in the recorded estimate",
-            got="none in the chosen slice",
-            where=f"{log.path} {wanted}",
-            remedy="check topic, field and slice",
-        )
+    _check_has_numbers(log, mapping, channels)
     repeated = sum(p[0].shape[0] for p in parts[base]) - len(channels[base])
     if repeated:
         where = mapping.signals[base].topic
@@ -98,6 +92,17 @@ def read_estimate(
     finite = {n: _without_nan(c) for n, c in channels.items() if n in BASE_ORDER}
     samples = {s.label: len(channels[n]) for n, s in mapping.signals.items()}
     return RecordedEstimate(track, finite, frozenset(channels), samples, notes), losses
+
+
+def _check_has_numbers(log: DriveLog, mapping: SignalMapping, channels: Mapping[str, Channel]) -> None:
+    if any(np.isfinite(channels[name].values).any() for name in BASE_ORDER if name in channels):
+        return
+    raise MappingError(
+        expected="numbers in the recorded estimate",
+        got="none in the chosen slice",
+        where=f"{log.path} {', '.join(s.label for n, s in mapping.signals.items() if n in BASE_ORDER)}",
+        remedy="check topic, field and slice",
+    )
 
 
 def _without_nan(channel: Channel) -> Channel:

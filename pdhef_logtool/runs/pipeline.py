@@ -63,9 +63,9 @@ from pdhef_logtool.results.run_report import (
     write_json,
 )
 from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, Shown, Sink
-from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.config import Keep, RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
-from pdhef_logtool.runs.scoring import evaluate, in_time
+from pdhef_logtool.runs.scoring import Evaluation, evaluate, in_time
 from pdhef_logtool.runs.selection import choose_main, contradiction, default_names
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore
@@ -288,81 +288,115 @@ class _Job:
 
 def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporter: Reporter) -> LogResult:
     """Estimate, score and write one drive."""
-    from pdhef_logtool.evaluation.thresholds import check_thresholds
-    from pdhef_logtool.runs.drive_details import drive_details
-
-    drive, car, ready = job.drive, job.car, job.ready
-    algorithms = {e.name: resolve(e) for e in ready}
-    intervals = calibrator(car, ready)
+    drive, car = job.drive, job.car
+    intervals = calibrator(car, job.ready)
     with outputs.begin(log_place(drive.name), stale=STALE_FILES) as change, ExitStack() as opened:
         store = opened.enter_context(TrackStore(change.scratch / "tracks"))
         causality = CausalityCheck()
-        signals = _estimate(drive, ready, intervals, store, reporter, causality)
-        ready = _without_failed(drive, ready, causality.failed)
-        sensors = log_sensors(drive.car.vehicle, job.calibration)
-        found = evaluate(drive, [e.name for e in ready], store.read, signals, sensors)
-        if drive.friction.bank is not None:
-            observable = friction_events(drive.friction, signals)
-            found = replace(found, events=sorted([*found.events, *observable], key=in_time))
-        if against := contradiction(found.rows):
-            drive.notes.append(f"WARNING: {against.text}")  # the answer's words say what comes of it
-        main = choose_main(ready, found.rows, proven=drive.car.has_evidence, named=config.estimators is not None)
-        limits = check_thresholds(job.thresholds, found.rows, log=drive.name)
-        details = drive_details(drive, ready, main.name, store.read, signals, limits, brief=config.kept != "full")
-        shown = _shown(main, [e.name for e in ready])
+        signals = _estimate(drive, job.ready, intervals, store, reporter, causality)
+        job = replace(job, ready=_without_failed(drive, job.ready, causality.failed))
+        scored = _score(job, store, signals)
+        main = choose_main(job.ready, scored.rows, proven=drive.car.has_evidence, named=config.estimators is not None)
+        shown = _shown(main, [e.name for e in job.ready])
         sinks = opened.enter_context(_open_sinks(change, drive, config, car, shown, outputs.path))
         _write(store, sinks, frozenset(causality.failed))
-        digests = {name: a.sha256[:SHOWN_DIGITS] for name, a in algorithms.items()}
-        rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in found.rows]
-        events = found.events
         if intervals.warning:
             drive.tell(intervals.warning)
-        if not found.moves:
+        if not scored.moves:
             drive.tell(_NEVER_MOVES.format(car.vehicle.low_speed_blend_m_s))
-        silent = [Loss("no-valid-row", _SILENT.format(name), drive.name) for name in found.silent]
-        failed = [Loss("estimator-failed", f"{name} {text}", drive.name) for name, text in causality.failed.items()]
-        losses = merge_losses([drive.losses, *(sink.lost for sink in sinks), silent, failed])
-        ran = [
-            EstimatorFacts(
-                e.name,
-                causal=e.causal and not drive.not_causal,
-                notes=(*notes_of(e), *([drive.not_causal] if drive.not_causal else [])),
-                intervals=intervals.notes(e.name),
-                reasons=found.reasons[e.name],
-                algorithm={"sha256": a.sha256, **a.model_dump(mode="json")},
-            )
-            for e in ready
-            for a in (algorithms[e.name],)
-        ]
-        ran += [EstimatorFacts(name, causal=False, failed=text) for name, text in causality.failed.items()]
-        left_out = [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in job.skipped]
-        facts = report_facts(drive, car, [*ran, *left_out], rows, events, losses)
-        calibration = None if job.calibration is None else job.calibration.to_dict()
-        facts = replace(facts, friction=friction_facts(drive.friction), calibration=calibration)
-        facts = replace(facts, main=main, details=details)
+        losses = merge_losses([drive.losses, *(s.lost for s in sinks), *_losses(drive, scored, causality.failed)])
+        facts = _facts(job, config, main, scored, (store, signals), (intervals, causality.failed), losses)
         report = build_report(facts)
         for sink in sinks:
-            sink.finish(report, events)
-        if config.kept == "metrics":
-            report = brief_report(report)
-        else:
-            from pdhef_logtool.results.parquet_sink import write_metrics
-
-            write_metrics(change.file(METRICS_FILE), rows)
-        head = f"Mounting, units, delays and clocks of {drive.name}, for pdhef run --setup."
-        write_bytes(change.file(SETUP_FILE), setup_toml(setup_of(drive.plan), head).encode())
-        write_json(change.file(REPORT_FILE), report, brief=config.kept == "metrics")
+            sink.finish(report, scored.events)
+        report = _write_files(change, drive, report, facts.metrics, config.kept)
     outcome = replace(
         outcome_of(drive, losses),
         car=_car_facts(drive.car),
         main=None if main is None else main.name,
-        algorithms={name: a.identity for name, a in algorithms.items()},
+        algorithms={e.name: resolve(e).identity for e in job.ready},
         files=files_of(change.target),
+        failed=_ALL_SILENT if len(scored.silent) == len(job.ready) else None,
     )
-    if len(found.silent) == len(ready):
-        outcome = replace(outcome, failed=_ALL_SILENT)
     failed_checks = sum(c.verdict == "failed" and not c.waived for c in drive.checks)
-    return LogResult(outcome, change.target, report, tuple(rows), failed_checks=failed_checks)
+    return LogResult(outcome, change.target, report, tuple(facts.metrics), failed_checks=failed_checks)
+
+
+def _score(job: _Job, store: TrackStore, signals: Signals) -> Evaluation:
+    """Score the stored tracks; add the events of an estimated friction and a contradiction as a note of the drive."""
+    drive = job.drive
+    sensors = log_sensors(drive.car.vehicle, job.calibration)
+    scored = evaluate(drive, [e.name for e in job.ready], store.read, signals, sensors)
+    if drive.friction.bank is not None:
+        observable = friction_events(drive.friction, signals)
+        scored = replace(scored, events=sorted([*scored.events, *observable], key=in_time))
+    if against := contradiction(scored.rows):
+        drive.notes.append(f"WARNING: {against.text}")  # the selected estimate's text gives the consequence
+    return scored
+
+
+def _losses(drive: Drive, scored: Evaluation, failed: dict[str, str]) -> Iterator[list[Loss]]:
+    """Yield the estimators without a valid row and those that failed, as losses."""
+    yield [Loss("no-valid-row", _SILENT.format(name), drive.name) for name in scored.silent]
+    yield [Loss("estimator-failed", f"{name} {text}", drive.name) for name, text in failed.items()]
+
+
+def _facts(
+    job: _Job,
+    config: RunConfig,
+    main: MainFacts,
+    scored: Evaluation,
+    estimates: tuple[TrackStore, Signals],
+    ran: tuple[TrackCalibrator, dict[str, str]],
+    losses: Sequence[Loss],
+) -> ReportFacts:
+    """Gather the content of report.json; ``ran``: intervals, and the estimators that failed with their reasons."""
+    from pdhef_logtool.evaluation.thresholds import check_thresholds
+    from pdhef_logtool.runs.drive_details import drive_details
+
+    drive, (store, signals), (intervals, failed) = job.drive, estimates, ran
+    algorithms = {e.name: resolve(e) for e in job.ready}
+    estimators = [
+        EstimatorFacts(
+            e.name,
+            causal=e.causal and not drive.not_causal,
+            notes=(*notes_of(e), *([drive.not_causal] if drive.not_causal else [])),
+            intervals=intervals.notes(e.name),
+            reasons=scored.reasons[e.name],
+            algorithm={"sha256": a.sha256, **a.model_dump(mode="json")},
+        )
+        for e in job.ready
+        for a in (algorithms[e.name],)
+    ]
+    estimators += [EstimatorFacts(name, causal=False, failed=text) for name, text in failed.items()]
+    estimators += [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in job.skipped]
+    digests = {name: a.sha256[:SHOWN_DIGITS] for name, a in algorithms.items()}
+    rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows]
+    limits = check_thresholds(job.thresholds, scored.rows, log=drive.name)
+    return replace(
+        report_facts(drive, job.car, estimators, rows, scored.events, losses),
+        friction=friction_facts(drive.friction),
+        calibration=None if job.calibration is None else job.calibration.to_dict(),
+        main=main,
+        details=drive_details(drive, job.ready, main.name, store.read, signals, limits, brief=config.kept != "full"),
+    )
+
+
+def _write_files(
+    change: FolderTransaction, drive: Drive, report: dict[str, Any], rows: Sequence[MetricRow], kept: Keep
+) -> dict[str, Any]:
+    """Write metrics.parquet, setup.toml and report.json; return the report as written."""
+    from pdhef_logtool.results.parquet_sink import write_metrics
+
+    brief = kept == "metrics"
+    if brief:
+        report = brief_report(report)
+    else:
+        write_metrics(change.file(METRICS_FILE), rows)
+    head = f"Mounting, units, delays and clocks of {drive.name}, for pdhef run --setup."
+    write_bytes(change.file(SETUP_FILE), setup_toml(setup_of(drive.plan), head).encode())
+    write_json(change.file(REPORT_FILE), report, brief=brief)
+    return report
 
 
 def files_of(folder: Path) -> dict[str, str]:

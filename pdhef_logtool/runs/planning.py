@@ -67,41 +67,55 @@ def plan_logs(inputs: Sequence[LogInput], journal: Journal, *, twice: bool, repo
     """
     places = [Place.of(log) for log in inputs]
     sizes = Counter(place.bytes for place in places)
-    planned: dict[int, PlannedLog] = {}
-    owner: dict[str, str] = {}
-    claimed: set[str] = set()
-
-    def claim(number: int, one: PlannedLog) -> None:
-        planned[number] = one
-        claimed.add(one.log.stem)
-        if one.identity is not None:
-            owner.setdefault(one.identity, one.log.path.name)
-
+    labels = _Labels(journal)
     later: list[tuple[int, str | None]] = []
     for number, (log, place) in enumerate(zip(inputs, places, strict=True)):
         label, identity = (place.is_local and journal.known(place)) or ("", None)
-        if label and label not in claimed:
-            claim(number, PlannedLog(replace(log, stem=label), place, identity))
+        if label and label not in labels.claimed:
+            labels.claim(number, PlannedLog(replace(log, stem=label), place, identity))
         else:
             later.append((number, identity))
     unknown = [n for n, identity in later if identity is None and _may_be_known(places[n], journal, sizes)]
     identities = dict(later) | dict(zip(unknown, _identities([inputs[n] for n in unknown]), strict=True))
-    taken = {as_taken(label) for label in journal.entries}
     for number, identity in identities.items():
-        log, place = inputs[number], places[number]
-        labels = [] if identity is None else journal.labels_of(identity)
-        free = next((label for label in labels if label not in claimed), None)
-        if identity in owner and not twice:
-            reporter.warn(f"{log.path.name} holds what {owner[identity]} holds: the drive is run once")
-        elif free is not None:
-            claim(number, PlannedLog(replace(log, stem=free), place, identity, moved=True))
-        elif (was := journal.label_at(place)) is not None and was not in claimed:
-            claim(number, PlannedLog(replace(log, stem=was), place, identity))  # another content: it is run again
+        log = inputs[number]
+        if identity in labels.owner and not twice:
+            reporter.warn(f"{log.path.name} holds what {labels.owner[identity]} holds: the drive is run once")
         else:
-            new = with_free_stem(log, taken)
-            taken.add(as_taken(new.stem))
-            claim(number, PlannedLog(new, place, identity))
-    return [planned[number] for number in sorted(planned)]
+            labels.claim(number, labels.of(log, places[number], identity))
+    return [labels.planned[number] for number in sorted(labels.planned)]
+
+
+@dataclass(slots=True)
+class _Labels:
+    """Labels of logs while they are assigned: those of the journal stay with their content, else with their path."""
+
+    journal: Journal
+    planned: dict[int, PlannedLog] = field(default_factory=dict)
+    owner: dict[str, str] = field(default_factory=dict)
+    claimed: set[str] = field(default_factory=set)
+    _taken: set[str] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._taken = {as_taken(label) for label in self.journal.entries}
+
+    def claim(self, number: int, one: PlannedLog) -> None:
+        """Assign the label of a planned log."""
+        self.planned[number] = one
+        self.claimed.add(one.log.stem)
+        if one.identity is not None:
+            self.owner.setdefault(one.identity, one.log.path.name)
+
+    def of(self, log: LogInput, place: Place, identity: str | None) -> PlannedLog:
+        """Return a log with the first label that is free: of its content, of its path, or a new one."""
+        for label in () if identity is None else self.journal.labels_of(identity):
+            if label not in self.claimed:
+                return PlannedLog(replace(log, stem=label), place, identity, moved=True)
+        if (was := self.journal.label_at(place)) is not None and was not in self.claimed:
+            return PlannedLog(replace(log, stem=was), place, identity)  # another content: it is run again
+        new = with_free_stem(log, self._taken)
+        self._taken.add(as_taken(new.stem))
+        return PlannedLog(new, place, identity)
 
 
 def _may_be_known(place: Place, journal: Journal, sizes: Counter[int]) -> bool:
