@@ -19,8 +19,10 @@ if TYPE_CHECKING:
     from pdhef_logtool.learning.network.train_command import run_training as train  # noqa: F401
     from pdhef_logtool.mapping import load_mapping as load_mapping
     from pdhef_logtool.records.errors import PdhefError as PdhefError
+    from pdhef_logtool.records.reporter import Reporter as Reporter
     from pdhef_logtool.runs.config import RunConfig as RunConfig
     from pdhef_logtool.runs.estimating import estimate_windows as estimate_windows
+    from pdhef_logtool.runs.fleet import Schedule as Schedule
     from pdhef_logtool.runs.fleet import run_logs as run  # noqa: F401
     from pdhef_logtool.runs.frames import choose as choose
     from pdhef_logtool.runs.frames import estimate as estimate
@@ -41,7 +43,9 @@ _HOMES = {
     "train": "learning.network.train_command:run_training",
     "load_mapping": "mapping",
     "PdhefError": "records.errors",
+    "Reporter": "records.reporter",
     "RunConfig": "runs.config",
+    "Schedule": "runs.fleet",
     "estimate_windows": "runs.estimating",
     "choose": "runs.frames",
     "estimate": "runs.frames",
