@@ -128,4 +128,4 @@ def test_every_name_of_the_api_is_tested_or_takes_no_file() -> None:
     tested |= {"learn", "extract"}
     of_drives = {"choose", "estimate", "estimate_windows", "score", "Drive"}
     settings = {name for name in pdhef.__all__ if name.endswith("Settings")}
-    assert set(pdhef.__all__) == tested | of_drives | settings | {"PdhefError", "__version__"}
+    assert set(pdhef.__all__) == tested | of_drives | settings | {"PdhefError", "Reporter", "Schedule", "__version__"}

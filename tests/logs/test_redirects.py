@@ -134,7 +134,7 @@ def test_the_option_reaches_the_processes_of_a_fleet(server: CountingServer, tmp
     server.fault = _redirecting(server.place("dlc.mcap").replace("127.0.0.1", "localhost"))
     urls = [server.place("away.mcap"), server.place("dlc.mcap")]
     config = RunConfig(estimators=("zero",), annotate="none", keep="metrics", allow_private_redirects=True)
-    result = run(urls, tmp_path / "out", config, jobs=2, report=False)
+    result = run(urls, tmp_path / "out", config, schedule=Schedule(jobs=2), report=False)
     assert result.exit_code == EXIT_OK
     assert "allow_private_redirects" not in (tmp_path / "out" / "run.json").read_text()
 
