@@ -15,7 +15,7 @@ pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool
 
 import aiohttp
 
-from pdhef_logtool import Car, ReadOptions, RunConfig, read_drive, run
+from pdhef_logtool import Car, ReadOptions, RunConfig, Schedule, read_drive, run
 from pdhef_logtool.cli.app import app
 from pdhef_logtool.logs import remote_objects, remote_source
 from pdhef_logtool.logs.discovery import LogInput, identity_of
