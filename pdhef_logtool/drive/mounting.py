@@ -408,13 +408,7 @@ def survey_log(
         measured = measure(channels.signals, channels.truth, truth)
     latency = truth_latency(channels, truth)
     survey = Survey(mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, found, placed, framed)
-    if rescale and mapping.origin == "auto" and (scaled := _rescaled(survey)) != mapping:
-        undone = survey_log(log, scaled, clocks, span_ns, vehicle, rescale=False)
-        # A sensor that fails looks like a wrong unit of another; what is right contradicts nothing any more.
-        failed = [check.name for check in undone.checks if check.verdict == "failed"]
-        if not any(name.endswith((".sign", ".unit", ".axis", ".fault")) for name in failed):
-            return undone
-    return survey
+    return _rescaled(survey, log, clocks, span_ns) if rescale and mapping.origin == "auto" else survey
 
 
 def _by_frames(
@@ -447,25 +441,29 @@ def _by_frames(
     return placed, check if alone.is_as_named else frames_alone(placed, believed), alone
 
 
-def _rescaled(survey: Survey) -> Mapping:
-    """Return a recognised mapping with the one unit or sign undone that alone contradicts all else, with a note.
+def _rescaled(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:
+    """Return the survey with the one unit or sign corrected that alone contradicts everything else, with a note.
 
-    The truth takes no part in it, and is itself only checked: what is scored against is not bent.
+    Ground truth takes no part in it: it is only checked.
     """
     mapping = survey.mapping
-    alone = survey.measured.without_truth()
-    found = explained_factors(alone, mounting_is_known=survey.is_mounted, most=1)
-    if found:
+    factors = explained_factors(survey.measured.without_truth(), mounting_is_known=survey.is_mounted, most=1)
+    if factors:
         sound, shares = without_faulty_samples(survey.channels.signals, survey.vehicle)
         if shares:
-            found = explained_factors(measure(sound), mounting_is_known=survey.is_mounted, most=1)
-    for name, (factor, evidence) in found.items():
-        if name not in mapping.signals:
-            continue
-        signals = {**mapping.signals, name: scaled_source(mapping.signals[name], factor)}
-        note = f"{name} is read with {factor:.6g} times its scale: {evidence}"
-        mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
-    return mapping
+            factors = explained_factors(measure(sound), mounting_is_known=survey.is_mounted, most=1)
+    signals, notes = dict(mapping.signals), list(mapping.notes)
+    for name, (factor, evidence) in factors.items():
+        if name in signals:
+            signals[name] = scaled_source(signals[name], factor)
+            notes.append(f"{name} is read with {factor:.6g} times its scale: {evidence}")
+    if signals == mapping.signals:
+        return survey
+    scaled = replace(mapping, signals=signals, notes=tuple(notes))
+    corrected = survey_log(log, scaled, clocks, span_ns, survey.vehicle, rescale=False)
+    # A failing sensor looks like a wrong unit of another one; after a right correction nothing contradicts any more.
+    failed = [check.name for check in corrected.checks if check.verdict == "failed"]
+    return survey if any(n.endswith((".sign", ".unit", ".axis", ".fault")) for n in failed) else corrected
 
 
 def scaled_source(source: SignalSource, factor: float) -> SignalSource:

@@ -5,8 +5,9 @@ Where they contradict one another, the smallest mistake that explains all of the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 from pdhef_logtool.drive.checks.kind import CheckKind
 from pdhef_logtool.drive.measured import WHEEL_SPEEDS, Measured
@@ -55,31 +56,41 @@ def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Che
     if "truth.sideslip_rad" in names and "truth.vy_m_s" in names:  # which is v_x times its tangent
         names.remove("truth.vy_m_s")
     explanations = smallest_explanations(relations, known_mistakes(list(columns), groups))
-    blamed, suspected = _mistakes_by_signal(explanations)
-    culprits = set() if explanations else contradicting(relations)
+    likeliest, others = _mistakes_by_signal(explanations)
+    explained = _Explained(likeliest, others, bool(explanations), set() if explanations else contradicting(relations))
     checks: list[Check] = []
     for name in names:
         mine = [r for r in relations if name in r.powers]
-        telling = [r for r in mine if r.tells]
-        bad = [r for r in telling if not r.accepts()]
-        good = [r for r in telling if r.accepts()]
-        stray = [r for r in mine if r.unrelated and not _is_cleared(name, r, relations)]
-        if stray:
-            checks.append(_stray(name, stray[0]))
-        if name in blamed or name in suspected:
-            found = _blamed(name, blamed.get(name) or suspected[name], bad or telling)
-            is_sure = name in blamed and not (bad and all(r.is_vague for r in bad))
-            checks += found if is_sure else [replace(c, verdict="undecided") for c in found]
-        elif name in culprits:
-            checks.append(_unexplained(name, bad))
-        elif good or (bad and explanations):
-            best = max(telling if explanations else good, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
-            checks += [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
-        elif bad:
-            checks.append(_contradicted(name, bad[0], culprits))
-        elif not stray:
-            checks.append(_not_excited(name, mine))
+        unrelated = [r for r in mine if r.unrelated and not _is_cleared(name, r, relations)]
+        judged = _judged(name, [r for r in mine if r.tells], explained)
+        checks += [_unrelated(name, r) for r in unrelated[:1]]
+        checks += judged or ([] if unrelated else [_not_excited(name, mine)])
     return tuple(checks)
+
+
+class _Explained(NamedTuple):
+    """Mistakes by signal of the likeliest explanations and of the others, and signals to blame where there is none."""
+
+    likeliest: Mapping[str, list[Mistake]]
+    others: Mapping[str, list[Mistake]]
+    is_explained: bool
+    culprits: set[str]
+
+
+def _judged(name: str, relations: Sequence[Relation], explained: _Explained) -> list[Check]:
+    """Return sign and unit checks of a signal by the relations that tell; empty without any."""
+    bad, good = ([r for r in relations if r.accepts() is accepted] for accepted in (False, True))
+    if name in explained.likeliest or name in explained.others:
+        failed = _failed(name, explained.likeliest.get(name) or explained.others[name], bad or good)
+        is_sure = name in explained.likeliest and not (bad and all(r.is_vague for r in bad))
+        return failed if is_sure else [replace(c, verdict="undecided") for c in failed]
+    if name in explained.culprits:
+        return [_unexplained(name, bad)]
+    if good or (bad and explained.is_explained):
+        usable = relations if explained.is_explained else good
+        best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
+        return [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
+    return [_contradicted(name, bad[0], explained.culprits)] if bad else []
 
 
 def _mistakes_by_signal(
@@ -128,23 +139,23 @@ def _contradicted(name: str, relation: Relation, culprits: set[str]) -> Check:
 _JUDGED_TRUTH = (*(f"truth.{n}" for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2")),)
 
 
-def _is_cleared(name: str, stray: Relation, relations: Sequence[Relation]) -> bool:
+def _is_cleared(name: str, unrelated: Relation, relations: Sequence[Relation]) -> bool:
     """Return whether another relation shows the signal to be right, and none does so for the others of the pair."""
 
     def shown(signal: str) -> bool:
-        return any(r.tells and r.accepts() and signal in r.powers and r.powers != stray.powers for r in relations)
+        return any(r.tells and r.accepts() and signal in r.powers and r.powers != unrelated.powers for r in relations)
 
     paces = {"speed_m_s", WHEEL_SPEEDS, "truth.vx_m_s"}
-    others = [n for n in stray.powers if n != name and n not in paces]
+    others = [n for n in unrelated.powers if n != name and n not in paces]
     return name in paces or (shown(name) and not all(shown(n) for n in others))
 
 
-def _stray(name: str, relation: Relation) -> Check:
+def _unrelated(name: str, relation: Relation) -> Check:
     evidence = f"{relation.text}: one moves and the other does not with it, correlation {relation.correlation:.2f}"
     return AXIS.failed(evidence, name, signal_name=name)
 
 
-def _blamed(name: str, mistakes: Sequence[Mistake], relations: Sequence[Relation]) -> list[Check]:
+def _failed(name: str, mistakes: Sequence[Mistake], relations: Sequence[Relation]) -> list[Check]:
     kinds = {m.kind for m in mistakes}
     wrong = [c for a, c in (("sign", SIGN), ("unit", UNIT)) if any(a in k for k in kinds)]
     words = " or ".join(dict.fromkeys(m.words for m in mistakes))
