@@ -307,8 +307,8 @@ def _median_period_s(channel: Channel) -> float | None:
 
 
 def _grid_channel(periods: Mapping[str, float | None]) -> str:
-    known = {name: p for name in _IMU if (p := periods.get(name)) is not None}
-    if not known:
+    period_by_name = {name: p for name in _IMU if (p := periods.get(name)) is not None}
+    if not period_by_name:
         mapped = ", ".join(sorted(name for name in _IMU if name in periods))
         raise MappingError(
             expected="samples of yaw_rate_rad_s, ay_m_s2 or ax_m_s2, whose stamps are the grid",
@@ -316,8 +316,8 @@ def _grid_channel(periods: Mapping[str, float | None]) -> str:
             where="alignment",
             remedy="map an IMU topic (pdhef inspect LOG shows what the log holds)",
         )
-    fastest = min(known.values())
-    return next(name for name, period in known.items() if period <= 2.0 * fastest)
+    fastest = min(period_by_name.values())
+    return next(name for name, period in period_by_name.items() if period <= 2.0 * fastest)
 
 
 def _choose_sources(

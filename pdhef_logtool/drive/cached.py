@@ -28,8 +28,8 @@ def cached(
         return
     from pdhef_logtool.drive.slim_cache import SlimCache
 
-    with SlimCache(options.cache, mapping, options).standing_in(log, warn) as found:
-        yield found, mapping if found.path == log.path else None
+    with SlimCache(options.cache, mapping, options).standing_in(log, warn) as substitute:
+        yield substitute, mapping if substitute.path == log.path else None
 
 
 @contextmanager
@@ -38,7 +38,7 @@ def read_cached(
 ) -> Iterator[Drive]:
     """Open a log as :func:`~pdhef_logtool.drive.reading.read_drive` does, or what stands for it."""
     with (
-        cached(log, mapping, options, warn) as (found, of_it),
-        read_drive(found, car, of_it, options, tell=warn) as drive,
+        cached(log, mapping, options, warn) as (substitute, mapping_of_it),
+        read_drive(substitute, car, mapping_of_it, options, tell=warn) as drive,
     ):
         yield drive

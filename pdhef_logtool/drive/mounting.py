@@ -122,10 +122,10 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
     ups = _ups(f, w, named)
     if len(ups) > 1 and not references:  # gravity does not say which way is up
         references = steering_references(columns, speed_name)
-    found = [m for h in (1.0, -1.0) for up in ups if (m := _turned(f, h * w, speed, up, references)) is not None]
-    hands = [1.0] * (len(found) // 2) + [-1.0] * (len(found) // 2)
+    turns = [m for h in (1.0, -1.0) for up in ups if (m := _turned(f, h * w, speed, up, references)) is not None]
+    hands = [1.0] * (len(turns) // 2) + [-1.0] * (len(turns) // 2)
     # Another measurement of the yaw rate must say so before a sensor is taken for a left-handed one.
-    fitting = [(m, h) for m, h in zip(found, hands, strict=True) if m.fits and h * HAND_CORRELATION > -m.sign]
+    fitting = [(m, h) for m, h in zip(turns, hands, strict=True) if m.fits and h * HAND_CORRELATION > -m.sign]
     if not fitting:
         return None
     best, hand = max(fitting, key=lambda x: x[0].correlation + np.sign(x[0].sign))
@@ -256,8 +256,8 @@ def _snapped(turn: _Turn) -> FloatArray:
     rest = rotation @ step.T
     tilt = math.degrees(math.acos(float(np.clip(rest[2, 2], -1.0, 1.0))))
     yaw = math.degrees(math.atan2(rest[1, 0] - rest[0, 1], rest[0, 0] + rest[1, 1]))
-    known = turn.correlation >= ASKEW_CORRELATION and turn.error_deg <= ASKEW_ERROR_DEG
-    if not known or turn.samples < ASKEW_SAMPLES:
+    is_precise = turn.correlation >= ASKEW_CORRELATION and turn.error_deg <= ASKEW_ERROR_DEG
+    if not is_precise or turn.samples < ASKEW_SAMPLES:
         return step
     is_turned = abs(yaw) > max(YAW_DEG, 3.0 * turn.error_deg)
     if tilt > TILT_DEG:
@@ -317,7 +317,7 @@ class Survey:
     def checks(self) -> tuple[Check, ...]:
         """The checks of the mounting with those of :func:`~pdhef_logtool.drive.checks.running.check_drive`."""
         channels = self.channels
-        found = check_drive(
+        drive_checks = check_drive(
             channels.signals,
             channels.truth,
             self.truth,
@@ -331,34 +331,35 @@ class Survey:
             # Right axes have right signs, and gravity says the unit.
             settled = {f"{n}.sign" for n in MOUNTED}
             evidence = self.mounting.evidence
-            known = [replace(c, verdict="passed", evidence=evidence, remedy="") for c in found]
-            found = tuple(
-                k if c.verdict == "undecided" and c.name in settled else c for c, k in zip(found, known, strict=True)
+            passed = [replace(c, verdict="passed", evidence=evidence, remedy="") for c in drive_checks]
+            drive_checks = tuple(
+                k if c.verdict == "undecided" and c.name in settled else c
+                for c, k in zip(drive_checks, passed, strict=True)
             )
-        return (*self.mounted, *self._of_names(found), *found)
+        return (*self.mounted, *self._of_names(drive_checks), *drive_checks)
 
     @cached_property
     def late(self) -> tuple[LateSensor, ...]:
         """The sensors whose stamps are late by what the signals alone say; a sensor that fails for a while is none."""
-        found = late_sensors(self.channels.signals)
-        if not found:
+        sensors = late_sensors(self.channels.signals)
+        if not sensors:
             return ()
         sound, shares = without_faulty_samples(self.channels.signals, self.vehicle)
-        return late_sensors(sound) if shares else found
+        return late_sensors(sound) if shares else sensors
 
-    def _of_names(self, found: tuple[Check, ...]) -> Iterator[Check]:
+    def _of_names(self, drive_checks: tuple[Check, ...]) -> Iterator[Check]:
         """Yield what the mapping's names left undecided and the drive has not settled since."""
-        passed = {c.name for c in found if c.verdict == "passed"} - {
-            f"{c.subject}.sign" for c in found if c.verdict != "passed"
+        passed = {c.name for c in drive_checks if c.verdict == "passed"} - {
+            f"{c.subject}.sign" for c in drive_checks if c.verdict != "passed"
         }
         doubted = {c.name.removesuffix(".candidate") for c in self.mapping.checks if "unit" in c.evidence}
-        told = units_told(self.measured.relations, doubted)
+        resolved = units_told(self.measured.relations, doubted)
         for check in self.mapping.checks:
             signal = check.name.removesuffix(".candidate")
             if check.name in ("imu.mounting", "mapping.sign") and self.mounting is not None and self.mounting.confident:
                 continue
             # A doubt about a unit stays unless the drive rules out all others: a gain that passes is wider than some.
-            if f"{signal}.sign" not in passed or (signal in doubted and signal not in told):
+            if f"{signal}.sign" not in passed or (signal in doubted and signal not in resolved):
                 yield check
 
 
@@ -390,24 +391,24 @@ def survey_log(
     truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
     measured = measure(channels.signals, channels.truth, truth)
     # What an estimator is given must not hang on the truth: with it, a mounting is only checked.
-    found = find_mounting(measured.without_truth(), triads, mapping)
-    blind = found is not None and found.confident
+    mounting = find_mounting(measured.without_truth(), triads, mapping)
+    blind = mounting is not None and mounting.confident
     if not blind and truth is not None:
-        found = find_mounting(measured, triads, mapping)
-    placed, framed, by_frames = _by_frames(log, mapping, channels, triads, found)
-    found = by_frames or found
+        mounting = find_mounting(measured, triads, mapping)
+    placed, framed, by_frames = _by_frames(log, mapping, channels, triads, mounting)
+    mounting = by_frames or mounting
     channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
     measured = measured.without(extra)
     trusted = blind or by_frames is not None
-    if found is not None and mapping.origin == "auto" and trusted and not found.is_as_named:
-        note = f"{found.text}, and is read so: {found.evidence}"
-        signals = turned_signals(mapping, found, triads)
+    if mounting is not None and mapping.origin == "auto" and trusted and not mounting.is_as_named:
+        note = f"{mounting.text}, and is read so: {mounting.evidence}"
+        signals = turned_signals(mapping, mounting, triads)
         mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
         channels = read_signals(log, mapping, clocks, *span_ns)
-        found = replace(found, named=found.rows)
+        mounting = replace(mounting, named=mounting.rows)
         measured = measure(channels.signals, channels.truth, truth)
     latency = truth_latency(channels, truth)
-    survey = Survey(mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, found, placed, framed)
+    survey = Survey(mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, placed, framed)
     return _rescaled(survey, log, clocks, span_ns) if rescale and mapping.origin == "auto" else survey
 
 
@@ -416,7 +417,7 @@ def _by_frames(
     mapping: Mapping,
     channels: MappedChannels,
     triads: tuple[Triad | None, Triad | None],
-    found: Mounting | None,
+    by_drive: Mounting | None,
 ) -> tuple[Placement | None, Check | None, Mounting | None]:
     """Return where recorded frames put the IMU, the check of it, and the mounting where they alone say it.
 
@@ -430,7 +431,7 @@ def _by_frames(
         return placed, None, None
     components = [channels.signals.get(n) for n in ACCELERATIONS]
     force = np.array([np.nanmean(c.values) if c is not None and len(c) else np.nan for c in components])
-    sure = found if found is not None and found.confident else None
+    sure = by_drive if by_drive is not None and by_drive.confident else None
     shown, evidence = (None, "") if sure is None else (sure.rotation, sure.evidence)
     check = frames_check(placed, shown, evidence, force)
     believed = "" if sure is not None else gravity_agrees(placed, force)
@@ -484,13 +485,13 @@ def truth_latency(channels: MappedChannels, truth: TruthTrack | None) -> Latency
     rate = channels.truth.get("yaw_rate_rad_s") or yaw_rate_channel(truth)
     if not len(rate):
         return None
-    found = estimate_truth_latency(gyro, rate)
+    latency = estimate_truth_latency(gyro, rate)
     speed = channels.signals.get("speed_m_s")
     other = None
     if speed is not None and speed.source.split(".")[0] != gyro.source.split(".")[0]:
         vx = channel_of(truth, "vx_m_s")
         other = estimate_truth_latency(speed, vx) if min(len(speed), len(vx)) >= 2 else None
-    return booked_on_the_late(found, other)
+    return booked_on_the_late(latency, other)
 
 
 def turned_signals(

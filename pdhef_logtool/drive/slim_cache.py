@@ -116,9 +116,9 @@ class SlimCache:
         left = _left_bytes.get(self.place, 0.0) - made.stat().st_size
         if left < 0.0:
             left = _LOOK_SHARE * most
-            found = [(state.st_mtime_ns, state.st_size, path) for path, state in _entries(Path(self.place))]
-            size = sum(one[1] for one in found)
-            for _, size_bytes, path in sorted(found):
+            entries = [(state.st_mtime_ns, state.st_size, path) for path, state in _entries(Path(self.place))]
+            size = sum(entry[1] for entry in entries)
+            for _, size_bytes, path in sorted(entries):
                 if size <= most:
                     break
                 if path != made:

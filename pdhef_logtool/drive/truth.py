@@ -264,8 +264,8 @@ def truth_at(
     bracket = Bracket(track.stamps_ns, stamps_ns + round(latency_s * 1e9), round(truth.max_gap_s * 1e9))
     vx, vy = bracket.linear(track.vx_m_s), bracket.linear(track.vy_m_s)
     beta = bracket.angle(track.sideslip_rad)
-    known = np.isfinite(vx) & np.isfinite(vy)
-    beta[known] = np.arctan2(vy[known], vx[known])
+    finite = np.isfinite(vx) & np.isfinite(vy)
+    beta[finite] = np.arctan2(vy[finite], vx[finite])
     rate, ay = bracket.linear(track.yaw_rate_rad_s), bracket.linear(track.ay_m_s2)
     return make_track(
         "truth",
@@ -289,20 +289,20 @@ def valid_as_a_whole(truth: StateTrack, derivation: Mapping[str, str], standstil
     earlier than they do. Figures count each quantity where it is known itself.
     """
     standing = np.hypot(truth.vx_m_s, truth.vy_m_s) < standstill_m_s
-    known = truth.valid & (np.isfinite(truth.sideslip_rad) | standing | ("sideslip_rad" not in derivation))
+    complete = truth.valid & (np.isfinite(truth.sideslip_rad) | standing | ("sideslip_rad" not in derivation))
     for name, how in derivation.items():
         for column in () if how == _AY_DERIVED else _COLUMNS.get(name, ()):
-            known &= np.isfinite(getattr(truth, column))
-    return replace(truth, valid=known)
+            complete &= np.isfinite(getattr(truth, column))
+    return replace(truth, valid=complete)
 
 
 def channel_of(truth: TruthTrack, name: str) -> Channel:
     """Return a column of the truth as a channel without NaN."""
     values = getattr(truth.track, name)
-    known = np.isfinite(values)
-    stamps = truth.track.stamps_ns[known]
+    finite = np.isfinite(values)
+    stamps = truth.track.stamps_ns[finite]
     source = truth.derivation.get(name, "none")
-    return Channel(name, TRUTH_UNITS.get(name, ""), source, stamps, stamps, values[known])
+    return Channel(name, TRUTH_UNITS.get(name, ""), source, stamps, stamps, values[finite])
 
 
 def yaw_rate_channel(truth: TruthTrack) -> Channel:
@@ -310,7 +310,7 @@ def yaw_rate_channel(truth: TruthTrack) -> Channel:
     return channel_of(truth, "yaw_rate_rad_s")
 
 
-def booked_on_the_late(found: LatencyEstimate, speed: LatencyEstimate | None) -> LatencyEstimate:
+def booked_on_the_late(latency: LatencyEstimate, speed: LatencyEstimate | None) -> LatencyEstimate:
     """Return the latency with what is the gyro's taken from the truth.
 
     No truth shows a motion before it happens: where it leads the gyro, the gyro's stamps are late. Only where a speed
@@ -320,17 +320,17 @@ def booked_on_the_late(found: LatencyEstimate, speed: LatencyEstimate | None) ->
     ----------
     found : gyro against truth yaw rate. speed : the speed sensor of another topic against the truth's v_x.
     """
-    leads = -found.latency_s
-    if not found.reliable or leads <= max(LATE_GYRO_S, 3.0 * found.std_error_s):
-        return found
+    leads = -latency.latency_s
+    if not latency.reliable or leads <= max(LATE_GYRO_S, 3.0 * latency.std_error_s):
+        return latency
     if (
         speed is not None
         and speed.reliable
-        and abs(speed.latency_s - found.latency_s) <= max(2.0 * LATE_GYRO_S, 3.0 * speed.std_error_s)
+        and abs(speed.latency_s - latency.latency_s) <= max(2.0 * LATE_GYRO_S, 3.0 * speed.std_error_s)
     ):
-        return replace(found, reason=f"{found.reason}; the speed sensor is late by as much")
+        return replace(latency, reason=f"{latency.reason}; the speed sensor is late by as much")
     reason = f"the gyro is {leads * 1e3:.1f} ms late against the truth, which leads no motion"
-    return replace(found, latency_s=0.0, gyro_delay_s=leads, reason=reason)
+    return replace(latency, latency_s=0.0, gyro_delay_s=leads, reason=reason)
 
 
 def estimate_truth_latency(
@@ -393,7 +393,7 @@ def dependent_signals(
     -------
     By truth name, a sentence for the report. Metrics of that name are to be marked ``not independent``.
     """
-    found: dict[str, str] = {}
+    dependent: dict[str, str] = {}
     for name, truth in sorted(truth_channels.items()):
         for signal in sorted(signals_channels):
             channel = signals_channels[signal]
@@ -401,11 +401,11 @@ def dependent_signals(
                 continue
             share = _same_share(channel, truth)
             if share >= SAME_SHARE:
-                found[name] = (
+                dependent[name] = (
                     f"{truth.source} equals the {role} {signal} ({channel.source}) on {share:.1%} of its samples"
                 )
                 break
-    return found
+    return dependent
 
 
 # ---- planning ----
@@ -599,8 +599,8 @@ def differentiate(
     if n < 2 * h + 1:
         return slope
     gaps = np.concatenate([[0], np.cumsum(np.diff(stamps_ns) > max_gap_ns)])
-    known = np.concatenate([[0], np.cumsum(~np.isfinite(values))])
-    whole = (gaps[2 * h :] == gaps[: n - 2 * h]) & (known[2 * h + 1 :] == known[: n - 2 * h])
+    missing_before = np.concatenate([[0], np.cumsum(~np.isfinite(values))])
+    whole = (gaps[2 * h :] == gaps[: n - 2 * h]) & (missing_before[2 * h + 1 :] == missing_before[: n - 2 * h])
     centres = np.flatnonzero(whole) + h
     offsets = np.arange(-h, h + 1)
     for start in range(0, centres.shape[0], _CHUNK):

@@ -83,11 +83,11 @@ class Seconds:
         marks = (
             np.empty(0, dtype=np.int64) if self._mark is None else np.arange(self._mark, int(stamps[-1]) + 1, second)
         )
-        at = np.searchsorted(stamps, marks)
+        anchors = np.searchsorted(stamps, marks)
         up_to = self._lost + np.cumsum(~motion)
         columns = (self._rows + np.arange(len(stamps)), pose, up_to - ~motion, up_to, self._gaps + np.cumsum(gap))
         poses = (*_dead_reckon(estimate, self._reckoner), truth.x_m, truth.y_m, truth.yaw_rad)
-        self._anchors.append(np.stack([np.asarray(c[at], dtype=np.float64) for c in (*columns, *poses)]))
+        self._anchors.append(np.stack([np.asarray(c[anchors], dtype=np.float64) for c in (*columns, *poses)]))
         self._mark = None if self._mark is None else self._mark + second * len(marks)
         self._lost += int(np.count_nonzero(~motion))
         self._gaps += int(np.count_nonzero(gap))
@@ -97,9 +97,9 @@ class Seconds:
         """Return the lateral errors of all blocks."""
         anchors = np.concatenate([np.empty((11, 0)), *self._anchors], axis=1)
         begin, end = anchors[:, :-1], anchors[:, 1:]
-        at, pose, lost, _, gaps = range(5)
+        row, pose, lost, _, gaps = range(5)
         whole = (end[3] == begin[lost]) & (end[gaps] == begin[gaps]) & (begin[pose] * end[pose] > 0)
-        whole &= end[at] > begin[at]
+        whole &= end[row] > begin[row]
         x, y, yaw, true_x, true_y, true_yaw = begin[5:, whole]
         x_end, y_end, _, true_x_end, true_y_end, true_yaw_end = end[5:, whole]
         # One dead reckoning serves all seconds: a new start pose only turns and moves it.
@@ -111,13 +111,13 @@ class Seconds:
 
 def pose_known(truth: StateTrack) -> BoolArray:
     """Return where the truth has a pose [N]."""
-    known: BoolArray = truth.valid & np.isfinite(truth.x_m) & np.isfinite(truth.y_m) & np.isfinite(truth.yaw_rad)
-    return known
+    is_known: BoolArray = truth.valid & np.isfinite(truth.x_m) & np.isfinite(truth.y_m) & np.isfinite(truth.yaw_rad)
+    return is_known
 
 
 def _motion_known(track: StateTrack) -> BoolArray:
-    known: BoolArray = track.valid & np.isfinite(track.vx_m_s) & np.isfinite(track.vy_m_s)
-    return known & np.isfinite(track.yaw_rate_rad_s)
+    is_known: BoolArray = track.valid & np.isfinite(track.vx_m_s) & np.isfinite(track.vy_m_s)
+    return is_known & np.isfinite(track.yaw_rate_rad_s)
 
 
 def _dead_reckon(

@@ -68,24 +68,24 @@ def operating_space(
         steps = np.diff(part.stamps_ns, append=part.stamps_ns[-1:]) * 1e-9
         steps = np.minimum(np.where(steps > 0.0, steps, step_ns * 1e-9), MAX_STEP_S)
         core = slice(a - first, b - first)
-        known = (np.isfinite(speed) & np.isfinite(ay))[core]
-        i = np.searchsorted(SPEED_EDGES_M_S, speed[core][known], side="right") - 1
-        j = np.searchsorted(AY_EDGES_M_S2, ay[core][known], side="right") - 1
+        finite = (np.isfinite(speed) & np.isfinite(ay))[core]
+        i = np.searchsorted(SPEED_EDGES_M_S, speed[core][finite], side="right") - 1
+        j = np.searchsorted(AY_EDGES_M_S2, ay[core][finite], side="right") - 1
         cell = np.maximum(i, 0) * shape[1] + j
-        totals[0] += np.bincount(cell, weights=steps[core][known], minlength=size)
+        totals[0] += np.bincount(cell, weights=steps[core][finite], minlength=size)
         if truth is not None:
-            error = signal_error(estimate.rows(a, b), truth.rows(a, b), "sideslip_rad", low_speed_m_s)[known]
+            error = signal_error(estimate.rows(a, b), truth.rows(a, b), "sideslip_rad", low_speed_m_s)[finite]
             scored = np.isfinite(error)
             totals[1] += np.bincount(cell[scored], minlength=size)
             totals[2] += np.bincount(cell[scored], weights=error[scored] ** 2, minlength=size)
     seconds, counts, squares = totals
     return tuple(
         Cell(
-            speed=int(at // shape[1]),
-            ay=int(at % shape[1]),
-            seconds=float(seconds[at]),
-            scored=int(counts[at]),
-            sideslip_mse_rad2=float(squares[at] / counts[at]) if counts[at] else float("nan"),
+            speed=int(cell_index // shape[1]),
+            ay=int(cell_index % shape[1]),
+            seconds=float(seconds[cell_index]),
+            scored=int(counts[cell_index]),
+            sideslip_mse_rad2=float(squares[cell_index] / counts[cell_index]) if counts[cell_index] else float("nan"),
         )
-        for at in np.flatnonzero(seconds)
+        for cell_index in np.flatnonzero(seconds)
     )

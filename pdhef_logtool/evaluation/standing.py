@@ -59,27 +59,27 @@ def standings(
     track = read(name)
     assert track is not None
     block_s = BLOCK_S * max(1, -(-_duration_s(truth) // (BLOCK_S * _MOST_BLOCKS)))
-    found = []
+    results = []
     for signal in JUDGED_SIGNALS:
 
         def sums(*tracks: StateTrack, signal: str = signal) -> tuple[FloatArray, FloatArray]:
             return _sums(tracks, truth, signal, low_speed_m_s, block_s)
 
-        own = _with_bounds(rmse_interval(*sums(track)))
+        rmse = _with_bounds(rmse_interval(*sums(track)))
         best: tuple[float, str, Interval] | None = None
         for rival in rivals:
             other = read(rival)
             assert other is not None
             squares, counts = sums(track, other)
-            if own is None or not counts.size:
+            if rmse is None or not counts.size:
                 continue
             theirs = float(np.sqrt(squares[1].sum() / counts.sum()))
             if best is None or theirs < best[0]:
                 best = theirs, rival, rmse_difference_interval(squares, counts)
         rival_rmse, chosen, difference = best or (None, None, None)
         bounded = None if difference is None else _with_bounds(difference)
-        found.append(Standing(signal, name, own, chosen, rival_rmse, bounded, block_s))
-    return found
+        results.append(Standing(signal, name, rmse, chosen, rival_rmse, bounded, block_s))
+    return results
 
 
 def _duration_s(track: StateTrack) -> float:
@@ -89,11 +89,11 @@ def _duration_s(track: StateTrack) -> float:
     return float(track.rows(n - 1, n).stamps_ns[0] - track.rows(0, 1).stamps_ns[0]) * 1e-9
 
 
-def _with_bounds(found: Interval) -> Interval | None:
-    if found.blocks == 0:
+def _with_bounds(interval: Interval) -> Interval | None:
+    if interval.blocks == 0:
         return None
     nan = float("nan")
-    return found if found.blocks >= LEAST_BLOCKS else Interval(found.value, nan, nan, found.blocks)
+    return interval if interval.blocks >= LEAST_BLOCKS else Interval(interval.value, nan, nan, interval.blocks)
 
 
 def _sums(
@@ -101,16 +101,16 @@ def _sums(
 ) -> tuple[FloatArray, FloatArray]:
     """Return sums of squared errors [tracks, K] and counts [K] by block, of the stamps at which all are scored."""
     first_ns: int | None = None
-    found: dict[int, FloatArray] = {}
+    by_block: dict[int, FloatArray] = {}
     for a, b in row_blocks(len(truth)):
         part = truth.rows(a, b)
         stamps = part.stamps_ns
         errors = [signal_error(t.rows(a, b), part, signal, low_speed_m_s) for t in tracks]
-        known = np.isfinite(np.stack(errors)).all(axis=0)
-        if first_ns is None and known.any():
-            first_ns = int(stamps[np.argmax(known)])
+        finite = np.isfinite(np.stack(errors)).all(axis=0)
+        if first_ns is None and finite.any():
+            first_ns = int(stamps[np.argmax(finite)])
         sums, counts, numbers = block_sums(errors, stamps, block_s, first_ns)
         for number, column in zip(numbers.tolist(), np.vstack([sums, counts]).T, strict=True):
-            found[number] = found[number] + column if number in found else column
-    rows = np.stack([*found.values()], axis=1) if found else np.zeros((len(tracks) + 1, 0))
+            by_block[number] = by_block[number] + column if number in by_block else column
+    rows = np.stack([*by_block.values()], axis=1) if by_block else np.zeros((len(tracks) + 1, 0))
     return rows[:-1], rows[-1]

@@ -142,9 +142,9 @@ def thresholds_from_dict(raw: dict[str, Any], *, where: str) -> tuple[Threshold,
     if not isinstance(tables, list) or not tables:
         problems.append("threshold: give at least one [[threshold]] table")
         tables = []
-    found = [_read_table(table, f"threshold[{i}]", problems) for i, table in enumerate(tables)]
+    thresholds = [_read_table(table, f"threshold[{i}]", problems) for i, table in enumerate(tables)]
     seen: dict[tuple[str, ...], int] = {}
-    for i, threshold in enumerate(found):
+    for i, threshold in enumerate(thresholds):
         if threshold is None:
             continue
         key = (threshold.estimator, threshold.signal, threshold.segment, threshold.metric)
@@ -158,7 +158,7 @@ def thresholds_from_dict(raw: dict[str, Any], *, where: str) -> tuple[Threshold,
             where=where,
             remedy="see docs/formats.md for every entry",
         )
-    return tuple(t for t in found if t is not None)
+    return tuple(t for t in thresholds if t is not None)
 
 
 def _read_table(raw: object, where: str, problems: list[str]) -> Threshold | None:
@@ -166,13 +166,13 @@ def _read_table(raw: object, where: str, problems: list[str]) -> Threshold | Non
     if table is None:
         return None
     before = len(problems)
-    for key, value, known in (
+    for key, value, allowed in (
         ("signal", table.signal, tuple(SIGNALS)),
         ("metric", table.metric, tuple(registered())),
         ("segment", table.segment, SEGMENTS),
     ):
-        if value not in known:
-            problems.append(f"{where}.{key} = {unknown(value, known)}")
+        if value not in allowed:
+            problems.append(f"{where}.{key} = {unknown(value, allowed)}")
     if table.min is None and table.max is None:
         problems.append(f"{where}: give min, max or both")
     elif table.min is not None and table.max is not None and table.min > table.max:
@@ -217,10 +217,10 @@ def check_thresholds(thresholds: Sequence[Threshold], rows: Sequence[MetricRow],
     verdicts = []
     for threshold in thresholds:
         figure = (threshold.signal, threshold.segment, threshold.metric)
-        found = [r for r in rows if (r.signal, r.segment, r.metric) == figure and _is_meant(threshold, r.estimator)]
-        if not found:
+        matching = [r for r in rows if (r.signal, r.segment, r.metric) == figure and _is_meant(threshold, r.estimator)]
+        if not matching:
             verdicts.append(_without_figure(threshold, log, threshold.estimator, "no such figure in this log"))
-        for row in found:
+        for row in matching:
             if math.isfinite(row.value):
                 verdicts.append(_judge(threshold, row))
             else:

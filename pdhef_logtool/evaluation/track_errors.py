@@ -40,10 +40,10 @@ def raw_error(estimate: StateTrack, truth: StateTrack, signal: str) -> FloatArra
 
 def scorable(truth: StateTrack, signal: str, low_speed_m_s: float) -> BoolArray:
     """Return where the truth can score a signal [N]: sideslip only above a speed."""
-    known: BoolArray = truth.valid & np.isfinite(getattr(truth, signal))
+    is_scorable: BoolArray = truth.valid & np.isfinite(getattr(truth, signal))
     if signal == "sideslip_rad":
-        known = known & (truth_speed(truth) > low_speed_m_s)
-    return known
+        is_scorable = is_scorable & (truth_speed(truth) > low_speed_m_s)
+    return is_scorable
 
 
 def total_std(estimate: StateTrack, truth: StateTrack, signal: str) -> FloatArray | None:
@@ -51,11 +51,11 @@ def total_std(estimate: StateTrack, truth: StateTrack, signal: str) -> FloatArra
     name = _STDS.get(signal)
     if name is None or (name != "sideslip_std_rad" and not estimate.covariance.shape[0]):
         return None
-    own: FloatArray = getattr(estimate, name)
+    std: FloatArray = getattr(estimate, name)
     of_truth = getattr(truth, name)
     if not np.isfinite(of_truth).any():
-        return own
-    return np.asarray(np.hypot(own, np.nan_to_num(of_truth, nan=0.0)), dtype=np.float64)
+        return std
+    return np.asarray(np.hypot(std, np.nan_to_num(of_truth, nan=0.0)), dtype=np.float64)
 
 
 def selected(values: NDArray[Any], mask: BoolArray) -> NDArray[Any]:

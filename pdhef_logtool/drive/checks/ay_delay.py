@@ -13,10 +13,10 @@ from pdhef_logtool.records.checks import Check
 
 def _check(drive: CheckedDrive) -> Iterator[Check]:
     errors = errors_of_ay(drive)
-    found = None if errors is None else ay_delay(errors, drive.latency)
-    if found is None:
+    delay_and_error = None if errors is None else ay_delay(errors, drive.latency)
+    if delay_and_error is None:
         return
-    delay, error = found
+    delay, error = delay_and_error
     evidence = f"a_y is {delay * 1e3:.1f} +- {error * 1e3:.1f} ms late against the truth"
     if delay > max(SENSOR_DELAY_S, SURE * error):
         yield DELAY.failed(evidence, delay=delay)

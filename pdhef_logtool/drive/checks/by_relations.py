@@ -40,12 +40,12 @@ def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int 
     if chosen is None or len(chosen) > most or not all(m.is_exact for m in chosen):
         return {}
     bad = [r for r in relations if r.tells and not r.accepts()]
-    found = {}
+    factor_by_name = {}
     for mistake in chosen:
         for name, factor in mistake.factors.items():
             evidence = next((r.evidence for r in bad if name in r.powers), "")
-            found[name] = (factor, f"{mistake.words}: {evidence}")
-    return found
+            factor_by_name[name] = (factor, f"{mistake.words}: {evidence}")
+    return factor_by_name
 
 
 def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Check, ...]:
@@ -101,11 +101,11 @@ def _mistakes_by_signal(
     blamed: dict[str, list[Mistake]] = {}
     suspected: dict[str, list[Mistake]] = {}
     for chosen in explanations:
-        found = blamed if _likelihood(chosen) == least else suspected
+        by_signal = blamed if _likelihood(chosen) == least else suspected
         for mistake in chosen:
             for name in mistake.factors:
-                if mistake not in found.setdefault(name, []):
-                    found[name].append(mistake)
+                if mistake not in by_signal.setdefault(name, []):
+                    by_signal[name].append(mistake)
     return blamed, suspected
 
 

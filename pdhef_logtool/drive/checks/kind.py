@@ -72,7 +72,7 @@ class CheckedDrive:
     vehicle : of the file, or the default one, which is no ``has_file``.
     latency : of the truth against the gyro, or the gyro's own. late : sensors that are late without truth.
     has_truth : whether the truth at the CG is known.
-    related : checks of signals by the relations between them. found : the checks so far.
+    related : checks of signals by the relations between them. judged : the checks so far.
     """
 
     measured: Measured
@@ -82,7 +82,7 @@ class CheckedDrive:
     late: tuple[LateSensor, ...]
     has_truth: bool
     related: tuple[Check, ...]
-    found: list[Check] = field(default_factory=list)
+    judged: list[Check] = field(default_factory=list)
     _shared: dict[Callable[[CheckedDrive], object], object] = field(default_factory=dict)
 
     @property

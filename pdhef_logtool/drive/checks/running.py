@@ -55,12 +55,12 @@ def check_drive(
         )
         return _all_checks(drive)
 
-    found = checks_of(measure(signals, truth, derived) if measured is None else measured)
-    if all(check.verdict != "failed" for check in found):
-        return found
+    checks = checks_of(measure(signals, truth, derived) if measured is None else measured)
+    if all(check.verdict != "failed" for check in checks):
+        return checks
     sound, shares = without_faulty_samples(signals, vehicle or default_vehicle())
     if not shares:
-        return found
+        return checks
     faults = (fault_check(name, share) for name, share in shares.items())
     return (*(c for c in faults if c.verdict == "failed"), *checks_of(measure(sound, truth, derived)))
 
@@ -68,9 +68,9 @@ def check_drive(
 def _all_checks(drive: CheckedDrive) -> tuple[Check, ...]:
     for kind in registered().values():
         if kind.function is not None:
-            drive.found.extend(kind.function(drive))
+            drive.judged.extend(kind.function(drive))
     unique: dict[str, Check] = {}
-    for check in drive.found:  # of two of a name the worse counts
+    for check in drive.judged:  # of two of a name the worse counts
         if check.name not in unique or _BADNESS[check.verdict] > _BADNESS[unique[check.name].verdict]:
             unique[check.name] = check
     return tuple(unique.values())

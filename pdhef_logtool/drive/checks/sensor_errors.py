@@ -54,22 +54,22 @@ def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
     gyro, ay = columns.get("yaw_rate_rad_s"), columns.get("ay_m_s2")
     if rate is not None and gyro is not None:
         everywhere = np.ones(rate.shape[0], np.bool_)
-        found = fit(gyro, [rate, derivative(rate), np.ones_like(rate)], everywhere)
-        gain = nothing if found is None else (found[0][0], found[1][0])
+        result = fit(gyro, [rate, derivative(rate), np.ones_like(rate)], everywhere)
+        gain = nothing if result is None else (result[0][0], result[1][0])
     if vx is not None and vy is not None and rate is not None and ay is not None:
         lateral = derivative(vy) + vx * rate
         regressors = [derivative(rate), lateral, derivative(lateral), np.ones_like(rate)]
         late_s = 0.0
         for _ in range(DELAY_STEPS):  # a lever's part is late too, so that one step is not all of it
-            found = fit(earlier(ay, late_s), regressors, moving_at(vx))
-            if found is None or found[0][1] <= 0.0:
+            result = fit(earlier(ay, late_s), regressors, moving_at(vx))
+            if result is None or result[0][1] <= 0.0:
                 break
-            (place, scale, slope, _), (place_error, scale_error, slope_error, _), _ = found
+            (place, scale, slope, _), (place_error, scale_error, slope_error, _), _ = result
             step_s = -slope / scale
             late_s += step_s
-            known = abs(step_s) < DELAY_KNOWN_S and late_s < MOST_DELAY_S
-            delay = (late_s, slope_error / scale) if known else nothing
-            if lever == nothing or (known and late_s > SURE * delay[1]):
+            is_converged = abs(step_s) < DELAY_KNOWN_S and late_s < MOST_DELAY_S
+            delay = (late_s, slope_error / scale) if is_converged else nothing
+            if lever == nothing or (is_converged and late_s > SURE * delay[1]):
                 lever, ay_gain = (place, place_error), (scale, scale_error)
     return SensorErrors(*(float(x) for x in (*lever, *gain, *ay_gain, *delay)))
 
@@ -77,15 +77,15 @@ def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
 def errors_of_ay(drive: CheckedDrive) -> SensorErrors | None:
     """Return the errors of the accelerometer; None where the drive does not tell, or a signal is wrong."""
     errors = drive.once(_errors) if drive.has_truth else None
-    known = errors is not None and math.isfinite(errors.lever_m) and not drive.wrong & {"ay_m_s2", *_TRUTH}
-    return errors if known else None
+    is_usable = errors is not None and math.isfinite(errors.lever_m) and not drive.wrong & {"ay_m_s2", *_TRUTH}
+    return errors if is_usable else None
 
 
 def errors_of_gyro(drive: CheckedDrive) -> SensorErrors | None:
     """Return the errors of the gyro; None where the drive does not tell, or a signal is wrong."""
     errors = drive.once(_errors) if drive.has_truth else None
-    known = errors is not None and math.isfinite(errors.yaw_rate_gain)
-    return errors if known and not drive.wrong & {"yaw_rate_rad_s", *_TRUTH} else None
+    is_usable = errors is not None and math.isfinite(errors.yaw_rate_gain)
+    return errors if is_usable and not drive.wrong & {"yaw_rate_rad_s", *_TRUTH} else None
 
 
 def _errors(drive: CheckedDrive) -> SensorErrors:

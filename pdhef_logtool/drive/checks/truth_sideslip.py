@@ -27,10 +27,10 @@ def _checks(drive: CheckedDrive) -> list[Check]:
     vx, vy = columns["truth.vx_m_s"], columns["truth.vy_m_s"]
     sideslip = np.arctan2(vy, vx)
     moving = moving_at(np.hypot(vx, vy))
-    known = moving & np.isfinite(sideslip)
-    if not known.any():
+    finite = moving & np.isfinite(sideslip)
+    if not finite.any():
         return []
-    typical = float(np.median(np.abs(sideslip[known])))
+    typical = float(np.median(np.abs(sideslip[finite])))
     evidence = f"its median size is {math.degrees(typical):.1f} deg where the car moves"
     frame = FRAME.judged(typical <= SIDEWAYS_RAD, evidence)
     offset = _offset_check(columns) if frame.verdict == "passed" else None
@@ -46,8 +46,8 @@ def sideslip_offset(columns: Mapping[str, FloatArray]) -> tuple[float, float] | 
     moving = moving_at(np.hypot(vx, vy))
     with np.errstate(divide="ignore", invalid="ignore"):
         regressors = [np.ones_like(vx), rate / vx, ay]
-    found = fit(np.arctan2(vy, vx), regressors, gentle_at(rate * vx, moving))
-    return None if found is None else (float(found[0][0]), float(found[1][0]))
+    result = fit(np.arctan2(vy, vx), regressors, gentle_at(rate * vx, moving))
+    return None if result is None else (float(result[0][0]), float(result[1][0]))
 
 
 def is_turned(offset_rad: float, error_rad: float) -> bool:
@@ -59,10 +59,10 @@ def _offset_check(columns: Mapping[str, FloatArray]) -> Check | None:
     """Return the check of the truth's sideslip on straights; None without IMU."""
     if "yaw_rate_rad_s" not in columns or "ay_m_s2" not in columns:
         return None
-    found = sideslip_offset(columns)
-    if found is None:
+    result = sideslip_offset(columns)
+    if result is None:
         return OFFSET.undecided("too little gentle driving")
-    offset, error = found
+    offset, error = result
     evidence = f"{math.degrees(offset):.2f} +- {math.degrees(error):.2f} deg are left where the car goes straight"
     if is_turned(offset, error):
         return OFFSET.failed(evidence)

@@ -47,12 +47,12 @@ class _TruthSquares:
 
     def of(self, block: SignalBlock) -> dict[str, float]:
         key = block.signal, block.start
-        found = self._found.get(key)
-        if found is None or not np.array_equal(found[0], block.scored):
+        cached = self._found.get(key)
+        if cached is None or not np.array_equal(cached[0], block.scored):
             values = getattr(block.truth, block.signal)
             sums = {s: float(np.sum(selected(values, mask & block.scored) ** 2)) for s, mask in block.inside.items()}
-            self._found[key] = found = block.scored, sums
-        return found[1]
+            self._found[key] = cached = block.scored, sums
+        return cached[1]
 
 
 def summarise_errors(error: FloatArray) -> dict[str, float]:

@@ -25,7 +25,7 @@ def state_rows(track: StateTrack, masks: Mapping[str, BoolArray], *, log: str) -
         dof = part.nis_dof
         innovation.add(inside, np.where(dof > 0, part.nis, np.nan), dof)
         diverged.add(inside, part.diverged)
-    found = [
+    figures = [
         (segment, metric, float(total[i]) / n, n)
         for sums, metrics in ((innovation, ("nis", "nis_dof")), (diverged, ("diverged",)))
         for segment, (n, total) in sums.totals().items()
@@ -34,7 +34,7 @@ def state_rows(track: StateTrack, masks: Mapping[str, BoolArray], *, log: str) -
     place = list(masks).index
     return [
         MetricRow(log, track.name, "state", *figure[:3], "1", figure[3])
-        for figure in sorted(found, key=lambda f: place(f[0]))
+        for figure in sorted(figures, key=lambda f: place(f[0]))
     ]
 
 

@@ -67,11 +67,11 @@ def track_rows(track: StateTrack, truth: StateTrack | None, masks: SegmentMasks,
 def drive_rows(drive: EvaluatedDrive) -> dict[str, list[MetricRow]]:
     """Return the figures that take the sensors or several tracks, by estimator."""
     functions = dict.fromkeys(m.function for m in registered().values() if isinstance(m.function, OfDrive))
-    found: dict[str, list[MetricRow]] = {}
+    by_estimator: dict[str, list[MetricRow]] = {}
     for function in functions:
         for row in function.rows(drive):
-            found.setdefault(row.estimator, []).append(row)
-    return found
+            by_estimator.setdefault(row.estimator, []).append(row)
+    return by_estimator
 
 
 class Scorer:
@@ -103,20 +103,22 @@ class Scorer:
         by_signal = {s: [f.start(reference, estimate, s) for f in functions] for s in SCORED_SIGNALS}
         positions = _Positions(len(reference.truth)) if self._has_pose else None
         for a, b in row_blocks(len(reference.truth)):
-            own, truth = HeldRows(estimate.rows(a, b)), HeldRows(reference.truth.rows(a, b))
+            estimated, truth = HeldRows(estimate.rows(a, b)), HeldRows(reference.truth.rows(a, b))
             inside = dict(reference.masks.rows(a, b))
             for signal, figures in by_signal.items():
-                block = self._block(own, truth, inside, signal, a)
-                for one in figures:
-                    one.add(block)
+                block = self._block(estimated, truth, inside, signal, a)
+                for part in figures:
+                    part.add(block)
             if positions is not None:
-                positions.add(own, truth)
+                positions.add(estimated, truth)
         rows = [row for signal, figures in by_signal.items() for row in self._rows(estimate.name, signal, figures)]
         for signal, sums in {} if positions is None else positions.sums().items():
-            found = {metric: (value, sums.n) for metric, value in sums.figures().items()}
+            figures_by_metric = {metric: (value, sums.n) for metric, value in sums.figures().items()}
             if signal == "position_m":
-                del found["bias"]  # a distance has no sign
-            rows += [self._row(estimate.name, signal, ALL, metric, figure) for metric, figure in found.items()]
+                del figures_by_metric["bias"]  # a distance has no sign
+            rows += [
+                self._row(estimate.name, signal, ALL, metric, figure) for metric, figure in figures_by_metric.items()
+            ]
         rows += track_rows(estimate, reference.truth, reference.masks, log=reference.log)
         return marked(rows, self._dependent)
 
@@ -131,12 +133,12 @@ class Scorer:
 
     def _rows(self, estimate: str, signal: str, figures: list[SignalFigures]) -> Iterator[MetricRow]:
         for segment in self._reference.masks:
-            found: dict[str, Figure] = {}
-            for one in figures:
-                found |= one.of(segment)
+            figures_by_metric: dict[str, Figure] = {}
+            for part in figures:
+                figures_by_metric |= part.of(segment)
             for metric in self._metrics:
-                if metric in found:
-                    yield self._row(estimate, signal, segment, metric, found[metric])
+                if metric in figures_by_metric:
+                    yield self._row(estimate, signal, segment, metric, figures_by_metric[metric])
 
     def _row(self, estimate: str, signal: str, segment: str, metric: str, figure: Figure) -> MetricRow:
         unit = self._metrics[metric].unit_of(signal)
