@@ -104,12 +104,7 @@ def _d2_of(drive: Drive, estimators: Sequence[Estimator], sensors: SensorErrors)
 
     The windows have a fixed length. NaN where it cannot be told.
     """
-    from pdhef_logtool.evaluation.metrics import ALL
-    from pdhef_logtool.evaluation.metrics.lateral_consistency import (
-        consistency_rows,
-        driven_consistency,
-        driving_products,
-    )
+    from pdhef_logtool.evaluation.metrics import ALL, lateral_consistency
 
     slow = drive.car.vehicle.low_speed_blend_m_s
     carries: list[Any] = [None] * len(estimators)
@@ -120,14 +115,16 @@ def _d2_of(drive: Drive, estimators: Sequence[Estimator], sensors: SensorErrors)
         whole = {ALL: np.ones(len(signals), dtype=np.bool_)}
         for i, estimator in enumerate(estimators):
             track, carries[i] = run_window(estimator, signals, carries[i], None)
-            for row in consistency_rows([track], signals, whole, log="", low_speed_m_s=slow, sensors=sensors):
+            for row in lateral_consistency.consistency_rows(
+                [track], signals, whole, log="", low_speed_m_s=slow, sensors=sensors
+            ):
                 squares[i] += row.value**2 * row.n
                 counts[i] += row.n
-            more, lasted = driving_products(track, signals, low_speed_m_s=slow, sensors=sensors)
+            more, lasted = lateral_consistency.driving_products(track, signals, low_speed_m_s=slow, sensors=sensors)
             products[i] += more
             seconds[i] += lasted
     whole_d2 = (math.sqrt(total / n) if n else math.nan for total, n in zip(squares, counts, strict=True))
-    return list(zip(whole_d2, map(driven_consistency, products, seconds), strict=True))
+    return list(zip(whole_d2, map(lateral_consistency.driven_consistency, products, seconds), strict=True))
 
 
 def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
