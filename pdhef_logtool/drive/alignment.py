@@ -314,7 +314,7 @@ def _grid_channel(periods: Mapping[str, float | None]) -> str:
             expected="samples of yaw_rate_rad_s, ay_m_s2 or ax_m_s2, whose stamps are the grid",
             got=f"no samples of {mapped}" if mapped else "none of them mapped",
             where="alignment",
-            remedy="map an IMU topic (pdhef inspect LOG shows what the log holds)",
+            remedy="map an IMU topic (pdhef inspect LOG shows the topics and fields)",
         )
     fastest = min(period_by_name.values())
     return next(name for name, period in period_by_name.items() if period <= 2.0 * fastest)

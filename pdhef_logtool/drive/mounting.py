@@ -438,7 +438,7 @@ def _by_frames(
     if not believed:
         return placed, check, None
     rotation, named = placed_rotation(placed), _named_rows(mapping, accelerations, rates)
-    alone = Mounting(rotation, named, f"{believed}; the drive does not tell the rest", confident=False)
+    alone = Mounting(rotation, named, f"{believed}; the drive does not show the rest", confident=False)
     return placed, check if alone.is_as_named else frames_alone(placed, believed), alone
 
 

@@ -14,10 +14,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.checks.ay_place import LEVER_M, MOST_LEVER_M
 from pdhef_logtool.drive.checks.by_relations import explained_factors
 from pdhef_logtool.drive.checks.fitting import SURE
-from pdhef_logtool.drive.checks.sensor_errors import SensorErrors, ay_delay, sensor_errors
+from pdhef_logtool.drive.checks.sensor_errors import LEVER_M, MOST_LEVER_M, SensorErrors, ay_delay, sensor_errors
 from pdhef_logtool.drive.checks.truth_sideslip import is_turned, sideslip_offset
 from pdhef_logtool.drive.measured import drive_columns
 from pdhef_logtool.drive.mounting import Survey, scaled_source, turned_signals
@@ -111,7 +110,7 @@ def _delays(survey: Survey) -> dict[str, tuple[float, str]]:
     is_mounted = survey.mounting is None or survey.mounting.is_as_named
     by_truth = ay_delay(sensor_errors(survey.measured.columns), latency) if is_mounted else None
     if by_truth is not None and by_truth[0] > max(LEAST_AY_DELAY_S, SURE * by_truth[1]):
-        delays["ay_m_s2"] = by_truth[0], f"a_y is {by_truth[0] * 1e3:.1f} ms late against the truth"
+        delays["ay_m_s2"] = by_truth[0], f"a_y is {by_truth[0] * 1e3:.1f} ms late against ground truth"
     for sensor in survey.late:
         told_by_truth = sensor.names[0] == "yaw_rate_rad_s" and latency is not None and latency.reliable
         for name in sensor.names if sensor.exact and not told_by_truth else ():
@@ -179,7 +178,7 @@ def car_proposals(
         proposals += _of_frames(placed, errors, vehicle)
     off = abs(errors.yaw_rate_gain - vehicle.sensors.yaw_rate_gain)
     if max(LEAST_GAIN, SURE * errors.gain_error) < off < MOST_GAIN:
-        evidence = f"the gyro reads {errors.yaw_rate_gain:.3f} +- {errors.gain_error:.3f} of the truth's yaw rate"
+        evidence = f"the gyro reads {errors.yaw_rate_gain:.3f} +- {errors.gain_error:.3f} of the ground-truth yaw rate"
         gain = {"sensors.yaw_rate_gain": round(errors.yaw_rate_gain, 4)}
         proposals.append(Proposal("car", "yaw_rate_rad_s", evidence, entries=gain, error=errors.gain_error))
     if latency is not None and latency.gyro_delay_s >= LATE_GYRO_S:

@@ -551,7 +551,7 @@ def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relat
     moving = moving_at(speed)
     for name in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s"):
         if name in columns:
-            text = f"{name} against the turning of the truth's path"
+            text = f"{name} against the turning of the ground-truth path"
             use = (moving, gentle_at(columns[name] * speed, moving))
             relations += compare_at_ease(text, {name: 1}, course, columns[name], use, GAIN_RANGE, moves=MOVES_RAD_S)
     return relations

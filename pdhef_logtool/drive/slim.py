@@ -86,7 +86,7 @@ def _messages_of(drive: Drive) -> ColumnarLog:
     log = drive.log.messages
     if log is None:
         raise LogError(
-            expected="a log of messages, which a slim log keeps",
+            expected="a log of messages, which a reduced log keeps",
             got=f"a log of kind {drive.log.kind}, which has only columns",
             where=str(drive.path),
             remedy="read the log itself",

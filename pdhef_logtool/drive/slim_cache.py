@@ -31,7 +31,7 @@ from pdhef_logtool.storage.object_store import ObjectFolder, is_url
 _LOOK_SHARE = 0.05
 #: Bytes that this process adds to a cache before it looks again.
 _left_bytes: dict[str, float] = {}
-_DAMAGED = "its slim log in the cache is damaged and is made anew"
+_DAMAGED = "its reduced log in the cache is damaged and is written again"
 
 
 @dataclass(frozen=True, slots=True)

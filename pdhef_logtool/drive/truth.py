@@ -318,7 +318,7 @@ def booked_on_the_late(latency: LatencyEstimate, speed: LatencyEstimate | None) 
 
     Parameters
     ----------
-    found : gyro against truth yaw rate. speed : the speed sensor of another topic against the truth's v_x.
+    found : gyro against ground-truth yaw rate. speed : the speed sensor of another topic against the truth's v_x.
     """
     leads = -latency.latency_s
     if not latency.reliable or leads <= max(LATE_GYRO_S, 3.0 * latency.std_error_s):
@@ -329,7 +329,7 @@ def booked_on_the_late(latency: LatencyEstimate, speed: LatencyEstimate | None) 
         and abs(speed.latency_s - latency.latency_s) <= max(2.0 * LATE_GYRO_S, 3.0 * speed.std_error_s)
     ):
         return replace(latency, reason=f"{latency.reason}; the speed sensor is late by as much")
-    reason = f"the gyro is {leads * 1e3:.1f} ms late against the truth, which leads no motion"
+    reason = f"the gyro is {leads * 1e3:.1f} ms late against ground truth, which leads no motion"
     return replace(latency, latency_s=0.0, gyro_delay_s=leads, reason=reason)
 
 
@@ -349,7 +349,7 @@ def estimate_truth_latency(
         the metrics shall show, would be taken for the truth's.
     """
     if _same_share(sensor_yaw_rate, truth_yaw_rate) >= SAME_SHARE:
-        return LatencyEstimate(0.0, 1.0, 0.0, True, True, "the truth's yaw rate is the gyro's channel")
+        return LatencyEstimate(0.0, 1.0, 0.0, True, True, "the ground-truth yaw rate is the gyro's channel")
 
     def refuse(reason: str, correlation: float = 0.0, error: float = float("inf")) -> LatencyEstimate:
         return LatencyEstimate(0.0, correlation, error, False, False, reason)
@@ -371,10 +371,10 @@ def estimate_truth_latency(
     if not shift.inside:
         return refuse("no peak within the range searched", shift.correlation, error)
     if shift.correlation < 0.8:
-        return refuse("gyro and truth yaw rate correlate too little", shift.correlation, error)
+        return refuse("gyro and ground-truth yaw rate correlate too little", shift.correlation, error)
     if error > max_error_s:
         return refuse("too little yaw motion", shift.correlation, error)
-    return LatencyEstimate(shift.shift_s, shift.correlation, error, True, False, "gyro against truth yaw rate")
+    return LatencyEstimate(shift.shift_s, shift.correlation, error, True, False, "gyro against ground-truth yaw rate")
 
 
 def dependent_signals(

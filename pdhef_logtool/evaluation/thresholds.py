@@ -251,7 +251,7 @@ def _judge(threshold: Threshold, row: MetricRow) -> Verdict:
     passed = margin >= 0.0
     reasons = [] if passed else [f"{value:.6g} {threshold.unit} is beyond the limit by {-margin:.3g}"]
     if not row.independent:
-        reasons.append("not independent of the truth")
+        reasons.append("not independent of ground truth")
     return Verdict(
         log=row.log,
         estimator=row.estimator,

@@ -602,7 +602,7 @@ def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
         candidates = kept
     for topic in topics:
         if _is_truth(topic) and _type(topic) in SEVERAL_POSITIONS:
-            draft.doubt("truth position", (topic.name,), None, SEVERAL_POSITIONS[_type(topic)])
+            draft.doubt("ground-truth position", (topic.name,), None, SEVERAL_POSITIONS[_type(topic)])
     velocity = _map_truth_velocity(draft, candidates)
     _map_truth_position(draft, candidates, velocity)
 
@@ -610,7 +610,7 @@ def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
 def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo | None:
     twists = [t for t in candidates if _type(t) in TWIST_FIELDS and _has_twist(draft, t)]
     chosen = draft.choose(
-        "truth velocity",
+        "ground-truth velocity",
         twists,
         lambda t: (not _words(t.name) & TRUTH_WORDS, not _has_pose(draft, t)),
         "topics named as ground truth first, then topics with a pose",
@@ -625,15 +625,15 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
         up = draft.values(chosen.name, _twist(chosen, "linear", "z"))
         readings = (f"{chosen.name} as body velocity", f"{chosen.name} as east, north, up")
         if body is None or not np.isfinite(up).any():
-            draft.doubt("truth velocity frame", readings, None, "too little motion to identify the frame")
+            draft.doubt("ground-truth velocity frame", readings, None, "too little motion to identify the frame")
             return None
-        draft.doubt("truth velocity frame", readings, readings[1], "x is not the direction of travel")
+        draft.doubt("ground-truth velocity frame", readings, readings[1], "x is not the direction of travel")
         paths = tuple(_twist(chosen, "linear", a) for a in "xyz")
         draft.take(draft.truth, "enu_velocity_m_s", chosen.name, paths)
         return chosen
     if body is False:
         draft.doubt(
-            "truth velocity frame",
+            "ground-truth velocity frame",
             (f"{chosen.name} as body velocity",),
             chosen.name,
             "the type's convention is the body frame, although x is mostly not the direction of travel",
@@ -698,7 +698,7 @@ def _map_truth_position(draft: _Draft, candidates: list[TopicInfo], velocity: To
     else:
         positions = [t for t in candidates if _has_pose(draft, t) or _has_fix(draft, t)]
         chosen = draft.choose(
-            "truth position",
+            "ground-truth position",
             positions,
             lambda t: (not _words(t.name) & TRUTH_WORDS, _type(t) in FIX_TYPES),
             "topics named as ground truth first, then poses before satellite fixes",

@@ -45,7 +45,7 @@ class _FieldTable(BaseModel):
     @model_validator(mode="after")
     def _is_one_quantity(self) -> _FieldTable:
         if bool(self.signal) == bool(self.truth):
-            raise ValueError("give signal or truth, not both")
+            raise ValueError("give either signal or truth")
         if self.signal and self.signal not in SIGNAL_UNITS:
             raise ValueError(f"{self.signal!r} is no signal")
         if self.truth and self.truth not in TRUTH_UNITS:

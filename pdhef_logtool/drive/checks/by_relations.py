@@ -23,7 +23,7 @@ from pdhef_logtool.records.checks import Check
 
 _LACKS = {
     "ax_m_s2": "speeding up and braking, on straights",
-    "speed_m_s": "a wheel speed, an accelerometer or truth to hold it against, and speeding up or bends",
+    "speed_m_s": "a wheel speed, an accelerometer or ground truth to compare with, and speeding up or bends",
 }
 _BENDS = "bends to both sides at speed"
 
@@ -170,7 +170,7 @@ def _failed(name: str, mistakes: Sequence[Mistake], relations: Sequence[Relation
 def _not_excited(name: str, relations: Sequence[Relation]) -> Check:
     lacks = _LACKS.get(name, _BENDS)
     if not relations:
-        evidence = "nothing in the log says what it should be"
+        evidence = "no other signal of the log is related to it"
     else:
         best = max(relations, key=lambda r: abs(r.correlation))
         evidence = f"{best.text}: correlation {best.correlation:.2f} over {best.samples:.0f} independent samples"

@@ -73,16 +73,16 @@ def _offset_check(columns: Mapping[str, FloatArray]) -> Check | None:
 
 FRAME = CheckKind(
     "truth.sideslip_rad.frame",
-    compares="the truth's heading with its velocity",
+    compares="the heading of ground truth with its velocity",
     fails="its sideslip is above 20 degrees for half of the moving time",
-    remedy="heading and velocity do not belong together: look at frames, signs and units of the truth",
+    remedy="heading and velocity do not belong together: look at frames, signs and units of ground truth",
     function=_checks,
 )
 OFFSET = CheckKind(
     "truth.sideslip_rad.offset",
-    compares="the truth's sideslip on straights with 0",
+    compares="ground-truth sideslip on straights with 0",
     fails="it is off by 0.15 degrees",
-    remedy="the truth's heading is turned: a tyre, a crossfall or a bias of a_y makes less of that",
+    remedy="the heading of ground truth is turned: a tyre, a crossfall or a bias of a_y makes less of that",
     lacks="needs straights and bends",
 )
 CHECKS = (FRAME, OFFSET)

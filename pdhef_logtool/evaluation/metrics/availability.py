@@ -38,7 +38,7 @@ METRICS = (
     Metric(
         "availability",
         "available",
-        "share of the stamps with scorable truth at which the estimate is valid and finite; n = all of them",
+        "share of the stamps with scorable ground truth at which the estimate is valid and finite; n = all of them",
         OfSignal(_Availability),
         best="higher",
         unit="1",

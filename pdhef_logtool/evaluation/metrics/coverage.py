@@ -30,7 +30,7 @@ METRICS = (
     Metric(
         "coverage95",
         "in 95 % band",
-        "share of stamps with abs e ≤ 1.96 σ; σ² is the estimate's variance plus the truth's if known",
+        "share of stamps with abs e ≤ 1.96 σ; σ² is the estimate's variance plus that of ground truth if known",
         OfSignal(_Coverage),
         best=0.95,
         unit="1",

@@ -27,7 +27,7 @@ METRICS = (
     Metric(
         NOT_INDEPENDENT,
         "not independent",
-        "1 where the truth of this signal is one of the estimators' inputs: keep it out of rankings",
+        "1 where the ground truth of this signal is one of the estimators' inputs: keep it out of rankings",
         None,
         unit="1",
     ),

@@ -98,7 +98,7 @@ METRICS = (
     Metric(
         "lag_s",
         "lag",
-        "shift, within ± 0.3 s, at which the estimate correlates best with the truth; positive = estimate late. "
+        "shift, within ± 0.3 s, at which the estimate correlates best with ground truth; positive = estimate late. "
         "Segment `all` only, its first hour; NaN when the correlation stays below 0.5 or has no peak",
         OfSignal(_Lag),
         best=0.0,

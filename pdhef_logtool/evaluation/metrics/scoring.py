@@ -168,4 +168,4 @@ class _Positions:
 def _check_stamps(estimate: StateTrack, truth: StateTrack) -> None:
     blocks = ((estimate.rows(a, b), truth.rows(a, b)) for a, b in row_blocks(len(truth)))
     if len(estimate) != len(truth) or not all(np.array_equal(e.stamps_ns, t.stamps_ns) for e, t in blocks):
-        raise ValueError(f"estimate {estimate.name} and truth must be at the same stamps")
+        raise ValueError(f"estimate {estimate.name} and ground truth must be at the same stamps")
