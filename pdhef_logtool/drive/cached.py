@@ -1,4 +1,4 @@
-"""Logs that are read more than once: their slim logs, where a cache of these is named, else the logs themselves."""
+"""Logs that are read more than once: their reduced logs, where a cache of these is named, else the logs themselves."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _silent(_text: str) -> None:
 def cached(
     log: LogInput, mapping: Mapping | None, options: ReadOptions, warn: Warn = _silent
 ) -> Iterator[tuple[LogInput, Mapping | None]]:
-    """Yield what to read in place of a log, and with which mapping; a slim log has its own."""
+    """Yield what to read in place of a log, and with which mapping; a reduced log has its own."""
     if options.cache is None:
         yield log, mapping
         return

@@ -14,11 +14,11 @@ LOW_PASS_HZ = 1.0
 #: Samples are interpolated onto the grid over gaps of at most this length, and of this many of their periods.
 MAX_GAP_S = 0.5
 MAX_GAP_PERIODS = 2.5
-#: No sensor that is slower says anything of manoeuvres.
+#: A slower sensor does not resolve manoeuvres.
 LONGEST_GAP_S = 2.5
 #: 21 hours about the middle of the drive; it keeps one wrong stamp from making a grid of decades.
 MAX_CELLS = 1_500_000
-#: Moving: faster than this share of the drive's fast speeds, and than a speed at which little can be told.
+#: Moving: faster than this share of the drive's fast speeds, and than a speed that is too low for the relations.
 MOVING_SHARE = 0.25
 MIN_MOVING_M_S = 0.5
 

@@ -15,7 +15,7 @@ GAP_PERIODS = 3.0
 #: The common grid's step is kept within these bounds: finer gains nothing, coarser loses the peak.
 MIN_STEP_S, MAX_STEP_S = 0.005, 0.05
 #: Far above what rounding does to a rough correlation of signals that vary by all of their power; of such as vary by
-#: less of it than the least share nothing rough is told.
+#: less of it than the least share no rough value is given.
 _ROUGH_ERROR, _LEAST_POWER = 1e-10, 1e-4
 
 

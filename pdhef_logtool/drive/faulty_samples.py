@@ -1,6 +1,6 @@
 """Samples of an IMU that a sensor fault has spoilt: relations between signals are looked at without them.
 
-The detector is that of the filters (:mod:`pdhef_logtool.estimators.sensor_faults`). It cannot tell a dead
+The detector is that of the filters (:mod:`pdhef_logtool.estimators.sensor_faults`). It cannot distinguish a dead
 channel from one in another unit; here the whole drive is available.
 """
 

@@ -1,4 +1,4 @@
-"""Rotations of a sensor in a car, and recorded frames held against them: they are evidence, and may be wrong."""
+"""Rotations of a sensor in a car, and recorded frames compared with them: they are evidence, and may be wrong."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def placed_rotation(placed: Placement) -> FloatArray:
 
 
 def gravity_agrees(placed: Placement, force: FloatArray) -> str:
-    """Return why frames are believed by gravity, the mean [3] of the accelerations; empty where it does not say so."""
+    """Return why frames are accepted by gravity, the mean [3] of the accelerations; empty where it does not show it."""
     tilt = _tilt_deg(placed, force)
     if tilt is None or tilt > TILT_DEG:
         return ""
@@ -65,7 +65,7 @@ def gravity_agrees(placed: Placement, force: FloatArray) -> str:
 
 
 def frames_check(placed: Placement, shown: FloatArray | None, evidence: str, force: FloatArray) -> Check | None:
-    """Hold frames against the rotation [3, 3] that the drive shows, else against gravity; None where neither tells."""
+    """Compare frames against the rotation [3, 3] that the drive shows, else with gravity; None where neither tells."""
     said = f"the recorded frames ({_named(placed)}): {rotation_text(placed_rotation(placed))}"
     apart = None if shown is None else _between_deg(placed.rotation, shown)
     tilt = _tilt_deg(placed, force)
@@ -81,7 +81,7 @@ def frames_check(placed: Placement, shown: FloatArray | None, evidence: str, for
 
 
 def frames_alone(placed: Placement, believed: str) -> Check:
-    """Say that nothing but frames and gravity tells how the IMU lies."""
+    """Report that nothing but frames and gravity shows how the IMU lies."""
     evidence = f"{rotation_text(placed_rotation(placed))}: {believed}; the drive does not show the rest"
     return Check("imu.frames", "ay_m_s2", "undecided", evidence, _REMEDY)
 

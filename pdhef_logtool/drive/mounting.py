@@ -1,8 +1,8 @@
 """How an IMU is mounted in the car, from gravity, its speed and its turning.
 
-Gravity over the drive, less what driving explains of it, says which way is up; the rate about that axis is the yaw
+The mean specific force, less the accelerations of the car, shows which way is up; the rate about that axis is the yaw
 rate. Then what is left of the accelerations must be (v̇, v r) in the car's axes: one angle about the vertical makes it
-so, by complex regression, and its fit says whether all of it is believed.
+so, by complex regression, and its fit gives whether all of it is accepted.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ COMPENSATED_M_S2 = 3.0
 MIN_CORRELATION = 0.75
 #: Independent samples: 5 s of driving.
 MIN_SAMPLES = 10.0
-#: The regression's own gain: a unit is wrong beyond, and then no angle can be told from it.
+#: The regression's own gain: a unit is wrong beyond, and then no angle can be derived from it.
 GAIN_RANGE = (0.5, 2.0)
 #: Of a multiple of 90 degrees: half of 45 degrees at three standard errors.
 MAX_ERROR_DEG = 7.5
@@ -106,9 +106,9 @@ class Mounting:
 
 
 def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None], mapping: Mapping) -> Mounting | None:
-    """Find the rotation of an IMU from its six components; None where there are none, or the drive says nothing.
+    """Find the rotation of an IMU from its six components; None without them, or if the drive does not show it.
 
-    ``measured``: with the components of the triads beside the signals, and truth for the sign of the yaw rate.
+    ``measured``: with the components of the triads; ground truth, if any, for the sign of the yaw rate.
     """
     accelerations, rates = triads
     columns, speed_name = measured.columns, measured.speed_name
@@ -120,11 +120,11 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
     speed = np.full(f.shape[0], np.nan) if speed_name is None else columns[speed_name]
     references = yaw_references(columns, speed_name)
     ups = _ups(f, w, named)
-    if len(ups) > 1 and not references:  # gravity does not say which way is up
+    if len(ups) > 1 and not references:  # gravity does not show which way is up
         references = steering_references(columns, speed_name)
     turns = [m for h in (1.0, -1.0) for up in ups if (m := _turned(f, h * w, speed, up, references)) is not None]
     hands = [1.0] * (len(turns) // 2) + [-1.0] * (len(turns) // 2)
-    # Another measurement of the yaw rate must say so before a sensor is taken for a left-handed one.
+    # Another measurement of the yaw rate must show it before a sensor is taken for a left-handed one.
     fitting = [(m, h) for m, h in zip(turns, hands, strict=True) if m.fits and h * HAND_CORRELATION > -m.sign]
     if not fitting:
         return None
@@ -229,7 +229,7 @@ def _turned(
 
 
 def _along(measured: FloatArray, driven: FloatArray) -> bool:
-    """Return whether speeding up and braking alone say which way is forward."""
+    """Return whether speeding up and braking alone show which way is forward."""
     spread = float(measured.std() * driven.std())
     return spread > 0.0 and float(np.mean((measured - measured.mean()) * (driven - driven.mean()))) / spread > 0.5
 
@@ -285,7 +285,7 @@ def _level_only(rest: FloatArray) -> FloatArray:
 class Survey:
     """The first minutes of a log as its mapping reads them, the IMU turned into the car where that is certain.
 
-    ``vehicle``: whose file is held against the drive; the default car stands for none.
+    ``vehicle``: from the vehicle file, or the default car.
     """
 
     mapping: Mapping
@@ -328,7 +328,7 @@ class Survey:
             measured=self.measured,
         )
         if self.mounting is not None and self.is_mounted:
-            # Right axes have right signs, and gravity says the unit.
+            # Right axes have right signs, and gravity gives the unit.
             settled = {f"{n}.sign" for n in MOUNTED}
             evidence = self.mounting.evidence
             passed = [replace(c, verdict="passed", evidence=evidence, remedy="") for c in drive_checks]
@@ -390,7 +390,7 @@ def survey_log(
     truth_plan = plan_truth(channels.truth, truth_position_m=vehicle.truth_position_m) if channels.truth else None
     truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
     measured = measure(channels.signals, channels.truth, truth)
-    # What an estimator is given must not hang on the truth: with it, a mounting is only checked.
+    # The input of an estimator must not depend on ground truth: with it, a mounting is only checked.
     mounting = find_mounting(measured.without_truth(), triads, mapping)
     blind = mounting is not None and mounting.confident
     if not blind and truth is not None:
@@ -462,7 +462,7 @@ def _rescaled(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span
         return survey
     scaled = replace(mapping, signals=signals, notes=tuple(notes))
     corrected = survey_log(log, scaled, clocks, span_ns, survey.vehicle, rescale=False)
-    # A failing sensor looks like a wrong unit of another one; after a right correction nothing contradicts any more.
+    # A failing sensor resembles a wrong unit of another one; after a right correction nothing contradicts any more.
     failed = [check.name for check in corrected.checks if check.verdict == "failed"]
     return survey if any(n.endswith((".sign", ".unit", ".axis", ".fault")) for n in failed) else corrected
 
@@ -478,7 +478,7 @@ def scaled_source(source: SignalSource, factor: float) -> SignalSource:
 
 
 def truth_latency(channels: MappedChannels, truth: TruthTrack | None) -> LatencyEstimate | None:
-    """Return how late the truth is against the gyro, or the gyro against the truth; None where one is missing."""
+    """Return the latency of ground truth relative to the gyro, or of the gyro; None where one is missing."""
     gyro = channels.signals.get("yaw_rate_rad_s")
     if truth is None or gyro is None or not len(gyro):
         return None

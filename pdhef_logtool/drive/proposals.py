@@ -1,8 +1,8 @@
-"""What a drive shows to be wrong with its sensors and its truth: where each correction belongs, and its one use.
+"""Corrections of sensors and ground truth that a drive shows, and where each of them belongs.
 
-Unit, sign, mounting, a turned truth and a recorder's delay belong in the mapping; the accelerometer's place, the gyro's
-gain and what is left of its delay in the car's fit. Each is measured on what mapping and car already take off, and a
-delay in the car is the whole one: applied in any order, each is taken off once.
+Unit, sign, mounting, a turned ground truth and a recorder's delay belong in the mapping; the accelerometer's place, the
+gyro's gain and what is left of its delay in the car's fit. Each is measured on what mapping and car already take off,
+and a delay in the car is the whole one: applied in any order, each is taken off once.
 """
 
 from __future__ import annotations
@@ -101,12 +101,12 @@ def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
 
 
 def _delays(survey: Survey) -> dict[str, tuple[float, str]]:
-    """Return by signal what its stamps are late by, with the evidence: by truth, else by another sensor."""
+    """Return by signal what its stamps are late by, with the evidence: by ground truth, else by another sensor."""
     delays: dict[str, tuple[float, str]] = {}
     latency = survey.latency
     if latency is not None and latency.gyro_delay_s >= LATE_GYRO_S:
         delays["yaw_rate_rad_s"] = latency.gyro_delay_s, latency.reason
-    # From another axis nothing is told of a_y.
+    # The delay of a_y is not observable from another axis.
     is_mounted = survey.mounting is None or survey.mounting.is_as_named
     by_truth = ay_delay(sensor_errors(survey.measured.columns), latency) if is_mounted else None
     if by_truth is not None and by_truth[0] > max(LEAST_AY_DELAY_S, SURE * by_truth[1]):
@@ -119,7 +119,7 @@ def _delays(survey: Survey) -> dict[str, tuple[float, str]]:
 
 
 def _of_a_turned_truth(survey: Survey) -> list[Proposal]:
-    """Return the sources of a truth whose sideslip is off by a constant, as far as a mapping can turn them back."""
+    """Return corrected sources of ground truth whose sideslip has a constant offset, if a mapping can correct it."""
     offset_and_error = sideslip_offset(survey.measured.columns)
     if offset_and_error is None or survey.truth is None or not is_turned(*offset_and_error):
         return []
@@ -154,7 +154,7 @@ def car_proposals(
     vehicle: VehicleParameters,
     placed: Placement | None = None,
 ) -> tuple[Proposal, ...]:
-    """Return what regression on truth says of place, gain and delay of the sensors beside what the vehicle knows.
+    """Return position, gain and delay of the sensors by regression on ground truth where they differ from the vehicle.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ def car_proposals(
 
 
 def _of_frames(placed: Placement, errors: SensorErrors, vehicle: VehicleParameters) -> list[Proposal]:
-    """Return the place in the car that recorded frames give, where a_y tells which point of it their origin is."""
+    """Return the position that recorded frames give, if a_y shows which point of the car their origin is."""
     x, y = (float(v) for v in placed.position_m[:2])
     origins = {"the CG": 0.0, "the middle of the rear axle": -vehicle.cg_to_rear_axle_m}
     off = {name: abs(x + origin_x - errors.lever_m) for name, origin_x in origins.items()}

@@ -14,7 +14,7 @@ from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
 DEGREE = float(np.pi / 180.0)
 
-#: Below this correlation a gain says nothing; above it, it is known to its reciprocal.
+#: Below this correlation a gain gives no information; above it, it is known to its reciprocal.
 MIN_CORRELATION = 0.6
 #: What is left of two columns by regression is small, and a car that slides leaves it related otherwise.
 MIN_PARTIAL_CORRELATION = 0.8
@@ -38,11 +38,12 @@ SAME_RANGE = (0.75, 1.33)
 #: a_y - v_x r over the derivative of v_y: small differences of large quantities, of a body that rolls.
 SIDESLIP_RANGE = (0.3, 3.0)
 #: Slip of a rear axle at 1 m/s^2: cornering stiffness over load is 4 to 40 per rad, and much less where a model car
-#: drifts. It tells a sign, no unit.
+#: drifts. It gives a sign, no unit.
 COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
-#: Of the truth ahead of the rear axle. A truth that stands near that axle says nothing: its lever may be of any sign.
+#: Of ground truth ahead of the rear axle. Ground truth that stands near that axle gives no information: its lever may
+#: be of any sign.
 REAR_LEVER_M = (1.0, 12.0)
-#: What is left of sideslip beside a_y must move by more: a good truth is not surer of it, nor is a road flatter.
+#: What is left of sideslip beside a_y must move by more: a good ground truth is not surer of it, nor is a road flatter.
 LEAST_SIDESLIP_RAD = 0.05 * DEGREE
 #: Beyond, sideslip times lateral acceleration is no longer small beside the derivative of the speed.
 STRAIGHT_M_S2 = 3.0
@@ -54,7 +55,7 @@ ROAD_WHEEL_LENGTH_M = (0.15, 12.0)
 STEERING_WHEEL_LENGTH_M = (12.0, 240.0)
 #: Track from a 1:10 car to a truck.
 TRACK_M = (0.12, 3.0)
-#: Share of the drive's lateral acceleration up to which the steering angle is held against the curvature: beyond, the
+#: Share of the drive's lateral acceleration up to which the steering angle is compared with the curvature: beyond, the
 #: front tyres slip.
 STEERING_SHARE = 0.6
 #: Typical values that recognise one quantity recorded as another.
@@ -71,13 +72,13 @@ MAX_CULPRITS = 4
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """One relation with its measured gain; ``powers`` say how the gain grows with each signal's own scale.
+    """One relation with its measured gain; ``powers`` show how the gain grows with each signal's own scale.
 
     Attributes
     ----------
     expected : range of a plausible gain. samples : independent ones. moves : both sides, or one of two that must move
         together, move by more than what disturbs them. signless : a side is a size.
-    least_correlation : below it the gain says nothing. spread : 1-sigma of the measured side.
+    least_correlation : below it the gain gives no information. spread : 1-sigma of the measured side.
     """
 
     text: str
@@ -160,8 +161,8 @@ def measured_relations(columns: Mapping[str, FloatArray], speed_name: str | None
 
     Parameters
     ----------
-    columns : on the grid, SI, by signal name; those of truth begin with ``truth.``.
-    speed_name : the column that stands for the speed.
+    columns : on the grid, SI, by signal name; those of ground truth begin with ``truth.``.
+    speed_name : the column used as the speed.
     """
     relations: list[Relation] = []
     speed = None if speed_name is None else columns[speed_name]
@@ -181,7 +182,7 @@ def measured_relations(columns: Mapping[str, FloatArray], speed_name: str | None
 
 
 def smallest_explanations(relations: Sequence[Relation], mistakes: Sequence[Mistake]) -> list[tuple[Mistake, ...]]:
-    """Return the smallest sets of mistakes that make every relation that tells plausible; ``[()]``: there is none.
+    """Return the smallest sets of mistakes that make every relation that counts plausible; ``[()]``: none is needed.
 
     Empty where no set of ``MAX_MISTAKES`` does. A sign explains without a unit, and either of them without the other.
     """
@@ -232,7 +233,8 @@ def _sensor(name: str) -> str:
 def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
     """Return those of the signals of doubtful unit for which relations to others rule out every other unit.
 
-    A relation between two of them tells nothing until one is told; the truth's v_y has the unit of its v_x.
+    A relation between two of them gives no information until one is given; the ground-truth v_y has the unit of its
+    v_x.
     """
     # Rim speed in m/s and in rad/s look alike where the radius is not known: wheels are never told.
     open_, resolved = set(doubted), set[str]()
@@ -310,7 +312,8 @@ def known_mistakes(names: Sequence[str], together: Sequence[tuple[str, ...]] = (
         for size in range(2, len(present) + 1):
             for part in combinations(present, size):
                 words = f"{' and '.join(part)} have the wrong sign"
-                # A sensor is mounted upside down or backwards, or a truth has another convention; speeds count ahead.
+                # A sensor is mounted upside down or backwards, or ground truth has another convention; speeds count
+                # ahead.
                 if not _NEVER_TURNED & set(part):
                     out.append(Mistake(dict.fromkeys(part, -1.0), words, "sign"))
                 shared = dict(_units(part[0].removeprefix("truth.")))
@@ -401,7 +404,7 @@ def compare_at_ease(
 
 
 def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace: FloatArray) -> list[Relation]:
-    """Relate the accelerations to speed and yaw rate, of the sensors or of the truth."""
+    """Relate the accelerations to speed and yaw rate, of the sensors or of ground truth."""
     relations: list[Relation] = []
     moving = moving_at(pace)
     yaw, left, forward = (columns.get(f"{prefix}{n}") for n in ("yaw_rate_rad_s", "ay_m_s2", "ax_m_s2"))
@@ -462,7 +465,7 @@ def _steering(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatAr
 
 
 def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArray) -> list[Relation]:
-    """Relate wheel speeds and the truth's speeds to the speed: one quantity, so that the ratio tells at any driving."""
+    """Relate wheel speeds and ground-truth speeds to the speed: their ratio needs no manoeuvre."""
     wanted = {f"wheel_speed_{w}_m_s": WHEEL_RANGE for w in WHEELS}
     wanted |= {f"wheel_speed_{w}_rad_s": WHEEL_PER_RADIAN_RANGE for w in WHEELS}
     wanted |= {"truth.vx_m_s": SAME_RANGE, "truth.position_speed_m_s": SAME_RANGE}
@@ -543,7 +546,7 @@ def _scaled_to(wheel: FloatArray, speed: FloatArray, moving: BoolArray) -> Float
 
 
 def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relation]:
-    """Relate the yaw rates to the rate of the truth's course over ground."""
+    """Relate the yaw rates to the rate of the ground-truth course over ground."""
     course = columns.get("truth.course_rate_rad_s")
     if course is None:
         return []
@@ -569,9 +572,9 @@ def _twice(columns: Mapping[str, FloatArray], sensor: str, truth: str, moves: fl
 
 
 def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
-    """Relate the truth's sideslip to a_y and curvature: by kinematics where it moves fast, by the rear axle else.
+    """Relate the ground-truth sideslip to a_y and curvature: by kinematics where it moves fast, by the rear axle else.
 
-    a_y - v_x r is the derivative of v_y; the lever of an accelerometer, the roll of the body and a bias stand beside
+    a_y - v_x r is the derivative of v_y; the lever of an accelerometer, the roll of the body and a bias are next to
     it and go with the derivative of the yaw rate, with v_x r and with nothing. In gentle driving sideslip is the
     curvature times a lever, less a_y times the compliance of the rear tyres.
     """

@@ -30,11 +30,12 @@ def slim_log(
     options: ReadOptions,
     tell: Callable[[str], None] = lambda _text: None,
 ) -> SlimRecord:
-    """Write the slim log of a whole log, and return what is known of the log beside its messages.
+    """Write the reduced log of a whole log, and return what is known of the log beside its messages.
 
     Parameters
     ----------
-    mapping : None recognises types. options : of them count those that say how a log is opened and which truth counts.
+    mapping : None recognises types. options : of them count those that show how a log is opened and which ground truth
+    counts.
     tell : as for :func:`~pdhef_logtool.drive.reading.read_drive`.
 
     Raises
@@ -51,7 +52,7 @@ def slim_log(
 
 
 def write_slim(drive: Drive, target: Path) -> SlimRecord:
-    """Write the slim log of a drive that was read from start to end, and return its record."""
+    """Write the reduced log of a drive that was read from start to end, and return its record."""
     log = _messages_of(drive)
     lost, ledgers = log.lost, drive.byte_ledgers  # before the copy, which may look at more than a run does
     record = SlimRecord(

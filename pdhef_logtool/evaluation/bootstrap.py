@@ -70,7 +70,7 @@ def rmse_difference_interval(
 def block_sums(
     columns: list[FloatArray], stamps_ns: IntArray, block_s: float = 10.0, first_ns: int | None = None
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return sums of squares [columns, K], samples [K] and numbers [K] of the blocks that hold any.
+    """Return sums of squares [columns, K], samples [K] and numbers [K] of the blocks that contain any.
 
     Blocks hold only stamps at which all columns [N] are known, and are counted from ``first_ns``; None: the first of
     those stamps.

@@ -79,7 +79,7 @@ def end_to_end(stamps_ns: Sequence[IntArray]) -> IntArray:
 
 
 def shown_interval(interval: Interval, sign: str = "") -> str:
-    """Return a figure in rad with its bounds in degrees, as it stands in tables; ``sign`` ``+`` shows it always."""
+    """Return a figure in rad with its bounds in degrees, as it is in tables; ``sign`` ``+`` shows it always."""
     value, low, high = (math.degrees(x) for x in (interval.value, interval.low, interval.high))
     shown = f"{value:{sign}.3f}" if math.isfinite(value) else "–"
     return f"{shown} [{low:.3f}, {high:.3f}]" if math.isfinite(low) else shown

@@ -1,9 +1,9 @@
-"""Errors of positions, which exist only with the truth's pose: an estimate dead-reckoned from it, block by block.
+"""Errors of positions, which exist only with the ground-truth pose: an estimate dead-reckoned from it, block by block.
 
-``position_m``: distance between the truth's position and v_x, v_y, r dead-reckoned from the truth's pose at the first
-common stamp. ``lateral_1s_m``: dead reckoning is restarted from the truth's pose every second; the error is the lateral
-one, in the truth's axes, at the end of each second. A second with an invalid estimate, a missing pose or a gap does not
-count.
+``position_m``: distance between the ground-truth position and v_x, v_y, r dead-reckoned from the ground-truth pose at
+the first common stamp. ``lateral_1s_m``: dead reckoning is restarted from the ground-truth pose every second; the error
+is the lateral one, in the ground-truth axes, at the end of each second. A second with an invalid estimate, a missing
+pose or a gap does not count.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ MAX_STEP_S = 0.2
 
 
 def position_error(estimate: StateTrack, truth: StateTrack) -> FloatArray:
-    """Return the distance [N] in m between truth and dead reckoning; NaN before the start and without a truth pose."""
+    """Return the distance [N] in m between ground truth and dead reckoning; NaN before the start and without a pose."""
     path = Path()
     return np.concatenate([path.add(estimate.rows(a, b), truth.rows(a, b)) for a, b in row_blocks(len(truth))])
 
 
 class Path:
-    """An estimate dead-reckoned from the truth's pose at the first common stamp, block by block."""
+    """An estimate dead-reckoned from the ground-truth pose at the first common stamp, block by block."""
 
     def __init__(self) -> None:
         self._reckoner: DeadReckoner | None = None
@@ -60,7 +60,7 @@ def lateral_errors_after_one_second(estimate: StateTrack, truth: StateTrack) -> 
 
 
 class Seconds:
-    """An estimate and the truth at the first stamp of each second from the first common stamp on, block by block."""
+    """An estimate and ground truth at the first stamp of each second from the first common stamp on, block by block."""
 
     def __init__(self) -> None:
         self._reckoner = DeadReckoner((0.0, 0.0, 0.0))
@@ -110,7 +110,7 @@ class Seconds:
 
 
 def pose_known(truth: StateTrack) -> BoolArray:
-    """Return where the truth has a pose [N]."""
+    """Return where ground truth has a pose [N]."""
     is_known: BoolArray = truth.valid & np.isfinite(truth.x_m) & np.isfinite(truth.y_m) & np.isfinite(truth.yaw_rad)
     return is_known
 

@@ -1,8 +1,8 @@
 """Where a drive went in speed and lateral acceleration: seconds and sideslip error by cell of a fixed grid.
 
-Lateral acceleration and speed are those of the segments (:mod:`~pdhef_logtool.evaluation.segments`): of the truth where
-it has them, else of the sensors, the acceleration smoothed to 1 Hz. The grid is the same for all drives, so that the
-cells of a fleet add up.
+Lateral acceleration and speed are those of the segments (:mod:`~pdhef_logtool.evaluation.segments`): of ground truth
+where it has them, else of the sensors, the acceleration smoothed to 1 Hz. The grid is the same for all drives, so that
+the cells of a fleet add up.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def operating_space(
 
     Parameters
     ----------
-    signals, truth, estimate : at the same stamps [N]; truth None: sensors alone, and no error.
+    signals, truth, estimate : at the same stamps [N]; ground truth None: sensors alone, and no error.
     """
     shape = len(SPEED_EDGES_M_S), len(AY_EDGES_M_S2)
     size = shape[0] * shape[1]

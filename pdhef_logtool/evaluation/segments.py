@@ -1,6 +1,6 @@
 """Parts of a drive: boolean masks over the scored stamps, and the same as intervals for the eye.
 
-Lateral acceleration is the truth's where the truth has one, else the sensor's; likewise yaw rate and speed;
+Lateral acceleration is that of ground truth if it has one, else the sensor's; likewise yaw rate and speed;
 longitudinal acceleration is always the sensor's. Accelerations and yaw rate are smoothed without phase (Gaussian, over
 at most the gap-free run around a stamp): to 4 Hz for ``linear`` and ``nonlinear``, to 1 Hz for manoeuvres. μ is the
 log's friction, else the vehicle file's, else 1.
@@ -142,7 +142,7 @@ def moving_mask(signals: Signals, truth: StateTrack | None, vehicle: VehiclePara
 
 
 def known_of(truth: StateTrack | None) -> frozenset[str]:
-    """Return what is taken from the truth: all that it ever knows, so that a drive does not mix two sources."""
+    """Return what is taken from ground truth: all that it ever knows, so that a drive does not mix two sources."""
     if truth is None:
         return frozenset()
     return frozenset(c for c in ("ay_m_s2", "yaw_rate_rad_s", "vx_m_s") if _known_anywhere(truth, c))
@@ -253,7 +253,7 @@ def _gaussian_of_ones(n: int, sigma_rows: float) -> FloatArray:
 
 
 def _last_known(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
-    """Carry measurements, which stand at one stamp only, forward for up to ``RUN_GAP_S``."""
+    """Carry measurements, which are at one stamp only, forward for up to ``RUN_GAP_S``."""
     finite = np.isfinite(values)
     last = np.maximum.accumulate(np.where(finite, np.arange(values.shape[0]), -1))
     fresh = (last >= 0) & (stamps_ns - stamps_ns[np.maximum(last, 0)] <= RUN_GAP_S * 1e9)

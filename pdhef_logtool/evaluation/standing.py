@@ -1,8 +1,8 @@
 """How the answer of a drive stands against the best physics, signal by signal, with a bootstrap of blocks of time.
 
 Errors are those of :mod:`~pdhef_logtool.evaluation.metrics`, correlated over seconds, so that whole blocks are drawn
-(:mod:`~pdhef_logtool.evaluation.bootstrap`). The best physics is the best by this drive's truth: a rival that was
-chosen in hindsight, which makes the answer look no better than it is.
+(:mod:`~pdhef_logtool.evaluation.bootstrap`). The best physics is the best by this drive's ground truth: a rival that
+was chosen in hindsight, which makes the answer look no better than it is.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
-#: What a drive is judged by, in the order in which it is told.
+#: What a drive is judged by, in the order in which it is given.
 JUDGED_SIGNALS = ("sideslip_rad", "vy_m_s", "yaw_rate_rad_s", "vx_m_s")
 #: Of fewer blocks no interval is given: with five, all of one sign come by chance in more than one of twenty drives.
 LEAST_BLOCKS = 6
@@ -50,7 +50,7 @@ class Standing:
 def standings(
     name: str, rivals: Sequence[str], read: Callable[[str], StateTrack | None], truth: StateTrack, low_speed_m_s: float
 ) -> list[Standing]:
-    """Return how an estimator stands in each of :data:`JUDGED_SIGNALS`.
+    """Return how an estimator compares in each of :data:`JUDGED_SIGNALS`.
 
     Parameters
     ----------

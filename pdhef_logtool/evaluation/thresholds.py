@@ -1,7 +1,7 @@
 """Limits on figures: strict reading of thresholds.toml, and one verdict a threshold and estimator.
 
 A threshold that finds no figure is *not evaluated*, which fails like a figure beyond its limit, so that a renamed
-signal or a log without truth cannot pass a gate silently; ``optional = true`` turns that into *skipped*.
+signal or a log without ground truth cannot pass a gate silently; ``optional = true`` turns that into *skipped*.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Verdict:
     estimator : its name, or the threshold's pattern where no estimator matched.
     value, margin : in the threshold's unit; None where there is no figure. A margin below 0 is a failure.
     n : samples behind the figure.
-    independent : False where the truth of the figure is an input or the estimate itself.
+    independent : False where ground truth of the figure is an input or the estimate itself.
     reason : one sentence for a person, empty for a plain pass.
     """
 
@@ -125,7 +125,7 @@ def load_thresholds(path: Path) -> tuple[Threshold, ...]:
     Raises
     ------
     UsageError
-        The file is missing, is no TOML, or holds wrong, unknown, missing or contradicting entries; all are named.
+        The file is missing, is no TOML, or contains wrong, unknown, missing or contradicting entries; all are named.
     """
     return thresholds_from_dict(read_toml(path, "a thresholds TOML file", UsageError), where=str(path))
 
@@ -202,7 +202,7 @@ def unit_of(signal: str, metric: str, unit: str | None, where: str, problems: li
 
 
 def check_thresholds(thresholds: Sequence[Threshold], rows: Sequence[MetricRow], *, log: str) -> list[Verdict]:
-    """Hold the figures of one log against the thresholds.
+    """Compare the figures of one log with the thresholds.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """``SIGNAL.sign``, ``unit``, ``axis``: each signal by relations to others (:mod:`~pdhef_logtool.drive.relations`).
 
-Where they contradict one another, the smallest mistake that explains all of them says which signals fail.
+Where they contradict one another, the smallest mistake that explains all of them states which signals fail.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _BENDS = "bends to both sides at speed"
 def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int = 2) -> dict[str, tuple[float, str]]:
     """Return by signal the factor that undoes its wrong unit or sign, with the evidence, where only one explains it.
 
-    ``most``: mistakes at once that are believed.
+    ``most``: mistakes at once that are accepted.
     """
     relations = measured.relations
     groups = measured.groups(mounting_is_known=mounting_is_known)
@@ -78,7 +78,7 @@ class _Explained(NamedTuple):
 
 
 def _judged(name: str, relations: Sequence[Relation], explained: _Explained) -> list[Check]:
-    """Return sign and unit checks of a signal by the relations that tell; empty without any."""
+    """Return sign and unit checks of a signal by the relations that count; empty without any."""
     bad, good = ([r for r in relations if r.accepts() is accepted] for accepted in (False, True))
     if name in explained.likeliest or name in explained.others:
         failed = _failed(name, explained.likeliest.get(name) or explained.others[name], bad or good)
@@ -116,7 +116,7 @@ def _likelihood(explanation: tuple[Mistake, ...]) -> tuple[int, int]:
     return len(signals), seldom
 
 
-#: Of signals that explain a contradiction equally well the first is blamed: no standard says how a steering angle
+#: Of signals that explain a contradiction equally well the first is blamed: no standard states how a steering angle
 #: counts, and an axis of an IMU is turned more often than the sign of a gyro that is read from the right one.
 _OFTEN_WRONG = ("steering_wheel_rad", "steer_rad", "wheels", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 

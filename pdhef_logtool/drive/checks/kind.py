@@ -68,10 +68,10 @@ class CheckedDrive:
 
     Attributes
     ----------
-    measured : columns [N] on one grid, SI, by signal; those of truth begin with ``truth.``.
+    measured : columns [N] on one grid, SI, by signal; those of ground truth begin with ``truth.``.
     vehicle : of the file, or the default one, which is no ``has_file``.
-    latency : of the truth against the gyro, or the gyro's own. late : sensors that are late without truth.
-    has_truth : whether the truth at the CG is known.
+    latency : of ground truth against the gyro, or the gyro's own. late : sensors that are late without ground truth.
+    has_truth : whether ground truth at the CG is known.
     related : checks of signals by the relations between them. judged : the checks so far.
     """
 
@@ -87,7 +87,7 @@ class CheckedDrive:
 
     @property
     def speed(self) -> FloatArray | None:
-        """The column that stands for the speed [N]."""
+        """The column used as the speed [N]."""
         name = self.measured.speed_name
         return None if name is None else self.measured.columns[name]
 

@@ -1,4 +1,4 @@
-"""``SIGNAL.delay``: of two sensors that must go together one is late, which needs no truth."""
+"""``SIGNAL.delay``: of two sensors that must go together one is late, which needs no ground truth."""
 
 from __future__ import annotations
 

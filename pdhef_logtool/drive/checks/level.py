@@ -30,7 +30,7 @@ def _levels(drive: CheckedDrive) -> Iterator[Check]:
             continue
         driven, at_ease = np.zeros_like(columns[name]), np.ones(columns[name].shape[0], np.bool_)
         if speed is not None and yaw is not None:
-            # Where the car slides, speed and yaw rate no longer say what accelerates it.
+            # Where the car slides, speed and yaw rate no longer show what accelerates it.
             at_ease = gentle_at(yaw * speed, at_ease) & gentle_at(columns[name] - median_known(columns[name]), at_ease)
         if speed is not None and name == "ax_m_s2":
             driven = derivative(speed)
@@ -51,7 +51,7 @@ def _levels(drive: CheckedDrive) -> Iterator[Check]:
 
 
 def _level(name: str, rest: float, mean: float) -> Check:
-    # A wrong sign or unit of the speed makes the rest wrong, not the mean: both must stand out.
+    # A wrong sign or unit of the speed makes the rest wrong, not the mean: both must exceed the limit.
     size = min(abs(rest), abs(mean))
     evidence = f"mean {mean:.2f} m/s^2, of which driving leaves {rest:.2f}"
     if size > OTHER_AXIS_M_S2:

@@ -30,15 +30,15 @@ def check_drive(
     mounting_is_known: bool = False,
     measured: Measured | None = None,
 ) -> tuple[Check, ...]:
-    """Return the checks of mapped signals, of the truth and of the vehicle file; nothing that they decide is a guess.
+    """Return the checks of mapped signals, of ground truth and of the vehicle file.
 
-    What contradicts is looked at again without the samples that a sensor fault has spoilt.
+    If a check fails, they are repeated without the samples that a sensor fault has spoilt.
 
     Parameters
     ----------
-    signals, truth : by name, SI, as mapped. derived : truth at the CG.
-    vehicle : its file is held against the drive; None, or the default car: there is none.
-    latency : of the truth against the gyro, or the gyro's own. late : sensors that are late without truth.
+    signals, truth : by name, SI, as mapped. derived : ground truth at the CG.
+    vehicle : from a file; None or the default car: without a file.
+    latency : of ground truth against the gyro, or the gyro's own. late : sensors that are late without ground truth.
     mounting_is_known : gravity has shown that the IMU is not upside down.
     measured : what :func:`~pdhef_logtool.drive.measured.measure` makes of the channels, where that is known.
     """

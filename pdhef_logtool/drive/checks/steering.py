@@ -16,7 +16,7 @@ NEUTRAL_RAD_PER_M_S2 = 0.0006
 STEERING_RANGE = (0.75, 1.33)
 #: Share of the steering's spread that curvature and lateral acceleration may leave.
 UNEXPLAINED_STEERING = 0.5
-#: Highest over lowest speed from which wheelbase and understeer can be told apart.
+#: Highest over lowest speed from which wheelbase and understeer can be distinguished.
 SPEED_SPREAD = 1.4
 
 

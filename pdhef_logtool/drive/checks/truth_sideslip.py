@@ -1,4 +1,4 @@
-"""``truth.sideslip_rad``: whether the truth's heading and velocity belong together; sideslip is 0 on straights."""
+"""``truth.sideslip_rad``: whether the ground-truth heading and velocity belong together; sideslip is 0 on straights."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pdhef_logtool.drive.relations import gentle_at
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
 
-#: Truth stands wrong by more than what tyres and crossfall make of straight driving, and is known to a third of it.
+#: A larger sideslip on straights is an error of ground truth, not of tyres and crossfall.
 SIDESLIP_OFFSET_RAD = math.radians(0.15)
 #: No car drives sideways: half of its moving time beyond that, the heading and the velocity do not belong together.
 SIDEWAYS_RAD = math.radians(20.0)
@@ -38,7 +38,7 @@ def _checks(drive: CheckedDrive) -> list[Check]:
 
 
 def sideslip_offset(columns: Mapping[str, FloatArray]) -> tuple[float, float] | None:
-    """Return the truth's sideslip at no curvature and no lateral force, with its standard error; None: too little."""
+    """Return the ground-truth sideslip on straights with its standard error; None if too little is known."""
     rate, ay = (columns.get(n) for n in ("yaw_rate_rad_s", "ay_m_s2"))
     vx, vy = (columns.get(f"truth.{n}") for n in ("vx_m_s", "vy_m_s"))
     if rate is None or ay is None or vx is None or vy is None:
@@ -51,12 +51,12 @@ def sideslip_offset(columns: Mapping[str, FloatArray]) -> tuple[float, float] | 
 
 
 def is_turned(offset_rad: float, error_rad: float) -> bool:
-    """Return whether an offset of the truth's sideslip is one, and not tyres, crossfall or chance."""
+    """Return whether an offset of the ground-truth sideslip is larger than tyres, crossfall and chance explain."""
     return abs(offset_rad) > max(SIDESLIP_OFFSET_RAD, SURE * error_rad)
 
 
 def _offset_check(columns: Mapping[str, FloatArray]) -> Check | None:
-    """Return the check of the truth's sideslip on straights; None without IMU."""
+    """Return the check of the ground-truth sideslip on straights; None without IMU."""
     if "yaw_rate_rad_s" not in columns or "ay_m_s2" not in columns:
         return None
     result = sideslip_offset(columns)

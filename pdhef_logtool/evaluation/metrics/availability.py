@@ -25,7 +25,7 @@ class _Availability:
 
 
 def _count_scorable(reference: Reference) -> dict[str, dict[str, int]]:
-    """Return by signal how many stamps of each segment the truth can score."""
+    """Return by signal how many stamps of each segment ground truth can score."""
     by_signal: dict[str, dict[str, int]] = {signal: dict.fromkeys(reference.masks, 0) for signal in SCORED_SIGNALS}
     for a, b in row_blocks(len(reference.truth)):
         for segment, mask in reference.masks.rows(a, b).items():

@@ -1,4 +1,4 @@
-"""``coverage95``: whether intervals contain the truth as often as they claim."""
+"""``coverage95``: whether intervals contain ground truth as often as they claim."""
 
 from __future__ import annotations
 

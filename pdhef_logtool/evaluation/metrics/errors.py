@@ -40,7 +40,7 @@ class _Errors:
 
 
 class _TruthSquares:
-    """Sums of the truth's squares by segment of each block; most estimates are known at the same stamps."""
+    """Sums of the ground-truth squares by segment of each block; most estimates are known at the same stamps."""
 
     def __init__(self, _reference: Reference) -> None:
         self._found: dict[tuple[str, int], tuple[BoolArray, dict[str, float]]] = {}

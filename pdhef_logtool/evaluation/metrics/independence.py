@@ -1,4 +1,4 @@
-"""``not_independent``: the mark of signals whose truth is one of the estimators' inputs."""
+"""``not_independent``: the mark of signals whose ground truth is one of the estimators' inputs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a filter reports of itself: normalized innovations and divergence; needs no truth."""
+"""What a filter reports of itself: normalized innovations and divergence; needs no ground truth."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def _rows(estimate: StateTrack, _truth: StateTrack | None, masks: SegmentMasks, 
 
 
 def state_rows(track: StateTrack, masks: Mapping[str, BoolArray], *, log: str) -> list[MetricRow]:
-    """Return ``nis``, ``nis_dof`` and ``diverged`` of a track, which need no truth; no NIS rows for a track without."""
+    """Return ``nis``, ``nis_dof`` and ``diverged`` of a track; no NIS rows without innovations."""
     masks = packed(masks, len(track))
     innovation, diverged = SegmentSums(), SegmentSums()
     for a, b in row_blocks(len(track)):

@@ -40,7 +40,7 @@ class _Lag:
 
 
 class _Lags:
-    """Lags behind the truth [N] of its first hour; estimates that are known at the same stamps share the grid."""
+    """Lags behind ground truth [N] in its first hour; estimates that are scored at the same stamps share the grid."""
 
     def __init__(self, reference: Reference) -> None:
         self._truth = reference.truth
@@ -48,7 +48,7 @@ class _Lags:
         self._grids: list[tuple[BoolArray, EvenGrid, dict[str, FloatArray]]] = []
 
     def of(self, estimate: StateTrack, signal: str, scored: BoolArray) -> float:
-        """Return the lag of a signal that is scored where it is ``known`` [N]; NaN when there is no clear peak."""
+        """Return the lag of a signal that is ``scored`` at [N]; NaN when there is no clear peak."""
         scored = scored[: self._end]
         if np.count_nonzero(scored) < 2:
             return float("nan")
@@ -80,7 +80,7 @@ def _end_of_first_hour(truth: StateTrack) -> int:
 
 
 def lag_s(stamps_ns: IntArray, estimate: FloatArray, truth: FloatArray) -> float:
-    """Return by how many seconds the estimate [N] follows the truth [N]; NaN when there is no clear peak."""
+    """Return by how many seconds the estimate [N] follows the ground truth [N]; NaN when there is no clear peak."""
     finite = np.isfinite(estimate) & np.isfinite(truth)
     if np.count_nonzero(finite) < 2:
         return float("nan")

@@ -1,7 +1,7 @@
 """Computes the figures of every registered metric, in one pass over the blocks of a drive for those of signals.
 
-e = estimate − truth (angles wrapped), over the stamps of a segment at which the estimate and the truth are valid and
-finite; ``n`` is their number. Sideslip counts only where the truth's speed exceeds the low-speed blend.
+e = estimate − ground truth (angles wrapped), over the stamps of a segment at which the estimate and ground truth are
+valid and finite; ``n`` is their number. Sideslip counts only where the ground-truth speed exceeds the low-speed blend.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ def score_track(
     low_speed_m_s: float,
     not_independent: Mapping[str, str] | None = None,
 ) -> list[MetricRow]:
-    """Score one estimate against the truth at the same stamps.
+    """Score one estimate against ground truth at the same stamps.
 
     Parameters
     ----------
     estimate, truth : [N] at the same stamps (:func:`pdhef_logtool.drive.truth.truth_at`).
     masks : bool [N] by segment; ``all`` is added when it is absent.
-    low_speed_m_s : sideslip is scored above this truth speed.
+    low_speed_m_s : sideslip is scored above this ground truth speed.
     not_independent : by signal, from :func:`pdhef_logtool.drive.truth.dependent_signals`; other keys are ignored.
 
     Raises
