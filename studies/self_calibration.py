@@ -27,7 +27,7 @@ from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, signal_error
-from pdhef_logtool.evaluation.metrics.d2 import d2_rows, driven_d2, driving_products
+from pdhef_logtool.evaluation.metrics.lateral_consistency import consistency_rows, driven_consistency, driving_products
 from pdhef_logtool.records.errors import PdhefError, SimulationError
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -136,7 +136,7 @@ def taken(signals: Signals, file: VehicleParameters, calibration: SelfCalibratio
     car = replace(Car.of(file), self_calibrated=calibrated)
     track, _ = run_window(make_estimator("physics", car), signals)
     low, sensors = file.low_speed_blend_m_s, log_sensors(file, calibration)
-    driven = driven_d2(*driving_products(track, signals, low_speed_m_s=low, sensors=sensors))
+    driven = driven_consistency(*driving_products(track, signals, low_speed_m_s=low, sensors=sensors))
     return replace(car, self_calibrated=replace(calibrated, varied=calibration.varied, driven_d2_m_s=driven))
 
 
@@ -166,7 +166,7 @@ def errors_of(
             car = car.with_noise("physics", calibration.noise.model_copy(update={"r_std": {}}))
         used = "open-loop" if name == OPEN_LOOP and car.self_calibrated is None else name
         track, _ = run_window(make_estimator(used, car), drive.signals)
-        rows = d2_rows([track], drive.signals, whole, log="", low_speed_m_s=low, sensors=sensors)
+        rows = consistency_rows([track], drive.signals, whole, log="", low_speed_m_s=low, sensors=sensors)
         rmse = float(np.degrees(np.sqrt(np.nanmean(signal_error(track, truth, SIDESLIP, low) ** 2))))
         errors[name] = rmse, rows[0].value if rows else float("nan")
     return errors

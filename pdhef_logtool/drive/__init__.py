@@ -1,1 +1,1 @@
-"""From a log to aligned signals and truth."""
+"""From a log to aligned signals and ground truth."""

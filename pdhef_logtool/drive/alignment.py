@@ -9,7 +9,7 @@ Rules
   Irregular steps are kept, and no stamp is invented.
 * *Inputs* (steering, a_x, friction) are what the estimator's model is driven with: interpolated when their rate is
   comparable to the grid's, else the newest sample at or before the grid stamp is held.
-* *Measurements* (a_y, yaw rate, speed, wheel speeds) carry information once: a value stands at a grid stamp only when
+* *Measurements* (a_y, yaw rate, speed, wheel speeds) carry information once: a value is at a grid stamp only when
   there is a new sample for it, otherwise a filter would count the same reading several times.
 * Nothing is interpolated or held across a gap of more than ``max_gap_s``; nothing is extrapolated.
 * A sample that came much later than its neighbours is not waited for: it counts as missing.
@@ -65,7 +65,7 @@ class ChannelPlan:
     method : ``exact`` (value where the stamps coincide, else missing), ``interpolate`` (linear between neighbours),
         ``hold`` (newest sample at or before the stamp) or ``next`` (a measurement slower than the grid: at the first
         grid stamp at or after its own stamp, once).
-    period_s : median period; None when the survey holds fewer than two samples.
+    period_s : median period; None when the survey contains fewer than two samples.
     delay_s : median of arrival − stamp. late_limit_s : a sample this much slower than the fastest one within
         ``LATE_NEIGHBOURHOOD_S`` is not waited for.
     max_gap_s : longest step between samples that is bridged, and longest age of a held sample.
@@ -307,17 +307,17 @@ def _median_period_s(channel: Channel) -> float | None:
 
 
 def _grid_channel(periods: Mapping[str, float | None]) -> str:
-    known = {name: p for name in _IMU if (p := periods.get(name)) is not None}
-    if not known:
+    period_by_name = {name: p for name in _IMU if (p := periods.get(name)) is not None}
+    if not period_by_name:
         mapped = ", ".join(sorted(name for name in _IMU if name in periods))
         raise MappingError(
             expected="samples of yaw_rate_rad_s, ay_m_s2 or ax_m_s2, whose stamps are the grid",
             got=f"no samples of {mapped}" if mapped else "none of them mapped",
             where="alignment",
-            remedy="map an IMU topic (pdhef inspect LOG shows what the log holds)",
+            remedy="map an IMU topic (pdhef inspect LOG shows the topics and fields)",
         )
-    fastest = min(known.values())
-    return next(name for name, period in known.items() if period <= 2.0 * fastest)
+    fastest = min(period_by_name.values())
+    return next(name for name, period in period_by_name.items() if period <= 2.0 * fastest)
 
 
 def _choose_sources(

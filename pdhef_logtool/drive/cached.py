@@ -1,4 +1,4 @@
-"""Logs that are read more than once: their slim logs, where a cache of these is named, else the logs themselves."""
+"""Logs that are read more than once: their reduced logs, where a cache of these is named, else the logs themselves."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def _silent(_text: str) -> None:
 def cached(
     log: LogInput, mapping: Mapping | None, options: ReadOptions, warn: Warn = _silent
 ) -> Iterator[tuple[LogInput, Mapping | None]]:
-    """Yield what to read in place of a log, and with which mapping; a slim log has its own."""
+    """Yield what to read in place of a log, and with which mapping; a reduced log has its own."""
     if options.cache is None:
         yield log, mapping
         return
     from pdhef_logtool.drive.slim_cache import SlimCache
 
-    with SlimCache(options.cache, mapping, options).standing_in(log, warn) as found:
-        yield found, mapping if found.path == log.path else None
+    with SlimCache(options.cache, mapping, options).standing_in(log, warn) as substitute:
+        yield substitute, mapping if substitute.path == log.path else None
 
 
 @contextmanager
@@ -38,7 +38,7 @@ def read_cached(
 ) -> Iterator[Drive]:
     """Open a log as :func:`~pdhef_logtool.drive.reading.read_drive` does, or what stands for it."""
     with (
-        cached(log, mapping, options, warn) as (found, of_it),
-        read_drive(found, car, of_it, options, tell=warn) as drive,
+        cached(log, mapping, options, warn) as (substitute, mapping_of_it),
+        read_drive(substitute, car, mapping_of_it, options, tell=warn) as drive,
     ):
         yield drive

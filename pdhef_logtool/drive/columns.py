@@ -14,11 +14,11 @@ LOW_PASS_HZ = 1.0
 #: Samples are interpolated onto the grid over gaps of at most this length, and of this many of their periods.
 MAX_GAP_S = 0.5
 MAX_GAP_PERIODS = 2.5
-#: No sensor that is slower says anything of manoeuvres.
+#: A slower sensor does not resolve manoeuvres.
 LONGEST_GAP_S = 2.5
 #: 21 hours about the middle of the drive; it keeps one wrong stamp from making a grid of decades.
 MAX_CELLS = 1_500_000
-#: Moving: faster than this share of the drive's fast speeds, and than a speed at which little can be told.
+#: Moving: faster than this share of the drive's fast speeds, and than a speed that is too low for the relations.
 MOVING_SHARE = 0.25
 MIN_MOVING_M_S = 0.5
 
@@ -70,20 +70,20 @@ def _on_grid(channel: Channel, start_ns: int, cells: int) -> FloatArray:
     nothing = np.full(cells, np.nan)
     if cells < 2:
         return nothing
-    at = np.rint((channel.stamps_ns - start_ns) * (1e-9 / GRID_S)).astype(np.int64)
-    inside = (at >= 0) & (at < cells)
-    count = np.bincount(at[inside], minlength=cells).astype(np.float64)
-    total = np.bincount(at[inside], weights=channel.values[inside], minlength=cells)
-    known = np.flatnonzero(count > 0.0)
-    if known.shape[0] < 2:
+    cell_of = np.rint((channel.stamps_ns - start_ns) * (1e-9 / GRID_S)).astype(np.int64)
+    inside = (cell_of >= 0) & (cell_of < cells)
+    count = np.bincount(cell_of[inside], minlength=cells).astype(np.float64)
+    total = np.bincount(cell_of[inside], weights=channel.values[inside], minlength=cells)
+    filled_cells = np.flatnonzero(count > 0.0)
+    if filled_cells.shape[0] < 2:
         return nothing
     cell = np.arange(cells)
-    filled = np.interp(cell, known, total[known] / count[known])
-    before = known[np.maximum(np.searchsorted(known, cell, side="right") - 1, 0)]
-    after = known[np.minimum(np.searchsorted(known, cell), known.shape[0] - 1)]
+    filled = np.interp(cell, filled_cells, total[filled_cells] / count[filled_cells])
+    before = filled_cells[np.maximum(np.searchsorted(filled_cells, cell, side="right") - 1, 0)]
+    after = filled_cells[np.minimum(np.searchsorted(filled_cells, cell), filled_cells.shape[0] - 1)]
     period_s = float(np.median(np.diff(channel.stamps_ns))) * 1e-9
     good = (after - before) * GRID_S <= min(max(MAX_GAP_S, MAX_GAP_PERIODS * period_s), LONGEST_GAP_S)
-    good &= (cell >= known[0]) & (cell <= known[-1])
+    good &= (cell >= filled_cells[0]) & (cell <= filled_cells[-1])
     return _low_pass(filled, good)
 
 
@@ -106,5 +106,5 @@ def _low_pass(values: FloatArray, good: BoolArray) -> FloatArray:
 
 def median_known(column: FloatArray) -> float:
     """Return the median of what is known of a column [N], 0 where nothing is."""
-    known = column[np.isfinite(column)]
-    return float(np.median(known)) if known.size else 0.0
+    finite = column[np.isfinite(column)]
+    return float(np.median(finite)) if finite.size else 0.0

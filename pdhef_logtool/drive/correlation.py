@@ -15,7 +15,7 @@ GAP_PERIODS = 3.0
 #: The common grid's step is kept within these bounds: finer gains nothing, coarser loses the peak.
 MIN_STEP_S, MAX_STEP_S = 0.005, 0.05
 #: Far above what rounding does to a rough correlation of signals that vary by all of their power; of such as vary by
-#: less of it than the least share nothing rough is told.
+#: less of it than the least share no rough value is given.
 _ROUGH_ERROR, _LEAST_POWER = 1e-10, 1e-4
 
 
@@ -70,28 +70,28 @@ class EvenGrid:
         return self._without_trend(self._b.linear(values))
 
     def _without_trend(self, values: FloatArray) -> FloatArray:
-        known = np.isfinite(values)
-        if np.count_nonzero(known) < 2:
+        finite = np.isfinite(values)
+        if np.count_nonzero(finite) < 2:
             return values
-        if self._line is None or not np.array_equal(self._line.known, known):
-            self._line = _Line(known)
+        if self._line is None or not np.array_equal(self._line.is_known, finite):
+            self._line = _Line(finite)
         return self._line.removed_from(values)
 
 
 class _Line:
     """Fits a line to values on a grid [N] of which the same ones are known; the bits are those of ``np.polyfit``."""
 
-    def __init__(self, known: BoolArray) -> None:
-        n = known.shape[0]
-        self.known = known
-        self._powers = np.vander((np.arange(n) / n)[known], 2)
+    def __init__(self, is_known: BoolArray) -> None:
+        n = is_known.shape[0]
+        self.is_known = is_known
+        self._powers = np.vander((np.arange(n) / n)[is_known], 2)
         self._scale = np.sqrt((self._powers * self._powers).sum(axis=0))
         self._powers /= self._scale
 
     def removed_from(self, values: FloatArray) -> FloatArray:
-        known = values if self.known.all() else values[self.known]
-        precision = known.shape[0] * np.finfo(np.float64).eps
-        slope, offset = np.linalg.lstsq(self._powers, known, precision)[0] / self._scale
+        finite_values = values if self.is_known.all() else values[self.is_known]
+        precision = finite_values.shape[0] * np.finfo(np.float64).eps
+        slope, offset = np.linalg.lstsq(self._powers, finite_values, precision)[0] / self._scale
         n = values.shape[0]
         return np.asarray(values - offset - slope * (np.arange(n) / n), dtype=np.float64)
 
@@ -117,10 +117,10 @@ def find_shift(grid: CommonGrid, max_shift_s: float) -> Shift:
     # Candidates: all that rounding may have put behind the largest, and what cannot be told without the exact sums.
     near = ~(rough + error < np.nanmax(rough - error, initial=-np.inf))
     exact = {k: _correlation(grid.a, grid.b, k) for k in (np.flatnonzero(near) - reach).tolist()}
-    known = [k for k, value in exact.items() if np.isfinite(value)]
-    if not known:
+    finite = [k for k, value in exact.items() if np.isfinite(value)]
+    if not finite:
         return Shift(float("nan"), float("nan"), False)
-    best = max(known, key=lambda k: (exact[k], -k))
+    best = max(finite, key=lambda k: (exact[k], -k))
     if abs(best) == reach:
         return Shift(best * grid.step_s, exact[best], False)
     refined = parabolic_peak(*(exact[k] if k in exact else _correlation(grid.a, grid.b, k) for k in _around(best)))
@@ -130,14 +130,14 @@ def find_shift(grid: CommonGrid, max_shift_s: float) -> Shift:
 def has_peak_within(grid: CommonGrid, low_s: float, high_s: float, least: float) -> bool:
     """Return whether the correlation has a peak of ``least`` or more inside of a range, and not only beyond it."""
     shifts = range(round(low_s / grid.step_s) - 1, round(high_s / grid.step_s) + 2)
-    found = np.array([_correlation(grid.a, grid.b, k) for k in shifts])
-    inner = found[1:-1]
-    return bool(((inner > found[:-2]) & (inner >= found[2:]) & (inner >= least)).any())
+    correlations = np.array([_correlation(grid.a, grid.b, k) for k in shifts])
+    inner = correlations[1:-1]
+    return bool(((inner > correlations[:-2]) & (inner >= correlations[2:]) & (inner >= least)).any())
 
 
-def parabolic_peak(before: float, at: float, after: float) -> float:
+def parabolic_peak(before: float, middle: float, after: float) -> float:
     """Return the place of the vertex of the parabola through values at −1, 0, 1; 0 when it has no maximum."""
-    curvature = before - 2.0 * at + after
+    curvature = before - 2.0 * middle + after
     return float(0.5 * (before - after) / curvature) if curvature < 0 else 0.0
 
 
@@ -151,7 +151,7 @@ def _rough_correlations(a: FloatArray, b: FloatArray, reach: int) -> tuple[Float
     From sums: those of products a library of linear algebra forms ten times as fast as means are taken off.
     """
     of_a, of_b = _Sums(_unit_power(a)), _Sums(_unit_power(b))
-    found, error = np.full((2, 2 * reach + 1), np.nan)
+    correlations, error = np.full((2, 2 * reach + 1), np.nan)
     n = a.shape[0]
     for k in range(max(-reach, 1 - n), min(reach, n - 1) + 1):
         x, y = _overlap(n, k)
@@ -162,27 +162,27 @@ def _rough_correlations(a: FloatArray, b: FloatArray, reach: int) -> tuple[Float
             power_a, power_b = aa - sum_a * sum_a / count, bb - sum_b * sum_b / count
             least = min(power_a, power_b)
             if least > _LEAST_POWER * count:
-                found[reach + k] = (ab - sum_a * sum_b / count) / (power_a * power_b) ** 0.5
+                correlations[reach + k] = (ab - sum_a * sum_b / count) / (power_a * power_b) ** 0.5
                 error[reach + k] = _ROUGH_ERROR * count / least
-    return found, error
+    return correlations, error
 
 
 class _Sums:
     """Sums of parts of a signal [N]; ``values`` are 0 where it is not known."""
 
     def __init__(self, values: FloatArray) -> None:
-        known = np.isfinite(values)
-        self._whole = bool(known.all())
-        self.values = values if self._whole else np.where(known, values, 0.0)
-        self._columns = known, self.values, self.values * self.values
+        is_finite = np.isfinite(values)
+        self._whole = bool(is_finite.all())
+        self.values = values if self._whole else np.where(is_finite, values, 0.0)
+        self._columns = is_finite, self.values, self.values * self.values
         self._totals = [float(c.sum()) for c in self._columns]
 
-    def sums_beside(self, other: _Sums, own: slice, others: slice) -> list[float]:
+    def sums_beside(self, other: _Sums, mine: slice, others: slice) -> list[float]:
         """Return count, sum and sum of squares of a part, where the part of the other signal upon it is known."""
         if other._whole:
             ends = zip(self._totals, self._columns, strict=True)
-            return [total - float(c[: own.start].sum()) - float(c[own.stop :].sum()) for total, c in ends]
-        first, end = (np.clip(other._runs, others.start, others.stop) + own.start - others.start).T
+            return [total - float(c[: mine.start].sum()) - float(c[mine.stop :].sum()) for total, c in ends]
+        first, end = (np.clip(other._runs, others.start, others.stop) + mine.start - others.start).T
         return [float((c[end] - c[first]).sum()) for c in self._running]
 
     @cached_property
@@ -202,9 +202,9 @@ def _overlap(n: int, shift: int) -> tuple[slice, slice]:
 
 def _unit_power(values: FloatArray) -> FloatArray:
     finite = np.isfinite(values)
-    known = values if finite.all() else values[finite]
+    finite_values = values if finite.all() else values[finite]
     with np.errstate(over="ignore"):
-        size = float(np.sqrt(np.mean(np.square(known)))) if known.size else 0.0
+        size = float(np.sqrt(np.mean(np.square(finite_values)))) if finite_values.size else 0.0
     return values / size if size > 0 and np.isfinite(size) else values
 
 

@@ -1,6 +1,6 @@
 """Samples of an IMU that a sensor fault has spoilt: relations between signals are looked at without them.
 
-The detector is that of the filters (:mod:`pdhef_logtool.estimators.sensor_faults`). It cannot tell a dead
+The detector is that of the filters (:mod:`pdhef_logtool.estimators.sensor_faults`). It cannot distinguish a dead
 channel from one in another unit; here the whole drive is available.
 """
 
@@ -37,33 +37,33 @@ def without_faulty_samples(
     """
     from pdhef_logtool.estimators.sensor_faults import find_faults  # loads the compiler
 
-    found = dict(signals)
+    sound = dict(signals)
     if any(n not in signals or not len(signals[n]) for n in _OTHER):
-        return found, {}
+        return sound, {}
     gyro = signals["yaw_rate_rad_s"]
     middle, reach = int(np.median(gyro.stamps_ns)), round(0.5e9 * SURVEY_S)
     signals = {n: c.between(middle - reach, middle + reach) for n, c in signals.items()}
     if not has_imu(signals):
-        return found, {}
+        return sound, {}
     plan = plan_alignment(signals, steering_ratio=vehicle.steering_ratio, wheel_radius_m=vehicle.wheel_radius_m)
     aligned = align(signals, plan, middle - reach, middle + reach)
     faults, _ = find_faults(aligned, vehicle, None)
     shares: dict[str, float] = {}
     for i, (name, other) in enumerate(_OTHER.items()):
-        known = np.isfinite(getattr(aligned, name))
-        silent = known & ~np.isfinite(getattr(faults.filtered, name))
+        finite = np.isfinite(getattr(aligned, name))
+        silent = finite & ~np.isfinite(getattr(faults.filtered, name))
         # Rough road raises the noise too: a burst is one that would be reported.
         reported = aligned.stamps_ns[faults.reason & (BURST_AY << i) > 0]
-        bursts = known & (faults.extra_r[:, i] > 0.0) & _beside(aligned.stamps_ns, reported, BURST_S)
+        bursts = finite & (faults.extra_r[:, i] > 0.0) & _beside(aligned.stamps_ns, reported, BURST_S)
         if silent.any() and _moves(aligned.stamps_ns, getattr(aligned, name), silent):
             silent &= False
         if not (bursts | silent).any():
             continue
         shares[name] = _share_of_motion(getattr(aligned, other), silent)
-        found[name] = _without(found[name], aligned.stamps_ns[bursts | silent])
-        if "ax_m_s2" in found and _topic(found["ax_m_s2"]) == _topic(found[name]):
-            found["ax_m_s2"] = _without(found["ax_m_s2"], aligned.stamps_ns[bursts])
-    return found, shares
+        sound[name] = _without(sound[name], aligned.stamps_ns[bursts | silent])
+        if "ax_m_s2" in sound and _topic(sound["ax_m_s2"]) == _topic(sound[name]):
+            sound["ax_m_s2"] = _without(sound["ax_m_s2"], aligned.stamps_ns[bursts])
+    return sound, shares
 
 
 def _topic(channel: Channel) -> str:
@@ -73,11 +73,11 @@ def _topic(channel: Channel) -> str:
 def _moves(stamps_ns: IntArray, values: FloatArray, silent: BoolArray) -> bool:
     """Return whether a channel changes in its silent samples as it does in the others: then it is weak, not silent."""
     cells = (stamps_ns - stamps_ns[0]) // round(MEAN_S * 1e9)
-    known = np.isfinite(values)
-    count = np.bincount(cells[known])
+    finite = np.isfinite(values)
+    count = np.bincount(cells[finite])
     with np.errstate(divide="ignore", invalid="ignore"):
-        steps = np.diff(np.bincount(cells[known], weights=values[known]) / count)
-    quiet = np.bincount(cells[known], weights=silent[known]) == count
+        steps = np.diff(np.bincount(cells[finite], weights=values[finite]) / count)
+    quiet = np.bincount(cells[finite], weights=silent[finite]) == count
     within = quiet[1:] & quiet[:-1] & np.isfinite(steps)
     beyond = ~within & np.isfinite(steps)
     if not within.any() or not beyond.any():
@@ -86,8 +86,8 @@ def _moves(stamps_ns: IntArray, values: FloatArray, silent: BoolArray) -> bool:
 
 
 def _share_of_motion(other: FloatArray, faulty: BoolArray) -> float:
-    known = np.isfinite(other)
-    power = np.where(known, (other - (np.mean(other[known]) if known.any() else 0.0)) ** 2, 0.0)
+    finite = np.isfinite(other)
+    power = np.where(finite, (other - (np.mean(other[finite]) if finite.any() else 0.0)) ** 2, 0.0)
     return float(power[faulty].sum() / max(power.sum(), 1e-12))
 
 

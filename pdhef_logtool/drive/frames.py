@@ -1,4 +1,4 @@
-"""Rotations of a sensor in a car, and recorded frames held against them: they are evidence, and may be wrong."""
+"""Rotations of a sensor in a car, and recorded frames compared with them: they are evidence, and may be wrong."""
 
 from __future__ import annotations
 
@@ -57,22 +57,22 @@ def placed_rotation(placed: Placement) -> FloatArray:
 
 
 def gravity_agrees(placed: Placement, force: FloatArray) -> str:
-    """Return why frames are believed by gravity, the mean [3] of the accelerations; empty where it does not say so."""
+    """Return why frames are accepted by gravity, the mean [3] of the accelerations; empty where it does not show it."""
     tilt = _tilt_deg(placed, force)
     if tilt is None or tilt > TILT_DEG:
         return ""
-    return f"the recorded frames say so ({_named(placed)}), and gravity is {tilt:.0f} deg off their vertical"
+    return f"the recorded frames give it ({_named(placed)}), and gravity is {tilt:.0f} deg off their vertical"
 
 
 def frames_check(placed: Placement, shown: FloatArray | None, evidence: str, force: FloatArray) -> Check | None:
-    """Hold frames against the rotation [3, 3] that the drive shows, else against gravity; None where neither tells."""
-    said = f"the recorded frames ({_named(placed)}) say that {rotation_text(placed_rotation(placed))}"
+    """Compare frames against the rotation [3, 3] that the drive shows, else with gravity; None where neither tells."""
+    said = f"the recorded frames ({_named(placed)}): {rotation_text(placed_rotation(placed))}"
     apart = None if shown is None else _between_deg(placed.rotation, shown)
     tilt = _tilt_deg(placed, force)
     if apart is not None and apart <= APART_DEG:
         return Check("imu.frames", "ay_m_s2", "passed", f"{said}; the drive agrees within {apart:.0f} deg")
     if shown is not None:
-        evidence = f"{said}; the drive says that {rotation_text(shown)}: {evidence}"
+        evidence = f"{said}; the drive shows that {rotation_text(shown)}: {evidence}"
     elif tilt is not None and tilt > TILT_DEG:
         evidence = f"{said}, but gravity is {tilt:.0f} deg off their vertical"
     else:
@@ -81,8 +81,8 @@ def frames_check(placed: Placement, shown: FloatArray | None, evidence: str, for
 
 
 def frames_alone(placed: Placement, believed: str) -> Check:
-    """Say that nothing but frames and gravity tells how the IMU lies."""
-    evidence = f"{rotation_text(placed_rotation(placed))}: {believed}; the drive does not tell the rest"
+    """Report that nothing but frames and gravity shows how the IMU lies."""
+    evidence = f"{rotation_text(placed_rotation(placed))}: {believed}; the drive does not show the rest"
     return Check("imu.frames", "ay_m_s2", "undecided", evidence, _REMEDY)
 
 

@@ -63,9 +63,9 @@ class Bracket:
     def _between(self, values: FloatArray, difference: Callable[[FloatArray, FloatArray], FloatArray]) -> FloatArray:
         a, b = values[self._left], values[self._right]
         share = self._share.reshape(-1, *([1] * (values.ndim - 1)))
-        found: FloatArray = a + share * difference(a, b)
-        if len(found) == len(self.inside):
-            return found
+        values_inside: FloatArray = a + share * difference(a, b)
+        if len(values_inside) == len(self.inside):
+            return values_inside
         out = np.full((self.inside.shape[0], *values.shape[1:]), np.nan)
-        out[self.inside] = found
+        out[self.inside] = values_inside
         return out

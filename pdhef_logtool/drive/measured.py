@@ -1,4 +1,4 @@
-"""Signals and truth of a drive on one grid, and what kinematics says of them: computed once for all that asks."""
+"""Signals and ground truth of a drive on one grid, and the kinematic relations between them."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _TRUTH = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """Columns of the grid by name, those of truth with ``truth.``, and the relations that they allow.
+    """Columns of the grid by name, those of ground truth with ``truth.``, and the relations that they allow.
 
     Attributes
     ----------
-    speed_name : the column that stands for the speed. topics : of the signals, by name.
+    speed_name : the column used as the speed. topics : of the signals, by name.
     """
 
     columns: Mapping[str, FloatArray]
@@ -45,7 +45,7 @@ class Measured:
         return replace(self, columns=columns, topics={n: t for n, t in self.topics.items() if n not in gone})
 
     def groups(self, *, mounting_is_known: bool) -> list[tuple[str, ...]]:
-        """Return the signals whose signs or units are wrong together: those of one topic, and of the truth."""
+        """Return the signals whose signs or units are wrong together: those of one topic, and of ground truth."""
         columns = self.columns
         topics: dict[str, list[str]] = {}
         for name, topic in () if mounting_is_known else self.topics.items():
@@ -67,7 +67,7 @@ def _own(speed_name: str | None) -> str | None:
 def measure(
     signals: Mapping[str, Channel], truth: Mapping[str, Channel] | None = None, derived: TruthTrack | None = None
 ) -> Measured:
-    """Bring signals and truth, as mapped, to one grid and relate them. ``derived`` : the truth at the CG."""
+    """Bring signals and ground truth, as mapped, to one grid and relate them. ``derived`` : ground truth at the CG."""
     columns, speed_name = drive_columns(signals, truth or {}, derived)
     topics = {n: c.source.split(".")[0] for n, c in signals.items()}
     return Measured(columns, speed_name, tuple(measured_relations(columns, speed_name)), topics)
@@ -76,12 +76,12 @@ def measure(
 def drive_columns(
     signals: Mapping[str, Channel], truth: Mapping[str, Channel], derived: TruthTrack | None
 ) -> tuple[dict[str, FloatArray], str | None]:
-    """Return signals and truth on one grid, and the name of the column that stands for the speed."""
+    """Return signals and ground truth on one grid, and the name of the column used as the speed."""
     channels = {n: c for n, c in signals.items() if c.values.ndim == 1}
     if derived is not None:
         for name in _TRUTH:
             channels[f"truth.{name}"] = channel_of(derived, name)
-        # As mapped: a wrong unit is wrapped away in what is derived of it, and a derived a_y says nothing new.
+        # As mapped: a wrong unit is wrapped away in what is derived of it, and a derived a_y gives no new information.
         channels |= {f"truth.{n}": truth[n] for n in ("sideslip_rad", "ay_m_s2") if n in truth}
     columns = columns_on_grid(channels)
     if "truth.x_m" in columns and "truth.y_m" in columns:
@@ -92,7 +92,7 @@ def drive_columns(
 
 
 def _speed_of(columns: dict[str, FloatArray]) -> str | None:
-    """Return the name of the column that stands for the speed; the wheels' is added, since one alone turns in bends."""
+    """Return the name of the column used as the speed; the wheels' is added, since one alone turns in bends."""
     if "speed_m_s" in columns:
         return "speed_m_s"
     for unit in ("m_s", "rad_s"):

@@ -1,8 +1,8 @@
 """How an IMU is mounted in the car, from gravity, its speed and its turning.
 
-Gravity over the drive, less what driving explains of it, says which way is up; the rate about that axis is the yaw
+The mean specific force, less the accelerations of the car, shows which way is up; the rate about that axis is the yaw
 rate. Then what is left of the accelerations must be (v̇, v r) in the car's axes: one angle about the vertical makes it
-so, by complex regression, and its fit says whether all of it is believed.
+so, by complex regression, and its fit gives whether all of it is accepted.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ COMPENSATED_M_S2 = 3.0
 MIN_CORRELATION = 0.75
 #: Independent samples: 5 s of driving.
 MIN_SAMPLES = 10.0
-#: The regression's own gain: a unit is wrong beyond, and then no angle can be told from it.
+#: The regression's own gain: a unit is wrong beyond, and then no angle can be derived from it.
 GAIN_RANGE = (0.5, 2.0)
 #: Of a multiple of 90 degrees: half of 45 degrees at three standard errors.
 MAX_ERROR_DEG = 7.5
@@ -106,9 +106,9 @@ class Mounting:
 
 
 def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None], mapping: Mapping) -> Mounting | None:
-    """Find the rotation of an IMU from its six components; None where there are none, or the drive says nothing.
+    """Find the rotation of an IMU from its six components; None without them, or if the drive does not show it.
 
-    ``measured``: with the components of the triads beside the signals, and truth for the sign of the yaw rate.
+    ``measured``: with the components of the triads; ground truth, if any, for the sign of the yaw rate.
     """
     accelerations, rates = triads
     columns, speed_name = measured.columns, measured.speed_name
@@ -120,12 +120,12 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
     speed = np.full(f.shape[0], np.nan) if speed_name is None else columns[speed_name]
     references = yaw_references(columns, speed_name)
     ups = _ups(f, w, named)
-    if len(ups) > 1 and not references:  # gravity does not say which way is up
+    if len(ups) > 1 and not references:  # gravity does not show which way is up
         references = steering_references(columns, speed_name)
-    found = [m for h in (1.0, -1.0) for up in ups if (m := _turned(f, h * w, speed, up, references)) is not None]
-    hands = [1.0] * (len(found) // 2) + [-1.0] * (len(found) // 2)
-    # Another measurement of the yaw rate must say so before a sensor is taken for a left-handed one.
-    fitting = [(m, h) for m, h in zip(found, hands, strict=True) if m.fits and h * HAND_CORRELATION > -m.sign]
+    turns = [m for h in (1.0, -1.0) for up in ups if (m := _turned(f, h * w, speed, up, references)) is not None]
+    hands = [1.0] * (len(turns) // 2) + [-1.0] * (len(turns) // 2)
+    # Another measurement of the yaw rate must show it before a sensor is taken for a left-handed one.
+    fitting = [(m, h) for m, h in zip(turns, hands, strict=True) if m.fits and h * HAND_CORRELATION > -m.sign]
     if not fitting:
         return None
     best, hand = max(fitting, key=lambda x: x[0].correlation + np.sign(x[0].sign))
@@ -229,7 +229,7 @@ def _turned(
 
 
 def _along(measured: FloatArray, driven: FloatArray) -> bool:
-    """Return whether speeding up and braking alone say which way is forward."""
+    """Return whether speeding up and braking alone show which way is forward."""
     spread = float(measured.std() * driven.std())
     return spread > 0.0 and float(np.mean((measured - measured.mean()) * (driven - driven.mean()))) / spread > 0.5
 
@@ -256,8 +256,8 @@ def _snapped(turn: _Turn) -> FloatArray:
     rest = rotation @ step.T
     tilt = math.degrees(math.acos(float(np.clip(rest[2, 2], -1.0, 1.0))))
     yaw = math.degrees(math.atan2(rest[1, 0] - rest[0, 1], rest[0, 0] + rest[1, 1]))
-    known = turn.correlation >= ASKEW_CORRELATION and turn.error_deg <= ASKEW_ERROR_DEG
-    if not known or turn.samples < ASKEW_SAMPLES:
+    is_precise = turn.correlation >= ASKEW_CORRELATION and turn.error_deg <= ASKEW_ERROR_DEG
+    if not is_precise or turn.samples < ASKEW_SAMPLES:
         return step
     is_turned = abs(yaw) > max(YAW_DEG, 3.0 * turn.error_deg)
     if tilt > TILT_DEG:
@@ -285,7 +285,7 @@ def _level_only(rest: FloatArray) -> FloatArray:
 class Survey:
     """The first minutes of a log as its mapping reads them, the IMU turned into the car where that is certain.
 
-    ``vehicle``: whose file is held against the drive; the default car stands for none.
+    ``vehicle``: from the vehicle file, or the default car.
     """
 
     mapping: Mapping
@@ -317,7 +317,7 @@ class Survey:
     def checks(self) -> tuple[Check, ...]:
         """The checks of the mounting with those of :func:`~pdhef_logtool.drive.checks.running.check_drive`."""
         channels = self.channels
-        found = check_drive(
+        drive_checks = check_drive(
             channels.signals,
             channels.truth,
             self.truth,
@@ -328,37 +328,38 @@ class Survey:
             measured=self.measured,
         )
         if self.mounting is not None and self.is_mounted:
-            # Right axes have right signs, and gravity says the unit.
+            # Right axes have right signs, and gravity gives the unit.
             settled = {f"{n}.sign" for n in MOUNTED}
             evidence = self.mounting.evidence
-            known = [replace(c, verdict="passed", evidence=evidence, remedy="") for c in found]
-            found = tuple(
-                k if c.verdict == "undecided" and c.name in settled else c for c, k in zip(found, known, strict=True)
+            passed = [replace(c, verdict="passed", evidence=evidence, remedy="") for c in drive_checks]
+            drive_checks = tuple(
+                k if c.verdict == "undecided" and c.name in settled else c
+                for c, k in zip(drive_checks, passed, strict=True)
             )
-        return (*self.mounted, *self._of_names(found), *found)
+        return (*self.mounted, *self._of_names(drive_checks), *drive_checks)
 
     @cached_property
     def late(self) -> tuple[LateSensor, ...]:
         """The sensors whose stamps are late by what the signals alone say; a sensor that fails for a while is none."""
-        found = late_sensors(self.channels.signals)
-        if not found:
+        sensors = late_sensors(self.channels.signals)
+        if not sensors:
             return ()
         sound, shares = without_faulty_samples(self.channels.signals, self.vehicle)
-        return late_sensors(sound) if shares else found
+        return late_sensors(sound) if shares else sensors
 
-    def _of_names(self, found: tuple[Check, ...]) -> Iterator[Check]:
+    def _of_names(self, drive_checks: tuple[Check, ...]) -> Iterator[Check]:
         """Yield what the mapping's names left undecided and the drive has not settled since."""
-        passed = {c.name for c in found if c.verdict == "passed"} - {
-            f"{c.subject}.sign" for c in found if c.verdict != "passed"
+        passed = {c.name for c in drive_checks if c.verdict == "passed"} - {
+            f"{c.subject}.sign" for c in drive_checks if c.verdict != "passed"
         }
         doubted = {c.name.removesuffix(".candidate") for c in self.mapping.checks if "unit" in c.evidence}
-        told = units_told(self.measured.relations, doubted)
+        resolved = units_told(self.measured.relations, doubted)
         for check in self.mapping.checks:
             signal = check.name.removesuffix(".candidate")
             if check.name in ("imu.mounting", "mapping.sign") and self.mounting is not None and self.mounting.confident:
                 continue
             # A doubt about a unit stays unless the drive rules out all others: a gain that passes is wider than some.
-            if f"{signal}.sign" not in passed or (signal in doubted and signal not in told):
+            if f"{signal}.sign" not in passed or (signal in doubted and signal not in resolved):
                 yield check
 
 
@@ -389,32 +390,26 @@ def survey_log(
     truth_plan = plan_truth(channels.truth, truth_position_m=vehicle.truth_position_m) if channels.truth else None
     truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
     measured = measure(channels.signals, channels.truth, truth)
-    # What an estimator is given must not hang on the truth: with it, a mounting is only checked.
-    found = find_mounting(measured.without_truth(), triads, mapping)
-    blind = found is not None and found.confident
+    # The input of an estimator must not depend on ground truth: with it, a mounting is only checked.
+    mounting = find_mounting(measured.without_truth(), triads, mapping)
+    blind = mounting is not None and mounting.confident
     if not blind and truth is not None:
-        found = find_mounting(measured, triads, mapping)
-    placed, framed, by_frames = _by_frames(log, mapping, channels, triads, found)
-    found = by_frames or found
+        mounting = find_mounting(measured, triads, mapping)
+    placed, framed, by_frames = _by_frames(log, mapping, channels, triads, mounting)
+    mounting = by_frames or mounting
     channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
     measured = measured.without(extra)
     trusted = blind or by_frames is not None
-    if found is not None and mapping.origin == "auto" and trusted and not found.is_as_named:
-        note = f"{found.text}, and is read so: {found.evidence}"
-        signals = turned_signals(mapping, found, triads)
+    if mounting is not None and mapping.origin == "auto" and trusted and not mounting.is_as_named:
+        note = f"{mounting.text}, and is read so: {mounting.evidence}"
+        signals = turned_signals(mapping, mounting, triads)
         mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
         channels = read_signals(log, mapping, clocks, *span_ns)
-        found = replace(found, named=found.rows)
+        mounting = replace(mounting, named=mounting.rows)
         measured = measure(channels.signals, channels.truth, truth)
     latency = truth_latency(channels, truth)
-    survey = Survey(mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, found, placed, framed)
-    if rescale and mapping.origin == "auto" and (scaled := _rescaled(survey)) != mapping:
-        undone = survey_log(log, scaled, clocks, span_ns, vehicle, rescale=False)
-        # A sensor that fails looks like a wrong unit of another; what is right contradicts nothing any more.
-        failed = [check.name for check in undone.checks if check.verdict == "failed"]
-        if not any(name.endswith((".sign", ".unit", ".axis", ".fault")) for name in failed):
-            return undone
-    return survey
+    survey = Survey(mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, placed, framed)
+    return _rescaled(survey, log, clocks, span_ns) if rescale and mapping.origin == "auto" else survey
 
 
 def _by_frames(
@@ -422,7 +417,7 @@ def _by_frames(
     mapping: Mapping,
     channels: MappedChannels,
     triads: tuple[Triad | None, Triad | None],
-    found: Mounting | None,
+    by_drive: Mounting | None,
 ) -> tuple[Placement | None, Check | None, Mounting | None]:
     """Return where recorded frames put the IMU, the check of it, and the mounting where they alone say it.
 
@@ -436,36 +431,40 @@ def _by_frames(
         return placed, None, None
     components = [channels.signals.get(n) for n in ACCELERATIONS]
     force = np.array([np.nanmean(c.values) if c is not None and len(c) else np.nan for c in components])
-    sure = found if found is not None and found.confident else None
+    sure = by_drive if by_drive is not None and by_drive.confident else None
     shown, evidence = (None, "") if sure is None else (sure.rotation, sure.evidence)
     check = frames_check(placed, shown, evidence, force)
     believed = "" if sure is not None else gravity_agrees(placed, force)
     if not believed:
         return placed, check, None
     rotation, named = placed_rotation(placed), _named_rows(mapping, accelerations, rates)
-    alone = Mounting(rotation, named, f"{believed}; the drive does not tell the rest", confident=False)
+    alone = Mounting(rotation, named, f"{believed}; the drive does not show the rest", confident=False)
     return placed, check if alone.is_as_named else frames_alone(placed, believed), alone
 
 
-def _rescaled(survey: Survey) -> Mapping:
-    """Return a recognised mapping with the one unit or sign undone that alone contradicts all else, with a note.
+def _rescaled(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:
+    """Return the survey with the one unit or sign corrected that alone contradicts everything else, with a note.
 
-    The truth takes no part in it, and is itself only checked: what is scored against is not bent.
+    Ground truth takes no part in it: it is only checked.
     """
     mapping = survey.mapping
-    alone = survey.measured.without_truth()
-    found = explained_factors(alone, mounting_is_known=survey.is_mounted, most=1)
-    if found:
+    factors = explained_factors(survey.measured.without_truth(), mounting_is_known=survey.is_mounted, most=1)
+    if factors:
         sound, shares = without_faulty_samples(survey.channels.signals, survey.vehicle)
         if shares:
-            found = explained_factors(measure(sound), mounting_is_known=survey.is_mounted, most=1)
-    for name, (factor, evidence) in found.items():
-        if name not in mapping.signals:
-            continue
-        signals = {**mapping.signals, name: scaled_source(mapping.signals[name], factor)}
-        note = f"{name} is read with {factor:.6g} times its scale: {evidence}"
-        mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
-    return mapping
+            factors = explained_factors(measure(sound), mounting_is_known=survey.is_mounted, most=1)
+    signals, notes = dict(mapping.signals), list(mapping.notes)
+    for name, (factor, evidence) in factors.items():
+        if name in signals:
+            signals[name] = scaled_source(signals[name], factor)
+            notes.append(f"{name} is read with {factor:.6g} times its scale: {evidence}")
+    if signals == mapping.signals:
+        return survey
+    scaled = replace(mapping, signals=signals, notes=tuple(notes))
+    corrected = survey_log(log, scaled, clocks, span_ns, survey.vehicle, rescale=False)
+    # A failing sensor resembles a wrong unit of another one; after a right correction nothing contradicts any more.
+    failed = [check.name for check in corrected.checks if check.verdict == "failed"]
+    return survey if any(n.endswith((".sign", ".unit", ".axis", ".fault")) for n in failed) else corrected
 
 
 def scaled_source(source: SignalSource, factor: float) -> SignalSource:
@@ -479,20 +478,20 @@ def scaled_source(source: SignalSource, factor: float) -> SignalSource:
 
 
 def truth_latency(channels: MappedChannels, truth: TruthTrack | None) -> LatencyEstimate | None:
-    """Return how late the truth is against the gyro, or the gyro against the truth; None where one is missing."""
+    """Return the latency of ground truth relative to the gyro, or of the gyro; None where one is missing."""
     gyro = channels.signals.get("yaw_rate_rad_s")
     if truth is None or gyro is None or not len(gyro):
         return None
     rate = channels.truth.get("yaw_rate_rad_s") or yaw_rate_channel(truth)
     if not len(rate):
         return None
-    found = estimate_truth_latency(gyro, rate)
+    latency = estimate_truth_latency(gyro, rate)
     speed = channels.signals.get("speed_m_s")
     other = None
     if speed is not None and speed.source.split(".")[0] != gyro.source.split(".")[0]:
         vx = channel_of(truth, "vx_m_s")
         other = estimate_truth_latency(speed, vx) if min(len(speed), len(vx)) >= 2 else None
-    return booked_on_the_late(found, other)
+    return booked_on_the_late(latency, other)
 
 
 def turned_signals(

@@ -1,8 +1,8 @@
-"""What a drive shows to be wrong with its sensors and its truth: where each correction belongs, and its one use.
+"""Corrections of sensors and ground truth that a drive shows, and where each of them belongs.
 
-Unit, sign, mounting, a turned truth and a recorder's delay belong in the mapping; the accelerometer's place, the gyro's
-gain and what is left of its delay in the car's fit. Each is measured on what mapping and car already take off, and a
-delay in the car is the whole one: applied in any order, each is taken off once.
+Unit, sign, mounting, a turned ground truth and a recorder's delay belong in the mapping; the accelerometer's place, the
+gyro's gain and what is left of its delay in the car's fit. Each is measured on what mapping and car already take off,
+and a delay in the car is the whole one: applied in any order, each is taken off once.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.checks.ay_place import LEVER_M, MOST_LEVER_M
 from pdhef_logtool.drive.checks.by_relations import explained_factors
 from pdhef_logtool.drive.checks.fitting import SURE
-from pdhef_logtool.drive.checks.sensor_errors import SensorErrors, ay_delay, sensor_errors
+from pdhef_logtool.drive.checks.sensor_errors import LEVER_M, MOST_LEVER_M, SensorErrors, ay_delay, sensor_errors
 from pdhef_logtool.drive.checks.truth_sideslip import is_turned, sideslip_offset
 from pdhef_logtool.drive.measured import drive_columns
 from pdhef_logtool.drive.mounting import Survey, scaled_source, turned_signals
@@ -77,7 +76,7 @@ def apply_proposals(
 def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
     """Return the mountings, units, signs and delays that the first minutes of a drive ask for; no doubtful one."""
     mapping = survey.mapping
-    found: list[Proposal] = []
+    proposals: list[Proposal] = []
     signals, truth = dict(mapping.signals), dict(mapping.truth)
     mounting = survey.mounting
     is_turned_imu = mounting is not None and mounting.confident and not mounting.is_as_named
@@ -85,46 +84,46 @@ def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
         for name, source in turned_signals(mapping, mounting, survey.triads).items():
             if source != signals[name]:
                 signals[name] = source
-                found.append(Proposal("mapping", name, f"{mounting.text}: {mounting.evidence}", source))
+                proposals.append(Proposal("mapping", name, f"{mounting.text}: {mounting.evidence}", source))
     factors = {} if is_turned_imu else explained_factors(survey.measured, mounting_is_known=survey.is_mounted)
     for subject, (factor, evidence) in factors.items():
         section = truth if subject.startswith("truth.") else signals
         name = subject.removeprefix("truth.")
         if name in section:
             section[name] = scaled_source(section[name], factor)
-            found.append(Proposal("mapping", subject, evidence, section[name]))
+            proposals.append(Proposal("mapping", subject, evidence, section[name]))
     if not factors and not is_turned_imu:
-        found += _of_a_turned_truth(survey)
+        proposals += _of_a_turned_truth(survey)
     for name, (delay_s, evidence) in _delays(survey).items():
         late = replace(signals[name], latency_s=round(signals[name].latency_s + delay_s, 4))
-        found.append(Proposal("mapping", name, evidence, late))
-    return tuple(found)
+        proposals.append(Proposal("mapping", name, evidence, late))
+    return tuple(proposals)
 
 
 def _delays(survey: Survey) -> dict[str, tuple[float, str]]:
-    """Return by signal what its stamps are late by, with the evidence: by truth, else by another sensor."""
-    found: dict[str, tuple[float, str]] = {}
+    """Return by signal what its stamps are late by, with the evidence: by ground truth, else by another sensor."""
+    delays: dict[str, tuple[float, str]] = {}
     latency = survey.latency
     if latency is not None and latency.gyro_delay_s >= LATE_GYRO_S:
-        found["yaw_rate_rad_s"] = latency.gyro_delay_s, latency.reason
-    # From another axis nothing is told of a_y.
+        delays["yaw_rate_rad_s"] = latency.gyro_delay_s, latency.reason
+    # The delay of a_y is not observable from another axis.
     is_mounted = survey.mounting is None or survey.mounting.is_as_named
     by_truth = ay_delay(sensor_errors(survey.measured.columns), latency) if is_mounted else None
     if by_truth is not None and by_truth[0] > max(LEAST_AY_DELAY_S, SURE * by_truth[1]):
-        found["ay_m_s2"] = by_truth[0], f"a_y is {by_truth[0] * 1e3:.1f} ms late against the truth"
+        delays["ay_m_s2"] = by_truth[0], f"a_y is {by_truth[0] * 1e3:.1f} ms late against ground truth"
     for sensor in survey.late:
         told_by_truth = sensor.names[0] == "yaw_rate_rad_s" and latency is not None and latency.reliable
         for name in sensor.names if sensor.exact and not told_by_truth else ():
-            found.setdefault(name, (sensor.delay_s, sensor.evidence))
-    return found
+            delays.setdefault(name, (sensor.delay_s, sensor.evidence))
+    return delays
 
 
 def _of_a_turned_truth(survey: Survey) -> list[Proposal]:
-    """Return the sources of a truth whose sideslip is off by a constant, as far as a mapping can turn them back."""
-    found = sideslip_offset(survey.measured.columns)
-    if found is None or survey.truth is None or not is_turned(*found):
+    """Return corrected sources of ground truth whose sideslip has a constant offset, if a mapping can correct it."""
+    offset_and_error = sideslip_offset(survey.measured.columns)
+    if offset_and_error is None or survey.truth is None or not is_turned(*offset_and_error):
         return []
-    offset, error = found
+    offset, error = offset_and_error
     truth = survey.mapping.truth
     evidence = f"sideslip is {math.degrees(offset):.2f} +- {math.degrees(error):.2f} deg where the car goes straight"
     vx, vy = truth.get("vx_m_s"), truth.get("vy_m_s")
@@ -155,7 +154,7 @@ def car_proposals(
     vehicle: VehicleParameters,
     placed: Placement | None = None,
 ) -> tuple[Proposal, ...]:
-    """Return what regression on truth says of place, gain and delay of the sensors beside what the vehicle knows.
+    """Return position, gain and delay of the sensors by regression on ground truth where they differ from the vehicle.
 
     Parameters
     ----------
@@ -168,43 +167,43 @@ def car_proposals(
         channels = {**channels, "yaw_rate_rad_s": early}
     columns, _ = drive_columns(channels, {}, truth)
     errors = sensor_errors(columns)
-    found: list[Proposal] = []
+    proposals: list[Proposal] = []
     x, *rest = vehicle.imu_position_m
     off_m = abs(errors.lever_m - x)
     if max(LEAST_LEVER_M, SURE * errors.lever_error_m) < off_m < MOST_LEVER_M:
         evidence = f"a_y goes with {errors.lever_m:.2f} +- {errors.lever_error_m:.2f} m of the yaw acceleration"
         place = {"imu_position_m": (round(errors.lever_m, 3), *rest)}
-        found.append(Proposal("car", "ay_m_s2", evidence, entries=place, error=errors.lever_error_m))
+        proposals.append(Proposal("car", "ay_m_s2", evidence, entries=place, error=errors.lever_error_m))
     if placed is not None and errors.lever_error_m < MOST_LEVER_M:
-        found += _of_frames(placed, errors, vehicle)
+        proposals += _of_frames(placed, errors, vehicle)
     off = abs(errors.yaw_rate_gain - vehicle.sensors.yaw_rate_gain)
     if max(LEAST_GAIN, SURE * errors.gain_error) < off < MOST_GAIN:
-        evidence = f"the gyro reads {errors.yaw_rate_gain:.3f} +- {errors.gain_error:.3f} of the truth's yaw rate"
+        evidence = f"the gyro reads {errors.yaw_rate_gain:.3f} +- {errors.gain_error:.3f} of the ground-truth yaw rate"
         gain = {"sensors.yaw_rate_gain": round(errors.yaw_rate_gain, 4)}
-        found.append(Proposal("car", "yaw_rate_rad_s", evidence, entries=gain, error=errors.gain_error))
+        proposals.append(Proposal("car", "yaw_rate_rad_s", evidence, entries=gain, error=errors.gain_error))
     if latency is not None and latency.gyro_delay_s >= LATE_GYRO_S:
         delay = {"sensors.yaw_rate_delay_s": round(gyro_latency_s + latency.gyro_delay_s, 4)}
-        found.append(Proposal("car", "yaw_rate_rad_s", latency.reason, entries=delay, error=latency.std_error_s))
-    return tuple(found)
+        proposals.append(Proposal("car", "yaw_rate_rad_s", latency.reason, entries=delay, error=latency.std_error_s))
+    return tuple(proposals)
 
 
 def _of_frames(placed: Placement, errors: SensorErrors, vehicle: VehicleParameters) -> list[Proposal]:
-    """Return the place in the car that recorded frames give, where a_y tells which point of it their origin is."""
+    """Return the position that recorded frames give, if a_y shows which point of the car their origin is."""
     x, y = (float(v) for v in placed.position_m[:2])
     origins = {"the CG": 0.0, "the middle of the rear axle": -vehicle.cg_to_rear_axle_m}
-    off = {name: abs(x + at - errors.lever_m) for name, at in origins.items()}
+    off = {name: abs(x + origin_x - errors.lever_m) for name, origin_x in origins.items()}
     near = [name for name, metres in off.items() if metres < max(FRAMES_M, 2.0 * errors.lever_error_m)]
     if len(near) != 1 or abs(y) > MOST_LEVER_M:
         return []
     ahead = x + origins[near[0]]
-    own_x, own_y, own_z = vehicle.imu_position_m
-    if math.hypot(ahead - own_x, y - own_y) < LEAST_LEVER_M:
+    imu_x, imu_y, imu_z = vehicle.imu_position_m
+    if math.hypot(ahead - imu_x, y - imu_y) < LEAST_LEVER_M:
         return []
     evidence = (
         f"the recorded frames put {placed.frame} at {x:.2f}, {y:.2f} m of {placed.base}, which is {near[0]}: "
         f"a_y goes with {errors.lever_m:.2f} +- {errors.lever_error_m:.2f} m of the yaw acceleration"
     )
-    place = {"imu_position_m": (round(ahead, 3), round(y, 3), own_z)}
+    place = {"imu_position_m": (round(ahead, 3), round(y, 3), imu_z)}
     return [Proposal("car", "ay_m_s2", evidence, entries=place, error=FRAMES_M)]
 
 

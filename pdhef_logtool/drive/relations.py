@@ -14,7 +14,7 @@ from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
 DEGREE = float(np.pi / 180.0)
 
-#: Below this correlation a gain says nothing; above it, it is known to its reciprocal.
+#: Below this correlation a gain gives no information; above it, it is known to its reciprocal.
 MIN_CORRELATION = 0.6
 #: What is left of two columns by regression is small, and a car that slides leaves it related otherwise.
 MIN_PARTIAL_CORRELATION = 0.8
@@ -38,11 +38,12 @@ SAME_RANGE = (0.75, 1.33)
 #: a_y - v_x r over the derivative of v_y: small differences of large quantities, of a body that rolls.
 SIDESLIP_RANGE = (0.3, 3.0)
 #: Slip of a rear axle at 1 m/s^2: cornering stiffness over load is 4 to 40 per rad, and much less where a model car
-#: drifts. It tells a sign, no unit.
+#: drifts. It gives a sign, no unit.
 COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
-#: Of the truth ahead of the rear axle. A truth that stands near that axle says nothing: its lever may be of any sign.
+#: Of ground truth ahead of the rear axle. Ground truth that stands near that axle gives no information: its lever may
+#: be of any sign.
 REAR_LEVER_M = (1.0, 12.0)
-#: What is left of sideslip beside a_y must move by more: a good truth is not surer of it, nor is a road flatter.
+#: What is left of sideslip beside a_y must move by more: a good ground truth is not surer of it, nor is a road flatter.
 LEAST_SIDESLIP_RAD = 0.05 * DEGREE
 #: Beyond, sideslip times lateral acceleration is no longer small beside the derivative of the speed.
 STRAIGHT_M_S2 = 3.0
@@ -54,7 +55,7 @@ ROAD_WHEEL_LENGTH_M = (0.15, 12.0)
 STEERING_WHEEL_LENGTH_M = (12.0, 240.0)
 #: Track from a 1:10 car to a truck.
 TRACK_M = (0.12, 3.0)
-#: Share of the drive's lateral acceleration up to which the steering angle is held against the curvature: beyond, the
+#: Share of the drive's lateral acceleration up to which the steering angle is compared with the curvature: beyond, the
 #: front tyres slip.
 STEERING_SHARE = 0.6
 #: Typical values that recognise one quantity recorded as another.
@@ -71,13 +72,13 @@ MAX_CULPRITS = 4
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """One relation with its measured gain; ``powers`` say how the gain grows with each signal's own scale.
+    """One relation with its measured gain; ``powers`` show how the gain grows with each signal's own scale.
 
     Attributes
     ----------
     expected : range of a plausible gain. samples : independent ones. moves : both sides, or one of two that must move
         together, move by more than what disturbs them. signless : a side is a size.
-    least_correlation : below it the gain says nothing. spread : 1-sigma of the measured side.
+    least_correlation : below it the gain gives no information. spread : 1-sigma of the measured side.
     """
 
     text: str
@@ -123,9 +124,9 @@ class Relation:
 
         It lies between the two regressions, which are correlation x gain and gain / correlation.
         """
-        gain, known = self.gain * factor, abs(self.correlation)
+        gain, size = self.gain * factor, abs(self.correlation)
         gain = abs(gain) if self.signless else gain
-        return known > 0.0 and gain / known >= self.expected[0] and gain * known <= self.expected[1]
+        return size > 0.0 and gain / size >= self.expected[0] and gain * size <= self.expected[1]
 
     @property
     def evidence(self) -> str:
@@ -160,28 +161,28 @@ def measured_relations(columns: Mapping[str, FloatArray], speed_name: str | None
 
     Parameters
     ----------
-    columns : on the grid, SI, by signal name; those of truth begin with ``truth.``.
-    speed_name : the column that stands for the speed.
+    columns : on the grid, SI, by signal name; those of ground truth begin with ``truth.``.
+    speed_name : the column used as the speed.
     """
-    found: list[Relation] = []
+    relations: list[Relation] = []
     speed = None if speed_name is None else columns[speed_name]
     for prefix in ("", "truth."):
         pace_name = f"{prefix}vx_m_s" if f"{prefix}vx_m_s" in columns else speed_name
         pace = None if pace_name is None else columns[pace_name]
         if pace_name is not None and pace is not None:
-            found += _motion(columns, prefix, pace_name, pace)
+            relations += _motion(columns, prefix, pace_name, pace)
     if speed_name is not None and speed is not None:
-        found += _steering(columns, speed_name, speed)
-        found += _speeds(columns, speed_name, speed)
-        found += _wheel_differences(columns, speed_name, speed)
-        found += _courses(columns, speed)
-    found += _twice(columns, "yaw_rate_rad_s", "truth.yaw_rate_rad_s", MOVES_RAD_S)
-    found += _twice(columns, "ay_m_s2", "truth.ay_m_s2", MOVES_M_S2)
-    return found + _sideslips(columns)
+        relations += _steering(columns, speed_name, speed)
+        relations += _speeds(columns, speed_name, speed)
+        relations += _wheel_differences(columns, speed_name, speed)
+        relations += _courses(columns, speed)
+    relations += _twice(columns, "yaw_rate_rad_s", "truth.yaw_rate_rad_s", MOVES_RAD_S)
+    relations += _twice(columns, "ay_m_s2", "truth.ay_m_s2", MOVES_M_S2)
+    return relations + _sideslips(columns)
 
 
 def smallest_explanations(relations: Sequence[Relation], mistakes: Sequence[Mistake]) -> list[tuple[Mistake, ...]]:
-    """Return the smallest sets of mistakes that make every relation that tells plausible; ``[()]``: there is none.
+    """Return the smallest sets of mistakes that make every relation that counts plausible; ``[()]``: none is needed.
 
     Empty where no set of ``MAX_MISTAKES`` does. A sign explains without a unit, and either of them without the other.
     """
@@ -192,15 +193,15 @@ def smallest_explanations(relations: Sequence[Relation], mistakes: Sequence[Mist
     names = {n for r in failed for n in r.powers}
     useful = [m for m in mistakes if names & set(m.factors)]
     for size in range(1, MAX_MISTAKES + 1):
-        found = [
+        explanations = [
             chosen
             for chosen in combinations(useful, size)
             if len({n for m in chosen for n in m.factors}) == sum(len(m.factors) for m in chosen)
             and all(r.accepts(float(np.prod([m.acts_on(r) for m in chosen]))) for r in telling)
         ]
-        if found:
-            simplest = min(_cost(chosen) for chosen in found)
-            cheap = [chosen for chosen in found if _cost(chosen) == simplest]
+        if explanations:
+            simplest = min(_cost(chosen) for chosen in explanations)
+            cheap = [chosen for chosen in explanations if _cost(chosen) == simplest]
             return [c for c in cheap if not any(_signals(other) < _signals(c) for other in cheap)]
     return []
 
@@ -221,8 +222,8 @@ def contradicting(relations: Sequence[Relation]) -> set[str]:
                 cost = size + sum(bool({_sensor(n) for n in r.powers} & set(chosen)) for r in good)
                 if best is None or cost < best[0]:
                     best = cost, chosen
-    found = set(names if best is None else best[1])
-    return {n for r in bad for n in r.powers if _sensor(n) in found}
+    culprits = set(names if best is None else best[1])
+    return {n for r in bad for n in r.powers if _sensor(n) in culprits}
 
 
 def _sensor(name: str) -> str:
@@ -232,23 +233,24 @@ def _sensor(name: str) -> str:
 def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
     """Return those of the signals of doubtful unit for which relations to others rule out every other unit.
 
-    A relation between two of them tells nothing until one is told; the truth's v_y has the unit of its v_x.
+    A relation between two of them gives no information until one is given; the ground-truth v_y has the unit of its
+    v_x.
     """
     # Rim speed in m/s and in rad/s look alike where the radius is not known: wheels are never told.
-    open_, told = set(doubted), set[str]()
+    open_, resolved = set(doubted), set[str]()
     while True:
-        found = {
+        newly_resolved = {
             n
             for n in open_
             if not n.startswith("wheel_speed")
             and _is_told(n, [r for r in relations if not (set(r.powers) - {n}) & open_])
         }
-        if "truth.vx_m_s" in found | told:
-            found |= open_ & {"truth.vy_m_s"}
-        if not found:
-            return told
-        told |= found
-        open_ -= found
+        if "truth.vx_m_s" in newly_resolved | resolved:
+            newly_resolved |= open_ & {"truth.vy_m_s"}
+        if not newly_resolved:
+            return resolved
+        resolved |= newly_resolved
+        open_ -= newly_resolved
 
 
 def _is_told(name: str, relations: Sequence[Relation]) -> bool:
@@ -310,13 +312,14 @@ def known_mistakes(names: Sequence[str], together: Sequence[tuple[str, ...]] = (
         for size in range(2, len(present) + 1):
             for part in combinations(present, size):
                 words = f"{' and '.join(part)} have the wrong sign"
-                # A sensor is mounted upside down or backwards, or a truth has another convention; speeds count ahead.
+                # A sensor is mounted upside down or backwards, or ground truth has another convention; speeds count
+                # ahead.
                 if not _NEVER_TURNED & set(part):
                     out.append(Mistake(dict.fromkeys(part, -1.0), words, "sign"))
                 shared = dict(_units(part[0].removeprefix("truth.")))
                 for name in part[1:]:
-                    own = dict(_units(name.removeprefix("truth.")))
-                    shared = {f: text for f, text in shared.items() if f in own}
+                    units_of_name = dict(_units(name.removeprefix("truth.")))
+                    shared = {f: text for f, text in shared.items() if f in units_of_name}
                 words = " and ".join(part)
                 out += [Mistake(dict.fromkeys(part, f), f"{words}: each {text}", "unit") for f, text in shared.items()]
     return out
@@ -393,23 +396,23 @@ def compare_at_ease(
 
     A sign, a unit and an axis are wrong everywhere; what holds in gentle driving is not wrong where the car slides.
     """
-    found = compare(text, powers, reference, measured, use[0], expected, moves=moves)
-    if all(r.accepts() and not r.unrelated for r in found):
-        return found
+    relations = compare(text, powers, reference, measured, use[0], expected, moves=moves)
+    if all(r.accepts() and not r.unrelated for r in relations):
+        return relations
     gentle = compare(text, powers, reference, measured, use[1], expected, moves=moves)
-    return gentle if gentle and all(r.tells and r.accepts() for r in gentle) else found
+    return gentle if gentle and all(r.tells and r.accepts() for r in gentle) else relations
 
 
 def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace: FloatArray) -> list[Relation]:
-    """Relate the accelerations to speed and yaw rate, of the sensors or of the truth."""
-    found: list[Relation] = []
+    """Relate the accelerations to speed and yaw rate, of the sensors or of ground truth."""
+    relations: list[Relation] = []
     moving = moving_at(pace)
     yaw, left, forward = (columns.get(f"{prefix}{n}") for n in ("yaw_rate_rad_s", "ay_m_s2", "ax_m_s2"))
     if yaw is not None and left is not None:
         powers = {f"{prefix}ay_m_s2": 1, f"{prefix}yaw_rate_rad_s": -1, pace_name: -1}
         text = f"{prefix}ay_m_s2 against {prefix}yaw_rate_rad_s x speed"
         use = (moving, gentle_at(yaw * pace, moving))
-        found += compare_at_ease(text, powers, yaw * pace, left, use, GAIN_RANGE, moves=MOVES_M_S2)
+        relations += compare_at_ease(text, powers, yaw * pace, left, use, GAIN_RANGE, moves=MOVES_M_S2)
     if forward is not None:
         powers = {f"{prefix}ax_m_s2": 1, pace_name: -1}
         text = f"{prefix}ax_m_s2 against the derivative of the speed"
@@ -418,25 +421,25 @@ def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace
         # A pitching body moves a_x without any change of the speed, and noise the derivative of a satellite's.
         moves = None if pace_name == "truth.vx_m_s" else MOVES_M_S2
         reference = derivative(pace)
-        found += compare(text, powers, reference, forward, straight, GAIN_RANGE, moves=moves, either=False)
-    return found
+        relations += compare(text, powers, reference, forward, straight, GAIN_RANGE, moves=moves, either=False)
+    return relations
 
 
 def gentle_at(lateral_m_s2: FloatArray, moving: BoolArray) -> BoolArray:
     """Return where the car moves and corners gently by the drive's own measure."""
     size = np.abs(lateral_m_s2)
-    known = moving & np.isfinite(size)
-    if not known.any():
+    finite = moving & np.isfinite(size)
+    if not finite.any():
         return moving
     with np.errstate(invalid="ignore"):
-        return np.asarray(moving & (size <= STEERING_SHARE * np.quantile(size[known], 0.95)))
+        return np.asarray(moving & (size <= STEERING_SHARE * np.quantile(size[finite], 0.95)))
 
 
 def _steering(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArray) -> list[Relation]:
-    found: list[Relation] = []
+    relations: list[Relation] = []
     yaw = columns.get("yaw_rate_rad_s")
     if yaw is None:
-        return found
+        return relations
     moving = moving_at(speed)
     with np.errstate(divide="ignore", invalid="ignore"):
         curvature = yaw / speed
@@ -452,21 +455,21 @@ def _steering(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatAr
             for r in compare(f"{name} against yaw_rate_rad_s / speed", powers, curvature, steer, use, lengths)
         ]
         # Sliding front tyres break the relation, and so does noise where there is little of it.
-        found += sorted(either, key=lambda r: (r.tells and r.accepts(), abs(r.correlation)))[-1:]
+        relations += sorted(either, key=lambda r: (r.tells and r.accepts(), abs(r.correlation)))[-1:]
         if "ay_m_s2" in columns:
             powers = {"ay_m_s2": 1, name: -1, speed_name: -2}
             text = f"ay_m_s2 against {name} x speed^2"
             inverse = (1.0 / lengths[1], 1.0 / lengths[0])
-            found += compare(text, powers, steer * speed**2, columns["ay_m_s2"], gentle, inverse)
-    return found
+            relations += compare(text, powers, steer * speed**2, columns["ay_m_s2"], gentle, inverse)
+    return relations
 
 
 def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArray) -> list[Relation]:
-    """Relate wheel speeds and the truth's speeds to the speed: one quantity, so that the ratio tells at any driving."""
+    """Relate wheel speeds and ground-truth speeds to the speed: their ratio needs no manoeuvre."""
     wanted = {f"wheel_speed_{w}_m_s": WHEEL_RANGE for w in WHEELS}
     wanted |= {f"wheel_speed_{w}_rad_s": WHEEL_PER_RADIAN_RANGE for w in WHEELS}
     wanted |= {"truth.vx_m_s": SAME_RANGE, "truth.position_speed_m_s": SAME_RANGE}
-    found = []
+    relations = []
     moving = moving_at(speed)
     # A wheel spins or locks at the limit, and each of them goes its own way where the car does.
     gentle = moving if "yaw_rate_rad_s" not in columns else gentle_at(columns["yaw_rate_rad_s"] * speed, moving)
@@ -482,17 +485,17 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
             continue
         ratio = float(np.median(column[use] / speed[use]))
         relation = Relation(f"{name} over {speed_name}", {name: 1, speed_name: -1}, 1.0, ratio, expected, samples)
-        found.append(replace(relation, signless=name == "truth.position_speed_m_s"))
-    return found
+        relations.append(replace(relation, signless=name == "truth.position_speed_m_s"))
+    return relations
 
 
 def yaw_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
     """Return other measurements of the yaw rate than the gyro's, to any factor; steering has no certain sign."""
-    found = [(n, columns[n]) for n in ("truth.course_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns]
+    references = [(n, columns[n]) for n in ("truth.course_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns]
     if speed_name is None:
-        return found
+        return references
     speed = columns[speed_name]
-    return found + _axle_differences(columns, speed)
+    return references + _axle_differences(columns, speed)
 
 
 def steering_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
@@ -504,14 +507,14 @@ def steering_references(columns: Mapping[str, FloatArray], speed_name: str | Non
 def _axle_differences(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[tuple[str, FloatArray]]:
     """Return what the wheels of each axle turn faster on the right, scaled to the speed: radii and units aside."""
     moving = moving_at(speed)
-    found = []
+    differences = []
     for unit in ("m_s", "rad_s"):
         for axle in ("r", "f"):
             pair = [columns.get(f"wheel_speed_{axle}{side}_{unit}") for side in "lr"]
             scaled = [_scaled_to(w, speed, moving) for w in pair if w is not None]
             if len(scaled) == 2:
-                found.append((f"wheel speeds {axle}r - {axle}l", scaled[1] - scaled[0]))
-    return found
+                differences.append((f"wheel speeds {axle}r - {axle}l", scaled[1] - scaled[0]))
+    return differences
 
 
 def _wheel_differences(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArray) -> list[Relation]:
@@ -519,7 +522,7 @@ def _wheel_differences(columns: Mapping[str, FloatArray], speed_name: str, speed
     moving = moving_at(speed)
     pairs = _axle_differences(columns, speed)
     gentle = moving if "yaw_rate_rad_s" not in columns else gentle_at(columns["yaw_rate_rad_s"] * speed, moving)
-    found = []
+    relations = []
     for name, factor, powers in (
         ("yaw_rate_rad_s", np.ones_like(speed), {"yaw_rate_rad_s": -1, speed_name: 1}),
         ("ay_m_s2", speed, {"ay_m_s2": -1, speed_name: 2}),
@@ -532,8 +535,8 @@ def _wheel_differences(columns: Mapping[str, FloatArray], speed_name: str, speed
                     f"{text} against {name}", powers, columns[name], factor * difference, (moving, gentle), TRACK_M
                 )
             ]
-            found += sorted(either, key=lambda r: abs(r.correlation))[-1:]
-    return found
+            relations += sorted(either, key=lambda r: abs(r.correlation))[-1:]
+    return relations
 
 
 def _scaled_to(wheel: FloatArray, speed: FloatArray, moving: BoolArray) -> FloatArray:
@@ -543,18 +546,18 @@ def _scaled_to(wheel: FloatArray, speed: FloatArray, moving: BoolArray) -> Float
 
 
 def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relation]:
-    """Relate the yaw rates to the rate of the truth's course over ground."""
+    """Relate the yaw rates to the rate of the ground-truth course over ground."""
     course = columns.get("truth.course_rate_rad_s")
     if course is None:
         return []
-    found = []
+    relations = []
     moving = moving_at(speed)
     for name in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s"):
         if name in columns:
-            text = f"{name} against the turning of the truth's path"
+            text = f"{name} against the turning of the ground-truth path"
             use = (moving, gentle_at(columns[name] * speed, moving))
-            found += compare_at_ease(text, {name: 1}, course, columns[name], use, GAIN_RANGE, moves=MOVES_RAD_S)
-    return found
+            relations += compare_at_ease(text, {name: 1}, course, columns[name], use, GAIN_RANGE, moves=MOVES_RAD_S)
+    return relations
 
 
 def _twice(columns: Mapping[str, FloatArray], sensor: str, truth: str, moves: float) -> list[Relation]:
@@ -569,9 +572,9 @@ def _twice(columns: Mapping[str, FloatArray], sensor: str, truth: str, moves: fl
 
 
 def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
-    """Relate the truth's sideslip to a_y and curvature: by kinematics where it moves fast, by the rear axle else.
+    """Relate the ground-truth sideslip to a_y and curvature: by kinematics where it moves fast, by the rear axle else.
 
-    a_y - v_x r is the derivative of v_y; the lever of an accelerometer, the roll of the body and a bias stand beside
+    a_y - v_x r is the derivative of v_y; the lever of an accelerometer, the roll of the body and a bias are next to
     it and go with the derivative of the yaw rate, with v_x r and with nothing. In gentle driving sideslip is the
     curvature times a lever, less a_y times the compliance of the rear tyres.
     """
@@ -582,19 +585,19 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     ay, vx, vy, rate = (columns[n] for n in names)
     subject = "truth.sideslip_rad" if "truth.sideslip_rad" in columns else "truth.vy_m_s"
     sideslip = columns.get("truth.sideslip_rad", np.arctan2(vy, vx))
-    moving, one = moving_at(vx), np.ones_like(ay)
+    moving, ones = moving_at(vx), np.ones_like(ay)
     text = f"ay_m_s2 - v_x r against the derivative of {subject}"
     kinematic = _partial(
-        text, {subject: -1, "ay_m_s2": 1}, derivative(vy), ay, [derivative(rate), vx * rate, one], moving
+        text, {subject: -1, "ay_m_s2": 1}, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         curvature = rate / vx
     text = f"{subject} against -ay_m_s2, apart from curvature"
     gentle = gentle_at(vx * rate, moving)
-    handling = _partial(text, {subject: 1, "ay_m_s2": -1}, -ay, sideslip, [curvature, one], gentle)
+    handling = _partial(text, {subject: 1, "ay_m_s2": -1}, -ay, sideslip, [curvature, ones], gentle)
     text = f"{subject} against curvature, apart from a_y"
     powers = {subject: 1, turning: -1}
-    rolling = _partial(text, powers, curvature, sideslip, [ay, one], gentle)
+    rolling = _partial(text, powers, curvature, sideslip, [ay, ones], gentle)
     return [
         *(replace(r, expected=SIDESLIP_RANGE) for r in kinematic),
         *(replace(r, expected=COMPLIANCE_RAD_PER_M_S2) for r in handling),
@@ -615,14 +618,14 @@ def _partial(
     use: BoolArray,
 ) -> list[Relation]:
     """Return the relation between what regression on other columns leaves of two columns."""
-    known = use & np.isfinite(np.stack([reference, measured, *others])).all(axis=0)
-    if independent_samples(int(np.count_nonzero(known))) < 2.0 * MIN_SAMPLES:
+    finite = use & np.isfinite(np.stack([reference, measured, *others])).all(axis=0)
+    if independent_samples(int(np.count_nonzero(finite))) < 2.0 * MIN_SAMPLES:
         return []
-    aside = np.stack(others, axis=1)[known]
+    aside = np.stack(others, axis=1)[finite]
     left = []
     for column in (reference, measured):
         out = np.full(column.shape[0], np.nan)
-        out[known] = column[known] - aside @ np.linalg.lstsq(aside, column[known], rcond=None)[0]
+        out[finite] = column[finite] - aside @ np.linalg.lstsq(aside, column[finite], rcond=None)[0]
         left.append(out)
-    found = compare(text, powers, left[0], left[1], known, (0.0, np.inf))
-    return [replace(r, least_correlation=MIN_PARTIAL_CORRELATION) for r in found]
+    relations = compare(text, powers, left[0], left[1], finite, (0.0, np.inf))
+    return [replace(r, least_correlation=MIN_PARTIAL_CORRELATION) for r in relations]

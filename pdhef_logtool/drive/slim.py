@@ -30,11 +30,12 @@ def slim_log(
     options: ReadOptions,
     tell: Callable[[str], None] = lambda _text: None,
 ) -> ReducedRecord:
-    """Write the slim log of a whole log, and return what is known of the log beside its messages.
+    """Write the reduced log of a whole log, and return what is known of the log beside its messages.
 
     Parameters
     ----------
-    mapping : None recognises types. options : of them count those that say how a log is opened and which truth counts.
+    mapping : None recognises types. options : of them count those that show how a log is opened and which ground truth
+    counts.
     tell : as for :func:`~pdhef_logtool.drive.reading.read_drive`.
 
     Raises
@@ -51,7 +52,7 @@ def slim_log(
 
 
 def write_slim(drive: Drive, target: Path) -> ReducedRecord:
-    """Write the slim log of a drive that was read from start to end, and return its record."""
+    """Write the reduced log of a drive that was read from start to end, and return its record."""
     log = _messages_of(drive)
     lost, ledgers = log.lost, drive.byte_ledgers  # before the copy, which may look at more than a run does
     record = ReducedRecord(
@@ -86,7 +87,7 @@ def _messages_of(drive: Drive) -> ColumnarLog:
     log = drive.log.messages
     if log is None:
         raise LogError(
-            expected="a log of messages, which a slim log keeps",
+            expected="a log of messages, which a reduced log keeps",
             got=f"a log of kind {drive.log.kind}, which has only columns",
             where=str(drive.path),
             remedy="read the log itself",

@@ -1,8 +1,8 @@
-"""A cache of slim logs, in a folder or an object store: a log that was read once is only asked for what it is.
+"""A cache of reduced logs, in a folder or an object store: a log that was read once is only asked for what it is.
 
 An entry is known by the source's identity and by all that decides what of it is kept: mapping, truth, definitions,
 budget and version. It appears when it is complete, so that several processes may share a cache; one that is damaged is
-made anew.
+regenerated.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from pdhef_logtool.storage.documents import digest, jsonable
 from pdhef_logtool.storage.files import scratch_folder
 from pdhef_logtool.storage.object_store import ObjectFolder, is_url
 
-#: A process looks at what a cache holds each time that it has added this share of what it may hold.
+#: A process examines what a cache holds each time that it has added this share of what it may contain.
 _LOOK_SHARE = 0.05
 #: Bytes that this process adds to a cache before it looks again.
 _left_bytes: dict[str, float] = {}
-_DAMAGED = "its slim log in the cache is damaged and is made anew"
+_DAMAGED = "its reduced log in the cache is damaged and is written again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +49,10 @@ class SlimCache:
 
     @contextmanager
     def standing_in(self, log: LogInput, warn: Callable[[str], None] = lambda _text: None) -> Iterator[LogInput]:
-        """Yield the slim log of a log with the log's name and slice, made if it is not there.
+        """Yield the reduced log of a log with the log's name and slice, made if it is not there.
 
         A log of which there can be none is yielded as it is, and so is each one when the cache cannot be written;
-        ``warn`` is told that, and which entry was damaged.
+        ``warn`` is given that, and which entry was damaged.
         """
         with scratch_folder() as scratch:
             yield self._found(log, Path(scratch), warn) or log
@@ -60,7 +60,7 @@ class SlimCache:
     def _found(self, log: LogInput, scratch: Path, warn: Callable[[str], None]) -> LogInput | None:
         try:
             identity = identity_of(log)
-        except (OSError, PdhefError):  # whoever reads it says what is wrong with it
+        except (OSError, PdhefError):  # whoever reads it states what is wrong with it
             return None
         key = self._key(identity)
         try:
@@ -116,9 +116,9 @@ class SlimCache:
         left = _left_bytes.get(self.place, 0.0) - made.stat().st_size
         if left < 0.0:
             left = _LOOK_SHARE * most
-            found = [(state.st_mtime_ns, state.st_size, path) for path, state in _entries(Path(self.place))]
-            size = sum(one[1] for one in found)
-            for _, size_bytes, path in sorted(found):
+            entries = [(state.st_mtime_ns, state.st_size, path) for path, state in _entries(Path(self.place))]
+            size = sum(entry[1] for entry in entries)
+            for _, size_bytes, path in sorted(entries):
                 if size <= most:
                     break
                 if path != made:
@@ -143,7 +143,7 @@ def _entries(place: Path) -> Iterator[tuple[Path, os.stat_result]]:
 
 
 def _is_sound(path: Path) -> bool:
-    """Tell whether a file is a slim log that is as it was written."""
+    """Return whether a file is a reduced log that is as it was written."""
     try:
         if not is_whole(path):
             return False

@@ -1,6 +1,6 @@
-"""Truth on its own clock: every quantity that the mapped channels allow, how it was derived, and its latency.
+"""Ground truth on its own clock: every quantity that the mapped channels allow, how it was derived, and its latency.
 
-Derivations (``TruthTrack.derivation`` says which applied):
+Derivations (``TruthTrack.derivation`` states which applied):
 
 * body velocity from v_x and v_y; v_x and sideslip; ENU or ECEF velocity and heading (quaternion or yaw); position and
   heading; v_x, course and yaw; ground speed and sideslip; ground speed alone (then v_x only);
@@ -41,7 +41,7 @@ DIFFERENTIATION_HALF_S = 0.2
 MAX_LATENCY_S = 0.5
 #: And known to this, 1-sigma.
 MAX_LATENCY_ERROR_S = 0.005
-#: A truth that leads the gyro by more than this does not: the gyro's stamps are late.
+#: Ground truth that leads the gyro by more than this does not: the gyro's stamps are late.
 LATE_GYRO_S = 0.005
 #: Two channels are the same if this share of their samples agrees to ``SAME_RELATIVE``.
 SAME_SHARE = 0.99
@@ -91,13 +91,13 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class TruthPlan:
-    """How one log's truth is derived; made once from a survey stretch, valid for all windows.
+    """How one log's ground truth is derived; made once from a survey stretch, valid for all windows.
 
     Attributes
     ----------
-    base : channel whose stamps are the truth's clock. period_s : its median period.
+    base : channel whose stamps are the ground-truth clock. period_s : its median period.
     max_gap_s : longest step that is bridged, by channel. half_window : samples on each side of a derivative.
-    position_m : where the truth is measured, from the CG, ISO 8855.
+    position_m : where ground truth is measured, from the CG, ISO 8855.
     delay_s : largest median arrival − stamp of the channels.
     """
 
@@ -114,7 +114,7 @@ class TruthPlan:
 
     @property
     def margin_ns(self) -> int:
-        """Truth needed before and after a window, so that windows join bit-identically."""
+        """Ground truth needed before and after a window, so that windows join bit-identically."""
         derivative = self.half_window * self.max_gap_s[self.base]  # per pass; velocity, then acceleration
         reach = 2 * derivative + max(self.max_gap_s.values()) + self.max_gap_s[self.base]
         return round((reach + MAX_LATENCY_S + self.delay_s + 1.0) * 1e9)
@@ -122,7 +122,7 @@ class TruthPlan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TruthTrack:
-    """Truth at the CG on its own clock. ``derivation`` says by quantity where it comes from.
+    """Ground truth at the CG on its own clock. ``derivation`` gives by quantity where it comes from.
 
     ``max_gap_s``: no value may be interpolated across a longer step.
     """
@@ -134,11 +134,11 @@ class TruthTrack:
 
 @dataclass(frozen=True, slots=True)
 class LatencyEstimate:
-    """How much later than the sensors the truth shows the same motion.
+    """How much later than the sensors ground truth shows the same motion.
 
-    ``latency_s`` is 0 unless ``reliable``. ``identical``: the truth's yaw rate is the gyro's own channel, so that the
-    latency is 0 by construction and says nothing about the other truth channels. ``reason`` is for the report.
-    ``gyro_delay_s``: the gyro's stamps are late by so much; the truth's latency is then 0.
+    ``latency_s`` is 0 unless ``reliable``. ``identical``: the ground-truth yaw rate is the gyro's own channel, so that
+    the latency is 0 by construction and gives no information about the other truth channels. ``reason`` is for the
+    report. ``gyro_delay_s``: the gyro's stamps are late by so much; the ground-truth latency is then 0.
     """
 
     latency_s: float
@@ -161,7 +161,7 @@ def plan_truth(
     Parameters
     ----------
     channels : truth channels by name, quality gate applied (samples that failed are absent).
-    truth_position_m : where the truth is measured, from the CG. max_gap_s : default three median periods.
+    truth_position_m : where ground truth is measured, from the CG. max_gap_s : default three median periods.
 
     Returns
     -------
@@ -199,7 +199,7 @@ def derive_truth(
     max_gap_s: float | None = None,
     plan: TruthPlan | None = None,
 ) -> TruthTrack:
-    """Derive body velocity, yaw rate, sideslip, a_y and pose at the CG from whatever truth is mapped.
+    """Derive body velocity, yaw rate, sideslip, a_y and pose at the CG from the mapped truth channels.
 
     Parameters
     ----------
@@ -210,8 +210,8 @@ def derive_truth(
     Returns
     -------
     TruthTrack
-        Empty without truth. Stamps are those of the plan's base channel. Sideslip is the atan2 of the velocities at
-        the CG, or the mapped sideslip where no velocity is known. ``yaw_rad`` is wrapped.
+        Empty without ground truth. Stamps are those of the plan's base channel. Sideslip is the atan2 of the velocities
+        at the CG, or the mapped sideslip where no velocity is known. ``yaw_rad`` is wrapped.
     """
     if plan is None:
         plan = plan_truth(truth_channels, truth_position_m=truth_position_m, max_gap_s=max_gap_s)
@@ -247,12 +247,12 @@ def derive_truth(
 def truth_at(
     truth: TruthTrack, stamps_ns: IntArray, latency_s: float = 0.0, *, standstill_m_s: float = 0.0
 ) -> StateTrack:
-    """Bring the truth to other stamps by linear interpolation, angles along the shorter way.
+    """Bring ground truth to other stamps by linear interpolation, angles along the shorter way.
 
     Parameters
     ----------
     stamps_ns : int64 [N], the stamps to score at, on the sensors' clock.
-    latency_s : the truth shows at t + latency what the sensors show at t.
+    latency_s : ground truth shows at t + latency what the sensors show at t.
     standstill_m_s : below this speed there is no sideslip.
 
     Returns
@@ -264,8 +264,8 @@ def truth_at(
     bracket = Bracket(track.stamps_ns, stamps_ns + round(latency_s * 1e9), round(truth.max_gap_s * 1e9))
     vx, vy = bracket.linear(track.vx_m_s), bracket.linear(track.vy_m_s)
     beta = bracket.angle(track.sideslip_rad)
-    known = np.isfinite(vx) & np.isfinite(vy)
-    beta[known] = np.arctan2(vy[known], vx[known])
+    finite = np.isfinite(vx) & np.isfinite(vy)
+    beta[finite] = np.arctan2(vy[finite], vx[finite])
     rate, ay = bracket.linear(track.yaw_rate_rad_s), bracket.linear(track.ay_m_s2)
     return make_track(
         "truth",
@@ -283,60 +283,60 @@ def truth_at(
 
 
 def valid_as_a_whole(truth: StateTrack, derivation: Mapping[str, str], standstill_m_s: float) -> StateTrack:
-    """Return the truth [N] as it is written: valid where all is known that it consists of by its derivation.
+    """Return the ground truth [N] as it is written: valid where all is known that it consists of by its derivation.
 
     At standstill that is without sideslip, and always without an a_y that is a derivative of the velocities: it ends
     earlier than they do. Figures count each quantity where it is known itself.
     """
     standing = np.hypot(truth.vx_m_s, truth.vy_m_s) < standstill_m_s
-    known = truth.valid & (np.isfinite(truth.sideslip_rad) | standing | ("sideslip_rad" not in derivation))
+    complete = truth.valid & (np.isfinite(truth.sideslip_rad) | standing | ("sideslip_rad" not in derivation))
     for name, how in derivation.items():
         for column in () if how == _AY_DERIVED else _COLUMNS.get(name, ()):
-            known &= np.isfinite(getattr(truth, column))
-    return replace(truth, valid=known)
+            complete &= np.isfinite(getattr(truth, column))
+    return replace(truth, valid=complete)
 
 
 def channel_of(truth: TruthTrack, name: str) -> Channel:
-    """Return a column of the truth as a channel without NaN."""
+    """Return a column of ground truth as a channel without NaN."""
     values = getattr(truth.track, name)
-    known = np.isfinite(values)
-    stamps = truth.track.stamps_ns[known]
+    finite = np.isfinite(values)
+    stamps = truth.track.stamps_ns[finite]
     source = truth.derivation.get(name, "none")
-    return Channel(name, TRUTH_UNITS.get(name, ""), source, stamps, stamps, values[known])
+    return Channel(name, TRUTH_UNITS.get(name, ""), source, stamps, stamps, values[finite])
 
 
 def yaw_rate_channel(truth: TruthTrack) -> Channel:
-    """Return the truth's yaw rate, mapped or derived, as a channel without NaN, for :func:`estimate_truth_latency`."""
+    """Return the ground-truth yaw rate, mapped or derived, as a channel without NaN."""
     return channel_of(truth, "yaw_rate_rad_s")
 
 
-def booked_on_the_late(found: LatencyEstimate, speed: LatencyEstimate | None) -> LatencyEstimate:
-    """Return the latency with what is the gyro's taken from the truth.
+def booked_on_the_late(latency: LatencyEstimate, speed: LatencyEstimate | None) -> LatencyEstimate:
+    """Return the latency with what is the gyro's taken from ground truth.
 
-    No truth shows a motion before it happens: where it leads the gyro, the gyro's stamps are late. Only where a speed
-    sensor of another topic is late by as much do all sensors agree, and the truth's clock is early.
+    No ground truth shows a motion before it happens: where it leads the gyro, the gyro's stamps are late. Only where a
+    speed sensor of another topic is late by as much do all sensors agree, and the ground-truth clock is early.
 
     Parameters
     ----------
-    found : gyro against truth yaw rate. speed : the speed sensor of another topic against the truth's v_x.
+    latency : gyro against ground-truth yaw rate. speed : speed sensor of another topic against ground-truth v_x.
     """
-    leads = -found.latency_s
-    if not found.reliable or leads <= max(LATE_GYRO_S, 3.0 * found.std_error_s):
-        return found
+    leads = -latency.latency_s
+    if not latency.reliable or leads <= max(LATE_GYRO_S, 3.0 * latency.std_error_s):
+        return latency
     if (
         speed is not None
         and speed.reliable
-        and abs(speed.latency_s - found.latency_s) <= max(2.0 * LATE_GYRO_S, 3.0 * speed.std_error_s)
+        and abs(speed.latency_s - latency.latency_s) <= max(2.0 * LATE_GYRO_S, 3.0 * speed.std_error_s)
     ):
-        return replace(found, reason=f"{found.reason}; the speed sensor is late by as much")
-    reason = f"the gyro is {leads * 1e3:.1f} ms late against the truth, which leads no motion"
-    return replace(found, latency_s=0.0, gyro_delay_s=leads, reason=reason)
+        return replace(latency, reason=f"{latency.reason}; the speed sensor is late by as much")
+    reason = f"the gyro is {leads * 1e3:.1f} ms late against ground truth, which leads no motion"
+    return replace(latency, latency_s=0.0, gyro_delay_s=leads, reason=reason)
 
 
 def estimate_truth_latency(
     sensor_yaw_rate: Channel, truth_yaw_rate: Channel, *, max_error_s: float = MAX_LATENCY_ERROR_S
 ) -> LatencyEstimate:
-    """Estimate the truth's latency against the gyro by cross-correlation of detrended yaw rates.
+    """Estimate the ground-truth latency against the gyro by cross-correlation of detrended yaw rates.
 
     Both are sampled on a common grid, linear trends removed; the correlation coefficient is computed at each shift
     within ± ``MAX_LATENCY_S`` over the samples that both have, and its peak refined by a parabola. The standard error
@@ -346,10 +346,10 @@ def estimate_truth_latency(
     Parameters
     ----------
     sensor_yaw_rate, truth_yaw_rate : on their own clocks. Never give an estimator's output here: its lag, which is what
-        the metrics shall show, would be taken for the truth's.
+        the metrics shall show, would be taken for that of ground truth.
     """
     if _same_share(sensor_yaw_rate, truth_yaw_rate) >= SAME_SHARE:
-        return LatencyEstimate(0.0, 1.0, 0.0, True, True, "the truth's yaw rate is the gyro's channel")
+        return LatencyEstimate(0.0, 1.0, 0.0, True, True, "the ground-truth yaw rate is the gyro's channel")
 
     def refuse(reason: str, correlation: float = 0.0, error: float = float("inf")) -> LatencyEstimate:
         return LatencyEstimate(0.0, correlation, error, False, False, reason)
@@ -371,10 +371,10 @@ def estimate_truth_latency(
     if not shift.inside:
         return refuse("no peak within the range searched", shift.correlation, error)
     if shift.correlation < 0.8:
-        return refuse("gyro and truth yaw rate correlate too little", shift.correlation, error)
+        return refuse("gyro and ground-truth yaw rate correlate too little", shift.correlation, error)
     if error > max_error_s:
         return refuse("too little yaw motion", shift.correlation, error)
-    return LatencyEstimate(shift.shift_s, shift.correlation, error, True, False, "gyro against truth yaw rate")
+    return LatencyEstimate(shift.shift_s, shift.correlation, error, True, False, "gyro against ground-truth yaw rate")
 
 
 def dependent_signals(
@@ -391,9 +391,9 @@ def dependent_signals(
 
     Returns
     -------
-    By truth name, a sentence for the report. Metrics of that name are to be marked ``not independent``.
+    By name of the truth channel, a sentence for the report. Metrics of that name are to be marked ``not independent``.
     """
-    found: dict[str, str] = {}
+    dependent: dict[str, str] = {}
     for name, truth in sorted(truth_channels.items()):
         for signal in sorted(signals_channels):
             channel = signals_channels[signal]
@@ -401,11 +401,11 @@ def dependent_signals(
                 continue
             share = _same_share(channel, truth)
             if share >= SAME_SHARE:
-                found[name] = (
+                dependent[name] = (
                     f"{truth.source} equals the {role} {signal} ({channel.source}) on {share:.1%} of its samples"
                 )
                 break
-    return found
+    return dependent
 
 
 # ---- planning ----
@@ -497,7 +497,7 @@ def _forward_share(rotation: FloatArray, velocity: FloatArray) -> float:
     return median_known((rotation[moving, :, 0] * velocity[moving]).sum(axis=1) / speed[moving])
 
 
-# ---- columns on the truth's clock ----
+# ---- columns on the ground-truth clock ----
 
 
 class _Source:
@@ -531,7 +531,7 @@ class _Source:
 
     @property
     def reference(self) -> Literal["ENU", "ECEF"]:
-        """Frame of three-dimensional vectors: ECEF only when nothing says where on Earth the car is."""
+        """Frame of three-dimensional vectors: ECEF only when nothing shows where on Earth the car is."""
         only_ecef = "ecef_velocity_m_s" in self and "enu_velocity_m_s" not in self and self.plan.origin is None
         return "ECEF" if only_ecef else "ENU"
 
@@ -591,7 +591,7 @@ def differentiate(
 ) -> FloatArray:
     """Differentiate [N] by time: slope at the centre of a cubic fitted to 2 · half_window + 1 samples (Savitzky–Golay).
 
-    The true stamps are used, so that jitter does not turn into noise. NaN where the window holds NaN, a step longer
+    The true stamps are used, so that jitter does not turn into noise. NaN where the window contains NaN, a step longer
     than ``max_gap_ns``, or the end of the data. ``angle``: differences to the centre are wrapped.
     """
     n, h = int(stamps_ns.shape[0]), half_window
@@ -599,8 +599,8 @@ def differentiate(
     if n < 2 * h + 1:
         return slope
     gaps = np.concatenate([[0], np.cumsum(np.diff(stamps_ns) > max_gap_ns)])
-    known = np.concatenate([[0], np.cumsum(~np.isfinite(values))])
-    whole = (gaps[2 * h :] == gaps[: n - 2 * h]) & (known[2 * h + 1 :] == known[: n - 2 * h])
+    missing_before = np.concatenate([[0], np.cumsum(~np.isfinite(values))])
+    whole = (gaps[2 * h :] == gaps[: n - 2 * h]) & (missing_before[2 * h + 1 :] == missing_before[: n - 2 * h])
     centres = np.flatnonzero(whole) + h
     offsets = np.arange(-h, h + 1)
     for start in range(0, centres.shape[0], _CHUNK):
@@ -657,7 +657,7 @@ def _yaw_rate(source: _Source, yaw: FloatArray, says: dict[str, str]) -> FloatAr
 
 
 def _body_velocity(source: _Source, says: dict[str, str]) -> tuple[FloatArray, FloatArray]:
-    """Return v_x, v_y at the truth's own place."""
+    """Return v_x, v_y at the point where ground truth is measured."""
     kind = source.plan.velocity
     nothing = np.full(source.stamps_ns.shape[0], np.nan)
     if kind == "none":

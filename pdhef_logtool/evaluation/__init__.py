@@ -1,1 +1,1 @@
-"""Truth, metrics, segments and consistency; sees state tracks, never an estimator."""
+"""Ground truth, metrics, segments and consistency; sees state tracks, never an estimator."""

@@ -117,11 +117,11 @@ class SegmentSums:
 
     def add(self, masks: Mapping[str, BoolArray], *columns: NDArray[np.generic]) -> None:
         """Take a block of columns [M], of which the stamps count at which the first column is finite."""
-        known = np.isfinite(columns[0])
-        if not known.any():
+        finite = np.isfinite(columns[0])
+        if not finite.any():
             return
         for segment, mask in masks.items():
-            use = mask & known
+            use = mask & finite
             self.add_to(segment, *(columns if use.all() else (c[use] for c in columns)))
 
     def add_to(self, segment: str, *columns: NDArray[np.generic]) -> None:

@@ -70,18 +70,18 @@ def rmse_difference_interval(
 def block_sums(
     columns: list[FloatArray], stamps_ns: IntArray, block_s: float = 10.0, first_ns: int | None = None
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return sums of squares [columns, K], samples [K] and numbers [K] of the blocks that hold any.
+    """Return sums of squares [columns, K], samples [K] and numbers [K] of the blocks that contain any.
 
     Blocks hold only stamps at which all columns [N] are known, and are counted from ``first_ns``; None: the first of
     those stamps.
     """
-    known = np.isfinite(np.stack(columns)).all(axis=0)
-    if not known.any():
+    finite = np.isfinite(np.stack(columns)).all(axis=0)
+    if not finite.any():
         return np.zeros((len(columns), 0)), np.zeros(0), np.zeros(0, dtype=np.int64)
-    start_ns = stamps_ns[known][0] if first_ns is None else first_ns
-    block = (stamps_ns[known] - start_ns) // round(block_s * 1e9)
+    start_ns = stamps_ns[finite][0] if first_ns is None else first_ns
+    block = (stamps_ns[finite] - start_ns) // round(block_s * 1e9)
     numbers, index = np.unique(block, return_inverse=True)
-    sums = [np.bincount(index, weights=c[known] ** 2) for c in columns]
+    sums = [np.bincount(index, weights=c[finite] ** 2) for c in columns]
     return np.stack(sums).astype(np.float64), np.bincount(index).astype(np.float64), numbers
 
 

@@ -50,21 +50,21 @@ class Compared:
 
 def compare(lines: Sequence[Errors], yardstick: str | None) -> Iterator[Compared]:
     """Yield the lines that scored anything; ``yardstick`` names one of them, None: nothing is compared."""
-    yard = next((one for one in lines if one.name == yardstick), None)
-    most = max((one.scored for one in lines), default=0)
-    for one in lines:
-        if not one.scored:
+    yard = next((line for line in lines if line.name == yardstick), None)
+    most = max((line.scored for line in lines), default=0)
+    for line in lines:
+        if not line.scored:
             continue
-        known = np.isfinite(one.error)
-        paired = yard is not None and yard is not one and np.array_equal(yard.stamps_ns, one.stamps_ns)
+        finite = np.isfinite(line.error)
+        paired = yard is not None and yard is not line and np.array_equal(yard.stamps_ns, line.stamps_ns)
         yield Compared(
-            name=one.name,
-            rmse=block_bootstrap_interval(one.error, one.stamps_ns, block_s=BLOCK_S),
-            share=one.scored / most,
-            difference=block_bootstrap_difference(one.error, yard.error, one.stamps_ns, block_s=BLOCK_S)
+            name=line.name,
+            rmse=block_bootstrap_interval(line.error, line.stamps_ns, block_s=BLOCK_S),
+            share=line.scored / most,
+            difference=block_bootstrap_difference(line.error, yard.error, line.stamps_ns, block_s=BLOCK_S)
             if paired and yard is not None
             else None,
-            covered=None if one.inside is None else float(np.mean(one.inside[known])),
+            covered=None if line.inside is None else float(np.mean(line.inside[finite])),
         )
 
 
@@ -72,14 +72,14 @@ def end_to_end(stamps_ns: Sequence[IntArray]) -> IntArray:
     """Return the stamps of several slices, each moved behind the one before, so that no block holds two of them."""
     moved: list[IntArray] = []
     begin = 0
-    for one in (s for s in stamps_ns if s.size):
-        moved.append(one - one[0] + begin)
+    for stamps in (s for s in stamps_ns if s.size):
+        moved.append(stamps - stamps[0] + begin)
         begin = int(moved[-1][-1]) + round(BLOCK_S * 1e9)
     return np.concatenate(moved) if moved else np.empty(0, dtype=np.int64)
 
 
-def shown_interval(found: Interval, sign: str = "") -> str:
-    """Return a figure in rad with its bounds in degrees, as it stands in tables; ``sign`` ``+`` shows it always."""
-    value, low, high = (math.degrees(x) for x in (found.value, found.low, found.high))
+def shown_interval(interval: Interval, sign: str = "") -> str:
+    """Return a figure in rad with its bounds in degrees, as it is in tables; ``sign`` ``+`` shows it always."""
+    value, low, high = (math.degrees(x) for x in (interval.value, interval.low, interval.high))
     shown = f"{value:{sign}.3f}" if math.isfinite(value) else "–"
     return f"{shown} [{low:.3f}, {high:.3f}]" if math.isfinite(low) else shown

@@ -1,9 +1,9 @@
-"""Errors of positions, which exist only with the truth's pose: an estimate dead-reckoned from it, block by block.
+"""Errors of positions, which exist only with the ground-truth pose: an estimate dead-reckoned from it, block by block.
 
-``position_m``: distance between the truth's position and v_x, v_y, r dead-reckoned from the truth's pose at the first
-common stamp. ``lateral_1s_m``: dead reckoning is restarted from the truth's pose every second; the error is the lateral
-one, in the truth's axes, at the end of each second. A second with an invalid estimate, a missing pose or a gap does not
-count.
+``position_m``: distance between the ground-truth position and v_x, v_y, r dead-reckoned from the ground-truth pose at
+the first common stamp. ``lateral_1s_m``: dead reckoning is restarted from the ground-truth pose every second; the error
+is the lateral one, in the ground-truth axes, at the end of each second. A second with an invalid estimate, a missing
+pose or a gap does not count.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ MAX_STEP_S = 0.2
 
 
 def position_error(estimate: StateTrack, truth: StateTrack) -> FloatArray:
-    """Return the distance [N] in m between truth and dead reckoning; NaN before the start and without a truth pose."""
+    """Return the distance [N] in m between ground truth and dead reckoning; NaN before the start and without a pose."""
     path = Path()
     return np.concatenate([path.add(estimate.rows(a, b), truth.rows(a, b)) for a, b in row_blocks(len(truth))])
 
 
 class Path:
-    """An estimate dead-reckoned from the truth's pose at the first common stamp, block by block."""
+    """An estimate dead-reckoned from the ground-truth pose at the first common stamp, block by block."""
 
     def __init__(self) -> None:
         self._reckoner: DeadReckoner | None = None
@@ -60,7 +60,7 @@ def lateral_errors_after_one_second(estimate: StateTrack, truth: StateTrack) -> 
 
 
 class Seconds:
-    """An estimate and the truth at the first stamp of each second from the first common stamp on, block by block."""
+    """An estimate and ground truth at the first stamp of each second from the first common stamp on, block by block."""
 
     def __init__(self) -> None:
         self._reckoner = DeadReckoner((0.0, 0.0, 0.0))
@@ -83,11 +83,11 @@ class Seconds:
         marks = (
             np.empty(0, dtype=np.int64) if self._mark is None else np.arange(self._mark, int(stamps[-1]) + 1, second)
         )
-        at = np.searchsorted(stamps, marks)
+        anchors = np.searchsorted(stamps, marks)
         up_to = self._lost + np.cumsum(~motion)
         columns = (self._rows + np.arange(len(stamps)), pose, up_to - ~motion, up_to, self._gaps + np.cumsum(gap))
         poses = (*_dead_reckon(estimate, self._reckoner), truth.x_m, truth.y_m, truth.yaw_rad)
-        self._anchors.append(np.stack([np.asarray(c[at], dtype=np.float64) for c in (*columns, *poses)]))
+        self._anchors.append(np.stack([np.asarray(c[anchors], dtype=np.float64) for c in (*columns, *poses)]))
         self._mark = None if self._mark is None else self._mark + second * len(marks)
         self._lost += int(np.count_nonzero(~motion))
         self._gaps += int(np.count_nonzero(gap))
@@ -97,9 +97,9 @@ class Seconds:
         """Return the lateral errors of all blocks."""
         anchors = np.concatenate([np.empty((11, 0)), *self._anchors], axis=1)
         begin, end = anchors[:, :-1], anchors[:, 1:]
-        at, pose, lost, _, gaps = range(5)
+        row, pose, lost, _, gaps = range(5)
         whole = (end[3] == begin[lost]) & (end[gaps] == begin[gaps]) & (begin[pose] * end[pose] > 0)
-        whole &= end[at] > begin[at]
+        whole &= end[row] > begin[row]
         x, y, yaw, true_x, true_y, true_yaw = begin[5:, whole]
         x_end, y_end, _, true_x_end, true_y_end, true_yaw_end = end[5:, whole]
         # One dead reckoning serves all seconds: a new start pose only turns and moves it.
@@ -110,14 +110,14 @@ class Seconds:
 
 
 def pose_known(truth: StateTrack) -> BoolArray:
-    """Return where the truth has a pose [N]."""
-    known: BoolArray = truth.valid & np.isfinite(truth.x_m) & np.isfinite(truth.y_m) & np.isfinite(truth.yaw_rad)
-    return known
+    """Return where ground truth has a pose [N]."""
+    is_known: BoolArray = truth.valid & np.isfinite(truth.x_m) & np.isfinite(truth.y_m) & np.isfinite(truth.yaw_rad)
+    return is_known
 
 
 def _motion_known(track: StateTrack) -> BoolArray:
-    known: BoolArray = track.valid & np.isfinite(track.vx_m_s) & np.isfinite(track.vy_m_s)
-    return known & np.isfinite(track.yaw_rate_rad_s)
+    is_known: BoolArray = track.valid & np.isfinite(track.vx_m_s) & np.isfinite(track.vy_m_s)
+    return is_known & np.isfinite(track.yaw_rate_rad_s)
 
 
 def _dead_reckon(

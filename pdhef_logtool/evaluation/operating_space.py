@@ -1,8 +1,8 @@
 """Where a drive went in speed and lateral acceleration: seconds and sideslip error by cell of a fixed grid.
 
-Lateral acceleration and speed are those of the segments (:mod:`~pdhef_logtool.evaluation.segments`): of the truth where
-it has them, else of the sensors, the acceleration smoothed to 1 Hz. The grid is the same for all drives, so that the
-cells of a fleet add up.
+Lateral acceleration and speed are those of the segments (:mod:`~pdhef_logtool.evaluation.segments`): of ground truth
+where it has them, else of the sensors, the acceleration smoothed to 1 Hz. The grid is the same for all drives, so that
+the cells of a fleet add up.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def operating_space(
 
     Parameters
     ----------
-    signals, truth, estimate : at the same stamps [N]; truth None: sensors alone, and no error.
+    signals, truth, estimate : at the same stamps [N]; ground truth None: sensors alone, and no error.
     """
     shape = len(SPEED_EDGES_M_S), len(AY_EDGES_M_S2)
     size = shape[0] * shape[1]
@@ -68,24 +68,24 @@ def operating_space(
         steps = np.diff(part.stamps_ns, append=part.stamps_ns[-1:]) * 1e-9
         steps = np.minimum(np.where(steps > 0.0, steps, step_ns * 1e-9), MAX_STEP_S)
         core = slice(a - first, b - first)
-        known = (np.isfinite(speed) & np.isfinite(ay))[core]
-        i = np.searchsorted(SPEED_EDGES_M_S, speed[core][known], side="right") - 1
-        j = np.searchsorted(AY_EDGES_M_S2, ay[core][known], side="right") - 1
+        finite = (np.isfinite(speed) & np.isfinite(ay))[core]
+        i = np.searchsorted(SPEED_EDGES_M_S, speed[core][finite], side="right") - 1
+        j = np.searchsorted(AY_EDGES_M_S2, ay[core][finite], side="right") - 1
         cell = np.maximum(i, 0) * shape[1] + j
-        totals[0] += np.bincount(cell, weights=steps[core][known], minlength=size)
+        totals[0] += np.bincount(cell, weights=steps[core][finite], minlength=size)
         if truth is not None:
-            error = signal_error(estimate.rows(a, b), truth.rows(a, b), "sideslip_rad", low_speed_m_s)[known]
+            error = signal_error(estimate.rows(a, b), truth.rows(a, b), "sideslip_rad", low_speed_m_s)[finite]
             scored = np.isfinite(error)
             totals[1] += np.bincount(cell[scored], minlength=size)
             totals[2] += np.bincount(cell[scored], weights=error[scored] ** 2, minlength=size)
     seconds, counts, squares = totals
     return tuple(
         Cell(
-            speed=int(at // shape[1]),
-            ay=int(at % shape[1]),
-            seconds=float(seconds[at]),
-            scored=int(counts[at]),
-            sideslip_mse_rad2=float(squares[at] / counts[at]) if counts[at] else float("nan"),
+            speed=int(cell_index // shape[1]),
+            ay=int(cell_index % shape[1]),
+            seconds=float(seconds[cell_index]),
+            scored=int(counts[cell_index]),
+            sideslip_mse_rad2=float(squares[cell_index] / counts[cell_index]) if counts[cell_index] else float("nan"),
         )
-        for at in np.flatnonzero(seconds)
+        for cell_index in np.flatnonzero(seconds)
     )

@@ -111,9 +111,9 @@ class ReasonIntervals:
     def append(self, stamps_ns: IntArray, reason: IntArray) -> None:
         """Take the stamps and bit masks [N] of the next window."""
         for r in REASONS:
-            at = np.flatnonzero(reason & r.bit)
-            if at.size:
-                self._spans.setdefault(r.bit, _Spans()).add(stamps_ns[at], self._count + at)
+            rows = np.flatnonzero(reason & r.bit)
+            if rows.size:
+                self._spans.setdefault(r.bit, _Spans()).add(stamps_ns[rows], self._count + rows)
         self._count += len(stamps_ns)
 
     def intervals(self) -> dict[str, list[Interval]]:
@@ -127,17 +127,17 @@ class ReasonIntervals:
             if r.bit not in self._spans:
                 continue
             spans = self._spans[r.bit]
-            found = _intervals(spans)
+            intervals = _intervals(spans)
             facts.append(
                 ReasonFacts(
                     name=r.name,
                     text=r.text,
                     share=spans.stamps / self._count,
                     share_within=spans.stamps / spans.within,
-                    intervals=len(found),
-                    first_ns=found[0].start_ns,
-                    end_ns=found[-1].end_ns,
-                    longest=_longest(found, NAMED_INTERVALS),
+                    intervals=len(intervals),
+                    first_ns=intervals[0].start_ns,
+                    end_ns=intervals[-1].end_ns,
+                    longest=_longest(intervals, NAMED_INTERVALS),
                 )
             )
         return tuple(facts)
@@ -145,17 +145,17 @@ class ReasonIntervals:
 
 def summarise_reasons(track: StateTrack) -> tuple[ReasonFacts, ...] | None:
     """Return the summary of a whole track; None where the source gives no reasons."""
-    found = _gathered(track)
-    return None if found is None else found.summary()
+    gathered = _gathered(track)
+    return None if gathered is None else gathered.summary()
 
 
 def sensor_faults(track: StateTrack) -> tuple[SensorFault, ...] | None:
     """Return the faults that an estimator found in its sensors; None where it does not look."""
-    found = _gathered(track)
-    if found is None:
+    gathered = _gathered(track)
+    if gathered is None:
         return None
     faults = []
-    for name, intervals in found.intervals().items():
+    for name, intervals in gathered.intervals().items():
         kind, _, sensor = name.partition("_")
         seconds = sum(i.end_ns - i.start_ns for i in intervals) * 1e-9
         listed = _longest(intervals, LISTED_INTERVALS)
@@ -166,11 +166,11 @@ def sensor_faults(track: StateTrack) -> tuple[SensorFault, ...] | None:
 def _gathered(track: StateTrack) -> ReasonIntervals | None:
     if not len(track.rows(0, 1).reason) == len(track.rows(0, 1)) > 0:
         return None
-    found = ReasonIntervals()
+    gathered = ReasonIntervals()
     for a, b in row_blocks(len(track)):
         part = track.rows(a, b)
-        found.append(part.stamps_ns, part.reason)
-    return found
+        gathered.append(part.stamps_ns, part.reason)
+    return gathered
 
 
 def _longest(intervals: list[Interval], most: int) -> tuple[Interval, ...]:

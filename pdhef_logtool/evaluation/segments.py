@@ -1,6 +1,6 @@
 """Parts of a drive: boolean masks over the scored stamps, and the same as intervals for the eye.
 
-Lateral acceleration is the truth's where the truth has one, else the sensor's; likewise yaw rate and speed;
+Lateral acceleration is that of ground truth if it has one, else the sensor's; likewise yaw rate and speed;
 longitudinal acceleration is always the sensor's. Accelerations and yaw rate are smoothed without phase (Gaussian, over
 at most the gap-free run around a stamp): to 4 Hz for ``linear`` and ``nonlinear``, to 1 Hz for manoeuvres. μ is the
 log's friction, else the vehicle file's, else 1.
@@ -142,7 +142,7 @@ def moving_mask(signals: Signals, truth: StateTrack | None, vehicle: VehiclePara
 
 
 def known_of(truth: StateTrack | None) -> frozenset[str]:
-    """Return what is taken from the truth: all that it ever knows, so that a drive does not mix two sources."""
+    """Return what is taken from ground truth: all that it ever knows, so that a drive does not mix two sources."""
     if truth is None:
         return frozenset()
     return frozenset(c for c in ("ay_m_s2", "yaw_rate_rad_s", "vx_m_s") if _known_anywhere(truth, c))
@@ -175,7 +175,7 @@ def find_intervals(stamped: Signals | StateTrack, masks: Mapping[str, BoolArray]
     ``end_ns`` is one past the last stamp inside.
     """
     masks = packed(masks, len(stamped))
-    found: dict[str, list[Segment]] = {name: [] for name in masks}
+    by_name: dict[str, list[Segment]] = {name: [] for name in masks}
     for a, b in row_blocks(len(stamped)):
         # From the last row of the block before on: what goes across the border overlaps there.
         start = max(a - 1, 0)
@@ -183,10 +183,10 @@ def find_intervals(stamped: Signals | StateTrack, masks: Mapping[str, BoolArray]
         for name, mask in masks.rows(start, b).items():
             for i, j in _runs(stamps, mask):
                 new = Segment(name, int(stamps[i]), int(stamps[j - 1]) + 1)
-                if found[name] and new.start_ns < found[name][-1].end_ns:
-                    new = replace(new, start_ns=found[name].pop().start_ns)
-                found[name].append(new)
-    return sorted((s for spans in found.values() for s in spans), key=lambda s: (s.start_ns, s.end_ns, s.name))
+                if by_name[name] and new.start_ns < by_name[name][-1].end_ns:
+                    new = replace(new, start_ns=by_name[name].pop().start_ns)
+                by_name[name].append(new)
+    return sorted((s for spans in by_name.values() for s in spans), key=lambda s: (s.start_ns, s.end_ns, s.name))
 
 
 def reach_rows(step_ns: float, cutoff_hz: float) -> int:
@@ -209,9 +209,9 @@ def smooth(stamps_ns: IntArray, values: FloatArray, cutoff_hz: float, step_ns: f
     if values.shape[0] < 2:
         return values.astype(np.float64)
     sigma = _sigma_rows(float(np.median(np.diff(stamps_ns))) if step_ns is None else step_ns, cutoff_hz)
-    known = np.isfinite(values)
+    finite = np.isfinite(values)
     for a, b in _runs(stamps_ns, np.ones(values.shape[0], dtype=np.bool_)):
-        here = known[a:b]
+        here = finite[a:b]
         if here.all():
             out[a:b] = _gaussian(values[a:b], sigma) / _gaussian_of_ones(b - a, sigma)
         else:
@@ -253,11 +253,11 @@ def _gaussian_of_ones(n: int, sigma_rows: float) -> FloatArray:
 
 
 def _last_known(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
-    """Carry measurements, which stand at one stamp only, forward for up to ``RUN_GAP_S``."""
-    known = np.isfinite(values)
-    at = np.maximum.accumulate(np.where(known, np.arange(values.shape[0]), -1))
-    fresh = (at >= 0) & (stamps_ns - stamps_ns[np.maximum(at, 0)] <= RUN_GAP_S * 1e9)
-    return np.where(fresh, values[np.maximum(at, 0)], np.nan)
+    """Carry measurements, which are at one stamp only, forward for up to ``RUN_GAP_S``."""
+    finite = np.isfinite(values)
+    last = np.maximum.accumulate(np.where(finite, np.arange(values.shape[0]), -1))
+    fresh = (last >= 0) & (stamps_ns - stamps_ns[np.maximum(last, 0)] <= RUN_GAP_S * 1e9)
+    return np.where(fresh, values[np.maximum(last, 0)], np.nan)
 
 
 def _runs(stamps_ns: IntArray, mask: BoolArray) -> list[tuple[int, int]]:

@@ -1,8 +1,8 @@
 """How the answer of a drive stands against the best physics, signal by signal, with a bootstrap of blocks of time.
 
 Errors are those of :mod:`~pdhef_logtool.evaluation.metrics`, correlated over seconds, so that whole blocks are drawn
-(:mod:`~pdhef_logtool.evaluation.bootstrap`). The best physics is the best by this drive's truth: a rival that was
-chosen in hindsight, which makes the answer look no better than it is.
+(:mod:`~pdhef_logtool.evaluation.bootstrap`). The best physics is the best by this drive's ground truth: a rival that
+was chosen in hindsight, which makes the answer look no better than it is.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
-#: What a drive is judged by, in the order in which it is told.
+#: What a drive is judged by, in the order in which it is given.
 JUDGED_SIGNALS = ("sideslip_rad", "vy_m_s", "yaw_rate_rad_s", "vx_m_s")
 #: Of fewer blocks no interval is given: with five, all of one sign come by chance in more than one of twenty drives.
 LEAST_BLOCKS = 6
@@ -50,7 +50,7 @@ class Standing:
 def standings(
     name: str, rivals: Sequence[str], read: Callable[[str], StateTrack | None], truth: StateTrack, low_speed_m_s: float
 ) -> list[Standing]:
-    """Return how an estimator stands in each of :data:`JUDGED_SIGNALS`.
+    """Return how an estimator compares in each of :data:`JUDGED_SIGNALS`.
 
     Parameters
     ----------
@@ -59,27 +59,27 @@ def standings(
     track = read(name)
     assert track is not None
     block_s = BLOCK_S * max(1, -(-_duration_s(truth) // (BLOCK_S * _MOST_BLOCKS)))
-    found = []
+    results = []
     for signal in JUDGED_SIGNALS:
 
         def sums(*tracks: StateTrack, signal: str = signal) -> tuple[FloatArray, FloatArray]:
             return _sums(tracks, truth, signal, low_speed_m_s, block_s)
 
-        own = _with_bounds(rmse_interval(*sums(track)))
+        rmse = _with_bounds(rmse_interval(*sums(track)))
         best: tuple[float, str, Interval] | None = None
         for rival in rivals:
             other = read(rival)
             assert other is not None
             squares, counts = sums(track, other)
-            if own is None or not counts.size:
+            if rmse is None or not counts.size:
                 continue
             theirs = float(np.sqrt(squares[1].sum() / counts.sum()))
             if best is None or theirs < best[0]:
                 best = theirs, rival, rmse_difference_interval(squares, counts)
         rival_rmse, chosen, difference = best or (None, None, None)
         bounded = None if difference is None else _with_bounds(difference)
-        found.append(Standing(signal, name, own, chosen, rival_rmse, bounded, block_s))
-    return found
+        results.append(Standing(signal, name, rmse, chosen, rival_rmse, bounded, block_s))
+    return results
 
 
 def _duration_s(track: StateTrack) -> float:
@@ -89,11 +89,11 @@ def _duration_s(track: StateTrack) -> float:
     return float(track.rows(n - 1, n).stamps_ns[0] - track.rows(0, 1).stamps_ns[0]) * 1e-9
 
 
-def _with_bounds(found: Interval) -> Interval | None:
-    if found.blocks == 0:
+def _with_bounds(interval: Interval) -> Interval | None:
+    if interval.blocks == 0:
         return None
     nan = float("nan")
-    return found if found.blocks >= LEAST_BLOCKS else Interval(found.value, nan, nan, found.blocks)
+    return interval if interval.blocks >= LEAST_BLOCKS else Interval(interval.value, nan, nan, interval.blocks)
 
 
 def _sums(
@@ -101,16 +101,16 @@ def _sums(
 ) -> tuple[FloatArray, FloatArray]:
     """Return sums of squared errors [tracks, K] and counts [K] by block, of the stamps at which all are scored."""
     first_ns: int | None = None
-    found: dict[int, FloatArray] = {}
+    by_block: dict[int, FloatArray] = {}
     for a, b in row_blocks(len(truth)):
         part = truth.rows(a, b)
         stamps = part.stamps_ns
         errors = [signal_error(t.rows(a, b), part, signal, low_speed_m_s) for t in tracks]
-        known = np.isfinite(np.stack(errors)).all(axis=0)
-        if first_ns is None and known.any():
-            first_ns = int(stamps[np.argmax(known)])
+        finite = np.isfinite(np.stack(errors)).all(axis=0)
+        if first_ns is None and finite.any():
+            first_ns = int(stamps[np.argmax(finite)])
         sums, counts, numbers = block_sums(errors, stamps, block_s, first_ns)
         for number, column in zip(numbers.tolist(), np.vstack([sums, counts]).T, strict=True):
-            found[number] = found[number] + column if number in found else column
-    rows = np.stack([*found.values()], axis=1) if found else np.zeros((len(tracks) + 1, 0))
+            by_block[number] = by_block[number] + column if number in by_block else column
+    rows = np.stack([*by_block.values()], axis=1) if by_block else np.zeros((len(tracks) + 1, 0))
     return rows[:-1], rows[-1]

@@ -1,7 +1,7 @@
 """Limits on figures: strict reading of thresholds.toml, and one verdict a threshold and estimator.
 
 A threshold that finds no figure is *not evaluated*, which fails like a figure beyond its limit, so that a renamed
-signal or a log without truth cannot pass a gate silently; ``optional = true`` turns that into *skipped*.
+signal or a log without ground truth cannot pass a gate silently; ``optional = true`` turns that into *skipped*.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Verdict:
     estimator : its name, or the threshold's pattern where no estimator matched.
     value, margin : in the threshold's unit; None where there is no figure. A margin below 0 is a failure.
     n : samples behind the figure.
-    independent : False where the truth of the figure is an input or the estimate itself.
+    independent : False where ground truth of the figure is an input or the estimate itself.
     reason : one sentence for a person, empty for a plain pass.
     """
 
@@ -125,7 +125,7 @@ def load_thresholds(path: Path) -> tuple[Threshold, ...]:
     Raises
     ------
     UsageError
-        The file is missing, is no TOML, or holds wrong, unknown, missing or contradicting entries; all are named.
+        The file is missing, is no TOML, or contains wrong, unknown, missing or contradicting entries; all are named.
     """
     return thresholds_from_dict(read_toml(path, "a thresholds TOML file", UsageError), where=str(path))
 
@@ -142,9 +142,9 @@ def thresholds_from_dict(raw: dict[str, Any], *, where: str) -> tuple[Threshold,
     if not isinstance(tables, list) or not tables:
         problems.append("threshold: give at least one [[threshold]] table")
         tables = []
-    found = [_read_table(table, f"threshold[{i}]", problems) for i, table in enumerate(tables)]
+    thresholds = [_read_table(table, f"threshold[{i}]", problems) for i, table in enumerate(tables)]
     seen: dict[tuple[str, ...], int] = {}
-    for i, threshold in enumerate(found):
+    for i, threshold in enumerate(thresholds):
         if threshold is None:
             continue
         key = (threshold.estimator, threshold.signal, threshold.segment, threshold.metric)
@@ -158,7 +158,7 @@ def thresholds_from_dict(raw: dict[str, Any], *, where: str) -> tuple[Threshold,
             where=where,
             remedy="see docs/formats.md for every entry",
         )
-    return tuple(t for t in found if t is not None)
+    return tuple(t for t in thresholds if t is not None)
 
 
 def _read_table(raw: object, where: str, problems: list[str]) -> Threshold | None:
@@ -166,13 +166,13 @@ def _read_table(raw: object, where: str, problems: list[str]) -> Threshold | Non
     if table is None:
         return None
     before = len(problems)
-    for key, value, known in (
+    for key, value, allowed in (
         ("signal", table.signal, tuple(SIGNALS)),
         ("metric", table.metric, tuple(registered())),
         ("segment", table.segment, SEGMENTS),
     ):
-        if value not in known:
-            problems.append(f"{where}.{key} = {unknown(value, known)}")
+        if value not in allowed:
+            problems.append(f"{where}.{key} = {unknown(value, allowed)}")
     if table.min is None and table.max is None:
         problems.append(f"{where}: give min, max or both")
     elif table.min is not None and table.max is not None and table.min > table.max:
@@ -202,7 +202,7 @@ def unit_of(signal: str, metric: str, unit: str | None, where: str, problems: li
 
 
 def check_thresholds(thresholds: Sequence[Threshold], rows: Sequence[MetricRow], *, log: str) -> list[Verdict]:
-    """Hold the figures of one log against the thresholds.
+    """Compare the figures of one log with the thresholds.
 
     Parameters
     ----------
@@ -217,10 +217,10 @@ def check_thresholds(thresholds: Sequence[Threshold], rows: Sequence[MetricRow],
     verdicts = []
     for threshold in thresholds:
         figure = (threshold.signal, threshold.segment, threshold.metric)
-        found = [r for r in rows if (r.signal, r.segment, r.metric) == figure and _is_meant(threshold, r.estimator)]
-        if not found:
+        matching = [r for r in rows if (r.signal, r.segment, r.metric) == figure and _is_meant(threshold, r.estimator)]
+        if not matching:
             verdicts.append(_without_figure(threshold, log, threshold.estimator, "no such figure in this log"))
-        for row in found:
+        for row in matching:
             if math.isfinite(row.value):
                 verdicts.append(_judge(threshold, row))
             else:
@@ -251,7 +251,7 @@ def _judge(threshold: Threshold, row: MetricRow) -> Verdict:
     passed = margin >= 0.0
     reasons = [] if passed else [f"{value:.6g} {threshold.unit} is beyond the limit by {-margin:.3g}"]
     if not row.independent:
-        reasons.append("not independent of the truth")
+        reasons.append("not independent of ground truth")
     return Verdict(
         log=row.log,
         estimator=row.estimator,

@@ -1,4 +1,4 @@
-"""Errors of an estimate against the truth at the same stamps, sample by sample, and where they count."""
+"""Errors of an estimate against ground truth at the same stamps, sample by sample, and where they count."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ _STDS = {
 
 
 def truth_speed(truth: StateTrack) -> FloatArray:
-    """Return the truth's speed [N] in m/s, abs v_x where v_y is not known; NaN where v_x is not."""
+    """Return the ground-truth speed [N] in m/s, abs v_x where v_y is not known; NaN where v_x is not."""
     return np.where(np.isfinite(truth.vy_m_s), np.hypot(truth.vx_m_s, truth.vy_m_s), np.abs(truth.vx_m_s))
 
 
 def signal_error(estimate: StateTrack, truth: StateTrack, signal: str, low_speed_m_s: float) -> FloatArray:
-    """Return estimate − truth [N] of a signal; NaN where it is not scored."""
+    """Return estimate − ground truth [N] of a signal; NaN where it is not scored."""
     error = raw_error(estimate, truth, signal)
     scored = estimate.valid & scorable(truth, signal, low_speed_m_s)
     return np.where(scored & np.isfinite(error), error, np.nan)
 
 
 def raw_error(estimate: StateTrack, truth: StateTrack, signal: str) -> FloatArray:
-    """Return estimate − truth [N], angles wrapped, also where it is not scored."""
+    """Return estimate − ground truth [N], angles wrapped, also where it is not scored."""
     error: FloatArray = getattr(estimate, signal) - getattr(truth, signal)
     return wrap_angle(error) if signal == "sideslip_rad" else error
 
 
 def scorable(truth: StateTrack, signal: str, low_speed_m_s: float) -> BoolArray:
-    """Return where the truth can score a signal [N]: sideslip only above a speed."""
-    known: BoolArray = truth.valid & np.isfinite(getattr(truth, signal))
+    """Return where ground truth can score a signal [N]: sideslip only above a speed."""
+    is_scorable: BoolArray = truth.valid & np.isfinite(getattr(truth, signal))
     if signal == "sideslip_rad":
-        known = known & (truth_speed(truth) > low_speed_m_s)
-    return known
+        is_scorable = is_scorable & (truth_speed(truth) > low_speed_m_s)
+    return is_scorable
 
 
 def total_std(estimate: StateTrack, truth: StateTrack, signal: str) -> FloatArray | None:
@@ -51,11 +51,11 @@ def total_std(estimate: StateTrack, truth: StateTrack, signal: str) -> FloatArra
     name = _STDS.get(signal)
     if name is None or (name != "sideslip_std_rad" and not estimate.covariance.shape[0]):
         return None
-    own: FloatArray = getattr(estimate, name)
+    std: FloatArray = getattr(estimate, name)
     of_truth = getattr(truth, name)
     if not np.isfinite(of_truth).any():
-        return own
-    return np.asarray(np.hypot(own, np.nan_to_num(of_truth, nan=0.0)), dtype=np.float64)
+        return std
+    return np.asarray(np.hypot(std, np.nan_to_num(of_truth, nan=0.0)), dtype=np.float64)
 
 
 def selected(values: NDArray[Any], mask: BoolArray) -> NDArray[Any]:

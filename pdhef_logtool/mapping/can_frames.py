@@ -3,8 +3,8 @@
 A source whose field is ``can:<message>.<signal>`` gets a view of its own: the frames of that message (and, for a
 multiplexed signal, of that selector) with the signal as a column. Everything behind it reads the view like a topic.
 
-A signal's bits are gathered from the few bytes that hold it, for all frames at once. Bit numbers follow the DBC: bit b
-is bit b mod 8 of byte b div 8; a little-endian signal starts at its least significant bit, a big-endian one at its
+A signal's bits are gathered from the few bytes that contain it, for all frames at once. Bit numbers follow the DBC: bit
+b is bit b mod 8 of byte b div 8; a little-endian signal starts at its least significant bit, a big-endian one at its
 most significant bit.
 """
 
@@ -58,7 +58,7 @@ def with_can_signals(log: DriveLog, mapping: SignalMapping) -> DriveLog:
     Raises
     ------
     MappingError
-        A DBC cannot be read, lacks a message or signal, or a topic holds no recognisable frames; all are named.
+        A DBC cannot be read, lacks a message or signal, or a topic contains no recognisable frames; all are named.
     """
     sources = [s for s in mapping.sources() if s.can_signal is not None]
     if not sources or isinstance(log, CanSignalLog):

@@ -1,8 +1,8 @@
 """Candidates for signals and ground truth among all numeric fields of a log: by names first, then by values.
 
 Recognised message types come before (``recognition.py``); what they leave open is looked for here. A candidate is
-*taken* when its name or a documented type says what it is and nothing speaks against it; what remains unsure about a
-taken one (its unit, its sign) becomes a check that is undecided. Other candidates stand in the mapping as comments.
+*taken* when its name or a documented type gives its quantity and nothing contradicts; what remains unsure about a
+taken one (its unit, its sign) becomes a check that is undecided. Other candidates are in the mapping as comments.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from pdhef_logtool.records.signals import WHEELS, FloatArray
 
 #: What the names around a field make of it.
 Role: TypeAlias = Literal["sensor", "navigation", "truth", "estimate", "command", "device"]
-#: A field whose name or documented type gives it a meaning; the last entry tells a documented one.
+#: A field whose name or documented type gives it a meaning; the last entry shows a documented one.
 Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 
 #: Words of a field that a navigation system gives beside others' sensors.
@@ -60,13 +60,13 @@ MOST = {
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A field that may be a signal or a truth quantity.
+    """A field that may be a signal or ground truth quantity.
 
     Attributes
     ----------
     section : ``signals`` or ``truth``. source : the field, with its likeliest scale and offset.
     score : 0 to 1. reason : what speaks for it. doubt : what is unsure of it, empty if nothing is.
-    taken : it stands in the mapping.
+    taken : it is in the mapping.
     """
 
     section: Literal["signals", "truth"]
@@ -93,7 +93,7 @@ class Field:
     Attributes
     ----------
     factors : units that it may be in, the likeliest first. fixed : unit and sign are documented.
-    section : ``signals`` or ``truth`` if its documentation says which.
+    section : ``signals`` or ``truth`` by its documentation.
     known : its unit is sure. anchor : it is mapped already. sign : that it is taken with.
     is_weak : values do not decide what it is, so that it is never taken.
     """
@@ -197,7 +197,7 @@ def names_of(quantity: str, part: str) -> tuple[str, ...]:
 
 
 def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendors: Vendors) -> list[Named]:
-    """Return the fields whose name or documented type gives them a meaning; the last entry tells a documented one."""
+    """Return the fields whose name or documented type gives them a meaning; the last entry shows a documented one."""
     results = []
     for topic, role in topics:
         fields = log.fields(topic.name, quiet=True)
@@ -317,7 +317,7 @@ def anchor_of(source: SignalSource, results: Sequence[Field]) -> Field | None:
 
 
 def _factors(meaning: Meaning, seen: Seen) -> tuple[tuple[str, float], ...]:
-    """Return the units that a field can be in by its range; one that its name says comes alone."""
+    """Return the units that a field can be in by its range; a unit in its name is the only one."""
     most = MOST.get(meaning.quantity)
     if meaning.scale is not None:
         return ((meaning.unit, meaning.scale),)

@@ -17,12 +17,12 @@ from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.records.ledger import Role
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, BoolArray, Channel, FloatArray, IntArray, Loss
 
-#: A gate sample holds for this many of its periods, then the truth's quality is unknown.
+#: A gate sample holds for this many of its periods, then the ground-truth quality is unknown.
 GATE_HOLD_PERIODS = 2.0
-#: How much earlier or later than the truth a gate message with the same stamp may be recorded.
+#: How much earlier or later than ground truth a gate message with the same stamp may be recorded.
 GATE_MARGIN_NS = 2_000_000_000
 
-#: What one loss of each kind says; how many there are, and when, stands beside it.
+#: What one loss of each kind says; how many there are, and when, is next to it.
 LOSS_TEXTS = {
     "bad-stamp": "message without a usable stamp (zero, not a number, or a minute off the others) dropped",
     "nan": "sample that is not a number dropped",
@@ -76,7 +76,7 @@ def clean_samples(
 ) -> CleanSamples:
     """Drop what is not finite or out of range, sort by stamp, and keep the first arrival of each stamp.
 
-    The result does not depend on the order of the samples: samples of one stamp and one arrival are told apart by
+    The result does not depend on the order of the samples: samples of one stamp and one arrival are distinguished by
     value, the smallest first.
 
     Parameters
@@ -114,7 +114,7 @@ def clean_samples(
 def gate_mask(
     stamps_ns: IntArray, gate_stamps_ns: IntArray, gate_values: FloatArray, gate: QualityGate, hold_ns: int
 ) -> BoolArray:
-    """Return where truth may be used: the last gate sample at or before a stamp passes and is at most ``hold_ns`` old.
+    """Return where ground truth may be used: the last gate sample passes and is at most ``hold_ns`` old.
 
     Parameters
     ----------

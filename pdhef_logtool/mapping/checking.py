@@ -1,4 +1,4 @@
-"""What a mapping says against what a log holds: names, near misses, and which stamp each source uses."""
+"""What a mapping gives against what a log contains: names, near misses, and which stamp each source uses."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def resolve_mapping(log: DriveLog, mapping: Mapping) -> Mapping:
 
 
 def check_mapping(mapping: Mapping, log: DriveLog) -> None:
-    """Check that the log holds every topic and field that the mapping names.
+    """Check that the log contains every topic and field that the mapping names.
 
     Raises
     ------

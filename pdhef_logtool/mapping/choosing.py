@@ -22,7 +22,7 @@ class ChosenMapping:
     Attributes
     ----------
     missing : signals that it lacks. ambiguities : what may be wrong. remarks : what else is worth knowing.
-    prefer_truth : which truth of a simulated log was to count.
+    prefer_truth : which ground truth of a simulated log was to count.
     """
 
     mapping: Mapping
@@ -40,7 +40,7 @@ class ChosenMapping:
 
     @property
     def dbc_names(self) -> tuple[str, ...]:
-        """What the DBC files of the mapping are called in a slim log."""
+        """What the DBC files of the mapping are called in a reduced log."""
         dbc = () if self.mapping.can is None else self.mapping.can.dbc
         return tuple(f"dbc-{number}-{path.name}" for number, path in enumerate(dbc))
 
@@ -50,7 +50,7 @@ def recorded_mapping(log: ReducedLog, prefer_truth: Literal["perfect", "rtk"]) -
 
     Raises
     ------
-    LogError : its record holds none that is one. MappingError : it was made for another truth.
+    LogError : its record contains none that is one. MappingError : it was made for another ground truth.
     """
     from pydantic import TypeAdapter, ValidationError
 
@@ -78,7 +78,7 @@ def recorded_mapping(log: ReducedLog, prefer_truth: Literal["perfect", "rtk"]) -
 
 
 def recognise(log: DriveLog, *, prefer_truth: Literal["perfect", "rtk"]) -> AutoMapping:
-    """Return what :func:`auto_map` recognises, or for a slim log what it was made with."""
+    """Return what :func:`auto_map` recognises, or for a reduced log what it was made with."""
     if log.reduced is None:
         return auto_map(log, prefer_truth=prefer_truth)
     recorded = recorded_mapping(log.reduced, prefer_truth)
@@ -115,7 +115,7 @@ def choose_mapping(
 
 
 def _filled(mapping: Mapping, auto: Mapping) -> Mapping:
-    """Return the mapping with what recognised types give for the signals, and the truth as a whole, that it lacks."""
+    """Return the mapping with missing signals, or all of missing ground truth, from recognised types."""
     return replace(
         mapping,
         signals={**auto.signals, **mapping.signals},
@@ -127,7 +127,7 @@ def _filled(mapping: Mapping, auto: Mapping) -> Mapping:
 
 
 def _borrowed(log: DriveLog, mapping: Mapping) -> list[str]:
-    """Say which topics are read by definitions of this machine, which may be another version's."""
+    """Report which topics are read by definitions of this machine, which may be another version's."""
     files = {source.topic: log.borrowed(source.topic) for source in mapping.sources()}
     return [
         f"{topic} is read by {', '.join(map(str, paths))} of this machine, as the log does not define its type: "

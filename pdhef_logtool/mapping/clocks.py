@@ -171,7 +171,7 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
         raw, log_time, steps = (np.concatenate(column) for column in zip(*parts[key], strict=True))
         seen, recorded_ns, _ = (np.concatenate(column) for column in zip(*whole.get(key, parts[key]), strict=True))
         unusable = "" if source.stamp == "log_time" else why_unusable(seen, recorded_ns)
-        if unusable:  # they do not tell the period either
+        if unusable:  # they do not show the period either
             steps = np.concatenate([np.diff(part[1]) for part in parts[key]]) * 1e-9
         clocks[key] = _clock_of(source, raw, log_time, steps, unusable)
     for key, why in _of_other_clocks(clocks).items():
@@ -213,7 +213,7 @@ def _survey(
 
 
 def _offset_changes(parts: Sequence[_Stamps]) -> bool:
-    """Tell whether the least delay of one part differs from the next one's by more than clocks drift."""
+    """Return whether the least delay of one part differs from the next one's by more than clocks drift."""
     least = np.array([float((log_time - raw).min()) for raw, log_time, _ in parts if raw.shape[0]])
     return bool((np.abs(np.diff(least)) > STEP_BACK_NS).any())
 
@@ -306,7 +306,7 @@ def _to_nanoseconds(parts: list[NDArray[np.generic]], units: tuple[str, ...]) ->
 
 
 def survey_windows(start_ns: int, end_ns: int) -> list[tuple[int, int]]:
-    """Return what :func:`fit_clocks` looks at: all of a short log, windows of 10 s spread over a longer one."""
+    """Return what :func:`fit_clocks` examines: all of a short log, windows of 10 s spread over a longer one."""
     if end_ns - start_ns <= SURVEY_WHOLE_NS:
         return [(start_ns, end_ns)] if start_ns < end_ns else []
     starts = np.linspace(start_ns, end_ns - SURVEY_WINDOW_NS, SURVEY_WINDOWS).astype(np.int64)

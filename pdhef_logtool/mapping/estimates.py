@@ -153,7 +153,7 @@ def _split_signal(text: str, units: Mapping[str, str], option: str) -> tuple[str
 
 
 def _split_topic(log: DriveLog, text: str, option: str) -> tuple[TopicInfo, str]:
-    """Split TOPIC.FIELD at the longest topic of the log that fits: outside of ROS 2, topics may hold dots."""
+    """Split TOPIC.FIELD at the longest topic of the log that fits: outside of ROS 2, topics may contain dots."""
     fitting = [t for t in log.topics if text == t.name or text.startswith(f"{t.name}.")]
     if fitting:
         topic = max(fitting, key=lambda t: len(t.name))

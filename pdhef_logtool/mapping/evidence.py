@@ -22,7 +22,7 @@ LARGEST = 1e12
 BRIDGED_CELLS = 5
 #: Columns of an array of unknown length that are looked at.
 MOST_COLUMNS = 8
-#: Fewer cells than this tell nothing.
+#: Fewer cells than this give no information.
 FEWEST_CELLS = 40
 
 
@@ -118,7 +118,7 @@ class Pieces:
         return Seen(values, cells, float(values.shape[0]) / (busy * CELL_NS * 1e-9))
 
     def rate_of(self, cells: FloatArray) -> FloatArray:
-        """Return the change a second of what stands on the grid [M]; nothing crosses from one piece to the next."""
+        """Return the change a second of what is on the grid [M]; nothing crosses from one piece to the next."""
         rows = cells.reshape(len(self.starts), self.cells_a_piece)
         out = np.full_like(rows, np.nan)
         out[:, 2:-2] = (rows[:, 4:] - rows[:, :-4]) / (4.0 * CELL_NS * 1e-9)

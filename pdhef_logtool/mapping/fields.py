@@ -1,4 +1,4 @@
-"""The fields of a log while candidates are weighed: look-ups, and the relations that hold them against one another."""
+"""The fields of a log while candidates are weighed: look-ups and relations."""
 
 from __future__ import annotations
 

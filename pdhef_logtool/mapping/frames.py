@@ -12,7 +12,7 @@ from pdhef_logtool.logs.message_schema import value_at
 from pdhef_logtool.records.geometry import rotation_from_quat
 from pdhef_logtool.records.signals import FloatArray
 
-#: Names of the frame of a car itself, without what stands before a slash.
+#: Names of the frame of a car itself, without what is before a slash.
 BASES = ("base_link", "base_footprint", "ego_vehicle", "vehicle", "base", "car", "chassis")
 _TYPES = frozenset({"tf2_msgs/TFMessage", "tf/tfMessage"})
 #: Messages of fixed frames that are read, and frames between a sensor and its car.
@@ -60,12 +60,12 @@ def placement_of(log: DriveLog, topic: str) -> Placement | None:
 
 
 def holds_fixed_frames(topic: TopicInfo) -> bool:
-    """Tell whether a topic holds fixed frames."""
+    """Return whether a topic contains fixed frames."""
     return topic.type_name.replace("/msg/", "/") in _TYPES and topic.name.endswith("tf_static")
 
 
 def _fixed_frames(log: DriveLog) -> Mapping[str, _Step]:
-    """Return the frames that never move, by name; one that is told twice in different places is none."""
+    """Return the frames that never move, by name; one that is given twice in different places is none."""
     by_name: dict[str, _Step] = {}
     moved: set[str] = set()
     for topic in log.topics:

@@ -25,7 +25,7 @@ NEVER_NEGATIVE = "the length of a velocity over ground, which is never negative:
 
 
 def length_of(velocity: SignalSource) -> SignalSource:
-    """Return the speed that a velocity of truth has: the length of its level part, of three in ECEF."""
+    """Return the speed that a velocity of ground truth has: the length of its level part, of three in ECEF."""
     level = len(velocity.paths) if velocity.name == "ecef_velocity_m_s" else 2
     scale = velocity.scale[:level] if isinstance(velocity.scale, tuple) else (velocity.scale,) * level
     return SignalSource(
@@ -51,7 +51,7 @@ def speed_over_ground(
 
     Parameters
     ----------
-    topics : with the struct of a velocity's x and y where the type tells it, else empty: names tell it then.
+    topics : with the struct of a velocity's x and y where the type tells it, else empty: names give it then.
     signals, truth : what is mapped already.
     """
     vectors = [v for topic, base in topics for v in _vectors(log, topic, base)]

@@ -1,4 +1,4 @@
-"""Joints of a vehicle's model (``sensor_msgs/JointState``): the messages say which number is whose, not the type."""
+"""Joints of a vehicle's model (``sensor_msgs/JointState``): the messages show which number is whose, not the type."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _WHEELS = frozenset({"wheel", "wheels", "whl", "tire", "tyre"})
 
 
 def is_joints(topic: TopicInfo) -> bool:
-    """Return whether a topic holds the states of joints."""
+    """Return whether a topic contains the states of joints."""
     return topic.type_name.replace("/msg/", "/") == "sensor_msgs/JointState"
 
 

@@ -122,7 +122,7 @@ def load_mapping(path: Path | str) -> Mapping:
     Raises
     ------
     MappingFileError
-        The file is missing, is no TOML, or holds wrong, unknown, missing or contradicting entries; all are named.
+        The file is missing, is no TOML, or contains wrong, unknown, missing or contradicting entries; all are named.
     """
     path = Path(path)
     raw = read_toml(path, "a mapping TOML file", MappingFileError)
@@ -295,7 +295,7 @@ def mapping_to_toml(
     Parameters
     ----------
     comments : text by name (``steer_rad``) or table (``truth.yaw_rate_rad_s``), by ``truth_quality``, or under ``""``
-        for the head of the file; it stands above the entry as a comment.
+        for the head of the file; it is above the entry as a comment.
     alternatives : candidates; those that are not taken follow as comments, with score and reason.
 
     Signals that the mapping lacks appear as commented examples, so that they only need a topic and a field.
@@ -368,7 +368,7 @@ def _alternative_lines(section: str, name: str, candidates: Sequence[Candidate])
 
 
 def missing_signals(mapping: Mapping) -> tuple[str, ...]:
-    """Return the signals that an estimator looks for and the mapping lacks; the speed may come from any wheel."""
+    """Return the signals that an estimator searches for and the mapping lacks; the speed may come from any wheel."""
     have = set(mapping.signals)
     out = []
     if not have & {"steer_rad", "steering_wheel_rad"}:

@@ -1,6 +1,6 @@
 """Names of fields: their quantity, axis or wheel, and unit.
 
-Nothing here looks at values. Names are cut into words (``WheelSpd_FL``, ``steeringangle``, ``latAccelG``) before they
+Nothing here examines values. Names are cut into words (``WheelSpd_FL``, ``steeringangle``, ``latAccelG``) before they
 are looked up, so that the spelling of a recorder does not matter.
 """
 

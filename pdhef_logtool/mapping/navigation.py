@@ -1,6 +1,6 @@
-"""Truth of a navigation system whose type nobody documents: vectors by their names, a heading by the path it drives.
+"""Ground truth of an undocumented navigation system: vectors by their names, a heading by the path.
 
-North, east and up, or ECEF, stand in names; that a heading counts clockwise from north, or counter-clockwise from east,
+Names contain north, east and up, or ECEF; whether a heading counts clockwise from north or counter-clockwise from east,
 in degrees or radians, hardly ever does. The path shows it: a car mostly drives where it points.
 """
 
@@ -26,7 +26,7 @@ from pdhef_logtool.records.signals import FloatArray
 MOVING_M_S = 3.0
 #: A heading of the right convention is this near to the course (median), and every other one this far away.
 NEAR_RAD, FAR_RAD = math.radians(12.0), math.radians(25.0)
-#: Nobody drives farther in a log.
+#: Nobody drives further in a log.
 WIDEST_DEG = 10.0
 _SIDES = {
     "north": "n", "n": "n", "vn": "n", "veln": "n", "east": "e", "e": "e", "ve": "e", "vele": "e",
@@ -156,7 +156,7 @@ def _convention(seen: Seen | None, course: FloatArray | None, unit: float | None
 
     Parameters
     ----------
-    unit : radians of its unit if its name says it; else more than one turn in radians is degrees.
+    unit : radians of its unit if its name gives it; else more than one turn in radians is degrees.
     """
     if seen is None or course is None:
         return None

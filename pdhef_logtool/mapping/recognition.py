@@ -27,7 +27,8 @@ from pdhef_logtool.records.signals import WHEELS, FloatArray
 TRUTH_WORDS = frozenset(
     {"truth", "groundtruth", "gt", "perfect", "mocap", "optitrack", "vicon", "qualisys", "correvit"}
 )
-#: Words of satellite and inertial navigation: velocities and poses of such topics are truth, their IMU is a sensor.
+#: Words of satellite and inertial navigation: velocities and poses of such topics are ground truth, their IMU is a
+#: sensor.
 NAVIGATION_WORDS = frozenset(
     {"ins", "gnss", "gps", "rtk", "oxts", "novatel", "applanix", "vbox", "sbg", "span", "navsat", "dgps", "ppk", "adma"}
 )
@@ -42,7 +43,7 @@ DEVICE_WORDS = frozenset(
     {"camera", "lidar", "realsense", "zed", "ouster", "livox", "velodyne", "phone", "os1", "radar"}
 )
 
-#: Starts of types that hold no signal of a car, and much else.
+#: Starts of types that contain no signal of a car, and much else.
 NO_SENSORS = (
     "sensor_msgs/Image", "sensor_msgs/CompressedImage", "sensor_msgs/PointCloud", "sensor_msgs/LaserScan",
     "sensor_msgs/CameraInfo", "visualization_msgs/", "tf2_msgs/", "tf/", "rosgraph_msgs/", "rcl_interfaces/",
@@ -95,14 +96,14 @@ SPEED_FIELDS = {
 WHEEL_SPEED_TYPES = frozenset({"truthsim_msgs/WheelSpeeds"})
 IMU_TYPES = frozenset({"sensor_msgs/Imu"})
 FIX_TYPES = frozenset({"sensor_msgs/NavSatFix", "foxglove.LocationFix"})
-#: Types that hold positions of which nobody says which one is the vehicle's.
+#: Types that contain positions without the information which one is the vehicle's.
 SEVERAL_POSITIONS = {
     "foxglove.PosesInFrame": "it is a list of poses, and the type does not give which pose is the vehicle's",
     "foxglove.LocationFixes": "it is a list of fixes, and the type does not give which fix is the vehicle's",
     "foxglove.FrameTransform": "the type does not give which frame is the vehicle",
     "foxglove.FrameTransforms": "the type does not give which frame is the vehicle",
 }
-#: What a type must have to be what its name says; of an IMU any of them, of others all.
+#: What a type must have to be what its name gives; of an IMU any of them, of others all.
 _IMU_PATHS = ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z")
 
 
@@ -205,11 +206,11 @@ class _Draft:
 def auto_map(
     log: DriveLog, *, prefer_truth: Literal["perfect", "rtk"] = "perfect", vendors: Vendors | None = None
 ) -> AutoMapping:
-    """Map a log's topics to signals and truth: by well-known types, and for what these leave open by candidates.
+    """Map a log's topics to signals and ground truth: by well-known types, and for what these leave open by candidates.
 
     Parameters
     ----------
-    prefer_truth : which truth to take from a simulated log, the perfect one under ``/truth/perfect`` or the
+    prefer_truth : which ground truth to take from a simulated log, the perfect one under ``/truth/perfect`` or the
         RTK-like one; a log with only one of them gets that.
     vendors : documented types; None takes those that are shipped and the user's.
     """
@@ -306,7 +307,7 @@ def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
 
 
 def _map_documented_truth(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
-    """Take truth from an INS whose type is documented, where recognised types give a position at most."""
+    """Take ground truth from an INS whose type is documented, where recognised types give a position at most."""
     if {"vx_m_s", "enu_velocity_m_s", "quat_wxyz", "yaw_rad", "x_m"} & set(draft.truth):
         return
     whole: dict[str, dict[str, SignalSource]] = {}
@@ -333,7 +334,7 @@ def _map_documented_truth(draft: _Draft, topics: list[TopicInfo], vendors: Vendo
 
 
 def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
-    """Take truth from a navigation system by the names of its vectors, where there is a position at most."""
+    """Take ground truth from a navigation system by the names of its vectors, where there is a position at most."""
     if set(draft.truth) - {"lat_deg", "lon_deg", "alt_m", "course_rad"}:
         return
     unknown = [t for t in topics if not _is_well_known(t) and not vendors.fields_of(t.type_name)]
@@ -393,7 +394,7 @@ def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
 
 
 def _speed_of_navigation(draft: _Draft, topics: list[TopicInfo]) -> None:
-    """Take the speed of a navigation system that is the truth too."""
+    """Take the speed of a navigation system that is ground truth too."""
     names = ("vx_m_s", "enu_velocity_m_s", "ecef_velocity_m_s")
     truth = next((draft.truth[n] for n in names if n in draft.truth), None)
     source = None if truth is None else next((t for t in topics if t.name == truth.topic), None)
@@ -468,7 +469,7 @@ def _join(prefix: str, path: str) -> str:
 
 
 def _probe(log: DriveLog, topics: list[TopicInfo]) -> dict[str, dict[str, FloatArray]]:
-    """Read a few seconds here and there of what tells a measured field from a filler."""
+    """Read a few seconds in five places of the fields that may be fillers."""
     requests: dict[str, list[str]] = {}
     for topic in topics:
         if paths := _probed_paths(topic):
@@ -584,7 +585,7 @@ def _map_wheel_speeds(draft: _Draft, topics: list[TopicInfo]) -> None:
         draft.take(draft.signals, name, chosen.name, f"{wheel}_m_s")
 
 
-# ------------------------------------------------------------------------------------------------ truth
+# ------------------------------------------------------------------------------------------------ ground truth
 
 
 def _truth_group(topic: TopicInfo) -> str:
@@ -602,7 +603,7 @@ def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
         candidates = kept
     for topic in topics:
         if _is_truth(topic) and _type(topic) in SEVERAL_POSITIONS:
-            draft.doubt("truth position", (topic.name,), None, SEVERAL_POSITIONS[_type(topic)])
+            draft.doubt("ground-truth position", (topic.name,), None, SEVERAL_POSITIONS[_type(topic)])
     velocity = _map_truth_velocity(draft, candidates)
     _map_truth_position(draft, candidates, velocity)
 
@@ -610,7 +611,7 @@ def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
 def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo | None:
     twists = [t for t in candidates if _type(t) in TWIST_FIELDS and _has_twist(draft, t)]
     chosen = draft.choose(
-        "truth velocity",
+        "ground-truth velocity",
         twists,
         lambda t: (not _words(t.name) & TRUTH_WORDS, not _has_pose(draft, t)),
         "topics named as ground truth first, then topics with a pose",
@@ -625,15 +626,15 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
         up = draft.values(chosen.name, _twist(chosen, "linear", "z"))
         readings = (f"{chosen.name} as body velocity", f"{chosen.name} as east, north, up")
         if body is None or not np.isfinite(up).any():
-            draft.doubt("truth velocity frame", readings, None, "too little motion to identify the frame")
+            draft.doubt("ground-truth velocity frame", readings, None, "too little motion to identify the frame")
             return None
-        draft.doubt("truth velocity frame", readings, readings[1], "x is not the direction of travel")
+        draft.doubt("ground-truth velocity frame", readings, readings[1], "x is not the direction of travel")
         paths = tuple(_twist(chosen, "linear", a) for a in "xyz")
         draft.take(draft.truth, "enu_velocity_m_s", chosen.name, paths)
         return chosen
     if body is False:
         draft.doubt(
-            "truth velocity frame",
+            "ground-truth velocity frame",
             (f"{chosen.name} as body velocity",),
             chosen.name,
             "the type's convention is the body frame, although x is mostly not the direction of travel",
@@ -698,7 +699,7 @@ def _map_truth_position(draft: _Draft, candidates: list[TopicInfo], velocity: To
     else:
         positions = [t for t in candidates if _has_pose(draft, t) or _has_fix(draft, t)]
         chosen = draft.choose(
-            "truth position",
+            "ground-truth position",
             positions,
             lambda t: (not _words(t.name) & TRUTH_WORDS, _type(t) in FIX_TYPES),
             "topics named as ground truth first, then poses before satellite fixes",

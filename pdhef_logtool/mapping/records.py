@@ -17,7 +17,7 @@ StampUnit: TypeAlias = Literal["ros", "s", "ms", "us", "ns"]
 Clock: TypeAlias = Literal["utc", "device"]
 Combine: TypeAlias = Literal["sum", "norm"]
 
-#: How a frame's bytes stand in a message: as numbers, or as a text of digits.
+#: Encoding of a frame's bytes in a message: numbers, or a text of digits.
 CanDataEncoding: TypeAlias = Literal["bytes", "hex", "base64"]
 
 #: Start of a field that names a signal of a DBC: ``can:<message>.<signal>``.
@@ -25,7 +25,8 @@ CAN_PREFIX = "can:"
 
 #: Values of ``stamp`` that name the recorder's times instead of a field of the message.
 RECORDER_STAMPS = ("log_time", "publish_time")
-#: ``stamp`` when a mapping file says nothing: the message's header.stamp or stamp if its schema has one, else log time.
+#: ``stamp`` when a mapping file gives no information: the message's header.stamp or stamp if its schema has one, else
+#: log time.
 AUTO_STAMP = "auto"
 
 
@@ -38,12 +39,12 @@ class SignalSource:
 
     Attributes
     ----------
-    name : signal or truth name, a key of ``SIGNAL_UNITS`` or ``TRUTH_UNITS``.
+    name : signal or ground truth name, a key of ``SIGNAL_UNITS`` or ``TRUTH_UNITS``.
     topic : topic name.
     field : dotted path, ``[3]`` indexes an array; a tuple of paths gives a vector signal column by column,
         or the sum of a scalar one.
     stamp : dotted path of the measurement time, ``log_time``, ``publish_time``, or ``auto``.
-    scale, offset : raw unit to SI; a tuple holds one entry a column of a vector signal, a scale also one a summand.
+    scale, offset : raw unit to SI; a tuple contains one entry a column of a vector signal, a scale also one a summand.
     latency_s : what the stamp is late by.
     valid_min, valid_max : SI values outside are dropped and counted.
     stamp_unit : ``ros`` (a struct of seconds and nanoseconds) or the unit of a number.
@@ -83,7 +84,7 @@ class SignalSource:
 
     @property
     def label(self) -> str:
-        """``/topic.field``, for people and for ``Channel.source``; sums of the same fields are told apart by name."""
+        """``/topic.field``, for texts and ``Channel.source``; sums of the same fields are distinguished by name."""
         if isinstance(self.field, str):
             return f"{self.topic}.{self.field}"
         return f"{self.topic}.{'' if self.columns > 1 else self.name}{{{','.join(self.field)}}}"
@@ -101,10 +102,11 @@ class CanSettings:
     Attributes
     ----------
     dbc : the files that describe the frames.
-    id_field, data_field, length_field, extended_field : paths in the messages that hold frames; empty: found by name.
-    data_encoding : how the bytes stand in ``data_field``.
+    id_field, data_field, length_field, extended_field : paths in the messages that contain frames; empty: found by
+    name.
+    data_encoding : encoding of the bytes in ``data_field``.
     bus_field, bus : frames of other buses are left out, where both are given.
-    id_mask : bits of the identifier that tell messages apart; all 29 by default.
+    id_mask : bits of the identifier that distinguish messages; all 29 by default.
     """
 
     dbc: tuple[Path, ...]
@@ -120,7 +122,7 @@ class CanSettings:
 
 @dataclass(frozen=True, slots=True)
 class QualityGate:
-    """When truth may be used: where the field is in [``minimum``, ``maximum``] or one of ``values``."""
+    """When ground truth may be used: where the field is in [``minimum``, ``maximum``] or one of ``values``."""
 
     topic: str
     field: str
@@ -163,9 +165,9 @@ class Mapping:
     Attributes
     ----------
     signals, truth : by name; what an estimator may see, and what it is scored against.
-    quality : gate on the truth, if any.
+    quality : gate on ground truth, if any.
     origin : ``file`` or ``auto`` (recognised types).
-    notes : sentences that the reader of a report must know of this mapping.
+    notes : sentences that the reader of a report needs to know of this mapping.
     can : how raw CAN frames are read, for sources whose field is ``can:<message>.<signal>``.
     estimates : estimates that somebody else recorded in the log, by estimator and quantity (``ESTIMATE_UNITS``). They
         are no part of :meth:`sources`: only ``pdhef metrics`` reads them.
@@ -185,7 +187,7 @@ class Mapping:
 
     @property
     def sha256(self) -> str:
-        """Hash of what is read and how: sources, scales, stamps, latencies, limits and the truth's gate."""
+        """Hash of what is read and how: sources, scales, stamps, latencies, limits and the ground-truth gate."""
         return digest(jsonable({"signals": self.signals, "truth": self.truth, "quality": self.quality}))
 
     def sources(self) -> Iterator[SignalSource]:

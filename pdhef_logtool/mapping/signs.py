@@ -1,6 +1,6 @@
 """Signs: which of steering, yaw rate and a_y contradict one another, and the way the car really turned.
 
-Three signals that agree may all be positive to the right. What cannot be is told by what needs no convention: the path
+Three signals that agree may all be positive to the right. What cannot be is shown by what needs no convention: the path
 that positions show, right minus left wheel, a navigation system's heading, which counts clockwise, and gravity,
 which the accelerometer of an upright IMU has along +z.
 """
@@ -21,9 +21,9 @@ from pdhef_logtool.mapping.naming import G_M_S2
 from pdhef_logtool.mapping.path import heading_turn, path_turn
 from pdhef_logtool.records.signals import FloatArray
 
-#: Speeds below tell nothing of the path.
+#: Speeds below give no information of the path.
 SLOW_M_S = 1.0
-#: Correlations from here on tell a sign.
+#: Correlations from here on give a sign.
 TELLS = 0.6
 #: What a person calls the signals.
 WORDS = {"steer": "steering", "rate": "yaw rate", "ay": "a_y"}
@@ -55,7 +55,7 @@ class Signs:
 def judge_signs(
     fields: Fields, trio: Mapping[str, Field | None], speed: Field | None, wheels: FloatArray | None
 ) -> Signs:
-    """Hold the signs of steering, yaw rate and a_y against one another and against the way the car turned.
+    """Compare the signs of steering, yaw rate and a_y with one another and with the turning of the car.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def may_turn(item: Field) -> bool:
 
 
 def _has_documented_sign(item: Field) -> bool:
-    """Return whether documentation or a name says the sign; of a well-known type it depends on the mounting."""
+    """Return whether documentation or a name gives the sign; of a well-known type it depends on the mounting."""
     return not item.anchor and (item.fixed or item.is_downward)
 
 

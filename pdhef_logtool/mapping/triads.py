@@ -1,4 +1,4 @@
-"""The three axes of an accelerometer and of a gyro: which fields stand beside the one that a mapping names."""
+"""The three axes of an accelerometer and of a gyro: which fields are next to the one that a mapping names."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _triad(log: DriveLog, mapping: Mapping, names: tuple[str, ...]) -> Triad | N
 
 
 def _siblings(paths: tuple[str, ...]) -> Iterator[tuple[str, str, str]]:
-    """Yield the triples of paths that a path may stand in."""
+    """Yield the triples of paths that a path may be in."""
     path = paths[0]
     if index := re.fullmatch(r"(.*)\[(\d+)\]", path):
         start = int(index[2]) - int(index[2]) % 3

@@ -1,4 +1,4 @@
-"""Units that no name tells: by gravity, by other speeds, by a_y ≈ v r and by a_x ≈ v̇."""
+"""Units that no name gives: by gravity, by other speeds, by a_y ≈ v r and by a_x ≈ v̇."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ RADII_M = (0.02, 0.7)
 SLOWEST = 1.0
 #: Share of gravity along +z of an upright sensor.
 MOST_TILTED = 0.9
-#: Names that tell a filtered or derived copy of a sensor from the sensor.
+#: Names that count a filtered or derived copy of a sensor from the sensor.
 _SECOND_CHOICE = ("raw", "uncomp", "delta", "error", "offset", "relative")
 
 
 def decide_units(fields: Fields) -> None:
-    """Decide units that no name tells: gravity first, then one quantity against another."""
+    """Decide units that no name gives: gravity first, then one quantity against another."""
     _by_gravity(fields)
     _rank(fields)
     _speeds(fields)
@@ -59,7 +59,7 @@ def _by_gravity(fields: Fields) -> None:
 
 
 def _say_mounting(fields: Fields, z: Field, gravity: FloatArray) -> None:
-    """Say where gravity is not along +z of an accelerometer that names its axes: its axes are not the car's."""
+    """Report where gravity is not along +z of an accelerometer that names its axes: its axes are not the car's."""
     if z.fixed or gravity[2] > MOST_TILTED or z.role in ("command", "estimate", "truth"):
         return
     along = "xyz"[int(np.argmax(np.abs(gravity)))]
@@ -76,7 +76,7 @@ def _say_mounting(fields: Fields, z: Field, gravity: FloatArray) -> None:
 
 
 def _by_wheel_rates(fields: Fields) -> None:
-    """Tell the unit of a gyro where wheels turn in rad/s and their radius is not known: only one gives a wheel's."""
+    """Find the unit of a gyro where wheels turn in rad/s and their radius is not known: only one gives a wheel's."""
     wheels = [f for f in fields.candidates if f.meaning.quantity == "wheel rate" and f.unit_known]
     if not wheels:
         return
@@ -106,7 +106,7 @@ def _rank(fields: Fields) -> None:
 
 
 def _speeds(fields: Fields) -> None:
-    """Tell units of speeds by one another: what is known, then a_x, then the least assuming."""
+    """Find the units of speeds by a known speed, by positions, then by a_x."""
     settled = [f for f in fields.all("speed") if f.unit_known or f.fixed]
     reference = max(settled, key=lambda f: f.score, default=None)
     path = path_speed(fields)
@@ -127,7 +127,7 @@ def _speeds(fields: Fields) -> None:
 
 
 def _by_turning(fields: Fields) -> None:
-    """Tell units of a_y, yaw rate and speed by a_y ≈ v r, where one combination alone gives it."""
+    """Find units of a_y, yaw rate and speed by a_y ≈ v r, where one combination alone gives it."""
     speed = fields.best("speed") or fields.wheel_mean()
     if speed is None:
         return

@@ -2,7 +2,7 @@
 
 Speed, yaw rate and the accelerations are accepted where only one choice of columns satisfies a_y = v r and a_x = v̇ at
 once, with slopes that units explain: the second slope gives the units of speed and accelerations, the ratio of the two
-that of the yaw rate. A steering angle looks like a yaw rate over a speed too, but for that ratio. Left and
+that of the yaw rate. A steering angle resembles a yaw rate over a speed too, but for that ratio. Left and
 right are not observable. Choices that are not accepted remain candidates that are not taken.
 """
 
@@ -58,7 +58,7 @@ class _Choice:
     """Columns that are speed, yaw rate, a_y and a_x, the relations between them, and the units of the first three.
 
     ``x`` and ``speeding`` are None where no column is the speed's change. ``is_plausible``: its slopes are near to what
-    units explain, and a_y is as large as one; ``is_strict``: both relations hold so well that it is accepted if no
+    units explain, and a_y is as large as one; ``is_strict``: both relations fit so well that it is accepted if no
     other is as near. ``ahead_s`` : how far a_y is ahead of v r.
     """
 
@@ -85,7 +85,7 @@ class _Choice:
 
     @property
     def score(self) -> float:
-        """How well the relations hold."""
+        """How well the relations fit."""
         return abs(self.turning.correlation) * (0.0 if self.speeding is None else abs(self.speeding.correlation))
 
     @property
@@ -99,7 +99,7 @@ class _Choice:
 
 
 def unlabelled_columns(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], pieces: Pieces) -> list[Field]:
-    """Return the columns of sensors' topics whose names say nothing, with what stands in them."""
+    """Return the columns of sensors' topics whose names give no information, with what is in them."""
     requests: dict[str, list[str]] = {}
     for topic, role in topics:
         fields = log.fields(topic.name, quiet=True)
@@ -131,7 +131,7 @@ def identified(fields: Fields, unlabelled: Sequence[Field]) -> tuple[list[Field]
 
     Parameters
     ----------
-    unlabelled : columns with a meaning that is empty; fields that names tell serve as what they are.
+    unlabelled : columns with a meaning that is empty; fields that names give serve as what they are.
     """
     order = sorted(_choices(fields, unlabelled), key=lambda c: (-c.score, -abs(c.turning.correlation)))
     best = next((c for c in order if c.is_strict), None)
@@ -256,7 +256,7 @@ def _values(item: Field) -> FloatArray:
 
 
 def _known(fields: Fields, what: str) -> list[Field]:
-    """Return the surest field that a name says to be a quantity and whose unit is known."""
+    """Return the surest field that a name gives to be a quantity and whose unit is known."""
     kind = {"speed": ("speed", None), "rate": ("rate", "z"), "ay": ("acceleration", "y"), "ax": ("acceleration", "x")}
     every = [f for f in fields.all(*kind[what]) if (f.unit_known or f.fixed) and f.seen.changes]
     return every[:1]

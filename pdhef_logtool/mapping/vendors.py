@@ -1,4 +1,4 @@
-"""Message types of vendors whose documentation says what their fields are: ``vendors.toml`` and files like it."""
+"""Message types of vendors whose documentation gives what their fields are: ``vendors.toml`` and files like it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class _FieldTable(BaseModel):
     @model_validator(mode="after")
     def _is_one_quantity(self) -> _FieldTable:
         if bool(self.signal) == bool(self.truth):
-            raise ValueError("give signal or truth, not both")
+            raise ValueError("give either signal or truth")
         if self.signal and self.signal not in SIGNAL_UNITS:
             raise ValueError(f"{self.signal!r} is no signal")
         if self.truth and self.truth not in TRUTH_UNITS:
@@ -97,7 +97,7 @@ class VendorField:
 
 
 def meaning_of_signal(name: str) -> Meaning:
-    """Return what a name would have to say for a field to be a signal or truth quantity."""
+    """Return the meaning of a signal or ground-truth quantity."""
     quantity, part = _QUANTITIES.get(name, ("", ""))
     if name.startswith("wheel_speed_"):
         quantity = "wheel rate" if name.endswith("rad_s") else "wheel speed"
@@ -109,8 +109,9 @@ def meaning_of_signal(name: str) -> Meaning:
 class Vendors:
     """Documented types by name, as ROS 2 spells it without ``/msg``, and why some are left out.
 
-    ``vectors`` are truth quantities that several fields make, with an empty topic. ``exports`` are the fields that tell
-    a recorder's export, which has no type of its own, by the name that it has here; other channels stand beside them.
+    ``vectors`` are ground truth quantities that several fields make, with an empty topic. ``exports`` are the fields
+    that count a recorder's export, which has no type of its own, by the name that it has here; other channels are next
+    to them.
     """
 
     types: Mapping[str, Mapping[str, VendorField]] = field(default_factory=dict)
@@ -152,7 +153,7 @@ def load_vendors(path: Path | None = None) -> Vendors:
 
     Raises
     ------
-    MappingFileError : A file is missing, is no TOML or holds wrong entries; all are named.
+    MappingFileError : A file is missing, is no TOML or contains wrong entries; all are named.
     """
     given = path or (Path(os.environ[USERS_FILE]) if os.environ.get(USERS_FILE) else None)
     if given is None:

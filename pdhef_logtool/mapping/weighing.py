@@ -37,7 +37,7 @@ from pdhef_logtool.mapping.vendors import Vendors
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, FloatArray
 
-#: Truth quantities that show the path.
+#: Ground truth quantities that show the path.
 _POSITIONS = ("lat_deg", "lon_deg", "x_m", "y_m")
 #: Signals that one field gives: name, quantity and parts, in the order in which they are chosen.
 _SENSORS = (
@@ -81,7 +81,7 @@ def weigh(
 
     Parameters
     ----------
-    topics : those that may hold candidates, with what their names make of them.
+    topics : those that may contain candidates, with what their names make of them.
     signals, truth : what recognised types give already.
     """
     wanted = [
@@ -110,7 +110,7 @@ def weigh(
 
 
 def _upward(log: DriveLog, signals: Mapping[str, SignalSource]) -> dict[str, SignalSource]:
-    """Return the third axis of a mapped accelerometer, which tells where gravity is."""
+    """Return the third axis of a mapped accelerometer, which shows where gravity is."""
     lateral = signals.get("ay_m_s2")
     path = "" if lateral is None else f"{lateral.paths[0].removesuffix('.y')}.z"
     if lateral is None or not has_path(log.fields(lateral.topic), path):
@@ -152,7 +152,7 @@ class _Weighing:
         usable = [f for f in self.fields.candidates if f.role in ("sensor", "navigation", "device")]
         usable = [f for f in usable if (f.seen.changes or f.fixed) and f.section != "truth"]
         for item in usable:
-            # A message that holds the answer gives the sensors too only where no other one does.
+            # Sensors of the message with ground truth are taken only if no other message has them.
             item.bonus -= 0.2 if item.topic.name == self.truth_from else 0.0
         wheels = any(n.startswith("wheel_speed") for n in have)
         for name, quantity, part in _SENSORS:
@@ -270,7 +270,7 @@ class _Weighing:
             self.taken[f"wheel_speed_{corner}_{'rad_s' if kind == 'wheel rate' else 'm_s'}"] = item
 
     def _wheel_unit_by_turning(self, mean: FloatArray) -> tuple[str, tuple[str, float], str, str]:
-        """Return what :func:`_wheel_unit` does, by a_y ≈ v r, which tells less: roll is in a_y."""
+        """Return what :func:`_wheel_unit` does, by a_y ≈ v r, which shows less: roll is in a_y."""
         rate, ay = self._chosen("yaw_rate_rad_s"), self._chosen("ay_m_s2")
         relation = None if rate is None or ay is None else self.fields.turning(ay.si, rate.si, mean)
         if relation is None or abs(relation.correlation) < CLEAR:
@@ -337,7 +337,7 @@ class _Weighing:
     # ------------------------------------------------------------------------------------------------ signs
 
     def _signs(self) -> None:
-        """Turn signs where one way alone settles what contradicts, and say what stays open."""
+        """Turn the signs that contradict others if there is one way to do so; report what remains open."""
         trio = {
             "steer": self._chosen("steer_rad", "steering_wheel_rad"),
             "rate": self._chosen("yaw_rate_rad_s"),
@@ -352,7 +352,7 @@ class _Weighing:
             if item is not None:
                 item.sign = -item.sign
                 item.reasons.append(f"sign turned: {signs.contradiction} contradict one another")
-        hangs = signs.contradiction == f"{WORDS['rate']} and {WITNESSES['gravity']}"  # imu.mounting says so
+        hangs = signs.contradiction == f"{WORDS['rate']} and {WITNESSES['gravity']}"  # imu.mounting shows it
         if signs.contradiction and not hangs and not (signs.decided and signs.absolute):
             turned = ", ".join(WORDS[n] for n in signs.turned)
             taken = f"{turned} was turned as the odd one" if turned else "the wrong one is not observable"
@@ -376,7 +376,7 @@ class _Weighing:
         return self._chosen("speed_m_s") or self.fields.wheel_mean() or self.fields.best("speed")
 
     def _follow(self) -> None:
-        """Say what does not follow the car's motion although the drive excites it: a name may be wrong, or an axis."""
+        """Add a doubt to accelerations that do not follow the car's motion although the drive excites it."""
         speed, rate = self._speed() or self.fields.wheel_turns(), self._chosen("yaw_rate_rad_s")
         self._both_signs()
         if speed is None:
@@ -392,7 +392,7 @@ class _Weighing:
                 item.doubts.append(f"its correlation with {words} is only {relation.correlation:.2f}")
 
     def _both_signs(self) -> None:
-        """Say what is never negative although the car turns both ways: its sign stands in another field."""
+        """Add a doubt to fields that are never negative although the car turns both ways: their sign is elsewhere."""
         names = ("yaw_rate_rad_s", "ay_m_s2", "steer_rad", "steering_wheel_rad")
         there = {n: f for n in names if (f := self._chosen(n)) is not None and f.seen.changes}
         if not any(is_of_both_signs(f.seen.values) for f in there.values()):
@@ -417,10 +417,10 @@ class _Weighing:
                     return self.fields.pieces.smooth(right.si - left.si)
         return None
 
-    # ------------------------------------------------------------------------------------------------ truth
+    # ------------------------------------------------------------------------------------------------ ground truth
 
     def choose_truth(self) -> None:
-        """Take truth from the one topic that has sideslip or a lateral velocity, and calls itself truth if any does."""
+        """Take ground truth from the topic chosen by :func:`truth_topic`."""
         if not self.truth_from:
             return
         its = [f for f in self.fields.candidates if f.topic.name == self.truth_from and f.section != "signals"]
@@ -430,7 +430,7 @@ class _Weighing:
             return
         first = its[0]
         agrees = self._truth_turns()
-        # What is truth is no input, unless a navigation system is the only speed there is.
+        # Fields of ground truth are no inputs, except the speed of a navigation system without another speed.
         mine = set(map(id, self.truth.values()))
         for signal in [n for n, f in self.taken.items() if id(f) in mine and n != "speed_m_s"]:
             if first.role != "navigation":
@@ -450,7 +450,7 @@ class _Weighing:
             self._tell(f"truth.{name}", item)
 
     def _truth_turns(self) -> bool:
-        """Give the truth's yaw rate the sign of the sensor's; return whether the two are one motion."""
+        """Give the ground-truth yaw rate the sign of the sensor's; return whether the two are one motion."""
         sensor = self._chosen("yaw_rate_rad_s")
         true = self.truth.get("yaw_rate_rad_s")
         relation = None if sensor is None or true is None else fit(sensor.si, true.si)
@@ -464,7 +464,7 @@ class _Weighing:
     # ------------------------------------------------------------------------------------------- what is said
 
     def _tell(self, name: str, item: Field) -> None:
-        """Note what stays unsure of what is taken, and mark what stands in for a sensor."""
+        """Turn the doubts of a taken field into an undecided check; note a speed of the navigation system."""
         item.doubts = [d for d in item.doubts if d]
         if name == "speed_m_s" and item.role == "navigation":
             self.notes.append(
@@ -507,7 +507,7 @@ class _Weighing:
 
 
 def _truth_of(candidates: Sequence[Field]) -> dict[str, Field]:
-    """Return truth quantities of one topic's fields; empty without sideslip, lateral velocity or a position."""
+    """Return ground truth quantities of one topic's fields; empty without sideslip, lateral velocity or a position."""
     truth: dict[str, Field] = {}
     for item in sorted(candidates, key=lambda f: -f.score):
         name = _truth_name(item)
@@ -569,7 +569,7 @@ def truth_topic(weighable: Sequence[Field]) -> str:
 
 
 def _rate_by_track(rate: Field, slope_m: float) -> None:
-    """Tell the unit of a yaw rate by the track that it gives with the wheels' difference: model cars to lorries."""
+    """Find the unit of a yaw rate by the track that it gives with the wheels' difference: model cars to lorries."""
     if rate.unit_known or rate.fixed:
         return
     for unit, factor in rate.factors:

@@ -94,7 +94,7 @@ def _driven_d2_of(drive: Drive, estimator: Estimator, sensors: SensorErrors) -> 
 
     The windows have a fixed length, so that the length of the run's windows does not change it.
     """
-    from pdhef_logtool.evaluation.metrics.d2 import driven_d2, driving_products
+    from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency, driving_products
 
     slow, carry = drive.car.vehicle.low_speed_blend_m_s, None
     products, seconds = np.zeros((4, 4)), 0.0
@@ -103,7 +103,7 @@ def _driven_d2_of(drive: Drive, estimator: Estimator, sensors: SensorErrors) -> 
         more, lasted = driving_products(track, window.signals, low_speed_m_s=slow, sensors=sensors)
         products += more
         seconds += lasted
-    return driven_d2(products, seconds)
+    return driven_consistency(products, seconds)
 
 
 def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:

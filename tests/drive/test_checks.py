@@ -353,7 +353,7 @@ def test_place_gain_and_delay_are_told_apart(sample_logs_dir: Path, errors: dict
 def test_a_place_that_no_car_has_is_undecided(sample_logs_dir: Path) -> None:
     checks = late_checks(planted(survey(sample_logs_dir / "sweep.mcap"), lever_m=-7.0))
     (place,) = (c for c in checks if c.name == "ay_m_s2.place")
-    assert place.verdict == "undecided" and "no car has it there" in place.remedy
+    assert place.verdict == "undecided" and "no car has its sensor there" in place.remedy
 
 
 def test_sideslip_that_hardly_moves_beside_a_y_tells_no_sign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

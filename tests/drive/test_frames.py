@@ -114,7 +114,7 @@ def test_frames_alone_turn_an_imu_where_gravity_agrees_and_this_is_said(drives) 
     survey = surveyed(FramedLog(drives["fishhook"], turn, turn), 2.0)
     assert survey.mapping.signals["ay_m_s2"].field == "linear_acceleration.x"
     assert verdicts(survey) == ["undecided"]
-    assert "the recorded frames say so" in survey.mapping.notes[-1]
+    assert "the recorded frames give it" in survey.mapping.notes[-1]
     file = surveyed(FramedLog(drives["fishhook"], turn, turn), 2.0, origin="file")
     assert file.mapping.signals["ay_m_s2"].field == "linear_acceleration.y"
     assert {c.verdict for c in file.mounted} == {"undecided"}

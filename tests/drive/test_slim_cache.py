@@ -89,7 +89,7 @@ def test_a_damaged_entry_is_made_anew_with_a_note(tmp_path: Path, spoilt: str) -
     flipped[len(whole) // 3] ^= 1
     contents = {"a byte": flipped, "the end": whole[:-9], "all": b"", "another file": DLC.read_bytes()}
     entry.write_bytes(contents[spoilt])
-    assert _use(cache)[1] == ["dlc: its slim log in the cache is damaged and is made anew"]
+    assert _use(cache)[1] == ["dlc: its reduced log in the cache is damaged and is written again"]
     assert entry.read_bytes() == whole
     assert _entries(tmp_path / "cache") == [entry]
 

@@ -138,7 +138,7 @@ def test_two_imus_are_said() -> None:
 
 def test_two_truths_are_said_and_the_one_with_a_pose_is_taken() -> None:
     auto = found({"/ins/a": odometry(pose=False), "/ins/longer_name": odometry()})
-    assert [a.subject for a in auto.ambiguities] == ["truth velocity"]
+    assert [a.subject for a in auto.ambiguities] == ["ground-truth velocity"]
     assert {s.topic for s in auto.mapping.truth.values()} == {"/ins/longer_name"}
 
 
@@ -215,7 +215,7 @@ def test_a_receivers_velocity_is_recognised_as_east_north_up() -> None:
     )
     assert set(auto.mapping.truth) == {"enu_velocity_m_s"}
     assert auto.mapping.truth["enu_velocity_m_s"].paths == ("twist.linear.x", "twist.linear.y", "twist.linear.z")
-    assert [a.subject for a in auto.ambiguities] == ["truth velocity frame"]
+    assert [a.subject for a in auto.ambiguities] == ["ground-truth velocity frame"]
 
 
 def test_a_velocity_frame_that_cannot_be_told_is_not_guessed() -> None:

@@ -1,12 +1,13 @@
 """``SIGNAL.sign``, ``unit``, ``axis``: each signal by relations to others (:mod:`~pdhef_logtool.drive.relations`).
 
-Where they contradict one another, the smallest mistake that explains all of them says which signals fail.
+Where they contradict one another, the smallest mistake that explains all of them states which signals fail.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 from pdhef_logtool.drive.checks.kind import CheckKind
 from pdhef_logtool.drive.measured import WHEEL_SPEEDS, Measured
@@ -22,7 +23,7 @@ from pdhef_logtool.records.checks import Check
 
 _LACKS = {
     "ax_m_s2": "speeding up and braking, on straights",
-    "speed_m_s": "a wheel speed, an accelerometer or truth to hold it against, and speeding up or bends",
+    "speed_m_s": "a wheel speed, an accelerometer or ground truth to compare with, and speeding up or bends",
 }
 _BENDS = "bends to both sides at speed"
 
@@ -30,7 +31,7 @@ _BENDS = "bends to both sides at speed"
 def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int = 2) -> dict[str, tuple[float, str]]:
     """Return by signal the factor that undoes its wrong unit or sign, with the evidence, where only one explains it.
 
-    ``most``: mistakes at once that are believed.
+    ``most``: mistakes at once that are accepted.
     """
     relations = measured.relations
     groups = measured.groups(mounting_is_known=mounting_is_known)
@@ -39,12 +40,12 @@ def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int 
     if chosen is None or len(chosen) > most or not all(m.is_exact for m in chosen):
         return {}
     bad = [r for r in relations if r.tells and not r.accepts()]
-    found = {}
+    factor_by_name = {}
     for mistake in chosen:
         for name, factor in mistake.factors.items():
             evidence = next((r.evidence for r in bad if name in r.powers), "")
-            found[name] = (factor, f"{mistake.words}: {evidence}")
-    return found
+            factor_by_name[name] = (factor, f"{mistake.words}: {evidence}")
+    return factor_by_name
 
 
 def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Check, ...]:
@@ -55,31 +56,41 @@ def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Che
     if "truth.sideslip_rad" in names and "truth.vy_m_s" in names:  # which is v_x times its tangent
         names.remove("truth.vy_m_s")
     explanations = smallest_explanations(relations, known_mistakes(list(columns), groups))
-    blamed, suspected = _mistakes_by_signal(explanations)
-    culprits = set() if explanations else contradicting(relations)
+    likeliest, others = _mistakes_by_signal(explanations)
+    explained = _Explained(likeliest, others, bool(explanations), set() if explanations else contradicting(relations))
     checks: list[Check] = []
     for name in names:
         mine = [r for r in relations if name in r.powers]
-        telling = [r for r in mine if r.tells]
-        bad = [r for r in telling if not r.accepts()]
-        good = [r for r in telling if r.accepts()]
-        stray = [r for r in mine if r.unrelated and not _is_cleared(name, r, relations)]
-        if stray:
-            checks.append(_stray(name, stray[0]))
-        if name in blamed or name in suspected:
-            found = _blamed(name, blamed.get(name) or suspected[name], bad or telling)
-            is_sure = name in blamed and not (bad and all(r.is_vague for r in bad))
-            checks += found if is_sure else [replace(c, verdict="undecided") for c in found]
-        elif name in culprits:
-            checks.append(_unexplained(name, bad))
-        elif good or (bad and explanations):
-            best = max(telling if explanations else good, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
-            checks += [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
-        elif bad:
-            checks.append(_contradicted(name, bad[0], culprits))
-        elif not stray:
-            checks.append(_not_excited(name, mine))
+        unrelated = [r for r in mine if r.unrelated and not _is_cleared(name, r, relations)]
+        judged = _judged(name, [r for r in mine if r.tells], explained)
+        checks += [_unrelated(name, r) for r in unrelated[:1]]
+        checks += judged or ([] if unrelated else [_not_excited(name, mine)])
     return tuple(checks)
+
+
+class _Explained(NamedTuple):
+    """Mistakes by signal of the likeliest explanations and of the others, and signals to blame where there is none."""
+
+    likeliest: Mapping[str, list[Mistake]]
+    others: Mapping[str, list[Mistake]]
+    is_explained: bool
+    culprits: set[str]
+
+
+def _judged(name: str, relations: Sequence[Relation], explained: _Explained) -> list[Check]:
+    """Return sign and unit checks of a signal by the relations that count; empty without any."""
+    bad, good = ([r for r in relations if r.accepts() is accepted] for accepted in (False, True))
+    if name in explained.likeliest or name in explained.others:
+        failed = _failed(name, explained.likeliest.get(name) or explained.others[name], bad or good)
+        is_sure = name in explained.likeliest and not (bad and all(r.is_vague for r in bad))
+        return failed if is_sure else [replace(c, verdict="undecided") for c in failed]
+    if name in explained.culprits:
+        return [_unexplained(name, bad)]
+    if good or (bad and explained.is_explained):
+        usable = relations if explained.is_explained else good
+        best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
+        return [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
+    return [_contradicted(name, bad[0], explained.culprits)] if bad else []
 
 
 def _mistakes_by_signal(
@@ -90,11 +101,11 @@ def _mistakes_by_signal(
     blamed: dict[str, list[Mistake]] = {}
     suspected: dict[str, list[Mistake]] = {}
     for chosen in explanations:
-        found = blamed if _likelihood(chosen) == least else suspected
+        by_signal = blamed if _likelihood(chosen) == least else suspected
         for mistake in chosen:
             for name in mistake.factors:
-                if mistake not in found.setdefault(name, []):
-                    found[name].append(mistake)
+                if mistake not in by_signal.setdefault(name, []):
+                    by_signal[name].append(mistake)
     return blamed, suspected
 
 
@@ -105,7 +116,7 @@ def _likelihood(explanation: tuple[Mistake, ...]) -> tuple[int, int]:
     return len(signals), seldom
 
 
-#: Of signals that explain a contradiction equally well the first is blamed: no standard says how a steering angle
+#: Of signals that explain a contradiction equally well the first is blamed: no standard states how a steering angle
 #: counts, and an axis of an IMU is turned more often than the sign of a gyro that is read from the right one.
 _OFTEN_WRONG = ("steering_wheel_rad", "steer_rad", "wheels", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 
@@ -128,23 +139,23 @@ def _contradicted(name: str, relation: Relation, culprits: set[str]) -> Check:
 _JUDGED_TRUTH = (*(f"truth.{n}" for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2")),)
 
 
-def _is_cleared(name: str, stray: Relation, relations: Sequence[Relation]) -> bool:
+def _is_cleared(name: str, unrelated: Relation, relations: Sequence[Relation]) -> bool:
     """Return whether another relation shows the signal to be right, and none does so for the others of the pair."""
 
     def shown(signal: str) -> bool:
-        return any(r.tells and r.accepts() and signal in r.powers and r.powers != stray.powers for r in relations)
+        return any(r.tells and r.accepts() and signal in r.powers and r.powers != unrelated.powers for r in relations)
 
     paces = {"speed_m_s", WHEEL_SPEEDS, "truth.vx_m_s"}
-    others = [n for n in stray.powers if n != name and n not in paces]
+    others = [n for n in unrelated.powers if n != name and n not in paces]
     return name in paces or (shown(name) and not all(shown(n) for n in others))
 
 
-def _stray(name: str, relation: Relation) -> Check:
+def _unrelated(name: str, relation: Relation) -> Check:
     evidence = f"{relation.text}: one moves and the other does not with it, correlation {relation.correlation:.2f}"
     return AXIS.failed(evidence, name, signal_name=name)
 
 
-def _blamed(name: str, mistakes: Sequence[Mistake], relations: Sequence[Relation]) -> list[Check]:
+def _failed(name: str, mistakes: Sequence[Mistake], relations: Sequence[Relation]) -> list[Check]:
     kinds = {m.kind for m in mistakes}
     wrong = [c for a, c in (("sign", SIGN), ("unit", UNIT)) if any(a in k for k in kinds)]
     words = " or ".join(dict.fromkeys(m.words for m in mistakes))
@@ -159,7 +170,7 @@ def _blamed(name: str, mistakes: Sequence[Mistake], relations: Sequence[Relation
 def _not_excited(name: str, relations: Sequence[Relation]) -> Check:
     lacks = _LACKS.get(name, _BENDS)
     if not relations:
-        evidence = "nothing in the log says what it should be"
+        evidence = "no other signal of the log is related to it"
     else:
         best = max(relations, key=lambda r: abs(r.correlation))
         evidence = f"{best.text}: correlation {best.correlation:.2f} over {best.samples:.0f} independent samples"

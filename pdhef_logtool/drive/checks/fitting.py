@@ -24,11 +24,11 @@ def fit(
     are too few, or where the regressors do not vary apart from one another.
     """
     matrix = np.stack(regressors, axis=1)
-    known = use & np.isfinite(measured) & np.isfinite(matrix).all(axis=1)
-    samples = independent_samples(int(np.count_nonzero(known)))
+    usable = use & np.isfinite(measured) & np.isfinite(matrix).all(axis=1)
+    samples = independent_samples(int(np.count_nonzero(usable)))
     if samples < 4.0 * len(regressors):
         return None
-    a, b = matrix[known], measured[known]
+    a, b = matrix[usable], measured[usable]
     scale = np.linalg.norm(a, axis=0)
     if (scale <= 1e-12).any() or np.linalg.cond(a / scale) > 1e4:
         return None

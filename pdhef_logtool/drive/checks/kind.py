@@ -68,11 +68,11 @@ class CheckedDrive:
 
     Attributes
     ----------
-    measured : columns [N] on one grid, SI, by signal; those of truth begin with ``truth.``.
+    measured : columns [N] on one grid, SI, by signal; those of ground truth begin with ``truth.``.
     vehicle : of the file, or the default one, which is no ``has_file``.
-    latency : of the truth against the gyro, or the gyro's own. late : sensors that are late without truth.
-    has_truth : whether the truth at the CG is known.
-    related : checks of signals by the relations between them. found : the checks so far.
+    latency : of ground truth against the gyro, or the gyro's own. late : sensors that are late without ground truth.
+    has_truth : whether ground truth at the CG is known.
+    related : checks of signals by the relations between them. judged : the checks so far.
     """
 
     measured: Measured
@@ -82,12 +82,12 @@ class CheckedDrive:
     late: tuple[LateSensor, ...]
     has_truth: bool
     related: tuple[Check, ...]
-    found: list[Check] = field(default_factory=list)
+    judged: list[Check] = field(default_factory=list)
     _shared: dict[Callable[[CheckedDrive], object], object] = field(default_factory=dict)
 
     @property
     def speed(self) -> FloatArray | None:
-        """The column that stands for the speed [N]."""
+        """The column used as the speed [N]."""
         name = self.measured.speed_name
         return None if name is None else self.measured.columns[name]
 

@@ -1,4 +1,4 @@
-"""``SIGNAL.delay``: of two sensors that must go together one is late, which needs no truth."""
+"""``SIGNAL.delay``: of two sensors that must go together one is late, which needs no ground truth."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pdhef_logtool.records.checks import Check
 
 
 def _checks(drive: CheckedDrive) -> list[Check]:
-    by_truth = {c.name for c in drive.found}
+    by_truth = {c.name for c in drive.judged}
     return [check for check in delay_checks(drive.late) if check.name not in by_truth]
 
 

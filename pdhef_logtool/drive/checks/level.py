@@ -30,28 +30,28 @@ def _levels(drive: CheckedDrive) -> Iterator[Check]:
             continue
         driven, at_ease = np.zeros_like(columns[name]), np.ones(columns[name].shape[0], np.bool_)
         if speed is not None and yaw is not None:
-            # Where the car slides, speed and yaw rate no longer say what accelerates it.
+            # Where the car slides, speed and yaw rate no longer show what accelerates it.
             at_ease = gentle_at(yaw * speed, at_ease) & gentle_at(columns[name] - median_known(columns[name]), at_ease)
         if speed is not None and name == "ax_m_s2":
             driven = derivative(speed)
         elif speed is not None and yaw is not None:
             driven = yaw * speed
         rest = columns[name] - driven
-        known = np.isfinite(rest)
-        if independent_samples(int(np.count_nonzero(known))) < 6.0:
-            rest, known = columns[name], np.isfinite(columns[name])
-        if independent_samples(int(np.count_nonzero(known))) < 2.0:
+        finite = np.isfinite(rest)
+        if independent_samples(int(np.count_nonzero(finite))) < 6.0:
+            rest, finite = columns[name], np.isfinite(columns[name])
+        if independent_samples(int(np.count_nonzero(finite))) < 2.0:
             continue
-        told = independent_samples(int(np.count_nonzero(known & at_ease))) >= LEVEL_SAMPLES
-        use = known & at_ease if told else known
+        is_gentle_enough = independent_samples(int(np.count_nonzero(finite & at_ease))) >= LEVEL_SAMPLES
+        use = finite & at_ease if is_gentle_enough else finite
         bias = sensors.ax_bias_m_s2 if name == "ax_m_s2" else sensors.ay_bias_m_s2
         check = _level(name, float(np.mean(rest[use])) - bias, float(np.mean(columns[name][use])) - bias)
-        if (driving_is_known and told) or check.name == f"{name}.axis":
+        if (driving_is_known and is_gentle_enough) or check.name == f"{name}.axis":
             yield check
 
 
 def _level(name: str, rest: float, mean: float) -> Check:
-    # A wrong sign or unit of the speed makes the rest wrong, not the mean: both must stand out.
+    # A wrong sign or unit of the speed makes the rest wrong, not the mean: both must exceed the limit.
     size = min(abs(rest), abs(mean))
     evidence = f"mean {mean:.2f} m/s^2, of which driving leaves {rest:.2f}"
     if size > OTHER_AXIS_M_S2:

@@ -21,11 +21,11 @@ def _check(drive: CheckedDrive) -> Iterator[Check]:
         return
     # Roll makes a_y too large, and a car that begins to spin its yaw rate.
     lateral = np.minimum(np.abs(ay), np.abs(rate * speed))
-    known = lateral[np.isfinite(lateral)]
+    finite = lateral[np.isfinite(lateral)]
     friction = max(1.0, vehicle.assumed_friction)
     carried = [vehicle.magic_formula(front, friction)[2] / vehicle.axle_load_n(front) for front in (True, False)]
     most = GRAVITY_M_S2 * min(carried)
-    seen = float(np.quantile(known, 0.99)) if known.size else 0.0
+    seen = float(np.quantile(finite, 0.99)) if finite.size else 0.0
     evidence = f"{seen:.1f} m/s^2 were driven, the file's tyres carry its mass up to {most:.1f} m/s^2"
     yield MASS.judged(seen <= MAX_GRIP_USE * most, evidence)
 

@@ -16,11 +16,7 @@ MODULES = (
     "by_relations",
     "level",
     "truth_sideslip",
-    "ay_place",
-    "ay_gain",
-    "ay_delay",
-    "yaw_rate_gain",
-    "yaw_rate_delay",
+    "sensor_errors",
     "late_sensors",
     "wheel_radius",
     "steering",
@@ -35,10 +31,10 @@ def registered() -> Mapping[str, CheckKind]:
 
 @cache
 def _load(modules: tuple[str, ...]) -> Mapping[str, CheckKind]:
-    found: dict[str, CheckKind] = {}
+    kinds: dict[str, CheckKind] = {}
     for module in modules:
         for kind in import_module(f"pdhef_logtool.drive.checks.{module}").CHECKS:
-            if kind.name in found:
+            if kind.name in kinds:
                 raise ValueError(f"check {kind.name!r} of {module}.py is registered twice")
-            found[kind.name] = kind
-    return MappingProxyType(found)
+            kinds[kind.name] = kind
+    return MappingProxyType(kinds)

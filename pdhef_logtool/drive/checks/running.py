@@ -30,15 +30,15 @@ def check_drive(
     mounting_is_known: bool = False,
     measured: Measured | None = None,
 ) -> tuple[Check, ...]:
-    """Return the checks of mapped signals, of the truth and of the vehicle file; nothing that they decide is a guess.
+    """Return the checks of mapped signals, of ground truth and of the vehicle file.
 
-    What contradicts is looked at again without the samples that a sensor fault has spoilt.
+    If a check fails, they are repeated without the samples that a sensor fault has spoilt.
 
     Parameters
     ----------
-    signals, truth : by name, SI, as mapped. derived : truth at the CG.
-    vehicle : its file is held against the drive; None, or the default car: there is none.
-    latency : of the truth against the gyro, or the gyro's own. late : sensors that are late without truth.
+    signals, truth : by name, SI, as mapped. derived : ground truth at the CG.
+    vehicle : from a file; None or the default car: without a file.
+    latency : of ground truth against the gyro, or the gyro's own. late : sensors that are late without ground truth.
     mounting_is_known : gravity has shown that the IMU is not upside down.
     measured : what :func:`~pdhef_logtool.drive.measured.measure` makes of the channels, where that is known.
     """
@@ -55,12 +55,12 @@ def check_drive(
         )
         return _all_checks(drive)
 
-    found = checks_of(measure(signals, truth, derived) if measured is None else measured)
-    if all(check.verdict != "failed" for check in found):
-        return found
+    checks = checks_of(measure(signals, truth, derived) if measured is None else measured)
+    if all(check.verdict != "failed" for check in checks):
+        return checks
     sound, shares = without_faulty_samples(signals, vehicle or default_vehicle())
     if not shares:
-        return found
+        return checks
     faults = (fault_check(name, share) for name, share in shares.items())
     return (*(c for c in faults if c.verdict == "failed"), *checks_of(measure(sound, truth, derived)))
 
@@ -68,9 +68,9 @@ def check_drive(
 def _all_checks(drive: CheckedDrive) -> tuple[Check, ...]:
     for kind in registered().values():
         if kind.function is not None:
-            drive.found.extend(kind.function(drive))
+            drive.judged.extend(kind.function(drive))
     unique: dict[str, Check] = {}
-    for check in drive.found:  # of two of a name the worse counts
+    for check in drive.judged:  # of two of a name the worse counts
         if check.name not in unique or _BADNESS[check.verdict] > _BADNESS[unique[check.name].verdict]:
             unique[check.name] = check
     return tuple(unique.values())

@@ -1,34 +1,42 @@
-"""What regression on the truth says of an accelerometer's place and delay, and of gains."""
+"""Position, gain and delay of the accelerometer and gain and delay of the gyro, by regression on ground truth."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from pdhef_logtool.drive.checks.fitting import SURE, fit
-from pdhef_logtool.drive.checks.kind import CheckedDrive
+from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind
 from pdhef_logtool.drive.columns import derivative, earlier, moving_at
 from pdhef_logtool.drive.truth import LatencyEstimate
+from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
 
-#: What an accelerometer reads of the lateral acceleration: roll adds a tenth, banked bends take a quarter.
+#: Plausible gain of an accelerometer in lateral acceleration: roll adds 10 %, banked bends take 25 %.
 AY_GAIN_RANGE = (0.65, 1.3)
-#: The delay of a_y is found in so many steps, the last of which is less than this, and is none beyond.
+#: Production gyros have a gain error of 1 %, cheap ones of 3 %.
+GAIN_ERROR = 0.05
+#: A sensor's filter and a bus take 10 to 20 ms; at 0.5 Hz, 30 ms are 5 degrees of phase.
+SENSOR_DELAY_S = 0.03
+#: A sensor is mounted elsewhere than the vehicle file gives if the distance is larger, m. Beyond the second value no
+#: sensor is inside a car: another quantity correlates with the yaw acceleration.
+LEVER_M, MOST_LEVER_M = 0.5, 5.0
+#: Steps to find the delay of a_y, the largest last step, and the largest delay.
 DELAY_STEPS, DELAY_KNOWN_S, MOST_DELAY_S = 4, 0.005, 0.3
 _TRUTH = {"truth.vx_m_s", "truth.vy_m_s", "truth.yaw_rate_rad_s"}
 
 
 @dataclass(frozen=True, slots=True)
 class SensorErrors:
-    """What regression on truth says of an accelerometer's place and of a gyro's gain, with standard errors.
+    """Errors of accelerometer and gyro with their standard errors.
 
     Attributes
     ----------
-    lever_m : of the accelerometer ahead of the CG. yaw_rate_gain : what the gyro reads of 1.
-    ay_gain : what the accelerometer reads of 1, with the roll of the body. ay_delay_s : how late it is.
+    lever_m : position of the accelerometer ahead of the CG. yaw_rate_gain : of the gyro.
+    ay_gain, ay_delay_s : of the accelerometer; the gain includes body roll.
     """
 
     lever_m: float
@@ -42,10 +50,10 @@ class SensorErrors:
 
 
 def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
-    """Regress a_y and the gyro on the truth; NaN for what the drive does not tell.
+    """Regress a_y and the gyro on ground truth; NaN for errors that the drive does not excite.
 
-    a_y is the truth's v̇_y + v_x r, as far as roll makes it larger; a lever adds the derivative of the yaw rate, a delay
-    takes the derivative of all that off, a bias adds a constant.
+    The regressors of a_y are v̇_y + v_x r (gain, with body roll), the yaw acceleration (lever arm), the derivative of
+    v̇_y + v_x r (delay) and a constant (bias).
     """
     nothing = (math.nan, math.inf)
     lever = gain = ay_gain = delay = nothing
@@ -54,38 +62,38 @@ def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
     gyro, ay = columns.get("yaw_rate_rad_s"), columns.get("ay_m_s2")
     if rate is not None and gyro is not None:
         everywhere = np.ones(rate.shape[0], np.bool_)
-        found = fit(gyro, [rate, derivative(rate), np.ones_like(rate)], everywhere)
-        gain = nothing if found is None else (found[0][0], found[1][0])
+        result = fit(gyro, [rate, derivative(rate), np.ones_like(rate)], everywhere)
+        gain = nothing if result is None else (result[0][0], result[1][0])
     if vx is not None and vy is not None and rate is not None and ay is not None:
         lateral = derivative(vy) + vx * rate
         regressors = [derivative(rate), lateral, derivative(lateral), np.ones_like(rate)]
         late_s = 0.0
-        for _ in range(DELAY_STEPS):  # a lever's part is late too, so that one step is not all of it
-            found = fit(earlier(ay, late_s), regressors, moving_at(vx))
-            if found is None or found[0][1] <= 0.0:
+        for _ in range(DELAY_STEPS):  # the part of the lever arm is late too: one step is not enough
+            result = fit(earlier(ay, late_s), regressors, moving_at(vx))
+            if result is None or result[0][1] <= 0.0:
                 break
-            (place, scale, slope, _), (place_error, scale_error, slope_error, _), _ = found
+            (place, scale, slope, _), (place_error, scale_error, slope_error, _), _ = result
             step_s = -slope / scale
             late_s += step_s
-            known = abs(step_s) < DELAY_KNOWN_S and late_s < MOST_DELAY_S
-            delay = (late_s, slope_error / scale) if known else nothing
-            if lever == nothing or (known and late_s > SURE * delay[1]):
+            is_converged = abs(step_s) < DELAY_KNOWN_S and late_s < MOST_DELAY_S
+            delay = (late_s, slope_error / scale) if is_converged else nothing
+            if lever == nothing or (is_converged and late_s > SURE * delay[1]):
                 lever, ay_gain = (place, place_error), (scale, scale_error)
     return SensorErrors(*(float(x) for x in (*lever, *gain, *ay_gain, *delay)))
 
 
 def errors_of_ay(drive: CheckedDrive) -> SensorErrors | None:
-    """Return the errors of the accelerometer; None where the drive does not tell, or a signal is wrong."""
+    """Return the errors of the accelerometer; None if the drive does not excite them or a signal is wrong."""
     errors = drive.once(_errors) if drive.has_truth else None
-    known = errors is not None and math.isfinite(errors.lever_m) and not drive.wrong & {"ay_m_s2", *_TRUTH}
-    return errors if known else None
+    is_usable = errors is not None and math.isfinite(errors.lever_m) and not drive.wrong & {"ay_m_s2", *_TRUTH}
+    return errors if is_usable else None
 
 
 def errors_of_gyro(drive: CheckedDrive) -> SensorErrors | None:
-    """Return the errors of the gyro; None where the drive does not tell, or a signal is wrong."""
+    """Return the errors of the gyro; None if the drive does not excite them or a signal is wrong."""
     errors = drive.once(_errors) if drive.has_truth else None
-    known = errors is not None and math.isfinite(errors.yaw_rate_gain)
-    return errors if known and not drive.wrong & {"yaw_rate_rad_s", *_TRUTH} else None
+    is_usable = errors is not None and math.isfinite(errors.yaw_rate_gain)
+    return errors if is_usable and not drive.wrong & {"yaw_rate_rad_s", *_TRUTH} else None
 
 
 def _errors(drive: CheckedDrive) -> SensorErrors:
@@ -93,9 +101,9 @@ def _errors(drive: CheckedDrive) -> SensorErrors:
 
 
 def ay_delay(errors: SensorErrors, latency: LatencyEstimate | None) -> tuple[float, float] | None:
-    """Return how late the accelerometer is, and its standard error; None where the truth does not tell.
+    """Return the delay of the accelerometer and its standard error; None if ground truth does not show it.
 
-    A truth whose yaw rate is the gyro's own may have velocities of another time, and says nothing of a_y.
+    If the yaw rate of ground truth is the gyro's channel, its velocities may have another delay.
     """
     low, high = AY_GAIN_RANGE
     if latency is None or not latency.reliable or latency.identical:
@@ -103,3 +111,114 @@ def ay_delay(errors: SensorErrors, latency: LatencyEstimate | None) -> tuple[flo
     if not low < errors.ay_gain < high or not math.isfinite(errors.ay_delay_s):
         return None
     return errors.ay_delay_s + latency.latency_s, math.hypot(errors.ay_delay_error_s, latency.std_error_s)
+
+
+def _ay_place(drive: CheckedDrive) -> Iterator[Check]:
+    errors = errors_of_ay(drive)
+    if errors is None:
+        return
+    place = drive.vehicle.imu_position_m[0]
+    off, error = errors.lever_m - place, errors.lever_error_m
+    evidence = (
+        f"the accelerometer is {errors.lever_m:.2f} +- {error:.2f} m ahead of the CG, the vehicle file gives {place:g}"
+    )
+    if abs(off) > max(MOST_LEVER_M, SURE * error):
+        yield AY_PLACE.undecided(evidence)
+    elif abs(off) > LEVER_M and abs(off) > SURE * error:
+        yield AY_PLACE.failed(evidence, lever=errors.lever_m)
+    elif abs(off) + 2.0 * error < 2.0 * LEVER_M:
+        yield AY_PLACE.passed(evidence)
+
+
+AY_PLACE = CheckKind(
+    "ay_m_s2.place",
+    compares="the position of the accelerometer, by a_y against ground truth, with the position in the vehicle file",
+    fails="they are 0.5 m apart",
+    remedy="imu_position_m = [{lever:.2f}, 0.0, 0.0] in the vehicle file, or pdhef learn --stages identify",
+    lacks="no car has its sensor there: lateral velocity or yaw rate of ground truth may be of another point or time",
+    function=_ay_place,
+)
+
+
+def _ay_gain(drive: CheckedDrive) -> Iterator[Check]:
+    errors = errors_of_ay(drive)
+    if errors is None:
+        return
+    gain, error = errors.ay_gain, errors.ay_gain_error
+    low, high = AY_GAIN_RANGE
+    evidence = f"a_y reads {gain:.2f} +- {error:.2f} of the ground-truth lateral acceleration, with roll and bank"
+    if gain + SURE * error < low or gain - SURE * error > high:
+        yield AY_GAIN.failed(evidence, gain=gain)
+    elif low <= gain - 2.0 * error and gain + 2.0 * error <= high:
+        yield AY_GAIN.passed(evidence)
+
+
+AY_GAIN = CheckKind(
+    "ay_m_s2.gain",
+    compares="a_y with the ground-truth lateral acceleration",
+    fails="it reads less than 0.65 or more than 1.3 of it",
+    remedy="divide its scale in the mapping by about {gain:.2f}",
+    function=_ay_gain,
+)
+
+
+def _ay_delay(drive: CheckedDrive) -> Iterator[Check]:
+    errors = errors_of_ay(drive)
+    delay_and_error = None if errors is None else ay_delay(errors, drive.latency)
+    if delay_and_error is None:
+        return
+    delay, error = delay_and_error
+    evidence = f"a_y is {delay * 1e3:.1f} +- {error * 1e3:.1f} ms late against ground truth"
+    if delay > max(SENSOR_DELAY_S, SURE * error):
+        yield AY_DELAY.failed(evidence, delay=delay)
+    elif abs(delay) + 2.0 * error < 2.0 * SENSOR_DELAY_S:
+        yield AY_DELAY.passed(evidence)
+
+
+AY_DELAY = CheckKind(
+    "ay_m_s2.delay",
+    compares="the stamps of a_y with those of ground truth",
+    fails="a_y is 30 ms late",
+    remedy="latency_s = {delay:.4f} more in the mapping",
+    function=_ay_delay,
+)
+
+
+def _gyro_gain(drive: CheckedDrive) -> Iterator[Check]:
+    errors = errors_of_gyro(drive)
+    if errors is None:
+        return
+    gain, error = errors.yaw_rate_gain / drive.vehicle.sensors.yaw_rate_gain, errors.gain_error
+    evidence = f"the gyro reads {gain:.3f} +- {error:.3f} of the ground-truth yaw rate"
+    if abs(gain - 1.0) > GAIN_ERROR and abs(gain - 1.0) > SURE * error:
+        yield GYRO_GAIN.failed(evidence, gain=errors.yaw_rate_gain)
+    elif abs(gain - 1.0) + 2.0 * error < 2.0 * GAIN_ERROR:
+        yield GYRO_GAIN.passed(evidence)
+
+
+GYRO_GAIN = CheckKind(
+    "yaw_rate_rad_s.gain",
+    compares="the gyro with the ground-truth yaw rate",
+    fails="its gain is off by 5 %",
+    remedy="sensors.yaw_rate_gain = {gain:.3f} in the vehicle file, or pdhef learn --stages identify",
+    function=_gyro_gain,
+)
+
+
+def _gyro_delay(drive: CheckedDrive) -> Iterator[Check]:
+    latency = drive.latency
+    if not drive.has_truth or latency is None or not latency.reliable or latency.identical:
+        return
+    delay = latency.gyro_delay_s
+    evidence = f"{delay * 1e3:.1f} +- {latency.std_error_s * 1e3:.1f} ms late against ground truth"
+    yield GYRO_DELAY.judged(delay <= SENSOR_DELAY_S, evidence, delay=delay)
+
+
+GYRO_DELAY = CheckKind(
+    "yaw_rate_rad_s.delay",
+    compares="the stamps of the gyro with those of ground truth",
+    fails="the gyro is 30 ms late",
+    remedy="latency_s = {delay:.4f} more in the mapping, or pdhef learn --stages identify",
+    function=_gyro_delay,
+)
+CHECKS = (AY_PLACE, AY_GAIN, AY_DELAY, GYRO_GAIN, GYRO_DELAY)

@@ -16,7 +16,7 @@ NEUTRAL_RAD_PER_M_S2 = 0.0006
 STEERING_RANGE = (0.75, 1.33)
 #: Share of the steering's spread that curvature and lateral acceleration may leave.
 UNEXPLAINED_STEERING = 0.5
-#: Highest over lowest speed from which wheelbase and understeer can be told apart.
+#: Highest over lowest speed from which wheelbase and understeer can be distinguished.
 SPEED_SPREAD = 1.4
 
 
@@ -32,13 +32,13 @@ def _checks(drive: CheckedDrive) -> list[Check]:
         curved = vehicle.wheelbase_m * rate / speed
     lateral = rate * speed
     gentle = gentle_at(lateral, moving_at(speed))
-    found = fit(steer, [curved, lateral, np.ones_like(steer)], gentle)
+    result = fit(steer, [curved, lateral, np.ones_like(steer)], gentle)
     speeds = np.abs(speed[gentle & np.isfinite(speed)])
     # At one speed curvature and lateral acceleration are one regressor.
-    if found is None or np.quantile(speeds, 0.9) < SPEED_SPREAD * np.quantile(speeds, 0.1):
+    if result is None or np.quantile(speeds, 0.9) < SPEED_SPREAD * np.quantile(speeds, 0.1):
         lacks = "needs bends to both sides at low and at high speed"
         return [kind.undecided("too little driving in bends", lacks=lacks) for kind in CHECKS]
-    (share, gradient, _), (share_error, error, _), left = found
+    (share, gradient, _), (share_error, error, _), left = result
     if share <= 0.0 or left > UNEXPLAINED_STEERING * float(np.std(steer[gentle & np.isfinite(steer)])):
         lacks = "needs bends that the car does not slide through"
         evidence = "curvature and lateral acceleration do not explain the steering"

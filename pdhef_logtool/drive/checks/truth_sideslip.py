@@ -1,4 +1,4 @@
-"""``truth.sideslip_rad``: whether the truth's heading and velocity belong together; sideslip is 0 on straights."""
+"""``truth.sideslip_rad``: whether the ground-truth heading and velocity belong together; sideslip is 0 on straights."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pdhef_logtool.drive.relations import gentle_at
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
 
-#: Truth stands wrong by more than what tyres and crossfall make of straight driving, and is known to a third of it.
+#: A larger sideslip on straights is an error of ground truth, not of tyres and crossfall.
 SIDESLIP_OFFSET_RAD = math.radians(0.15)
 #: No car drives sideways: half of its moving time beyond that, the heading and the velocity do not belong together.
 SIDEWAYS_RAD = math.radians(20.0)
@@ -27,10 +27,10 @@ def _checks(drive: CheckedDrive) -> list[Check]:
     vx, vy = columns["truth.vx_m_s"], columns["truth.vy_m_s"]
     sideslip = np.arctan2(vy, vx)
     moving = moving_at(np.hypot(vx, vy))
-    known = moving & np.isfinite(sideslip)
-    if not known.any():
+    finite = moving & np.isfinite(sideslip)
+    if not finite.any():
         return []
-    typical = float(np.median(np.abs(sideslip[known])))
+    typical = float(np.median(np.abs(sideslip[finite])))
     evidence = f"its median size is {math.degrees(typical):.1f} deg where the car moves"
     frame = FRAME.judged(typical <= SIDEWAYS_RAD, evidence)
     offset = _offset_check(columns) if frame.verdict == "passed" else None
@@ -38,7 +38,7 @@ def _checks(drive: CheckedDrive) -> list[Check]:
 
 
 def sideslip_offset(columns: Mapping[str, FloatArray]) -> tuple[float, float] | None:
-    """Return the truth's sideslip at no curvature and no lateral force, with its standard error; None: too little."""
+    """Return the ground-truth sideslip on straights with its standard error; None if too little is known."""
     rate, ay = (columns.get(n) for n in ("yaw_rate_rad_s", "ay_m_s2"))
     vx, vy = (columns.get(f"truth.{n}") for n in ("vx_m_s", "vy_m_s"))
     if rate is None or ay is None or vx is None or vy is None:
@@ -46,23 +46,23 @@ def sideslip_offset(columns: Mapping[str, FloatArray]) -> tuple[float, float] | 
     moving = moving_at(np.hypot(vx, vy))
     with np.errstate(divide="ignore", invalid="ignore"):
         regressors = [np.ones_like(vx), rate / vx, ay]
-    found = fit(np.arctan2(vy, vx), regressors, gentle_at(rate * vx, moving))
-    return None if found is None else (float(found[0][0]), float(found[1][0]))
+    result = fit(np.arctan2(vy, vx), regressors, gentle_at(rate * vx, moving))
+    return None if result is None else (float(result[0][0]), float(result[1][0]))
 
 
 def is_turned(offset_rad: float, error_rad: float) -> bool:
-    """Return whether an offset of the truth's sideslip is one, and not tyres, crossfall or chance."""
+    """Return whether an offset of the ground-truth sideslip is larger than tyres, crossfall and chance explain."""
     return abs(offset_rad) > max(SIDESLIP_OFFSET_RAD, SURE * error_rad)
 
 
 def _offset_check(columns: Mapping[str, FloatArray]) -> Check | None:
-    """Return the check of the truth's sideslip on straights; None without IMU."""
+    """Return the check of the ground-truth sideslip on straights; None without IMU."""
     if "yaw_rate_rad_s" not in columns or "ay_m_s2" not in columns:
         return None
-    found = sideslip_offset(columns)
-    if found is None:
+    result = sideslip_offset(columns)
+    if result is None:
         return OFFSET.undecided("too little gentle driving")
-    offset, error = found
+    offset, error = result
     evidence = f"{math.degrees(offset):.2f} +- {math.degrees(error):.2f} deg are left where the car goes straight"
     if is_turned(offset, error):
         return OFFSET.failed(evidence)
@@ -73,16 +73,16 @@ def _offset_check(columns: Mapping[str, FloatArray]) -> Check | None:
 
 FRAME = CheckKind(
     "truth.sideslip_rad.frame",
-    compares="the truth's heading with its velocity",
+    compares="the heading of ground truth with its velocity",
     fails="its sideslip is above 20 degrees for half of the moving time",
-    remedy="heading and velocity do not belong together: look at frames, signs and units of the truth",
+    remedy="heading and velocity do not belong together: look at frames, signs and units of ground truth",
     function=_checks,
 )
 OFFSET = CheckKind(
     "truth.sideslip_rad.offset",
-    compares="the truth's sideslip on straights with 0",
+    compares="ground-truth sideslip on straights with 0",
     fails="it is off by 0.15 degrees",
-    remedy="the truth's heading is turned: a tyre, a crossfall or a bias of a_y makes less of that",
+    remedy="the heading of ground truth is turned: a tyre, a crossfall or a bias of a_y makes less of that",
     lacks="needs straights and bends",
 )
 CHECKS = (FRAME, OFFSET)

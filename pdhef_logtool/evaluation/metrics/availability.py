@@ -25,20 +25,20 @@ class _Availability:
 
 
 def _count_scorable(reference: Reference) -> dict[str, dict[str, int]]:
-    """Return by signal how many stamps of each segment the truth can score."""
-    found: dict[str, dict[str, int]] = {signal: dict.fromkeys(reference.masks, 0) for signal in SCORED_SIGNALS}
+    """Return by signal how many stamps of each segment ground truth can score."""
+    by_signal: dict[str, dict[str, int]] = {signal: dict.fromkeys(reference.masks, 0) for signal in SCORED_SIGNALS}
     for a, b in row_blocks(len(reference.truth)):
         for segment, mask in reference.masks.rows(a, b).items():
-            for signal, counts in found.items():
+            for signal, counts in by_signal.items():
                 counts[segment] += int(np.count_nonzero(mask & reference.scorable.rows(a, b)[signal]))
-    return found
+    return by_signal
 
 
 METRICS = (
     Metric(
         "availability",
         "available",
-        "share of the stamps with scorable truth at which the estimate is valid and finite; n = all of them",
+        "share of the stamps with scorable ground truth at which the estimate is valid and finite; n = all of them",
         OfSignal(_Availability),
         best="higher",
         unit="1",

@@ -1,4 +1,4 @@
-"""``coverage95``: whether intervals contain the truth as often as they claim."""
+"""``coverage95``: whether intervals contain ground truth as often as they claim."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ class _Coverage:
     def add(self, block: SignalBlock) -> None:
         if block.std is None:
             return
-        known = block.scored & np.isfinite(block.std)
-        covered = known & (np.abs(block.error) <= NORMAL_95 * block.std)
+        has_interval = block.scored & np.isfinite(block.std)
+        covered = has_interval & (np.abs(block.error) <= NORMAL_95 * block.std)
         for segment, mask in block.inside.items():
-            self._counts[segment] += np.count_nonzero(mask & known), np.count_nonzero(mask & covered)
+            self._counts[segment] += np.count_nonzero(mask & has_interval), np.count_nonzero(mask & covered)
 
     def of(self, segment: str) -> dict[str, Figure]:
-        known, covered = self._counts[segment].tolist()
-        return {"coverage95": (covered / known, known)} if known else {}
+        has_interval, covered = self._counts[segment].tolist()
+        return {"coverage95": (covered / has_interval, has_interval)} if has_interval else {}
 
 
 METRICS = (
     Metric(
         "coverage95",
         "in 95 % band",
-        "share of stamps with abs e ≤ 1.96 σ; σ² is the estimate's variance plus the truth's if known",
+        "share of stamps with abs e ≤ 1.96 σ; σ² is the estimate's variance plus that of ground truth if known",
         OfSignal(_Coverage),
         best=0.95,
         unit="1",

@@ -1,4 +1,4 @@
-"""``disagreement_rms``: how far two estimates are apart, where no truth says which of them is right."""
+"""``disagreement_rms``: how far two estimates are apart, where no ground truth states which of them is right."""
 
 from __future__ import annotations
 

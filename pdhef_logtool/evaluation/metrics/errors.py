@@ -40,19 +40,19 @@ class _Errors:
 
 
 class _TruthSquares:
-    """Sums of the truth's squares by segment of each block; most estimates are known at the same stamps."""
+    """Sums of the ground-truth squares by segment of each block; most estimates are known at the same stamps."""
 
     def __init__(self, _reference: Reference) -> None:
         self._found: dict[tuple[str, int], tuple[BoolArray, dict[str, float]]] = {}
 
     def of(self, block: SignalBlock) -> dict[str, float]:
         key = block.signal, block.start
-        found = self._found.get(key)
-        if found is None or not np.array_equal(found[0], block.scored):
+        cached = self._found.get(key)
+        if cached is None or not np.array_equal(cached[0], block.scored):
             values = getattr(block.truth, block.signal)
             sums = {s: float(np.sum(selected(values, mask & block.scored) ** 2)) for s, mask in block.inside.items()}
-            self._found[key] = found = block.scored, sums
-        return found[1]
+            self._found[key] = cached = block.scored, sums
+        return cached[1]
 
 
 def summarise_errors(error: FloatArray) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""What a filter reports of itself: normalized innovations and divergence; needs no truth."""
+"""What a filter reports of itself: normalized innovations and divergence; needs no ground truth."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def _rows(estimate: StateTrack, _truth: StateTrack | None, masks: SegmentMasks, 
 
 
 def state_rows(track: StateTrack, masks: Mapping[str, BoolArray], *, log: str) -> list[MetricRow]:
-    """Return ``nis``, ``nis_dof`` and ``diverged`` of a track, which need no truth; no NIS rows for a track without."""
+    """Return ``nis``, ``nis_dof`` and ``diverged`` of a track; no NIS rows without innovations."""
     masks = packed(masks, len(track))
     innovation, diverged = SegmentSums(), SegmentSums()
     for a, b in row_blocks(len(track)):
@@ -25,7 +25,7 @@ def state_rows(track: StateTrack, masks: Mapping[str, BoolArray], *, log: str) -
         dof = part.nis_dof
         innovation.add(inside, np.where(dof > 0, part.nis, np.nan), dof)
         diverged.add(inside, part.diverged)
-    found = [
+    figures = [
         (segment, metric, float(total[i]) / n, n)
         for sums, metrics in ((innovation, ("nis", "nis_dof")), (diverged, ("diverged",)))
         for segment, (n, total) in sums.totals().items()
@@ -34,7 +34,7 @@ def state_rows(track: StateTrack, masks: Mapping[str, BoolArray], *, log: str) -
     place = list(masks).index
     return [
         MetricRow(log, track.name, "state", *figure[:3], "1", figure[3])
-        for figure in sorted(found, key=lambda f: place(f[0]))
+        for figure in sorted(figures, key=lambda f: place(f[0]))
     ]
 
 

@@ -40,32 +40,32 @@ class _Lag:
 
 
 class _Lags:
-    """Lags behind the truth [N] of its first hour; estimates that are known at the same stamps share the grid."""
+    """Lags behind ground truth [N] in its first hour; estimates that are scored at the same stamps share the grid."""
 
     def __init__(self, reference: Reference) -> None:
         self._truth = reference.truth
         self._end = _end_of_first_hour(reference.truth)
         self._grids: list[tuple[BoolArray, EvenGrid, dict[str, FloatArray]]] = []
 
-    def of(self, estimate: StateTrack, signal: str, known: BoolArray) -> float:
-        """Return the lag of a signal that is scored where it is ``known`` [N]; NaN when there is no clear peak."""
-        known = known[: self._end]
-        if np.count_nonzero(known) < 2:
+    def of(self, estimate: StateTrack, signal: str, scored: BoolArray) -> float:
+        """Return the lag of a signal that is ``scored`` at [N]; NaN when there is no clear peak."""
+        scored = scored[: self._end]
+        if np.count_nonzero(scored) < 2:
             return float("nan")
-        grid, of_truth = self._grid(known)
+        grid, of_truth = self._grid(scored)
         if signal not in of_truth:
-            of_truth[signal] = grid.of_a(selected(getattr(self._truth.rows(0, self._end), signal), known))
-        of_estimate = grid.of_b(selected(getattr(estimate.rows(0, self._end), signal), known))
+            of_truth[signal] = grid.of_a(selected(getattr(self._truth.rows(0, self._end), signal), scored))
+        of_estimate = grid.of_b(selected(getattr(estimate.rows(0, self._end), signal), scored))
         return _clear_lag_s(CommonGrid(grid.step_s, of_truth[signal], of_estimate))
 
-    def _grid(self, known: BoolArray) -> tuple[EvenGrid, dict[str, FloatArray]]:
-        found = next((g for g in self._grids if np.array_equal(g[0], known)), None)
-        if found is None:
-            stamps = selected(self._truth.rows(0, self._end).stamps_ns, known)
-            found = known, EvenGrid(stamps, stamps), {}
-        latest = [g for g in self._grids if g is not found][1 - GRIDS_HELD :]
-        self._grids = [*latest, found]
-        return found[1:]
+    def _grid(self, scored: BoolArray) -> tuple[EvenGrid, dict[str, FloatArray]]:
+        cached = next((g for g in self._grids if np.array_equal(g[0], scored)), None)
+        if cached is None:
+            stamps = selected(self._truth.rows(0, self._end).stamps_ns, scored)
+            cached = scored, EvenGrid(stamps, stamps), {}
+        latest = [g for g in self._grids if g is not cached][1 - GRIDS_HELD :]
+        self._grids = [*latest, cached]
+        return cached[1:]
 
 
 def _end_of_first_hour(truth: StateTrack) -> int:
@@ -80,12 +80,12 @@ def _end_of_first_hour(truth: StateTrack) -> int:
 
 
 def lag_s(stamps_ns: IntArray, estimate: FloatArray, truth: FloatArray) -> float:
-    """Return by how many seconds the estimate [N] follows the truth [N]; NaN when there is no clear peak."""
-    known = np.isfinite(estimate) & np.isfinite(truth)
-    if np.count_nonzero(known) < 2:
+    """Return by how many seconds the estimate [N] follows the ground truth [N]; NaN when there is no clear peak."""
+    finite = np.isfinite(estimate) & np.isfinite(truth)
+    if np.count_nonzero(finite) < 2:
         return float("nan")
-    stamps = stamps_ns[known]
-    return _clear_lag_s(on_common_grid(stamps, truth[known], stamps, estimate[known]))
+    stamps = stamps_ns[finite]
+    return _clear_lag_s(on_common_grid(stamps, truth[finite], stamps, estimate[finite]))
 
 
 def _clear_lag_s(grid: CommonGrid) -> float:
@@ -98,7 +98,7 @@ METRICS = (
     Metric(
         "lag_s",
         "lag",
-        "shift, within ± 0.3 s, at which the estimate correlates best with the truth; positive = estimate late. "
+        "shift, within ± 0.3 s, at which the estimate correlates best with ground truth; positive = estimate late. "
         "Segment `all` only, its first hour; NaN when the correlation stays below 0.5 or has no peak",
         OfSignal(_Lag),
         best=0.0,

@@ -26,8 +26,8 @@ class MetricRow:
 
     ``algorithm`` is the digest of what ran under the estimator's name; empty where nobody knows (recorded estimates).
 
-    ``independent`` is False when the truth of this signal is one of the estimators' inputs; tables and rankings leave
-    such rows out. In the file a row with metric ``not_independent`` says so for its estimator and signal.
+    ``independent`` is False when ground truth of this signal is one of the estimators' inputs; tables and rankings
+    leave such rows out. In the file a row with metric ``not_independent`` shows it for its estimator and signal.
     """
 
     log: str
@@ -88,13 +88,13 @@ class Metric:
 
 @dataclass(frozen=True, slots=True)
 class SignalBlock:
-    """A block of M stamps of one signal of an estimate and of its truth.
+    """A block of M stamps of one signal of an estimate and of its ground truth.
 
     Attributes
     ----------
-    start : its first row. error : estimate − truth [M], angles wrapped, also where it is not scored.
-    scorable, scored : where the truth can score the signal, and where the estimate is valid and finite besides [M].
-    std : 1-sigma of the error [M], with that of the truth where it is known; None where the estimate never has one.
+    start : its first row. error : estimate − ground truth [M], angles wrapped, also where it is not scored.
+    scorable, scored : where ground truth can score the signal, and where the estimate is valid and finite besides [M].
+    std : 1-sigma of the error [M], with that of ground truth where it is known; None where the estimate never has one.
     inside : mask [M] by segment.
     """
 
@@ -120,9 +120,9 @@ class SignalFigures(Protocol):
 
 
 class Reference:
-    """What the estimates of a drive are scored against: the truth [N], masks by segment, and what all of them share.
+    """Ground truth [N] and masks by segment of a drive, and intermediate results that its estimates share.
 
-    ``scorable``: where the truth can score each signal.
+    ``scorable``: where ground truth can score each signal.
     """
 
     def __init__(self, truth: StateTrack, masks: Mapping[str, BoolArray], *, log: str, low_speed_m_s: float) -> None:
@@ -190,7 +190,7 @@ class OfSignal:
 
 @dataclass(frozen=True, slots=True)
 class OfTrack:
-    """Function of a metric of one track [N] as a whole: called with its truth [N] or None, masks and the log's name."""
+    """Function of a metric of a whole track [N]: called with ground truth or None, masks and the name of the log."""
 
     rows: Callable[[StateTrack, StateTrack | None, SegmentMasks, str], Iterable[MetricRow]]
 

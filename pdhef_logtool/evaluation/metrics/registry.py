@@ -18,7 +18,7 @@ MODULES = (
     "nees",
     "innovations",
     "whiteness",
-    "d2",
+    "lateral_consistency",
     "disagreement",
     "sensor_residuals",
     "independence",
@@ -32,10 +32,10 @@ def registered() -> Mapping[str, Metric]:
 
 @cache
 def _load(modules: tuple[str, ...]) -> Mapping[str, Metric]:
-    found: dict[str, Metric] = {}
+    metrics: dict[str, Metric] = {}
     for module in modules:
         for metric in import_module(f"pdhef_logtool.evaluation.metrics.{module}").METRICS:
-            if metric.name in found:
+            if metric.name in metrics:
                 raise ValueError(f"metric {metric.name!r} of {module}.py is registered twice")
-            found[metric.name] = metric
-    return MappingProxyType(found)
+            metrics[metric.name] = metric
+    return MappingProxyType(metrics)

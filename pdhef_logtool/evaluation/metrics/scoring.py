@@ -1,7 +1,7 @@
 """Computes the figures of every registered metric, in one pass over the blocks of a drive for those of signals.
 
-e = estimate − truth (angles wrapped), over the stamps of a segment at which the estimate and the truth are valid and
-finite; ``n`` is their number. Sideslip counts only where the truth's speed exceeds the low-speed blend.
+e = estimate − ground truth (angles wrapped), over the stamps of a segment at which the estimate and ground truth are
+valid and finite; ``n`` is their number. Sideslip counts only where the ground-truth speed exceeds the low-speed blend.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ def score_track(
     low_speed_m_s: float,
     not_independent: Mapping[str, str] | None = None,
 ) -> list[MetricRow]:
-    """Score one estimate against the truth at the same stamps.
+    """Score one estimate against ground truth at the same stamps.
 
     Parameters
     ----------
     estimate, truth : [N] at the same stamps (:func:`pdhef_logtool.drive.truth.truth_at`).
     masks : bool [N] by segment; ``all`` is added when it is absent.
-    low_speed_m_s : sideslip is scored above this truth speed.
+    low_speed_m_s : sideslip is scored above this ground truth speed.
     not_independent : by signal, from :func:`pdhef_logtool.drive.truth.dependent_signals`; other keys are ignored.
 
     Raises
@@ -67,11 +67,11 @@ def track_rows(track: StateTrack, truth: StateTrack | None, masks: SegmentMasks,
 def drive_rows(drive: EvaluatedDrive) -> dict[str, list[MetricRow]]:
     """Return the figures that take the sensors or several tracks, by estimator."""
     functions = dict.fromkeys(m.function for m in registered().values() if isinstance(m.function, OfDrive))
-    found: dict[str, list[MetricRow]] = {}
+    by_estimator: dict[str, list[MetricRow]] = {}
     for function in functions:
         for row in function.rows(drive):
-            found.setdefault(row.estimator, []).append(row)
-    return found
+            by_estimator.setdefault(row.estimator, []).append(row)
+    return by_estimator
 
 
 class Scorer:
@@ -103,20 +103,22 @@ class Scorer:
         by_signal = {s: [f.start(reference, estimate, s) for f in functions] for s in SCORED_SIGNALS}
         positions = _Positions(len(reference.truth)) if self._has_pose else None
         for a, b in row_blocks(len(reference.truth)):
-            own, truth = HeldRows(estimate.rows(a, b)), HeldRows(reference.truth.rows(a, b))
+            estimated, truth = HeldRows(estimate.rows(a, b)), HeldRows(reference.truth.rows(a, b))
             inside = dict(reference.masks.rows(a, b))
             for signal, figures in by_signal.items():
-                block = self._block(own, truth, inside, signal, a)
-                for one in figures:
-                    one.add(block)
+                block = self._block(estimated, truth, inside, signal, a)
+                for part in figures:
+                    part.add(block)
             if positions is not None:
-                positions.add(own, truth)
+                positions.add(estimated, truth)
         rows = [row for signal, figures in by_signal.items() for row in self._rows(estimate.name, signal, figures)]
         for signal, sums in {} if positions is None else positions.sums().items():
-            found = {metric: (value, sums.n) for metric, value in sums.figures().items()}
+            figures_by_metric = {metric: (value, sums.n) for metric, value in sums.figures().items()}
             if signal == "position_m":
-                del found["bias"]  # a distance has no sign
-            rows += [self._row(estimate.name, signal, ALL, metric, figure) for metric, figure in found.items()]
+                del figures_by_metric["bias"]  # a distance has no sign
+            rows += [
+                self._row(estimate.name, signal, ALL, metric, figure) for metric, figure in figures_by_metric.items()
+            ]
         rows += track_rows(estimate, reference.truth, reference.masks, log=reference.log)
         return marked(rows, self._dependent)
 
@@ -131,12 +133,12 @@ class Scorer:
 
     def _rows(self, estimate: str, signal: str, figures: list[SignalFigures]) -> Iterator[MetricRow]:
         for segment in self._reference.masks:
-            found: dict[str, Figure] = {}
-            for one in figures:
-                found |= one.of(segment)
+            figures_by_metric: dict[str, Figure] = {}
+            for part in figures:
+                figures_by_metric |= part.of(segment)
             for metric in self._metrics:
-                if metric in found:
-                    yield self._row(estimate, signal, segment, metric, found[metric])
+                if metric in figures_by_metric:
+                    yield self._row(estimate, signal, segment, metric, figures_by_metric[metric])
 
     def _row(self, estimate: str, signal: str, segment: str, metric: str, figure: Figure) -> MetricRow:
         unit = self._metrics[metric].unit_of(signal)
@@ -166,4 +168,4 @@ class _Positions:
 def _check_stamps(estimate: StateTrack, truth: StateTrack) -> None:
     blocks = ((estimate.rows(a, b), truth.rows(a, b)) for a, b in row_blocks(len(truth)))
     if len(estimate) != len(truth) or not all(np.array_equal(e.stamps_ns, t.stamps_ns) for e, t in blocks):
-        raise ValueError(f"estimate {estimate.name} and truth must be at the same stamps")
+        raise ValueError(f"estimate {estimate.name} and ground truth must be at the same stamps")

@@ -48,26 +48,26 @@ def sensor_rows(signals: Signals, masks: Mapping[str, BoolArray], *, log: str, l
 
 def carried_speed(signals: Signals) -> FloatArray:
     """Return the speed [N] between its measurements, linear, not across gaps."""
-    known = np.isfinite(signals.speed_m_s)
-    bracket = Bracket(signals.stamps_ns[known], signals.stamps_ns, round(MAX_STEP_S * 1e9))
-    return bracket.linear(signals.speed_m_s[known])
+    finite = np.isfinite(signals.speed_m_s)
+    bracket = Bracket(signals.stamps_ns[finite], signals.stamps_ns, round(MAX_STEP_S * 1e9))
+    return bracket.linear(signals.speed_m_s[finite])
 
 
 def _speed_change_residual(signals: Signals) -> FloatArray:
     """Return v(t) − v(t − 1 s) − ∫ a_x dt at stamps with a speed measurement, [N]; NaN elsewhere."""
     t = signals.stamps_ns
     residual = np.full(len(signals), np.nan)
-    at = np.flatnonzero(np.isfinite(signals.speed_m_s))
-    if at.size < 2:
+    measured = np.flatnonzero(np.isfinite(signals.speed_m_s))
+    if measured.size < 2:
         return residual
     step_s = np.diff(t) * 1e-9
     broken = ~np.isfinite(signals.ax_m_s2[1:] + signals.ax_m_s2[:-1]) | (step_s > MAX_STEP_S)
     mean_ax = np.where(broken, 0.0, 0.5 * (signals.ax_m_s2[1:] + signals.ax_m_s2[:-1]))
     gained = np.concatenate([[0.0], np.cumsum(mean_ax * step_s)])
     breaks = np.concatenate([[0], np.cumsum(broken)])
-    earlier = np.searchsorted(t[at], t[at] - round(SPEED_SPAN_S * 1e9), side="right") - 1
+    earlier = np.searchsorted(t[measured], t[measured] - round(SPEED_SPAN_S * 1e9), side="right") - 1
     whole = earlier >= 0
-    i, j = at[np.maximum(earlier, 0)], at
+    i, j = measured[np.maximum(earlier, 0)], measured
     whole &= (breaks[i] == breaks[j]) & (t[j] - t[i] <= round((SPEED_SPAN_S + MAX_STEP_S) * 1e9))
     i, j = i[whole], j[whole]
     residual[j] = signals.speed_m_s[j] - signals.speed_m_s[i] - (gained[j] - gained[i])

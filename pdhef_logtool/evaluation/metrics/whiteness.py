@@ -44,9 +44,9 @@ def _pairs(track: StateTrack, masks: SegmentMasks) -> Iterator[tuple[dict[str, B
         start = max(a - 1, 0)
         part = track.rows(start, b)
         nis, dof = part.nis, part.nis_dof
-        known = np.isfinite(nis) & (dof > 0)
-        ratio = np.where(known, nis / np.where(known, dof, 1.0), np.nan)
-        both = known[1:] & known[:-1]
+        has_nis = np.isfinite(nis) & (dof > 0)
+        ratio = np.where(has_nis, nis / np.where(has_nis, dof, 1.0), np.nan)
+        both = has_nis[1:] & has_nis[:-1]
         inside = {segment: mask[1:] & mask[:-1] for segment, mask in masks.rows(start, b).items()}
         yield inside, np.where(both, ratio[:-1], np.nan), np.where(both, ratio[1:], np.nan)
 

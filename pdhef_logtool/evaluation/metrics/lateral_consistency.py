@@ -1,4 +1,4 @@
-"""``d2``: how far an estimated v_y strays from accelerometer and gyro over two seconds; it needs no truth."""
+"""``d2``, lateral kinematic consistency: change of the estimated v_y over 2 s minus the integral of a_y − v_x r."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from pdhef_logtool.evaluation.metrics.sensor_residuals import MAX_STEP_S, carrie
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
-D2_SPAN_S = 2.0
+SPAN_S = 2.0
 
 
 def _rows(drive: EvaluatedDrive) -> list[MetricRow]:
-    return d2_rows(
+    return consistency_rows(
         [*drive.tracks.values()],
         drive.signals,
         drive.masks,
@@ -26,7 +26,7 @@ def _rows(drive: EvaluatedDrive) -> list[MetricRow]:
     )
 
 
-def d2_rows(
+def consistency_rows(
     tracks: Sequence[StateTrack],
     signals: Signals,
     masks: Mapping[str, BoolArray],
@@ -35,18 +35,18 @@ def d2_rows(
     low_speed_m_s: float,
     sensors: SensorErrors,
 ) -> list[MetricRow]:
-    """Return ``d2`` of estimators at the same stamps as the signals [N], a row a segment; none where v_y is not."""
+    """Return ``d2`` of estimators at the same stamps as the signals [N], one row per segment with a finite residual."""
     masks = packed(masks, len(signals))
-    found = [SegmentSums() for _ in tracks]
-    for first, a, b, end in blocks_with_halo(signals, D2_SPAN_S + MAX_STEP_S, 1):
+    sums_by_track = [SegmentSums() for _ in tracks]
+    for first, a, b, end in blocks_with_halo(signals, SPAN_S + MAX_STEP_S, 1):
         core, inside = slice(a - first, b - first), dict(masks.rows(a, b))
         driven = _Driven(signals.rows(first, end), low_speed_m_s, sensors)
-        for track, sums in zip(tracks, found, strict=True):
+        for track, sums in zip(tracks, sums_by_track, strict=True):
             residual = driven.residual(track.rows(first, end))[core]
             sums.add(inside, residual, residual**2)
     return [
         MetricRow(log, track.name, "vy_m_s", segment, "d2", float(np.sqrt(squares / n)), "m/s", n)
-        for track, sums in zip(tracks, found, strict=True)
+        for track, sums in zip(tracks, sums_by_track, strict=True)
         for segment, (n, (_, squares)) in sums.totals().items()
     ]
 
@@ -54,37 +54,40 @@ def d2_rows(
 def driving_products(
     track: StateTrack, signals: Signals, *, low_speed_m_s: float, sensors: SensorErrors
 ) -> tuple[FloatArray, float]:
-    """Return what :func:`driven_d2` needs of a window, to be added up: integrals over time [4, 4], and how long, s.
+    """Return the inputs of :func:`driven_consistency` from a window; windows are added up.
 
-    They are of the products of the changes over 2 s of v_y, v_x r and a_y, and of the residual that d2 squares.
+    Returns
+    -------
+    integrals over time [4, 4] of the products of four columns: the changes over 2 s of v_y, v_x r and a_y, and the
+    residual; and the duration in s.
     """
     driven = _Driven(signals, low_speed_m_s, sensors)
     vy = driven.carried_vy(track)
     rows = np.stack([*map(driven.change, (vy, driven.turn, signals.ay_m_s2)), driven.residual(track)])
     step_s = np.minimum(np.diff(signals.stamps_ns, prepend=signals.stamps_ns[:1]) * 1e-9, MAX_STEP_S)
-    known = np.isfinite(rows).all(axis=0)
-    rows, step_s = rows[:, known], step_s[known]
+    finite = np.isfinite(rows).all(axis=0)
+    rows, step_s = rows[:, finite], step_s[finite]
     return np.stack([(rows * row * step_s).sum(axis=1) for row in rows]), float(step_s.sum())
 
 
-def driven_d2(products: FloatArray, seconds: float) -> float:
-    """Return that part of d2 in m/s which goes with v_y, v_x r and a_y: what the model is wrong by as the car turns.
+def driven_consistency(products: FloatArray, seconds: float) -> float:
+    """Return the part of the residual in m/s that correlates with v_y, v_x r and a_y: the error of the model in turns.
 
-    The rest is the road's: a bank moves a_y and says nothing of the estimate. What the rest would
-    explain by chance, with 2 s as one sample, is believed the less. NaN for less than five of them.
+    The remaining part comes from the road: a bank changes a_y and is no error of the estimate. The share that the
+    remaining part would explain by chance, with 2 s as one sample, is taken off. NaN below five samples.
     """
-    if seconds < 5.0 * D2_SPAN_S:
+    if seconds < 5.0 * SPAN_S:
         return float("nan")
     of_residual = products[:-1, -1]
     fit = float(of_residual @ np.linalg.pinv(products[:-1, :-1], hermitian=True) @ of_residual)
     explained = min(max(fit, 0.0), float(products[-1, -1]))
-    chance = len(of_residual) * D2_SPAN_S / seconds * (float(products[-1, -1]) - explained)
-    believed = explained**2 / (explained + chance) if explained > 0.0 else 0.0
-    return float(np.sqrt(believed / seconds))
+    chance = len(of_residual) * SPAN_S / seconds * (float(products[-1, -1]) - explained)
+    significant = explained**2 / (explained + chance) if explained > 0.0 else 0.0
+    return float(np.sqrt(significant / seconds))
 
 
 class _Driven:
-    """What d2 needs of the signals [N] of a part of a drive, whichever estimate is held against them.
+    """Terms of the residual that depend on the signals [N] of a part of a drive, not on the estimate.
 
     Attributes
     ----------
@@ -103,21 +106,21 @@ class _Driven:
         broken = ~np.isfinite(rising[1:] + rising[:-1]) | (steps > MAX_STEP_S)
         gained[1:] = np.cumsum(np.where(broken, 0.0, 0.5 * (rising[1:] + rising[:-1]) * steps))
         breaks[1:] = np.cumsum(broken)
-        earlier = np.searchsorted(t, t - round(D2_SPAN_S * 1e9), side="right") - 1
+        earlier = np.searchsorted(t, t - round(SPAN_S * 1e9), side="right") - 1
         self._before = i = np.maximum(earlier, 0)
-        self._whole = (earlier >= 0) & (breaks[i] == breaks) & (t - t[i] <= round((D2_SPAN_S + MAX_STEP_S) * 1e9))
+        self._whole = (earlier >= 0) & (breaks[i] == breaks) & (t - t[i] <= round((SPAN_S + MAX_STEP_S) * 1e9))
         self._gained = gained - gained[i]
 
     def carried_vy(self, track: StateTrack) -> FloatArray:
-        """Return v_y [N] of an estimate with the lever's share of ∫ a_y; NaN where it does not count."""
+        """Return v_y [N] of an estimate plus the share of ∫ a_y due to the lever arm; NaN where it is not scored."""
         return np.where(track.valid & self._fast, track.vy_m_s, np.nan) + self._of_lever
 
     def change(self, values: FloatArray) -> FloatArray:
-        """Return by how much values [N] changed in 2 s, [N]; NaN where that cannot be told."""
+        """Return the change of values [N] over 2 s, [N]; NaN across gaps."""
         return np.where(self._whole, values - values[self._before], np.nan)
 
     def residual(self, track: StateTrack) -> FloatArray:
-        """Return v_y(t) − v_y(t − 2 s) − ∫ (a_y − v_x r) dt, [N]; NaN where it cannot be told."""
+        """Return v_y(t) − v_y(t − 2 s) − ∫ (a_y − v_x r) dt, [N]; NaN across gaps."""
         return self.change(self.carried_vy(track)) - self._gained
 
 

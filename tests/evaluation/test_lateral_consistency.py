@@ -9,7 +9,7 @@ import pytest
 
 from pdhef_logtool.evaluation import blocks
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.evaluation.metrics.d2 import d2_rows, driven_d2, driving_products
+from pdhef_logtool.evaluation.metrics.lateral_consistency import consistency_rows, driven_consistency, driving_products
 from pdhef_logtool.evaluation.metrics.metric import SensorErrors
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
@@ -45,7 +45,7 @@ def track(vy: np.ndarray) -> StateTrack:
 
 
 def d2(of: Signals, vy: np.ndarray, sensors: SensorErrors) -> MetricRow:
-    (row,) = d2_rows([track(vy)], of, EVERYTHING, log="drive", low_speed_m_s=3.0, sensors=sensors)
+    (row,) = consistency_rows([track(vy)], of, EVERYTHING, log="drive", low_speed_m_s=3.0, sensors=sensors)
     return row
 
 
@@ -56,7 +56,7 @@ def driven(of: Signals, vy: np.ndarray, *ends: int) -> float:
         part, estimate = of.rows(a, b), track(vy).rows(a, b)
         products, lasted = driving_products(estimate, part, low_speed_m_s=3.0, sensors=SENSORS)
         total, seconds = total + products, seconds + lasted
-    return driven_d2(total, seconds)
+    return driven_consistency(total, seconds)
 
 
 def test_what_a_wrong_model_does_goes_with_the_driving_and_a_rough_road_does_not() -> None:
@@ -74,7 +74,7 @@ def test_windows_of_it_add_up() -> None:
 
 
 def test_it_is_not_told_of_too_little_driving() -> None:
-    assert np.isnan(driven_d2(np.eye(4), 9.0))
+    assert np.isnan(driven_consistency(np.eye(4), 9.0))
     assert np.isnan(driven(signals(SENSORS), np.full(T.size, np.nan)))
 
 
@@ -106,9 +106,11 @@ def test_gaps_and_invalid_stamps_are_left_out() -> None:
     row = d2(replace(s, ay_m_s2=ay), VY, SENSORS)
     assert row.value < 2e-3
     assert row.n < T.size - 300
-    nothing = d2_rows([track(np.full(T.size, np.nan))], s, EVERYTHING, log="drive", low_speed_m_s=3.0, sensors=SENSORS)
+    nothing = consistency_rows(
+        [track(np.full(T.size, np.nan))], s, EVERYTHING, log="drive", low_speed_m_s=3.0, sensors=SENSORS
+    )
     assert nothing == []
-    assert d2_rows([track(VY)], s, EVERYTHING, log="drive", low_speed_m_s=30.0, sensors=SENSORS) == []
+    assert consistency_rows([track(VY)], s, EVERYTHING, log="drive", low_speed_m_s=30.0, sensors=SENSORS) == []
 
 
 def test_blocks_change_no_figure(monkeypatch: pytest.MonkeyPatch) -> None:
