@@ -151,24 +151,14 @@ class Car:
         """
         source = SHIPPED_CARS.get(str(path), None if path is None else Path(path))
         folder = source if source is not None and source.is_dir() else None
-        if folder is not None:
-            if not (folder / VEHICLE_FILE).is_file():
-                what = "a network's" if (folder / DOCUMENT_FILE).is_file() else "another"
-                raise VehicleError(
-                    expected=f"a car: a folder with {VEHICLE_FILE}, or such a file",
-                    got=f"{what} folder",
-                    where=str(folder),
-                )
-            file = read_vehicle_file(folder / VEHICLE_FILE)
-        else:
-            file = VehicleFile(default_vehicle(), None, ()) if source is None else read_vehicle_file(source)
+        file = _file_of(source, folder)
         car = cls(file.vehicle, file.vehicle, trust=file.trust, assumed=file.assumed, source=source)
         if folder is not None:
             car = _with_parts(car, folder)
         name, home = _network_of(car, folder, network)
         bundle = None if home is None else load_bundle(home)
-        found = _intervals_of(folder, name, intervals)
-        car = replace(car, network=bundle, network_name=name, network_folder=home, intervals=found)
+        selected = _intervals_of(folder, name, intervals)
+        car = replace(car, network=bundle, network_name=name, network_folder=home, intervals=selected)
         if str(intervals) == NO_INTERVALS and car.fitted_physics is not None:
             car = replace(car, fitted_physics=car.fitted_physics.model_copy(update={"varied": ()}))
         stale = list(car.notes)
@@ -179,7 +169,7 @@ class Car:
         own = intervals is None and folder is not None and (folder / INTERVALS_FILE).is_file()
         if intervals is None and not own and car.varied_physics:
             car = replace(car, intervals=None)  # what its own drives left open says more than another car's intervals
-        if own and found is not None and found.physics_sha256 != car.physics_sha256:
+        if own and selected is not None and selected.physics_sha256 != car.physics_sha256:
             stale.append(f"{INTERVALS_FILE} was made with other physics; pdhef learn --stages intervals makes it anew")
         return replace(car, notes=tuple(stale))
 
@@ -311,6 +301,17 @@ class Car:
             trust = trust.model_copy(update={"physics_sha256": None})
         own = self.own.model_copy(update=other)
         return replace(self, vehicle=vehicle, own=own, trust=trust, fitted_physics=physics)
+
+
+def _file_of(source: Path | None, folder: Path | None) -> VehicleFile:
+    """Return the vehicle file of a car, that of the default sedan without a source; raises VehicleError."""
+    if folder is None:
+        return VehicleFile(default_vehicle(), None, ()) if source is None else read_vehicle_file(source)
+    if not (folder / VEHICLE_FILE).is_file():
+        what = "a network's" if (folder / DOCUMENT_FILE).is_file() else "another"
+        expected = f"a car: a folder with {VEHICLE_FILE}, or such a file"
+        raise VehicleError(expected=expected, got=f"{what} folder", where=str(folder))
+    return read_vehicle_file(folder / VEHICLE_FILE)
 
 
 def _with_parts(car: Car, folder: Path) -> Car:

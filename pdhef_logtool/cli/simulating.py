@@ -74,12 +74,7 @@ def simulate(
         _list_manoeuvres(as_json)
         return
     if manoeuvre is None or output is None:
-        raise UsageError(
-            expected="a manoeuvre and -o FILE",
-            got="no " + ("manoeuvre" if manoeuvre is None else "-o FILE"),
-            where="pdhef simulate",
-            remedy="pdhef simulate --list shows the manoeuvres",
-        )
+        raise _incomplete("manoeuvre" if manoeuvre is None else "-o FILE")
     from truthsim.batch import sensor_noise
     from truthsim.drive import DEFAULT_VEHICLE, simulate_drive, write_drive
     from truthsim.faults import parse_fault
@@ -102,6 +97,11 @@ def simulate(
     )
     write_drive(drive, output, without=without or (), steering_wheel=steering_wheel)
     (console.print_json if as_json else console.print_facts)({"output": str(output), **drive.facts()})
+
+
+def _incomplete(missing: str) -> UsageError:
+    remedy = "pdhef simulate --list shows the manoeuvres"
+    return UsageError(expected="a manoeuvre and -o FILE", got=f"no {missing}", where="pdhef simulate", remedy=remedy)
 
 
 @options.command(

@@ -204,25 +204,10 @@ def _band(report: Report, main: MainFacts, figures: _Figures) -> str:
 
 
 def _assumed(report: Report, main: MainFacts) -> list[str]:
-    vehicle, friction = report["vehicle"], report["friction"]
+    friction, calibration = report["friction"], report["self_calibration"]
     own = next(e for e in report["estimators"] if e["name"] == main.name)
     modelled = own["algorithm"] is not None and own["algorithm"]["physics_sha256"] is not None
-    calibration = report["self_calibration"]
-    used = calibration is not None and not calibration["refused"]
-    calibrated = modelled and used and (calibration.get("online", False) or not own["causal"])
-    if not modelled:
-        said = [f"no vehicle model ({main.name} needs none)"]
-    elif calibrated:
-        where = "this log" if calibration["logs"] == 1 else f"{calibration['logs']} logs"
-        therefore = "as it goes on" if own["causal"] else "therefore not causal"
-        said = [_car(vehicle), f"calibrated on {where} without ground truth, {therefore}"]
-    elif vehicle["file"] is None:
-        said = [_car(vehicle)]
-    else:
-        proven = (
-            "validated on drives with ground truth" if vehicle["proven"] else "parameters of its file, not validated"
-        )
-        said = [f"{_car(vehicle)}, {proven}"]
+    said = _model(report, own["causal"]) if modelled else [f"no vehicle model ({main.name} needs none)"]
     if calibration is not None and modelled:
         if calibration["refused"]:
             said.append(f"not calibrated on this log: {calibration['refused']}")
@@ -238,6 +223,20 @@ def _assumed(report: Report, main: MainFacts) -> list[str]:
         found = f"residual gain of the network {trust:g}, from the car's validation data"
         said.append(found if trust else "network not used: no validation data show that it helps")
     return said
+
+
+def _model(report: Report, causal: bool) -> list[str]:
+    """Return the car of an estimator with a vehicle model, and what it is based on."""
+    vehicle, calibration = report["vehicle"], report["self_calibration"]
+    used = calibration is not None and not calibration["refused"]
+    if used and (calibration.get("online", False) or not causal):
+        where = "this log" if calibration["logs"] == 1 else f"{calibration['logs']} logs"
+        therefore = "as it goes on" if causal else "therefore not causal"
+        return [_car(vehicle), f"calibrated on {where} without ground truth, {therefore}"]
+    if vehicle["file"] is None:
+        return [_car(vehicle)]
+    proven = "validated on drives with ground truth" if vehicle["proven"] else "parameters of its file, not validated"
+    return [f"{_car(vehicle)}, {proven}"]
 
 
 def _friction(friction: Mapping[str, Any]) -> str:

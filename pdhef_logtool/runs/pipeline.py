@@ -16,7 +16,7 @@ from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.friction import FrictionSource
 from pdhef_logtool.drive.reading import Drive, lost_texts
 from pdhef_logtool.drive.setup import setup_toml
-from pdhef_logtool.drive.windows import setup_of
+from pdhef_logtool.drive.windows import DrivePlan, setup_of
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.causality_check import CausalityCheck
@@ -576,19 +576,6 @@ def report_facts(
     samples = drive.samples if samples is None else samples
     mapping = plan.mapping
     mapped = set(mapping.topics)
-    notes = []
-    if plan.latency is not None:
-        found = plan.latency
-        measured = f"{found.latency_s * 1e3:.1f} ms ± {found.std_error_s * 1e3:.1f} ms" if found.reliable else "unknown"
-        verdict = "applied" if plan.truth_latency_s else "not applied: it does not stand out of its own uncertainty"
-        if found.gyro_delay_s:
-            verdict = "so that the truth is not moved"
-        notes.append(f"latency {measured} ({found.reason}), {verdict}")
-    notes += [f"{signal} is not independent: {reason}" for signal, reason in plan.dependent.items()]
-    if "cg" in plan.derivation:
-        notes.append(plan.derivation["cg"])
-    if plan.truth is not None and not plan.has_truth_pose:
-        notes.append("no true position: the drawn truth trajectory is its velocity dead-reckoned")
     return ReportFacts(
         log=LogFacts(
             name=drive.name,
@@ -623,7 +610,7 @@ def report_facts(
             ],
             latency_s=None if plan.latency is None else plan.truth_latency_s,
             not_independent=sorted(plan.dependent),
-            notes=notes,
+            notes=_truth_notes(plan),
         ),
         metrics=rows,
         segments=events,
@@ -635,6 +622,24 @@ def report_facts(
         checks=drive.checks,
         versions=run_versions(),
     )
+
+
+def _truth_notes(plan: DrivePlan) -> list[str]:
+    """Return remarks on the ground truth: its latency, what it depends on, and its position."""
+    notes = []
+    if (latency := plan.latency) is not None:
+        std = f" ± {latency.std_error_s * 1e3:.1f} ms"
+        measured = f"{latency.latency_s * 1e3:.1f} ms{std}" if latency.reliable else "unknown"
+        verdict = "applied" if plan.truth_latency_s else "not applied: it does not stand out of its own uncertainty"
+        if latency.gyro_delay_s:
+            verdict = "so that the truth is not moved"
+        notes.append(f"latency {measured} ({latency.reason}), {verdict}")
+    notes += [f"{signal} is not independent: {reason}" for signal, reason in plan.dependent.items()]
+    if "cg" in plan.derivation:
+        notes.append(plan.derivation["cg"])
+    if plan.truth is not None and not plan.has_truth_pose:
+        notes.append("no true position: the drawn truth trajectory is its velocity dead-reckoned")
+    return notes
 
 
 def friction_facts(friction: FrictionSource) -> FrictionFacts:
