@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.runs.frames import score as score
     from pdhef_logtool.runs.inspection import inspect_log as inspect_log
 
-#: Where each name stands, ``module`` or ``module:name there``; it is imported when it is first asked for.
+#: Where each name is, ``module`` or ``module:name there``; it is imported when it is first asked for.
 _HOMES = {
     "Car": "car.car",
     "ReadOptions": "drive.options",

@@ -27,7 +27,7 @@ LIMITS = Path(__file__).with_name("language_limits.json")
 AREAS = ("documentation", "help", "messages", "comments", "names")
 #: Retired phrase (a regular expression, whole words, any case), and what to write instead.
 PHRASES = {
-    r"(?<!ground )(?<!ground-)truth(?! channel)": "ground truth",
+    r"(?<!ground )(?<!ground-)truth(?! channel|\.\w|\])": "ground truth",
     r"the answer|main (estimator|estimate|one)": "selected estimate",
     r"bands?": "confidence interval",
     r"(?<!order )holds?": "contains, coverage, limits ...",
@@ -43,7 +43,7 @@ PHRASES = {
     r"slim logs?|far logs?|strangers?": "reduced, remote, third-party log",
     r"torture": "fuzz and fault-injection tests",
     r"occupied|strays?": "recording span, outlier stamps",
-    r"budgets?": "resource limits, error decomposition",
+    r"budgets?(?!=)": "resource limits, error decomposition",
     r"looks": "number of evaluations",
     r"(fit|check|last) part": "training, validation, test split",
     r"roles?": "split assignment",
@@ -60,7 +60,7 @@ RETIRED = {
 }
 NAMES = frozenset({"found", "known", "told", "own", "one", "at"})
 #: Pages that a command writes: they follow when its texts change.
-GENERATED = re.compile(r"^Written by|<!-- generated", re.MULTILINE)
+GENERATED = re.compile(r"^Written by|<!-- generated|^Command: `", re.MULTILINE)
 
 
 class Hit(NamedTuple):
@@ -74,6 +74,7 @@ class Hit(NamedTuple):
 
 def in_text(area: str, place: str, text: str) -> Iterator[Hit]:
     """Yield the retired phrases of a text."""
+    text = re.sub(r"\s+", " ", text)
     text = re.sub(r"`+[^`]*`+|https?://\S+|\b(docs|pdhef_logtool|studies)/\S+|\bpdhef [a-z]+", " ", text)
     for pattern, better in RETIRED.items():
         for match in pattern.finditer(text):

@@ -65,16 +65,16 @@ class AllowedTrust:
 
     @property
     def note(self) -> str:
-        """What the report says."""
-        return f"network trust {self.cap:g}: {self.reason}"
+        """What the report states."""
+        return f"residual gain {self.cap:g}: {self.reason}"
 
 
 @dataclass(frozen=True, slots=True)
 class WithoutTruth:
-    """The vehicle as driving without truth calibrated it, for the log that it is about.
+    """The vehicle as driving without ground truth calibrated it, for the log that it is about.
 
     ``told_friction`` : whether the signals' friction is one that the calibration knew too; an estimate, made with the
-    file as it stands, is none. ``noise`` : of ``physics``. ``note`` : what a reader of the report must know.
+    file as it is, is none. ``noise`` : of ``physics``. ``note`` : what a reader of the report must know.
     ``varied`` : the vehicle one posterior 1-sigma away, in directions that are independent. ``driven_d2_m_s`` : d2 of
     ``physics`` on the log as far as it goes with the driving, NaN where that cannot be told. ``earlier`` : what applied
     before, in time order, where the log calibrates its car as it goes on; each applies from its ``since_ns``.
@@ -92,7 +92,7 @@ class WithoutTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Car:
-    """A vehicle with what was learnt of it.
+    """A vehicle with what was identified of it.
 
     Attributes
     ----------
@@ -164,13 +164,16 @@ class Car:
         stale = list(car.notes)
         if other := car._other_than_tried:
             stale.append(
-                f"{NETWORK_FILE} allows no trust: it was found with {other}; pdhef learn --stages gain makes it anew"
+                f"{NETWORK_FILE} allows no residual gain: it was fitted with {other}; "
+                "pdhef learn --stages gain creates it again"
             )
         own = intervals is None and folder is not None and (folder / INTERVALS_FILE).is_file()
         if intervals is None and not own and car.varied_physics:
-            car = replace(car, intervals=None)  # what its own drives left open says more than another car's intervals
+            car = replace(car, intervals=None)  # what its own drives left open states more than another car's intervals
         if own and selected is not None and selected.physics_sha256 != car.physics_sha256:
-            stale.append(f"{INTERVALS_FILE} was made with other physics; pdhef learn --stages intervals makes it anew")
+            stale.append(
+                f"{INTERVALS_FILE} was made with other physics; pdhef learn --stages intervals creates it again"
+            )
         return replace(car, notes=tuple(stale))
 
     @property
@@ -211,7 +214,7 @@ class Car:
 
     @property
     def residual_network(self) -> ModelBundle | None:
-        """The network, if it says what ``physics`` lacks; that of the paper says what ``phy-ukf`` lacks."""
+        """The network, if it states what ``physics`` lacks; that of the paper states what ``phy-ukf`` lacks."""
         return self.network if self.network is not None and self.network.model == PHYSICS_MODEL else None
 
     @property
@@ -229,7 +232,7 @@ class Car:
         found = self.trust
         if found is None or not found.has_evidence:
             why = f"no evidence that this network helps on {self.vehicle.name}"
-            return AllowedTrust(0.0, f"{why}; a drive with truth and pdhef learn --stages gain give it")
+            return AllowedTrust(0.0, f"{why}; a drive with ground truth and pdhef learn --stages gain give it")
         here = "" if self.network is None else self.network.sha256
         if found.network_sha256 is not None and found.network_sha256 != here:
             return AllowedTrust(
@@ -239,7 +242,7 @@ class Car:
             )
         if other := self._other_than_tried:
             return AllowedTrust(
-                0.0, f"the car's evidence was found with {other}; pdhef learn --stages gain gives it anew"
+                0.0, f"the car's evidence was found with {other}; pdhef learn --stages gain creates it again"
             )
         return AllowedTrust(found.trust_cap, found.evidence)
 
@@ -273,7 +276,7 @@ class Car:
         """Return the car as identification found it; what was found of a network with other tyres counts no more."""
         vehicle = fit.values.applied_to(self.own)
         found = replace(self, vehicle=vehicle, fitted_physics=fit.physics)
-        how = "(calibrated without truth)" if fit.without_truth else "(identified)"
+        how = "(calibrated without ground truth)" if fit.without_truth else "(identified)"
         if vehicle != self.own and not vehicle.name.endswith(how):
             vehicle = vehicle.model_copy(update={"name": f"{vehicle.name} {how}"})
         noise = {n: one for n, one in self.noise.items() if found.owns_noise(n, one)} | fit.filter
@@ -331,7 +334,7 @@ def _with_parts(car: Car, folder: Path) -> Car:
 
 
 def _stale(what: str, why: str, stage: str) -> str:
-    return f"{what} is not used: {why}; pdhef learn --stages {stage} makes it anew"
+    return f"{what} is not used: {why}; pdhef learn --stages {stage} creates it again"
 
 
 def _part(path: Path, kind: type[PartT]) -> PartT | None:

@@ -1,4 +1,4 @@
-"""What commands learn about a car, one part a command: fit, noise, network and its trust, intervals.
+"""What commands learn about a car, one part a command: fit, noise, network and its residual gain, intervals.
 
 Every part names what it depends on by the digest of just that, so that a part whose basis has changed is known to be
 stale and is not taken, however the files came together.
@@ -28,10 +28,10 @@ Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 #: The filter on physics that has parts of its own.
 PHYSICS = "physics"
-#: Filters whose noise a car may hold, by the name of the estimator that it belongs to.
+#: Filters whose noise a car may contain, by the name of the estimator that it belongs to.
 NOISY_FILTERS = ("phy-ukf:tuned", PHYSICS)
 #: By what the process noise of v_y and yaw rate is multiplied where ``physics`` is smoothed, and nothing was found on
-#: truth: ``studies.defaults.tune_smoothing``, on simulated cars.
+#: ground truth: ``studies.defaults.tune_smoothing``, on simulated cars.
 SMOOTHING = (0.5, 3.0)
 #: Measurements that ``r_std`` is about.
 MEASUREMENTS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
@@ -54,7 +54,7 @@ def car_folder(name: str, physics_sha256: str) -> str:
 
 
 class LearntOn(Record):
-    """A drive that something was learnt on, with the span in seconds from the start of its log."""
+    """A drive that something was identified on, with the span in seconds from the start of its log."""
 
     name: str
     sha256: str = ""
@@ -220,7 +220,7 @@ class Trust(Record):
     ----------
     network : a shipped network's name, or the folder ``network`` of the car. network_sha256 : of it.
     trust_cap : share of its residual that ``pd-hef`` takes, in [0, 1]. evidence : in words, with its figures.
-    physics_sha256, noise_sha256 : of what it was tried with; None: written by hand, holds for any.
+    physics_sha256, noise_sha256 : of what it was tried with; None: written by hand, applies to any.
     """
 
     format: Literal["pdhef-network"] = "pdhef-network"
@@ -236,7 +236,7 @@ class Trust(Record):
 
     @property
     def has_evidence(self) -> bool:
-        """Whether the part says why; without, its cap counts for nothing."""
+        """Whether the part states why; without, its cap counts for nothing."""
         return self.evidence.strip().lower() not in ("", "none")
 
 
@@ -272,7 +272,7 @@ class Inflation(Record):
 
 
 class Algorithm(Record):
-    """What really runs under a name; names are presets, and may stand for another algorithm on another car.
+    """What really runs under a name; names are presets, and may represent another algorithm on another car.
 
     Attributes
     ----------

@@ -1,6 +1,6 @@
 """Writing a part of a car into its folder, as a change that is either complete or absent.
 
-The folder is made beside the old one and takes its place by exchange, so that whoever reads sees one of the two.
+The folder is made beside the old one and takes its place by exchange, so that a reader sees one of the two.
 """
 
 from __future__ import annotations
@@ -91,13 +91,13 @@ def vehicle_file(car: Car) -> bytes:
 def update_car(source: Car, output: Path, change: Change, *, parts_from: Path | None = None) -> Path:
     """Write a change into the car's folder ``output``; return the path of the part.
 
-    A new folder holds the source's vehicle.toml and parts as well. ``output`` may be the source itself.
+    A new folder contains the source's vehicle.toml and parts as well. ``output`` may be the source itself.
     ``parts_from``: a car's folder whose parts and history take the place of those in ``output``.
 
     Raises
     ------
     OutputError
-        The folder cannot be written; the old one then stands as it was.
+        The folder cannot be written; the old one then is as it was.
     UsageError
         See :func:`check_output`.
     """

@@ -31,7 +31,7 @@ from pdhef_logtool.storage.files import OF_WRITING, cannot_write
 #: The error of a word that no command takes; it belongs to click, or to the copy of it that newer typers carry.
 _WrongWord: type[Any] = typer.BadParameter.__bases__[0]
 _INTERRUPTED = 130
-#: Whoever read the output has had enough, as of any command in a pipe.
+#: A reader of the output has had enough, as of any command in a pipe.
 _NOT_READ = 141
 _GLOBAL = frozenset({"--quiet", "-q", "--verbose", "--no-color"})
 #: Standard input, output and error.
@@ -91,7 +91,7 @@ def main() -> NoReturn:
     except BaseException as error:
         if (stop := stopping.came()) is None:
             raise
-        # Whatever came up: the request to end may have been swallowed, or have become another error, on its way.
+        # Any exception: the request to end may have been swallowed, or have become another error, on its way.
         if isinstance(error, Exception) and os.environ.get("PDHEF_TRACEBACK"):
             raise
         code = stopping.tell(stop, error)

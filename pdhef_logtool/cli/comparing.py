@@ -99,7 +99,7 @@ def _gate(
         raise UsageError(expected="a share such as 5% or 0.05", got=max_regression, where="--max-regression")
     figure = Figure(metric=metric or "rmse", estimator=estimator or MAIN, limit=limit)
     if problems := figure_problems(figure.signal, figure.metric, figure.segment):
-        raise UsageError(expected="a figure of which less is better", got="; ".join(problems), where="--metric")
+        raise UsageError(expected="a figure; lower is better", got="; ".join(problems), where="--metric")
     return Gate((figure,), allow_unpaired)
 
 

@@ -40,7 +40,7 @@ def stdout() -> Console:
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError  # as for what is printed without rich
 
-    # A pipe has no width of its own: tables are then as wide as they need to be, unless COLUMNS says otherwise.
+    # A pipe has no width of its own: tables are then as wide as they need to be, unless COLUMNS states otherwise.
     return Piped(
         highlight=False,
         markup=False,
@@ -91,7 +91,7 @@ def warn(text: str) -> None:
 
 
 def print_json(document: Any) -> None:
-    """Print one JSON document; what a terminal would obey stands as JSON's escape of it."""
+    """Print one JSON document; what a terminal would obey is as JSON's escape of it."""
     text = json.dumps(jsonable(document), indent=2, sort_keys=False, ensure_ascii=False, allow_nan=False)
     signs = (c if c.isprintable() or c == "\n" else json.dumps(c)[1:-1] for c in text)
     print(text if text.replace("\n", "").isprintable() else "".join(signs))  # noqa: T201

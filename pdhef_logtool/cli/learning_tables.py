@@ -159,7 +159,7 @@ def render_extraction(result: ExtractResult, console: Console) -> None:
 
 
 def _print_cells(held: Mapping[str, Any], choice: Mapping[str, Any] | None, console: Console) -> None:
-    """Print how much of each cell of driving split train holds, and how many hold nothing."""
+    """Print how much of each cell of driving split train contains, and how many contain nothing."""
     from pdhef_logtool.learning.network.cells import AY_M_S2, FRICTION, SPEED_M_S, cells
     from pdhef_logtool.learning.network.dataset import CHOSEN_SPLIT
 
@@ -177,7 +177,7 @@ def _print_cells(held: Mapping[str, Any], choice: Mapping[str, Any] | None, cons
     console.print(f"seconds to learn from in split {CHOSEN_SPLIT}" + ("" if most == math.inf else ", as chosen"))
     console.print(shown)
     within = sum(c.in_reach for c in cells())
-    console.print(f"{len(empty)} of the {within} cells that grip allows hold nothing")
+    console.print(f"{len(empty)} of the {within} cells below the friction limit are empty")
 
 
 def _span(edges: Sequence[float], number: int) -> str:
@@ -206,7 +206,7 @@ def render_baselines(result: BaselinesResult, console: Console) -> None:
 
 
 def render_retraining(result: RetrainResult, console: Console) -> None:
-    """Print what the candidate learnt on, how it compares on the drives of the gate, and the verdict."""
+    """Print what the candidate identified on, how it compares on the drives of the gate, and the verdict."""
     from pdhef_logtool.results.gate import Figure
 
     found = result.document
@@ -220,7 +220,9 @@ def render_retraining(result: RetrainResult, console: Console) -> None:
     console.print("the candidate against the car as it is, on the drives of the gate")
     console.print(shown)
     if found["judged"] > 1:
-        console.print(f"{found['judged']} candidates were judged on these drives: the more there are, the less it says")
+        console.print(
+            f"{found['judged']} candidates were judged on these drives: the more there are, the less it shows"
+        )
     for reason in found["reasons"]:
         console.print(f"rejected: {reason}")
     console.print(f"{'accepted' if result.accepted else 'rejected'}: {result.folder}", soft_wrap=True)

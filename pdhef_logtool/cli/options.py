@@ -192,7 +192,7 @@ def command(
     Parameters
     ----------
     group : commands to add it to.
-    examples, notes : what stands below the options: lines as they are typed, and paragraphs.
+    examples, notes : what is below the options: lines as they are typed, and paragraphs.
     name : that of the command; None = the function's.
     panel : group of commands in the help of ``pdhef``.
     shared : shared options beside --mapping, --config and --set, which every ``config`` takes.
@@ -218,7 +218,7 @@ def command(
                 values["config"] = run_config({key: values.pop(key) for key in taken})
             function(**values)
 
-        # Typer reads a command's options off its signature, where the shared ones stand in the place of ``config``.
+        # Typer reads a command's options off its signature, where the shared ones are in the place of ``config``.
         hints = get_type_hints(function, localns={"RunConfig": object}, include_extras=True)
         options = [Parameter(key, Parameter.KEYWORD_ONLY, default=None, annotation=o) for key, o in taken.items()]
         parameters: list[Parameter] = []

@@ -55,7 +55,7 @@ def report(
 
 
 def open_page(result: WrittenPages) -> None:
-    """Open the page of the run in the browser, that of the log where it is the only one, or say where it is."""
+    """Open the page of the run in the browser, that of the log where it is the only one, or state where it is."""
     import webbrowser
 
     pages = (*result.pages, result.fleet) if len(result.pages) == 1 else (result.fleet, *result.pages)

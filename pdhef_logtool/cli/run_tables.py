@@ -36,7 +36,7 @@ _Key: TypeAlias = tuple[str, str, str]
 
 
 class _Column(NamedTuple):
-    """A figure by which estimators are told apart: its head, what it is of, factor to the unit shown, digits."""
+    """A figure by which estimators are distinguished: its head, what it is of, factor to the unit shown, digits."""
 
     head: str
     signal: str
@@ -81,7 +81,7 @@ _TEXTS = {
 
 
 def render_run(result: RunResult, console: Console) -> None:
-    """Print the answer of each log, or of several in one table, and where the outputs are."""
+    """Print the selected estimate of each log, or of several in one table, and where the outputs are."""
     told = [(r, all_printable(r.report)) for r in result.results]
     reports = [report for _, report in told if report is not None]
     alike = None
@@ -112,7 +112,7 @@ def render_fleet(summary: RunSummary, console: Console) -> None:
         for of in summary.errors:
             figures = (cell(x, DEGREES, 3) for x in (of.median_rad, of.p90_rad, of.max_rad))
             spread.add_row(of.estimator, str(of.drives), *figures)
-        console.print(f"RMSE of sideslip over {summary.scored} drives with an independent truth")
+        console.print(f"RMSE of sideslip over {summary.scored} drives with an independent ground truth")
         console.print(spread)
         console.print()
     if summary.worst:
@@ -159,7 +159,7 @@ def _render_verdicts(verdicts: Sequence[Verdict], console: Console) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Alike:
-    """What is said once of several logs: ``texts`` of all of them, ``remarks`` with the logs that they are on."""
+    """What is stated once of several logs: ``texts`` of all of them, ``remarks`` with the logs that they are on."""
 
     texts: Mapping[str, str]
     remarks: Mapping[str, Sequence[str]]
@@ -186,7 +186,7 @@ def _print_indented(line: str | Text, console: Console) -> None:
 
 
 def _render_log(outcome: LogOutcome, report: _Report | None, console: Console, alike: _Alike | None) -> None:
-    """Print one log; ``alike`` is what was said of several, whose joint table has the figures. None: it is alone."""
+    """Print one log; ``alike`` is what was stated of several, whose joint table has the figures. None: it is alone."""
     if report is None:
         console.print(Text.assemble((outcome.log, "bold"), f"  {outcome.outcome}\n"))
         return
@@ -221,7 +221,7 @@ def _render_log(outcome: LogOutcome, report: _Report | None, console: Console, a
 
 
 def _texts(report: _Report) -> dict[str, str]:
-    """Return what is said in words, in its order; nothing where nothing was estimated."""
+    """Return what is stated in words, in its order; nothing where nothing was estimated."""
     answer = report["answer"]
     if answer is None:
         return {}
@@ -229,12 +229,12 @@ def _texts(report: _Report) -> dict[str, str]:
     if best is not None and best["name"] != answer["main"]:
         error = degrees(best["sideslip_rmse_rad"])
         name = best["name"] if best["causal"] else f"{best['name']} (not causal)"
-        texts["hindsight"] = f"by this log's truth {name} was best, {error} RMSE; nothing was chosen by it"
+        texts["hindsight"] = f"by this log's ground truth {name} was best, {error} RMSE; nothing was chosen by it"
     return {key: texts[key] for key in _TEXTS if texts.get(key)}
 
 
 def _clauses(key: str, text: str) -> list[str]:
-    """Return what is told of several logs once, clause by clause where the clauses stand for themselves."""
+    """Return what is given of several logs once, clause by clause where the clauses are independent."""
     return text.split("; ") if key in ("assumed", "next") else [text]
 
 
@@ -261,7 +261,7 @@ def _failed_checks(report: _Report) -> Iterable[str | Text]:
 
 
 def _losses(report: _Report) -> Iterable[str]:
-    """Yield what of the input was lost, then what else is known of it; what several channels share stands once."""
+    """Yield what of the input was lost, then what else is known of it; what several channels share is once."""
     where: dict[tuple[str, str, str], list[str]] = {}
     for loss in sorted(report["losses"], key=lambda x: x["severity"] != "lost"):
         told = loss["count"] is None or loss["kind"] == "gap" or str(loss["count"]) in loss["what"].split()
@@ -280,7 +280,7 @@ def _below(report: _Report, told: Container[str], *, tabled: bool) -> Iterable[s
     """Yield what belongs below the table: its marks, what did not run, what happened, and remarks not yet ``told``."""
     shown = _shown(report)
     if tabled and report["truth"]["not_independent"]:
-        yield "† the truth is an input or the estimate itself: no independent check"
+        yield "† the ground truth is an input or the estimate itself: no independent check"
     if tabled and any(not e["causal"] for e in shown):
         yield "* not causal: uses what was measured later"
     skipped: dict[str, list[str]] = {}
@@ -302,7 +302,7 @@ def _below(report: _Report, told: Container[str], *, tabled: bool) -> Iterable[s
 
 
 def _shown(report: _Report) -> list[Mapping[str, Any]]:
-    """Return the estimators that a person is shown: the answer first, or those that know the future last."""
+    """Return the estimators that a person is shown: the selected estimate first, or those that know the future last."""
     answer = report["answer"]
     ran = {e["name"]: e for e in report["estimators"] if e["outcome"] == "ran"}
     if answer is not None and not answer["named"]:
@@ -390,7 +390,7 @@ def _table_of(
 
 
 def _joint_table(reports: Sequence[_Report]) -> Table:
-    """Return one line a log: the errors of the main estimator, physics and the naive one, and what to look at."""
+    """Return one line a log: the errors of the selected estimate, physics and the naive one, and what to look at."""
     mains = list(dict.fromkeys(report["answer"]["main"] for report in reports))
     rivals = [n for n in ("physics", "zero") if [n] != mains and any(n in r["answer"]["shown"] for r in reports)]
     head = f">{mains[0]}\nRMSE °" if len(mains) == 1 else ">sideslip\nRMSE °"
@@ -414,8 +414,8 @@ def _look_at(report: _Report, inside: float | None, main: str) -> str:
         f"by {main}" if main else "",
         f"{failed} check{'s' * (failed > 1)} failed" if failed else "",
         "input lost" if any(x["severity"] == "lost" for x in report["losses"]) else "",
-        "no truth" if not report["truth"]["available"] else "" if scored else "not scored",
+        "no ground truth" if not report["truth"]["available"] else "" if scored else "not scored",
         "diverged" if diverged_line(report, report["answer"]["main"]) else "",
-        "band too narrow" if inside is not None and inside < NEARLY_HOLDS else "",
+        "interval too narrow" if inside is not None and inside < NEARLY_HOLDS else "",
     ]
     return ", ".join(filter(None, found))

@@ -34,7 +34,7 @@ def _list_estimators(show: bool) -> None:
         raise typer.Exit
 
 
-#: Thresholds that failed, of which each is told.
+#: Thresholds that failed, of which each is given.
 _MOST_VERDICTS = 50
 
 
@@ -226,7 +226,7 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
     else:
         console.show(result, render_run, as_json)
         for one in result.results:
-            if one.outcome.failed is not None and one.report is not None:  # of the others the tables say it
+            if one.outcome.failed is not None and one.report is not None:  # of the others the tables state it
                 console.error(f"pdhef: {one.outcome.log}: {one.outcome.failed}")
     failed = [v for v in result.verdicts if v.failed]
     for verdict in failed[:_MOST_VERDICTS]:

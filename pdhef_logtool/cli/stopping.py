@@ -42,7 +42,7 @@ def check() -> None:
 
 
 def tell(stop: Stopped, error: BaseException) -> int:
-    """Say what ended and what ``error``, which came up, has notes of; return the exit code."""
+    """State what ended and what ``error``, which came up, has notes of; return the exit code."""
     notes = getattr(error, "__notes__", [])
     text = "; ".join([f"pdhef: {stop}", "nothing half-written was left under its final name", *notes])
     print(text, file=sys.stderr)  # noqa: T201

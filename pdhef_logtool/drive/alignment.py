@@ -84,7 +84,7 @@ class ChannelPlan:
 
     @property
     def max_delay_s(self) -> float:
-        """Delay beyond which a sample counts as missing whatever its neighbours did."""
+        """Delay beyond which a sample counts as missing regardless of its neighbours."""
         return self.delay_s + self.late_limit_s + DELAY_DRIFT_S
 
 
@@ -109,7 +109,7 @@ class AlignmentPlan:
 
     @property
     def available(self) -> frozenset[str]:
-        """Aligned columns that the mapping provides, whatever their source (``speed_m_s`` also from wheels)."""
+        """Aligned columns that the mapping provides, regardless of their source (``speed_m_s`` also from wheels)."""
         names = {c.target for c in self.channels}
         return frozenset(names | ({"speed_m_s"} if self.speed_from != "none" else set()))
 
@@ -200,7 +200,7 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
 
     Measurements are used once. On the grid's own clock (``exact``) that is so by itself. ``interpolate``: the value at
     a grid stamp lies between the sample before and the sample after; it is given only when the sample after has not
-    served the previous grid stamp already. ``next``: the value stands, unchanged, at the first grid stamp at or after
+    served the previous grid stamp already. ``next``: the value is, unchanged, at the first grid stamp at or after
     its own stamp (time error below one grid step); of several samples within one step the newest counts.
 
     ``speed_m_s`` without a speed channel comes from the wheel speeds, see :func:`combine_wheel_speeds`.

@@ -36,7 +36,7 @@ def cached(
 def read_cached(
     log: LogInput, car: Car, mapping: Mapping | None, options: ReadOptions, warn: Warn = _silent
 ) -> Iterator[Drive]:
-    """Open a log as :func:`~pdhef_logtool.drive.reading.read_drive` does, or what stands for it."""
+    """Open a log as :func:`~pdhef_logtool.drive.reading.read_drive` does, or what represents it."""
     with (
         cached(log, mapping, options, warn) as (substitute, mapping_of_it),
         read_drive(substitute, car, mapping_of_it, options, tell=warn) as drive,

@@ -61,7 +61,7 @@ def moving_at(speed: FloatArray) -> BoolArray:
 
 
 def independent_samples(count: int) -> float:
-    """Return how many independent samples this many cells hold after the low pass."""
+    """Return how many independent samples this many cells contain after the low pass."""
     return 2.0 * LOW_PASS_HZ * GRID_S * count
 
 

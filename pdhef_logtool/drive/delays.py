@@ -2,7 +2,7 @@
 
 No sensor shows a motion before it happens: of two sensors that follow one motion, the later one is late if their shift
 is larger than that of correct sensors. Only the difference of the rear wheel speeds follows the gyro without a delay;
-sideslip, pitch and the vehicle's response stand between the other pairs, so that only large delays show in them.
+sideslip, pitch and the vehicle's response are between the other pairs, so that only large delays show in them.
 """
 
 from __future__ import annotations

@@ -50,8 +50,8 @@ class FrictionSource:
     Attributes
     ----------
     label : where it comes from, in the words of the report.
-    note : what a user must be told before the run; empty: nothing.
-    constant : told to all estimators; None leaves the signals' own (and the vehicle file's where they have none).
+    note : what a user must be given before the run; empty: nothing.
+    constant : given to all estimators; None leaves the signals' own (and the vehicle file's where they have none).
     bank : estimates it; None where nothing is estimated.
     factor : by which what topic or option tell is made wrong on purpose, for training (docs/method.md#limits).
     stamps, observable_stamps : of the windows so far.

@@ -33,7 +33,7 @@ class Measured:
     topics: Mapping[str, str]
 
     def without_truth(self) -> Measured:
-        """Return what the signals alone say."""
+        """Return what the signals alone state."""
         columns = {n: c for n, c in self.columns.items() if not n.startswith("truth.")}
         kept = tuple(r for r in self.relations if not any(n.startswith("truth.") for n in r.powers))
         return replace(self, columns=columns, speed_name=_own(self.speed_name), relations=kept)

@@ -53,7 +53,7 @@ from pdhef_logtool.records.signals import FloatArray
 #: Mean accelerations below are no gravity: the sensor's software took it off.
 COMPENSATED_M_S2 = 3.0
 #: How far speed and yaw rate explain the level accelerations once the axes are right; the rest is sideslip, roll,
-#: grade, crossfall and noise. Below, nothing is said.
+#: grade, crossfall and noise. Below, nothing is stated.
 MIN_CORRELATION = 0.75
 #: Independent samples: 5 s of driving.
 MIN_SAMPLES = 10.0
@@ -78,7 +78,7 @@ HAND_CORRELATION = 0.8
 class Mounting:
     """Rotation [3, 3] from the sensor's axes to forward, left, up; what it was found from; whether it can be applied.
 
-    ``named`` are the rows [3, 3] that the mapping reads as it stands, 0 where it lacks one. ``hand``: -1 where the
+    ``named`` are the rows [3, 3] that the mapping reads as it is, 0 where it lacks one. ``hand``: -1 where the
     sensor's rates turn to the left about its axes.
     """
 
@@ -419,7 +419,7 @@ def _by_frames(
     triads: tuple[Triad | None, Triad | None],
     by_drive: Mounting | None,
 ) -> tuple[Placement | None, Check | None, Mounting | None]:
-    """Return where recorded frames put the IMU, the check of it, and the mounting where they alone say it.
+    """Return where recorded frames put the IMU, the check of it, and the mounting where they alone state it.
 
     Parameters
     ----------
@@ -508,7 +508,7 @@ def turned_signals(
 
 
 def mounting_checks(mapping: Mapping, mounting: Mounting, triads: tuple[Triad | None, Triad | None]) -> list[Check]:
-    """Return for each of the IMU's signals whether it is read from the axis that the drive says."""
+    """Return for each of the IMU's signals whether it is read from the axis that the drive states."""
     turned = turned_signals(mapping, mounting, triads)
     checks = []
     for i, name in enumerate(MOUNTED):

@@ -1,4 +1,4 @@
-"""What of a log is read and how: slice, sensors, truth, friction; and times as users write them."""
+"""What of a log is read and how: slice, sensors, ground truth, friction; and times as users write them."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class ReadOptions:
     ----------
     start, end : slice as given (:func:`parse_time`); None = the log's own.
     sensors : ``esp`` is the paper's suite without wheel speeds in the filters.
-    friction : of :func:`~pdhef_logtool.drive.friction.parse_friction`; None leaves what the log says, if anything.
-    prefer_truth : which truth counts in a simulated log that has both.
+    friction : of :func:`~pdhef_logtool.drive.friction.parse_friction`; None leaves what the log states, if anything.
+    prefer_truth : which ground truth counts in a simulated log that has both.
     window_s : length of the windows that the log is processed in; changes no number.
     clock : ``arrival`` takes samples as known when they arrived, as in a car; ``stamp`` by their stamps (not causal).
     budget : factor on what reading a log may cost.
@@ -34,8 +34,8 @@ class ReadOptions:
     setup : file with what is decided once per drive; None decides it on the log. setup_from_s : decided on the first so
         many seconds of the slice; None = its first ten minutes, and clocks on all of it.
     msgs : folder with definitions of message types that a log does not define.
-    cache : folder or URL of slim logs, which stand for logs that were read before; changes no number.
-    cache_max_gb : what the cache may hold, in GB, if it is a folder; None = any.
+    cache : folder or URL of reduced logs, which represent logs that were read before; changes no number.
+    cache_max_gb : what the cache may contain, in GB, if it is a folder; None = any.
     allow_private_redirects : whether a web server may redirect to other hosts of this machine and its network.
     """
 

@@ -40,14 +40,14 @@ Tell = Callable[[str], None]
 #: Makes the mapping that is read with from the log and the mapping in effect; may tell something.
 Adjust = Callable[[DriveLog, Mapping, Tell], Mapping]
 
-#: Signals, truth and what is computed of them may take this much memory, of all drives of a command together.
+#: Signals, ground truth and what is computed of them may take this much memory, of all drives of a command together.
 MAX_BYTES = 2 << 30
 _AS_IT_IS = ReadOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WholeDrive:
-    """A drive in memory: signals [N], and the truth [N] at their stamps (None if the log has none)."""
+    """A drive in memory: signals [N], and the ground truth [N] at their stamps (None if the log has none)."""
 
     name: str
     path: LogPlace
@@ -86,7 +86,7 @@ class Drive:
     name : of the log in tables and folders. chosen : the mapping as it was before anything was decided.
     plan : what was decided from the first minutes; another one may be put in its place before reading.
     friction : what :meth:`windows` fills in; another one may be put in its place before reading.
-    notes : everything that was told of this drive: what may be wrong. remarks : what else is worth knowing.
+    notes : everything that was given of this drive: what may be wrong. remarks : what else is worth knowing.
     """
 
     name: str
@@ -114,7 +114,7 @@ class Drive:
 
     @property
     def file(self) -> str:
-        """Name of the file or folder; of a slim log that of the one that it stands for."""
+        """Name of the file or folder; of a reduced log that of the one that it represents."""
         return self.path.name if self.log.reduced is None else self.log.reduced.record.file
 
     @property
@@ -144,7 +144,7 @@ class Drive:
 
     @property
     def not_causal(self) -> str:
-        """Why no estimate of this drive is causal, whatever the estimator; empty if an estimator decides it."""
+        """Why no estimate of this drive is causal, regardless of the estimator; empty if an estimator decides it."""
         names = [c.name for c in self.plan.alignment.channels if c.clock == "stamp" or not self._delay_known(c.name)]
         if not names:
             return ""
@@ -156,14 +156,14 @@ class Drive:
 
     @property
     def checks(self) -> tuple[Check, ...]:
-        """What physics says of signals, truth and vehicle file, with those that the options waive."""
+        """What physics states of signals, ground truth and vehicle file, with those that the options waive."""
         return _checks_of(self.plan, self.options)
 
     @property
     def sha256(self) -> str:
         """What the log is known by (:func:`identity_of`), computed when it is first asked for.
 
-        Of a slim log it is that of the one that it stands for.
+        Of a reduced log it is that of the one that it represents.
         """
         if self.log.reduced is not None:
             return self.log.reduced.record.identity
@@ -177,7 +177,7 @@ class Drive:
 
     @property
     def truth_sha256(self) -> str | None:
-        """Hash of the mapped truth, as :attr:`signals_sha256`."""
+        """Hash of the mapped ground truth, as :attr:`signals_sha256`."""
         return None if self._reader is None else self._reader.hashes["truth"].hexdigest()
 
     @property
@@ -208,7 +208,7 @@ class Drive:
         return () if self._reader is None else self._reader.ledger()
 
     def tell(self, text: str) -> None:
-        """Say what a user must know of this drive, and keep it in the notes."""
+        """State what a user must know of this drive, and keep it in the notes."""
         self.notes.append(text)
         self._tell(f"{self.name}: {text}")
 
@@ -217,7 +217,7 @@ class Drive:
 
         Parameters
         ----------
-        fill_friction : False leaves the friction that the log says. window_s : None: that of the options.
+        fill_friction : False leaves the friction that the log states. window_s : None: that of the options.
         """
         window_s = self.options.window_s if window_s is None else window_s
         reader = self._reader
@@ -233,11 +233,11 @@ class Drive:
 
         Parameters
         ----------
-        fill_friction : as for :meth:`windows`. max_bytes : that signals and truth may take; None = no bound.
+        fill_friction : as for :meth:`windows`. max_bytes : that signals and ground truth may take; None = no bound.
 
         Raises
         ------
-        EstimatorError : The slice holds no stamp, or the drive takes more memory than it may.
+        EstimatorError : The slice contains no stamp, or the drive takes more memory than it may.
         """
         signals, truth, held = [], [], 0
         for window in self.windows(fill_friction=fill_friction):
@@ -277,7 +277,7 @@ def read_drive(
     adjust: Adjust | None = None,
     require_sensors: bool = True,
 ) -> Drive:
-    """Open a log for a car and decide everything that holds for all of it: mapping, clocks, alignment, friction.
+    """Open a log for a car and decide everything that applies to all of it: mapping, clocks, alignment, friction.
 
     Parameters
     ----------
@@ -286,7 +286,7 @@ def read_drive(
     car : or what :meth:`Car.load` takes. mapping : or its file; None recognises types.
     tell : called with ``NAME: text`` for all that a user must know of the drive; :attr:`Drive.notes` has it too.
     adjust : changes the mapping in effect.
-    require_sensors : False reads a log without an IMU, or without any recognised signal, for its truth alone.
+    require_sensors : False reads a log without an IMU, or without any recognised signal, for its ground truth alone.
 
     Returns
     -------
@@ -325,7 +325,7 @@ def read_drive(
             told(str(ambiguity))
         remarks += chosen.remarks
         if opened.reduced is not None:
-            remarks.append(f"a slim log stands for {opened.reduced.record.file}")
+            remarks.append(f"a reduced log replaces {opened.reduced.record.file}")
         used = chosen.mapping
         if adjust is not None:
             used = adjust(opened, used, told)
@@ -384,7 +384,7 @@ def _reopened(log: DriveLog, mapping: Mapping, slice_ns: tuple[int, int], option
 
 
 def one_log(argument: LogPlace | str, options: ReadOptions = _AS_IT_IS) -> LogInput:
-    """Return the log that a file, folder or pattern stands for; raises UsageError unless it is one."""
+    """Return the log that a file, folder or pattern represents; raises UsageError unless it is one."""
     inputs = find_logs(argument, private_redirects=options.allow_private_redirects)
     if len(inputs) != 1:
         raise UsageError(expected="one log", got=f"{len(inputs)} of them", where=str(argument))
@@ -402,14 +402,14 @@ def no_samples(path: LogPlace) -> EstimatorError:
         expected="IMU samples in the chosen slice",
         got="none that can be used",
         where=str(path),
-        remedy="pdhef inspect LOG shows what the log holds and what was dropped",
+        remedy="pdhef inspect LOG shows what the log contains and what was dropped",
     )
 
 
 def too_big(where: str) -> EstimatorError:
     """Return the error for drives that do not fit into memory."""
     return EstimatorError(
-        expected=f"drives whose signals and truth fit in {MAX_BYTES >> 20} MiB together",
+        expected=f"drives whose signals and ground truth fit in {MAX_BYTES >> 20} MiB together",
         got="more",
         where=where,
         remedy="give fewer drives, or a slice of each with --start and --end",

@@ -18,9 +18,9 @@ DEGREE = float(np.pi / 180.0)
 MIN_CORRELATION = 0.6
 #: What is left of two columns by regression is small, and a car that slides leaves it related otherwise.
 MIN_PARTIAL_CORRELATION = 0.8
-#: And it must stand so far out of chance, by Fisher's z of the independent samples.
+#: And it must be so far from chance, by Fisher's z of the independent samples.
 MIN_CHANCE_Z = 3.0
-#: Independent samples below which nothing is said: 3 s of driving.
+#: Independent samples below which nothing is stated: 3 s of driving.
 MIN_SAMPLES = 6.0
 #: Two sides that move, and not with one another: another field was mapped. Crossfall and grade alone move an
 #: accelerometer by less than this (5 % are 0.5 m/s^2), and noise of 1 Hz bandwidth moves a gyro by less.
@@ -157,7 +157,7 @@ class Mistake:
 
 
 def measured_relations(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[Relation]:
-    """Return every relation that the columns allow, whether it tells or not.
+    """Return every relation that the columns allow, whether it shows or not.
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
     A relation between two of them gives no information until one is given; the ground-truth v_y has the unit of its
     v_x.
     """
-    # Rim speed in m/s and in rad/s look alike where the radius is not known: wheels are never told.
+    # Rim speed in m/s and in rad/s look alike where the radius is not known: wheels are never given.
     open_, resolved = set(doubted), set[str]()
     while True:
         newly_resolved = {
@@ -326,7 +326,7 @@ def known_mistakes(names: Sequence[str], together: Sequence[tuple[str, ...]] = (
 
 
 def _units(name: str) -> list[tuple[float, str]]:
-    """Return by what a signal is off where its unit is taken for another, and how that is said."""
+    """Return by what a signal is off where its unit is taken for another, and how that is stated."""
     to_radians = [(DEGREE, "is in degrees"), (1.0 / DEGREE, "was converted from degrees twice")]
     of_speeds = [(1.0 / 3.6, "is in km/h"), (3.6, "was converted from km/h twice"), (0.44704, "is in mph")]
     if name == "yaw_rate_rad_s" or name == "sideslip_rad":
@@ -377,7 +377,7 @@ def compare(
     if min(spread_a, spread_b) <= 1e-12:
         return [Relation(text, powers, 0.0, float("nan"), expected, samples, both)]
     correlation = float(np.mean(a * b) / (spread_a * spread_b))
-    # The ratio of the spreads lies between the two regressions, neither of which knows where the noise is.
+    # The ratio of the spreads lies between the two regressions, as the position of the noise is unknown.
     gain = float(np.copysign(spread_b / spread_a, correlation))
     return [Relation(text, powers, correlation, gain, expected, samples, both, spread=spread_b)]
 
@@ -392,9 +392,9 @@ def compare_at_ease(
     *,
     moves: float | None = None,
 ) -> list[Relation]:  # positional: both sides of a relation and what is wanted of them
-    """Return the relation over the first of ``use``, or over the second where it holds there alone.
+    """Return the relation over the first of ``use``, or over the second where only that is reliable.
 
-    A sign, a unit and an axis are wrong everywhere; what holds in gentle driving is not wrong where the car slides.
+    A sign, a unit and an axis are wrong everywhere; a relation in gentle driving is not wrong where the car slides.
     """
     relations = compare(text, powers, reference, measured, use[0], expected, moves=moves)
     if all(r.accepts() and not r.unrelated for r in relations):

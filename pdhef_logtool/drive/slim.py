@@ -1,4 +1,4 @@
-"""Slim logs: what a run reads of a log, written so that a run of it gives the same figures bit for bit."""
+"""Reduced logs: what a run reads of a log, written so that a run of it gives the same figures bit for bit."""
 
 from __future__ import annotations
 

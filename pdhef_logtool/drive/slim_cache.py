@@ -27,7 +27,7 @@ from pdhef_logtool.storage.documents import digest, jsonable
 from pdhef_logtool.storage.files import scratch_folder
 from pdhef_logtool.storage.object_store import ObjectFolder, is_url
 
-#: A process examines what a cache holds each time that it has added this share of what it may contain.
+#: A process examines what a cache contains each time that it has added this share of what it may contain.
 _LOOK_SHARE = 0.05
 #: Bytes that this process adds to a cache before it looks again.
 _left_bytes: dict[str, float] = {}
@@ -36,7 +36,7 @@ _DAMAGED = "its reduced log in the cache is damaged and is written again"
 
 @dataclass(frozen=True, slots=True)
 class SlimCache:
-    """Slim logs of logs that are read alike.
+    """Reduced logs of logs that are read alike.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class SlimCache:
     def _found(self, log: LogInput, scratch: Path, warn: Callable[[str], None]) -> LogInput | None:
         try:
             identity = identity_of(log)
-        except (OSError, PdhefError):  # whoever reads it states what is wrong with it
+        except (OSError, PdhefError):  # a reader it states what is wrong with it
             return None
         key = self._key(identity)
         try:

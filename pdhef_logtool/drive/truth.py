@@ -82,7 +82,7 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where the local ENU frame stands: ECEF position in m, latitude and longitude in rad."""
+    """Where the local ENU frame is: ECEF position in m, latitude and longitude in rad."""
 
     ecef_m: tuple[float, float, float]
     lat_rad: float

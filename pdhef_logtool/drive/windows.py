@@ -1,4 +1,4 @@
-"""From a log to aligned signals and truth, window by window, with everything decided once a log beforehand."""
+"""From a log to aligned signals and ground truth, window by window, with everything decided once a log beforehand."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ from pdhef_logtool.records.readings import impossible_readings
 from pdhef_logtool.records.signals import Channel, Loss, Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack
 
-#: A silence of a channel is told from here on, and from this many of its periods.
+#: A silence of a channel is given from here on, and from this many of its periods.
 TOLD_GAP_S = 1.0
 TOLD_GAP_PERIODS = 10.0
 #: Why a signal's samples are not used although nothing is wrong with them.
@@ -62,16 +62,16 @@ _LATE = "samples arrived much later than their neighbours: they were not waited 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrivePlan:
-    """What is decided from the first ten minutes of a log and holds for all of its windows.
+    """What is decided from the first ten minutes of a log and applies to all of its windows.
 
     Attributes
     ----------
     survey_truth : the truth's channels that it was decided on.
-    latency : of the truth against the sensors; None without truth yaw rate or gyro.
-    dependent : truth quantities that are an input of the estimators, with the reason.
-    derivation : by truth quantity, how it is derived.
+    latency : of the ground truth against the sensors; None without ground truth yaw rate or gyro.
+    dependent : ground truth quantities that are an input of the estimators, with the reason.
+    derivation : by ground truth quantity, how it is derived.
     decided_s : seconds of the log, or of that of the set-up, that the sensors' part was decided on.
-    checks : of signals, truth and vehicle file. placed : where recorded frames put the IMU.
+    checks : of signals, ground truth and vehicle file. placed : where recorded frames put the IMU.
     """
 
     mapping: Mapping
@@ -91,13 +91,13 @@ class DrivePlan:
 
     @property
     def truth_latency_s(self) -> float:
-        """Latency that all estimators' comparison with truth uses; 0 unless it stands out of its own uncertainty."""
+        """Latency that all estimators' comparison with ground truth uses; 0 unless it is out of its own uncertainty."""
         known = self.latency is not None and abs(self.latency.latency_s) > 2.0 * self.latency.std_error_s
         return self.latency.latency_s if known and self.latency is not None else 0.0
 
     @property
     def has_truth_pose(self) -> bool:
-        """Whether the truth has position and heading."""
+        """Whether the ground truth has position and heading."""
         return {"position_m", "yaw_rad"} <= self.derivation.keys()
 
     @property
@@ -109,7 +109,7 @@ class DrivePlan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveWindow:
-    """One window: what the estimators see, and the truth at the same stamps (None if the log has none)."""
+    """One window: what the estimators see, and the ground truth at the same stamps (None if the log has none)."""
 
     signals: Signals
     truth: StateTrack | None
@@ -127,7 +127,7 @@ def plan_drive(
     clock: Clock = "arrival",
     setup: Setup | None = None,
 ) -> DrivePlan:
-    """Read at most ten minutes of the slice [start_ns, end_ns) and decide clocks, alignment and truth.
+    """Read at most ten minutes of the slice [start_ns, end_ns) and decide clocks, alignment and ground truth.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def setup_of(plan: DrivePlan) -> Setup:
 
 
 def with_gyro_delay(mapping: Mapping, vehicle: VehicleParameters) -> Mapping:
-    """Return the mapping with the gyro's delay that the car knows: all of it, in place of the mapping's own."""
+    """Return the mapping with the gyro's delay that the car has: all of it, in place of the mapping's own."""
     delay_s, gyro = vehicle.sensors.yaw_rate_delay_s, mapping.signals.get("yaw_rate_rad_s")
     if delay_s == 0.0 or gyro is None or gyro.latency_s == delay_s:
         return mapping
@@ -360,7 +360,7 @@ def _by_role(
 def with_look_ahead(
     windows: Iterable[DriveWindow], look_ahead_s: float
 ) -> Iterator[tuple[DriveWindow, Signals | None]]:
-    """Yield the windows that hold a stamp, each with the signals of the ``look_ahead_s`` behind its last stamp.
+    """Yield the windows that contain a stamp, each with the signals of the ``look_ahead_s`` behind its last stamp.
 
     They are fewer only where the drive ends, and None where there are none or none are asked for. No more windows
     are held at once than that takes.

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 #: What a model may lack, as parts of ``physics``; each is the state of one filter.
 CURES = ("force_scale", "bank")
-#: Time constant with which the likelihood is forgotten, s. Chosen on simulated drives that no table holds; from 1 to
+#: Time constant with which the likelihood is forgotten, s. Chosen on simulated drives that no table contains; from 1 to
 #: 5 s little changes.
 FORGET_S = 2.0
 #: A smaller weight is none.
@@ -225,7 +225,7 @@ class AdaptivePhysics:
     physics : the car's filter with its parts and noise.
     network : what its model lacks, None without; trust : share of that which all filters take, in [0, 1].
     adaptive : False leaves the mechanism out: no detector, and the car's filter alone, with its cures as states.
-    notes : what the report says of it, such as the reason for its trust.
+    notes : what the report states of it, such as the reason for its residual gain.
     """
 
     algorithm = "adaptive-physics"

@@ -46,7 +46,7 @@ class Steps(StepColumns):
     """Estimates on measurement time, [K]: the state after all samples of the stamp were used.
 
     ``values`` [K, 4] over [v_x, v_y, r, a_y], NaN where unknown; ``rates`` [K, 4] their time derivatives, which the
-    latency compensation holds; ``valid`` [K].
+    latency compensation contains; ``valid`` [K].
     """
 
     values: FloatArray
@@ -124,7 +124,7 @@ class LookingAhead(Protocol):
     def run(self, signals: Signals, state: Any | None, ahead: Signals | None = None) -> tuple[Any, Any]:
         """Process one window as :meth:`Estimator.run`; ``ahead`` is what follows, and the next window begins with it.
 
-        Without it the log ends with the window for all that the estimator knows.
+        Without it the log ends with the window for all that the estimator has.
         """
         ...
 
@@ -164,5 +164,5 @@ def linear_track(name: str, steps: Steps, ahead: Extrapolation, stamps_ns: IntAr
 
 
 def notes_of(estimator: Estimator) -> tuple[str, ...]:
-    """Return what a reader of the report must know of an estimator; only some have something to say."""
+    """Return what a reader of the report must know of an estimator; only some have something to state."""
     return tuple(getattr(estimator, "notes", ()))

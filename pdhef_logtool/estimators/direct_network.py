@@ -1,7 +1,7 @@
 """``pure-lstm``: a network that says v_y itself, from what the hybrid filter's network sees, with no filter behind it.
 
 The paper's Pure-LSTM with the same information as PD-HEF: sensors, the parallel physics filter's outputs and friction.
-v_x is that filter's, the yaw rate the gyro's. At the scored stamp stands what the sensors say of the latency:
+v_x is that filter's, the yaw rate the gyro's. At the scored stamp is what the sensors state of the latency:
 v_x and v_y go on by a_x + v_y r and a_y − v_x r, a_y corrected for body roll.
 """
 
@@ -70,7 +70,7 @@ class DirectNetwork:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Say which file ran: run.json has the residual network's hash alone."""
+        """State which file ran: run.json has the residual network's hash alone."""
         return (f"network {self.network.bundle.sha256}",)
 
     def run(self, signals: Signals, state: DirectState | None) -> tuple[Steps, DirectState]:

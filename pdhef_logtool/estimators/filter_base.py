@@ -44,7 +44,7 @@ STATES = 4
 Z_AY, Z_YAW_RATE, Z_SPEED = 0, 1, 2
 MEASUREMENTS = 3
 MOTION = 3  # entries of the state that an output has a covariance of
-# Inputs of a step; a_x is 0 where U_AX_KNOWN is 0. U_SPEED is the last speed sample that was believed, 0 before any.
+# Inputs of a step; a_x is 0 where U_AX_KNOWN is 0. U_SPEED is the last speed sample that was accepted, 0 before any.
 U_STEER, U_AX, U_FRICTION, U_AX_KNOWN, U_SPEED = 0, 1, 2, 3, 4
 INPUTS = 5
 
@@ -62,7 +62,7 @@ GATE_INFLATION = 10.0
 STANDSTILL_SPEED_M_S = 0.05
 STANDSTILL_YAW_RATE_RAD_S = 0.05
 STANDSTILL_AFTER_S = 0.3
-#: A standstill is not believed for longer than this without a speed sample that says so.
+#: A standstill is not accepted for longer than this without a speed sample that states so.
 STANDSTILL_SILENCE_S = 1.5
 #: Of the first four entries; NaN is an entry that a standstill leaves as it is.
 STANDSTILL_STD = (0.02, 0.01, 0.002, math.nan)
@@ -81,7 +81,7 @@ M_RATE_VY, M_RATE_R = 9, 10  # residual of the step before
 M_REJECTED = 11  # and the two after it, one a measurement: time since the first sample of an unbroken rejection
 M_SPEED = 14  # last speed sample
 MEMORY = 15
-#: What M_REJECTED holds at the first rejected sample itself; 0 is "the last sample was accepted".
+#: What M_REJECTED contains at the first rejected sample itself; 0 is "the last sample was accepted".
 JUST_REJECTED_S = 1e-9
 
 
@@ -181,7 +181,7 @@ class Sample(NamedTuple):
 class StepInputs(NamedTuple):
     """Inputs at step k, held where they are missing, and its measurements.
 
-    ``steers`` says that the steering was measured, ``steer_ok`` that it is not held for too long.
+    ``steers`` states that the steering was measured, ``steer_ok`` that it is not held for too long.
     """
 
     dt: float
@@ -272,7 +272,7 @@ def all_finite(x, P):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def begin_step(sample, rules, memory):  # type: ignore[no-untyped-def]
-    """Reset after a time gap and zero-order-hold missing inputs. Return the inputs of this step."""
+    """Reset after a time gap and zero-order-contain missing inputs. Return the inputs of this step."""
     restart = not sample.dt <= RESTART_GAP_S
     if restart:
         memory[:] = 0.0
@@ -395,7 +395,7 @@ def open_gate(use, memory):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def settle(now, gated, rules, standstill_std, x, P, memory):  # type: ignore[no-untyped-def]
-    """Average how far innovations are from what the filter expects, and hold a car that stands."""
+    """Average how far innovations are from what the filter expects, and contain a car that is."""
     if gated.seen > 0:
         share = min(1.0, now.dt / DIVERGED_AVERAGE_S)
         memory[M_NIS] += share * (gated.squares / gated.seen - memory[M_NIS])
@@ -492,7 +492,7 @@ class StepLinks(StepColumns):
 
     ``kind`` [K] is one of LINK_NONE, LINK_WHOLE, LINK_BIASES; ``predicted_P`` [K, n, n] the covariance before the
     update, with what an opened gate added to it; ``cross`` [K, n, n] the covariance between the state of the step
-    before (rows) and the predicted state (columns), from the sigma points before Q is added and they are drawn anew.
+    before (rows) and the predicted state (columns), from the sigma points before Q is added and they are drawn again.
     """
 
     kind: IntArray
@@ -633,7 +633,7 @@ def predicted_track(
 
 
 def rolls_forward(vx_m_s: FloatArray, last_speed_m_s: FloatArray) -> BoolArray:
-    """Return where v_x [N] does not contradict the last speed sample: the sideslip would stand at 180 degrees there."""
+    """Return where v_x [N] does not contradict the last speed sample: the sideslip would be at 180 degrees there."""
     against: BoolArray = (vx_m_s < 0.0) & (last_speed_m_s > FORWARD_M_S)
     return ~against
 

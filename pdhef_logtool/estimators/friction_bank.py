@@ -5,13 +5,13 @@ Every filter j of the bank has the state [v_y, r] at its own friction μ_j, and 
 model-error level: below some four tenths of the grip a model error says more than friction does, and must not move it.
 
 The weights follow w_j ∝ (w_j^f · prior_j^(1−f)) · L_j^η with f = exp(−Δt/τ): what was seen is forgotten with the time
-constant τ, and where nothing tells frictions apart the dry prior comes back. L_j is the likelihood of the innovations
+constant τ, and where nothing shows frictions apart the dry prior comes back. L_j is the likelihood of the innovations
 of a_y and yaw rate under a Student distribution, so that no single sample decides, without its normalising factor: R is
 much larger than the noise, and a filter that claims a smaller covariance is not the better one for it (with the factor
 a straight road would look slippery). The power η < 1 counts neighbouring samples, whose model errors are the same, as
 fewer than they are.
 
-The estimate is the weighted mean, but not less than the lateral acceleration reached just now needs. What stands at
+The estimate is the weighted mean, but not less than the lateral acceleration reached just now needs. What is at
 step k was known before the samples of step k: a filter that uses it is not handed its own measurement back.
 """
 

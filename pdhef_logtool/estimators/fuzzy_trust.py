@@ -1,7 +1,7 @@
 """The paper's fuzzy scheduler: trust in the network from two signs that the model fails (Eq 24, 25, Table 2).
 
 Inputs are E_ay = |a_y,m − a_y,nom| and I_dyn = |a_y,m| / (μ g), each in three overlapping sets. The paper gives Table 2
-and no set; docs/method.md#paper-adaptation fixes the sets: triangles with shoulders whose tops stand at the constants
+and no set; docs/method.md#paper-adaptation fixes the sets: triangles with shoulders whose tops are at the constants
 below. A rule is as strong as the weaker of its two memberships (Mamdani's AND); the output is the mean of the rules'
 singletons weighted by strength, which is the centre of gravity of singletons.
 """

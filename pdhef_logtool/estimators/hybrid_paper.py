@@ -6,12 +6,12 @@ k:
 - β_k from the fuzzy rules (Eq 24, 25, Table 2); a_y,nom is the nominal model's at the parallel physics filter's prior,
   without residual. A missing a_y leaves β where it was.
 - χ_k = RK4(f_nom; χ_{k−1}, u) + β_k Δx_net(I_{k−1}), the increment whole at the step's end (Eq 19); mean and
-  covariance with Q_k = Q_0 (1 + γ β_k) (Eq 20, 21, 26); sigma points anew. Eq 19 writes u_{k−1}; u is the mean of
+  covariance with Q_k = Q_0 (1 + γ β_k) (Eq 20, 21, 26); sigma points again. Eq 19 writes u_{k−1}; u is the mean of
   u_{k−1} and u_k, as in ``phy-ukf`` and in the residual targets, so that half a step of delay is not held against it.
 - h_ay = ΣF/m + β_k Δx_net[v_y]/Δt: the residual belongs to the predicted a_y too (docs/method.md#hybrid).
 - C_k = θ C_{k−1} + (1 − θ) ν νᵀ and R_k = max(R_0, C_k − P_zz) on the diagonal (Eq 22, 23). C starts at P_zz + R_0.
 
-What the paper does not say is as in ``phy-ukf``: state [v_x, v_y, r, b_ax], Q_0, wheel speed as a measurement, start
+What the paper does not state is as in ``phy-ukf``: state [v_x, v_y, r, b_ax], Q_0, wheel speed as a measurement, start
 and gaps. It has no gate of innovations, no standstill and no roll correction: the paper has none.
 """
 
@@ -100,7 +100,7 @@ class Parallel(NamedTuple):
 def _propagate(chi, over, rate, dt, p, points):  # type: ignore[no-untyped-def]
     """Move sigma points [s, 4] by ``dt`` and add the increment of the residual ``rate`` whole at the end (Eq 19).
 
-    A residual counts where the model is dynamic: it knows nothing of the kinematic range. ``points`` is work space.
+    A residual counts where the model is dynamic: it has nothing of the kinematic range. ``points`` is work space.
     """
     rate_vy, rate_r = rate
     share = dynamic_share(chi[0, base.VX], p) * dt
@@ -280,7 +280,7 @@ class PaperHybridUkf:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Say where this is not the paper's filter: its network may have other features than the paper's six."""
+        """State where this is not the paper's filter: its network may have other features than the paper's six."""
         names = self.network.bundle.feature_names
         if names == PAPER_FEATURES:
             return ()

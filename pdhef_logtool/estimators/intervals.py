@@ -99,7 +99,7 @@ class TrackCalibrator:
                 *([other] if other else []),
             )
         made = self.intervals
-        of = f"wrong by {made.spread:g}" if made.spread > 0.0 else "as told"
+        of = f"wrong by {made.spread:g}" if made.spread > 0.0 else "as given"
         then, now = found[0].algorithm, found[1]
         others = [
             what

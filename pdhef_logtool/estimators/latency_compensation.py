@@ -1,10 +1,10 @@
 """Latency compensation of all estimators: which step had arrived by a scored stamp, and its extrapolation to it.
 
-A sample arrives later than it was measured. What a receiver knows at a scored stamp t is the newest step k whose data,
+A sample arrives later than it was measured. What a receiver has at a scored stamp t is the newest step k whose data,
 and those of all steps before it, had arrived by t (``Signals.ready_ns``). The estimate at t is that step extrapolated
 over the whole latency t - t_k. An estimator returns steps and has no part in this choice.
 
-An estimator that looks ahead is not causal: it knows each step at the step's own stamp.
+An estimator that looks ahead is not causal: it has each step at the step's own stamp.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ class LinearRegression:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Say which file ran: run.json has the residual network's hash alone."""
+        """State which file ran: run.json has the residual network's hash alone."""
         return (f"coefficients {self.model.sha256}",)
 
     def run(self, signals: Signals, state: RegressionState | None) -> tuple[Steps, RegressionState]:

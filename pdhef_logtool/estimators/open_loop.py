@@ -51,7 +51,7 @@ def _open_loop(inputs, default_friction, p, state, values, rates, valid):  # typ
             state[2] = p.rear_m * state[3]
         ok = ok and math.isfinite(state[2]) and math.isfinite(state[3])
         if not ok:
-            state[2] = math.nan  # steering lost, or a vehicle too light for its tyres: start anew
+            state[2] = math.nan  # steering lost, or a vehicle too light for its tyres: start again
         state[4] = steer[k]
         state[5] = mu
         valid[k] = ok

@@ -1,6 +1,6 @@
 """The pure physics filter that runs beside the network and gives it its features (docs/method.md#network).
 
-Which one a network was trained with stands in its bundle: ``physics``, or ``phy-ukf`` for the paper's network and the
+Which one a network was trained with is in its bundle: ``physics``, or ``phy-ukf`` for the paper's network and the
 baselines beside it, which are frozen.
 """
 
@@ -58,7 +58,7 @@ def _physics_ay(x, inputs, layout, p, f, out):  # type: ignore[no-untyped-def]
 
 
 def car_features(vehicle: VehicleParameters, friction: FloatArray) -> FloatArray:
-    """Return what tells cars apart, [K, 7], at the friction [K] of each step (see features.FEATURES)."""
+    """Return what shows cars apart, [K, 7], at the friction [K] of each step (see features.FEATURES)."""
     m, front, rear = vehicle.mass_kg, vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
     columns = [
         np.full_like(friction, front),

@@ -1,4 +1,4 @@
-"""``pd-hef`` and its variants: ``physics`` of the car plus trust times what the network says that it lacks.
+"""``pd-hef`` and its variants: ``physics`` of the car plus trust times what the network states that it lacks.
 
 The trust is what the car's evidence allows; without a network or evidence it is 0, and ``pd-hef`` is ``physics``.
 """
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
-    """Return ``physics`` of a car with its network, at the trust that options, name or evidence say."""
+    """Return ``physics`` of a car with its network, at the residual gain that options, name or evidence state."""
     trust, notes = _trust(name, car, options)
     return AdaptivePhysics(
         of_car(car, use_speed=options.use_speed),
@@ -43,7 +43,7 @@ def build_smoothed(name: str, car: Car, options: Options) -> SmoothedPhysics:
 def _trust(name: str, car: Car, options: Options) -> tuple[float, tuple[str, ...]]:
     if car.residual_network is None:
         why = "the car has no network" if car.network is None else "the network is one for phy-ukf, as the paper has it"
-        return 0.0, (f"network trust 0: {why}",)
+        return 0.0, (f"residual gain 0: {why}",)
     if options.trust is not None:
         return options.trust, ()
     if chosen := options_of(name):

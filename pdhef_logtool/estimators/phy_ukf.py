@@ -64,7 +64,7 @@ def _propagate(chi, over, rate, dt, p, points):  # type: ignore[no-untyped-def]
 
     Half of the residual's increment goes in before the model's step and half after it: all of it at the end, as Eq 19
     has it, would leave the tyres' answer to it out of the step, 3 % of a residual at 25 m/s and 10 ms. A residual
-    counts where the model is dynamic: it knows nothing of the kinematic range. ``over`` are the inputs
+    counts where the model is dynamic: it has nothing of the kinematic range. ``over`` are the inputs
     (:class:`~.filter_base.HeldInputs`), ``rate`` the residual of v̇_y and ṙ, ``points`` [work_size(s)] is work space.
     """
     rate_vy, rate_r = rate
@@ -246,7 +246,7 @@ class PhysicsUkf(base.LinkedFilter):
     q_std : process 1-sigma per √s of [v_x, v_y, r, b_ax].
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
     slip_gate : leave out the speed of wheels that spin or lock (:mod:`~.speed_slip`).
-    standstill : hold v_x, v_y and r at zero while the car stands.
+    standstill : contain v_x, v_y and r at zero while the car is.
     """
 
     algorithm = "physics-ukf"

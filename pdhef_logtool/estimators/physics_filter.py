@@ -87,7 +87,7 @@ BIAS_WALK_STD = (0.004, 0.00008, 0.00002)
 #: Spread of the force scale (docs/method.md#adaptation).
 FORCE_SCALE_STD = 0.05
 
-#: The column of a block of points that holds the centre.
+#: The column of a block of points that contains the centre.
 _CENTRE = AY_BIAS
 #: How many places there are behind the first whole vector.
 _REST = PLACES - LANES
@@ -105,7 +105,7 @@ class _Constants(NamedTuple):
     """Vectors that stay what they are: read as a whole, they need not wait for numbers that were just written."""
 
     signs: FloatArray  # which of the columns 8 to 15 lie before and behind the centre
-    centre: FloatArray  # 1 where the centre stands there, else 0
+    centre: FloatArray  # 1 where the centre is there, else 0
     biases: FloatArray  # 1 for the sensors' biases among the entries 8 to 15, else 0
     others: FloatArray  # the reverse
     unit: FloatArray  # a single 1, ROOM numbers before and behind it
@@ -129,7 +129,7 @@ def _draw(x, L, scale, constants, points):  # type: ignore[no-untyped-def]
 
     Columns i and 16 + i, of the entries 8 to 10 columns i and 4 + i, differ from the centre along column i of the
     factor; the rest are the centre. Points that differ in the sensors' biases alone move with their centre and are left
-    out; the rows of these biases hold what the other points differ from their centre.
+    out; the rows of these biases contain what the other points differ from their centre.
     """
     root = spread(math.sqrt(scale))
     for j in range(PLACES):
@@ -144,9 +144,9 @@ def _draw(x, L, scale, constants, points):  # type: ignore[no-untyped-def]
 def _moments(points, scale, q, constants, x, P, whole):  # type: ignore[no-untyped-def]
     """Write mean and covariance of points that :func:`_draw` drew, with ``q`` [ROOM] added to the variances.
 
-    Of the covariance only that of the motion, unless the ``whole`` is wanted. In place of the points stands what they
+    Of the covariance only that of the motion, unless the ``whole`` is wanted. In place of the points is what they
     differ from their centre, e. With δ the mean of e, the moments about the mean, the weight of the centre among them,
-    are Σ w e eᵀ + δ δᵀ: in the centre's place stands δ / √w.
+    are Σ w e eᵀ + δ δᵀ: in the centre's place is δ / √w.
     """
     weight = 0.5 / scale
     per_weight = 1.0 / math.sqrt(weight)
@@ -495,13 +495,13 @@ class PhysicsFilter(base.LinkedFilter):
 
     Parameters
     ----------
-    vehicle : parameters; ``physics`` says which parts it has, ``sensors`` gives R unless ``r_std`` does, and the
+    vehicle : parameters; ``physics`` states which parts it has, ``sensors`` gives R unless ``r_std`` does, and the
         priors of the biases.
     q_std : process 1-sigma per √s of [v_x, v_y, r, b_ax, f_f, f_r], forces over mass in m/s².
     r_std : 1-sigma of [a_y, r, v_x].
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
     slip_gate : leave out the speed of wheels that spin or lock (:mod:`~.speed_slip`).
-    standstill : hold the motion at zero while the car stands.
+    standstill : contain the motion at zero while the car is.
     read_with : the vehicle with which its signals were read and corrected, where that is another; None: its own.
     """
 
@@ -521,7 +521,7 @@ class PhysicsFilter(base.LinkedFilter):
 
     @property
     def layout(self) -> Layout:
-        """Where the states of the car's parts stand."""
+        """Where the states of the car's parts are."""
         return layout_of(self.vehicle)
 
     @property

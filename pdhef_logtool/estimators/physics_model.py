@@ -11,8 +11,8 @@ part, [φ, φ̇], [bank], [s], [b_δ], [b_ay, b_r]. f = F_y / m is an axle's lat
   (1 + g G) Σf.
 - **Load transfer** takes x = 2 h a_y / (g T) of a wheel's load to the other one of its axle; with roll a_y is φ / G,
   for springs carry it. A tyre whose force per load falls by the share s_z for each relative excess of load leaves
-  1 − s_z x² of an axle's force (Eq 7). A magic formula that was fitted to an axle holds that loss already for steady
-  cornering, in which the axle's own force says what a_y was: what is left is the ratio of the two.
+  1 − s_z x² of an axle's force (Eq 7). A magic formula that was fitted to an axle contains that loss already for steady
+  cornering, in which the axle's own force states what a_y was: what is left is the ratio of the two.
 - **Braking** (``ax`` below 0) moves the load a_x h / L to the front and takes from both axles' grip what it uses,
   √(1 − (a_x / μ g)²), with brakes that are shared as the loads are. Which axle drives is not known: nothing is done
   when the car accelerates.
@@ -21,7 +21,7 @@ part, [φ, φ̇], [bank], [s], [b_δ], [b_ay, b_r]. f = F_y / m is an axle's lat
 
 A step moves eight points at once in an inner loop without branches, as :mod:`~pdhef_logtool.car.nominal_points` does:
 each part has its place there, and what a car lacks is 0 (:func:`spread_layout`). One evaluation of the tyres a step:
-the exponential kernel of the lag weighs what they were asked over the step, and stands for one instant of it, t*; the
+the exponential kernel of the lag weighs what they were asked over the step, and represents one instant of it, t*; the
 state there is that at the start, moved by its derivative. Velocities take the mean of the forces at both ends. Second
 order in the step but for what changes slowly over one (speed in the lag, bank, force scale, and the load transfer where
 nothing rolls), and stable for any lag.
@@ -58,7 +58,7 @@ BANK_TIME_S = 5.0
 _MAX_ROLL_STEP = 0.5
 #: Grip is never taken to be used up by braking alone: a car that still steers has this share.
 _LEAST_GRIP = 0.2
-#: A body that hardly rolls, rad/(m/s²), tells nothing of the load transfer, which then follows the acceleration.
+#: A body that hardly rolls, rad/(m/s²), shows nothing of the load transfer, which then follows the acceleration.
 LEAST_ROLL_GRADIENT = 1e-3
 
 _compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -66,7 +66,7 @@ _inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 
 
 class Layout(NamedTuple):
-    """Where the entries of the parts stand in the state; −1: the car has no such part."""
+    """Where the entries of the parts are in the state; −1: the car has no such part."""
 
     size: int
     roll: int  # φ, and φ̇ behind it
@@ -77,7 +77,7 @@ class Layout(NamedTuple):
 
     @property
     def named(self) -> dict[str, int]:
-        """Where the states stand that a track has a column for, by its name; those that the car has."""
+        """Where the states are that a track has a column for, by its name; those that the car has."""
         places = {
             "roll_rad": self.roll,
             "bank_rad": self.bank,
@@ -104,7 +104,7 @@ def spread_layout(layout):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def places_of(layout):  # type: ignore[no-untyped-def]
-    """Return where each entry of a state [n] stands in one in which every part has its place, [n]."""
+    """Return where each entry of a state [n] is in one in which every part has its place, [n]."""
     places = np.arange(layout.size)
     for at, place, width in (
         (layout.roll, ROLL, 2),
@@ -138,7 +138,7 @@ class PhysicsParameters(NamedTuple):
 
 
 def layout_of(vehicle: VehicleParameters) -> Layout:
-    """Return where the states of a car's parts stand."""
+    """Return where the states of a car's parts are."""
     parts = vehicle.physics
     at = CORE
     places = []
@@ -184,7 +184,7 @@ class _Step(NamedTuple):
     kept: float  # share of an axle's force at the start that is left at the end of the step
     tyre_s: float  # t*: the time from the step's start at which the tyres are asked
     inertia: float  # m / I_z
-    front_held: float  # s_z where the front axle's formula holds the transfer of steady cornering already, else 0
+    front_held: float  # s_z where the front axle's formula contains the transfer of steady cornering already, else 0
     rear_held: float
 
 

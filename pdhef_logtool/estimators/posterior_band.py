@@ -3,9 +3,9 @@
     s² = (k_o s_own)² + Σ_i (v_y,i − v_y)² / v_x² + w²
 
 v_y,i is that of the physics filter on the vehicle one posterior 1-sigma away in direction i, without the states that
-cure what a car lacks. w is what accelerometer and gyro say against the estimate's own changes, ``kinematic`` of
+cure what a car lacks. w is what accelerometer and gyro state against the estimate's own changes, ``kinematic`` of
 :mod:`~pdhef_logtool.estimators.error_features`: driving unlike that of the identification shows there. Both are
-available online, so that the band is causal. The own one counts less, for the
+available online, so that the confidence interval is causal. The own one counts less, for the
 noise of an identified car includes what its model leaves of a_y.
 """
 
@@ -33,7 +33,7 @@ _KINEMATIC = TERMS.index("kinematic")
 
 @dataclass(slots=True)
 class PosteriorBand:
-    """The band of one car over one drive, window by window; windows change no bit.
+    """The confidence interval of one car over one drive, window by window; windows change no bit.
 
     ``filters`` : the physics filter on the car, then on it away from there. All tracks of a window share their runs.
     """

@@ -1,11 +1,11 @@
 """Estimators on the vehicle that their log has calibrated: they see their signals as that vehicle reads them.
 
-What a whole log says of its car is known only at its end: none of them is causal.
+What a whole log states of its car is known only at its end: none of them is causal.
 
 Their variance of sideslip is their own, what the parameters leave open, and what the sensors contradict
 (docs/method.md#intervals):
 
-    s² = s_own² + (Σ_i (2 (v_y,i − v_y))² + (d2 / 2)²) / v_x²,
+    s² = s_own² + (Σ_i (2 (v_y,i − v_y))² + (lateral kinematic consistency / 2)²) / v_x²,
 
 where v_y,i is that of the physics filter on the vehicle one posterior 1-sigma away in direction i, and d2 is that of
 the whole log as far as it goes with the driving. The posterior is doubled, for the directions are only the five that
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 SELF_CALIBRATED = frozenset({"physics", "pd-hef", "pd-hef-smoothed"})
 #: The open-loop model on the calibrated vehicle.
 OPEN_LOOP = "open-loop:calibrated"
-#: Factors of the posterior and of d2 above.
+#: Factors of the posterior and of lateral kinematic consistency above.
 POSTERIOR_SHARE, D2_SHARE = 2.0, 0.5
 
 
@@ -106,7 +106,7 @@ class SelfCalibrated:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the report says of it."""
+        """What the report states of it."""
         return (*notes_of(self.estimator), self.calibration.note)
 
     @property
@@ -143,7 +143,7 @@ def widened(
     ----------
     compared : v_y of the physics filter [N], first on the vehicle, then on those away from it.
     seen_m_s : what the sensors contradict, as a velocity [N].
-    slow_m_s : a velocity tells of sideslip no more below this speed than there.
+    slow_m_s : a velocity shows of sideslip no more below this speed than there.
     own_share : of the track's own 1-sigma that counts.
     """
     added = np.where(np.isfinite(seen_m_s), seen_m_s, 0.0) ** 2

@@ -8,10 +8,10 @@ backward goes each of them, from the last step that is seen,
     P^s_k = P_k + G_k (P^s_{k+1} − P_{k+1|k}) G_kᵀ
 
 with C from the sigma points of the step before Q is added and they are drawn anew (Särkkä 2008). The network's residual
-is a known input of the step, so that it stands in x_{k+1|k} and needs no term of its own. The process noise is what
+is a known input of the step, so that it is in x_{k+1|k} and needs no term of its own. The process noise is what
 identification found for smoothing, another one than the filter's (:func:`for_smoothing`).
 
-- A start (first step, gap, failure) ends the recursion: nothing behind it tells of what lies before it.
+- A start (first step, gap, failure) ends the recursion: nothing behind it shows of what lies before it.
 - A standstill overwrites the motion with zero. That is no measurement, so none of it goes back.
 - Where the gate opened, the inflated covariance counts as that of the prediction: process noise of that step.
 - The detector is causal: what comes later does not make it find a fault sooner.
@@ -61,9 +61,9 @@ from pdhef_logtool.records.tracks import StateTrack
 #: A step sees at least this much ahead and at most twice as much. Sensor biases remember for minutes: against a
 #: smoother that sees all of a drive of 300 s this changed v_y by less than 5e-5 m/s (60 s: 5e-4 m/s).
 BLOCK_S = 120.0
-#: Steps that are filtered and smoothed at a time, whatever the window. Changes no bit.
+#: Steps that are filtered and smoothed at a time, regardless of the window. Changes no bit.
 STEPS_AT_ONCE = 8192
-#: What the report says of it.
+#: What the report states of it.
 NOT_CAUSAL = "not causal: an estimate uses what was measured later; to be ranked apart from causal ones"
 
 
@@ -176,7 +176,7 @@ def _smooth(forward, links, tie, span, xs, Ps, out_x, out_P):  # type: ignore[no
     """Smooth steps of a piece from the last of a span to its first; ``xs`` [n] and ``Ps`` [n, n] are moved.
 
     ``forward`` are posterior state, covariance and prior state, ``links`` kind, predicted covariance, cross covariance
-    and prior, and ``tie`` those of the step behind the span, where xs and Ps stand; without one they are not looked at.
+    and prior, and ``tie`` those of the step behind the span, where xs and Ps are; without one they are not looked at.
     ``span`` is the first step, the last one that is written and the last one, inclusive.
     """
     x, P, _ = forward
@@ -246,7 +246,7 @@ def smooth_blocks(
 ) -> Smoothed:
     """Return what `smooth_steps` does of all steps of the blocks that the first ``count`` steps lie in, [M ≥ count].
 
-    ``pieces`` follow each other and hold the steps at ``stamps_ns``. ``known`` [D] is what this has returned of the
+    ``pieces`` follow each other and contain the steps at ``stamps_ns``. ``known`` [D] is what this has returned of the
     first steps before, up to the end of a block: it is not done again.
     """
     n, done = pieces[0].posterior.x.shape[1], 0 if known is None else len(known[0])
@@ -357,7 +357,7 @@ class SmoothedPhysics:
     ----------
     filtered : what is smoothed: its inputs, and its filters run forward.
     block_s : a step sees at least this much ahead, in s, and at most twice as much.
-    notes : what the report says of it.
+    notes : what the report states of it.
     """
 
     algorithm = "smoothed-physics"
@@ -386,7 +386,7 @@ class SmoothedPhysics:
         Parameters
         ----------
         ahead : what follows the window, at least ``look_ahead_s`` of it or all that there is; the next window begins
-            with it. Without it the log ends here for all that the smoother knows.
+            with it. Without it the log ends here for all that the smoother has.
         """
         given = signals if ahead is None else join_signals([signals, ahead])
         if state is None:

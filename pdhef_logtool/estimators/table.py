@@ -131,7 +131,7 @@ SPECS: tuple[Spec, ...] = (
         _INPUTS, 0xE69F00,
     ),
     Spec(
-        OPEN_LOOP, "open-loop on the car as its log calibrated it, without truth: not causal",
+        OPEN_LOOP, "open-loop on the car as its log calibrated it, without ground truth: not causal",
         "open_loop:build", _INPUTS, 0x661100, causal=False,
     ),
     Spec(
@@ -152,11 +152,11 @@ SPECS: tuple[Spec, ...] = (
         "phy_ukf:build", _INPUTS, 0x56B4E9, needs_noise=True, tunable=True,
     ),
     Spec(
-        "pure-lstm", "a network that says v_y itself, from the same inputs, no filter (needs a network with baselines)",
+        "pure-lstm", "a network that outputs v_y itself, no filter (needs a network with baselines)",
         "direct_network:build", FEATURES, 0xAA4499, network="pure_lstm",
     ),
     Spec(
-        "pd-hef", "physics plus what its network says that it lacks, as far as the car's evidence lets it",
+        "pd-hef", "physics plus the residual of its network, as far as the car's evidence lets it",
         "pd_hef:build", _INPUTS, 0xD55E00, network="optional",
     ),
     Spec(
@@ -245,9 +245,9 @@ def check_names(names: Sequence[str]) -> None:
 
 
 def all_names(car: Car) -> tuple[str, ...]:
-    """Return the estimators that :data:`ALL_ESTIMATORS` stands for: those that the car has what they need for.
+    """Return the estimators that :data:`ALL_ESTIMATORS` represents: those that the car has what they need for.
 
-    Baselines and physics first, then what rests on a network.
+    Baselines and physics first, then what depends on a network.
     """
     suited = [s for s in all_specs() if s.in_all and not s.missing(car)]
     return tuple(s.name for s in sorted(suited, key=lambda s: bool(s.network)))

@@ -72,7 +72,7 @@ def block_sums(
 ) -> tuple[FloatArray, FloatArray, IntArray]:
     """Return sums of squares [columns, K], samples [K] and numbers [K] of the blocks that contain any.
 
-    Blocks hold only stamps at which all columns [N] are known, and are counted from ``first_ns``; None: the first of
+    Blocks contain only stamps at which all columns [N] are known, and are counted from ``first_ns``; None: the first of
     those stamps.
     """
     finite = np.isfinite(np.stack(columns)).all(axis=0)

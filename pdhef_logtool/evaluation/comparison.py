@@ -69,7 +69,7 @@ def compare(lines: Sequence[Errors], yardstick: str | None) -> Iterator[Compared
 
 
 def end_to_end(stamps_ns: Sequence[IntArray]) -> IntArray:
-    """Return the stamps of several slices, each moved behind the one before, so that no block holds two of them."""
+    """Return the stamps of several slices, each moved behind the one before, so that no block contains two of them."""
     moved: list[IntArray] = []
     begin = 0
     for stamps in (s for s in stamps_ns if s.size):

@@ -17,7 +17,7 @@ from pdhef_logtool.records.tracks import StateTrack
 
 #: Stamps with the same reason up to this far apart are one interval.
 MERGE_S = 0.5
-#: Intervals that a summary names, and that a list of faults holds.
+#: Intervals that a summary names, and that a list of faults contains.
 NAMED_INTERVALS = 3
 LISTED_INTERVALS = 50
 #: Signal by what the name of a reason ends with.

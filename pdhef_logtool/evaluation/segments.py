@@ -73,7 +73,7 @@ def segment_masks(signals: Signals, truth: StateTrack | None, vehicle: VehiclePa
 
     Parameters
     ----------
-    signals : what the sensors say at the scored stamps. truth : at the same stamps, or None.
+    signals : what the sensors state at the scored stamps. truth : at the same stamps, or None.
     """
     step_ns, of_truth, bits = median_step_ns(signals), known_of(truth), []
     for first, a, b, end in blocks_with_halo(signals, HALO_S, reach_rows(step_ns, MANOEUVRE_SMOOTHING_HZ)):
@@ -142,7 +142,7 @@ def moving_mask(signals: Signals, truth: StateTrack | None, vehicle: VehiclePara
 
 
 def known_of(truth: StateTrack | None) -> frozenset[str]:
-    """Return what is taken from ground truth: all that it ever knows, so that a drive does not mix two sources."""
+    """Return what is taken from ground truth: all that it ever has, so that a drive does not mix two sources."""
     if truth is None:
         return frozenset()
     return frozenset(c for c in ("ay_m_s2", "yaw_rate_rad_s", "vx_m_s") if _known_anywhere(truth, c))

@@ -2,7 +2,7 @@
 
 Errors are those of :mod:`~pdhef_logtool.evaluation.metrics`, correlated over seconds, so that whole blocks are drawn
 (:mod:`~pdhef_logtool.evaluation.bootstrap`). The best physics is the best by this drive's ground truth: a rival that
-was chosen in hindsight, which makes the answer look no better than it is.
+was chosen in hindsight, which favours no estimate.
 """
 
 from __future__ import annotations

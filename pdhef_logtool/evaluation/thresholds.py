@@ -59,7 +59,7 @@ class Threshold:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """How one estimator stands against one threshold in one log.
+    """How one estimator is against one threshold in one log.
 
     Attributes
     ----------
@@ -189,7 +189,7 @@ def _read_table(raw: object, where: str, problems: list[str]) -> Threshold | Non
 def unit_of(signal: str, metric: str, unit: str | None, where: str, problems: list[str]) -> tuple[str, float]:
     """Return the unit that an entry is in and its factor to that of metrics.parquet; a wrong one adds to ``problems``.
 
-    ``unit``: what the entry says; None: that of metrics.parquet.
+    ``unit``: what the entry states; None: that of metrics.parquet.
     """
     native = registered()[metric].unit_of(signal)
     typed, factor = typed_unit(native)

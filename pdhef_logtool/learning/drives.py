@@ -301,7 +301,7 @@ def no_true_sideslip(plan: DrivePlan) -> str:
     if plan.truth is None or "sideslip_rad" not in plan.derivation:
         return "no true sideslip"
     if "sideslip_rad" in plan.dependent:
-        return f"its truth is no truth: {plan.dependent['sideslip_rad']}"
+        return f"its ground truth is invalid: {plan.dependent['sideslip_rad']}"
     return ""
 
 

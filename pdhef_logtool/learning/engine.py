@@ -300,16 +300,16 @@ def _read(inputs: Sequence[LogInput], task: Task) -> tuple[tuple[DriveRecord, ..
         use = usable_stamps(drive, vehicle)
         seconds: FloatArray = (drive.signals.stamps_ns[use] - drive.log_start_ns).astype(np.float64) * 1e-9
         if seconds.size < 2:
-            return replace(record, left_out="no driving with truth above twice the low-speed limit"), None
+            return replace(record, left_out="no driving with ground truth above twice the low-speed limit"), None
         return record, DriveTimes(log, seconds, period_s(drive))
 
     records, times = task.read(inputs, read, 0.05)
     if not times:
-        raise no_drive("truth velocities", "learn")
+        raise no_drive("ground truth velocities", "learn")
     usable_s = sum(t.seconds for t in times)
     if usable_s < LEAST_S:
         raise EstimatorError(
-            expected=f"at least {LEAST_S:g} s of driving with truth, above twice the low-speed limit",
+            expected=f"at least {LEAST_S:g} s of driving with ground truth, above twice the low-speed limit",
             got=f"{usable_s:.1f} s",
             where="learn",
             remedy="give more drives",
@@ -473,7 +473,7 @@ def _validation_errors(call: _Call, car_folder: Path) -> Errors:
             expected=f"an estimate of {name} on the validation part",
             got=scored.skipped.get(name, "none"),
             where="learn",
-            remedy="give more driving with truth",
+            remedy="give more driving with ground truth",
         )
     return scored.errors[name]
 

@@ -97,7 +97,7 @@ def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def _text(value: str) -> str:
-    """Return a text from outside as a cell of a table can hold it."""
+    """Return a text from outside as a cell of a table can contain it."""
     return printable(value).replace("|", "\\|")
 
 

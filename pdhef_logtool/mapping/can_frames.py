@@ -133,7 +133,7 @@ class _FramePaths:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _CanView:
-    """One signal of one topic. ``selectors`` are the multiplexers that have to hold one of their values."""
+    """One signal of one topic. ``selectors`` are the multiplexers that have to contain one of their values."""
 
     source: SignalSource
     paths: _FramePaths
@@ -280,7 +280,7 @@ def _is_message(frames: Columns, view: _CanView, settings: CanSettings) -> BoolA
     """Return which frames [N] carry data of the view's message."""
     number = np.asarray(frames.fields[view.paths.identifier], dtype=np.float64)
     valid_ids = np.isfinite(number) & (number >= 0.0) & (number < 2.0**32)
-    # Signed 32-bit fields hold an identifier with the extended flag as a negative number.
+    # Signed 32-bit fields contain an identifier with the extended flag as a negative number.
     negative = np.isfinite(number) & (number < 0.0) & (number >= -(2.0**31))
     ids: IntArray = np.where(valid_ids, number, np.where(negative, number + 2.0**32, 0.0)).astype(np.int64)
     fits = (valid_ids | negative) & ((ids & NO_DATA_FLAGS) == 0)
@@ -394,7 +394,7 @@ def _frame_paths(topic: str, fields: tuple[FieldInfo, ...], settings: CanSetting
 
 
 def _plain_kinds(fields: tuple[FieldInfo, ...]) -> dict[str, str]:
-    """Return kinds by path, arrays of numbers as one ``array``; what stands inside arrays of structs is left out."""
+    """Return kinds by path, arrays of numbers as one ``array``; what is inside arrays of structs is left out."""
     kinds: dict[str, str] = {}
     for leaf in fields:
         base, bracket, rest = leaf.path.partition("[")

@@ -17,12 +17,12 @@ from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.records.ledger import Role
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, BoolArray, Channel, FloatArray, IntArray, Loss
 
-#: A gate sample holds for this many of its periods, then the ground-truth quality is unknown.
+#: A gate sample applies to this many of its periods, then the ground-truth quality is unknown.
 GATE_HOLD_PERIODS = 2.0
 #: How much earlier or later than ground truth a gate message with the same stamp may be recorded.
 GATE_MARGIN_NS = 2_000_000_000
 
-#: What one loss of each kind says; how many there are, and when, is next to it.
+#: What one loss of each kind states; how many there are, and when, is next to it.
 LOSS_TEXTS = {
     "bad-stamp": "message without a usable stamp (zero, not a number, or a minute off the others) dropped",
     "nan": "sample that is not a number dropped",
@@ -118,7 +118,7 @@ def gate_mask(
 
     Parameters
     ----------
-    stamps_ns : int64 [N], truth.
+    stamps_ns : int64 [N], ground truth.
     gate_stamps_ns, gate_values : int64 [M] ascending, float64 [M]; NaN never passes.
     """
     if gate_stamps_ns.shape[0] == 0:
@@ -185,7 +185,7 @@ def read_signals(
 
 
 def join_channels(parts: Sequence[Channel]) -> Channel:
-    """Join the windows of one channel; a stamp that two windows hold is kept as it arrived first."""
+    """Join the windows of one channel; a stamp that two windows contain is kept as it arrived first."""
     first = parts[0]
     joined = clean_samples(
         np.concatenate([p.stamps_ns for p in parts]),
@@ -336,7 +336,7 @@ def _apply_gate(
     source = gate.as_source()
     clock = clocks.get(clock_key(source), ClockModel())
     period_ns = clock.median_period_s * 1e9
-    # A gate that was sent once holds for the whole log.
+    # A gate that was sent once applies to the whole log.
     hold_ns = int(GATE_HOLD_PERIODS * period_ns) if np.isfinite(period_ns) else max(0, log.end_ns - log.start_ns)
     requests: dict[str, list[str]] = {}
     request_source(log, source, requests)

@@ -109,7 +109,7 @@ def sources_of(
 
     Raises
     ------
-    UsageError : The signal is not known or cannot be told from the topic's type, or one is named twice.
+    UsageError : The signal is not known or cannot be determined from the topic's type, or one is named twice.
     MappingError : The log has no such topic.
     """
     sources: dict[str, SignalSource] = {}
@@ -171,7 +171,7 @@ def _split_topic(log: DriveLog, text: str, option: str) -> tuple[TopicInfo, str]
 def _recognise(
     topic: TopicInfo, path: str, units: Mapping[str, str], text: str, option: str
 ) -> tuple[dict[str, str], list[CovarianceSource]]:
-    """Return the fields by signal that a topic's type tells, all of them or the one that was named."""
+    """Return the fields by signal that a topic's type shows, all of them or the one that was named."""
     kind = topic.type_name.replace("/msg/", "/")
     path_of: dict[str, str] = {}
     covariance: list[CovarianceSource] = []

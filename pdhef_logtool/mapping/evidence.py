@@ -1,4 +1,4 @@
-"""What short pieces of a log say of its fields: values on one grid of time, and how one follows another."""
+"""What short pieces of a log state of its fields: values on one grid of time, and how one follows another."""
 
 from __future__ import annotations
 

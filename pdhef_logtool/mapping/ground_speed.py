@@ -20,7 +20,7 @@ from pdhef_logtool.records.signals import FloatArray
 NEAR_PATH = 0.08
 NEAR_A_X = (0.6, 1.6)
 SLOW_M_S = 1.0
-#: What is said of every speed that is a length.
+#: What is stated of every speed that is a length.
 NEVER_NEGATIVE = "the length of a velocity over ground, which is never negative: in reverse it has the wrong sign"
 
 
@@ -47,11 +47,11 @@ def speed_over_ground(
     signals: Mapping[str, SignalSource],
     truth: Mapping[str, SignalSource],
 ) -> tuple[SignalSource, str] | None:
-    """Return a velocity whose length is the car's speed, as positions or a_x say, and the evidence.
+    """Return a velocity whose length is the car's speed, as positions or a_x state, and the evidence.
 
     Parameters
     ----------
-    topics : with the struct of a velocity's x and y where the type tells it, else empty: names give it then.
+    topics : with the struct of a velocity's x and y where the type shows it, else empty: names give it then.
     signals, truth : what is mapped already.
     """
     vectors = [v for topic, base in topics for v in _vectors(log, topic, base)]

@@ -57,7 +57,7 @@ OWN_PREFIX = "/pdhef/"
 PROBE_NS = 2_000_000_000
 PROBE_AT = (0.0, 0.25, 0.5, 0.75, 1.0)
 
-#: Where a type keeps its velocities; the braces stand for ``linear`` or ``angular``.
+#: Where a type keeps its velocities; the braces represent ``linear`` or ``angular``.
 TWIST_FIELDS = {
     "nav_msgs/Odometry": "twist.twist.{}",
     "geometry_msgs/TwistStamped": "twist.{}",
@@ -276,7 +276,7 @@ def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
         if reason:
             draft.notes.append(f"{topic.name} ({topic.type_name.replace('/msg/', '/')}) is left out: {reason}")
     rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not _type(t).startswith(NO_SENSORS)]
-    # A measured steering angle goes before a command, whatever its type.
+    # A measured steering angle goes before a command, regardless of its type.
     command = draft.signals.pop("steer_rad", None) if any(n.startswith(FROM_COMMAND) for n in draft.notes) else None
     weighed = weigh(draft.log, rest, draft.signals, draft.truth, vendors)
     if command is not None and not {"steer_rad", "steering_wheel_rad"} & set(weighed.signals):
@@ -411,7 +411,7 @@ def _speed_of_navigation(draft: _Draft, topics: list[TopicInfo]) -> None:
 
 
 def _type(topic: TopicInfo) -> str:
-    """Return a topic's type as the tables here spell it, whatever encoding it comes in.
+    """Return a topic's type as the tables here spell it, regardless of its encoding.
 
     JSON and protobuf spell ROS types with dots too (``ros.sensor_msgs.Imu``), ROS spells Foxglove's with slashes.
     """
@@ -599,7 +599,7 @@ def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
     if len(groups) > 1:
         kept = [t for t in candidates if _truth_group(t) == prefer]
         left = sorted(t.name for t in candidates if _truth_group(t) != prefer)
-        draft.notes.append(f"{prefer} truth taken; {', '.join(left)} not used")
+        draft.notes.append(f"{prefer} ground truth used; {', '.join(left)} not used")
         candidates = kept
     for topic in topics:
         if _is_truth(topic) and _type(topic) in SEVERAL_POSITIONS:

@@ -191,7 +191,7 @@ class Mapping:
         return digest(jsonable({"signals": self.signals, "truth": self.truth, "quality": self.quality}))
 
     def sources(self) -> Iterator[SignalSource]:
-        """Yield every source: signals, truth, the gate."""
+        """Yield every source: signals, ground truth, the gate."""
         yield from self.signals.values()
         yield from self.truth.values()
         if self.quality is not None:

@@ -45,7 +45,7 @@ class _FieldTable(BaseModel):
     @model_validator(mode="after")
     def _is_one_quantity(self) -> _FieldTable:
         if bool(self.signal) == bool(self.truth):
-            raise ValueError("give either signal or truth")
+            raise ValueError("give either signal or ground truth")
         if self.signal and self.signal not in SIGNAL_UNITS:
             raise ValueError(f"{self.signal!r} is no signal")
         if self.truth and self.truth not in TRUTH_UNITS:
@@ -92,7 +92,7 @@ class VendorField:
 
     @property
     def meaning(self) -> Meaning:
-        """What a name would have to say to mean the same."""
+        """What a name would have to state to mean the same."""
         return replace(meaning_of_signal(self.name), unit=self.unit, scale=abs(self.scale))
 
 

@@ -122,7 +122,7 @@ def _is_wanted(
     quantity: str, part: str, role: Role, signals: Mapping[str, SignalSource], truth: Mapping[str, SignalSource]
 ) -> bool:
     """Return whether a field can fill a gap, or tell something of one that does."""
-    if quantity == "acceleration" and part == "z":  # tells gravity
+    if quantity == "acceleration" and part == "z":  # shows gravity
         return not {"ax_m_s2", "ay_m_s2"} <= set(signals)
     if quantity in ("latitude", "longitude") and not {"lat_deg", "x_m"} & set(truth):  # show the path
         return True
@@ -212,7 +212,7 @@ class _Weighing:
                 return
 
     def _better(self, rivals: Sequence[Field]) -> Field:
-        """Return the one that follows the others' physics best; the first where nothing tells."""
+        """Return the one that follows the others' physics best; the first where nothing shows."""
         speed = self._speed()
         if speed is None:
             return rivals[0]
@@ -372,7 +372,7 @@ class _Weighing:
         return item is not None and f" of {triad_of(item)}, " in check.evidence
 
     def _speed(self) -> Field | None:
-        """Return what tells others best how fast the car was, taken or not."""
+        """Return what shows others best how fast the car was, taken or not."""
         return self._chosen("speed_m_s") or self.fields.wheel_mean() or self.fields.best("speed")
 
     def _follow(self) -> None:
@@ -461,7 +461,7 @@ class _Weighing:
             true.reasons.append("sign turned: it is that of the sensor's yaw rate reversed")
         return abs(relation.correlation) > 0.97 and abs(abs(relation.slope) - 1.0) < 0.1
 
-    # ------------------------------------------------------------------------------------------- what is said
+    # ------------------------------------------------------------------------------------------- what is stated
 
     def _tell(self, name: str, item: Field) -> None:
         """Turn the doubts of a taken field into an undecided check; note a speed of the navigation system."""

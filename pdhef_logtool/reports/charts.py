@@ -110,7 +110,7 @@ class TimeFigure:
 
     @property
     def heading(self) -> str:
-        """What stands over the figure."""
+        """What is over the figure."""
         return f"{self.title} [{self.unit}]" if self.unit else self.title
 
 
@@ -123,7 +123,7 @@ class StripFigure:
 
     @property
     def heading(self) -> str:
-        """What stands over the figure."""
+        """What is over the figure."""
         return self.title
 
 
@@ -140,7 +140,7 @@ class PointsFigure:
 
     @property
     def heading(self) -> str:
-        """What stands over the figure."""
+        """What is over the figure."""
         return self.title
 
 
@@ -155,7 +155,7 @@ class IntervalsFigure:
 
     @property
     def heading(self) -> str:
-        """What stands over the figure."""
+        """What is over the figure."""
         return self.title
 
 
@@ -171,7 +171,7 @@ class BarsFigure:
 
     @property
     def heading(self) -> str:
-        """What stands over the figure."""
+        """What is over the figure."""
         return self.title
 
 

@@ -7,14 +7,14 @@ from pdhef_logtool.results.palette import colour_rgb
 from pdhef_logtool.results.sink import TRUTH
 
 INK = "#1a1a1a"
-#: Of what is wrong, of what is only told, and of what goes on; safe beside each other for the colour-blind.
+#: Of what is wrong, of what is only given, and of what goes on; safe beside each other for the colour-blind.
 FAULT, NOTE, PLAIN = "#b2182b", "#7a5195", "#6b7785"
 #: Of lines on white, as WCAG 2.1 asks of graphics.
 _LEAST_CONTRAST = 3.0
 
 
 def colour(name: str) -> str:
-    """Return ``#rrggbb`` of an estimator or of the truth, the same on every page."""
+    """Return ``#rrggbb`` of an estimator or of the ground truth, the same on every page."""
     if name == TRUTH:
         return INK
     rgb = colour_rgb(name, {s.name: s.colour for s in all_specs()})

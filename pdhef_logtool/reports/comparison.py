@@ -24,7 +24,7 @@ from pdhef_logtool.results.comparison_words import (
 
 #: Drives in the table, half of them from either end.
 _MOST_DRIVES = 200
-_KIND = {"worse": "bad", "no figure": "bad", "better": "good", "not worse": "good", "equal": "good", "cannot tell": ""}
+_KIND = {"worse": "bad", "no figure": "bad", "better": "good", "not worse": "good", "equal": "good", "inconclusive": ""}
 _BLUE = "#0072b2"
 
 

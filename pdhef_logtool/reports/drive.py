@@ -15,13 +15,13 @@ from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
 from pdhef_logtool.results.run_report import reasons_line
 
-#: What reports of earlier versions do not say: the default of a vehicle file.
+#: What reports of earlier versions do not state: the default of a vehicle file.
 _LOW_SPEED_M_S = 3.0
 #: The strongest filter on physics alone.
 _PHYSICS = "physics"
-#: Of a shorter drive nothing can be said with any certainty.
+#: Of a shorter drive nothing can be stated with any certainty.
 _SHORT_S = 10.0
-#: The figures of a page, in the order in which they stand.
+#: The figures of a page, in the order in which they are.
 OVER_TIME = ("sideslip", "error", "trust", "r_scale", "nis", "speed", "ay", "strip")
 IN_PLANE = ("path", "ay_sideslip", "phase")
 FIGURES = (*OVER_TIME, *IN_PLANE)
@@ -32,7 +32,7 @@ _OUTCOMES = {
     "better": ("better", "good"),
     "same": ("as good", ""),
     "worse": ("worse", "bad"),
-    "undecided": ("cannot tell", ""),
+    "undecided": ("inconclusive", ""),
     "alone": ("alone", ""),
     "none": ("no verdict", ""),
 }
@@ -57,7 +57,7 @@ class DrivePage:
 
 
 def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
-    """Return the page of a log of a run; one that failed has a page that says why.
+    """Return the page of a log of a run; one that failed has a page that states why.
 
     ``back``: address of the page of the whole run, empty without one. Raises OutputError for a damaged report.json.
     """
@@ -117,7 +117,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
 
 
 def roles_of(report: Mapping[str, Any]) -> Roles | None:
-    """Return who is drawn how: the answer and the best physics, as the verdict on sideslip has them."""
+    """Return who is drawn how: the selected estimate and the best physics, as the verdict on sideslip has them."""
     ran = [e for e in report["estimators"] if e["outcome"] == "ran"]
     names: list[str] = [e["name"] for e in ran]
     if not names:
@@ -159,7 +159,7 @@ def _told(report: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 
 def verdicts_of(report: Mapping[str, Any]) -> list[Verdict]:
-    """Return the sentences at the head of a page; without verdicts, the words of the answer."""
+    """Return the sentences at the head of a page; without verdicts, the words of the selected estimate."""
     told = []
     for v in _told(report):
         word, kind = _OUTCOMES.get(str(v.get("outcome")), (str(v.get("outcome")), ""))
@@ -183,12 +183,13 @@ def _notices(report: Mapping[str, Any], figures: DriveFigures | None, low_speed:
         )
     if not report["truth"]["available"]:
         said.append(
-            "The log has no truth: no error is known, and no estimate can be called good or bad. Shown instead: "
+            "The log has no ground truth: no error is known, and no estimate can be called good or bad. Shown instead: "
             "how far the estimates disagree, and how much sensors surprise the filters."
         )
     elif figures is not None and not figures.scored and figures.moves:
         said.append(
-            "The truth of this log does not score sideslip: disagreement of the estimates is shown in place of errors."
+            "The ground truth of this log does not score sideslip: "
+            "disagreement of the estimates is shown in place of errors."
         )
     if figures is not None and figures.absent:
         said.append(f"Not in estimates.parquet, so not drawn: {', '.join(figures.absent)}.")

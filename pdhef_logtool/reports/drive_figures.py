@@ -38,7 +38,7 @@ _PLANES = (
 
 @dataclass(frozen=True, slots=True)
 class Roles:
-    """Who is drawn how: the answer, the best physics (empty without), and the others that ran."""
+    """Who is drawn how: the selected estimate, the best physics (empty without), and the others that ran."""
 
     main: str
     rival: str
@@ -46,7 +46,7 @@ class Roles:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All of them, the answer first."""
+        """All of them, the selected estimate first."""
         return tuple(n for n in (self.main, self.rival, *self.others) if n)
 
     def series(self, name: str, values: FloatArray, width: float = 1.2) -> Series:
@@ -73,7 +73,7 @@ class Peak:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveFigures:
-    """What is drawn of a drive, and what the page says beside it.
+    """What is drawn of a drive, and what the page states beside it.
 
     ``other``: what the answer is held against, the truth or, without one, another estimator; empty where there is none.
     ``scored``: whether any sideslip error is known. ``moves``: whether a sideslip is known at all above the low-speed
@@ -94,7 +94,7 @@ class DriveFigures:
 
 
 def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles, low_speed_m_s: float) -> DriveFigures | None:
-    """Return the figures of a drive, None where the file holds no row of its answer.
+    """Return the figures of a drive, None where the file contains no row of its answer.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def _peaks(
 
 
 def _lines(series: Mapping[str, DriveSeries], roles: Roles, values: str, names: Sequence[str]) -> list[Series]:
-    """Return a line of each track that has any such value; the answer comes last and so lies on top."""
+    """Return a line of each track that has any such value; the selected estimate comes last and so lies on top."""
     lines = []
     for name in [*(n for n in names if n != roles.main), *(n for n in names if n == roles.main)]:
         if name in series:
@@ -194,7 +194,11 @@ def _add_sideslip(charts: Charts, series: Mapping[str, DriveSeries], roles: Role
     if not lines:
         return
     low, high = series[roles.main].band_low.least, series[roles.main].band_high.largest
-    bands = [Band(f"{roles.main}, 95 % band", colour(roles.main), low, high)] if np.isfinite(low).any() else []
+    bands = (
+        [Band(f"{roles.main}, 95 % confidence interval", colour(roles.main), low, high)]
+        if np.isfinite(low).any()
+        else []
+    )
     charts.time("sideslip", "Sideslip", "°", lines, bands=bands, level=0.0, resolution=_DEGREES_SEEN, height=260)
 
 
@@ -213,7 +217,7 @@ def _add_error(
 
 def _add_filter(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> None:
     if trust := _lines(series, roles, "trust", roles.names):
-        charts.time("trust", "Network trust", "", trust, resolution=_SHARE_SEEN, height=120)
+        charts.time("trust", "Residual gain", "", trust, resolution=_SHARE_SEEN, height=120)
     scales = _lines(series, roles, "r_scale", roles.names)
     if any(np.nanmax(s.values) > 1.0 + 1e-9 for s in scales):
         title = "R scale: how much wider than usual the filter takes its sensors' noise"

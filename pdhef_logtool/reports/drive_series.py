@@ -1,6 +1,6 @@
 """The series of one drive, read from its estimates.parquet block by block: memory grows by cells, not by stamps.
 
-Of the answer and of what it is held against, the sideslip is kept at every stamp, for the largest errors.
+Of the selected estimate and of what it is held against, the sideslip is kept at every stamp, for the largest errors.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from pdhef_logtool.results.sink import TRUTH
 
 #: NIS is shown as its mean over so long.
 _NIS_S = 1.0
-#: What is drawn of every track, and beside it of the truth and of the answer.
+#: What is drawn of every track, and beside it of the ground truth and of the selected estimate.
 _COLUMNS = ("vx_m_s", "vy_m_s", "sideslip_rad", "network_trust", "r_scale", "nis", "valid", "reason")
 _MORE_COLUMNS = ("yaw_rate_rad_s", "ay_m_s2", "x_m", "y_m", "sideslip_std_rad")
 _BLOCK_ROWS = 1 << 15
-#: What errors and gaps of sideslip are told from.
+#: What errors and gaps of sideslip are given from.
 _OF_SIDESLIP = ("vx_m_s", "vy_m_s", "sideslip_rad", "valid")
 
 
@@ -101,7 +101,7 @@ class Points:
 class DriveSeries:
     """What is drawn of one track; angles in degrees. ``error``: absolute, against what the page compares with.
 
-    Band, speed, a_y and the planes are empty but for the truth and the answer.
+    Band, speed, a_y and the planes are empty but for the ground truth and the selected estimate.
     """
 
     def __init__(self, name: str, grid: Grid) -> None:
@@ -157,8 +157,8 @@ def gather(
 
     Parameters
     ----------
-    reference : what its errors are told against; None: none are. nis_dof : mean degrees of freedom by estimator.
-    whole : whether band, motion and planes are drawn of it too.
+    reference : what its errors are given against; None: none are. nis_dof : mean degrees of freedom by estimator.
+    whole : whether confidence interval, motion and planes are drawn of it too.
     """
     made = DriveSeries(name, grid)
     for track in tracks.blocks(name, (*_COLUMNS, *_MORE_COLUMNS) if whole else _COLUMNS):

@@ -28,7 +28,7 @@ class Score:
 
 @dataclass(frozen=True, slots=True)
 class ScoreTable:
-    """The figures of one signal in ``unit``; ``independent``: whether its truth is a check at all."""
+    """The figures of one signal in ``unit``; ``independent``: whether its ground truth is a check at all."""
 
     name: str
     unit: str
@@ -57,7 +57,7 @@ class Consistency:
 
 @dataclass(frozen=True, slots=True)
 class Residual:
-    """What sensors say of each other, in ``unit``."""
+    """What sensors state of each other, in ``unit``."""
 
     signal: str
     rms: float | None
@@ -66,7 +66,7 @@ class Residual:
 
 
 def scores(report: Mapping[str, Any], roles: Roles) -> list[ScoreTable]:
-    """Return the errors over the whole drive, a table a signal, the answer first."""
+    """Return the errors over the whole drive, a table a signal, the selected estimate first."""
     causal = {e["name"]: bool(e["causal"]) for e in report["estimators"]}
     tables = []
     for signal in SCORED_SIGNALS:
@@ -122,7 +122,7 @@ def consistency(report: Mapping[str, Any], roles: Roles | None) -> Consistency |
         values = [ratio, *(_read(by_signal[signal].get(name, {}), m.name) for signal, m in shown)]
         if any(value is not None for value in values):
             rows.append((name, values))
-    heads = ["NIS / dof", *(m.head(signal) for signal, m in shown)]
+    heads = ["NIS per degree of freedom", *(m.head(signal) for signal, m in shown)]
     return Consistency(heads, rows) if rows else None
 
 
@@ -137,7 +137,7 @@ def residuals(report: Mapping[str, Any]) -> list[Residual]:
 
 
 def disagreements(report: Mapping[str, Any], roles: Roles) -> dict[str, float]:
-    """Return by how many rad RMS the sideslip of each other estimator and that of the answer differ."""
+    """Return by how many rad RMS the sideslip of each other estimator and that of the selected estimate differ."""
     found = {}
     for m in report["metrics"]:
         first, _, second = m["estimator"].partition("~")

@@ -1,4 +1,4 @@
-"""Series as a page holds them: envelopes on a grid of cells, quantised, as differences, deflated, in base64.
+"""Series as a page contains them: envelopes on a grid of cells, quantised, as differences, deflated, in base64.
 
 The page undoes it (``decode`` of ``report.js``): 36,000 cells of two values cost 50 to 120 kB.
 """
@@ -18,9 +18,9 @@ from pdhef_logtool.records.signals import FloatArray, IntArray
 CELL_NS = 100_000_000
 MOST_CELLS = 36_000
 _FINE_CELLS = 6_000
-#: A cell holds at least so many steps between stamps, so that stamps that come a little late leave none empty.
+#: A cell contains at least so many steps between stamps, so that stamps that come a little late leave none empty.
 _STEPS_A_CELL = 2.5
-#: Quantised values are 0 to LEVELS; GAP stands for "not known".
+#: Quantised values are 0 to LEVELS; GAP represents "not known".
 LEVELS = 65_534
 GAP = 65_535
 
@@ -163,7 +163,7 @@ def encode(values: FloatArray, resolution: float = 0.0) -> Encoded:
     step = max(span / LEVELS, resolution) or 1.0
     q = np.full(len(flat), GAP, dtype=np.uint16)
     q[known] = np.clip(np.rint((inside - low) / step), 0, LEVELS).astype(np.uint16)
-    # Differences modulo 2¹⁶, their sign in the lowest bit, all low bytes before all high ones: zeros stand together.
+    # Differences modulo 2¹⁶, their sign in the lowest bit, all low bytes before all high ones: zeros are together.
     steps = np.diff(q, prepend=np.uint16(0)).view(np.int16)
     folded = ((steps << 1) ^ (steps >> 15)).view(np.uint16)
     planes = (folded & 0xFF).astype(np.uint8).tobytes() + (folded >> 8).astype(np.uint8).tobytes()

@@ -20,12 +20,12 @@ from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
 
 #: Keys of the figures of the page.
 FIGURES = ("medians", "spread", "against")
-#: Rows of tables that a run can make as long as it likes, keys that are told, and bars of a histogram at most.
+#: Rows of tables that a run can make as long as it likes, keys that are given, and bars of a histogram at most.
 MOST_ROWS, _MOST_KEYS, _MOST_BARS = 1000, 12, 40
 #: Errors beyond this quantile of the drives are counted in the last bar.
 _MOST_SHARE = 0.98
 _LEVELS = 8
-#: Estimators with a median error beyond this many times the answer's are left to the table.
+#: Estimators with a median error beyond this many times the selected estimate's are left to the table.
 _DRAWN = 5.0
 #: The table of the operating space shows at least this far, so that what a car can do and nobody did is seen.
 _SPEED_M_S, _AY_M_S2 = 40.0, 8.0
@@ -33,7 +33,7 @@ _SPEED_M_S, _AY_M_S2 = 40.0, 8.0
 
 @dataclass(frozen=True, slots=True)
 class SpaceCell:
-    """A cell of the table: its classes and what stands in it, empty for one where nobody drove."""
+    """A cell of the table: its classes and what is in it, empty for one where nobody drove."""
 
     kind: str
     minutes: str
@@ -99,7 +99,7 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
     charts.intervals(
         "medians",
         f"Median RMSE of sideslip over {first.drives} drives, 95 % interval"
-        + ("" if len(near) == len(judged) else f" (beyond {_DRAWN:g} times the answer's: table)"),
+        + ("" if len(near) == len(judged) else f" (beyond {_DRAWN:g} times the selected estimate's: table)"),
         "°",
         [
             Interval(d.estimator, d.median.low * degree, d.median.value * degree, d.median.high * degree, _colour(d))
@@ -110,7 +110,7 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
         values = first.values * degree
         edges, counts = _histogram(values)
         beyond = ", the last bar and beyond" if values[-1] > edges[-1] else ""
-        charts.bars("spread", f"Drives by RMSE of the answer's sideslip{beyond}", "°", edges, counts)
+        charts.bars("spread", f"Drives by RMSE of the selected estimate's sideslip{beyond}", "°", edges, counts)
     rival, drives = _rival(fleet), fleet.scored
     if rival is not None:
         own, other = (np.array([d.error(name) * degree for d in drives]) for name in (ANSWER, rival))
@@ -119,9 +119,9 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
             ends = np.array([min(own[known].min(), other[known].min()), max(own[known].max(), other[known].max())])
             charts.points(
                 "against",
-                f"A point a drive: the answer is nearer than {rival} below the line",
+                f"A point a drive: the selected estimate has the lower error below the line, {rival} above it",
                 f"RMSE of {rival}, °",
-                "RMSE of the answer, °",
+                "RMSE of the selected estimate, °",
                 [
                     Cloud("equal", PLAIN, ends, ends, line=True),
                     Cloud("drives", INK, other[known], own[known]),
@@ -160,20 +160,20 @@ def _histogram(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _paired(fleet: Fleet) -> str:
-    """Return how the answer stands against the rival over drives, in words; empty without one."""
+    """Return how the selected estimate is against the rival over drives, in words; empty without one."""
     rival = _rival(fleet)
     rank = next((r for r in fleet.ranking if r.estimator == rival), None)
     if rank is None or rank.against_answer is None or len(fleet.scored) < 2:
         return ""
     found = rank.against_answer
     side = "above" if found.value >= 0.0 else "below"
-    how = f"In the median of drives the error of {rival} is {abs(found.value):.1%} {side} the answer's"
+    how = f"In the median of drives the error of {rival} is {abs(found.value):.1%} {side} the selected estimate's"
     if not math.isfinite(found.low):
-        return f"{how}; too few drives to tell."
+        return f"{how}; inconclusive with so few drives."
     bounds = f"{how} (95 % between {found.low:+.1%} and {found.high:+.1%})"
     if found.low > 0.0:
-        return f"{bounds}: the answer is better."
-    return f"{bounds}: {'the answer is worse.' if found.high < 0.0 else 'not told apart.'}"
+        return f"{bounds}: the selected estimate is better."
+    return f"{bounds}: {'the selected estimate is worse.' if found.high < 0.0 else 'no significant difference.'}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ from pdhef_logtool.records.version import __version__
 from pdhef_logtool.reports.charts import Charts
 
 _HERE = Path(__file__).parent
-#: Scripts in order: ours before uPlot tells it how fine to draw.
+#: Scripts in order: ours before uPlot shows it how fine to draw.
 _SCRIPTS = ("before.js", "uplot.min.js", "report.js")
 _STYLES = ("uplot.min.css", "report.css")
 #: A text in a paragraph or a table's cell.
@@ -110,7 +110,7 @@ def _digest(text: str) -> str:
 
 
 def _embedded(document: dict[str, Any]) -> Markup:
-    """Return JSON that may stand in a script element: it holds no sign that HTML could read."""
+    """Return JSON that may be in a script element: it contains no character with a meaning in HTML."""
     text = json.dumps(document, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))  # noqa: S704
 

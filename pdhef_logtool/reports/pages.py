@@ -80,7 +80,7 @@ def write_pages(
 ) -> WrittenPages:
     """Write the page of each log of a run, then that of the run; one that cannot be made never stops the others.
 
-    The caller holds the folder. ``progress`` is told which log, and the share that is done; ``png``: whether each
+    The caller contains the folder. ``progress`` is given which log, and the share that is done; ``png``: whether each
     figure is written as a picture too; ``by``: keys that the run's page breaks the drives down by, none: what it finds.
 
     Raises

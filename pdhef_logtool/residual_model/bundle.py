@@ -22,7 +22,7 @@ FORMAT = "pdhef.residual-model"
 FORMAT_VERSION = 2
 WEIGHTS_FILE = "weights.safetensors"
 DOCUMENT_FILE = "model.json"
-#: Baselines that were trained on the same dataset stand beside the network, where there are any.
+#: Baselines that were trained on the same dataset are beside the network, where there are any.
 PURE_LSTM_FOLDER = "baselines/pure-lstm"
 LINEAR_REGRESSION_FILE = "baselines/linear-regression.json"
 #: The paper's network, six features and Table 1's size, for the paper's filter.
@@ -64,7 +64,7 @@ class ModelBundle:
     feature_names : in order; a subset of :data:`~.features.FEATURES`.
     hidden, layers, head : architecture. period_s : step that the network was trained at.
     weights : by name, float32, as PyTorch names them.
-    provenance : training data hash, seeds, metrics and what else the model card says; JSON-able.
+    provenance : training data hash, seeds, metrics and what else the model card states; JSON-able.
     target : what it predicts, one of :data:`OUTPUT_COUNT`.
     model : the filter that its features come from and that its residual is of, one of :data:`MODELS`.
     physics_sha256 : digest of the physics of the car, or the cars, that it was trained on.
@@ -98,7 +98,7 @@ class ModelBundle:
 
     @property
     def columns(self) -> list[int]:
-        """Where the bundle's features stand in the full feature array."""
+        """Where the bundle's features are in the full feature array."""
         return [FEATURES.index(name) for name in self.feature_names]
 
     @property
@@ -115,7 +115,7 @@ class ModelBundle:
             shapes |= {f"lstm.weight_ih_l{layer}": (rows, columns), f"lstm.weight_hh_l{layer}": (rows, self.hidden)}
             shapes |= {f"lstm.bias_ih_l{layer}": (rows,), f"lstm.bias_hh_l{layer}": (rows,)}
         for n, (columns, rows) in enumerate(pairwise((self.hidden, *self.head, OUTPUT_COUNT[self.target]))):
-            # Behind each layer of the head but the last stand a ReLU and a dropout, which have a number too.
+            # Behind each layer of the head but the last are a ReLU and a dropout, which have a number too.
             shapes |= {f"head.{3 * n}.weight": (rows, columns), f"head.{3 * n}.bias": (rows,)}
         return shapes
 
@@ -165,7 +165,7 @@ def open_model(model: Path | None) -> ModelBundle | None:
     Raises
     ------
     ModelError
-        The folder holds no model.
+        The folder contains no model.
     """
     folder = model_folder(model)
     if folder is None or (model is None and not (folder / DOCUMENT_FILE).is_file()):
@@ -222,10 +222,10 @@ def load_network(folder: Path, target: str) -> ModelBundle:
     if document.get("format") != FORMAT or document.get("version") != FORMAT_VERSION:
         got = f"{document.get('format')} {document.get('version')}"
         raise ModelError(
-            expected=f"{FORMAT} {FORMAT_VERSION}, which says whose physics a network completes",
+            expected=f"{FORMAT} {FORMAT_VERSION}, which names the physics that a network completes",
             got=got,
             where=where,
-            remedy=f"pdhef extract LOG... -o DATASET and pdhef train DATASET -o {folder.name} make it anew",
+            remedy=f"pdhef extract LOG... -o DATASET and pdhef train DATASET -o {folder.name} create it again",
         )
     if (learnt := document.get("target", RESIDUAL)) != target:
         raise ModelError(expected=f"a network for {target}", got=f"one for {learnt}", where=where)

@@ -1,7 +1,7 @@
 """The network's inputs, one piece of code for training and service (docs/method.md#network).
 
 A filter on physics runs in parallel and gives the reference for ε_phy: Δr = r_m − r̂⁻ and Δβ = β̂⁺ − β̂⁻, prior and
-posterior of that filter. Nothing here depends on what the hybrid filter does, and nothing on truth.
+posterior of that filter. Nothing here depends on what the hybrid filter does, and nothing on ground truth.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FEATURES = (
     "delta_sideslip_rad",
     "physics_vy_m_s",
     "physics_yaw_rate_rad_s",
-    "friction",  # as the model is told it
+    "friction",  # as the model is given it
     "ax_m_s2",  # measured; 0 where missing
     "utilisation",  # |a_y| / (μ g)
     "roll_rad",  # of the physics filter; 0 where the car has no such state, as the next three
@@ -63,7 +63,7 @@ ODD_FEATURES = frozenset(
     }
 )
 
-#: As in car.vehicle, which stands above this.
+#: As in car.vehicle, which is above this.
 _GRAVITY_M_S2 = 9.80665
 # Entries of the filter's state, as in estimators.filter_base.
 _VX, _VY, _YAW_RATE = 0, 1, 2

@@ -31,7 +31,7 @@ class LinearModel:
     ----------
     feature_names : out of :data:`~.features.FEATURES`. coefficients : rad per unit of each feature, [k].
     intercept_rad : sideslip at features of zero. low_pass_hz : corner of the low-pass.
-    provenance : training data hash, errors and what else the model card says; JSON-able.
+    provenance : training data hash, errors and what else the model card states; JSON-able.
     """
 
     feature_names: tuple[str, ...]

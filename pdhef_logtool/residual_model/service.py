@@ -44,7 +44,7 @@ class NetworkService:
         Parameters
         ----------
         features : [N, 28] as from :func:`~.features.make_features`; rows with NaN give 0 and end the sequence.
-        starts : [N], where a sequence begins anew.
+        starts : [N], where a sequence begins again.
         """
         out = np.zeros((features.shape[0], OUTPUT_COUNT[self.bundle.target]))
         known = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
@@ -79,7 +79,7 @@ class RememberingNetwork(NetworkService):
     _known: dict[bytes, tuple[FloatArray, NetworkCarry]] = field(default_factory=dict, compare=False)
 
     def run(self, features: FloatArray, starts: BoolArray, carry: NetworkCarry) -> tuple[FloatArray, NetworkCarry]:
-        """Return what the network says; what is remembered are whole drives, from their start."""
+        """Return what the network states; what is remembered are whole drives, from their start."""
         if carry is not None:
             return super().run(features, starts, carry)
         key = hashlib.sha256(np.ascontiguousarray(features).tobytes() + starts.tobytes()).digest()

@@ -18,7 +18,7 @@ from pdhef_logtool.results.parquet_sink import list_estimators, read_track
 from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder
 
-#: Folder of the clips within those of a run; it holds those of the last search alone.
+#: Folder of the clips within those of a run; it contains those of the last search alone.
 CLIPS = "clips"
 _ANNOTATED = "annotated.mcap"
 
@@ -37,7 +37,7 @@ def write_clips(
     Parameters
     ----------
     pad_s : what a clip has before and behind its event.
-    named : tracks that clips have beside the truth and those that the report shows.
+    named : tracks that clips have beside the ground truth and those that the report shows.
     source : folder (or file) with the logs; None takes the full copies that the run wrote.
     tell : called with what a drive's clips lack.
 
@@ -57,7 +57,7 @@ def write_clips(
                 tell(f"{label}: no clip: {error}")
                 continue
             if opened.messages is None or all(t.name.startswith(NAMESPACE) for t in opened.topics):
-                tell(f"{label}: clips hold our tracks only: the log has no messages to copy")
+                tell(f"{label}: clips contain the tool's tracks only: the log has no messages to copy")
             try:
                 names += [
                     str(run.folder / CLIPS / name)
@@ -101,7 +101,7 @@ def _span(log: DriveLog, event: FoundEvent, pad_s: float) -> tuple[int, int]:
 
 
 def _source_of(run: OpenedRun, log: OpenedLog, folder: Path | None) -> Path:
-    """Return a file with all that the source of a drive holds; raises OutputError where there is none."""
+    """Return a file with all that the source of a drive contains; raises OutputError where there is none."""
     sha256, name = log.entry.get("sha256"), str(log.entry.get("file", ""))
     if folder is not None:
         candidates = [folder] if folder.name == name else sorted(p for p in folder.rglob("*") if p.name == name)
@@ -117,5 +117,5 @@ def _source_of(run: OpenedRun, log: OpenedLog, folder: Path | None) -> Path:
         expected=f"a full copy of {name}, {_ANNOTATED}",
         got="a run without one",
         where=str(log.folder),
-        remedy="say where the logs are: --source DIR",
+        remedy="name the folder of the logs: --source DIR",
     )

@@ -34,7 +34,7 @@ FigureVerdict: TypeAlias = Verdict | Literal["no figure"]
 #: Of the drives whose figure changed most, so many are followed into their tracks.
 MOST_FOLLOWED = 10
 #: The graver verdict is that of the whole.
-_GRAVITY: tuple[FigureVerdict, ...] = ("worse", "no figure", "cannot tell", "not worse", "better", "equal")
+_GRAVITY: tuple[FigureVerdict, ...] = ("worse", "no figure", "inconclusive", "not worse", "better", "equal")
 #: Rows of metrics.parquet that are in memory at once.
 _ROWS = 1 << 18
 _FIGURE = ["estimator", "signal", "segment", "metric", "value", "n", "unit"]
@@ -112,7 +112,7 @@ class Comparison:
 
     Attributes
     ----------
-    a, b : the folders. pairs : how many drives are in both, by what said so. only_a, only_b : drives in one alone.
+    a, b : the folders. pairs : how many drives are in both, by what stated so. only_a, only_b : drives in one alone.
     differences : what else may have changed figures, a line each. changed : drives with any figure that is not the
         same bit for bit.
     figures : those that were asked for or that the gate has. others : shown beside them; none where nothing changed.
@@ -170,7 +170,7 @@ class Comparison:
             found += [f"{f.figure.label}: {f.verdict}" for f in self.figures if f.verdict in ("worse", "no figure")]
             found += () if self.allow_unpaired else self.unpaired
         if self.strict:
-            told = ("cannot tell",) if self.gated else ("cannot tell", "no figure")
+            told = ("inconclusive",) if self.gated else ("inconclusive", "no figure")
             found += [
                 f"{f.figure.label}: {f.verdict}, which --strict refuses" for f in self.figures if f.verdict in told
             ]
@@ -223,7 +223,7 @@ def compare_runs(
     Raises
     ------
     OutputError : No drive is in both runs, or the figures of a run are damaged.
-    UsageError : No drive knows the estimator, or the key.
+    UsageError : No drive has the estimator, or the key.
     """
     pairing = pair_logs(a.logs, b.logs)
     if not pairing.pairs:
@@ -378,11 +378,11 @@ class _Tables:
         known = {name for frame in frames for name in frame["estimator"]}
         for name in sorted(missing - known):
             single = sorted(k for k in known if "~" not in k and k != SENSORS)
-            got = "none named, and none that is the answer" if name == MAIN else name
+            got = "none named, and none that is selected" if name == MAIN else name
             raise UsageError(expected=f"an estimator of these runs: {', '.join(single)}", got=got, where="--estimator")
 
     def _rows(self, figures: Sequence[Figure]) -> list[pl.DataFrame]:
-        """Return the rows of figures, and of what is said of their truth, of both runs."""
+        """Return the rows of figures, and of what is stated of their ground truth, of both runs."""
         import polars as pl
 
         named = {f.estimator for f in figures} - {MAIN}
@@ -448,7 +448,7 @@ def _notes(drives: Sequence[DriveFigure], tainted: int) -> Iterator[str]:
         share = _share(sum(d.n_a for d in drives), sum(d.n_b for d in drives)) or 0.0
         yield f"other stamps are scored in {len(other)} of {len(drives)} drives, {share:+.2%} in all"
     if tainted:
-        yield f"in {tainted} of {len(drives)} drives the truth is one of the estimator's inputs"
+        yield f"in {tainted} of {len(drives)} drives the ground truth is one of the estimator's inputs"
 
 
 def _share(a: float, b: float) -> float | None:
@@ -494,7 +494,7 @@ def _most_changed(pairs: Sequence[Pair], changed: frozenset[str], figure: Compar
 
 
 def _clusters(pairing: Pairing, key: str, damaged: _Damaged) -> list[object]:
-    """Return what each pair is of; a drive that does not say is its own."""
+    """Return what each pair is of; a drive that does not state is its own."""
     found: list[str | None] = [None] * len(pairing.pairs)
     known: set[str] = set()
     for number, pair in enumerate(pairing.pairs):

@@ -32,10 +32,10 @@ def verdict_text(found: Comparison) -> str:
         "better": "B is better",
         "not worse": "B is not worse",
         "equal": "no figure that was asked for changed",
-        "cannot tell": "these drives cannot tell",
-        "no figure": "no drive has the figure on both sides (is there truth?)",
+        "inconclusive": "inconclusive with these drives",
+        "no figure": "no drive has the figure on both sides (is there ground truth?)",
     }[found.verdict]
-    detectable = [f.detectable for f in found.figures if f.verdict == "cannot tell"]
+    detectable = [f.detectable for f in found.figures if f.verdict == "inconclusive"]
     if any(math.isfinite(d) for d in detectable):
         told += f"; a worsening of {percent(max(d for d in detectable if math.isfinite(d)))} would have shown"
     elif detectable:

@@ -1,4 +1,4 @@
-"""Where in the drives of a run a condition holds: rows of drive, start, end and peak."""
+"""Where in the drives of a run a condition is true: rows of drive, start, end and peak."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def _unfit(log: OpenedLog, condition: Condition, estimator: str | None) -> str |
     there = _tracks(log)
     for name in _needed(condition, estimator or log.main()):
         if name not in there:
-            return "it has no truth" if name == TRUTH else f"it has no estimator {name}".strip()
+            return "it has no ground truth" if name == TRUTH else f"it has no estimator {name}".strip()
     return None
 
 
@@ -154,7 +154,7 @@ def _check_tracks(logs: Sequence[OpenedLog], condition: Condition, estimator: st
     if estimator is None and not any(log.main() for log in logs):
         raise UsageError(
             expected=f"an estimator of this run: {', '.join(sorted(known))}",
-            got="none named, and none that is the answer",
+            got="none named, and none that is selected",
             where="--estimator",
         )
     asked = {c.track for c in condition.columns() if c.track is not None} | ({estimator} if estimator else set())
@@ -288,7 +288,7 @@ class _Builder:
         return (vx * vx + vy.fill_null(0.0) * vy.fill_null(0.0)).sqrt()
 
     def _error(self, track: str, signal: str) -> pl.Expr:
-        """Return estimate − truth where it is scored: both valid, and for sideslip above the lowest speed."""
+        """Return estimate − ground truth where it is scored: both valid, and for sideslip above the lowest speed."""
         import polars as pl
 
         error = self._read(track, signal) - self._read(TRUTH, signal)

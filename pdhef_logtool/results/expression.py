@@ -63,7 +63,7 @@ class Number:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column of a track; ``track`` None: of the main estimator. ``factor``: to the unit that was asked for."""
+    """A column of a track; ``track`` None: of the selected estimate. ``factor``: to the unit that was asked for."""
 
     track: str | None
     name: str
@@ -83,7 +83,7 @@ Node: TypeAlias = Number | Column | Applied
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """A condition with the time for which it must hold.
+    """A condition with the time for which it must contain.
 
     ``peak`` is what an event has a peak of, the left side of the first comparison, None without one; ``falls``: its
     smallest value is the peak.
@@ -103,12 +103,12 @@ class Condition:
 def parse_condition(text: str, columns: tuple[str, ...] = COLUMNS, guide: str = "docs/compare.md") -> Condition:
     """Read a condition on the columns of tracks, or on others, which are all numbers and of no track.
 
-    ``guide``: the page that tells of the columns.
+    ``guide``: the page that shows of the columns.
 
     Raises
     ------
     UsageError
-        It does not parse, names no column, or mixes numbers with what is true or false; the place is told.
+        It does not parse, names no column, or mixes numbers with what is true or false; the place is given.
     """
     plain = "".join(" " if sign.isspace() else sign for sign in text)
     parser = _Parser(plain, columns, guide)
@@ -124,7 +124,7 @@ def parse_condition(text: str, columns: tuple[str, ...] = COLUMNS, guide: str = 
 
 
 def where_holds(condition: Condition, columns: Mapping[str, FloatArray]) -> BoolArray:
-    """Return where a condition on columns [N] holds, its time aside; of a NaN no comparison holds but !=."""
+    """Return where a condition on columns [N] is true, its time aside; of a NaN only != is true."""
     count = len(next(iter(columns.values())))
     with np.errstate(all="ignore"):
         return np.broadcast_to(np.asarray(_value(condition.node, columns), dtype=np.bool_), count)
@@ -192,7 +192,7 @@ class _Parser:
         return seconds
 
     def _parsed(self, text: str) -> ast.expr:
-        #: The names of tracks as they were written, by the names that stand for them.
+        #: The names of tracks as they were written, by the names that represent them.
         self._tracks = {name.replace("-", "_"): name for name in _TRACK.findall(text)}
         try:
             with warnings.catch_warnings():

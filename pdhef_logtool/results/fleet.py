@@ -28,20 +28,20 @@ if TYPE_CHECKING:
 
 #: Name of the estimate that each drive's report calls its answer.
 ANSWER = "answer"
-#: Errors that are told, in order: signal and unit.
+#: Errors that are given, in order: signal and unit.
 SIGNALS = {s: SCORED_SIGNALS[s] for s in ("sideslip_rad", "vy_m_s", "yaw_rate_rad_s", "vx_m_s")}
 JUDGED = "sideslip_rad"
-#: Of fewer drives no interval is told.
+#: Of fewer drives no interval is given.
 LEAST_DRIVES = 5
 #: A difference counts as one below this corrected p-value.
 SIGNIFICANT = 0.05
 WORST = 20
-#: Values of a key that are told one by one; numbers beyond them are told by quarters.
+#: Values of a key that are given one by one; numbers beyond them are given by quarters.
 MOST_VALUES = 12
 _QUARTERS = 4
-#: Folders from the top that drives are told by.
+#: Folders from the top that drives are given by.
 _MOST_FOLDERS = 3
-#: Labels that a group of failures names, and groups that are told.
+#: Labels that a group of failures names, and groups that are given.
 NAMED, _MOST_GROUPS = 10, 50
 _PLACE = re.compile(r"\s*\([^()]*\)\s*$")
 _NUMBER = re.compile(r"\d+(\.\d+)?")
@@ -62,12 +62,12 @@ class FleetDrive:
 
     Attributes
     ----------
-    seconds : length. main : the answer's estimator, empty without one.
-    truth : whether its sideslip is scored against an independent truth. unscored : why not, else empty.
-    errors : RMSE by estimator and signal, where the truth is independent of both.
+    seconds : length. main : the selected estimate's estimator, empty without one.
+    truth : whether its sideslip is scored against an independent ground truth. unscored : why not, else empty.
+    errors : RMSE by estimator and signal, where the ground truth is independent of both.
     nis, d2, naive_d2 : what needs no truth: NIS over its degrees of freedom and d2 of the answer, d2 of sideslip 0.
-    verdict : of sideslip: ``better``, ``worse`` and so on. coverage : of the 95 % band.
-    failed_checks : those that count. lost : what could not be used, empty for nothing. keys : what it can be told by.
+    verdict : of sideslip: ``better``, ``worse`` and so on. coverage : of the 95 % confidence interval.
+    failed_checks : those that count. lost : what could not be used, empty for nothing. keys : what it can be given by.
     """
 
     label: str
@@ -138,7 +138,7 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Breakdown:
-    """The drives by what a key says; ``explains``: share of the spread of log errors that lies between groups."""
+    """The drives by what a key states; ``explains``: share of the spread of log errors that lies between groups."""
 
     key: str
     groups: tuple[Group, ...]
@@ -205,7 +205,7 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
 
     Parameters
     ----------
-    by : keys to break the drives down by; none: every key that tells drives apart.
+    by : keys to break the drives down by; none: every key that shows drives apart.
 
     Raises
     ------
@@ -362,14 +362,14 @@ def _drive(log: OpenedLog, report: Mapping[str, Any], figures: Mapping[tuple[str
 
 def _why_unscored(report: Mapping[str, Any], verdict: Mapping[str, Any]) -> str:
     if not report["truth"]["available"]:
-        return "the log has no truth"
+        return "the log has no ground truth"
     if JUDGED in report["truth"]["not_independent"]:
-        return "its truth is no independent one"
+        return "its ground truth is no independent one"
     return str(verdict.get("text", "nothing of it is scored")).partition(": ")[2] or "nothing of it is scored"
 
 
 def _keys(log: OpenedLog, report: Mapping[str, Any], main: str) -> dict[str, str]:
-    """Return what a drive can be told by: what its log says of itself, and what the run knows."""
+    """Return what a drive can be given by: what its log states of itself, and what the run has."""
     friction = report.get("friction") or {}
     car = log.entry.get("car") or {}
     source = str(friction.get("source", ""))
@@ -437,7 +437,7 @@ def _ranking(drives: Sequence[FleetDrive], names: Sequence[str]) -> list[Rank]:
     mains = {d.main for d in drives}
     return [
         Rank(
-            # Equal places where nothing tells them apart.
+            # Equal places where nothing shows them apart.
             place=1 + sum(len(lost[o]) - len(beats[o]) < len(lost[name]) - len(beats[name]) for o in names),
             estimator=name,
             drives=int(np.isfinite(errors[name]).sum()),
@@ -454,7 +454,7 @@ def _share(of_logs: Median) -> Median:
 
 
 def _breakdowns(drives: Sequence[FleetDrive], by: Sequence[str]) -> list[Breakdown]:
-    """Return the drives by each key that tells them apart, the one that explains most first; ``by`` keeps its order."""
+    """Return the drives by each key that shows them apart, the one that explains most first; ``by`` keeps its order."""
     known = {key: None for d in drives for key in d.keys}
     found = []
     for key in by or known:
@@ -466,13 +466,13 @@ def _breakdowns(drives: Sequence[FleetDrive], by: Sequence[str]) -> list[Breakdo
         return found
     same: dict[tuple[tuple[int, float], ...], Breakdown] = {}
     for one in sorted(found, key=lambda b: (-b.explains if math.isfinite(b.explains) else 1.0, b.key)):
-        # Two keys that part the drives alike say it once.
+        # Two keys that part the drives alike state it once.
         same.setdefault(tuple((g.drives, g.median.value) for g in one.groups if g.scored), one)
     return [*same.values()]
 
 
 def _told(key: str, drives: Sequence[FleetDrive]) -> list[str | None]:
-    """Return what is told of each drive by a key: its text, a quarter of its numbers, or that it is rare."""
+    """Return what is given of each drive by a key: its text, a quarter of its numbers, or that it is rare."""
     texts = [d.keys.get(key) for d in drives]
     counts = Counter(t for t in texts if t is not None)
     if len(counts) <= MOST_VALUES:
@@ -499,7 +499,7 @@ def _as_number(text: str | None) -> float:
 def _breakdown(key: str, drives: Sequence[FleetDrive], values: Sequence[str | None]) -> Breakdown:
     members: dict[str, list[FleetDrive]] = {}
     for drive, value in zip(drives, values, strict=True):
-        members.setdefault("not told" if value is None else value, []).append(drive)
+        members.setdefault("not given" if value is None else value, []).append(drive)
     groups = []
     logs: list[FloatArray] = []
     for value, of_group in sorted(members.items(), key=lambda item: _in_order(item[0])):
@@ -516,7 +516,7 @@ def _in_order(value: str) -> tuple[bool, float, str]:
 
 
 def _explained(groups: Sequence[FloatArray]) -> float:
-    """Return the share of variance between groups, less what chance puts there; NaN where it cannot be told."""
+    """Return the share of variance between groups, less what chance puts there; NaN where it cannot be determined."""
     n, k = sum(g.size for g in groups), len(groups)
     if k < 2 or n <= k + 1:
         return math.nan

@@ -17,7 +17,7 @@ from pdhef_logtool.evaluation.units import LABELS, SIGNALS
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.storage.documents import checked, read_toml, unknown
 
-#: What stands for A's main estimator of each drive.
+#: What represents A's main estimator of each drive.
 MAIN = "main"
 _SHARE = re.compile(r"\s*([0-9]*\.?[0-9]+)\s*(%?)\s*")
 
@@ -80,7 +80,7 @@ def load_gate(path: Path) -> Gate:
     Raises
     ------
     UsageError
-        The file is missing, is no TOML, or holds wrong, unknown or missing entries; all are named.
+        The file is missing, is no TOML, or contains wrong, unknown or missing entries; all are named.
     """
     return gate_from_dict(read_toml(path, "a gate TOML file", UsageError), where=str(path))
 
@@ -123,14 +123,14 @@ def _read_figure(raw: object, where: str, problems: list[str]) -> Figure | None:
 
 def figure_problems(signal: str, metric: str, segment: str, where: str = "") -> list[str]:
     """Return what is wrong with the words of a figure."""
-    # Less is better, and 0 is best: those that a ratio says something of.
+    # Less is better, and 0 is best: those that a ratio states something of.
     compared = tuple(name for name, one in registered().items() if one.best == "lower")
     choices = (("signal", signal, tuple(SIGNALS)), ("metric", metric, compared), ("segment", segment, SEGMENTS))
     return [f"{where}{key} = {unknown(value, known)}" for key, value, known in choices if value not in known]
 
 
 def share_of(text: str | float) -> float | None:
-    """Return the share that ``5%``, ``0.05`` or a number stands for; None for what is none, or above 10."""
+    """Return the share that ``5%``, ``0.05`` or a number represents; None for what is none, or above 10."""
     if isinstance(text, str):
         found = _SHARE.fullmatch(text)
         if found is None:

@@ -18,9 +18,9 @@ from pdhef_logtool.storage.files import write_bytes
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One testcase. ``suite``, ``subject``: what it is of; ``output``: its figures, shown whatever came out.
+    """One testcase. ``suite``, ``subject``: what it is of; ``output``: its figures, shown in any case.
 
-    ``outcome`` is the type of a failure where it ``failed``; ``reason`` says why it failed or was skipped.
+    ``outcome`` is the type of a failure where it ``failed``; ``reason`` states why it failed or was skipped.
     """
 
     suite: str
@@ -121,5 +121,5 @@ def _add_case(suite: ET.Element, case: Case) -> None:
 
 
 def _text(text: str) -> str:
-    """Replace what XML 1.0 cannot hold."""
+    """Replace what XML 1.0 cannot contain."""
     return re.sub("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]", "?", text)

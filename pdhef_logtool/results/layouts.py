@@ -40,7 +40,7 @@ class LayoutsSink(Sink):
 
     Parameters
     ----------
-    foxglove, plotjuggler : where the finished files stand.
+    foxglove, plotjuggler : where the finished files are.
     names : of the tracks that are written; None: all.
     colours : 0xRRGGBB by estimator.
     """

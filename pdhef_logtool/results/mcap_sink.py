@@ -68,19 +68,19 @@ def topic_of(estimator: str, what: str) -> str:
 
 
 class AnnotatedMcapSink(Sink):
-    """Writes the annotated log window by window; what the source holds passes through a chunk at a time.
+    """Writes the annotated log window by window; what the source contains passes through a chunk at a time.
 
-    Sound chunks that hold nothing but what stays are written as they are, others message by message.
+    Sound chunks that contain nothing but what stays are written as they are, others message by message.
 
     Each track becomes ``state`` (:data:`STATE_TYPE`, every stamp) and ``odometry`` (``nav_msgs/msg/Odometry``, the
-    stamps that are valid and have a pose, as the message can say neither; of a track that is not shown first, 20 a
+    stamps that are valid and have a pose, as the message can state neither; of a track that is not shown first, 20 a
     second). Log and publish time are the scored stamp. Numbers are :func:`~pdhef_logtool.results.sink.rounded`.
     Everything that an earlier annotation left in the source is replaced.
 
     Parameters
     ----------
-    path : where the finished file stands.
-    source : the log to copy in full; None, or a log without messages, for a sidecar that holds our topics alone.
+    path : where the finished file is.
+    source : the log to copy in full; None, or a log without messages, for a sidecar that contains our topics alone.
     names : of the tracks that are written; None: all.
     shown : of the tracks whose pose is written at every stamp; of others every 50 ms. None: all.
     thin : both state and pose of the others are written every :data:`LONG_STEP_NS` alone.
@@ -196,11 +196,11 @@ class AnnotatedMcapSink(Sink):
 def metrics_record(report: Mapping[str, Any]) -> dict[str, str]:
     """Return the figures as ``estimator/signal/segment/metric`` → ``value unit n=samples`` (``null``: not computable).
 
-    ``log``, ``truth`` (``available``, ``no truth``) and ``estimator/algorithm`` (what ran, as JSON) stand beside them.
+    ``log``, ``truth`` (``available``, ``no truth``) and ``estimator/algorithm`` (what ran, as JSON) are beside them.
     """
     record = {
         "log": str(report["log"]["name"]),
-        "truth": "available" if report["truth"]["available"] else "no truth",
+        "truth": "available" if report["truth"]["available"] else "no ground truth",
     }
     for e in report["estimators"]:
         if e["algorithm"] is not None:

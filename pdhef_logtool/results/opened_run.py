@@ -146,7 +146,7 @@ class OpenedLog:
 
 @dataclass(frozen=True, slots=True)
 class OpenedRun:
-    """A run's folder: ``document`` is run.json, ``logs`` stand in its order, failed ones too.
+    """A run's folder: ``document`` is run.json, ``logs`` are in its order, failed ones too.
 
     Of a run at a URL the folder is one of this machine, which has of it what was asked for and goes with this.
     """

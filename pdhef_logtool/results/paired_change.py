@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.records.signals import FloatArray, IntArray
 
-Verdict: TypeAlias = Literal["equal", "worse", "not worse", "better", "cannot tell"]
+Verdict: TypeAlias = Literal["equal", "worse", "not worse", "better", "inconclusive"]
 
 RESAMPLES = 2000
 _SEED = 0
 #: Drives times resamples that are in memory at once.
 _AT_ONCE = 1 << 20
-#: With fewer drives (clusters) the bootstrap knows too little to give bounds: all of four are worse by chance in 6 %.
+#: With fewer drives (clusters) the bootstrap has too little to give bounds: all of four are worse by chance in 6 %.
 LEAST_CLUSTERS = 5
 #: Normal deviates of a one-sided 95 % bound, and of being found in 80 % of all cases.
 _BOUND_95, _FOUND_80 = 1.6448536269514722, 0.8416212335729143
@@ -63,7 +63,7 @@ class PairedChange:
             return "worse"
         if self.most < 0.0:
             return "better"
-        return "not worse" if self.most <= beyond else "cannot tell"
+        return "not worse" if self.most <= beyond else "inconclusive"
 
     def detectable(self, limit: float = 0.0) -> float:
         """Return the smallest worsening (a share) that :meth:`verdict` finds in 80 % of all cases; NaN: unknown."""
@@ -98,7 +98,7 @@ def paired_change(ratios: FloatArray, clusters: Sequence[object] | None = None) 
     votes = sign_p(np.array([np.sum(np.sign(ratios[of_drive == g])) for g in range(groups)]) if clusters else ratios)
     if groups < LEAST_CLUSTERS:
         return PairedChange(n, groups, median, nan, nan, nan, nan, nan, votes)
-    if ascending[0] == ascending[-1]:  # whatever is drawn
+    if ascending[0] == ascending[-1]:  # for any drawing
         return PairedChange(n, groups, median, median, median, median, median, 0.0, votes)
     step = max(1, _AT_ONCE // n)
     parts = (_draws(groups)[i : i + step, of_drive[order]] for i in range(0, RESAMPLES, step))

@@ -20,7 +20,7 @@ _KEYS: tuple[tuple[PairedBy, Callable[[OpenedLog], object]], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """One drive in both runs, and what says that it is one."""
+    """One drive in both runs, and what states that it is one."""
 
     a: OpenedLog
     b: OpenedLog

@@ -41,11 +41,11 @@ _STD_COLUMNS = ("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s")
 
 
 class RowGroups:
-    """A Parquet file that is written in row groups under a temporary name; a row group holds the rows of one key.
+    """A Parquet file that is written in row groups under a temporary name; a row group contains the rows of one key.
 
     Parameters
     ----------
-    path : where the finished file stands. rows_a_group : rows of one row group.
+    path : where the finished file is. rows_a_group : rows of one row group.
     dictionaries : columns of few values.
     joined : every row group is written from one piece, so that the same rows give the same bytes.
     encodings : Parquet's, by column. level : of zstd; None: Parquet's own, which is the lowest.
@@ -133,13 +133,13 @@ class RowGroups:
 
 
 class EstimatesSink(Sink):
-    """Writes estimates.parquet; a row group holds one estimator, so that one can be read without the others.
+    """Writes estimates.parquet; a row group contains one estimator, so that one can be read without the others.
 
     Numbers are :func:`~pdhef_logtool.results.sink.rounded` and stored byte by byte: a sixth of the file.
 
     Parameters
     ----------
-    path : where the finished file stands.
+    path : where the finished file is.
     rows_a_group : rows of one row group.
     selected : estimator whose track is written a second time, as :data:`SELECTED`.
 
@@ -171,7 +171,7 @@ class EstimatesSink(Sink):
 
 
 def track_table(track: StateTrack, *, as_written: bool = False) -> pa.Table:
-    """Return a track [N] as rows of estimates.parquet, rounded as they stand in the file if ``as_written``."""
+    """Return a track [N] as rows of estimates.parquet, rounded as they are in the file if ``as_written``."""
     schema = arrow_schema("estimates.parquet.json")
     columns: dict[str, Any] = dict(track.columns())
     if as_written:
@@ -206,13 +206,13 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
     Returns
     -------
     StateTrack
-        In order of time. The file holds standard deviations only: ``covariance`` has them on its diagonal, NaN
+        In order of time. The file contains standard deviations only: ``covariance`` has them on its diagonal, NaN
         elsewhere, and length 0 if none was read or known. ``nis_dof`` is NaN. Optional columns that were not read, or
         that are null throughout, have length 0.
 
     Raises
     ------
-    OutputError : When the file is no estimates.parquet or holds no such track.
+    OutputError : When the file is no estimates.parquet or contains no such track.
     """
     tables = list(_tables(path, estimator, None if columns is None else set(columns)))
     if not tables:
@@ -223,7 +223,7 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
 def read_blocks(path: Path, estimator: str, columns: Iterable[str]) -> Iterator[StateTrack]:
     """Yield one track of an estimates.parquet in order of time, a row group at once; none where it is not in the file.
 
-    As :func:`read_track` says; a column that an earlier version did not write stays NaN.
+    As :func:`read_track` states; a column that an earlier version did not write stays NaN.
 
     Raises
     ------
@@ -316,7 +316,7 @@ def _open(path: Path, kind: str) -> pq.ParquetFile:
 
 
 def _class_of(kind: pa.DataType) -> str:
-    """Return what the values of a column are, however many bits they have; texts may stand in a dictionary."""
+    """Return what the values of a column are, however many bits they have; texts may be in a dictionary."""
     if pa.types.is_dictionary(kind):
         kind = kind.value_type
     if pa.types.is_string(kind) or pa.types.is_large_string(kind):
@@ -333,7 +333,7 @@ def _without(path: Path, kind: str, absent: Iterable[str]) -> OutputError:
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Turn what Arrow says of a damaged file into an OutputError."""
+    """Turn what Arrow states of a damaged file into an OutputError."""
     try:
         yield
     except (OSError, ValueError, LookupError, pa.ArrowException) as error:

@@ -1,4 +1,4 @@
-"""recording.rrd: plots, uncertainty bands, plan view, events and the text report, with a blueprint."""
+"""recording.rrd: plots, uncertainty confidence intervals, plan view, events and the text report, with a blueprint."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from pdhef_logtool.results.sink import (
 )
 from pdhef_logtool.storage.files import PendingFile, cannot_write, open_new, writing
 
-#: Estimators beside the main one and the baseline that the blueprint has places for, hidden until asked for.
+#: Estimators beside the selected estimate and the baseline that the blueprint has places for, hidden until asked for.
 MOST_OTHERS = 6
 
 #: Half width of the 95 % interval of a normal distribution, in standard deviations.
@@ -79,11 +79,11 @@ _STATES = (
     _Plot("vy_m_s", "lateral velocity [m/s]", "vy_m_s", std="vy_std_m_s"),
     _Plot("ay_m_s2", "lateral acceleration [m/s²]", "ay_m_s2"),
 )
-#: Whose error is drawn; the other two errors say the same once more.
+#: Whose error is drawn; the other two errors state the same once more.
 _ERRORS = (_STATES[0], _STATES[1], _STATES[3])
 _HEALTH = (
     _Plot("nis", "normalised innovation squared", "nis", sparse=True),
-    _Plot("network_trust", "network trust", "network_trust"),
+    _Plot("network_trust", "residual gain", "network_trust"),
     _Plot("r_scale", "factor on R", "r_scale"),
     _Plot("mixture_weight", "weight of the filters with a force scale or a bank", "mixture_weight"),
     _Plot("friction", "friction", "friction"),
@@ -106,15 +106,15 @@ class RerunSink(Sink):
     Each track is one entity with a row a stamp (of a drive above ten minutes 10 a second, of other estimators 5) and a
     component a quantity, which holds value and band. Entities are named by what a track is for (``/truth``, ``/main``,
     ``/baseline``, ``/other/1``), so that one blueprint suits all drives of a run whatever ran on them; the lines carry
-    the estimators' names. Errors stand where truth and estimate share a stamp.
+    the estimators' names. Errors are where ground truth and estimate share a stamp.
 
     Parameters
     ----------
-    path : where the finished recording stands.
+    path : where the finished recording is.
     application_id : the same for all logs of a run; the viewer shows them as one dataset with one blueprint.
     log_name : shown as the recording's name.
-    input_hash : hexadecimal hash of the log, by which the viewer tells the recordings of a run from one another.
-    start_ns : zero of the timeline ``elapsed``. end_ns : of the drive, which tells whether it is long; None: it is not.
+    input_hash : hexadecimal hash of the log, by which the viewer shows the recordings of a run from one another.
+    start_ns : zero of the timeline ``elapsed``. end_ns : of the drive, which shows whether it is long; None: it is not.
     shown : which estimators the recording opens on.
     min_speed_m_s : sideslip is not drawn below, where it has no meaning. colours : 0xRRGGBB by estimator.
 
@@ -362,7 +362,7 @@ class RerunSink(Sink):
             self._send(f"/plan/{place}/now", track.stamps_ns[shown], points)
 
     def _draw_reasons(self) -> list[Event]:
-        """Draw each reason as a state that holds in its intervals; return the intervals as events."""
+        """Draw each reason as a state that is active in its intervals; return the intervals as events."""
         events = []
         for name, intervals in self._reasons.items():
             for reason, spans in intervals.intervals().items():
@@ -375,7 +375,7 @@ class RerunSink(Sink):
 
 
 def _errors(track: StateTrack, truth: StateTrack | None, min_speed_m_s: float) -> dict[str, FloatArray]:
-    """Return the errors by component, [N, 1] each, NaN where truth or estimate is not known."""
+    """Return the errors by component, [N, 1] each, NaN where ground truth or estimate is not known."""
     columns = {f"error_{plot.name}": np.full((len(track), 1), np.nan) for plot in _ERRORS}
     if truth is None:
         return columns
@@ -488,7 +488,7 @@ class _Column:
 
 @dataclass(slots=True)
 class _Rows:
-    """Where an entity stands between windows: its last stamp, and when each sparse component was last known."""
+    """Where an entity is between windows: its last stamp, and when each sparse component was last known."""
 
     last_ns: int | None = None
     known_ns: dict[str, int] = field(default_factory=dict)
@@ -499,7 +499,7 @@ class _Rows:
         return np.concatenate([[first], stamps_ns[:-1]])
 
     def gaps(self, stamps_ns: IntArray) -> IntArray:
-        """Return the rows before which nothing stands for longer than LONGEST_BRIDGE_NS: lines must break there."""
+        """Return the rows after more than LONGEST_BRIDGE_NS: lines must break there."""
         return np.flatnonzero(stamps_ns - self.before(stamps_ns) > LONGEST_BRIDGE_NS)
 
     def bridged(self, name: str, stamps_ns: IntArray, known: BoolArray) -> BoolArray:

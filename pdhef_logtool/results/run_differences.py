@@ -1,4 +1,4 @@
-"""What differs between two runs before any figure: cars, mappings, signals, truth, configuration, versions."""
+"""What differs between two runs before any figure: cars, mappings, signals, ground truth, configuration, versions."""
 
 from __future__ import annotations
 
@@ -66,11 +66,11 @@ def _sources(pairs: Sequence[Pair]) -> Iterator[str]:
     blind = [pair for pair in pairs if pair.by == "name" and pair.same("signals_sha256") is not False]
     if unproven := [pair for pair in blind if pair.same("sha256") is not True]:
         where = f"{_of(len(unproven), len(pairs))}: {_names(unproven)}"
-        yield f"drives: nothing but their name says that they are one{where}"
+        yield f"drives: only their names indicate that they are equal{where}"
 
 
 def _example(pair: Pair, what: str) -> str:
-    """Return how the first changed source of a pair changed, empty where the reports do not say."""
+    """Return how the first changed source of a pair changed, empty where the reports do not state."""
     if what not in ("mapping", "truth"):
         return ""
     key = "signals" if what == "mapping" else "quantities"
@@ -91,7 +91,7 @@ def _example(pair: Pair, what: str) -> str:
 def _main(pairs: Sequence[Pair]) -> Iterator[str]:
     changes = Counter((p.a.entry["main"], p.b.entry["main"]) for p in pairs if p.same("main") is False)
     for (one, other), count in changes.most_common(_MOST_NAMED):
-        yield f"main estimator: {one} → {other}{_of(count, len(pairs))}; that of A is compared on both sides"
+        yield f"selected estimate: {one} → {other}{_of(count, len(pairs))}; that of A is compared on both sides"
 
 
 def _entries(what: str, one: object, other: object) -> Iterator[str]:
@@ -120,7 +120,7 @@ def _outcomes(pairs: Sequence[Pair]) -> Iterator[str]:
 def _unknown(pairs: Sequence[Pair]) -> Iterator[str]:
     unstated = sum(pair.same("signals_sha256") is None and pair.a.outcome == pair.b.outcome == "ok" for pair in pairs)
     if unstated:
-        yield f"signals, truth, mapping: nothing says whether they are the same{_of(unstated, len(pairs))}"
+        yield f"signals, ground truth, mapping: not recorded whether they are the same{_of(unstated, len(pairs))}"
 
 
 def _of(count: int, pairs: int) -> str:

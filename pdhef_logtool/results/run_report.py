@@ -76,9 +76,9 @@ class LogFacts:
 
 @dataclass(frozen=True, slots=True)
 class SourceFacts:
-    """Where one signal or truth quantity came from.
+    """Where one signal or ground truth quantity came from.
 
-    ``source`` is ``/topic.field``; ``derivation`` says in words how it was computed, empty if it was read as it is.
+    ``source`` is ``/topic.field``; ``derivation`` states how it was computed, empty if it was read directly.
     """
 
     name: str
@@ -93,7 +93,7 @@ class EstimatorFacts:
     """One estimator that was asked for.
 
     ``skipped`` is the reason if it did not run, ``failed`` the reason if its estimates are not used.
-    ``notes``: what it has to say of itself. ``intervals``: what its 95 % intervals are made of, empty without.
+    ``notes``: what it has to state of itself. ``intervals``: what its 95 % intervals are made of, empty without.
     ``reasons``: why it did not use its sensors as usual; None if it does not look. ``algorithm``: what ran under the
     name, with its digest; None if it did not run.
     """
@@ -120,7 +120,7 @@ class TruthFacts:
 
 @dataclass(frozen=True, slots=True)
 class FrictionFacts:
-    """The friction that every estimator was told: ``source`` in words, and what an estimate of it was worth.
+    """The friction that every estimator was given: ``source`` in words, and what an estimate of it was worth.
 
     ``observable_share`` of the stamps, ``observable_std`` the median 1-sigma there; NaN where nothing was estimated.
     """
@@ -134,12 +134,12 @@ class FrictionFacts:
 
 @dataclass(frozen=True, slots=True)
 class DriveDetails:
-    """What a report's page shows and no table holds, of a drive that a run estimated.
+    """What a report's page shows and no table contains, of a drive that a run estimated.
 
     ``faults`` of the sensors, None where no estimator looks for them. ``innovations`` by channel.
-    ``standings`` of the main estimator, empty without truth; ``limits``: how it stands against the thresholds.
+    ``standings`` of the selected estimate, empty without ground truth; ``limits``: how it is against the thresholds.
     ``error_budget`` has a reason where there is none. ``operating_space``: the cells that the drive was in.
-    ``metadata`` : what the log says of itself.
+    ``metadata`` : what the log states of itself.
     """
 
     faults: Sequence[SensorFault] | None
@@ -153,13 +153,13 @@ class DriveDetails:
 
 @dataclass(frozen=True, slots=True)
 class ReportFacts:
-    """Everything that report.json says about one log.
+    """Everything that report.json states about one log.
 
     ``vehicle_file``: the car's folder or file, None where none was given; ``vehicle_proven``: whether driving with
-    truth showed it to be right. ``low_speed_m_s``: below it sideslip is not scored.
-    ``main``: the estimator that is the answer, None where nothing was estimated.
+    ground truth showed it to be right. ``low_speed_m_s``: below it sideslip is not scored.
+    ``main``: the estimator of the selected estimate, None where nothing was estimated.
     ``warnings``: what may be wrong; ``remarks``: what else is worth knowing.
-    ``calibration``: what the drive said of its car without truth, None where it was not asked.
+    ``calibration``: what the drive stated of its car without ground truth, None where it was not asked.
     ``file_bytes``: what became of the bytes of each file; ``samples``: of the samples of each mapped source.
     ``checks``: what physics says of signals, truth and vehicle file. ``details``: None where nothing was estimated.
     """
@@ -205,7 +205,7 @@ class CarFacts:
 class LogOutcome:
     """How one log of a run ended, with which car; None where it was not read or nothing was estimated.
 
-    ``failed`` is the one-line reason if nothing came out; ``lost`` says what of the log could not be used.
+    ``failed`` is the one-line reason if nothing came out; ``lost`` states what of the log could not be used.
     ``main``: the estimator that is the answer. ``folder`` of the log, below the one that holds all logs of the run.
     ``algorithms``: the identity of each estimator that ran. ``files``: sha256 by name of the files in the log's folder
     that commands read back.
@@ -338,7 +338,7 @@ def _detailed(details: DriveDetails) -> dict[str, Any]:
 def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
     """Return a report of a few kB, of many drives: figures that tables show, and no list that grows with the log.
 
-    All figures stand in metrics.parquet. Of topics those that were mapped stay, of algorithms all but the noise, of
+    All figures are in metrics.parquet. Of topics those that were mapped stay, of algorithms all but the noise, of
     segments the sideslip answer's own, and of the rest the first :data:`_MOST_LISTED`.
     """
     answer = report["answer"]
@@ -517,7 +517,7 @@ def _reason_text(reason: Mapping[str, Any], start_ns: int) -> str:
 
     more = reason["intervals"] - len(reason["longest"])
     text = f"{reason['text']} {', '.join(map(when, reason['longest']))}" + (f" and {more} more" if more else "")
-    # A sensor at a lower rate than the stamps, or single spikes, do not hold throughout.
+    # A sensor at a lower rate than the stamps, or single spikes, do not contain throughout.
     within = reason["share_within"]
     return text if within > _THROUGHOUT else f"{text} ({within:.0%} of it)"
 
@@ -541,9 +541,9 @@ def _source_line(source: Mapping[str, Any]) -> str:
 
 
 def _truth_lines(truth: Mapping[str, Any]) -> list[str]:
-    lines = ["## Truth", ""]
+    lines = ["## Ground truth", ""]
     if not truth["available"]:
-        lines.append("- no truth in this log")
+        lines.append("- no ground truth in this log")
     lines += [_source_line(q) for q in truth["quantities"]]
     if truth["latency_s"] is not None:
         lines.append(f"- latency {truth['latency_s'] * 1e3:.1f} ms")
@@ -563,7 +563,7 @@ def _metric_table(signal: str, rows: Sequence[Mapping[str, Any]], not_causal: se
         "| --- | --- |" + " ---: |" * len(heads),
     ]
     groups = dict.fromkeys((m["estimator"], m["segment"]) for m in rows)
-    for estimator, segment in sorted(groups, key=lambda g: g[0] in not_causal):  # those stand apart, below
+    for estimator, segment in sorted(groups, key=lambda g: g[0] in not_causal):  # those are apart, below
         own = {
             (m["metric"], m["unit"]): m["value"]
             for m in rows

@@ -35,7 +35,7 @@ _MOST_STEPS = 2
 
 @dataclass(frozen=True, slots=True)
 class MainFacts:
-    """The estimator whose estimate is the answer, chosen without truth, and what it is shown with.
+    """The estimator of the selected estimate, chosen without ground truth, and what it is shown with.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ def _against(own: float, other: float, text: str) -> str:
 
 
 def _truth_of(report: Report, name: str) -> str:
-    """Return the topics that a truth quantity comes from, as far as its derivation names them."""
+    """Return the topics that a ground truth quantity comes from, as far as its derivation names them."""
     by_name = {q["name"]: q for q in report["truth"]["quantities"]}
     parts = [by_name[n] for n in (name, "vx_m_s", "vy_m_s") if n in by_name]
     words = " ".join(f"{q['source']} {q['derivation']}" for q in parts).replace(",", " ").split()
@@ -273,7 +273,7 @@ def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]
         steps.append("recalibrate the intervals with drives like this one: pdhef learn --stages intervals")
     friction = report["friction"]
     if friction is not None and friction["estimated"] and (friction["observable_share"] or 0.0) < _FRICTION_SHOWN:
-        steps.append("give the friction if you know it: --friction 0.8")
+        steps.append("give the friction if it is known: --friction 0.8")
     return steps
 
 

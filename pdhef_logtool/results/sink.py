@@ -14,7 +14,7 @@ import numpy as np
 from pdhef_logtool.records.signals import FloatArray, IntArray, Loss, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
-#: Name of the track that holds the truth.
+#: Name of the track that contains the ground truth.
 TRUTH = "truth"
 
 #: A drive that takes longer is long: of it less is written than every stamp where a person only looks.
@@ -35,9 +35,9 @@ _STEPS = {
     "ay_m_s2": 2.0**-12,
     "orientation": 2.0**-18,
 }
-#: What stays in single precision: a person has told it, and reads 0.85 there.
+#: What stays in single precision: a person has given it, and reads 0.85 there.
 _SINGLE = frozenset({"friction", "network_trust", "r_scale"})
-#: Bits of a single precision number that are left out of all else, so that 12 stand behind the first.
+#: Bits of a single precision number that are left out of all else, so that 12 are behind the first.
 _BITS_OUT = 11
 
 
@@ -78,7 +78,7 @@ def rounded(name: str, values: FloatArray) -> FloatArray:
 
 
 def resolution(name: str) -> tuple[float, float]:
-    """Return by how much a column as files hold it may be off at most: absolute, and as a share of itself."""
+    """Return by how much a column as files contain it may be off at most: absolute, and as a share of itself."""
     return (_STEPS[name] / 2.0, 0.0) if name in _STEPS else (0.0, 2.0 ** (_BITS_OUT - 24))
 
 
@@ -101,8 +101,8 @@ class Sink(ABC):
 
     For each window :meth:`append_signals` comes at most once and :meth:`append` once per estimator and once for the
     track named ``truth`` (if there is one), in any order. The first track whose name was already given in the
-    current window opens the next one. Then either :meth:`finish` or :meth:`abort` ends the sink; nothing stands
-    under the final name before :meth:`finish` returns. ``lost``: what of the source this output cannot hold.
+    current window opens the next one. Then either :meth:`finish` or :meth:`abort` ends the sink; nothing is
+    under the final name before :meth:`finish` returns. ``lost``: what of the source this output cannot contain.
     """
 
     lost: tuple[Loss, ...] = ()

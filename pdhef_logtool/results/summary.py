@@ -17,14 +17,14 @@ from pdhef_logtool.results.opened_run import OpenedRun
 if TYPE_CHECKING:
     import polars as pl
 
-#: Drives that are named as the worst, and estimators that are told beside the answer.
+#: Drives that are named as the worst, and estimators that are given beside the selected estimate.
 WORST = 10
 _RIVALS = ("physics", "zero")
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorsOf:
-    """RMSE of sideslip in rad of one estimator over drives whose truth is independent of it."""
+    """RMSE of sideslip in rad of one estimator over drives whose ground truth is independent of it."""
 
     estimator: str
     drives: int
@@ -44,7 +44,7 @@ class WorstDrive:
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """What a run of many logs is told as.
+    """What a run of many logs is given as.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class RunSummary:
     checks_failed: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the summary as one JSON-able document; its drives stand one by one in run.json."""
+        """Return the summary as one JSON-able document; its drives are one by one in run.json."""
         return {**asdict(self), "output": str(self.output)}
 
 

@@ -1,4 +1,4 @@
-"""The verdict of a drive, a sentence a signal: the answer against the best physics and the thresholds.
+"""The verdict of a drive, a sentence a signal: the selected estimate against the best physics and the thresholds.
 
 Written from the figures of a report, like :mod:`~pdhef_logtool.results.selected_estimate`, which has the other
 sentences: how the estimate was selected, its interval, what was assumed, what to do next.
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 #: ``same``: the interval of the difference lies within
 #: :data:`~pdhef_logtool.results.selected_estimate.SAME` of the rival's error.
-#: ``undecided``: it holds 0, or there is none. ``alone``: no other physics ran.
+#: ``undecided``: it contains 0, or there is none. ``alone``: no other physics ran.
 Outcome: TypeAlias = Literal["better", "worse", "same", "undecided", "alone", "none"]
 
 
@@ -143,7 +143,7 @@ def _against(found: Standing, outcome: Outcome) -> str:
 
 
 def _limits(found: Standing, limits: Sequence[Verdict]) -> list[str]:
-    """Return what is said of the thresholds; of a limit of the RMSE also whether the interval reaches beyond it."""
+    """Return what is stated of the thresholds; of a limit of the RMSE also whether the interval reaches beyond it."""
     said = []
     for verdict in limits:
         limit = verdict.threshold

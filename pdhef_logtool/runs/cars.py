@@ -27,7 +27,7 @@ _Name = Annotated[str, Field(min_length=1)]
 
 
 class CarTable(Record):
-    """``cars.toml``: cars by log, by folder of logs, or by what the logs' metadata say.
+    """``cars.toml``: cars by log, by folder of logs, or by what the logs' metadata state.
 
     Cars and folders are relative to the file; a car may be a shipped one's name.
 
@@ -144,7 +144,7 @@ class RunCars:
             asked = [*table.metadata] or ["none"]
             raise UsageError(
                 expected=f"a car for every log in {self.config.cars}",
-                got=f"no name, no folder and no metadata (asked for: {', '.join(asked)}) that it knows",
+                got=f"no name, no folder and no metadata (asked for: {', '.join(asked)}) in it",
                 where=str(log.path),
                 remedy='name it under [logs], or give default = "car"',
             )
@@ -171,7 +171,7 @@ class RunCars:
 def car_record(car: Car) -> dict[str, Any]:
     """Return what a car is to a run that goes on: its name, its network's name and digest, and a digest of each part.
 
-    The parts are named as a person is told which of them has changed.
+    The parts are named as a person is given which of them has changed.
     """
     network = None if car.network is None else [Path(car.network_name).name, car.network.sha256]
     parts = {
@@ -179,7 +179,7 @@ def car_record(car: Car) -> dict[str, Any]:
         "the car's fit": [_plain(car.fitted_physics), [_plain(d) for d in car.learnt_on]],
         "the car's noise": {name: _plain(noise) for name, noise in car.noise.items()},
         "the network": network,
-        "the car's trust": _plain(car.trust),
+        "the car's gain limit": _plain(car.trust),
         "the car's intervals": _plain(car.intervals),
     }
     return {"name": car.file_name or "", "network": network, "parts": {k: digest_of(v) for k, v in parts.items()}}

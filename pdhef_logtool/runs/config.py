@@ -26,7 +26,7 @@ from pdhef_logtool.storage.object_store import is_url
 _FILES = ("car", "cars", "mapping", "msgs", "thresholds", "network", "intervals", "setup")
 #: Settings that change no result.
 _NO_RESULT = ("cache", "cache_max_gb", "allow_private_redirects", "log_timeout_s", "max_memory_mb", "full_worst")
-#: What may stand in place of a file.
+#: What may be in place of a file.
 _KEYWORDS = {
     "car": tuple(SHIPPED_CARS),
     "network": (*SHIPPED_FOLDERS, NO_MODEL),
@@ -135,13 +135,13 @@ class RunConfig:
 
     @property
     def annotation(self) -> Literal["full", "sidecar", "none"]:
-        """What annotated.mcap holds; what was asked for is never left out."""
+        """What annotated.mcap contains; what was asked for is never left out."""
         whole: Literal["full", "sidecar"] = "full" if self.cache is None else "sidecar"
         return self.annotate or (whole if self.kept == "full" else "none")
 
     @property
     def files(self) -> list[Path]:
-        """The files and folders that it names, with what may stand in place of one."""
+        """The files and folders that it names, with what may be in place of one."""
         return [path for key in _FILES if (path := getattr(self, key)) is not None]
 
     def to_dict(self) -> dict[str, Any]:
@@ -172,7 +172,7 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
         path = Path("pdhef.toml")
     raw = {} if path is None else _read_file(path)
     given = {key: value for key, value in flags.items() if value is not None}
-    if {"car", "cars"} & given.keys():  # one stands for the other
+    if {"car", "cars"} & given.keys():  # one replaces the other
         raw = {key: value for key, value in raw.items() if key not in {"car", "cars"}}
     if "friction" in given:
         given["friction"] = parse_friction(given["friction"])
@@ -193,7 +193,7 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
         raise UsageError(expected="--cache DIR", got=config.cache or "none", where="cache_max_gb")
     if config.setup is not None and config.setup_from_s is not None:
         raise UsageError(expected="--setup or --setup-from", got="both", where="--setup")
-    # Times are understood without a log, so that a typing error is told before the first log is opened.
+    # Times are understood without a log, so that a typing error is given before the first log is opened.
     for name, text in (("--start", config.start), ("--end", config.end)):
         if text is not None:
             parse_time(text, 0, 0, option=name)

@@ -1,4 +1,4 @@
-"""What the page of a drive shows and no table holds, gathered while the drive's tracks are still at hand."""
+"""What the page of a drive shows and no table contains, gathered while the drive's tracks are still at hand."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def drive_details(
     Parameters
     ----------
     ready : the estimators that ran. main : the name of the answer. read : returns the track of a name, ``truth`` too.
-    signals : what the estimators saw. limits : how the figures stand against the thresholds.
+    signals : what the estimators saw. limits : how the figures are against the thresholds.
     brief : without innovations and error budget, for which estimators run once more.
     """
     truth, slow = read(TRUTH), drive.car.vehicle.low_speed_blend_m_s
@@ -92,11 +92,11 @@ def _rivals(ready: Sequence[Estimator], main: Estimator) -> list[str]:
 def _budget(drive: Drive, physics: Estimator | None, read: _Read, signals: Signals) -> ErrorBudget:
     truth, slow = read(TRUTH), drive.car.vehicle.low_speed_blend_m_s
     if truth is None:
-        return no_budget("the log has no truth")
+        return no_budget("the log has no ground truth")
     if physics is None:
         return no_budget(f"{PHYSICS} did not run")
     if "sideslip_rad" in drive.plan.dependent:
-        return no_budget("the truth of sideslip is an input or an estimate, and no independent one")
+        return no_budget("the ground truth of sideslip is an input or an estimate, and no independent one")
     track = read(PHYSICS)
     assert track is not None
     sample = sample_drive(signals, truth, _squared_error(track, truth, slow))  # where there is most to explain

@@ -24,7 +24,7 @@ SETTLE_S = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveSample:
-    """Stamps of a drive [M], blocks one behind the other; a gap between two of them starts every filter anew.
+    """Stamps of a drive [M], blocks one behind the other; a gap between two of them starts every filter again.
 
     ``truth`` is None where the drive has none. ``block`` [M] numbers the block of a stamp, −1 while filters settle.
     """
@@ -85,7 +85,7 @@ def sample_drive(signals: Signals, truth: StateTrack | None, weight: FloatArray)
 
 
 def bare_filter(estimator: Estimator, signals: Signals) -> tuple[Estimator, Signals]:
-    """Return what runs under stand-in and self-calibration, and what it is given of a drive's signals."""
+    """Return what runs under a fallback and self-calibration, and what it is given of a drive's signals."""
     while isinstance(estimator, SelfCalibrated | OnlineCalibrated):
         if isinstance(estimator, SelfCalibrated):
             signals = estimator.given(signals)

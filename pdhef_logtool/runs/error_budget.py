@@ -2,12 +2,12 @@
 
 On the blocks of :mod:`~pdhef_logtool.runs.drive_sample` the filter runs again with each parameter of a cause moved a
 little. The change of its error by the parameter is the sensitivity, and a regression of the error on the sensitivities
-of a cause, held back by what a car's file is usually wrong by, says how far its parameters are off. The filter then
+of a cause, held back by what a car's file is usually wrong by, states how far its parameters are off. The filter then
 runs with them moved so far, and the RMSE that is left is measured.
 
-The blocks are in two halves. What is left of one is always measured with what the other one says, so that a cause
+The blocks are in two halves. What is left of one is always measured with what the other one states, so that a cause
 takes off what is constant over the drive, and chance takes off nothing; a cause can leave more than there was. Causes
-overlap: the shares do not add up, and the first one need not be the true one. It reads the truth: an estimate of
+overlap: the shares do not add up, and the first one need not be the true one. It reads the ground truth: an estimate of
 nothing, and fed to none.
 """
 
@@ -31,11 +31,11 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.drive_sample import DriveSample, bare_filter
 
-#: Seconds of scored driving below which nothing is told.
+#: Seconds of scored driving below which nothing is given.
 LEAST_S = 10.0
 #: Errors stay alike for this long, s.
 _ALIKE_S = 1.0
-#: Share of its spread by which a parameter is moved for its sensitivity, and most that it is believed to be off.
+#: Share of its spread by which a parameter is moved for its sensitivity, and most that it is accepted to be off.
 _STEP, _MOST_SPREADS = 0.2, 3.0
 #: Roll gradient that is left to a car whose model rolls, rad/(m/s²).
 _LEAST_ROLL = 0.001
@@ -60,7 +60,7 @@ class _Parameter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Case:
-    """The filter, what it is given, what it is held against, and the stamps [M] that count; ``ran``: what it said."""
+    """The filter, what it is given, what it is held against, and the stamps [M] that count; ``ran``: what it stated."""
 
     physics: AdaptivePhysics
     signals: Signals
@@ -79,7 +79,7 @@ class _Case:
         return np.where(self.counts, error, np.nan)
 
     def estimate(self) -> StateTrack:
-        """Return what the filter says; it runs where it has not."""
+        """Return what the filter states; it runs where it has not."""
         return run_window(self.physics, self.signals)[0] if self.ran is None else self.ran
 
     def with_vehicle(self, **changes: Any) -> _Case:
@@ -105,7 +105,7 @@ class MovedParameter:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """What one cause takes off: the RMSE that is left, in rad, NaN with the ``reason`` where nothing can be told."""
+    """What one cause takes off: the RMSE that is left, in rad, NaN with the ``reason`` where nothing can be given."""
 
     name: str
     rmse_left_rad: float
@@ -133,11 +133,11 @@ def _too_short(seconds: float) -> str:
 
 
 def error_budget(estimator: Estimator, sample: DriveSample, low_speed_m_s: float) -> ErrorBudget:
-    """Return what may have caused the error of ``physics`` on the blocks of a drive with truth.
+    """Return what may have caused the error of ``physics`` on the blocks of a drive with ground truth.
 
     Parameters
     ----------
-    low_speed_m_s : sideslip is scored above this truth speed.
+    low_speed_m_s : sideslip is scored above this ground truth speed.
     """
     bare, _ = bare_filter(estimator, sample.signals)
     if not isinstance(bare, AdaptivePhysics) or sample.truth is None:
@@ -191,7 +191,7 @@ def _cause(name: str, parameters: Sequence[_Parameter], halves: Sequence[_Half],
     errors = [h.error for h in halves]
     rate = seconds / _ALIKE_S / sum(h.scored for h in halves)
     of_first, of_second = (_regressed(e, s, rate) for e, s in zip(errors, sensitivity, strict=True))
-    # What one half says is tried on the other.
+    # What one half states is tried on the other.
     left = np.concatenate([halves[0].left(shown, of_second), halves[1].left(shown, of_first)])
     before = np.concatenate(errors)
     both = np.isfinite(left) & np.isfinite(before)
@@ -277,7 +277,7 @@ def _late_truth(case: _Case, delay_s: float) -> _Case:
     return replace(case, truth=replace(truth, sideslip_rad=np.where(known, moved, np.nan)))
 
 
-#: Spreads: friction that is told or estimated, and the priors' about a vehicle file and a car's sensors.
+#: Spreads: friction that is given or estimated, and the priors' about a vehicle file and a car's sensors.
 _CAUSES: dict[str, tuple[_Parameter, ...]] = {
     "friction": (_Parameter("friction", "1", 0.2, _friction),),
     "tyres": (

@@ -45,11 +45,11 @@ def read_estimate(
 ) -> tuple[RecordedEstimate, list[Loss]]:
     """Read one recorded estimate with log time in [start, end) onto the stamps of its first quantity of BASE_ORDER.
 
-    NaN stays: where an estimator says nothing it is not available, which is a figure and no loss.
+    NaN stays: where an estimator states nothing it is not available, which is a figure and no loss.
 
     Raises
     ------
-    MappingError : The slice holds no message of it, or not one number.
+    MappingError : The slice contains no message of it, or not one number.
     """
     log = with_can_signals(log, source.as_mapping())
     mapping = resolve_mapping(log, source.as_mapping())
@@ -135,7 +135,7 @@ def _ordered(
 
 
 def _planar_covariance(topic: Columns, source: CovarianceSource) -> FloatArray:
-    """Return [N, 3, 3] over v_x, v_y, yaw rate; NaN where it is unknown (all zero, or −1 first, as ROS says)."""
+    """Return [N, 3, 3] over v_x, v_y, yaw rate; NaN where it is unknown (all zero, or −1 first, as ROS states)."""
     raw = np.asarray(topic.fields[source.field], dtype=np.float64)
     n = raw.shape[0]
     if raw.ndim != 2 or raw.shape[1] != source.size**2:

@@ -59,7 +59,7 @@ def estimate_windows(
     Raises
     ------
     EstimatorError
-        The drive holds no stamp.
+        The drive contains no stamp.
     """
     from pdhef_logtool.estimators.divergence import DivergenceWatch
 
@@ -94,7 +94,7 @@ def estimate_windows(
 def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
     """Return what puts the car's intervals on the tracks of estimators, by what they really are.
 
-    What it has none for gets the band of what its identification left open of its parameters.
+    What it has none for gets the confidence interval of what its identification left open of its parameters.
     """
     from pdhef_logtool.estimators.posterior_band import posterior_band
 
@@ -136,7 +136,7 @@ class DeadReckoning:
 
 
 def first_pose(truth: StateTrack | None) -> tuple[float, float, float]:
-    """Return the first known pose x, y, yaw of the truth; the origin without one."""
+    """Return the first known pose x, y, yaw of the ground truth; the origin without one."""
     if truth is not None:
         known = np.flatnonzero(np.isfinite(truth.x_m) & np.isfinite(truth.y_m) & np.isfinite(truth.yaw_rad))
         if known.size:

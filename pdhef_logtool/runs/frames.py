@@ -64,7 +64,7 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
     Raises
     ------
     UsageError
-        A name is unknown. EstimatorError: the drive holds no stamp.
+        A name is unknown. EstimatorError: the drive contains no stamp.
 
     >>> from pdhef_logtool import Car, read_drive
     >>> with read_drive("sample_logs/dlc.mcap", Car.load("saloon")) as drive:
@@ -88,7 +88,7 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
 
 
 def score(estimates: Estimates) -> pl.DataFrame:
-    """Return the figures of estimates as rows of metrics.parquet; without truth those that need none.
+    """Return the figures of estimates as rows of metrics.parquet; without ground truth those that need none.
 
     >>> from pdhef_logtool import Car, read_drive
     >>> with read_drive("sample_logs/dlc.mcap", Car.load("saloon")) as drive:
@@ -101,7 +101,7 @@ def score(estimates: Estimates) -> pl.DataFrame:
     from pdhef_logtool.runs.scoring import evaluate
 
     def read(name: str) -> StateTrack | None:
-        """Return a track; the truth counts wherever one of its quantities is known."""
+        """Return a track; the ground truth counts wherever one of its quantities is known."""
         track = estimates.tracks.get(name)
         return replace(track, valid=track.something_known) if track is not None and name == TRUTH else track
 

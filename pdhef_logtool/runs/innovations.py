@@ -1,4 +1,4 @@
-"""Innovations of filters by channel, on a minute of a drive: what a whole track's NIS does not tell apart.
+"""Innovations of filters by channel, on a minute of a drive: what a whole track's NIS does not distinguish.
 
 ``mean`` and ``rms`` in the channel's unit; ``autocorrelation`` from one sample of the channel to the next. White
 innovations of a right model have mean 0 and an autocorrelation within ± 2/√n.
@@ -20,7 +20,7 @@ from pdhef_logtool.runs.drive_sample import DriveSample, bare_filter
 
 #: The channels of a filter in the order of its innovations.
 CHANNELS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
-#: Of fewer pairs no autocorrelation is told.
+#: Of fewer pairs no autocorrelation is given.
 LEAST_PAIRS = 10
 
 

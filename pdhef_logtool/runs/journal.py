@@ -1,8 +1,8 @@
 """journal.jsonl: what a run of several logs has done, a line a drive, from which a run that was ended goes on.
 
 A line is on the disk before the next drive counts as done, and ends with a checksum: one that is not as it was written
-is left out, so that its drive is run again. A log is known by what it holds; its label was given when it was first
-seen. Where it lies stands as a digest, so that nobody's folders get out, with size and time of change:
+is left out, so that its drive is run again. A log is known by what it contains; its label was given when it was first
+seen. Where it lies is as a digest, so that nobody's folders get out, with size and time of change:
 a log with the same ones is not read to be known again.
 """
 
@@ -41,7 +41,7 @@ _ELSEWHERE = -1
 class Place:
     """Where a log lies: digest of path and slice, size in bytes and time of change; of a folder those of its files.
 
-    Of a log on a server the digest is the URL's, and its identity alone, which is asked for, says whether it changed.
+    Of a log on a server the digest is the URL's, and its identity alone, which is asked for, states whether it changed.
     """
 
     key: str
@@ -76,7 +76,7 @@ def _key(path: str, span_s: tuple[float, float] | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """What the journal says of a drive; its outcome is read when it is asked for.
+    """What the journal states of a drive; its outcome is read when it is asked for.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class Journal:
 
     @classmethod
     def of(cls, folder: Path) -> Journal:
-        """Return a new journal of a folder, whatever it has."""
+        """Return a new journal of a folder, whether it exists or not."""
         return cls(folder / JOURNAL_FILE)
 
     @classmethod
@@ -177,7 +177,7 @@ class Journal:
         return (found[2], found[1]) if found is not None and found[0] == place else None
 
     def label_at(self, place: Place) -> str | None:
-        """Return the label of the log that lay there last, whatever it held."""
+        """Return the label of the log that lay there last, whether its content is the same or not."""
         found = self._places.get(place.key)
         return None if found is None else found[2]
 
@@ -246,7 +246,7 @@ class Journal:
             place = Place(**document["place"])
             self._places[place.key] = place, document["identity"], document["label"]
         elif document == _LEFT_OUT:
-            # The line may have said that a drive that failed before has not failed since.
+            # The line may have stated that a drive that failed before has not failed since.
             for label, entry in self.entries.items():
                 if entry.failed:
                     self.entries[label] = replace(entry, again=True, quarantined=False)
@@ -269,7 +269,7 @@ def _line(document: Mapping[str, Any]) -> bytes:
 
 
 def _document(line: bytes) -> dict[str, Any] | None:
-    """Return what a line says, None if it is not as it was written."""
+    """Return what a line states, None if it is not as it was written."""
     if line[-_SUM_BYTES:] != _sum(line[:-_SUM_BYTES]):
         return None
     document: dict[str, Any] = json.loads(line)

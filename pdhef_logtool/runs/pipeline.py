@@ -80,7 +80,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.results.selected_estimate import MainFacts
     from pdhef_logtool.storage.object_store import Mirror
 
-#: Up to so many logs each is told of by itself, and everything is kept.
+#: Up to so many logs each is given of by itself, and everything is kept.
 FEW_LOGS = 50
 #: What a run writes into a log's folder.
 LOG_FILES = (
@@ -99,10 +99,10 @@ LOG_FILES = (
 STALE_FILES = (SETUP_FILE, PAGE_FILE, METRICS_FILE, ESTIMATES_FILE, RECORDING_FILE)
 
 _SILENT = "{} has no valid row although the car moves"
-_NO_COPY = "annotated.mcap holds our topics only: a log of kind {} has no messages to copy"
+_NO_COPY = "annotated.mcap contains the tool's topics only: a log of kind {} has no messages to copy"
 _ALL_SILENT = "no estimator has a valid row although the car moves"
 _NEVER_MOVES = "the car is never faster than {:g} m/s: there is nothing to score"
-#: Units of truth quantities that have no channel of their own name.
+#: Units of ground truth quantities that have no channel of their own name.
 _DERIVED_UNITS = {"position_m": "m"}
 
 
@@ -113,8 +113,8 @@ class LogResult:
     Attributes
     ----------
     output : folder of the log, None where nothing was written.
-    document, figures : report and rows that are at hand, None where they stand in files; ``figures_file`` is theirs.
-    verdicts : how its figures stand against the thresholds; None without thresholds.
+    document, figures : report and rows that are at hand, None where they are in files; ``figures_file`` is theirs.
+    verdicts : how its figures are against the thresholds; None without thresholds.
     failed_checks : of the drive, those that count.
     """
 
@@ -152,7 +152,7 @@ class LogResult:
 class RunResult:
     """What came out of a run; ``output`` is None when nothing was to be written.
 
-    Where outputs are at a URL, ``stored`` says so, and ``output`` is a folder with what is told of them, which goes
+    Where outputs are at a URL, ``stored`` states so, and ``output`` is a folder with what is given of them, which goes
     with this result.
     """
 
@@ -253,7 +253,7 @@ def run_log(
 
     Parameters
     ----------
-    pool : what all logs of the run together say of the car; None: the log says it, if it is asked.
+    pool : what all logs of the run together state of the car; None: the log states it, if it is asked.
     thresholds : what the report's verdicts name; None: there are none.
     prepare : called with the names of the estimators before they run.
 
@@ -571,7 +571,7 @@ def report_facts(
     samples: dict[str, int] | None = None,
     ledger: Sequence[SampleCount] | None = None,
 ) -> ReportFacts:
-    """Gather what report.json says of one log; ``samples`` by source, ``ledger``: None is what the drive has read."""
+    """Gather what report.json states of one log; ``samples`` by source, ``ledger``: None is what the drive has read."""
     plan, log = drive.plan, drive.log
     samples = drive.samples if samples is None else samples
     mapping = plan.mapping
@@ -630,20 +630,20 @@ def _truth_notes(plan: DrivePlan) -> list[str]:
     if (latency := plan.latency) is not None:
         std = f" ± {latency.std_error_s * 1e3:.1f} ms"
         measured = f"{latency.latency_s * 1e3:.1f} ms{std}" if latency.reliable else "unknown"
-        verdict = "applied" if plan.truth_latency_s else "not applied: it does not stand out of its own uncertainty"
+        verdict = "applied" if plan.truth_latency_s else "not applied: it is within its uncertainty"
         if latency.gyro_delay_s:
-            verdict = "so that the truth is not moved"
+            verdict = "so that the ground truth is not moved"
         notes.append(f"latency {measured} ({latency.reason}), {verdict}")
     notes += [f"{signal} is not independent: {reason}" for signal, reason in plan.dependent.items()]
     if "cg" in plan.derivation:
         notes.append(plan.derivation["cg"])
     if plan.truth is not None and not plan.has_truth_pose:
-        notes.append("no true position: the drawn truth trajectory is its velocity dead-reckoned")
+        notes.append("no true position: the drawn ground truth trajectory is its velocity dead-reckoned")
     return notes
 
 
 def friction_facts(friction: FrictionSource) -> FrictionFacts:
-    """Return what the report says of a run's friction, after the run."""
+    """Return what the report states of a run's friction, after the run."""
     return FrictionFacts(
         source=friction.label,
         estimated=friction.bank is not None,

@@ -80,7 +80,7 @@ def plan_logs(inputs: Sequence[LogInput], journal: Journal, *, twice: bool, repo
     for number, identity in identities.items():
         log = inputs[number]
         if identity in labels.owner and not twice:
-            reporter.warn(f"{log.path.name} holds what {labels.owner[identity]} holds: the drive is run once")
+            reporter.warn(f"{log.path.name} has the same content as {labels.owner[identity]}: the drive is run once")
         else:
             labels.claim(number, labels.of(log, places[number], identity))
     return [labels.planned[number] for number in sorted(labels.planned)]
@@ -198,7 +198,7 @@ class Plan:
                 self.journal.add_place(one.log.stem, one.place, one.identity or "")
 
     def entry(self, one: PlannedLog) -> Entry | None:
-        """Return the journal's entry of a log if it is done, whatever files were kept."""
+        """Return the journal's entry of a log if it is done, whichever files were kept."""
         entry = self.journal.entries.get(one.log.stem)
         if entry is None or self._reason(one, "metrics", retry=False) not in (None, _REPEATED):
             return None
@@ -253,7 +253,7 @@ class Plan:
                     expected="the settings of the run in the folder",
                     got=", ".join(why),
                     where="--only",
-                    remedy="--resume runs its logs anew",
+                    remedy="--resume runs its logs again",
                 )
 
     def _reason(self, one: PlannedLog, keep: str, retry: bool) -> str | None:
@@ -300,7 +300,7 @@ class Plan:
     def _report(self, chosen: Sequence[PlannedLog], reasons: Sequence[str], retry: bool, reporter: Reporter) -> None:
         """Report which drives of an earlier run are kept, repeated or left out."""
         for why, count in Counter(reasons).most_common():
-            reporter.note(f"{count} of {len(chosen)} drives are run anew: {why}")
+            reporter.note(f"{count} of {len(chosen)} drives are run again: {why}")
         entries = [e for p in chosen if (e := self.journal.entries.get(p.log.stem)) is not None]
         quarantined = sum(e.quarantined for e in entries)
         if quarantined and not retry:

@@ -75,7 +75,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
 
 
-_RECORDED = "read from the log: nothing says whether it is causal, or what it was computed from"
+_RECORDED = "read from the log: not recorded whether it is causal, or what it was computed from"
 
 
 def score_log(
@@ -89,19 +89,19 @@ def score_log(
     junit: Path | None = None,
     reporter: Reporter = SILENT,
 ) -> RunResult:
-    """Score recorded estimates of one log against its truth; same figures, tables and report as a run.
+    """Score recorded estimates of one log against its ground truth; same figures, tables and report as a run.
 
     Parameters
     ----------
-    argument : the log. config : of it count vehicle, mapping, slice, truth choice and thresholds.
+    argument : the log. config : of it count vehicle, mapping, slice, ground truth choice and thresholds.
     estimates : ``[SIGNAL=]TOPIC[.FIELD]``, together one estimator called ``name`` (default: its topic); without any,
         the mapping's ``[estimates.NAME.SIGNAL]`` tables, all or the one called ``name``.
-    truth : likewise; without any, the mapping's or the recognised truth.
+    truth : likewise; without any, the mapping's or the recognised ground truth.
     output : folder for the files, None to write none. junit : as for :func:`pdhef_logtool.runs.fleet.run_logs`.
 
     Raises
     ------
-    PdhefError : There is no estimate, no truth, or nothing of the log can be used.
+    PdhefError : There is no estimate, no ground truth, or nothing of the log can be used.
     """
     log_input = one_log(argument, config.read_options)
     car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
@@ -110,7 +110,7 @@ def score_log(
     if config.car is None:
         slow = car.vehicle.low_speed_blend_m_s
         reporter.warn(
-            f"no --car: the truth is taken to be measured at the centre of gravity, sideslip is scored above "
+            f"no --car: the ground truth is taken to be measured at the centre of gravity, sideslip is scored above "
             f"{slow:g} m/s, and segments are cut at friction {car.vehicle.assumed_friction:g}"
         )
     check_places([log_input], output, config, mapping, junit)
@@ -147,7 +147,7 @@ class _Scoring:
     estimates: tuple[EstimateSource, ...] = ()
 
     def read(self, log_input: LogInput, mapping: SignalMapping | None) -> Drive:
-        """Open the log; decide which fields are estimate, truth and sensors."""
+        """Open the log; decide which fields are estimate, ground truth and sensors."""
         given = mapping
         if mapping is not None and not mapping.signals and not mapping.truth:
             mapping = None  # a file of estimates alone leaves the rest to recognition
@@ -161,13 +161,13 @@ class _Scoring:
             if self.truth:
                 quality = chosen.quality if given is None else given.quality
                 if quality is not None:
-                    tell(f"--truth replaces the mapped truth and its gate on {quality.describe()}")
+                    tell(f"--truth replaces the mapped ground truth and its gate on {quality.describe()}")
                 named = sources_of(log, self.truth, TRUTH_UNITS, "--truth")[0]
                 can = None if given is None else given.can
                 chosen = replace(chosen, truth=named, quality=None, can=can)
             if not chosen.truth:
                 raise MappingError(
-                    expected="a truth to score against",
+                    expected="a ground truth to score against",
                     got="none mapped and none recognised",
                     where=str(log.path),
                     remedy="name it with --truth SIGNAL=TOPIC.FIELD or in a mapping file",
@@ -207,7 +207,7 @@ class _Scoring:
         )  # fmt: skip
         read = {s.topic for e in self.estimates for s in e.signals.values()}
         topics = [replace(t, mapped=t.mapped or t.name in read) for t in facts.log.topics]
-        latency = [] if plan.latency is not None else ["no gyro to measure the truth's latency with: taken as 0"]
+        latency = [] if plan.latency is not None else ["no gyro to measure the ground truth's latency with: taken as 0"]
         facts = replace(
             facts,
             log=replace(facts.log, topics=topics),
@@ -253,7 +253,7 @@ class _Scoring:
         truth: TruthTrack,
         signals: Signals | None,
     ) -> tuple[list[MetricRow], dict[str, str]]:
-        """Score each estimate at its own stamps; return what of the derived truth equals an estimate besides."""
+        """Score each estimate at its own stamps; return what of the derived ground truth equals an estimate besides."""
         from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, score_track
         from pdhef_logtool.evaluation.segments import segment_masks
 
@@ -265,7 +265,7 @@ class _Scoring:
             )
             masks = segment_masks(signals_at(signals, r.track.stamps_ns), at_stamps, self.car.vehicle)
             same = {
-                name: f"the truth's {name} equals that of the estimate {r.track.name}"
+                name: f"the ground truth's {name} equals that of the estimate {r.track.name}"
                 for name in SCORED_SIGNALS
                 if _same_column(getattr(r.track, name), getattr(at_stamps, name))
             }
@@ -279,7 +279,9 @@ class _Scoring:
                 not_independent={**plan.dependent, **same},
             )
             if not any(row.metric == "rmse" for row in figures):
-                drive.tell(f"{r.track.name}: nowhere are estimate and truth known together, so there are no errors")
+                drive.tell(
+                    f"{r.track.name}: nowhere are estimate and ground truth known together, so there are no errors"
+                )
             # What the estimate does not claim is not missing from it.
             silent = {n for n in SCORED_SIGNALS if n not in r.claimed and not np.isfinite(getattr(r.track, n)).any()}
             rows += [
@@ -298,9 +300,9 @@ class _Scoring:
 
 
 def _read_sensors(drive: Drive) -> Signals | None:
-    """Return what the mapped sensors say, None without any; the drive then has the losses and samples of that."""
+    """Return what the mapped sensors state, None without any; the drive then has the losses and samples of that."""
     if not drive.plan.alignment.channels:
-        drive.tell("no IMU in the mapping: segments come from the truth alone")
+        drive.tell("no IMU in the mapping: segments come from the ground truth alone")
         return None
     drive.plan = replace(drive.plan, truth=None, mapping=replace(drive.mapping, truth={}, quality=None))
     seen = [w.signals for w in drive.windows() if len(w.signals)]
@@ -338,15 +340,15 @@ def _write(
 def read_truth(
     log: DriveLog, plan: DrivePlan, window_s: float
 ) -> tuple[TruthTrack, tuple[Loss, ...], dict[str, int], dict[tuple[Role, str], Counter[str]]]:
-    """Read and derive the whole truth on its own clock, window by window.
+    """Read and derive the whole ground truth on its own clock, window by window.
 
     Returns
     -------
-    truth, losses, samples by source, and the counts for :func:`~pdhef_logtool.drive.windows.sample_ledger`.
+    ground truth, losses, samples by source, and the counts for :func:`~pdhef_logtool.drive.windows.sample_ledger`.
 
     Raises
     ------
-    MappingError : The slice holds no truth.
+    MappingError : The slice contains no ground truth.
     """
     alone = replace(plan.mapping, signals={})
     channels: dict[str, Channel] = {}
@@ -378,10 +380,10 @@ def read_truth(
         channels = {n: c.between(until - plan.truth.margin_ns) for n, c in channels.items()}
     if plan.truth is None or not sum(len(t) for t in tracks):
         raise MappingError(
-            expected="truth in the chosen slice",
+            expected="ground truth in the chosen slice",
             got="no samples that can be used",
             where=f"{log.path} {', '.join(s.label for s in plan.mapping.truth.values())}",
-            remedy="pdhef inspect LOG shows what the log holds and what was dropped",
+            remedy="pdhef inspect LOG shows what the log contains and what was dropped",
         )
     gap_s = plan.truth.max_gap_s[plan.truth.base]
     return TruthTrack(concatenate(tracks), gap_s, plan.derivation), losses, samples, counts

@@ -49,7 +49,7 @@ def evaluate(
     Parameters
     ----------
     names : of the estimators. read : returns the track of a name, ``truth`` too; None if there is none.
-    signals : what the estimators saw. sensors : as the log calibrated them; None: as the car's file says.
+    signals : what the estimators saw. sensors : as the log calibrated them; None: as the car's file states.
     """
     from pdhef_logtool.evaluation.metrics import Scorer
     from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive
@@ -101,7 +101,7 @@ def segment_events(stamped: Signals | StateTrack, masks: Mapping[str, BoolArray]
 
 
 def diverged_events(track: StateTrack) -> list[Event]:
-    """Return when an estimator says of itself that it diverges."""
+    """Return when an estimator states of itself that it diverges."""
     from pdhef_logtool.evaluation.segments import find_intervals
 
     name, text = f"{track.name} diverged", "the estimator reports its own divergence"

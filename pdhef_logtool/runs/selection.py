@@ -46,8 +46,8 @@ class Contradiction:
     def text(self) -> str:
         """The warning of the report."""
         return (
-            f"{self.name} contradicts the sensors: its d2 is {self.own_d2:.3g} m/s, that of {self.best} "
-            f"{self.best_d2:.3g}; the vehicle file may be wrong"
+            f"{self.name} contradicts the sensors: its lateral kinematic consistency is {self.own_d2:.3g} m/s, "
+            f"that of {self.best} {self.best_d2:.3g}; the vehicle file may be wrong"
         )
 
 
@@ -83,7 +83,7 @@ def choose_main(ran: Sequence[Estimator], rows: Iterable[MetricRow], *, proven: 
 
     Parameters
     ----------
-    ran : the estimators, at least one. rows : figures of them. proven : whether the car has evidence of driving.
+    ran : the estimators, at least one. rows : figures of them. validated : whether the car has evidence of driving.
     named : whether a person named the estimators; all of them are then shown.
     """
     names = [e.name for e in ran]
@@ -95,7 +95,7 @@ def choose_main(ran: Sequence[Estimator], rows: Iterable[MetricRow], *, proven: 
         chosen_by, why = "d2", f"{name} contradicts the sensors more than {against.best} does"
         name = against.best
     elif proven:
-        chosen_by, why = "evidence", "driving with truth has proven this car"
+        chosen_by, why = "evidence", "driving with ground truth has validated this car"
     elif name != "kinematic" and any(r.metric == "d2" and r.estimator == name for r in rows):
         chosen_by, why = "d2", "no simple estimator agrees better with the sensors"
     else:

@@ -1,4 +1,4 @@
-"""The first pass over a log, in which it calibrates its car without truth, and what comes of it.
+"""The first pass over a log, in which it calibrates its car without ground truth, and what comes of it.
 
 See docs/method.md#self-calibration.
 """
@@ -36,7 +36,7 @@ _NEEDS = ("steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 
 
 def calibrate_drive(drive: Drive, config: RunConfig) -> SelfCalibration | None:
-    """Return what a drive says of its car; None where nobody asks or the log lacks a sensor for it."""
+    """Return what a drive states of its car; None where nobody asks or the log lacks a sensor for it."""
     if config.calibrate == "off" or not _asked(config, drive.car) or lacking(drive):
         return None
     from pdhef_logtool.estimators.calibration.calibration import calibrate_online, self_calibrate
@@ -49,7 +49,7 @@ def calibrate_drive(drive: Drive, config: RunConfig) -> SelfCalibration | None:
 def calibrate_pool(
     inputs: Sequence[LogInput], car: Car, mapping: Mapping | None, config: RunConfig
 ) -> SelfCalibration | None:
-    """Return what all logs of a run together say of its car; None where nobody asks. A log that fails is left out."""
+    """Return what all logs of a run together state of its car; None where nobody asks. A log that fails is left out."""
     if not _asked(config, car):
         return None
     from pdhef_logtool.estimators.calibration.calibration import self_calibrate
@@ -61,7 +61,7 @@ def calibrate_pool(
                 if not lacking(drive):
                     found.append(read_driving(drive))
         except PdhefError:
-            continue  # the run itself says what is wrong with it
+            continue  # the run itself states what is wrong with it
     return self_calibrate(found, car.vehicle)
 
 
@@ -71,7 +71,7 @@ def lacking(drive: Drive) -> list[str]:
 
 
 def read_driving(drive: Drive) -> Driving:
-    """Return the driving of a drive that can be calibrated on; its truth is not looked at."""
+    """Return the driving of a drive that can be calibrated on; its ground truth is not looked at."""
     from pdhef_logtool.estimators.calibration.driving import DrivingReader
 
     reader = DrivingReader(drive.car.vehicle)
@@ -84,7 +84,7 @@ def checked(drive: Drive, calibration: SelfCalibration | None) -> SelfCalibratio
     """Return a calibration with the part of d2 of ``physics`` on it that correlates with the driving."""
     if calibration is None or calibration.refused or calibration.earlier:
         return calibration
-    alone = self_calibrated(drive, replace(calibration, varied=()))  # d2 needs no interval
+    alone = self_calibrated(drive, replace(calibration, varied=()))  # lateral kinematic consistency needs no interval
     sensors = log_sensors(drive.car.vehicle, calibration)
     return replace(calibration, driven_d2_m_s=_driven_d2_of(drive, make_estimator("physics", alone), sensors))
 
@@ -129,7 +129,7 @@ def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
 
 
 def log_sensors(vehicle: VehicleParameters, calibration: SelfCalibration | None) -> SensorErrors:
-    """Return what the sensors of a log have that was read with a vehicle: as calibrated on it, else as its file says.
+    """Return what the sensors of a log have that was read with a vehicle: as calibrated on it, else as its file states.
 
     What is refused for its tyres is no worse for its sensors.
     """
@@ -157,5 +157,5 @@ def _asked(config: RunConfig, car: Car) -> bool:
 
 
 def _told(drive: Drive) -> bool:
-    """Whether the friction of a drive is told, and no estimate with the file as it stands."""
+    """Whether the friction of a drive is given, and no estimate with the file as it is."""
     return drive.friction.bank is None

@@ -65,14 +65,14 @@ def _is_hidden(path: Path) -> bool:
 
 
 def _order(name: str) -> tuple[bool, str]:
-    """Put what says that a drive is done behind all else."""
+    """Put what states that a drive is done behind all else."""
     return name.endswith(f"/{REPORT_FILE}"), name
 
 
 class StoredOutput(Mirror):
     """The output of a run at a URL, held by this command while it is entered.
 
-    Pages of drives stand in the folder as empty files where the store has them.
+    Pages of drives are in the folder as empty files where the store has them.
 
     Raises
     ------
@@ -91,7 +91,7 @@ class StoredOutput(Mirror):
         self._journal_bytes = -1
 
     def __enter__(self) -> Self:
-        """Take hold of the place and see what is there."""
+        """Take apply to the place and see what is there."""
         self.objects.acquire()
         try:
             for name in self.objects.names():
@@ -142,7 +142,7 @@ class StoredOutput(Mirror):
         return tuple(sorted(self._there.get(label, ())))
 
     def forget(self, part: str | None) -> None:
-        """Remove the figures of a drive that is run anew: were the run to end now, it would not be done."""
+        """Remove the figures of a drive that is run again: were the run to end now, it would not be done."""
         if part in self._own:
             self.objects.remove([str(part)])
             self._own.discard(str(part))
@@ -191,7 +191,7 @@ class StoredOutput(Mirror):
                 self._journal_bytes = size
 
     def _keep(self) -> None:
-        """Renew the hold and put the journal until the end; a store that fails for a while is asked again."""
+        """Renew the contain and put the journal until the end; a store that fails for a while is asked again."""
         wait_s = EVERY_S
         while not self._ended.wait(wait_s):
             began = time.monotonic()

@@ -1,4 +1,4 @@
-"""Whole tracks and signals of a log on disk, column by column, so that scoring holds only what it works on.
+"""Whole tracks and signals of a log on disk, column by column, so that scoring contains only what it works on.
 
 Ten hours at 100 Hz are 3.6 million rows: a track of them takes 0.8 GB, a column 29 MB. The columns of a short drive
 never see the disk, for its files would take longer than its figures, and neither do those that never change.
@@ -29,7 +29,7 @@ ROWS_HELD = 1 << 14
 class _Column:
     """A column that grows: rows so far, and what a row is.
 
-    While all rows are the same, as of what an estimator does not know, that one row stands for them; then they are in
+    While all rows are the same, as of what an estimator does not know, that one row represents them; then they are in
     memory, and from :data:`ROWS_HELD` on in a file.
     """
 

@@ -115,7 +115,7 @@ def position(folder: Path, name: str, experiment: Experiment, scenario: str, sch
         axes[0, 0].plot(x, y, **_style(scheme))
         axes[1, 0].plot(_time_s(truth), position_error(track, truth), **_thin(scheme))
     axes[0, 0].set(xlabel="x, m", ylabel="y, m (axes not equal)")
-    axes[1, 0].set(xlabel="time, s", ylabel="distance to truth, m", ylim=(0.0, None))
+    axes[1, 0].set(xlabel="time, s", ylabel="distance to ground truth, m", ylim=(0.0, None))
     _legend_above(axes[0, 0])
     save(fig, folder / f"{name}.png")
 

@@ -50,7 +50,7 @@ def test_a_car_without_evidence_gets_none() -> None:
 def test_evidence_counts_for_its_network(cap: float) -> None:
     allowed = _car(trust_cap=cap, evidence=EVIDENCE, network_sha256=_bundle().sha256).allowed_trust
     assert (allowed.cap, allowed.reason) == (cap, EVIDENCE)
-    assert allowed.note == f"network trust {cap:g}: {EVIDENCE}"
+    assert allowed.note == f"residual gain {cap:g}: {EVIDENCE}"
     for bundle in (_bundle(), _bundle(1)):  # by hand
         assert _car(bundle, trust_cap=cap, evidence=EVIDENCE).allowed_trust.cap == cap
 
@@ -124,10 +124,10 @@ def test_the_report_says_the_cap_and_why(
         )
         result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / f"out{cap}", config)
         report = json.loads((tmp_path / f"out{cap}" / "logs" / "dlc" / "report.json").read_text())
-        notes = {e["name"]: [n for n in e["notes"] if n.startswith("network trust")] for e in report["estimators"]}
+        notes = {e["name"]: [n for n in e["notes"] if n.startswith("residual gain")] for e in report["estimators"]}
         assert notes["pd-hef:gain=1"] == []
         (note,) = notes["pd-hef"]
-        assert note.startswith(f"network trust {cap:g}: ")
+        assert note.startswith(f"residual gain {cap:g}: ")
         assert why in note
         assert note in report_markdown(report)
         render_run(result, Console(width=400))

@@ -273,12 +273,13 @@ def test_other_physics_leave_fit_noise_and_trust_out_and_say_so(folder: Path, ol
     assert dict(car.noise) == {}
     assert car.learnt_on == ()
     assert car.notes == (
-        "fit.toml is not used: vehicle.toml has changed since; pdhef learn --stages identify makes it anew",
-        "noise of physics is not used: it belongs to other physics; pdhef learn --stages noise makes it anew",
-        "network.toml allows no trust: it was found with other physics; pdhef learn --stages gain makes it anew",
+        "fit.toml is not used: vehicle.toml has changed since; pdhef learn --stages identify creates it again",
+        "noise of physics is not used: it belongs to other physics; pdhef learn --stages noise creates it again",
+        "network.toml allows no residual gain: it was fitted with other physics; "
+        "pdhef learn --stages gain creates it again",
     )
     assert car.allowed_trust.cap == 0.0
-    assert "other physics; pdhef learn --stages gain gives it anew" in car.allowed_trust.note
+    assert "other physics; pdhef learn --stages gain creates it again" in car.allowed_trust.note
 
 
 @pytest.mark.parametrize(
@@ -324,7 +325,7 @@ def test_another_fit_leaves_the_noise_of_the_first_out(folder: Path) -> None:
     assert dict(car.noise) == fit.filter
     assert [note.split(":")[0] for note in car.notes] == [
         "noise of physics is not used",
-        "network.toml allows no trust",
+        "network.toml allows no residual gain",
     ]
     assert car.allowed_trust.cap == 0.0
 
@@ -335,7 +336,8 @@ def test_other_noise_takes_the_trust_but_nothing_else(folder: Path) -> None:
     add_noise(folder)
     car = load(folder, "default")
     assert car.notes == (
-        "network.toml allows no trust: it was found with other noise; pdhef learn --stages gain makes it anew",
+        "network.toml allows no residual gain: it was fitted with other noise; "
+        "pdhef learn --stages gain creates it again",
     )
     assert car.allowed_trust.cap == 0.0
     assert "other noise" in car.allowed_trust.reason
@@ -361,7 +363,7 @@ def test_trust_changes_no_physics_so_that_intervals_stay_those_of_the_car(folder
     assert after.notes == ()
     edit(folder, "mass_kg = 1440.0 ", "mass_kg = 1450.0 ")
     assert (
-        "intervals.json was made with other physics; pdhef learn --stages intervals makes it anew"
+        "intervals.json was made with other physics; pdhef learn --stages intervals creates it again"
         in Car.load(folder).notes
     )
     assert not any("intervals" in note for note in load(folder).notes)  # they are not in force
@@ -631,7 +633,7 @@ def test_noise_of_physics_belongs_to_the_values_that_were_found_through_it(folde
     car = load(folder)
     assert car.noise[OURS] == found.noise
     assert car.notes == (
-        "noise of physics is not used: it belongs to other physics; pdhef learn --stages noise makes it anew",
+        "noise of physics is not used: it belongs to other physics; pdhef learn --stages noise creates it again",
     )
 
 

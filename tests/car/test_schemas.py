@@ -63,7 +63,7 @@ def test_a_schema_is_what_its_model_says(part: str) -> None:
     path = FOLDER / f"car-{part}.schema.json"
     if os.environ.get("PDHEF_UPDATE_SCHEMAS") == "1":
         path.write_text(said_by_the_model(part), encoding="utf-8")
-    assert path.read_text(encoding="utf-8") == said_by_the_model(part), "PDHEF_UPDATE_SCHEMAS=1 writes it anew"
+    assert path.read_text(encoding="utf-8") == said_by_the_model(part), "PDHEF_UPDATE_SCHEMAS=1 writes it again"
     jsonschema.Draft202012Validator.check_schema(load_schema(path.name))
 
 

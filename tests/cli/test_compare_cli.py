@@ -73,7 +73,7 @@ def test_an_output_that_is_an_input_is_refused(runs: tuple[str, str], option: st
 def test_a_gate_file_and_a_figure_of_the_command_line_do_not_go_together(runs: tuple[str, str]) -> None:
     with pytest.raises(UsageError, match="--gate and --metric"):
         _pdhef("compare", *runs, "--gate", "gate.toml", "--metric", "mae")
-    with pytest.raises(UsageError, match=r"a figure of which less is better, got metric = bias"):
+    with pytest.raises(UsageError, match=r"a figure; lower is better, got metric = bias"):
         _pdhef("compare", *runs, "--metric", "bias")
     with pytest.raises(UsageError, match=r"a share such as 5% or 0\.05, got five"):
         _pdhef("compare", *runs, "--max-regression", "five")

@@ -84,7 +84,7 @@ def test_the_answer_stands_first_then_three_rows() -> None:
 def test_hindsight_is_one_line_and_only_where_another_was_better() -> None:
     assert "In hindsight" not in shown(named("drive"))
     text = shown(named("drive", metrics=errors_deg(pd_hef=0.3, zero=0.1)))
-    assert "In hindsight  by this log's truth zero was best, 0.100° RMSE; nothing was" in text
+    assert "In hindsight by this log's ground truth zero was best, 0.100° RMSE; nothing was" in " ".join(text.split())
 
 
 def test_hashes_and_notes_stay_in_the_report() -> None:
@@ -123,7 +123,7 @@ def test_several_logs_have_one_table_and_say_once_what_holds_for_all() -> None:
     text = shown(first, second, lost, failed="no log")
     assert all(len(line) <= 80 for line in text.splitlines())
     assert rows(text, "monday")[0].split() == ["monday", "10", "0.100", "0.200", "1.000", "0.96"]
-    assert rows(text, "tuesday")[0].split()[-2:] == ["no", "truth"]
+    assert rows(text, "tuesday")[0].split()[-3:] == ["no", "ground", "truth"]
     assert rows(text, "wednesday")[0].split()[-2:] == ["input", "lost"]
     assert text.count("car golf") == text.count("a remark") == 1
     assert "note: a remark (tuesday, wednesday)" in text
@@ -137,7 +137,7 @@ def test_the_joint_table_says_who_answers_and_what_to_look_at() -> None:
     narrow = [*errors_deg(pd_hef=0.1), *figures(("pd-hef", "sideslip_rad", "coverage95", 0.5))]
     text = shown(named("monday", segments=diverged), named("tuesday", metrics=narrow), width=120)
     looks = [rows(text, name)[0].rstrip().split("  ")[-1].strip() for name in ("monday", "tuesday")]
-    assert looks == ["diverged", "band too narrow"]
+    assert looks == ["diverged", "interval too narrow"]
     other = shown(named("monday"), report(replace(MAIN, name="zero"), metrics=GOOD))
     assert ("by pd-hef" in rows(other, "monday")[0], "by zero" in rows(other, "drive")[0]) == (True, True)
 

@@ -53,7 +53,7 @@ def _facts(path: Path, mapping: Mapping | None, options: ReadOptions) -> dict[st
             "columns": columns,
             "hashes": (drive.signals_sha256, drive.truth_sha256, drive.sha256, drive.mapping.sha256),
             "told": (drive.checks, drive.notes, drive.missing),
-            "remarks": [r for r in drive.remarks if not r.startswith("a slim log stands for")],
+            "remarks": [r for r in drive.remarks if not r.startswith("a reduced log replaces")],
             "losses": drive.losses,
             "samples": (drive.samples, drive.sample_ledger, drive.byte_ledgers),
             "log": (drive.file, log.kind, log.topics, log.start_ns, log.end_ns),

@@ -272,7 +272,7 @@ def test_the_notes_say_for_what_intervals_were_made() -> None:
         return "; ".join(calibrator.notes("e"))
 
     made = "intervals calibrated on car for friction and vehicle"
-    assert notes(_intervals()) == f"{made} as told"
+    assert notes(_intervals()) == f"{made} as given"
     assert notes(_intervals(spread=0.2)) == f"{made} wrong by 0.2"
     for changes, said in (
         ({"physics_sha256": "cd" * 32}, "physics"),
@@ -280,9 +280,9 @@ def test_the_notes_say_for_what_intervals_were_made() -> None:
         ({"network_sha256": "34" * 32}, "network"),
         ({"use_speed": False}, "sensors (with or without the speed)"),
     ):
-        assert notes(_intervals(), ALGORITHM.model_copy(update=changes)).endswith(f"as told, but with other {said}")
+        assert notes(_intervals(), ALGORITHM.model_copy(update=changes)).endswith(f"as given, but with other {said}")
     # The physics that the whole car has now are no matter: those of what ran are.
-    assert notes(_intervals(physics_sha256="cd" * 32)) == f"{made} as told"
+    assert notes(_intervals(physics_sha256="cd" * 32)) == f"{made} as given"
 
 
 # ---- the file ----

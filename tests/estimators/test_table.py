@@ -334,7 +334,7 @@ def test_intervals_of_the_one_are_never_put_on_the_other(signals: Signals) -> No
     for car, algorithm in ((CAR, hybrid), (BARE, cautious)):
         ratio, notes = with_intervals(car, intervals_for(algorithm), signals)
         assert ratio == pytest.approx(2.0)
-        assert notes == ("intervals calibrated on car for friction and vehicle as told",)
+        assert notes == ("intervals calibrated on car for friction and vehicle as given",)
 
 
 def test_without_trust_it_has_the_intervals_of_physics(signals: Signals) -> None:
@@ -350,4 +350,4 @@ def test_trust_changes_no_physics_so_that_the_notes_of_other_filters_stay(signal
         estimator = make_estimator("phy-ukf", car)
         applied = calibrator(replace(car, intervals=entries), [estimator])
         applied.add(run_window(estimator, signals)[0], signals)
-        assert applied.notes("phy-ukf") == ("intervals calibrated on car for friction and vehicle as told",)
+        assert applied.notes("phy-ukf") == ("intervals calibrated on car for friction and vehicle as given",)

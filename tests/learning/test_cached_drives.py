@@ -32,7 +32,7 @@ def test_drives_in_memory_are_the_same(sample_logs_dir: Path, tmp_path: Path, mo
             monkeypatch.setattr(slim_cache, "slim_log", lambda *_: pytest.fail("the log is read again"))
     (record, own), *others = found
     for again, drive in others:
-        assert again.notes == (*record.notes, "a slim log stands for dlc.mcap")
+        assert again.notes == (*record.notes, "a reduced log replaces dlc.mcap")
         assert replace(again, notes=record.notes) == record
         for track in ("signals", "truth"):
             one, other = getattr(own, track), getattr(drive, track)

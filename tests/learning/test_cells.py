@@ -113,7 +113,7 @@ def test_extract_chooses_leaves_copies_out_and_older_sets_still_open(sample_logs
     told: list[str] = []
     asked = ExtractSettings(RunConfig(), split="train", where="vx_m_s > 10", per_cell_s=2.0)
     result = extract([str(log), str(tmp_path / "b.mcap")], out, asked, reporter=Reporter(warn=told.append))
-    assert "b is left out: it holds the same signals as a" in told and result.exit_code == 0
+    assert "b is left out: it contains the same signals as a" in told and result.exit_code == 0
     assert result.manifest["duplicates"] == [{"log": "b", "file": "b.mcap", "of": "a"}]
     assert [p.name for p in out.rglob("*.parquet")] == ["part-a.parquet"]
     (drive,) = read_dataset(out).drives
@@ -135,7 +135,7 @@ def test_extract_chooses_leaves_copies_out_and_older_sets_still_open(sample_logs
     document = json.loads((out / MANIFEST).read_text())
     del document["digest"]
     (out / MANIFEST).write_text(json.dumps(seal({**document, "version": 2})))
-    with pytest.raises(OutputError, match="makes it anew"):
+    with pytest.raises(OutputError, match="creates it again"):
         read_dataset(out)
 
 
@@ -165,6 +165,6 @@ def test_a_fleet_is_told_by_what_gave_nothing_and_by_its_cells(capsys: pytest.Ca
     few, many = capsys.readouterr().out.split("dataset in out")[:2]
     assert " d39 " in few and " d39 " not in many and "as d3" in many
     assert f"{MOST_DRIVES + 1} drives, listed in manifest.json" in many
-    assert "38 of the 40 cells that grip allows hold nothing" in few
+    assert "38 of the 40 cells below the friction limit are empty" in few
     assert " 600 " in few and " <1 " in few and "as chosen" in few
     assert max(map(len, (few + many).splitlines())) <= 80

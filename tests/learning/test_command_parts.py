@@ -94,8 +94,8 @@ def test_a_record_in_json_and_as_a_car_remembers_it() -> None:
     assert (document["seconds"], document["span_s"], document["runs"]) == (1.235, [0.123, 9.877], 3)
     assert not {"counts", "bytes_held", "left_out", "reason"} & document.keys()
     assert full.learnt_on == LearntOn(name="a", sha256="a" * 64, start_s=0.12, end_s=9.88)
-    without = record("b", span_s=None, left_out="no truth")
-    assert without.to_dict()["span_s"] is None and without.to_dict()["reason"] == "no truth"
+    without = record("b", span_s=None, left_out="no ground truth")
+    assert without.to_dict()["span_s"] is None and without.to_dict()["reason"] == "no ground truth"
     assert (without.learnt_on.start_s, without.learnt_on.end_s) == (0.0, 0.0)
 
 
@@ -103,8 +103,8 @@ def test_what_a_user_must_know_of_a_drive_is_told_in_order_and_decides_the_exit_
     lost = Loss("gap", "2 s are gone", "/imu")
     note = Loss("late", "late", "/imu", severity="note")
     told: list[str] = []
-    tell_drive(record("a", notes=("perfect truth",), losses=(lost, note), left_out="it is short"), told.append)
-    assert told == ["a: perfect truth", "a: 2 s are gone (/imu)", "a is left out: it is short"]
+    tell_drive(record("a", notes=("perfect ground truth",), losses=(lost, note), left_out="it is short"), told.append)
+    assert told == ["a: perfect ground truth", "a: 2 s are gone (/imu)", "a is left out: it is short"]
     good, bad = record("a", losses=(note,)), record("b", left_out="x")
     assert [exit_code(r) for r in ([good], [good, bad], [good, record("c", losses=(lost,))], [bad])] == [0, 3, 3, 1]
 
@@ -117,7 +117,7 @@ def test_a_truth_is_missing_underived_or_no_truth() -> None:
     plan.derivation = {"sideslip_rad": "x"}
     assert no_true_sideslip(plan) == ""
     plan.dependent = {"sideslip_rad": "it is an estimate"}
-    assert no_true_sideslip(plan) == "its truth is no truth: it is an estimate"
+    assert no_true_sideslip(plan) == "its ground truth is invalid: it is an estimate"
 
 
 class ReadDrive:

@@ -188,7 +188,7 @@ def test_a_drive_below_the_low_speed_limit_gives_rows_and_is_told(
     result = _extract(tmp_path, monkeypatch, _log(drive(4.0, speed=2.0)))
     (one,) = result.results
     assert one.entry is not None and one.entry["rows"] == 400 and one.entry["usable_rows"] == 0
-    assert "not one usable target: no truth above the low-speed limit" in one.record.notes
+    assert "not one usable target: no ground truth above the low-speed limit" in one.record.notes
     assert one.record.seconds == pytest.approx(3.99) and result.exit_code == 0
 
 
@@ -285,7 +285,7 @@ def test_damaged_dataset_is_told(dataset: ExtractResult, tmp_path: Path) -> None
         read_dataset(copy)
     del document["digest"]
     (copy / MANIFEST).write_text(json.dumps(seal({**document, "version": 99})))
-    with pytest.raises(OutputError, match="makes it anew"):
+    with pytest.raises(OutputError, match="creates it again"):
         read_dataset(copy)
     (copy / MANIFEST).unlink()
     with pytest.raises(OutputError, match="--resume"):
@@ -431,7 +431,7 @@ def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
     result = called("extract", log, "-o", str(out), "--car", str(sample_logs_dir / "vehicle.toml"), "--split", "train")
     assert result.returncode == 0, result.stderr
     assert "dlc" in result.stdout and "train: 1 drives" in result.stdout
-    assert result.stderr.splitlines() == ["warning: dlc: perfect truth taken; /rtk/fix, /rtk/odometry not used"]
+    assert result.stderr.splitlines() == ["warning: dlc: perfect ground truth used; /rtk/fix, /rtk/odometry not used"]
     (drive,) = read_dataset(out).drives
     assert drive.usable_rows > 0.99 * drive.rows
     rtk = called("extract", log, "-o", str(tmp_path / "rtk"), "--set", "prefer_truth=rtk", "--split", "train", "--json")

@@ -151,7 +151,7 @@ def test_checkpoint_of_other_data_and_empty_splits_are_refused(tmp_path: Path) -
     for at in (4, 20, 300, len(sound) // 2, len(sound) - 5):
         for damaged in (sound[:at], sound[:at] + bytes([sound[at] ^ 4]) + sound[at + 1 :]):
             (tmp_path / CHECKPOINT).write_bytes(damaged)
-            with pytest.raises(ModelError, match=r"checkpoint.*remove it to train anew"):
+            with pytest.raises(ModelError, match=r"checkpoint.*remove it to train again"):
                 train(training, validation, replace(SMALL, epochs=1), tmp_path)
 
 

@@ -472,10 +472,10 @@ def test_what_is_not_excited_goes_back_to_its_prior_and_the_rest_is_fitted_again
     np.testing.assert_allclose(calls[1][2], math.radians(0.05))  # no less is believed
     assert calls[1][1].all() and (~calls[2][1]).sum() == 2
     assert [(s.part, s.seconds) for s in found.scores] == [("fit", 1), ("held out", 1)]
-    fitting = "fitting the filter's sideslip to the truth"
+    fitting = "fitting the filter's sideslip to the ground truth"
     assert told == [
         (fitting, 0.0), (fitting, pytest.approx(0.1)), (fitting, pytest.approx(0.2)), ("finding physics", 0.6),
-        ("fitting the smoother's sideslip to the truth", 0.9), ("scoring", 0.95),
+        ("fitting the smoother's sideslip to the ground truth", 0.9), ("scoring", 0.95),
     ]  # fmt: skip
     assert found.physics == PHYSICS.model_copy(update={"smoothing": (0.5, 2.0)})
     frequency, noise = found.physics_parameters
@@ -586,7 +586,7 @@ def test_intervals_are_said_in_words_beside_their_entries() -> None:
     said = stage._comments(FOUND)
     interval = "95 %: 4000 to 6000, prior 5500"
     assert said == {
-        "yaw_inertia_kg_m2": "kept at its prior: the sideslip says no more about it",
+        "yaw_inertia_kg_m2": "kept at its prior: the sideslip shows no more about it",
         "sensors.ay_bias_m_s2": "95 %: -0.01 to 0.11, prior 0",
         "tyres.front.C": interval,
         "tyres.rear.C": interval,

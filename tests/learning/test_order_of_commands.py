@@ -114,7 +114,9 @@ def commands(sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def _stale(notes: list[str] | tuple[str, ...]) -> set[str]:
     """Return the commands that notes name, each once."""
-    named = [command for note in notes for command in FILES if f"pdhef learn --stages {command} makes it anew" in note]
+    named = [
+        command for note in notes for command in FILES if f"pdhef learn --stages {command} creates it again" in note
+    ]
     assert len(named) == len(notes) == len(set(named)), notes
     return set(named)
 
@@ -158,7 +160,7 @@ def test_every_order_gives_parts_that_are_valid_or_said_to_be_stale(commands: Co
         assert ("physics" in car.noise) == (tuned or identified)
         assert (car.fitted_physics is not None) == identified
         assert ("gain" in made) == car.allowed_trust.reason.startswith(("too little", "the car's evidence was found"))
-        assert ("gain" in expected) == ("pdhef learn --stages gain gives it anew" in car.allowed_trust.reason)
+        assert ("gain" in expected) == ("pdhef learn --stages gain creates it again" in car.allowed_trust.reason)
         before = after
 
         if number == ORDER.index("identify") + 1:
@@ -171,7 +173,7 @@ def test_every_order_gives_parts_that_are_valid_or_said_to_be_stale(commands: Co
             said, notes = commands.run(commands.car.parent / "out", dlc)
             assert said == []
             assert notes["physics"] == [
-                "intervals calibrated on truthsim saloon (identified) for friction and vehicle as told"
+                "intervals calibrated on truthsim saloon (identified) for friction and vehicle as given"
             ]
 
 

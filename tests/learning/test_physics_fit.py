@@ -291,7 +291,7 @@ def test_what_is_found_puts_the_car_right(static: FitDrive, monkeypatch: pytest.
     assert held.values.applied_to(start) == found.vehicle != start
     assert found.vehicle.physics == parts("lag")
     assert (held.noise, held.tried) == (found.noise, ())
-    assert told == [("fitting the physics filter's sideslip to the truth", 0.7)]
+    assert told == [("fitting the physics filter's sideslip to the ground truth", 0.7)]
     assert FittedPhysics.model_validate(held.model_dump(mode="json")) == held
     assert find_physics([short], start)[1].values.physics == STATIC, "too little driving to choose by"
     assert fits[1:] == [STATIC]

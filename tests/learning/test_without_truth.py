@@ -44,18 +44,18 @@ def test_a_pool_of_logs_mends_the_file(pool: LearnResult, sample_logs_dir: Path)
 def test_the_car_says_what_it_rests_on_and_that_no_truth_was_looked_at(pool: LearnResult) -> None:
     text = (pool.car / "fit.toml").read_text()
     assert "without_truth = true" in text
-    assert "no truth was looked at" in text
+    assert "no ground truth was used" in text
     car = Car.load(pool.car)
     assert [d.name for d in car.learnt_on] == ["dlc", "sweep"]
     assert all(d.end_s > 5.0 for d in car.learnt_on)
-    assert car.vehicle.name.endswith("(calibrated without truth)")
+    assert car.vehicle.name.endswith("(calibrated without ground truth)")
     assert car.has_evidence  # it is not calibrated once more in a run
     assert make_estimator("physics", car).causal
     assert pool.figures["self_calibration"]["logs"] == 2
 
 
 def test_one_log_is_no_pool(sample_logs_dir: Path, config: RunConfig, tmp_path: Path) -> None:
-    with pytest.raises(EstimatorError, match="need not hold on another"):
+    with pytest.raises(EstimatorError, match="need not apply to another"):
         run_stage("identify", [str(sample_logs_dir / "dlc.mcap")], tmp_path / "car", config, without_truth=True)
     assert not (tmp_path / "car").exists()
 

@@ -218,7 +218,10 @@ def test_a_fleet_of_tables_runs_in_several_processes(package: Path, npz: Path, t
         folder = out / "logs" / log["log"]
         report = json.loads((folder / "report.json").read_text())
         assert report["log"]["kind"] == "npz"
-        assert "annotated.mcap holds our topics only: a log of kind npz has no messages to copy" in report["remarks"]
+        assert (
+            "annotated.mcap contains the tool's topics only: a log of kind npz has no messages to copy"
+            in report["remarks"]
+        )
         assert {m["metric"] for m in report["metrics"]} >= {"d2"}
         assert (folder / "report.html").stat().st_size > 10_000
         annotated = open_log(folder / "annotated.mcap")
@@ -227,7 +230,7 @@ def test_a_fleet_of_tables_runs_in_several_processes(package: Path, npz: Path, t
         }  # fmt: skip
         annotated.close()
     code, _, said = _pdhef(package, "events", out, "--where", "vx_m_s > 1", "--clip", "--source", logs / "one")
-    assert "one__drive: clips hold our tracks only: the log has no messages to copy" in said
+    assert "one__drive: clips contain the tool's tracks only: the log has no messages to copy" in said
     assert code == 3, said  # the source of the other drive is not there
     assert list((out / "clips").iterdir())
 

@@ -108,7 +108,7 @@ def test_wheel_speeds_and_perfect_truth_of_the_simulator() -> None:
     assert set(auto.mapping.truth) == {"vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m", "quat_wxyz"}
     assert auto.mapping.truth["quat_wxyz"].paths == tuple(f"pose.pose.orientation.{a}" for a in "wxyz")
     assert auto.missing == ("steer_rad",)
-    assert any("perfect truth taken; /rtk/fix, /rtk/odometry not used" in n for n in auto.mapping.notes)
+    assert any("perfect ground truth used; /rtk/fix, /rtk/odometry not used" in n for n in auto.mapping.notes)
     other = auto_map(FakeLog(contents), prefer_truth="rtk").mapping.truth
     assert {s.topic for s in other.values()} == {"/rtk/odometry"}
     # With only one of them that one is taken, whatever is preferred.

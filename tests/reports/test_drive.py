@@ -93,9 +93,9 @@ def test_standstill_says_that_there_is_no_sideslip(tmp_path):
 def test_without_truth_the_page_says_why_there_is_no_score_and_shows_disagreement(tmp_path):
     page = page_of(write_run(tmp_path, drive_tracks(truth=False)))
     text = words(page)
-    assert "The log has no truth" in text
+    assert "The log has no ground truth" in text
     assert "Largest disagreements of pd-hef" in text
-    assert "estimator NIS / dof pd-hef 1.033" in text  # NIS of 3.1 at 3 degrees of freedom
+    assert "estimator NIS per degree of freedom pd-hef 1.033" in text  # NIS of 3.1 at 3 degrees of freedom
     assert figures(page)["error"]["title"].startswith("Disagreement")
     assert [s["label"] for s in figures(page)["error"]["series"]] == ["physics", "zero"]
 

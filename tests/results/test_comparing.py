@@ -59,7 +59,7 @@ def test_drives_pair_by_signals_then_content_then_name(tmp_path: Path) -> None:
     assert found.pairs == {"signals": 1, "content": 3, "name": 1}
     assert (found.only_a, found.only_b, found.changed) == (("gone",), ("new",), 0)
     assert (found.verdict, found.exit_code) == ("equal", 3)
-    assert any(line.startswith("drives: nothing but their name") for line in found.differences)
+    assert any(line.startswith("drives: only their names") for line in found.differences)
 
 
 def test_a_removed_drive_closes_the_gate_unless_it_is_allowed(tmp_path: Path) -> None:
@@ -97,7 +97,7 @@ def test_cannot_tell_is_an_answer_and_strict_refuses_it(tmp_path: Path) -> None:
     b = write_run(tmp_path / "b", {k: v * (1.5 if i % 2 else 0.7) for i, (k, v) in enumerate(TEN.items())})
     for gate in (ASKED, GATE):
         found = _compare(a, b, gate)
-        assert (found.verdict, found.exit_code) == ("cannot tell", 0)
+        assert (found.verdict, found.exit_code) == ("inconclusive", 0)
         assert found.figures[0].detectable > 0.3
         assert replace(found, strict=True).exit_code == 4
 
@@ -106,7 +106,7 @@ def test_clusters_are_drawn_whole(tmp_path: Path) -> None:
     entries = [entry(label, car={"name": f"car{i // 5}", "sha256": "a"}) for i, label in enumerate(TEN)]
     a, b = write_run(tmp_path / "a", TEN, entries=entries), write_run(tmp_path / "b", _scaled(1.2), entries=entries)
     found = _compare(a, b, GATE, cluster="car")
-    assert (found.figures[0].change.clusters, found.verdict) == (2, "cannot tell")
+    assert (found.figures[0].change.clusters, found.verdict) == (2, "inconclusive")
     with pytest.raises(UsageError, match="--cluster: expected a key of the drives: car, day, got colour"):
         _compare(a, b, cluster="colour")
 
@@ -156,7 +156,7 @@ def test_what_else_differs_is_said(tmp_path: Path) -> None:
     assert "truth: another one (what it held), 1 of 10 drives: d1" in text
     assert "mapping: another one" in text
     assert "signals: they held something else, 1 of 10 drives: d2" in text
-    assert "main estimator: pd-hef → physics, 1 of 10 drives" in text
+    assert "selected estimate: pd-hef → physics, 1 of 10 drives" in text
     assert "configuration: friction auto → 0.3" in text
     assert "versions: numpy 2.0 → 2.1" in text
     assert "outcome of d4: ok → lost: a chunk" in text
@@ -169,7 +169,7 @@ def test_figures_over_other_stamps_or_of_a_truth_that_was_an_input_say_so(tmp_pa
     b = write_run(tmp_path / "b", {}, entries=[entry(label) for label in TEN], rows=[*fewer, *mark])
     assert _compare(a, b).figures[0].notes == (
         "other stamps are scored in 1 of 10 drives, -0.91% in all",
-        "in 1 of 10 drives the truth is one of the estimator's inputs",
+        "in 1 of 10 drives the ground truth is one of the estimator's inputs",
     )
 
 

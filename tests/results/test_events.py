@@ -73,7 +73,7 @@ def test_rows_have_drive_start_end_and_peak(run: Path) -> None:
     assert first.start_s == pytest.approx(2.03)
     assert (first.peak, first.peak_ns) == (pytest.approx(3.0, abs=1e-4), START_NS + 1_100_000_000)
     assert second.peak == pytest.approx(4.0, abs=1e-4)
-    assert found.left_out == {"no_truth": "it has no truth", "bad": "failed: empty"}
+    assert found.left_out == {"no_truth": "it has no ground truth", "bad": "failed: empty"}
     assert found.exit_code == 3
 
 

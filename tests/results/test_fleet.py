@@ -127,8 +127,8 @@ def test_drives_without_independent_truth_stand_apart_and_score_nothing(run: Run
     found = run.read()
     assert [d.label for d in found.scored] == ["good"]
     assert [(d.label, d.unscored) for d in found.without_truth] == [
-        ("none", "the log has no truth"),
-        ("own", "its truth is no independent one"),
+        ("none", "the log has no ground truth"),
+        ("own", "its ground truth is no independent one"),
     ]
     (answer, _) = found.distributions
     assert (answer.estimator, answer.drives) == (ANSWER, 1)
@@ -180,7 +180,7 @@ def test_a_key_that_parts_the_drives_comes_first_and_numbers_are_told_by_quarter
     assert [(g.value, g.scored) for g in only.groups] == [("1", 40)]
     assert run.read(by=["driver"]).breakdowns[0].groups[0].value == "28 others"
     (nothing,) = run.read(by=["no such key"]).breakdowns
-    assert [g.value for g in nothing.groups] == ["not told"]
+    assert [g.value for g in nothing.groups] == ["not given"]
 
 
 def test_the_operating_space_adds_up_and_empty_cells_are_empty(run: Run) -> None:
@@ -208,7 +208,7 @@ def test_folders_part_drives(run: Run) -> None:
         run.add(f"d{i}", {"pd-hef": 0.1 * (1 + i)}, folder=("golf/monday", "golf/friday", "mini")[i // 2])
     found = {b.key: [(g.value, g.drives) for g in b.groups] for b in run.read(by=["folder", "folder 2"]).breakdowns}
     assert found["folder"] == [("golf", 4), ("mini", 2)]
-    assert found["folder 2"] == [("golf/friday", 2), ("golf/monday", 2), ("not told", 2)]
+    assert found["folder 2"] == [("golf/friday", 2), ("golf/monday", 2), ("not given", 2)]
 
 
 @pytest.mark.fleet

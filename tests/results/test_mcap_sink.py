@@ -425,7 +425,7 @@ def test_odometry_holds_no_pose_that_is_not_known(tmp_path, circle):
 
 def test_a_log_without_truth_says_so_in_its_record():
     report = {**REPORT, "truth": {"available": False}, "metrics": [], "estimators": []}
-    assert metrics_record(report) == {"log": "drive", "truth": "no truth"}
+    assert metrics_record(report) == {"log": "drive", "truth": "no ground truth"}
 
 
 def test_a_covariance_that_is_not_known_is_zero_as_ros_wants_it():

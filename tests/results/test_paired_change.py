@@ -26,11 +26,11 @@ def test_false_alarms_are_few_and_a_planted_regression_is_found() -> None:
 
 def test_few_drives_cannot_tell_whatever_they_show() -> None:
     found = paired_change(np.full(4, 0.5))
-    assert found.verdict(0.05) == "cannot tell"
+    assert found.verdict(0.05) == "inconclusive"
     assert math.isnan(found.low)
     assert math.isnan(found.detectable(0.05))
     assert paired_change(np.full(5, 0.5)).verdict(0.05) == "worse"
-    assert paired_change(np.empty(0)).verdict() == "cannot tell"
+    assert paired_change(np.empty(0)).verdict() == "inconclusive"
 
 
 def test_a_change_below_the_limit_is_not_worse_and_one_the_other_way_is_better() -> None:

@@ -146,7 +146,7 @@ def test_report_without_truth_follows_its_schema_too():
     report = build_report(facts(truth=TruthFacts(), metrics=[], segments=[], losses=[], warnings=[]))
     validate(report, "report.schema.json")
     assert report["truth"]["available"] is False
-    assert "no truth" in report_markdown(report)
+    assert "no ground truth" in report_markdown(report)
 
 
 @pytest.mark.slow

@@ -152,7 +152,7 @@ def test_the_report_for_people_is_this() -> None:
         "# drive", "", "d.mcap (mcap), 6.0 s, sha256 abababababab; vehicle sedan", "",
         "## Warnings", "", "- careful", "",
         "## Losses", "", "- a gap (/imu)", "",
-        "## Truth", "", "- vy_m_s: `/ins.v`, 7 samples; moved", "- latency 12.5 ms",
+        "## Ground truth", "", "- vy_m_s: `/ins.v`, 7 samples; moved", "- latency 12.5 ms",
         "- not independent of the estimators' inputs: vx_m_s", "- smoothed", "",
         "Friction: vehicle file, 0.85, observable", "",
         "## sideslip_rad", "", "| estimator | segment | rmse [deg] | coverage |", "| --- | --- | ---: | ---: |",

@@ -62,7 +62,7 @@ def test_a_drive_whose_outputs_are_damaged_is_run_again_and_that_is_said(tmp_pat
     before = contents(out)
     flip(of_drive(out, kind, "b"))
     run(logs, out, resume=True, say=said.append, work=work)
-    assert (work.asked, said) == (["b"], ["1 of 2 drives are run anew: their outputs are damaged"])
+    assert (work.asked, said) == (["b"], ["1 of 2 drives are run again: their outputs are damaged"])
     assert contents(out) == before
 
 

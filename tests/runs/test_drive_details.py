@@ -44,7 +44,7 @@ def test_a_drive_with_truth_has_all_of_it(sample_logs_dir: Path, tmp_path: Path)
 def test_without_truth_there_is_a_reason_and_no_verdict(sample_logs_dir: Path, tmp_path: Path) -> None:
     report = run("no_truth", sample_logs_dir, tmp_path / "out")
     assert {v["outcome"] for v in report["verdicts"]} == {"none"}
-    assert report["error_budget"]["reason"] == "the log has no truth"
+    assert report["error_budget"]["reason"] == "the log has no ground truth"
     assert report["innovations"] and report["operating_space"]["cells"]
 
 

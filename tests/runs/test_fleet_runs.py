@@ -92,7 +92,7 @@ def test_a_log_is_known_by_what_it_holds(tmp_path: Path) -> None:
     (logs / "b.mcap").write_text("recorded again")
     run(logs, out, work=work, resume=True, say=said.append)
     assert (labels(out), work.asked) == (["b", "a"], ["a", "b", "b"])
-    assert said == ["1 of 2 drives are run anew: their logs have changed"]
+    assert said == ["1 of 2 drives are run again: their logs have changed"]
 
 
 def test_the_same_drive_under_two_names_is_run_once_and_that_is_said(tmp_path: Path) -> None:
@@ -102,7 +102,7 @@ def test_the_same_drive_under_two_names_is_run_once_and_that_is_said(tmp_path: P
     for options in ({}, {"resume": True}):
         run(logs, out, work=work, warn=warned.append, **options)
     assert (labels(out), work.asked) == (["a"], ["a"])
-    assert warned == ["b.mcap holds what a.mcap holds: the drive is run once"] * 2
+    assert warned == ["b.mcap has the same content as a.mcap: the drive is run once"] * 2
 
 
 def test_resuming_reads_no_log_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -129,8 +129,8 @@ def test_what_is_run_anew_is_said_and_why(tmp_path: Path, sample_logs_dir: Path)
     run(logs, out, RunConfig(car=car, friction=0.4), work=work, resume=True, say=said.append)
     run(logs, out, RunConfig(car=car, friction=0.4, window_s=60.0), work=work, resume=True, say=said.append)
     assert said == [
-        "2 of 2 drives are run anew: the car's physics changed",
-        "2 of 2 drives are run anew: --friction auto → 0.4",
+        "2 of 2 drives are run again: the car's physics changed",
+        "2 of 2 drives are run again: --friction auto → 0.4",
     ]
     assert work.asked == ["a", "b"] * 3
     assert len(list((out / "metrics").rglob("*.parquet"))) == 2  # those of before are gone

@@ -23,7 +23,7 @@ def _run(logs: Path, out: Path, **changes: Any) -> tuple[pl.DataFrame, list[dict
     assert run_logs(paths, out, config, report=False).exit_code == EXIT_OK
     reports = [json.loads((out / f"logs/{name}/report.json").read_text()) for name in NAMES]
     for report in reports:
-        report["remarks"] = [r for r in report["remarks"] if not r.startswith("a slim log stands for")]
+        report["remarks"] = [r for r in report["remarks"] if not r.startswith("a reduced log replaces")]
     return pl.read_parquet(out / "metrics.parquet"), reports
 
 

@@ -166,7 +166,7 @@ def test_whichever_call_fails_one_of_the_two_is_whole(
             except OutputError as error:
                 assert "Input/output error" in str(error)
             except OSError as error:
-                pytest.fail(f"call {number}: {error!r} is not told as an error of writing")
+                pytest.fail(f"call {number}: {error!r} is not given as an error of writing")
         found = texts(folder)
         new = {**OLD, "a.txt": "new a", "notes.txt": "mine"}
         assert found in ({**OLD, "notes.txt": "mine"}, new), number

@@ -74,7 +74,7 @@ def test_a_node_that_is_lost_while_its_task_runs_costs_no_item(cluster: Any, tmp
     assert {e.failure for e in ended} == {None}
     assert all(e.result == e.item[1] for e in ended)
     (begun,) = lost
-    assert len(begun.read_text().split()) == 2, "it was begun anew on another node"
+    assert len(begun.read_text().split()) == 2, "it was begun again on another node"
     assert sorted(p.read_text() for p in tmp_path.glob("*.done")) == sorted(value for _, value in items)
     assert not list(tmp_path.glob(".*")), "no file is left half-written"
 

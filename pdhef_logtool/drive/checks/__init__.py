@@ -1,4 +1,4 @@
-"""Checks: whether mapped signals, truth and vehicle file agree with physics and with one another.
+"""Checks: whether mapped signals, ground truth and vehicle file agree with physics and with one another.
 
 Each check is registered by one file, from which report.json, terminal, pages, ``--waive``, JUnit and documentation
 derive it. A new check is a file that exports ``CHECKS`` (:class:`~.kind.CheckKind`) and its name in ``MODULES`` of

@@ -179,8 +179,8 @@ def _not_excited(name: str, relations: Sequence[Relation]) -> Check:
 
 SIGN = CheckKind(
     "SIGNAL.sign",
-    compares="a_y with v r, steering with curvature, v̇ with a_x, wheel speeds, wheel differences and the truth's path "
-    "with the signals that they go with",
+    compares="a_y with v r, steering with curvature, v̇ with a_x, wheel speeds, wheel differences and the ground "
+    "ground truth's path with the signals that they correspond to",
     fails="they contradict the signal by its sign",
     remedy="{remedy}",
     lacks=f"needs {_BENDS}",

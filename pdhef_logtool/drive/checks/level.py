@@ -53,7 +53,7 @@ def _levels(drive: CheckedDrive) -> Iterator[Check]:
 def _level(name: str, rest: float, mean: float) -> Check:
     # A wrong sign or unit of the speed makes the rest wrong, not the mean: both must exceed the limit.
     size = min(abs(rest), abs(mean))
-    evidence = f"mean {mean:.2f} m/s^2, of which driving leaves {rest:.2f}"
+    evidence = f"mean {mean:.2f} m/s^2, after removal of the driving {rest:.2f}"
     if size > OTHER_AXIS_M_S2:
         return Check(f"{name}.axis", name, "failed", f"{evidence}: that is gravity", "map a level axis of the sensor")
     if size > LEVEL_M_S2:

@@ -1,4 +1,4 @@
-"""Every check of signals, truth and vehicle file, in the order in which they are made."""
+"""Every check of signals, ground truth and vehicle file, in the order in which they are made."""
 
 from __future__ import annotations
 

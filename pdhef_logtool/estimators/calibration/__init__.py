@@ -1,1 +1,1 @@
-"""A car that calibrates itself on a log without truth (docs/method.md#self-calibration)."""
+"""A car that calibrates itself on a log without ground truth (docs/method.md#self-calibration)."""

@@ -1,4 +1,4 @@
-"""What a log gives to its calibration: sensors on an even grid, in stretches of driving; no truth.
+"""What a log gives to its calibration: sensors on an even grid, in stretches of driving; no ground truth.
 
 A log of any length is taken window by window and thinned at once: of ten hours 72 MB remain. Windows change no bit.
 """

@@ -29,7 +29,7 @@ class _Coverage:
 METRICS = (
     Metric(
         "coverage95",
-        "in 95 % band",
+        "in 95 % CI",
         "share of stamps with abs e ≤ 1.96 σ; σ² is the estimate's variance plus that of ground truth if known",
         OfSignal(_Coverage),
         best=0.95,

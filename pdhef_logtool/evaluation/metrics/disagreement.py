@@ -46,7 +46,7 @@ METRICS = (
         "disagreement_rms",
         "RMS difference",
         "RMS of the difference of two estimates' sideslip, both above the low-speed blend; estimator `a~b`. Without "
-        "truth only",
+        "ground truth only",
         OfDrive(_rows),
         best="lower",
     ),

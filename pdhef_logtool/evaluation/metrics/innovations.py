@@ -43,7 +43,7 @@ METRICS = (
     Metric("nis", "NIS", "mean normalized innovation squared. Signal `state`", _FUNCTION, unit="1", brief=("state",)),
     Metric(
         "nis_dof",
-        "NIS dof",
+        "degrees of freedom",
         "mean of the degrees of freedom of NIS, which `nis` should equal. Signal `state`",
         _FUNCTION,
         unit="1",

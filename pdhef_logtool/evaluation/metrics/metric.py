@@ -24,7 +24,7 @@ Figure: TypeAlias = tuple[float, int]
 class MetricRow:
     """One figure. The first eight fields and ``algorithm`` are the columns of metrics.parquet.
 
-    ``algorithm`` is the digest of what ran under the estimator's name; empty where nobody knows (recorded estimates).
+    ``algorithm`` is the digest of what ran under the estimator's name; empty where nobody has (recorded estimates).
 
     ``independent`` is False when ground truth of this signal is one of the estimators' inputs; tables and rankings
     leave such rows out. In the file a row with metric ``not_independent`` shows it for its estimator and signal.

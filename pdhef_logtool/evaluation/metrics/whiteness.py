@@ -55,8 +55,8 @@ METRICS = (
     Metric(
         "nis_autocorrelation",
         "whiteness",
-        "autocorrelation of NIS / dof from one stamp to the next, signal `state`; 0 for white innovations, beyond "
-        "± 2/√n they are not white",
+        "autocorrelation of NIS per degree of freedom from one stamp to the next, signal `state`; 0 for white "
+        "innovations, beyond ± 2/√n they are not white",
         OfDrive(_rows),
         best=0.0,
         unit="1",

@@ -1,4 +1,4 @@
-"""Axle slip angles and lateral forces from truth, and a magic formula through them: where identification starts.
+"""Axle slip angles and lateral forces from ground truth, and a magic formula through them: where identification starts.
 
 F_yf cos δ + F_yr = m a_y and l_f F_yf cos δ − l_r F_yr = I_z ṙ give both axle forces; the slip angles follow from the
 true velocity (Eq 3, 4). The fit is least squares with the priors of docs/method.md#identification.
@@ -40,7 +40,7 @@ FORCE_STD_N_PER_KG = 0.35
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AxleSamples:
-    """Slip angle [N] in rad and lateral force [N] in N of both axles, from truth."""
+    """Slip angle [N] in rad and lateral force [N] in N of both axles, from ground truth."""
 
     front_slip_rad: FloatArray
     front_force_n: FloatArray
@@ -63,7 +63,7 @@ class AxleCurve:
 
 
 def usable_stamps(drive: FitDrive, vehicle: VehicleParameters) -> BoolArray:
-    """Return where truth and signals can be used for identification, [N]."""
+    """Return where ground truth and signals can be used for identification, [N]."""
     truth = drive.truth
     known = truth.valid & np.isfinite(truth.vx_m_s + truth.vy_m_s + truth.yaw_rate_rad_s + truth.ay_m_s2)
     moving = truth.vx_m_s > SPEED_FACTOR * vehicle.low_speed_blend_m_s
@@ -82,7 +82,7 @@ def sampled_errors(
 ) -> tuple[FloatArray, BoolArray, float]:
     """Return a filter's sideslip errors in rad at :data:`FIT_RATE_HZ`, 0 where it does not count, where it does, and s.
 
-    ``settle_s`` : what the filter needs before its error counts. The last value is the time that each error stands for.
+    ``settle_s`` : what the filter needs before its error counts. The last value is the time that each error represents.
     """
     every = max(1, round(1.0 / (FIT_RATE_HZ * period_s(drive))))
     pick = slice(None, None, every)

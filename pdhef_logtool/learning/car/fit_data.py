@@ -31,10 +31,10 @@ GUARD_S = 5.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitDrive:
-    """One drive, or a part of it: signals [N] and truth [N] at the same stamps.
+    """One drive, or a part of it: signals [N] and ground truth [N] at the same stamps.
 
     ``signals`` are as measured: no bias and no offset of a vehicle file is taken off.
-    ``independent_yaw_rate`` tells that the truth's yaw rate is not the gyro itself, ``steering_wheel`` that the log
+    ``independent_yaw_rate`` shows that the truth's yaw rate is not the gyro itself, ``steering_wheel`` that the log
     has the steering wheel's angle in place of the road wheels'. ``gyro_latency_s`` was taken off the gyro's stamps.
     ``placed`` is where recorded frames put the IMU.
     """
@@ -92,7 +92,7 @@ def load_fit_drive(
 
 
 def sensors_of(drives: Sequence[FitDrive], vehicle: VehicleParameters) -> tuple[Proposal, ...]:
-    """Return place, gain and delay of the car's sensors by the drives' truth, beside what the vehicle knows."""
+    """Return place, gain and delay of the car's sensors by the drives' ground truth, beside what the vehicle has."""
     return surest(p for drive in drives for p in _sensors_of(drive, vehicle))
 
 

@@ -7,8 +7,8 @@ cost is
     Σ_k w (β̂_k(θ) − β_k)² / σ² + |θ|²,
 
 where w makes one second of neighbouring, dependent samples count as one sample and σ is the error that remains, drive
-by drive. The intervals hold under the model: they do not contain what a single-track model cannot express. What
-the drives do not excite (posterior hardly narrower than the prior) is put back to its prior and said.
+by drive. The intervals contain under the model: they do not contain what a single-track model cannot express. What
+the drives do not excite (posterior hardly narrower than the prior) is put back to its prior and stated.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray
 CORRELATION_S = 1.0
 #: The filter needs this long from its start before its error counts.
 SETTLE_S = 3.0
-#: The error that remains is not believed to be smaller than this.
+#: The error that remains is not accepted to be smaller than this.
 MIN_SIGMA_RAD = math.radians(0.05)
 #: A parameter whose posterior is wider than this share of its prior was not excited.
 NOT_EXCITED = 0.8
@@ -94,7 +94,7 @@ class PartScore:
     physics_deg: float
 
     def to_dict(self) -> dict[str, float]:
-        """Return the figures as they stand with the car."""
+        """Return the figures as they are with the car."""
         figures = {"seconds": self.seconds, "zero_deg": self.zero_deg}
         figures |= {"starting_car_deg": self.start_file_deg, "identified_deg": self.identified_deg}
         figures["physics_deg"] = self.physics_deg
@@ -137,17 +137,17 @@ def fit_car(
     fit, held_out : parts of drives that share no stamp.
     start : gives geometry, mass, priors (its tyres, inertia, roll gradient) and sensor noise.
     steering_wheel : the steering signal is a steering-wheel angle, so that the ratio is identified too.
-    parts : of ``physics``; None: chosen by what part of the drives says of the other.
+    parts : of ``physics``; None: chosen by what part of the drives states of the other.
 
     Raises
     ------
     EstimatorError
-        There is too little usable driving with truth.
+        There is too little usable driving with ground truth.
     """
     usable_s = sum(usable_seconds(d, start) for d in fit)
     if usable_s < MIN_DRIVE_S:
         raise EstimatorError(
-            expected=f"at least {MIN_DRIVE_S:g} s of driving with truth, above twice the low-speed limit",
+            expected=f"at least {MIN_DRIVE_S:g} s of driving with ground truth, above twice the low-speed limit",
             got=f"{usable_s:.1f} s",
             where="identify",
             remedy="give more drives, a longer slice or a smaller --holdout",
@@ -160,7 +160,7 @@ def fit_car(
     total = OUTER_PASSES + 1
     std = np.ones(len(priors))
     for outer in range(total):
-        progress("fitting the filter's sideslip to the truth", 0.3 * outer / total)
+        progress("fitting the filter's sideslip to the ground truth", 0.3 * outer / total)
         theta, std, rmse = _minimise(fit, start, priors, theta, active, sigma)
         sigma = np.maximum(MIN_SIGMA_RAD, rmse)
         if outer == OUTER_PASSES - 1:
@@ -176,7 +176,7 @@ def fit_car(
         parts=parts,
         progress=lambda text, share: progress(text, 0.3 + 0.6 * share),
     )
-    progress("fitting the smoother's sideslip to the truth", 0.9)
+    progress("fitting the smoother's sideslip to the ground truth", 0.9)
     physics = physics.model_copy(update={"smoothing": fit_smoothing(fit, start, found)})
     progress("scoring", 0.95)
     scores = [_score("fit", fit, start, vehicle, noise, found)]
@@ -209,7 +209,7 @@ def _identified(
 def make_priors(
     samples: AxleSamples, start: VehicleParameters, usable_s: float, *, steering_wheel: bool
 ) -> tuple[Prior, ...]:
-    """Return the priors of docs/method.md#identification; those of the tyres stand about the fit to the axle forces.
+    """Return the priors of docs/method.md#identification; those of the tyres are about the fit to the axle forces.
 
     That fit has the starting file as its own prior, and its peaks stay above every force that was seen. As it has seen
     the drives already, the filter's error may move the tyres by ``AXLE_FIT_SHARE`` of those widths only: the error
@@ -317,7 +317,7 @@ def _minimise(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Minimise over the active parameters.
 
-    ``sigma`` [drives] is the error in rad that each drive is believed to leave: a violent drive, whose error the
+    ``sigma`` [drives] is the error in rad that each drive is accepted to leave: a violent drive, whose error the
     single-track model cannot remove, must not drown the others.
 
     Returns
@@ -463,7 +463,7 @@ def _notes(parameters: Sequence[Identified], drives: Sequence[FitDrive], usable_
     if kept:
         notes.append(f"not excited by these drives beyond what is in the prior, and kept there: {', '.join(kept)}")
     if not any(d.independent_yaw_rate for d in drives):
-        notes.append("the truth's yaw rate is the gyro itself: its bias is known through the sideslip alone")
+        notes.append("the ground truth's yaw rate is the gyro itself: its bias is known through the sideslip alone")
     edge = [p.name for p in parameters if p.excited and not p.low <= p.prior <= p.high and not p.tuning]
     if edge:
         notes.append(f"the sideslip asks for another value than the prior in: {', '.join(edge)}")

@@ -25,7 +25,9 @@ def plot_identification(found: Identification) -> bytes:
         (top[0][1], "rear", False, samples.rear_slip_rad, samples.rear_force_n),
     ):
         step = max(1, slip.size // _POINTS)
-        axes.plot(np.degrees(slip[::step]), force[::step] * 1e-3, ".", ms=1.5, color="0.65", label="from truth, 2 Hz")
+        axes.plot(
+            np.degrees(slip[::step]), force[::step] * 1e-3, ".", ms=1.5, color="0.65", label="from ground truth, 2 Hz"
+        )
         reach = 1.1 * float(np.max(np.abs(slip), initial=math.radians(2.0)))
         at = np.linspace(-reach, reach, 200)
         axes.plot(np.degrees(at), _force(found.vehicle, is_front, at) * 1e-3, color="#0072B2", lw=2, label="identified")

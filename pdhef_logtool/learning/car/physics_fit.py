@@ -5,9 +5,9 @@ In normalised parameters θ (distance from the prior in its standard deviations)
     Σ_i N_i log(s_i² + s_0²) + |θ|² + (log(NIS / dof) / w)²
 
 where s_i is the RMS of the filter's sideslip error on drive i, N_i its length over the time in which errors stay alike,
-and s_0 what is not believed to be beaten. With a fixed σ in place of the log, "σ is what remains" has two fixed points,
+and s_0 what is not accepted to be beaten. With a fixed σ in place of the log, "σ is what remains" has two fixed points,
 and a poor start ends at the worse one (docs/method.md#identification). The last term fixes the scale of Q and R, of
-which the gain knows the ratio alone. It is minimised by Gauss-Newton steps on errors over their present s_i,
+which the gain has the ratio alone. It is minimised by Gauss-Newton steps on errors over their present s_i,
 derivatives by differences.
 
 Force scale and bank are states of the one filter here, and filters of their own in service
@@ -48,7 +48,7 @@ from pdhef_logtool.records.signals import FloatArray
 
 #: Errors stay alike for this long, s; what the filter needs before its error counts, s.
 CORRELATION_S, SETTLE_S = 1.0, 2.0
-#: An RMS below this is not believed to be better still.
+#: An RMS below this is not accepted to be better still.
 FLOOR_RAD = math.radians(0.05)
 #: Spread of log(NIS / dof) about 0.
 NIS_LOG_STD = 1.0
@@ -234,7 +234,7 @@ def fit_physics(
     starts: Sequence[Theta] = STARTS,
     iterations: int = MAX_ITERATIONS,
 ) -> PhysicsFit:
-    """Fit the parameters and noise of ``physics`` with the given parts to drives with truth.
+    """Fit the parameters and noise of ``physics`` with the given parts to drives with ground truth.
 
     Parameters
     ----------
@@ -330,7 +330,7 @@ def scaled_errors(there: Sequence[DriveError], at: Sequence[DriveError]) -> Floa
 ORDER = ("braking", "force_scale", "bank", "biases", "load_transfer", "roll", "lag")
 #: A part stays if driving that its fits have not seen is worse by this share without it, on average over the folds.
 LEAST_GAIN = 0.01
-#: Steps of a fit that only says whether a part is worth having; it starts where the one with the part ended.
+#: Steps of a fit that only states whether a part is worth having; it starts where the one with the part ended.
 TRIAL_ITERATIONS = 8
 #: Drives from which on folds are whole drives; usable driving that a fold needs, for 75 s chose worse than none would
 #: have (150 s cannot choose a structure); nothing within this of a cut.
@@ -415,11 +415,11 @@ def find_physics(
     parts: PhysicsParts | None = None,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
 ) -> tuple[PhysicsFit, FittedPhysics]:
-    """Find what ``physics`` needs of a car on drives with truth, and return it as a car holds it, too.
+    """Find what ``physics`` needs of a car on drives with ground truth, and return it as a car contains it, too.
 
     Parameters
     ----------
-    parts : of the model; None: chosen by what part of the drives says of the other.
+    parts : of the model; None: chosen by what part of the drives states of the other.
     """
     tried: tuple[TriedParts, ...] = ()
     if parts is None:
@@ -429,7 +429,7 @@ def find_physics(
             parts, tried = choose_parts(
                 folds, start, steering_wheel=steering_wheel, progress=lambda text, share: progress(text, 0.7 * share)
             )
-    progress("fitting the physics filter's sideslip to the truth", 0.7)
+    progress("fitting the physics filter's sideslip to the ground truth", 0.7)
     found = fit_physics(drives, start, parts, steering_wheel=steering_wheel)
     varied = tuple(FittedValues.between(found.vehicle, v) for v in varied_vehicles(drives, start, found))
     values = FittedValues.of(found.vehicle)

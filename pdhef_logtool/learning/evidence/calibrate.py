@@ -6,11 +6,11 @@ Error e, terms t_i ≥ 0, s² = g² Σ (k_i t_i)². With r = log |e| − log(1.9
 
 is minimal where a share q of the errors lies inside; taken on the logarithm it weighs a straight road like a limit
 manoeuvre. Bins of grip use weigh alike, so do drives in a bin, and drives with the vehicle file as given and the same
-ones with it made wrong: the sensors often cannot tell which it is, so that one interval has to hold for both.
+ones with it made wrong: the sensors often cannot tell which it is, so that one interval has to apply to both.
 
 Errors of one drive are alike, so that the drives are the unit: what a fit is worth is found on drives that it has not
 seen (five folds of drives), and last factors make a share of *those* errors lie inside, each where a part of the grip
-is used: a drive that is lost near the limit says nothing of a straight road. That share is q (n + 1) / n of n drives,
+is used: a drive that is lost near the limit states nothing of a straight road. That share is q (n + 1) / n of n drives,
 as in conformal prediction: the next drive is one more that may be the worst.
 """
 
@@ -33,11 +33,11 @@ NORMAL_95 = 1.959963984540054
 #: Bins of true abs a_y over μ g (docs/method.md#evaluation), by name: lower and upper limit.
 BINS: dict[str, tuple[float, float]] = {"low": (0.0, 0.3), "middle": (0.3, 0.6), "high": (0.6, np.inf)}
 FOLDS = 5
-#: A fit on fewer drives says nothing of a further one.
+#: A fit on fewer drives states nothing of a further one.
 MIN_DRIVES = 5
 #: Samples from which on a drive counts in full: a second of them.
 FULL_SAMPLES = 20
-#: Errors are not told apart below this: 6e-5 degrees.
+#: Errors are not distinguished below this: 6e-5 degrees.
 LEAST_ERROR = 1e-6
 #: Coefficients below count for nothing.
 LEAST_COEFFICIENT = 1e-3
@@ -82,7 +82,7 @@ def join_samples(parts: Sequence[Samples]) -> Samples:
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """How the 95 % intervals of sideslip stand in one bin, before and after; after is of drives not fitted to.
+    """How the 95 % intervals of sideslip are in one bin, before and after; after is of drives not fitted to.
 
     ``width_*``: mean width over 3.92 times the RMSE; 1 for normal errors whose size is known.
     """
@@ -100,7 +100,7 @@ class Coverage:
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """The inflation of one estimator, the factor that unseen drives asked for in all, and how its intervals stand."""
+    """The inflation of one estimator, the factor that unseen drives asked for in all, and how its intervals are."""
 
     inflation: Inflation
     unseen_factor: float
@@ -170,7 +170,7 @@ def grip_factors(
 def share_for(covered: float, drives: int) -> float:
     """Return the share of known drives that must lie inside for ``covered`` of the next one, q (n + 1) / n.
 
-    No more than half of what q leaves out is added: few drives say little of such far quantiles.
+    No more than half of what q leaves out is added: few drives state little of such far quantiles.
     """
     return min(covered * (drives + 1) / drives, 0.5 * (1.0 + covered))
 

@@ -1,6 +1,6 @@
 """``pdhef train --baselines``: pure LSTM and linear regression, on the dataset that the residual network is trained on.
 
-Same drives, same split, same rows, same recipe: what differs is what is learnt. The regression is ordinary least
+Same drives, same split, same rows, same recipe: what differs is what is identified. The regression is ordinary least
 squares of the true sideslip on low-passed features (see :mod:`pdhef_logtool.residual_model.linear_model`).
 """
 
@@ -56,7 +56,7 @@ class SideslipSequence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BaselinesResult:
-    """What the command trained and wrote; the regression's errors stand in its provenance."""
+    """What the command trained and wrote; the regression's errors are in its provenance."""
 
     pure_lstm: TrainResult
     regression_file: Path
@@ -144,7 +144,7 @@ def fit_linear(
             expected="training drives with a true sideslip",
             got=f"{rows.shape[0]} usable rows",
             where="train --baselines",
-            remedy="extract more drives with truth",
+            remedy="extract more drives with ground truth",
         )
     mean, std = rows.mean(axis=0), rows.std(axis=0)
     varies = std > CONSTANT_SHARE * np.maximum(np.abs(mean), 1e-3)

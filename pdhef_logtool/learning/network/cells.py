@@ -1,4 +1,4 @@
-"""Which driving a dataset holds, in cells of speed x |a_y| x friction, and a choice of at most so much of each.
+"""Which driving a dataset contains, in cells of speed x |a_y| x friction, and a choice of at most so much of each.
 
 A row lies in the cell of its own features. What is chosen of a cell is drawn by seconds: each second of a drive draws a
 number by the hash of its log, the seed and itself, and the smallest ones are taken. So the choice depends on no order,
@@ -29,7 +29,7 @@ EDGES = {"speed_m_s": SPEED_M_S, "abs_ay_m_s2": AY_M_S2, "friction": FRICTION}
 COUNT = len(SPEED_M_S) * len(AY_M_S2) * len(FRICTION)
 #: Of rows without features.
 NO_CELL = -1
-#: Draws are multiples of this, which float32 holds exactly.
+#: Draws are multiples of this, which float32 contains exactly.
 _STEP = 2.0**-24
 
 
@@ -47,7 +47,7 @@ def condition_of(text: str) -> Condition:
 
 @dataclass(frozen=True, slots=True)
 class Picking:
-    """What says which rows of a drive are learnt from: a condition (None: all), and the key of its draws."""
+    """What states which rows of a drive are identified from: a condition (None: all), and the key of its draws."""
 
     condition: Condition | None = None
     key: str = ""
@@ -66,7 +66,7 @@ EVERYTHING = Picking()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picked:
-    """Of each row whether the condition holds, its cell, and what its second drew; all [N]."""
+    """Of each row whether the condition is true, its cell, and what its second drew; all [N]."""
 
     chosen: BoolArray
     cell: NDArray[np.int16]
@@ -150,7 +150,7 @@ def is_chosen(cell: NDArray[np.int16], draw: NDArray[np.float32], limits: Sequen
 
 
 def table_of(seconds: Mapping[str, Sequence[float]]) -> dict[str, Any]:
-    """Return the part of the manifest that tells of cells: edges, and the seconds of each cell by split."""
+    """Return the part of the manifest that shows of cells: edges, and the seconds of each cell by split."""
     return {
         "edges": {name: list(edges) for name, edges in EDGES.items()},
         "order": "speed changes first, friction last",

@@ -2,11 +2,11 @@
 
 See docs/formats.md#residual-dataset.
 
-Files stand in ``split=SPLIT/car=CAR/part-DRIVE.parquet``: ``polars.scan_parquet`` and others read them as one table.
+Files are in ``split=SPLIT/car=CAR/part-DRIVE.parquet``: ``polars.scan_parquet`` and others read them as one table.
 Features, targets and weights are stored as float32: a relative error of 6e-8, which no network sees. Each file carries
 its own entry of the manifest in its footer, so that what an interrupted command had finished can be kept. Files in the
 folder that the manifest does not name are no part of the dataset. Calls add up: the manifest keeps what earlier ones
-wrote, and what is extracted anew takes its place, by log and slice.
+wrote, and what is extracted again takes its place, by log and slice.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ FloatArray32: TypeAlias = NDArray[np.float32]
 class DriveWriter:
     """Writes the Parquet file of one drive; the same rows give the same bytes, however they are handed over.
 
-    ``picking`` says which rows are learnt from.
+    ``picking`` states which rows are identified from.
 
     Raises
     ------
@@ -77,7 +77,7 @@ class DriveWriter:
         self._file = RowGroups(path, self._schema, rows_a_group, ["segment", "cell", "draw"], joined=True)
 
     def append(self, rows: ResidualRows) -> Picked:
-        """Take the next rows of the drive; return which of them are learnt from."""
+        """Take the next rows of the drive; return which of them are identified from."""
         picked = self._picking.of(rows)
         self._file.append("", _table(rows, picked, self._schema))
         return picked
@@ -123,7 +123,7 @@ def read_entry(path: Path) -> dict[str, Any] | None:
 
 
 def drive_file(folder: Path, entry: Mapping[str, Any]) -> Path:
-    """Return where a drive stands in a dataset, by its entry: split, car and the name of its log and slice."""
+    """Return where a drive is in a dataset, by its entry: split, car and the name of its log and slice."""
     car = car_folder(entry["car"], entry["vehicle_sha256"])
     return folder / split_folder(entry["split"]) / car / f"part-{entry['name']}.parquet"
 
@@ -149,7 +149,7 @@ def write_manifest(
     ----------
     entries : one a drive, as in its file or an earlier manifest.
     failed : log, file and reason of the logs that gave none.
-    duplicates : log, file and the name of the drive that holds the same, of the logs that were left out for it.
+    duplicates : log, file and the name of the drive that contains the same, of the logs that were left out for it.
     settings, seed : of the call that wrote last; with ``per_cell_s`` so much of each cell is chosen of split train.
     vehicles : by the digest of their physics; those that no drive names are left out.
 
@@ -223,12 +223,12 @@ def remove_unnamed(folder: Path, manifest: Mapping[str, Any]) -> None:
         if path.relative_to(folder).as_posix() not in named:
             path.unlink()
             for parent in (path.parent, path.parent.parent):
-                with suppress(OSError):  # it holds others
+                with suppress(OSError):  # it contains others
                     parent.rmdir()
 
 
 def vehicle_entry(sha256: str, vehicle: VehicleParameters, *, identified: bool) -> dict[str, Any]:
-    """Return what the manifest says of a vehicle; ``identified``: whether driving gave its values."""
+    """Return what the manifest states of a vehicle; ``identified``: whether driving gave its values."""
     parameters = vehicle.model_dump(mode="json")
     return {"name": vehicle.name, "sha256": sha256, "parameters": parameters, "identified": identified}
 
@@ -265,9 +265,9 @@ class DriveArrays:
     stamps_ns : int64 [N]. features : float32 [N, 28], finite.
     targets : float32 [N, 2], increments to the next stamp in m/s and rad/s; 0 where ``weight`` is 0.
     step_s : float64 [N], time that a target covers: target / step is the residual rate; the period at the last row.
-    weight : float32 [N]. segment : int64 [N]; recurrent state starts anew where it changes.
+    weight : float32 [N]. segment : int64 [N]; recurrent state starts again where it changes.
     truth_velocity : float32 [N, 2], true v_x and v_y; NaN where unknown.
-    chosen : bool [N], which rows are learnt from where the weight allows it; None: all.
+    chosen : bool [N], which rows are identified from where the weight allows it; None: all.
     """
 
     stamps_ns: IntArray
@@ -284,7 +284,7 @@ class DriveArrays:
 class DatasetDrive:
     """One drive of a dataset, whose arrays are read each time that they are asked for: a set may not fit the memory.
 
-    ``entry`` is what the manifest says of it; ``limits`` are those of the cells, None: all is chosen.
+    ``entry`` is what the manifest states of it; ``limits`` are those of the cells, None: all is chosen.
     """
 
     name: str
@@ -332,7 +332,7 @@ class DatasetDrive:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dataset:
-    """A residual dataset: what its manifest says, and its drives, none of which is read before it is asked for.
+    """A residual dataset: what its manifest states, and its drives, none of which is read before it is asked for.
 
     ``features`` names the columns of :attr:`DriveArrays.features` in order; ``sha256`` identifies the content;
     ``model`` is the filter that features come from and residuals are of (:data:`~.bundle.MODELS`).
@@ -378,7 +378,7 @@ def read_dataset(folder: Path) -> Dataset:
     Raises
     ------
     OutputError
-        The folder holds no dataset, or one of another format or with other features.
+        The folder contains no dataset, or one of another format or with other features.
     """
     path = folder / MANIFEST
     try:
@@ -389,7 +389,7 @@ def read_dataset(folder: Path) -> Dataset:
                 expected=f"{FORMAT} {FORMAT_VERSION} with the features {', '.join(FEATURES)}",
                 got=f"{kind[0]} {kind[1]} with {', '.join(document['features'])}",
                 where=str(path),
-                remedy="pdhef extract LOG... -o DATASET makes it anew, in another folder",
+                remedy="pdhef extract LOG... -o DATASET creates it again, in another folder",
             )
         limits = (document.get("choice") or {}).get("limits")
         return Dataset(

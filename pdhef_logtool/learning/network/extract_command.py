@@ -86,9 +86,9 @@ class ExtractSettings:
 
     Attributes
     ----------
-    config : vehicle, mapping, slice, sensors, friction, which truth; the other entries are not used.
+    config : vehicle, mapping, slice, sensors, friction, which ground truth; the other entries are not used.
     truth_smoothing : ``auto`` (decided per drive from the truth's noise), ``none``, or a half window in seconds.
-    split : for all drives; None = what a set's manifest says of a drive, else 70/15/15 by a hash of its content.
+    split : for all drives; None = what a set's manifest states of a drive, else 70/15/15 by a hash of its content.
     seed : of that hash, and of the variation.
     vary : spread by which friction and vehicle are made wrong for a part of the drives (``variation.vary``).
     model : whose residuals, one of :data:`~.bundle.MODELS`.
@@ -151,7 +151,7 @@ class ExtractSettings:
 class DriveResult:
     """What came of one log: its entry in the manifest, None if it is left out. ``kept``: from an earlier command.
 
-    ``copy_of``: the drive in the dataset whose signals it holds too, empty without.
+    ``copy_of``: the drive in the dataset whose signals it contains too, empty without.
     """
 
     record: DriveRecord
@@ -207,7 +207,7 @@ class _Job:
         return self.settings.name_of(self.log_input.stem)
 
     def target(self, split: str) -> Path:
-        """Where the drive stands in the dataset."""
+        """Where the drive is in the dataset."""
         sha, vehicle = self.physics
         return drive_file(self.output, {"name": self.name, "split": split, "car": vehicle.name, "vehicle_sha256": sha})
 
@@ -229,20 +229,20 @@ def extract(
     splits: Mapping[str, str] | None = None,
     reporter: Reporter = SILENT,
 ) -> ExtractResult:
-    """Write the residual dataset of logs with truth to a folder.
+    """Write the residual dataset of logs with ground truth to a folder.
 
-    A log that cannot be read or has no truth is reported and never stops the others.
+    A log that cannot be read or has no ground truth is reported and never stops the others.
 
     Parameters
     ----------
     arguments : logs, folders, glob patterns. jobs : processes at work; changes nothing that is written.
     resume : keep drives whose log and settings are as they were.
-    splits : of each log by its stem, instead of what the manifests of sets say.
+    splits : of each log by its stem, instead of what the manifests of sets state.
 
     Raises
     ------
     UsageError, VehicleError, MappingError
-        What holds for all logs is wrong.
+        What applies to all logs is wrong.
     PdhefError
         The only log cannot be used.
     """
@@ -263,7 +263,7 @@ def extract(
     write = partial(_write, output, settings, kept, vehicles)
     folders = {split_folder(s) for s in (*SPLITS, settings.split, *(job.listed_split for job in work)) if s}
     with OutputFolder(output, sorted(folders)):
-        # Until the new manifest stands, what the old one says of the files that change is no longer true.
+        # Until the new manifest is, what the old one states of the files that change is no longer true.
         if kept:
             write([])
         else:
@@ -321,7 +321,7 @@ def _without_copies(results: Sequence[DriveResult], warn: Tell) -> tuple[DriveRe
         other = first[entry["signals_sha256"]]
         if other == entry["name"]:
             return result
-        warn(f"{result.record.name} is left out: it holds the same signals as {other}")
+        warn(f"{result.record.name} is left out: it contains the same signals as {other}")
         return replace(result, entry=None, copy_of=other)
 
     return tuple(told(r) for r in results)
@@ -359,7 +359,7 @@ def _earlier(output: Path, settings: ExtractSettings) -> dict[str, Any]:
     Raises
     ------
     UsageError
-        The folder holds another manifest, or a dataset that this one cannot add to.
+        The folder contains another manifest, or a dataset that this one cannot add to.
     """
     path = output / MANIFEST
     remedy = "choose another folder with -o"
@@ -503,7 +503,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             raise
         writer.finish(entry)
         if not entry["usable_rows"]:
-            drive.tell("not one usable target: no truth above the low-speed limit")
+            drive.tell("not one usable target: no ground truth above the low-speed limit")
         record = record_of(drive, split=split)
     return DriveResult(replace(record, seconds=entry["duration_s"]), entry)
 
@@ -548,7 +548,7 @@ def choose_split(
 ) -> tuple[str, str]:
     """Return a drive's split and where it is from: option, a set's manifest, or a hash of content and seed.
 
-    The hash does not depend on other drives, on names or on order: copies of a drive never stand on both sides.
+    The hash does not depend on other drives, on names or on order: copies of a drive never are on both sides.
     """
     if chosen is not None:
         return chosen, "option"
@@ -566,7 +566,7 @@ class _Listed:
 
 
 def _listed(log: LogInput, manifest: Mapping[str, Mapping[str, Any]]) -> _Listed:
-    """Return what the manifest of a simulated set beside a log says of it: its split and its vehicle file."""
+    """Return what the manifest of a simulated set beside a log states of it: its split and its vehicle file."""
     entry = manifest.get(log.path.name, {})
     split, vehicle = entry.get("split"), entry.get("vehicle_file", entry.get("vehicle"))
     car = log.folder / vehicle if log.folder is not None and isinstance(vehicle, str) else None
@@ -577,7 +577,7 @@ def _listed(log: LogInput, manifest: Mapping[str, Mapping[str, Any]]) -> _Listed
 
 
 def _strict_truth(plan: DrivePlan) -> DrivePlan:
-    """Bridge no truth gap: a line across a few lost samples is good enough to score on, not to differentiate."""
+    """Bridge no ground truth gap: a line across a few lost samples is good enough to score on, not to differentiate."""
     if plan.truth is None:
         return plan
     gaps = {name: gap * GAP_PERIODS / TRUTH_GAP_PERIODS for name, gap in plan.truth.max_gap_s.items()}
@@ -589,7 +589,7 @@ def _check_plan(plan: DrivePlan, job: _Job) -> None:
     needed = {"vx_m_s", "vy_m_s", "yaw_rate_rad_s"}
     if plan.truth is None or not needed <= plan.derivation.keys():
         raise EstimatorError(
-            expected="truth from which v_x, v_y and yaw rate follow",
+            expected="ground truth from which v_x, v_y and yaw rate follow",
             got=", ".join(sorted(needed & plan.derivation.keys())) or "none",
             where=where,
             remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
@@ -612,7 +612,7 @@ class _Smoothing:
 
 
 def _choose_smoothing(plan: DrivePlan, settings: ExtractSettings) -> _Smoothing:
-    """Decide from the survey whether one-step differences of the truth are usable as they are."""
+    """Decide from the survey whether one-step differences of the ground truth are usable as they are."""
     truth = derive_truth(plan.survey_truth, plan=plan.truth).track
     noise = (
         difference_noise(truth.stamps_ns, truth.vy_m_s),
@@ -621,7 +621,7 @@ def _choose_smoothing(plan: DrivePlan, settings: ExtractSettings) -> _Smoothing:
     asked = settings.smoothing_half_s()
     if asked is not None:
         return _Smoothing(asked, "as asked for", noise)
-    said = f"one-step noise of the truth {noise[0]:.3g} m/s² and {noise[1]:.3g} rad/s²"
+    said = f"one-step noise of the ground truth {noise[0]:.3g} m/s² and {noise[1]:.3g} rad/s²"
     limits = f"{NEGLIGIBLE_NOISE[0]:g} m/s² and {NEGLIGIBLE_NOISE[1]:g} rad/s²"
     if all(n <= limit for n, limit in zip(noise, NEGLIGIBLE_NOISE, strict=True)):  # NaN is not
         return _Smoothing(0.0, f"{said}: within {limits}", noise)

@@ -243,7 +243,7 @@ class PieceFile:
 
     Attributes
     ----------
-    sequences, steps : that it was filled from. sha256 : of all that it holds.
+    sequences, steps : that it was filled from. sha256 : of all that it contains.
 
     Raises
     ------
@@ -491,7 +491,7 @@ def _write_checkpoint(
         for key, value in state.items():
             tensors[f"optimiser.{i}.{key}"] = np.asarray(value.cpu().numpy()).copy()
     document = seal({"identity": identity, "history": [asdict(e) for e in history], "sha256": _sha256(tensors)})
-    # One file holds tensors and document, so that a kill between two writes cannot leave a pair that disagrees.
+    # One file contains tensors and document, so that a kill between two writes cannot leave a pair that disagrees.
     data = save(tensors, metadata={"document": json.dumps(document)})
     write_bytes(work / CHECKPOINT, data)
 
@@ -523,7 +523,7 @@ def _resume(
             raise ValueError("content that is not as it was written")
     except (OSError, ValueError, LookupError, TypeError, SafetensorError) as error:
         raise ModelError(
-            expected="a checkpoint of a training", got=str(error), where=str(file), remedy="remove it to train anew"
+            expected="a checkpoint of a training", got=str(error), where=str(file), remedy="remove it to train again"
         ) from None
     if document["identity"] != identity:
         raise ModelError(

@@ -4,7 +4,7 @@ From one stamp of the IMU to the next the residual is the increment
 
     Δx_net[k] = (x_true(t_k+1) − x_true(t_k)) − (step of the model from x_true(t_k) − x_true(t_k))
 
-with the model at the *true* v_x, v_y and r (at an estimated state the filter's own error would be learnt), and the
+with the model at the *true* v_x, v_y and r (at an estimated state the filter's own error would be identified), and the
 inputs of the same measurement times as the filter takes them. No truth tells the axles' forces and the roll: the model
 runs them along the true motion. Bank, biases and force scale are 0: at the filter's estimate of them, which
 changes while it learns, a residual would fit no other filter. The row of v_x is 0 by definition and not stored.
@@ -15,7 +15,7 @@ A recorded truth is noisy, and differences over one step are mostly that noise. 
 truth: increments are added up to a curve, a cubic is fitted by least squares to the ± half window about each step over
 the true stamps (Savitzky-Golay), and its increment over the step is the target. All of it is linear in the
 increments, so that what the nominal model explains, fast as it may be, is not damped; only the residual is, 1 % at 1 Hz
-and ± 0.2 s. No target where the window holds a gap.
+and ± 0.2 s. No target where the window contains a gap.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ GAP_PERIODS = 1.5
 #: Beyond this the car slides backwards rather than drives, and a single-track residual means nothing.
 MAX_SIDESLIP_RAD = math.radians(45.0)
 #: Half window of the smoothing when the truth is found to be noisy: on simulated RTK drives the targets were nearest to
-#: those of the perfect truth at 0.13 to 0.16 s (lane change, sweep).
+#: those of the perfect ground truth at 0.13 to 0.16 s (lane change, sweep).
 SMOOTHING_HALF_S = 0.15
 #: Truth noise in a one-step difference, of v̇_y in m/s² and ṙ in rad/s², up to which nothing is smoothed: well below
 #: what a training target varies by (0.2 and more).
@@ -76,7 +76,7 @@ class ResidualRows:
     targets : [N, 2], increments of v_y in m/s and of r in rad/s from this stamp to the next; NaN where unknown.
     step_s : [N], time to the next stamp; NaN at the last row.
     weight : [N], 1 where target and features can be used and the next row carries on from this one, else 0.
-    segment : int64 [N], a new number wherever the parallel filter starts anew: sequences must not cross it.
+    segment : int64 [N], a new number wherever the parallel filter starts again: sequences must not cross it.
     truth_velocity : [N, 2], true v_x and v_y at the stamp, for networks that learn them; NaN where unknown.
     """
 
@@ -128,7 +128,7 @@ def residual_increments(
     *,
     max_step_s: float,
 ) -> FloatArray:
-    """Return what truth moves by and the nominal model does not, from each stamp to the next, [N − 1, 2].
+    """Return what ground truth moves by and the nominal model does not, from each stamp to the next, [N − 1, 2].
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def residual_increments(
     return increments
 
 
-#: What the model's run along the truth keeps from step to step: whether it runs, forces, roll and roll rate.
+#: What the model's run along the ground truth keeps from step to step: whether it runs, forces, roll and roll rate.
 _RUN = 5
 
 
@@ -201,7 +201,7 @@ def physics_increments(
     *,
     max_step_s: float,
 ) -> FloatArray:
-    """Return what truth moves by and the model of ``physics`` does not, from each stamp to the next, [N − 1, 2].
+    """Return what ground truth moves by and the model of ``physics`` does not, from each stamp to the next, [N − 1, 2].
 
     Parameters
     ----------
@@ -235,7 +235,7 @@ def smooth_increments(stamps_ns: IntArray, increments: FloatArray, half_window: 
     """Smooth increments [N − 1, c] between stamps [N] by local cubics; the same array for a half window of 0.
 
     The curve of the added-up increments over 2 · half_window + 1 steps is fitted; the result is the fit's increment
-    over the middle step. NaN where the window holds NaN or the end of the data.
+    over the middle step. NaN where the window contains NaN or the end of the data.
     """
     if half_window == 0:
         return increments
@@ -330,7 +330,7 @@ def residual_windows(
         part = slice(first, end)
         known = _complete(steps.features)
         usable = _complete(targets) & known
-        # Where the next row starts anew, in service nothing is carried over to it either.
+        # Where the next row starts again, in service nothing is carried over to it either.
         usable[: n - 1] &= known[1:] & (steps.segment[1:] == steps.segment[:-1])
         return ResidualRows(
             stamps_ns=steps.stamps_ns[part],

@@ -142,7 +142,7 @@ def train_on(
     device: str = "cpu",
     progress: Callable[[str, float], None] = lambda _text, _share: None,
 ) -> TrainResult:
-    """Train one network by a recipe, whose target says what it learns; the rest as :func:`run_training`."""
+    """Train one network by a recipe, whose target states what it learns; the rest as :func:`run_training`."""
     splits = {
         name: SplitSequences(tuple(d for d in data.drives if d.split == name), recipe.target, recipe.odd)
         for name in SPLITS
@@ -241,7 +241,7 @@ def steering_offset(rows: DriveArrays) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class SplitSequences:
-    """The sequences of the drives of a split, read anew each time that they are gone through."""
+    """The sequences of the drives of a split, read again each time that they are gone through."""
 
     drives: tuple[DatasetDrive, ...]
     target: str

@@ -86,8 +86,8 @@ class DriveError:
     Attributes
     ----------
     rmse_rad : over the stamps that ``pdhef run`` scores; NaN where there is no estimate at all.
-    truth_rms_rad : of the truth, which is the error of β = 0.
-    scored, expected : stamps with an error, and stamps with truth above the low-speed limit.
+    truth_rms_rad : of the ground truth, which is the error of β = 0.
+    scored, expected : stamps with an error, and stamps with ground truth above the low-speed limit.
     """
 
     rmse_rad: float
@@ -106,7 +106,7 @@ class DriveError:
 
 
 def drive_error(estimate: StateTrack, truth: StateTrack, low_speed_m_s: float) -> DriveError:
-    """Score the sideslip of an estimate [N] against the truth [N] as ``pdhef run`` does."""
+    """Score the sideslip of an estimate [N] against the ground truth [N] as ``pdhef run`` does."""
     error = signal_error(estimate, truth, "sideslip_rad", low_speed_m_s)
     error = error[np.isfinite(error)]
     scorable = truth.sideslip_rad[scorable_stamps(truth, low_speed_m_s)]

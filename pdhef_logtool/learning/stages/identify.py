@@ -48,7 +48,7 @@ def identify(task: Task) -> StageOutput:
     start = task.car.own
     records, fit, held_out = _read(task, start)
     if not fit:
-        raise no_drive("truth velocities", IDENTIFY)
+        raise no_drive("ground truth velocities", IDENTIFY)
     # On the training part alone: nothing may be taken from what is held out.
     proposals = sensors_of(fit, start)
     for proposal in proposals:
@@ -141,7 +141,7 @@ def describe(parameter: Identified) -> str:
         return f"95 %: {parameter.low:.3g} to {parameter.high:.3g}"
     if not parameter.excited:
         tyre = parameter.name.startswith(("front", "rear"))
-        return f"kept at {'the fit to the axle forces' if tyre else 'its prior'}: the sideslip says no more about it"
+        return f"kept at {'the fit to the axle forces' if tyre else 'its prior'}: the sideslip shows no more about it"
     return f"95 %: {parameter.low:.4g} to {parameter.high:.4g}, prior {parameter.prior:.4g}"
 
 

@@ -148,7 +148,7 @@ def _run_drive(log: LogInput, number: int, task: Task) -> tuple[DriveRecord, _Ra
                 if len(part) >= MIN_SAMPLES:
                     ran.append((track.name, resolve(estimator), part))
     if not ran:
-        return replace(record, left_out="no estimate with an interval where the truth is known"), None
+        return replace(record, left_out="no estimate with an interval where the ground truth is known"), None
     return replace(record, counts={**record.counts, "runs": len(runs)}), ran
 
 

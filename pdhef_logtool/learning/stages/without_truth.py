@@ -50,7 +50,7 @@ def identify_without_truth(task: Task) -> StageOutput:
 
     records, drives = task.read(task.split.parts[TRAINING], read, 0.8)
     if len(drives) < LEAST_LOGS:
-        raise _refused(f"{len(drives)} of them", "logs of one car, for what one log says need not hold on another")
+        raise _refused(f"{len(drives)} of them", "logs of one car, for the result of one log need not apply to another")
     calibration = self_calibrate(
         drives,
         start,
@@ -60,7 +60,7 @@ def identify_without_truth(task: Task) -> StageOutput:
     if calibration.refused:
         raise _refused(calibration.refused, "logs with bends and lane changes that calibrate the car")
     part = fit_part(calibration, [r.learnt_on for r in records if not r.left_out])
-    head = f"Written by pdhef learn --stages identify --without-truth: no truth was looked at.\n{calibration.text}."
+    head = f"Written by pdhef learn --stages identify --without-truth: no ground truth was used.\n{calibration.text}."
     files = {FIT_FILE: part_toml(part, head).encode()}
     change = Change(f"learn --stages {IDENTIFY}", FIT_FILE, files, settings=task.settings.to_dict(), drives=part.drives)
     return StageOutput(change, records, calibration.text, {"self_calibration": calibration.to_dict()})
@@ -79,7 +79,7 @@ def fit_part(calibration: SelfCalibration, drives: Sequence[LearntOn]) -> Fit:
         ),
         without_truth=True,
         drives=tuple(drives),
-        notes=(calibration.text, "no truth was looked at: a drive with ground truth gives better values"),
+        notes=(calibration.text, "no ground truth was used: a drive with ground truth gives better values"),
     )
 
 
@@ -88,5 +88,5 @@ def _refused(got: str, expected: str) -> EstimatorError:
         expected=expected,
         got=got,
         where="learn --without-truth",
-        remedy="give more logs of this car, or one with truth without this option",
+        remedy="give more logs of this car, or one with ground truth without this option",
     )

@@ -25,7 +25,7 @@ HELP = "Enter keeps *, a number takes that candidate, - takes none, or type: TOP
 
 
 def ask_mapping(inspection: Inspection, ask: Callable[[str], str], tell: Callable[[str], None]) -> Mapping:
-    """Ask for each signal and truth quantity; return the mapping of the answers.
+    """Ask for each signal and ground truth quantity; return the mapping of the answers.
 
     Parameters
     ----------

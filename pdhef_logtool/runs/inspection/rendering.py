@@ -23,7 +23,7 @@ CANDIDATES_SHOWN = 2
 
 
 def render_inspection(inspection: Inspection, console: Console) -> None:
-    """Print an inspection: topics, signals and truth, what is missing, and everything to look at."""
+    """Print an inspection: topics, signals and ground truth, what is missing, and everything to look at."""
     messages = sum(t.messages for t in inspection.topics)
     console.print(Text(inspection.path, "bold"), soft_wrap=True)
     console.print(
@@ -50,7 +50,7 @@ def render_inspection(inspection: Inspection, console: Console) -> None:
 
 
 def empty_table(title: str, *headings: str | Text, words: int) -> Table:
-    """Return an empty table whose first ``words`` columns hold text and the others numbers."""
+    """Return an empty table whose first ``words`` columns contain text and the others numbers."""
     table = Table(
         title=Text(title),
         title_justify="left",

@@ -61,7 +61,7 @@ MOST_SAMPLED = 0.75
 TOPIC_DROPS = frozenset({"bad-stamp", "duplicate-stamp"})
 #: Topics with more number fields than this are listed in part.
 MAX_LISTED_FIELDS = 40
-#: Arrays that no signal comes from stand in one line.
+#: Arrays that no signal comes from are in one line.
 COVARIANCE = re.compile(r"cov(ariance)?(\[\d*\])?$", re.IGNORECASE)
 INDEX = re.compile(r"\[\d+\]$")
 #: A device clock whose envelope leaves the fitted line by more has stepped or bent.
@@ -70,10 +70,10 @@ CLOCK_RESIDUAL_S = 0.02
 
 @dataclass(frozen=True, slots=True)
 class TopicReport:
-    """One topic. Times in s; ``largest_gap_at_s`` is since the log's start; NaN where nothing can be said.
+    """One topic. Times in s; ``largest_gap_at_s`` is since the log's start; NaN where nothing can be stated.
 
     ``rate_hz`` is by the median step; of a topic of which no time was looked at, by its messages and the log's length.
-    ``delay_*`` are of log time − publish time, which equals zero where a recorder knows one time only.
+    ``delay_*`` are of log time − publish time, which equals zero where a recorder has one time only.
     """
 
     name: str
@@ -134,8 +134,8 @@ class SignalReport:
 class Sample:
     """What was looked at of a log that was not read whole.
 
-    ``times`` says what rates, jitter and gaps of topics come from: the ``index``, or the chunks that were read
-    (``sample``), as do delays, signals and truth in any case. Counts are the index's.
+    ``times`` states what rates, jitter and gaps of topics come from: the ``index``, or the chunks that were read
+    (``sample``), as do delays, signals and ground truth in any case. Counts are the index's.
     """
 
     chunks: int
@@ -143,7 +143,7 @@ class Sample:
     times: Literal["index", "sample"]
 
     def __str__(self) -> str:
-        """Say it in a line."""
+        """State it in a line."""
         what, index = ("values", "counts and rates") if self.times == "index" else ("values and rates", "counts")
         return (
             f"{what} from {self.chunks} of {self.of_chunks} chunks, {index} from the index; "
@@ -160,7 +160,7 @@ class Inspection:
     kind : of log. start_ns, end_ns : log time, [start, end).
     signals, truth : reports by name. missing : signals an estimator looks for and no topic provides.
     ambiguities, notes : of the mapping. candidates : fields that were weighed for it.
-    checks : what physics says of signals and truth. proposals : corrections of the mapping that are certain.
+    checks : what physics states of signals and ground truth. proposals : corrections of the mapping that are certain.
     lost : every loss and note of reading. sample : what was looked at; None: everything.
     checksummed_share : which share of the bytes that were read a verified checksum covers; None where none was read.
     """
@@ -240,13 +240,13 @@ def inspect_log(
 
     Of a large MCAP whose index agrees with itself values are looked at in a part of the chunks (``sample``), unless
     ``whole``; if anything is wrong in them, or little is left, all of it is read. Memory is bounded by windows of ten
-    minutes, whatever the log's length. ``prefer_truth`` is the choice of :func:`pdhef_logtool.mapping.recognise`;
+    minutes, regardless of the log's length. ``prefer_truth`` is the choice of :func:`pdhef_logtool.mapping.recognise`;
     ``budget`` is what reading may cost, ``msgs`` a folder with definitions of types that the log does not define.
 
     Raises
     ------
     LogError : The file is no log.
-    MappingError : The mapping names what the log does not hold.
+    MappingError : The mapping names what the log does not contain.
     """
     mapping = mapping_of(mapping)
     if not whole:
@@ -308,7 +308,7 @@ def inspect_drive_log(
         notes=(*mapping.notes, *_clock_notes(mapping, clocks)),
         checks=looked_at.checks,
         proposals=mapping_proposals(looked_at),
-        # Last, since a log knows all its losses only after it was read through.
+        # Last, since a log has all its losses only after it was read through.
         lost=merge_losses([log.lost, reading]),
         candidates=candidates,
         sample=None if look.sample is None else look.sample(),
@@ -352,8 +352,8 @@ class _Look:
     Attributes
     ----------
     windows : [start, end) that are read. stamps : topics whose times are read there.
-    by_index : the index that tells the times of all topics; None: what is read tells them.
-    sample : says what was looked at in the end; None: all of the log is.
+    by_index : the index that shows the times of all topics; None: what is read shows them.
+    sample : states what was looked at in the end; None: all of the log is.
     """
 
     windows: Iterable[tuple[int, int]]
@@ -399,7 +399,7 @@ def _gather(channels: MappedChannels, gathered: dict[tuple[str, str], _Gathered]
 
 
 def collapsed(fields: Sequence[FieldInfo]) -> list[tuple[str, str, list[str]]]:
-    """Return name, type and paths of what stands in a line each: covariances are one, with all their elements."""
+    """Return name, type and paths of what is in a line each: covariances are one, with all their elements."""
     lines: dict[str, tuple[str, list[str]]] = {}
     for info in fields:
         if info.kind not in ("number", "bool"):
