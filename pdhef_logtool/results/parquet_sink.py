@@ -15,10 +15,10 @@ import pyarrow.parquet as pq
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.records.tracks import OPTIONAL_COLUMNS, TRACK_COLUMNS, StateTrack, diagonal_covariance, make_track
 from pdhef_logtool.results.arrow_schema import arrow_schema
-from pdhef_logtool.results.sink import Event, Sink, rounded
+from pdhef_logtool.results.sink import TRUTH, Event, Sink, rounded
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
 #: Rows that are gathered of one estimator before a row group is written: 10 h at 100 Hz make 110 row groups an
@@ -142,14 +142,23 @@ class EstimatesSink(Sink):
     path : where the finished file is.
     rows_a_group : rows of one row group.
     selected : estimator whose track is written a second time, as :data:`SELECTED`.
+    causal_from_ns : first stamp from which the rows of an estimator depend on nothing later; an estimator without one
+        is causal nowhere. None: unknown, and ``causal`` is null.
 
     Raises
     ------
     OutputError : When the file cannot be written.
     """
 
-    def __init__(self, path: Path, rows_a_group: int = ROWS_A_GROUP, *, selected: str = "") -> None:
-        self._selected = selected
+    def __init__(
+        self,
+        path: Path,
+        rows_a_group: int = ROWS_A_GROUP,
+        *,
+        selected: str = "",
+        causal_from_ns: Mapping[str, int] | None = None,
+    ) -> None:
+        self._selected, self._causal_from_ns = selected, causal_from_ns
         schema = arrow_schema("estimates.parquet.json")
         split = {f.name: "BYTE_STREAM_SPLIT" for f in schema if pa.types.is_floating(f.type)}
         encodings = {**split, "stamp_ns": "DELTA_BINARY_PACKED"}
@@ -157,9 +166,16 @@ class EstimatesSink(Sink):
 
     def append(self, track: StateTrack) -> None:
         """Take one track of this window; [N] rows."""
-        self._file.append(track.name, track_table(track, as_written=True))
+        causal = self._causal(track)
+        self._file.append(track.name, track_table(track, as_written=True, causal=causal))
         if track.name == self._selected:
-            self._file.append(SELECTED, track_table(replace(track, name=SELECTED), as_written=True))
+            self._file.append(SELECTED, track_table(replace(track, name=SELECTED), as_written=True, causal=causal))
+
+    def _causal(self, track: StateTrack) -> BoolArray | None:
+        if self._causal_from_ns is None or track.name == TRUTH:
+            return None
+        first = self._causal_from_ns.get(track.name)
+        return np.zeros(len(track), np.bool_) if first is None else track.stamps_ns >= first
 
     def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:  # noqa: ARG002
         """Write what waits and give the file its name; the report is not part of this file."""
@@ -170,12 +186,17 @@ class EstimatesSink(Sink):
         self._file.abort()
 
 
-def track_table(track: StateTrack, *, as_written: bool = False) -> pa.Table:
-    """Return a track [N] as rows of estimates.parquet, rounded as they are in the file if ``as_written``."""
+def track_table(track: StateTrack, *, as_written: bool = False, causal: BoolArray | None = None) -> pa.Table:
+    """Return a track [N] as rows of estimates.parquet, rounded as they are in the file if ``as_written``.
+
+    ``causal`` [N]: whether a row depends on nothing later; None: unknown.
+    """
     schema = arrow_schema("estimates.parquet.json")
     columns: dict[str, Any] = dict(track.columns())
     if as_written:
         columns = {n: rounded(n, values) if values.dtype == np.float64 else values for n, values in columns.items()}
+    if causal is not None:
+        columns["causal"] = causal
     columns["estimator"] = pa.DictionaryArray.from_arrays(np.zeros(len(track), dtype=np.int32), [track.name])
     arrays = [
         pa.array(columns[f.name], type=f.type, from_pandas=True) if f.name in columns else pa.nulls(len(track), f.type)

@@ -66,7 +66,7 @@ from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, Shown, Si
 from pdhef_logtool.runs.config import Keep, RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 from pdhef_logtool.runs.scoring import Evaluation, evaluate, in_time
-from pdhef_logtool.runs.selection import choose_main, contradiction, default_names
+from pdhef_logtool.runs.selection import candidates, choose_main, contradiction, default_names
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore
 from pdhef_logtool.storage.documents import file_sha256
@@ -266,9 +266,9 @@ def run_log(
     with read_cached(log_input, car, mapping, config.read_options, reporter.warn) as drive:
         calibration = checked(drive, pool if pool is not None else calibrate_drive(drive, config))
         car = self_calibrated(drive, calibration)
-        ready, skipped = _choose_estimators(drive, config, car)
+        ready, skipped, requested = _choose_estimators(drive, config, car)
         prepare([e.name for e in ready])
-        job = _Job(drive, car, calibration, ready, skipped, tuple(thresholds or ()))
+        job = _Job(drive, car, calibration, ready, skipped, requested, tuple(thresholds or ()))
         result = _run_estimators(job, outputs, config, reporter)
     reporter.progress(result.outcome.log, 1.0)
     return result
@@ -276,13 +276,17 @@ def run_log(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Job:
-    """A drive with the car, as its log calibrated it where it did, and the estimators that run on it."""
+    """A drive with the car, as its log calibrated it where it did, and the estimators that run on it.
+
+    Those that are not ``requested`` are candidates for the selected estimate: only the selected one is in the outputs.
+    """
 
     drive: Drive
     car: Car
     calibration: SelfCalibration | None
     ready: Sequence[Estimator]
     skipped: Sequence[Skipped]
+    requested: frozenset[str]
     thresholds: Sequence[Threshold]
 
 
@@ -297,9 +301,11 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
         job = replace(job, ready=_without_failed(drive, job.ready, causality.failed))
         scored = _score(job, store, signals)
         main = choose_main(job.ready, scored.rows, proven=drive.car.has_evidence, named=config.estimators is not None)
+        left_out = frozenset(e.name for e in job.ready) - job.requested - {main.name}
+        job, scored, main = _without(left_out, job, scored, main)
         shown = _shown(main, [e.name for e in job.ready])
-        sinks = opened.enter_context(_open_sinks(change, drive, config, car, shown, outputs.path))
-        _write(store, sinks, frozenset(causality.failed))
+        sinks = opened.enter_context(_open_sinks(change, job, config, shown, outputs.path))
+        _write(store, sinks, left_out | frozenset(causality.failed))
         if intervals.warning:
             drive.tell(intervals.warning)
         if not scored.moves:
@@ -333,6 +339,17 @@ def _score(job: _Job, store: TrackStore, signals: Signals) -> Evaluation:
     if against := contradiction(scored.rows):
         drive.notes.append(f"WARNING: {against.text}")  # the selected estimate's text gives the consequence
     return scored
+
+
+def _without(
+    left_out: frozenset[str], job: _Job, scored: Evaluation, main: MainFacts
+) -> tuple[_Job, Evaluation, MainFacts]:
+    """Return estimators and figures without candidates that were neither requested nor selected."""
+    ready = [e for e in job.ready if e.name not in left_out]
+    rows = [r for r in scored.rows if left_out.isdisjoint(r.estimator.split("~"))]
+    silent = tuple(name for name in scored.silent if name not in left_out)
+    shown = [name for name in main.shown if name not in left_out]
+    return replace(job, ready=ready), replace(scored, rows=rows, silent=silent), replace(main, shown=shown)
 
 
 def _losses(drive: Drive, scored: Evaluation, failed: dict[str, str]) -> Iterator[list[Loss]]:
@@ -423,18 +440,27 @@ def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
     )
 
 
-def _choose_estimators(drive: Drive, config: RunConfig, car: Car) -> tuple[list[Estimator], list[Skipped]]:
-    """Return the estimators that can run and those that cannot; raises EstimatorError if none can."""
+def _choose_estimators(
+    drive: Drive, config: RunConfig, car: Car
+) -> tuple[list[Estimator], list[Skipped], frozenset[str]]:
+    """Return the estimators that run, those that cannot, and the names of the requested ones that run.
+
+    Candidates for the selected estimate run in any case. Raises EstimatorError if no requested estimator can.
+    """
     names = config.estimators or default_names(car, drive.available)
-    estimators, skipped = runnable(names, car, drive.available, Options(drive.options.use_speed))
-    if not estimators:
+    options = Options(drive.options.use_speed)
+    estimators, skipped = runnable(names, car, drive.available, options)
+    requested = frozenset(e.name for e in estimators)
+    more = [name for name in candidates(car, drive.available) if name not in requested]
+    estimators += runnable(more, car, drive.available, options)[0] if more else []
+    if not requested:
         raise EstimatorError(
             expected="at least one estimator that can run",
             got="; ".join(f"{s.name}: {s.reason}" for s in skipped),
             where=str(drive.path),
             remedy="map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)",
         )
-    return estimators, skipped
+    return estimators, skipped, requested
 
 
 def _shown(main: MainFacts, ran: Sequence[str]) -> Shown:
@@ -443,9 +469,17 @@ def _shown(main: MainFacts, ran: Sequence[str]) -> Shown:
     return Shown(main.name, next((name for name in order if name in ran and name != main.name), None))
 
 
+def _causal_from_ns(drive: Drive, estimators: Sequence[Estimator]) -> dict[str, int]:
+    """Return the first stamp from which the rows of each causal estimator depend on nothing later."""
+    frozen_s = drive.causal_from_s
+    after_s = drive.plan.decided_s if frozen_s is None else frozen_s
+    first = drive.plan.start_ns + round(after_s * 1e9)
+    return {e.name: first for e in estimators if e.causal and not drive.not_causal}
+
+
 @contextmanager
 def _open_sinks(
-    change: FolderTransaction, drive: Drive, config: RunConfig, car: Car, shown: Shown, output: Path
+    change: FolderTransaction, job: _Job, config: RunConfig, shown: Shown, output: Path
 ) -> Iterator[list[Sink]]:
     """Yield the outputs of a run that are fed window by window; on an exception they are aborted."""
     from pdhef_logtool.results.layouts import LayoutsSink
@@ -453,10 +487,12 @@ def _open_sinks(
     from pdhef_logtool.results.parquet_sink import EstimatesSink
 
     sinks: list[Sink] = []
+    drive, car = job.drive, job.car
     colours = {s.name: s.colour for s in all_specs()}
     try:
         if config.kept != "metrics":
-            sinks.append(EstimatesSink(change.file(ESTIMATES_FILE), selected=shown.main))
+            causal_from_ns = _causal_from_ns(drive, job.ready)
+            sinks.append(EstimatesSink(change.file(ESTIMATES_FILE), selected=shown.main, causal_from_ns=causal_from_ns))
         if config.annotation != "none":
             source = drive.log if config.annotation == "full" else None
             if source is not None and source.messages is None:

@@ -78,6 +78,11 @@ def default_names(car: Car, available: frozenset[str]) -> tuple[str, ...]:
     return tuple(name for name in all_names(car) if name in {PREFERRED, PHYSICS, NAIVE, *able})
 
 
+def candidates(car: Car, available: frozenset[str]) -> tuple[str, ...]:
+    """Return the estimators that the selected estimate is chosen from, whichever of them a user asks for."""
+    return tuple(name for name in default_names(car, available) if name != NAIVE)
+
+
 def choose_main(ran: Sequence[Estimator], rows: Iterable[MetricRow], *, proven: bool, named: bool) -> MainFacts:
     """Return the main estimator of a log and why it is; of the figures only d2 counts, which needs no truth.
 

@@ -367,7 +367,7 @@ def test_log_without_truth_shows_what_there_is_instead(sample_logs_dir: Path, tm
     assert result.returncode == 0
     assert "the log contains no ground truth" in " ".join(result.stdout.split())
     assert "Consistency" in result.stdout
-    assert "from phy-ukf °" in result.stdout
+    assert "from pd-hef °" in result.stdout
     assert "RMSE" not in result.stdout
 
 

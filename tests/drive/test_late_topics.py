@@ -83,7 +83,7 @@ def test_a_run_of_it_scores_and_calls_nothing_causal(
     code, report, err = run(capsys, tmp_path / "out", late, "--estimators", "zero,phy-ukf")
     assert code == 0
     assert STEERING in err
-    assert [e["causal"] for e in report["estimators"]] == [False, False]
+    assert [e["causal"] for e in report["estimators"]] == [False] * 3
     assert all("steer_rad read by stamp" in " ".join(e["notes"]) for e in report["estimators"])
     rows = pl.read_parquet(tmp_path / "out/logs/late/estimates.parquet").filter(estimator="phy-ukf")
     assert rows["valid"].mean() > 0.95  # type: ignore[operator]
@@ -99,7 +99,7 @@ def test_by_stamp_there_is_no_latency_and_nothing_is_causal(
 ) -> None:
     log = sample_logs_dir / "dlc.mcap"
     code, report, err = run(capsys, tmp_path / "stamp", log, "--estimators", "zero:no-lateral", "--clock", "stamp")
-    assert (code, [e["causal"] for e in report["estimators"]]) == (0, [False])
+    assert (code, [e["causal"] for e in report["estimators"]]) == (0, [False, False])
     assert "arrives" not in err, "the user asked for it: no warning"
     assert "not causal: all signals read by stamp, not by arrival" in report["estimators"][0]["notes"]
     _, plain, _ = run(capsys, tmp_path / "arrival", log, "--estimators", "zero:no-lateral")

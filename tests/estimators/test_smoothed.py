@@ -569,7 +569,9 @@ def test_a_run_is_the_same_whatever_its_windows_and_marks_it(sample_logs_dir: Pa
     assert span > 2.0 * smoothed.BLOCK_S * NS, "the drive must be longer than what is seen ahead"
 
     report = json.loads((out / "logs/road/report.json").read_text())
-    assert {e["name"]: e["causal"] for e in report["estimators"]} == {"pd-hef-smoothed": False, "zero": True}
+    assert {e["name"]: e["causal"] for e in report["estimators"]} == {
+        "pd-hef-smoothed": False, "zero": True, "pd-hef": True,
+    }  # fmt: skip
     lines = report_markdown(report).splitlines()
     rows = [line.split(" | ")[0] for line in lines if line.startswith(("| zero", "| pd-hef-smoothed"))]
     assert {"| zero", "| pd-hef-smoothed (not causal)"} == set(rows)

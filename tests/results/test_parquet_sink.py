@@ -45,6 +45,7 @@ ESTIMATE_COLUMNS = {
     "steer_bias_rad": pl.Float64,
     "ay_bias_m_s2": pl.Float64,
     "yaw_rate_bias_rad_s": pl.Float64,
+    "causal": pl.Boolean,
 }
 #: Those that none of these tracks has.
 OPTIONAL = {"mixture_weight", "reason", *ESTIMATED_COLUMNS}
@@ -77,6 +78,7 @@ UNITS = {
     "steer_bias_rad": "rad",
     "ay_bias_m_s2": "m/s^2",
     "yaw_rate_bias_rad_s": "rad/s",
+    "causal": "",
 }
 METRIC_COLUMNS = {
     "log": pl.String,

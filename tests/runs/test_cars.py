@@ -134,7 +134,7 @@ def test_a_run_says_which_car_each_log_had_and_one_without_stops_no_other(fleet:
     assert {name: car and car["file"] for name, car in cars.items()} == {
         "golf__day__golf_1": "golf.toml", "mini__day__mini_1": "mini.toml", "lost": None,
     }  # fmt: skip
-    assert said == ["lost.mcap failed, the others go on"]
+    assert "lost.mcap failed, the others go on" in said
     assert any("a car for every log" in log["outcome"] for log in run["logs"] if log["log"] == "lost")
     report = json.loads((fleet / "out/logs/mini__day__mini_1/report.json").read_text())
     assert report["vehicle"]["file"] == "mini.toml"

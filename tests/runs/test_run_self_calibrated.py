@@ -147,10 +147,10 @@ def test_an_estimate_that_contradicts_the_sensors_is_not_selected_and_keeps_its_
     )
     jsonschema.validate(report, load_schema("report.schema.json"))
     assert any(w.startswith("WARNING: pd-hef contradicts the sensors") for w in report["warnings"])
-    assert report["selected_estimate"] == report["answer"]["main"] == "phy-ukf"
+    assert report["selected_estimate"] == report["answer"]["main"] == "physics"
     file = tmp_path / "logs" / "sweep" / "estimates.parquet"
-    assert list_estimators(file) == ("truth", "zero", "phy-ukf", "pd-hef")
-    selected, named, other = (read_track(file, name) for name in ("selected", "phy-ukf", "pd-hef"))
+    assert list_estimators(file) == ("truth", "zero", "phy-ukf", "pd-hef", "physics")
+    selected, named, other = (read_track(file, name) for name in ("selected", "physics", "pd-hef"))
     np.testing.assert_array_equal(selected.sideslip_rad, named.sideslip_rad)
     assert (selected.sideslip_rad != other.sideslip_rad).any()
 

@@ -88,8 +88,8 @@ def test_state_topic_gives_the_figures_of_the_run_that_wrote_it(
 
 
 def test_odometry_gives_the_same_but_for_the_rows_that_it_lacks(annotated: Path, config: RunConfig) -> None:
-    state = _figures(_scored(annotated, config, "/pdhef/phy_ukf/state", name="x")["metrics"], "x")
-    odometry = _figures(_scored(annotated, config, "/pdhef/phy_ukf/odometry", name="x")["metrics"], "x")
+    state = _figures(_scored(annotated, config, "/pdhef/pd_hef/state", name="x")["metrics"], "x")
+    odometry = _figures(_scored(annotated, config, "/pdhef/pd_hef/odometry", name="x")["metrics"], "x")
     assert ("ay_m_s2", "all", "rmse") not in odometry  # the message has no acceleration
     assert ("state", "all", "diverged") not in odometry  # nor does it say whether its author diverged
     compared = 0

@@ -1,0 +1,35 @@
+"""Rows of estimates.parquet that depend on nothing later in the log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+import pytest
+
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.fleet import run_logs
+
+
+def rows(sample_logs_dir: Path, out: Path, **options: Any) -> pl.DataFrame:
+    config = RunConfig(car="saloon", annotate="none", estimators=("zero", "pd-hef-smoothed"), **options)
+    run_logs([str(sample_logs_dir / "dlc.mcap")], out, config)
+    table = pl.read_parquet(out / "logs/dlc/estimates.parquet").with_columns(pl.col("estimator").cast(pl.String))
+    return table.with_columns(after_s=(pl.col("stamp_ns") - pl.col("stamp_ns").min()) * 1e-9)
+
+
+@pytest.mark.slow
+def test_rows_are_causal_from_the_end_of_the_set_up_on(sample_logs_dir: Path, tmp_path: Path) -> None:
+    table = rows(sample_logs_dir, tmp_path, setup_from_s=4.0)
+    of_zero = table.filter(estimator="zero")
+    assert (of_zero["causal"] == (of_zero["after_s"] > 4.0 - 0.02)).mean() > 0.99
+    assert of_zero["causal"].any() and not of_zero["causal"].all()
+    assert not table.filter(estimator="pd-hef-smoothed")["causal"].any()
+    assert table.filter(estimator="truth")["causal"].is_null().all()
+    assert table.filter(estimator="selected")["causal"].equals(table.filter(estimator="pd-hef")["causal"])
+
+
+@pytest.mark.slow
+def test_a_set_up_on_the_whole_log_is_causal_nowhere_in_it(sample_logs_dir: Path, tmp_path: Path) -> None:
+    assert not rows(sample_logs_dir, tmp_path).filter(estimator="zero")["causal"].any()
