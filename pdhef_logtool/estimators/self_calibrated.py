@@ -5,11 +5,12 @@ What a whole log states of its car is known only at its end: none of them is cau
 Their variance of sideslip is their own, what the parameters leave open, and what the sensors contradict
 (docs/method.md#intervals):
 
-    s² = s_own² + (Σ_i (2 (v_y,i − v_y))² + (lateral kinematic consistency / 2)²) / v_x²,
+    s² = s_own² + s_car² + (Σ_i (2 (v_y,i − v_y))² + (lateral kinematic consistency / 2)²) / v_x²,
 
 where v_y,i is that of the physics filter on the vehicle one posterior 1-sigma away in direction i, and d2 is that of
 the whole log as far as it goes with the driving. The posterior is doubled, for the directions are only the five that
-move the sideslip most. That of v_y is the same sum as a velocity.
+move the sideslip most. s_car is what no parameter of a single track explains: nearly constant within a drive, it
+differs between drives and cars. That of v_y is the same sum as a velocity.
 Estimates themselves do not change.
 """
 
@@ -40,6 +41,8 @@ SELF_CALIBRATED = frozenset({"physics", "pd-hef", "pd-hef-smoothed"})
 OPEN_LOOP = "open-loop:calibrated"
 #: Factors of the posterior and of lateral kinematic consistency above.
 POSTERIOR_SHARE, D2_SHARE = 2.0, 0.5
+#: s_car above. Most likely on the real drives of the other cars: 0.05 to 0.10 degrees with one car left out.
+CAR_STD_RAD = math.radians(0.1)
 
 
 @dataclass(slots=True)
@@ -61,7 +64,8 @@ class CalibratedBand:
             self._window, self._vy = signals, [t.vy_m_s for t, _ in runs]
             self._states = tuple(state for _, state in runs)
         d2 = found.driven_d2_m_s
-        contradicted = np.full(len(track), D2_SHARE * d2 if math.isfinite(d2) else 0.0)
+        of_car = CAR_STD_RAD * np.abs(track.vx_m_s)
+        contradicted = np.hypot(of_car, D2_SHARE * d2) if math.isfinite(d2) else of_car
         away = [self._vy[0] + POSTERIOR_SHARE * (vy - self._vy[0]) for vy in self._vy] if self._vy else []
         return widened(track, away, contradicted, found.vehicle.low_speed_blend_m_s, own_share=1.0)
 

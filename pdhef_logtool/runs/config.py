@@ -48,6 +48,7 @@ Names = Annotated[
 #: A file or folder, as a path or a text.
 File = Annotated[Path, BeforeValidator(lambda v: Path(v) if isinstance(v, str) else v)]
 Keep = Literal["metrics", "estimates", "full"]
+Calibrate = Literal["off", "online", "log", "pool"]
 Friction = Annotated[float, Field(ge=POSSIBLE_FRICTION[0], le=POSSIBLE_FRICTION[1])]
 
 
@@ -112,7 +113,7 @@ class RunConfig:
     thresholds: File | None = None
     network: File | None = None
     intervals: File | None = None
-    calibrate: Literal["off", "online", "log", "pool"] = "log"
+    calibrate: Calibrate = "log"
     waived: Names = ()
     setup: File | None = None
     setup_from_s: Annotated[float, Field(ge=1)] | None = None

@@ -349,7 +349,11 @@ def _without(
     rows = [r for r in scored.rows if left_out.isdisjoint(r.estimator.split("~"))]
     silent = tuple(name for name in scored.silent if name not in left_out)
     shown = [name for name in main.shown if name not in left_out]
-    return replace(job, ready=ready), replace(scored, rows=rows, silent=silent), replace(main, shown=shown)
+    return (
+        replace(job, ready=ready),
+        replace(scored, rows=rows, silent=silent),
+        replace(main, shown=shown, naive=None if main.naive in left_out else main.naive),
+    )
 
 
 def _losses(drive: Drive, scored: Evaluation, failed: dict[str, str]) -> Iterator[list[Loss]]:

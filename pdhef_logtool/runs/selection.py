@@ -61,6 +61,12 @@ def contradiction(rows: Iterable[MetricRow], name: str = PREFERRED) -> Contradic
     return Contradiction(best, d2[name], simple[best], name) if d2[name] > FACTOR * simple[best] else None
 
 
+def _fails(rows: Iterable[MetricRow], name: str) -> bool:
+    """Return whether sideslip 0 agrees better with the sensors, at their estimated positions, than an estimate."""
+    d2 = {r.estimator: r.value for r in rows if (r.metric, r.segment) == ("d2", "all")}
+    return name in d2 and NAIVE in d2 and name != NAIVE and d2[name] > FACTOR * d2[NAIVE]
+
+
 def default_names(car: Car, available: frozenset[str]) -> tuple[str, ...]:
     """Return the estimators that run where none are named.
 
@@ -80,7 +86,7 @@ def default_names(car: Car, available: frozenset[str]) -> tuple[str, ...]:
 
 def candidates(car: Car, available: frozenset[str]) -> tuple[str, ...]:
     """Return the estimators that the selected estimate is chosen from, whichever of them a user asks for."""
-    return tuple(name for name in default_names(car, available) if name != NAIVE)
+    return default_names(car, available)
 
 
 def choose_main(ran: Sequence[Estimator], rows: Iterable[MetricRow], *, proven: bool, named: bool) -> MainFacts:
@@ -94,6 +100,7 @@ def choose_main(ran: Sequence[Estimator], rows: Iterable[MetricRow], *, proven: 
     names = [e.name for e in ran]
     others = [n for n in names if n not in (*_BEST_FIRST, *_LAST)]
     name = next(n for n in (*_BEST_FIRST, *others, *_LAST) if n in names)
+    rows = list(rows)
     against = None if proven else contradiction(rows, name)
     chosen_by: Literal["evidence", "d2", "order"]
     if against is not None:
@@ -105,11 +112,14 @@ def choose_main(ran: Sequence[Estimator], rows: Iterable[MetricRow], *, proven: 
         chosen_by, why = "d2", "no simple estimator agrees better with the sensors"
     else:
         chosen_by, why = "order", "the best that the log's signals allow"
+    fails = not proven and _fails(rows, name)
+    if fails:
+        why = f"no estimate agrees with the sensors as well as sideslip 0 does; {name} is the least bad one"
     return MainFacts(
         name=name,
         chosen_by=chosen_by,
         why=why,
-        distrusted=against is not None,
+        distrusted=against is not None or fails,
         naive=NAIVE if NAIVE in names else None,
         shown=names if named else [n for n in dict.fromkeys((name, PHYSICS, NAIVE)) if n in names],
         named=named,

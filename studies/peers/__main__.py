@@ -25,7 +25,7 @@ from pdhef_logtool.mapping import Mapping, mapping_to_toml
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE
-from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.config import Calibrate, RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from studies.pages import DOCS, DRIVES, RESULTS, options, write
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_of, read_peer_drive, vehicle_of
@@ -57,14 +57,16 @@ def drive_errors(drive: PeerDrive) -> DriveErrors:
     read = read_peer_drive(log, vehicle, mapping)
     with_sedan = read_peer_drive(log, default_vehicle(), mapping)
     estimates = peer_estimates(read.signals, with_sedan.signals, vehicle)
-    runs: dict[tuple[str, str], dict[str, FloatArray]] = {}
+    runs: dict[tuple[Calibrate, str], dict[str, tuple[FloatArray, FloatArray]]] = {}
+    stds: dict[str, FloatArray] = {}
+    missing = np.full(len(read.signals), np.nan)
     for name, (calibrate, car, preset) in OURS.items():
         if (calibrate, car) not in runs:
             given = vehicle if car == "file" else None
             runs[calibrate, car] = tool_estimates(log, mapping, given, calibrate, read.signals.stamps_ns)
-        estimates[name] = runs[calibrate, car].get(preset, np.full(len(read.signals), np.nan))
+        estimates[name], stds[name] = runs[calibrate, car].get(preset, (missing, missing))
     assert read.truth is not None
-    errors = score(drive, estimates, read.truth)
+    errors = score(drive, estimates, read.truth, stds)
     print(drive.log, {name: round(value, 3) for name, value in errors.rmse_deg.items()}, file=sys.stderr)
     return errors
 
@@ -77,9 +79,12 @@ def peer_estimates(signals: Signals, with_sedan: Signals, vehicle: VehicleParame
 
 
 def tool_estimates(
-    log: Path, mapping: Mapping, vehicle: VehicleParameters | None, calibrate: str, stamps_ns: IntArray
-) -> dict[str, FloatArray]:
-    """Return the sideslip of a default ``pdhef run`` by estimator, at the stamps [N]; nothing if the run refuses."""
+    log: Path, mapping: Mapping, vehicle: VehicleParameters | None, calibrate: Calibrate, stamps_ns: IntArray
+) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return sideslip and its standard deviation of a default ``pdhef run`` by estimator, at the stamps [N].
+
+    Nothing if the run refuses.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "mapping.toml").write_text(mapping_to_toml(mapping), encoding="utf-8")
@@ -92,7 +97,7 @@ def tool_estimates(
             mapping=folder / "mapping.toml",
             annotate="none",
             keep="estimates",
-            calibrate="off" if calibrate == "off" else "log",
+            calibrate=calibrate,
         )
         try:
             result = run_logs([str(log)], folder / "out", config, report=False).results[0]
@@ -105,10 +110,11 @@ def tool_estimates(
         table = pl.read_parquet(result.output / ESTIMATES_FILE)
     tracks = {}
     for (estimator,), rows in table.group_by("estimator"):
-        sideslip = np.full(len(stamps_ns), np.nan)
         usable = rows.filter(pl.col("valid"))
-        sideslip[np.searchsorted(stamps_ns, usable["stamp_ns"].to_numpy())] = usable["sideslip_rad"].to_numpy()
-        tracks[str(estimator)] = sideslip
+        at_stamps = np.full((2, len(stamps_ns)), np.nan)
+        index = np.searchsorted(stamps_ns, usable["stamp_ns"].to_numpy())
+        at_stamps[:, index] = usable["sideslip_rad"].to_numpy(), usable["sideslip_std_rad"].to_numpy()
+        tracks[str(estimator)] = at_stamps[0], at_stamps[1]
     return tracks
 
 

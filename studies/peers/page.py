@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from pdhef_logtool.runs.config import Calibrate
 from studies.pages import number, table
 from studies.peers.drives import FULL_SIZE, OFFSET, SMALL
 from studies.peers.scoring import (
@@ -18,10 +19,11 @@ from studies.peers.scoring import (
 )
 
 #: The presets of the tool: calibration, car and track.
-OURS = {
+OURS: dict[str, tuple[Calibrate, str, str]] = {
     "phy-ukf": ("log", "file", "phy-ukf"),
     "physics": ("log", "file", "physics"),
     "pd-hef": ("log", "file", "pd-hef"),
+    "pd-hef, online": ("online", "file", "pd-hef"),
     "pd-hef, causal": ("off", "file", "pd-hef"),
     "pd-hef, no file": ("log", "none", "pd-hef"),
 }
@@ -41,6 +43,7 @@ def page(errors: Sequence[DriveErrors]) -> str:
         means=means_table(full_size),
         full_size=drives_table(full_size),
         best=BEST_PEERS,
+        intervals=intervals_table(full_size),
         small_means=means_table(groups[SMALL]),
         small=drives_table(groups[SMALL]),
         offsets=offsets,
@@ -79,6 +82,16 @@ def means_table(errors: Sequence[DriveErrors]) -> str:
         body.append([f"`{name}`", *cells, str(lowest.count(name))])
     head = ["estimator", *car_means(errors, names[0]), "geometric mean", "spread", "lowest"]
     return table(head, body, right_from=1)
+
+
+def intervals_table(errors: Sequence[DriveErrors]) -> str:
+    """Return coverage and half-width of the 95 % intervals, a line a drive."""
+    names = [name for name in OURS if name in errors[0].coverage]
+    body = [
+        [f"`{_name(e)}`", *(f"{e.coverage[name]:.0%}, {number(e.half_width_deg[name], 2)}" for name in names)]
+        for e in errors
+    ]
+    return table(["drive", *(f"`{name}`" for name in names)], body, right_from=1)
 
 
 def drives_table(errors: Sequence[DriveErrors]) -> str:

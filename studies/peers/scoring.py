@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.evaluation.metrics import NORMAL_95
 from pdhef_logtool.evaluation.track_errors import scorable, truth_speed
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import FloatArray
@@ -23,13 +24,18 @@ BEST_PEERS = 3
 
 @dataclass(slots=True)
 class DriveErrors:
-    """Sideslip RMSE in degrees and share of missing estimates of a drive, by estimator, on ``scored`` stamps."""
+    """Sideslip RMSE in degrees and share of missing estimates of a drive, by estimator, on ``scored`` stamps.
+
+    ``coverage`` and ``half_width_deg`` (median) of the 95 % intervals are of valid estimates.
+    """
 
     drive: PeerDrive
     scored: int
     offset_deg: float
     rmse_deg: dict[str, float] = field(default_factory=dict)
     missing: dict[str, float] = field(default_factory=dict)
+    coverage: dict[str, float] = field(default_factory=dict)
+    half_width_deg: dict[str, float] = field(default_factory=dict)
 
     def document(self) -> dict[str, Any]:
         """Return it for JSON."""
@@ -41,6 +47,8 @@ class DriveErrors:
             "offset_removed_deg": round(self.offset_deg, 4),
             "rmse_deg": {name: round(value, 4) for name, value in self.rmse_deg.items()},
             "missing": {name: round(value, 4) for name, value in self.missing.items()},
+            "coverage95": {name: round(value, 4) for name, value in self.coverage.items()},
+            "half_width_deg": {name: round(value, 4) for name, value in self.half_width_deg.items()},
         }
 
     @classmethod
@@ -48,7 +56,8 @@ class DriveErrors:
         """Return the errors of a document."""
         drive = next(drive for drive in PEER_DRIVES if drive.log == document["log"])
         offset_deg = document["offset_removed_deg"]
-        return cls(drive, document["scored_stamps"], offset_deg, document["rmse_deg"], document["missing"])
+        intervals = document["coverage95"], document["half_width_deg"]
+        return cls(drive, document["scored_stamps"], offset_deg, document["rmse_deg"], document["missing"], *intervals)
 
 
 def usable_sideslip(track: StateTrack) -> FloatArray:
@@ -56,8 +65,16 @@ def usable_sideslip(track: StateTrack) -> FloatArray:
     return np.where(track.valid, track.sideslip_rad, np.nan)
 
 
-def score(drive: PeerDrive, estimates: Mapping[str, FloatArray], truth: StateTrack) -> DriveErrors:
-    """Score sideslip [N] in rad at the stamps of the ground truth; a missing estimate (NaN) counts as 0."""
+def score(
+    drive: PeerDrive,
+    estimates: Mapping[str, FloatArray],
+    truth: StateTrack,
+    stds: Mapping[str, FloatArray] | None = None,
+) -> DriveErrors:
+    """Score sideslip [N] in rad at the stamps of the ground truth, and intervals where there are any.
+
+    A missing estimate (NaN) counts as 0 in errors and not at all in intervals.
+    """
     scored = scorable(truth, SIDESLIP, drive.least_speed_m_s)
     offset = 0.0
     if drive.group == OFFSET:
@@ -66,6 +83,11 @@ def score(drive: PeerDrive, estimates: Mapping[str, FloatArray], truth: StateTra
     errors = DriveErrors(drive, int(np.count_nonzero(scored)), float(np.degrees(offset)))
     for name, sideslip in estimates.items():
         difference = wrap_angle(np.nan_to_num(sideslip, nan=0.0) - truth.sideslip_rad + offset)[scored]
+        if stds is not None and name in stds:
+            valid = np.isfinite(sideslip[scored])
+            half_width = NORMAL_95 * stds[name][scored][valid]
+            errors.coverage[name] = float(np.mean(np.abs(difference[valid]) <= half_width))
+            errors.half_width_deg[name] = float(np.degrees(np.median(half_width)))
         errors.rmse_deg[name] = float(np.degrees(np.sqrt(np.mean(difference**2))))
         errors.missing[name] = float(np.mean(~np.isfinite(sideslip[scored])))
     return errors

@@ -90,7 +90,11 @@ def test_evidence_goes_before_d2_and_d2_before_the_order() -> None:
 def test_zero_sideslip_is_a_baseline_and_never_chosen_by_its_agreement() -> None:
     """At the rear axle of a car the lateral velocity is small: an accelerometer there agrees with ``zero``."""
     names = ran("zero", "open-loop", "physics", "pd-hef")
-    assert main(names, d2(pd_hef=0.5, physics=0.5, open_loop=0.6, zero=0.1)).name == "pd-hef"
+    least_bad = main(names, d2(pd_hef=0.5, physics=0.5, open_loop=0.6, zero=0.1))
+    assert (least_bad.name, least_bad.distrusted) == ("pd-hef", True)
+    assert least_bad.why.endswith("as well as sideslip 0 does; pd-hef is the least bad one")
+    assert not main(names, d2(pd_hef=0.11, physics=0.5, open_loop=0.6, zero=0.1)).distrusted
+    assert not main(names, d2(pd_hef=0.5, zero=0.1), proven=True).distrusted
 
 
 def test_three_are_shown_the_answer_first_unless_they_were_named() -> None:
