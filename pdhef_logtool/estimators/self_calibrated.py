@@ -64,8 +64,7 @@ class CalibratedBand:
             self._window, self._vy = signals, [t.vy_m_s for t, _ in runs]
             self._states = tuple(state for _, state in runs)
         d2 = found.driven_d2_m_s
-        of_car = CAR_STD_RAD * np.abs(track.vx_m_s)
-        contradicted = np.hypot(of_car, D2_SHARE * d2) if math.isfinite(d2) else of_car
+        contradicted = np.hypot(CAR_STD_RAD * track.vx_m_s, D2_SHARE * d2 if math.isfinite(d2) else 0.0)
         away = [self._vy[0] + POSTERIOR_SHARE * (vy - self._vy[0]) for vy in self._vy] if self._vy else []
         return widened(track, away, contradicted, found.vehicle.low_speed_blend_m_s, own_share=1.0)
 
