@@ -353,11 +353,11 @@ def _columns(*, truth: bool) -> list[_Column]:
         columns += [_column(rmse, "sideslip_rad", segment, segment) for segment in ("linear", "nonlinear")]
         return [*columns, _NIS_RATIO]
     apart = _column(metrics["disagreement_rms"], "sideslip_rad", "all", "")
-    of_sensors = _column(metrics["d2"], "vy_m_s", "all", "v_y against sensors")
+    of_sensors = _column(metrics["d2"], "vy_m_s", "all", "lateral kin.")
     return [
         apart._replace(head="sideslip: RMS\nfrom {main} °", metric="from_main"),
         of_sensors,
-        _NIS_RATIO._replace(head=f"surprise{_NIS_RATIO.head}"),
+        _NIS_RATIO._replace(head=f"innovations{_NIS_RATIO.head}"),
         *columns,
     ]
 

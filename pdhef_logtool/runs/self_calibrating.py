@@ -17,12 +17,11 @@ from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.presets import preset_of
-from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED
-from pdhef_logtool.estimators.table import ALL_ESTIMATORS, make_estimator
+from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.errors import PdhefError
+from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
@@ -76,7 +75,7 @@ def read_driving(drive: Drive) -> Driving:
 
     reader = DrivingReader(drive.car.vehicle)
     for window in drive.windows(fill_friction=_told(drive)):
-        reader.add(window.signals)
+        reader.add(_without_log_friction(drive, window.signals))
     return reader.finish()
 
 
@@ -99,7 +98,7 @@ def _driven_d2_of(drive: Drive, estimator: Estimator, sensors: SensorErrors) -> 
     slow, carry = drive.car.vehicle.low_speed_blend_m_s, None
     products, seconds = np.zeros((4, 4)), 0.0
     for window in drive.windows(fill_friction=_told(drive), window_s=_WINDOW_S):
-        track, carry = run_window(estimator, window.signals, carry, None)
+        track, carry = run_window(estimator, _without_log_friction(drive, window.signals), carry, None)
         more, lasted = driving_products(track, window.signals, low_speed_m_s=slow, sensors=sensors)
         products += more
         seconds += lasted
@@ -149,11 +148,13 @@ def log_sensors(vehicle: VehicleParameters, calibration: SelfCalibration | None)
 
 
 def _asked(config: RunConfig, car: Car) -> bool:
-    """Whether an estimator of a run takes a calibration; the paper's suite has no speed to calibrate with."""
-    names = config.estimators
-    if car.has_evidence or config.sensors == "esp":
-        return False
-    return names is None or bool({ALL_ESTIMATORS, OPEN_LOOP, *SELF_CALIBRATED} & {*names, *map(preset_of, names)})
+    """Whether the candidates of the selected estimate take a calibration; the paper's suite has no speed for it."""
+    return not car.has_evidence and config.sensors != "esp"
+
+
+def _without_log_friction(drive: Drive, signals: Signals) -> Signals:
+    """Return signals [N] without the friction of the log where the run estimates it."""
+    return signals if _told(drive) else replace(signals, friction=np.full(len(signals), np.nan))
 
 
 def _told(drive: Drive) -> bool:

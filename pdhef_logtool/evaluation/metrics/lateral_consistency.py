@@ -127,7 +127,7 @@ class _Driven:
 METRICS = (
     Metric(
         "d2",
-        "d2",
+        "consistency",
         "signal `vy_m_s`: RMS of the change of the estimated v_y over 2 s minus the integral of a_y − v_x r, above the "
         "low-speed blend; a_y without bias, roll gain and lever arm as the log has them; large with a wrong "
         "model. `kinematic` integrates the same, so that its figure shows nothing",
