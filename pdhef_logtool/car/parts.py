@@ -37,7 +37,7 @@ SMOOTHING = (0.5, 3.0)
 MEASUREMENTS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 
 #: Entries of a vehicle file that change no estimate.
-_NOT_PHYSICS = {"name", "truth_position_m"}
+_NOT_PHYSICS = {"name", "truth_position_m", "gnss_antenna_position_m"}
 
 
 def physics_sha256(vehicle: VehicleParameters) -> str:

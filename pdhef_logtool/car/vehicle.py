@@ -157,6 +157,7 @@ class VehicleParameters(Record):
     friction: Friction | None = None
     imu_position_m: Position = (0.0, 0.0, 0.0)
     truth_position_m: Position = (0.0, 0.0, 0.0)
+    gnss_antenna_position_m: Position | None = None
     low_speed_blend_m_s: Annotated[float, Field(ge=0.01, le=30)] = 3.0
     #: Distance over which a lateral axle force builds up; 0.3-0.7 m for cars (docs/method.md#physics; Pacejka 2012,
     #: chapter 7).

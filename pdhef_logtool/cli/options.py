@@ -139,6 +139,14 @@ _OPTIONS: dict[str, Any] = {
             rich_help_panel=ESTIMATION,
         ),
     ],
+    "reference": Annotated[
+        _Text,
+        Option(
+            help="Sideslip reference without tyre data: auto (without ground truth), on or off.",
+            rich_help_panel=ESTIMATION,
+        ),
+    ],
+    "gnss": Annotated[_Text, Option(help="GNSS velocity in the reference: auto or off.", rich_help_panel=ESTIMATION)],
     "waived": Annotated[
         list[str] | None,
         Option("--waive", metavar="CHECK", help="Ignore the failure of this check. Repeatable.", rich_help_panel=INPUT),

@@ -354,7 +354,9 @@ def _columns(*, truth: bool) -> list[_Column]:
         return [*columns, _NIS_RATIO]
     apart = _column(metrics["disagreement_rms"], "sideslip_rad", "all", "")
     of_sensors = _column(metrics["d2"], "vy_m_s", "all", "lateral kin.")
+    of_reference = _column(metrics["reference_rms"], "sideslip_rad", "all", "")
     return [
+        of_reference._replace(head="sideslip: RMS\nfrom reference °"),
         apart._replace(head="sideslip: RMS\nfrom {main} °", metric="from_main"),
         of_sensors,
         _NIS_RATIO._replace(head=f"innovations{_NIS_RATIO.head}"),

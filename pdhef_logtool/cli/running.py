@@ -59,7 +59,8 @@ _MOST_VERDICTS = 50
     "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).\n\n"
     'cars.toml, with paths relative to it: [folders] "fleet/golf" = "cars/golf"; [logs] "run_*.mcap" = '
     '"mini.toml"; [metadata.vehicle_id] "WVW-1" = "cars/golf"; default = "saloon" above them.',
-    shared="cars estimators annotate keep cache clock setup setup_from_s friction thresholds network calibrate waived",
+    shared="cars estimators annotate keep cache clock setup setup_from_s friction thresholds network calibrate "
+    "reference gnss waived",
     car="Car of the logs (default: a sedan)",
 )
 def run(  # positional: one an option of the command line

@@ -18,7 +18,7 @@ Rules
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
@@ -50,6 +50,11 @@ MIN_LATE_S = 0.05
 DELAY_DRIFT_S = 2.0
 #: Share of stamps that must coincide for two channels to be on one clock.
 SAME_CLOCK_SHARE = 0.9
+
+#: How the names of all GNSS signals begin.
+GNSS = "gnss_"
+_GNSS_COMPONENTS = frozenset({"gnss_velocity_east_m_s", "gnss_velocity_north_m_s"})
+_GNSS_POLAR = frozenset({"gnss_speed_m_s", "gnss_course_rad"})
 
 _IMU = ("yaw_rate_rad_s", "ay_m_s2", "ax_m_s2")
 _INPUTS = frozenset({"steer_rad", "steering_wheel_rad", "ax_m_s2", "friction"})
@@ -97,7 +102,7 @@ class AlignmentPlan:
     grid_channel : the IMU channel that sets the clock. grid_channels : those that share its stamps, itself included.
     grid_period_s : its median period.
     channels : one entry a channel that is used. unused : mapped channels that are not used, with the reason.
-    speed_from : ``"speed_m_s"``, ``"wheel speeds"`` or ``"none"``.
+    speed_from : ``"speed_m_s"``, ``"wheel speeds"``, ``"GNSS"`` or ``"none"``.
     """
 
     grid_channel: str
@@ -112,6 +117,11 @@ class AlignmentPlan:
         """Aligned columns that the mapping provides, regardless of their source (``speed_m_s`` also from wheels)."""
         names = {c.target for c in self.channels}
         return frozenset(names | ({"speed_m_s"} if self.speed_from != "none" else set()))
+
+    @property
+    def has_gnss(self) -> bool:
+        """Whether the mapping provides GNSS velocity."""
+        return has_gnss({c.target for c in self.channels})
 
     @property
     def by_stamp(self) -> tuple[ChannelPlan, ...]:
@@ -173,7 +183,8 @@ def plan_alignment(
         speed_from = "speed_m_s"
     else:
         wheels = {target for target, _ in chosen.values() if target.startswith("wheel_speed_")}
-        speed_from = "wheel speeds" if _has_whole_axle(wheels) else "none"
+        gnss = "GNSS" if has_gnss(chosen) else "none"
+        speed_from = "wheel speeds" if _has_whole_axle(wheels) else gnss
     return AlignmentPlan(
         grid_channel=grid,
         grid_channels=tuple(p.name for p in plans if p.name in _IMU and p.method == "exact"),
@@ -227,13 +238,20 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
         if p.name in usable and stamps.size:
             values, arrival = _to_grid(usable[p.name], p, stamps, _ns(_max_gap_s(plan.grid_period_s)))
             columns[p.target] = p.scale * values if p.scale != 1.0 else values
-            np.maximum(ready, arrival, out=ready)
+            if not p.name.startswith(GNSS) or plan.speed_from == "GNSS":  # no causal estimator uses it otherwise
+                np.maximum(ready, arrival, out=ready)
     ready = np.maximum.accumulate(ready)
 
     inside = slice(int(np.searchsorted(stamps, start_ns)), None)
     missing = np.full(stamps.shape[0], np.nan)
     wheels = np.stack([columns.get(f"wheel_speed_{w}_m_s", missing) for w in WHEELS], axis=1)
-    speed = combine_wheel_speeds(wheels) if plan.speed_from == "wheel speeds" else columns.get("speed_m_s", missing)
+    velocity = gnss_velocity(columns) if plan.has_gnss else np.empty((0, 2))
+    if plan.speed_from == "wheel speeds":
+        speed = combine_wheel_speeds(wheels)
+    elif plan.speed_from == "GNSS":
+        speed = np.hypot(velocity[:, 0], velocity[:, 1])
+    else:
+        speed = columns.get("speed_m_s", missing)
 
     def column(name: str) -> FloatArray:
         return columns.get(name, missing)[inside].copy()
@@ -249,7 +267,25 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
         friction=column("friction"),
         wheel_speed_m_s=wheels[inside].copy(),
         available=plan.available,
+        gnss_velocity_m_s=velocity[inside].copy() if plan.has_gnss else velocity,
+        gnss_velocity_std_m_s=column("gnss_velocity_accuracy_m_s") if plan.has_gnss else np.empty(0),
     )
+
+
+def has_gnss(names: Collection[str]) -> bool:
+    """Return whether signals contain a GNSS velocity: its components, or speed and course."""
+    return any(names_of <= set(names) for names_of in (_GNSS_COMPONENTS, _GNSS_POLAR))
+
+
+def gnss_velocity(columns: Mapping[str, FloatArray]) -> FloatArray:
+    """Return GNSS velocity [N, 2] to the east and north, NaN without position (``gnss_fix_type`` below 1)."""
+    if set(columns) >= _GNSS_COMPONENTS:
+        velocity = np.stack([columns[name] for name in ("gnss_velocity_east_m_s", "gnss_velocity_north_m_s")], axis=1)
+    else:
+        speed, course = columns["gnss_speed_m_s"], columns["gnss_course_rad"]
+        velocity = np.stack([speed * np.cos(course), speed * np.sin(course)], axis=1)
+    velocity[columns.get("gnss_fix_type", np.ones(len(velocity))) < 1.0] = np.nan
+    return velocity
 
 
 def count_late(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, end_ns: int) -> dict[str, int]:
@@ -352,7 +388,7 @@ def _plan_channel(  # positional: one call
     comparable = period is not None and period <= 2.0 * grid_period_s
     if (channel.name in _IMU or not is_input) and (comparable or period is None) and _on_one_clock(channel, grid):
         method = "exact"
-    elif comparable:
+    elif comparable and not channel.name.startswith(GNSS):  # a course must not be interpolated across ±π
         method = "interpolate"
     else:
         method = "hold" if is_input else "next"

@@ -25,6 +25,12 @@ SIGNAL_UNITS: dict[str, str] = {
     "speed_m_s": "m/s",
     **{f"wheel_speed_{w}_m_s": "m/s" for w in WHEELS},
     **{f"wheel_speed_{w}_rad_s": "rad/s" for w in WHEELS},
+    "gnss_velocity_east_m_s": "m/s",  # of the antenna, Doppler
+    "gnss_velocity_north_m_s": "m/s",
+    "gnss_speed_m_s": "m/s",
+    "gnss_course_rad": "rad",  # ENU: counter-clockwise from east
+    "gnss_velocity_accuracy_m_s": "m/s",  # as the receiver states it, 1-sigma
+    "gnss_fix_type": "1",  # below 1: no position
     "friction": "1",
 }
 
@@ -137,6 +143,8 @@ class Signals:
     steer_rad, ax_m_s2, ay_m_s2, yaw_rate_rad_s, speed_m_s, friction : float64 [N].
     wheel_speed_m_s : float64 [N, 4] in the order fl, fr, rl, rr.
     available : names of the signals that the log's mapping provides at all.
+    gnss_velocity_m_s : float64 [N, 2], east and north, of the antenna, finite only at the first stamp after a new
+        sample; [0, 2] without GNSS. gnss_velocity_std_m_s : float64 [N], stated by the receiver; [0] without GNSS.
     """
 
     stamps_ns: IntArray
@@ -149,6 +157,8 @@ class Signals:
     friction: FloatArray
     wheel_speed_m_s: FloatArray
     available: frozenset[str] = field(default_factory=frozenset)
+    gnss_velocity_m_s: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    gnss_velocity_std_m_s: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __len__(self) -> int:
         """Return the number of stamps."""

@@ -9,6 +9,8 @@ import numpy as np
 
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
+#: Name of the sideslip reference in tables, files and recordings.
+REFERENCE = "reference"
 #: Columns of estimates.parquet in order, ``estimator`` left out (it is the track's name).
 TRACK_COLUMNS = (
     "stamp_ns",
@@ -38,11 +40,16 @@ TRACK_COLUMNS = (
     "steer_bias_rad",
     "ay_bias_m_s2",
     "yaw_rate_bias_rad_s",
+    "share_law",
+    "share_kinematics",
+    "share_gnss",
 )
+#: Shares of the information on v_y of the sideslip reference.
+SHARE_COLUMNS = TRACK_COLUMNS[-3:]
 #: Quantities that a filter may estimate in addition to the motion.
-ESTIMATED_COLUMNS = TRACK_COLUMNS[-6:]
+ESTIMATED_COLUMNS = TRACK_COLUMNS[-9:-3]
 #: Those that a source may not have at all.
-OPTIONAL_COLUMNS = ("mixture_weight", "reason", *ESTIMATED_COLUMNS)
+OPTIONAL_COLUMNS = ("mixture_weight", "reason", *ESTIMATED_COLUMNS, *SHARE_COLUMNS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,8 +62,8 @@ class StateTrack:
     which the estimator itself reports divergence. ``nis`` has the degrees of freedom ``nis_dof`` at each stamp.
     ``mixture_weight`` (of all filters of an adaptive estimator but its first) and ``reason`` (bits of
     :mod:`pdhef_logtool.records.reasons`, what is reported of a_y and yaw rate) are [N], or of length 0 where the source
-    has none; so are roll and bank, the share by which all lateral forces are larger, and the biases by which sensors
-    read too much.
+    has none; so are roll and bank, the share by which all lateral forces are larger, the biases by which sensors
+    read too much, and the shares of axle law, kinematics and GNSS in the sideslip reference.
     """
 
     name: str
@@ -86,6 +93,9 @@ class StateTrack:
     steer_bias_rad: FloatArray = field(default_factory=lambda: np.empty(0))
     ay_bias_m_s2: FloatArray = field(default_factory=lambda: np.empty(0))
     yaw_rate_bias_rad_s: FloatArray = field(default_factory=lambda: np.empty(0))
+    share_law: FloatArray = field(default_factory=lambda: np.empty(0))
+    share_kinematics: FloatArray = field(default_factory=lambda: np.empty(0))
+    share_gnss: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __len__(self) -> int:
         """Return the number of stamps."""

@@ -160,6 +160,7 @@ class ReportFacts:
     ``main``: the estimator of the selected estimate, None where nothing was estimated.
     ``warnings``: what may be wrong; ``remarks``: what else is worth knowing.
     ``calibration``: what the drive stated of its car without ground truth, None where it was not asked.
+    ``reference``: what came of the sideslip reference, None where it was not asked for.
     ``file_bytes``: what became of the bytes of each file; ``samples``: of the samples of each mapped source.
     ``checks``: what physics says of signals, truth and vehicle file. ``details``: None where nothing was estimated.
     """
@@ -178,6 +179,7 @@ class ReportFacts:
     low_speed_m_s: float | None = None
     friction: FrictionFacts | None = None
     calibration: Mapping[str, Any] | None = None
+    reference: Mapping[str, Any] | None = None
     metrics: Sequence[MetricRow] = ()
     segments: Sequence[Event] = ()
     losses: Sequence[Loss] = ()
@@ -294,6 +296,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
         "setup": facts.setup,
         "friction": facts.friction,
         "self_calibration": facts.calibration,
+        "reference": facts.reference,
         "metrics": [{name: getattr(m, name) for name in _METRIC_COLUMNS} for m in facts.metrics],
         "segments": list(facts.segments),
         "losses": list(facts.losses),

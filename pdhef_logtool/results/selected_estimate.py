@@ -93,7 +93,7 @@ def _error(figures: _Figures, name: str | None) -> float | None:
 def _result(report: Report, main: MainFacts, figures: _Figures) -> str:
     truth, own = report["truth"], _error(figures, main.name)
     if not truth["available"]:
-        return f"Sideslip estimate: {main.name}; its error is unknown, because the log contains no ground truth"
+        return f"Sideslip estimate: {main.name}; {_from_reference(report, main, figures)}"
     if own is None:
         return f"Sideslip of {main.name} is not scored: {_why_not_scored(report, main)}{_scored_instead(main, figures)}"
     said = [f"Sideslip RMSE of {main.name}: {degrees(own)} ({_truth_of(report, 'sideslip_rad')})"]
@@ -111,6 +111,21 @@ def _result(report: Report, main: MainFacts, figures: _Figures) -> str:
         else ""
     )
     return ", ".join(said) + useless
+
+
+def _from_reference(report: Report, main: MainFacts, figures: _Figures) -> str:
+    """Return how far the selected estimate is from the sideslip reference, or why its error is unknown."""
+    rms, std = (figures.get((main.name, "sideslip_rad", metric)) for metric in ("reference_rms", "reference_std"))
+    if rms is not None and std is not None:
+        within = " (within its uncertainty)" if rms <= std else ""
+        share = report["reference"]["valid_share"]
+        return (
+            f"RMS difference from the estimated reference {degrees(rms)}, reference ± {degrees(std)}{within}, "
+            f"on {share:.0%} of the log; it contains no ground truth"
+        )
+    reference = report.get("reference") or {}
+    why = f"; no reference: {reference['refused']}" if reference.get("refused") else ""
+    return f"its error is unknown, because the log contains no ground truth{why}"
 
 
 def _against(own: float, other: float, text: str) -> str:

@@ -82,6 +82,9 @@ class RunConfig:
         car's.
     calibrate : calibration of a car without validation data, without ground truth: per ``log``, ``online`` on what the
         log has shown so far (causal), on the ``pool`` of all logs, or ``off``.
+    reference : sideslip reference (not causal, without tyre data): ``auto`` (where the log has no ground truth of
+        sideslip), ``on`` (beside ground truth as well) or ``off``.
+    gnss : ``auto`` (the reference uses GNSS velocity where the log has it) or ``off``.
     waived : names of checks whose failure is ignored.
     setup : setup.toml of another run of the same car and recorder, from which mounting, units, delays and clocks are
         taken; None = decided on the log.
@@ -114,6 +117,8 @@ class RunConfig:
     network: File | None = None
     intervals: File | None = None
     calibrate: Calibrate = "log"
+    reference: Literal["auto", "on", "off"] = "auto"
+    gnss: Literal["auto", "off"] = "auto"
     waived: Names = ()
     setup: File | None = None
     setup_from_s: Annotated[float, Field(ge=1)] | None = None

@@ -21,7 +21,7 @@ from pdhef_logtool.estimators.presets import preset_of
 from pdhef_logtool.estimators.self_calibrated import SELF_CALIBRATED, CalibratedBand
 from pdhef_logtool.records.geometry import DeadReckoner
 from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,6 +106,8 @@ def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
     for estimator in estimators:
         if note := getattr(estimator, "intervals_note", ""):
             own[estimator.name] = note
+            if estimator.name == REFERENCE:
+                continue
             applies = online if isinstance(estimator, OnlineCalibrated) else calibrated
             if applies is not None:
                 posterior[estimator.name] = applies.add

@@ -35,6 +35,7 @@ from pdhef_logtool.records.errors import (
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
+from pdhef_logtool.records.tracks import REFERENCE
 from pdhef_logtool.results.opened_run import (
     ESTIMATES_FILE,
     LOGS,
@@ -45,6 +46,7 @@ from pdhef_logtool.results.opened_run import (
     SETUP_FILE,
     OpenedLog,
 )
+from pdhef_logtool.results.palette import REFERENCE_COLOUR
 from pdhef_logtool.results.run_report import (
     CarFacts,
     EstimatorFacts,
@@ -65,6 +67,7 @@ from pdhef_logtool.results.run_report import (
 from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, Shown, Sink
 from pdhef_logtool.runs.config import Keep, RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
+from pdhef_logtool.runs.referencing import DriveReference, reference_of
 from pdhef_logtool.runs.scoring import Evaluation, evaluate, in_time
 from pdhef_logtool.runs.selection import candidates, choose_main, contradiction, default_names
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
@@ -268,7 +271,10 @@ def run_log(
         car = self_calibrated(drive, calibration)
         ready, skipped, requested = _choose_estimators(drive, config, car)
         prepare([e.name for e in ready])
-        job = _Job(drive, car, calibration, ready, skipped, requested, tuple(thresholds or ()))
+        reference = reference_of(drive, calibration, config)
+        if reference is not None and reference.estimator is not None:
+            ready, requested = [*ready, reference.estimator], requested | {REFERENCE}
+        job = _Job(drive, car, calibration, reference, ready, skipped, requested, tuple(thresholds or ()))
         result = _run_estimators(job, outputs, config, reporter)
     reporter.progress(result.outcome.log, 1.0)
     return result
@@ -284,6 +290,7 @@ class _Job:
     drive: Drive
     car: Car
     calibration: SelfCalibration | None
+    reference: DriveReference | None
     ready: Sequence[Estimator]
     skipped: Sequence[Skipped]
     requested: frozenset[str]
@@ -398,6 +405,7 @@ def _facts(
         report_facts(drive, job.car, estimators, rows, scored.events, losses),
         friction=friction_facts(drive.friction),
         calibration=None if job.calibration is None else job.calibration.to_dict(),
+        reference=None if job.reference is None else job.reference.document,
         main=main,
         details=drive_details(drive, job.ready, main.name, store.read, signals, limits, brief=config.kept != "full"),
     )
@@ -492,7 +500,7 @@ def _open_sinks(
 
     sinks: list[Sink] = []
     drive, car = job.drive, job.car
-    colours = {s.name: s.colour for s in all_specs()}
+    colours = {REFERENCE: REFERENCE_COLOUR, **{s.name: s.colour for s in all_specs()}}
     try:
         if config.kept != "metrics":
             causal_from_ns = _causal_from_ns(drive, job.ready)

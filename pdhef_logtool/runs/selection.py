@@ -13,6 +13,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.table import all_names, spec_of
+from pdhef_logtool.records.tracks import REFERENCE
 from pdhef_logtool.results.selected_estimate import MainFacts
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ FACTOR = 1.2
 NAIVE = "zero"
 #: The selected estimate is the first of these that ran, unless d2 contradicts it; without any, the first other one.
 _BEST_FIRST = (PREFERRED, PHYSICS, "phy-ukf:tuned", "phy-ukf", "open-loop:calibrated", "open-loop", "kinematic")
-_LAST = (NAIVE, "zero:no-lateral")
+_LAST = (NAIVE, "zero:no-lateral", REFERENCE)
 
 
 @dataclass(frozen=True, slots=True)

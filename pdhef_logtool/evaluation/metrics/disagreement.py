@@ -11,13 +11,13 @@ from pdhef_logtool.evaluation.blocks import SegmentSums, packed, row_blocks
 from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, OfDrive
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray
-from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 
 
 def _rows(drive: EvaluatedDrive) -> list[MetricRow]:
     if drive.truth is not None:
         return []
-    tracks = [*drive.tracks.values()]
+    tracks = [track for name, track in drive.tracks.items() if name != REFERENCE]
     return disagreement_rows(tracks, drive.masks, log=drive.log, low_speed_m_s=drive.low_speed_m_s)
 
 

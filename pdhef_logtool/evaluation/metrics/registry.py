@@ -20,6 +20,7 @@ MODULES = (
     "whiteness",
     "lateral_consistency",
     "disagreement",
+    "reference",
     "sensor_residuals",
     "independence",
 )

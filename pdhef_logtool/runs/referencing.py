@@ -1,0 +1,129 @@
+"""The sideslip reference of a drive: when it is made, on what, and what the report states of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.drive.reading import Drive
+from pdhef_logtool.records.signals import Signals, join_signals
+from pdhef_logtool.runs.config import RunConfig
+
+if TYPE_CHECKING:
+    from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
+    from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference
+    from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
+
+#: A drive is smoothed in spans of this length, which overlap by twice the margin: memory does not grow with the drive.
+SPAN_S, MARGIN_S = 1200.0, 30.0
+#: A fitted position of the accelerometer replaces that of the file where it differs by so many of its 1-sigmas.
+SIGNIFICANT = 2.0
+_FILE_STD_M, _FITTED_STD_M, _LEAST_GAIN_STD = 0.05, 0.1, 0.02
+_NEEDS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveReference:
+    """What came of the reference: ``estimator``, None where refused, and what the report states (``document``)."""
+
+    estimator: ReferenceEstimator | None
+    document: dict[str, Any]
+
+
+def reference_of(drive: Drive, calibration: SelfCalibration | None, config: RunConfig) -> DriveReference | None:
+    """Return the sideslip reference of a drive; None where it is not asked for.
+
+    With ``reference = auto`` it is made where the log has no ground truth of sideslip.
+    """
+    scored = drive.plan.truth is not None and "sideslip_rad" in drive.plan.derivation
+    if config.reference == "off" or (config.reference == "auto" and scored):
+        return None
+    from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
+
+    missing = [name for name in _NEEDS if name not in drive.available]
+    if missing:
+        return DriveReference(None, _document([], f"the log has no {', '.join(missing)}"))
+    spans = list(_spans(drive, prior_of(drive.car.vehicle, calibration), use_gnss=config.gnss != "off"))
+    used = [span for span in spans if not span.refused]
+    refused = "" if used else next((span.refused for span in spans), "the log has no samples")
+    note = "estimated from the IMU and GNSS, without tyre data: not causal"
+    estimator = ReferenceEstimator(tuple(used), (note,)) if used else None
+    return DriveReference(estimator, _document(spans, refused))
+
+
+def prior_of(vehicle: VehicleParameters, calibration: SelfCalibration | None) -> ReferencePrior:
+    """Return what is known of a car before its drive: the geometry of its file, sensors as the log calibrated them."""
+    from pdhef_logtool.estimators.calibration.joint import AY_BIAS, AY_GAIN, IMU_X, RATE_BIAS
+    from pdhef_logtool.estimators.reference.drive import ReferencePrior
+
+    wheelbase = vehicle.cg_to_front_axle_m + vehicle.cg_to_rear_axle_m
+    gain = 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2
+    prior: dict[str, Any] = {
+        "imu_x_m": vehicle.imu_position_m[0],
+        "imu_x_std_m": _FILE_STD_M,
+        "ay_gain": gain,
+        "friction": vehicle.assumed_friction,
+    }
+    if calibration is not None and calibration.parameters:
+        fitted = {p.name: p for p in calibration.parameters}
+        if abs(fitted[IMU_X].value - vehicle.imu_position_m[0]) > SIGNIFICANT * fitted[IMU_X].sd:
+            prior |= {"imu_x_m": fitted[IMU_X].value, "imu_x_std_m": _FITTED_STD_M}
+        prior |= {
+            "ay_gain": fitted[AY_GAIN].value,
+            "ay_gain_std": max(_LEAST_GAIN_STD, fitted[AY_GAIN].sd),
+            "ay_bias_m_s2": fitted[AY_BIAS].value - vehicle.sensors.ay_bias_m_s2,
+            "yaw_rate_bias_rad_s": fitted[RATE_BIAS].value - vehicle.sensors.yaw_rate_bias_rad_s,
+        }
+        if not calibration.refused:
+            prior["friction"] = calibration.vehicle.assumed_friction
+    antenna = vehicle.gnss_antenna_position_m
+    if antenna is not None:
+        prior["antenna_m"] = antenna[:2]
+    return ReferencePrior(vehicle.cg_to_rear_axle_m, wheelbase, **prior)
+
+
+def _spans(drive: Drive, prior: ReferencePrior, *, use_gnss: bool) -> Iterator[SideslipReference]:
+    """Yield the reference of a drive span by span; of two that overlap the earlier one ends in the middle."""
+    from pdhef_logtool.estimators.reference.drive import refer
+
+    tail: Signals | None = None
+    for window in drive.windows(fill_friction=False, window_s=SPAN_S):
+        signals = window.signals if tail is None else join_signals([tail, window.signals])
+        if len(signals) < 2:
+            continue
+        span = refer(signals, prior, use_gnss=use_gnss)
+        end_ns = int(signals.stamps_ns[-1])
+        more = int(drive.plan.end_ns) - end_ns > round(MARGIN_S * 1e9)
+        yield span.between(
+            None if tail is None else _in_s(signals, MARGIN_S), _in_s(signals, -MARGIN_S) if more else None
+        )
+        first = int(np.searchsorted(signals.stamps_ns, end_ns - round(2.0 * MARGIN_S * 1e9)))
+        tail = signals.rows(first, len(signals))
+
+
+def _in_s(signals: Signals, seconds: float) -> int:
+    """Return the time a number of seconds after the first stamp, or before the last one where it is negative."""
+    return int(signals.stamps_ns[0 if seconds > 0 else -1]) + round(seconds * 1e9)
+
+
+def _document(spans: Sequence[SideslipReference], refused: str) -> dict[str, Any]:
+    """Return what report.json states; parameters are those of the longest span."""
+    longest = max(spans, key=lambda span: len(span.stamps_ns), default=None)
+    knots = sum(len(span.stamps_ns) for span in spans)
+    valid = sum(int(span.valid.sum()) for span in spans)
+    parameters = () if longest is None else longest.parameters
+    return {
+        "refused": refused or None,
+        "gnss": any(span.with_gnss for span in spans),
+        "valid_share": valid / knots if knots else 0.0,
+        "spans_refused": sum(bool(span.refused) for span in spans),
+        "spans": len(spans),
+        "parameters": [
+            {"name": p.name, "unit": p.unit, "value": p.value, "std": p.std, "prior": p.prior, "limit": p.limit}
+            for p in parameters
+        ],
+    }

@@ -1,0 +1,282 @@
+"""The sideslip reference: against an independent car, its own intervals, dense matrices, and what it must refuse."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.estimators.reference import drive as reference
+from pdhef_logtool.estimators.reference import smoother
+from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference, refer, sideslip_std
+from pdhef_logtool.estimators.reference.estimator import steps_at
+from pdhef_logtool.records.signals import FloatArray, Signals
+
+RATE_HZ = 100
+REAR_M, FRONT_M = 1.6, 1.1
+PRIOR = ReferencePrior(REAR_M, REAR_M + FRONT_M, ay_gain=1.0)
+START_NS = 1_700_000_000_000_000_000
+
+
+@dataclass(frozen=True)
+class Driven:
+    """A linear car (mass 1500 kg, I_z 2400 kg m²) whose tyres lose two thirds of their grip beyond a slip angle."""
+
+    signals: Signals
+    vx: FloatArray
+    vy: FloatArray
+    heading: FloatArray
+
+    def error_deg(self, found: SideslipReference) -> tuple[FloatArray, FloatArray]:
+        """Return error and 1-sigma of sideslip [K] in degrees."""
+        stamps = self.signals.stamps_ns
+        beta = np.interp(found.stamps_ns, stamps, np.arctan2(self.vy, self.vx))
+        error = np.arctan2(found.vy_m_s, found.vx_m_s) - beta
+        return np.degrees(error), np.degrees(sideslip_std(found.vx_m_s, found.vy_m_s, found.covariance))
+
+
+def _saturating(slip: float, stiffness: float, limit: float) -> float:
+    return limit * float(np.tanh(stiffness * slip / limit))
+
+
+def drive(steer, *, seconds: float = 30.0, speed: float = 25.0, seed: int = 1, mu: float = 0.9) -> Driven:  # type: ignore[no-untyped-def]
+    """Integrate a single-track car at 1 kHz; ``steer`` is the road-wheel angle in rad over time in s."""
+    mass, inertia, c_front, c_rear = 1500.0, 2400.0, 90_000.0, 120_000.0
+    load = mass * 9.81 / (REAR_M + FRONT_M)
+    v = r = psi = 0.0
+    rows = []
+    h = 1e-3
+    for k in range(round(seconds / h)):
+        t = k * h
+        front = -_saturating((v + FRONT_M * r) / speed - steer(t), c_front, mu * load * REAR_M)
+        rear = -_saturating((v - REAR_M * r) / speed, c_rear, mu * load * FRONT_M)
+        ay = (front + rear) / mass
+        if k % (1000 // RATE_HZ) == 0:
+            rows.append((t, v, r, ay, psi))
+        v += h * (ay - speed * r)
+        r += h * (FRONT_M * front - REAR_M * rear) / inertia
+        psi += h * r
+    t, v, r, ay, psi = np.array(rows).T
+    rng = np.random.default_rng(seed)
+    n = len(t)
+    vx = np.full(n, speed)
+    signals = Signals(
+        stamps_ns=START_NS + np.rint(t * 1e9).astype(np.int64),
+        ready_ns=START_NS + np.rint(t * 1e9).astype(np.int64),
+        steer_rad=np.array([steer(x) for x in t]),
+        ax_m_s2=-v * r + 0.05 * rng.standard_normal(n),
+        ay_m_s2=ay + 0.05 * rng.standard_normal(n) + 0.1,
+        yaw_rate_rad_s=r + 0.003 * rng.standard_normal(n) + 0.002,
+        speed_m_s=vx * 1.005 + 0.05 * rng.standard_normal(n),
+        friction=np.full(n, np.nan),
+        wheel_speed_m_s=np.full((n, 4), np.nan),
+    )
+    return Driven(signals, vx, v, psi)
+
+
+def with_gnss(driven: Driven, *, every: int = 10, std: float = 0.03, antenna_m: float = 0.5) -> Signals:
+    """Return the signals with the antenna's velocity to the east and north."""
+    signals = driven.signals
+    n = len(signals)
+    vy = driven.vy + antenna_m * signals.yaw_rate_rad_s
+    heading = driven.heading + 0.7
+    east = driven.vx * np.cos(heading) - vy * np.sin(heading)
+    north = driven.vx * np.sin(heading) + vy * np.cos(heading)
+    velocity = np.full((n, 2), np.nan)
+    velocity[::every] = np.stack([east, north], axis=1)[::every]
+    velocity += std * np.random.default_rng(3).standard_normal((n, 2))
+    return replace(signals, gnss_velocity_m_s=velocity, gnss_velocity_std_m_s=np.full(n, np.nan))
+
+
+def slalom(t: float) -> float:
+    """Return a slalom of 0.4 Hz between straights."""
+    return 0.02 * float(np.sin(2.0 * np.pi * 0.4 * t)) if 3.0 < t < 25.0 else 0.0
+
+
+def slide(t: float) -> float:
+    """Return a step that the tyres cannot follow, and back."""
+    return 0.12 if 8.0 < t < 10.5 else 0.0
+
+
+def long_slide(t: float) -> float:
+    """Return a turn beyond the linear range that lasts."""
+    return 0.055 if 5.0 < t < 27.0 else 0.0
+
+
+SLALOM, SLIDE, LONG = drive(slalom), drive(slide), drive(long_slide)
+
+
+@pytest.mark.parametrize("driven", [SLALOM, SLIDE], ids=["linear", "limit"])
+def test_the_reference_finds_sideslip_without_tyre_data_and_its_interval_contains_it(driven):
+    found = refer(driven.signals, PRIOR)
+    error, std = driven.error_deg(found)
+    assert not found.refused
+    assert np.sqrt(np.mean(error[found.valid] ** 2)) < 0.2
+    assert np.mean(np.abs(error[found.valid]) < 1.96 * std[found.valid]) > 0.9
+    assert found.valid.mean() > 0.6
+
+
+def test_long_driving_at_the_limit_needs_gnss_and_the_interval_shows_it():
+    alone = refer(LONG.signals, PRIOR)
+    aided = refer(with_gnss(LONG), PRIOR)
+    limit = (alone.stamps_ns - START_NS > 12e9) & (alone.stamps_ns - START_NS < 25e9)
+    error_alone, std_alone = LONG.error_deg(alone)
+    error_aided, std_aided = LONG.error_deg(aided)
+    assert std_aided[limit].mean() < 0.6 * std_alone[limit].mean()
+    assert np.sqrt(np.mean(error_aided[limit] ** 2)) < 0.3
+    assert np.mean(np.abs(error_alone) < 2.5 * std_alone) > 0.95
+    assert aided.gnss_share[limit].mean() > 0.5
+    assert alone.gnss_share.max() == 0.0
+
+
+def test_a_paired_jump_of_gnss_velocity_is_rejected():
+    signals = with_gnss(LONG)
+    jumped = signals.gnss_velocity_m_s.copy()
+    jumped[1500:2000, 1] += 1.0
+    clean, wrong = refer(signals, PRIOR), refer(replace(signals, gnss_velocity_m_s=jumped), PRIOR)
+    error, std = LONG.error_deg(wrong)
+    inside = (wrong.stamps_ns - START_NS > 14.5e9) & (wrong.stamps_ns - START_NS < 20.5e9)
+    assert np.abs(error[inside]).max() < 3.0 * std[inside].max()
+    assert np.abs(wrong.vy_m_s - clean.vy_m_s).max() < 0.3
+
+
+def test_gnss_off_is_the_reference_without_gnss():
+    alone, off = refer(SLIDE.signals, PRIOR), refer(with_gnss(SLIDE), PRIOR, use_gnss=False)
+    np.testing.assert_array_equal(alone.vy_m_s, off.vy_m_s)
+    assert not off.with_gnss
+
+
+def test_the_mirrored_drive_has_the_mirrored_reference():
+    signals = SLALOM.signals
+    mirrored = replace(signals, ay_m_s2=-signals.ay_m_s2, yaw_rate_rad_s=-signals.yaw_rate_rad_s)
+    prior = replace(PRIOR, yaw_rate_bias_rad_s=0.0)
+    a, b = refer(signals, prior), refer(mirrored, prior)
+    np.testing.assert_allclose(a.vy_m_s, -b.vy_m_s, atol=1e-8)
+    np.testing.assert_allclose(a.covariance[:, 2], b.covariance[:, 2], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda s: replace(s, ay_m_s2=1.8 * s.ay_m_s2), "roll gain"),
+        (lambda s: replace(s, speed_m_s=1.5 * s.speed_m_s), "implausible"),
+    ],
+    ids=["scaled a_y", "scaled speed"],
+)
+def test_a_drive_with_an_implausible_sensor_is_refused_with_the_parameter(change, named):
+    found = refer(change(SLALOM.signals), PRIOR)
+    assert named in found.refused
+    assert not found.valid.any()
+
+
+def test_a_stretch_without_imu_is_not_valid_and_the_rest_is():
+    signals = SLALOM.signals
+    ay = signals.ay_m_s2.copy()
+    ay[1200:1400] = np.nan
+    found = refer(replace(signals, ay_m_s2=ay), PRIOR)
+    seconds = (found.stamps_ns - START_NS) * 1e-9
+    assert not found.valid[(seconds > 12.1) & (seconds < 13.9)].any()
+    assert found.valid[(seconds > 16.0) & (seconds < 29.0)].all()
+
+
+def test_without_longitudinal_accelerometer_the_speed_stands_in():
+    found = refer(replace(SLALOM.signals, ax_m_s2=np.full(len(SLALOM.signals), np.nan)), PRIOR)
+    error, _ = SLALOM.error_deg(found)
+    assert not found.refused
+    assert np.sqrt(np.mean(error[found.valid] ** 2)) < 0.3
+
+
+def test_between_the_knots_the_reference_follows_the_kinematics():
+    found = refer(SLIDE.signals, PRIOR)
+    steps = steps_at([found], SLIDE.signals.stamps_ns)
+    error = np.degrees(np.arctan2(steps.values[:, 1], steps.values[:, 0]) - np.arctan2(SLIDE.vy, SLIDE.vx))
+    assert np.sqrt(np.mean(error[steps.valid] ** 2)) < 0.25
+    np.testing.assert_allclose(steps.shares[steps.valid].sum(axis=1), 1.0)
+    outside = steps_at([found], SLIDE.signals.stamps_ns[-1:] + 10**9)
+    assert not outside.valid[0]
+    assert np.isnan(outside.values).all()
+
+
+def test_spans_cover_a_drive_once():
+    found = refer(SLALOM.signals, PRIOR)
+    middle = int(found.stamps_ns[300])
+    parts = [found.between(None, middle), found.between(middle, None)]
+    whole, joined = steps_at([found], SLALOM.signals.stamps_ns), steps_at(parts, SLALOM.signals.stamps_ns)
+    np.testing.assert_array_equal(whole.values, joined.values)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000), size=st.sampled_from([smoother.WITHOUT_GNSS, smoother.WITH_GNSS]))
+def test_sparse_products_equal_dense_ones(seed, size):
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((size, size))
+    p = root @ root.T
+    point = 0.1 * rng.standard_normal(size)
+    point[smoother.VX] = 20.0
+    row = rng.standard_normal(smoother.INPUTS)
+    dense, x = np.zeros((3, size)), point.copy()
+    smoother._transition(x, point, 0.05, row, dense)
+    rows, decay = np.full(size, -1), np.ones(size)
+    rows[smoother.VX], rows[smoother.VY] = 0, 1
+    decay[smoother.AX_BIAS] = decay[smoother.AY_BIAS] = np.exp(-0.05 / smoother.BIAS_S)
+    decay[smoother.LAW_ERROR] = np.exp(-0.05 / smoother.LAW_S)
+    if size == smoother.WITH_GNSS:
+        rows[smoother.HEADING] = 2
+        decay[smoother.EAST_ERROR] = decay[smoother.NORTH_ERROR] = np.exp(-0.05 / smoother.RECEIVER_S)
+    f = np.diag(decay)
+    for i in np.flatnonzero(rows >= 0):
+        f[i] = dense[rows[i]]
+    forward, backward = np.empty_like(p), np.empty_like(p)
+    smoother._propagate(forward, x, p, dense, rows, decay)
+    smoother._pull_back(backward, p, dense, rows, decay)
+    vector = point.copy()
+    smoother._pull_vector(vector, dense, rows, decay)
+    np.testing.assert_allclose(forward, f @ p @ f.T, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(backward, f.T @ p @ f, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(vector, f.T @ point, rtol=1e-9, atol=1e-9)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10_000), east=st.booleans())
+def test_jacobians_equal_differences(seed, east):
+    rng = np.random.default_rng(seed)
+    point = 0.05 * rng.standard_normal(smoother.WITH_GNSS)
+    point[smoother.VX] = 15.0
+    point[smoother.HEADING] = rng.uniform(-3.0, 3.0)
+    row = rng.standard_normal(smoother.INPUTS)
+    row[smoother.LAW_STD] = 0.01
+    for function in (
+        lambda q, h: smoother._axle_law(q, row, 1.5, h),
+        lambda q, h: smoother._gnss(q, row, east, h),
+    ):
+        jacobian, scratch = np.zeros(smoother.WITH_GNSS), np.zeros(smoother.WITH_GNSS)
+        function(point, jacobian)
+        for i in range(smoother.WITH_GNSS):
+            if i in _LEFT_OUT and function(point, scratch) is not None:
+                continue
+            up, down = point.copy(), point.copy()
+            up[i] += 1e-5
+            down[i] -= 1e-5
+            slope = (function(up, scratch) - function(down, scratch)) / 2e-5
+            assert jacobian[i] == pytest.approx(slope, abs=2e-5, rel=1e-5), i
+
+
+#: Second-order effects within the time from a knot to a GNSS sample: biases of the IMU over some hundredths of a second.
+_LEFT_OUT = {
+    smoother.AX_BIAS,
+    smoother.AY_BIAS,
+    smoother.ROLL_GAIN,
+    smoother.IMU_X,
+    smoother.YAW_RATE_BIAS,
+    smoother.YAW_RATE_GAIN,
+}
+
+
+def test_the_noise_of_a_sensor_that_repeats_its_samples_is_that_of_the_new_ones():
+    rng = np.random.default_rng(0)
+    noise = np.repeat(0.2 * rng.standard_normal(500), 4)
+    held = replace(SLALOM.signals.rows(0, 2000), ay_m_s2=noise)
+    assert reference.accelerometer_noise(held) == pytest.approx(0.2 * np.sqrt(0.04), rel=0.15)
