@@ -18,14 +18,24 @@ Rules
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from pdhef_logtool.records.errors import MappingError
-from pdhef_logtool.records.signals import WHEELS, BoolArray, Channel, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import (
+    GNSS,
+    GNSS_COMPONENTS,
+    WHEELS,
+    BoolArray,
+    Channel,
+    FloatArray,
+    IntArray,
+    Signals,
+    has_gnss,
+)
 from pdhef_logtool.records.steps import MAX_PREDICTION_S
 from pdhef_logtool.storage.documents import jsonable
 
@@ -51,10 +61,6 @@ DELAY_DRIFT_S = 2.0
 #: Share of stamps that must coincide for two channels to be on one clock.
 SAME_CLOCK_SHARE = 0.9
 
-#: How the names of all GNSS signals begin.
-GNSS = "gnss_"
-_GNSS_COMPONENTS = frozenset({"gnss_velocity_east_m_s", "gnss_velocity_north_m_s"})
-_GNSS_POLAR = frozenset({"gnss_speed_m_s", "gnss_course_rad"})
 
 _IMU = ("yaw_rate_rad_s", "ay_m_s2", "ax_m_s2")
 _INPUTS = frozenset({"steer_rad", "steering_wheel_rad", "ax_m_s2", "friction"})
@@ -272,14 +278,9 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
     )
 
 
-def has_gnss(names: Collection[str]) -> bool:
-    """Return whether signals contain a GNSS velocity: its components, or speed and course."""
-    return any(names_of <= set(names) for names_of in (_GNSS_COMPONENTS, _GNSS_POLAR))
-
-
 def gnss_velocity(columns: Mapping[str, FloatArray]) -> FloatArray:
     """Return GNSS velocity [N, 2] to the east and north, NaN without position (``gnss_fix_type`` below 1)."""
-    if set(columns) >= _GNSS_COMPONENTS:
+    if set(columns) >= GNSS_COMPONENTS:
         velocity = np.stack([columns[name] for name in ("gnss_velocity_east_m_s", "gnss_velocity_north_m_s")], axis=1)
     else:
         speed, course = columns["gnss_speed_m_s"], columns["gnss_course_rad"]

@@ -13,6 +13,7 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.candidates import Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
+from pdhef_logtool.mapping.gnss_signals import gnss_signals
 from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, length_of, speed_over_ground
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
@@ -21,7 +22,7 @@ from pdhef_logtool.mapping.navigation import navigation_truth
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.mapping.weighing import Weighed, weigh
-from pdhef_logtool.records.signals import WHEELS, FloatArray
+from pdhef_logtool.records.signals import WHEELS, FloatArray, has_gnss
 
 #: Words of a topic's name that make it a reference to score against; never an input.
 TRUTH_WORDS = frozenset(
@@ -239,6 +240,7 @@ def auto_map(
     weighed = _weigh_the_rest(draft, topics, vendors)
     _map_navigation(draft, topics, vendors)
     _fall_back(draft, topics)
+    _map_gnss(draft, topics)
     mapping = Mapping(
         signals=draft.signals,
         truth=draft.truth,
@@ -344,6 +346,25 @@ def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
     draft.truth, draft.quality = truth[0], None
     draft.notes = [n for n in draft.notes if not n.startswith("ground truth is used where")]
     draft.notes.append(truth[1])
+
+
+def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
+    """Take GNSS velocity as a sensor: of ground truth without heading, else of a receiver that is not ground truth."""
+    draft.signals |= gnss_signals(draft.signals, draft.truth)
+    if has_gnss(draft.signals):
+        return
+    used = {source.topic for source in draft.truth.values()}
+    for topic in topics:
+        words = _words(topic.name)
+        if topic.name in used or words & TRUTH_WORDS or not words & NAVIGATION_WORDS:
+            continue
+        if _type(topic) not in TWIST_FIELDS or _type(topic) in BODY_TWIST_TYPES:
+            continue
+        paths = tuple(_twist(topic, "linear", axis) for axis in "xy")
+        if _looks_like_body_frame(*(draft.values(topic.name, path) for path in paths)) is False:
+            for name, path in zip(("gnss_velocity_east_m_s", "gnss_velocity_north_m_s"), paths, strict=True):
+                draft.take(draft.signals, name, topic.name, path)
+            return
 
 
 def _is_well_known(topic: TopicInfo) -> bool:

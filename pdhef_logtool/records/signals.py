@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Literal, TypeAlias
 
@@ -71,6 +71,11 @@ ESTIMATE_UNITS: dict[str, str] = {
     "diverged": "1",
 }
 
+#: How the names of all GNSS signals begin.
+GNSS = "gnss_"
+#: GNSS velocity by its components, or as speed and course.
+GNSS_COMPONENTS = frozenset({"gnss_velocity_east_m_s", "gnss_velocity_north_m_s"})
+_GNSS_POLAR = frozenset({"gnss_speed_m_s", "gnss_course_rad"})
 #: Signals the alignment's output carries as one column each.
 ALIGNED_SIGNALS = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "friction")
 
@@ -176,3 +181,8 @@ def join_signals(windows: Sequence[Signals]) -> Signals:
         f.name: np.concatenate([getattr(w, f.name) for w in windows]) for f in fields(Signals) if f.name != "available"
     }
     return Signals(**columns, available=windows[0].available)
+
+
+def has_gnss(names: Collection[str]) -> bool:
+    """Return whether signals contain a GNSS velocity: its components, or speed and course."""
+    return any(names_of <= set(names) for names_of in (GNSS_COMPONENTS, _GNSS_POLAR))

@@ -264,7 +264,7 @@ def test_jacobians_equal_differences(seed, east):
             assert jacobian[i] == pytest.approx(slope, abs=2e-5, rel=1e-5), i
 
 
-#: Second-order effects within the time from a knot to a GNSS sample: biases of the IMU over some hundredths of a second.
+#: Second-order effects between a knot and a GNSS sample: errors of the IMU over some hundredths of a second.
 _LEFT_OUT = {
     smoother.AX_BIAS,
     smoother.AY_BIAS,
@@ -280,3 +280,12 @@ def test_the_noise_of_a_sensor_that_repeats_its_samples_is_that_of_the_new_ones(
     noise = np.repeat(0.2 * rng.standard_normal(500), 4)
     held = replace(SLALOM.signals.rows(0, 2000), ay_m_s2=noise)
     assert reference.accelerometer_noise(held) == pytest.approx(0.2 * np.sqrt(0.04), rel=0.15)
+
+
+def test_gnss_whose_course_does_not_follow_the_gyro_is_not_used():
+    signals = with_gnss(LONG)
+    swapped = replace(signals, gnss_velocity_m_s=signals.gnss_velocity_m_s[:, ::-1].copy())
+    assert refer(signals, PRIOR).with_gnss
+    assert not refer(swapped, PRIOR).with_gnss
+    body = np.stack([LONG.vx, LONG.vy], axis=1)
+    assert not refer(replace(signals, gnss_velocity_m_s=body), PRIOR).with_gnss

@@ -20,6 +20,7 @@ from pdhef_logtool.drive.relations import (
     smallest_explanations,
 )
 from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.signals import GNSS
 
 _LACKS = {
     "ax_m_s2": "speeding up and braking, on straights",
@@ -52,7 +53,8 @@ def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Che
     """Judge sign, unit and field of every signal that a relation is about."""
     columns, relations = measured.columns, measured.relations
     groups = measured.groups(mounting_is_known=mounting_is_known)
-    names = [n for n in columns if n in measured.topics or n in _JUDGED_TRUTH]
+    # The sideslip reference compares GNSS velocity with gyro and speed itself.
+    names = [n for n in columns if (n in measured.topics and not n.startswith(GNSS)) or n in _JUDGED_TRUTH]
     if "truth.sideslip_rad" in names and "truth.vy_m_s" in names:  # which is v_x times its tangent
         names.remove("truth.vy_m_s")
     explanations = smallest_explanations(relations, known_mistakes(list(columns), groups))

@@ -25,6 +25,8 @@ LONGEST_IMU_GAP_S = 0.25
 STANDSTILL_M_S = 0.1
 #: 1-sigma of GNSS velocity without a stated accuracy, and its growth with acceleration (receivers filter).
 GNSS_STD_M_S, GNSS_LAG_S = 0.05, 0.01
+#: Speed from which on a course is known, and the turn between two samples below which it need not follow the gyro.
+LEAST_COURSE_SPEED_M_S, LEAST_TURN_RAD = 3.0, 0.05
 #: A jump of GNSS velocity against the IMU within one interval, m/s, that is rejected if one back follows in this time.
 JUMP_M_S, JUMP_BACK_S = 0.3, 60.0
 MAX_ITERATIONS, TOLERANCE_M_S, UNSETTLED_M_S = 8, 2e-3, 0.05
@@ -161,7 +163,7 @@ def refer(signals: Signals, prior: ReferencePrior, *, use_gnss: bool = True) -> 
     ``signals`` [N] need a_y and yaw rate, and speed or GNSS velocity.
     """
     stamps_ns, rows = knots(signals, prior)
-    with_gnss = use_gnss and bool(np.isfinite(rows[:, s.GNSS_EAST]).sum() >= 2)
+    with_gnss = use_gnss and course_follows_gyro(rows)
     noise = accelerometer_noise(signals)
     alone = _smooth(rows, prior, noise, s.WITHOUT_GNSS)
     best = alone
@@ -216,8 +218,8 @@ def _smooth(rows: FloatArray, prior: ReferencePrior, noise: float, n: int) -> _S
 
 
 def first_heading(rows: FloatArray) -> tuple[float, float]:
-    """Return the heading at the first knot from the first course above 3 m/s, with its 1-sigma."""
-    fast = np.flatnonzero(np.hypot(rows[:, s.GNSS_EAST], rows[:, s.GNSS_NORTH]) > 3.0)
+    """Return the heading at the first knot from the first course of a car that moves, with its 1-sigma."""
+    fast = np.flatnonzero(np.hypot(rows[:, s.GNSS_EAST], rows[:, s.GNSS_NORTH]) > LEAST_COURSE_SPEED_M_S)
     if not fast.size:
         return 0.0, math.pi
     k = int(fast[0])
@@ -374,6 +376,20 @@ def _add_gnss(rows: FloatArray, signals: Signals, knot_s: FloatArray) -> None:
     rows[k, s.GNSS_STD] = np.hypot(np.maximum(stated, GNSS_STD_M_S), GNSS_LAG_S * acceleration)
 
 
+def course_follows_gyro(rows: FloatArray) -> bool:
+    """Return whether the GNSS course turns as the gyro does; not if its axes are swapped or those of the body.
+
+    A course that turns with the gyro or, on a straight drive, not at all is accepted: only sideslip separates the two.
+    """
+    sampled = np.flatnonzero(np.hypot(rows[:, s.GNSS_EAST], rows[:, s.GNSS_NORTH]) > LEAST_COURSE_SPEED_M_S)
+    if sampled.size < 2:
+        return False
+    course = np.unwrap(np.arctan2(rows[sampled, s.GNSS_NORTH], rows[sampled, s.GNSS_EAST]))
+    turned = np.cumsum(rows[:, s.MEAN_YAW_RATE])[sampled] / RATE_HZ
+    apart = np.std(np.diff(course) - np.diff(turned))
+    return bool(apart < 0.5 * max(float(np.std(np.diff(turned))), LEAST_TURN_RAD))
+
+
 def without_jumps(rows: FloatArray, states: FloatArray) -> FloatArray:
     """Return the inputs without GNSS velocities between a jump against the IMU and one back (multipath).
 
@@ -389,7 +405,7 @@ def without_jumps(rows: FloatArray, states: FloatArray) -> FloatArray:
     turned = np.cumsum(rows[:, s.MEAN_YAW_RATE] - states[:, s.YAW_RATE_BIAS])[sampled] / RATE_HZ
     along = np.diff(speed - np.hypot(vx, vy))
     change = np.angle(np.exp(1j * np.diff(course - turned - np.arctan2(vy, vx))))
-    across = np.where(np.minimum(speed[1:], speed[:-1]) > 3.0, speed[1:] * change, 0.0)
+    across = np.where(np.minimum(speed[1:], speed[:-1]) > LEAST_COURSE_SPEED_M_S, speed[1:] * change, 0.0)
     jump = (along + 1j * across) * np.exp(1j * course[1:])
     limit = (
         JUMP_M_S + 0.02 * np.hypot(rows[sampled[1:], s.AX], rows[sampled[1:], s.AY]) + 0.2 * np.diff(sampled) / RATE_HZ
