@@ -25,8 +25,8 @@ LONGEST_IMU_GAP_S = 0.25
 STANDSTILL_M_S = 0.1
 #: 1-sigma of GNSS velocity without a stated accuracy, and its growth with acceleration (receivers filter).
 GNSS_STD_M_S, GNSS_LAG_S = 0.05, 0.01
-#: Speed from which on a course is known, and the turn between two samples below which it need not follow the gyro.
-LEAST_COURSE_SPEED_M_S, LEAST_TURN_RAD = 3.0, 0.05
+#: Speed from which on a course is known; the time over which it turns, and the turn below which it may differ.
+LEAST_COURSE_SPEED_M_S, TURN_S, LEAST_TURN_RAD = 3.0, 2.0, 0.2
 #: A jump of GNSS velocity against the IMU within one interval, m/s, that is rejected if one back follows in this time.
 JUMP_M_S, JUMP_BACK_S = 0.3, 60.0
 MAX_ITERATIONS, TOLERANCE_M_S, UNSETTLED_M_S = 8, 2e-3, 0.05
@@ -386,8 +386,13 @@ def course_follows_gyro(rows: FloatArray) -> bool:
         return False
     course = np.unwrap(np.arctan2(rows[sampled, s.GNSS_NORTH], rows[sampled, s.GNSS_EAST]))
     turned = np.cumsum(rows[:, s.MEAN_YAW_RATE])[sampled] / RATE_HZ
-    apart = np.std(np.diff(course) - np.diff(turned))
-    return bool(apart < 0.5 * max(float(np.std(np.diff(turned))), LEAST_TURN_RAD))
+    later = np.searchsorted(sampled, sampled + round(TURN_S * RATE_HZ))
+    first = np.flatnonzero(later < sampled.size)
+    if not first.size:
+        return False
+    by_course, by_gyro = course[later[first]] - course[first], turned[later[first]] - turned[first]
+    apart = float(np.sqrt(np.mean((by_course - by_gyro) ** 2)))
+    return apart < 0.5 * max(float(np.sqrt(np.mean(by_gyro**2))), LEAST_TURN_RAD)
 
 
 def without_jumps(rows: FloatArray, states: FloatArray) -> FloatArray:
