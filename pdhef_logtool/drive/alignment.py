@@ -251,7 +251,7 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
     inside = slice(int(np.searchsorted(stamps, start_ns)), None)
     missing = np.full(stamps.shape[0], np.nan)
     wheels = np.stack([columns.get(f"wheel_speed_{w}_m_s", missing) for w in WHEELS], axis=1)
-    velocity = gnss_velocity(columns) if plan.has_gnss else np.empty((0, 2))
+    velocity = gnss_velocity(columns) if plan.has_gnss else np.full((stamps.shape[0], 2), np.nan)
     if plan.speed_from == "wheel speeds":
         speed = combine_wheel_speeds(wheels)
     elif plan.speed_from == "GNSS":
@@ -273,8 +273,8 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
         friction=column("friction"),
         wheel_speed_m_s=wheels[inside].copy(),
         available=plan.available,
-        gnss_velocity_m_s=velocity[inside].copy() if plan.has_gnss else velocity,
-        gnss_velocity_std_m_s=column("gnss_velocity_accuracy_m_s") if plan.has_gnss else np.empty(0),
+        gnss_velocity_m_s=velocity[inside].copy(),
+        gnss_velocity_std_m_s=column("gnss_velocity_accuracy_m_s"),
     )
 
 

@@ -149,7 +149,7 @@ class Signals:
     wheel_speed_m_s : float64 [N, 4] in the order fl, fr, rl, rr.
     available : names of the signals that the log's mapping provides at all.
     gnss_velocity_m_s : float64 [N, 2], east and north, of the antenna, finite only at the first stamp after a new
-        sample; [0, 2] without GNSS. gnss_velocity_std_m_s : float64 [N], stated by the receiver; [0] without GNSS.
+        sample. gnss_velocity_std_m_s : float64 [N], as the receiver states it. NaN where they are not given.
     """
 
     stamps_ns: IntArray
@@ -164,6 +164,13 @@ class Signals:
     available: frozenset[str] = field(default_factory=frozenset)
     gnss_velocity_m_s: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     gnss_velocity_std_m_s: FloatArray = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        """Fill GNSS columns that are not given with NaN."""
+        if len(self.gnss_velocity_m_s) != len(self):
+            object.__setattr__(self, "gnss_velocity_m_s", np.full((len(self), 2), np.nan))
+        if len(self.gnss_velocity_std_m_s) != len(self):
+            object.__setattr__(self, "gnss_velocity_std_m_s", np.full(len(self), np.nan))
 
     def __len__(self) -> int:
         """Return the number of stamps."""

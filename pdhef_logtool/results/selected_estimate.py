@@ -121,7 +121,7 @@ def _from_reference(report: Report, main: MainFacts, figures: _Figures) -> str:
         share = report["reference"]["valid_share"]
         return (
             f"RMS difference from the estimated reference {degrees(rms)}, reference ± {degrees(std)}{within}, "
-            f"on {share:.0%} of the log; it contains no ground truth"
+            f"on {share:.0%} of the log; the log contains no ground truth"
         )
     reference = report.get("reference") or {}
     why = f"; no reference: {reference['refused']}" if reference.get("refused") else ""

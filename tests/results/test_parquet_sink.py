@@ -13,7 +13,7 @@ from written import as_written
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, concatenate, make_track
+from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, SHARE_COLUMNS, concatenate, make_track
 from pdhef_logtool.results.parquet_sink import EstimatesSink, list_estimators, read_metrics, read_track, write_metrics
 
 ESTIMATE_COLUMNS = {
@@ -45,10 +45,11 @@ ESTIMATE_COLUMNS = {
     "steer_bias_rad": pl.Float64,
     "ay_bias_m_s2": pl.Float64,
     "yaw_rate_bias_rad_s": pl.Float64,
+    **dict.fromkeys(("share_law", "share_kinematics", "share_gnss"), pl.Float64),
     "causal": pl.Boolean,
 }
 #: Those that none of these tracks has.
-OPTIONAL = {"mixture_weight", "reason", *ESTIMATED_COLUMNS}
+OPTIONAL = {"mixture_weight", "reason", *ESTIMATED_COLUMNS, *SHARE_COLUMNS}
 UNITS = {
     "stamp_ns": "ns",
     "estimator": "",
@@ -78,6 +79,7 @@ UNITS = {
     "steer_bias_rad": "rad",
     "ay_bias_m_s2": "m/s^2",
     "yaw_rate_bias_rad_s": "rad/s",
+    **dict.fromkeys(("share_law", "share_kinematics", "share_gnss"), "1"),
     "causal": "",
 }
 METRIC_COLUMNS = {

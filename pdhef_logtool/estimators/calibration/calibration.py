@@ -34,6 +34,9 @@ from pdhef_logtool.records.signals import FloatArray
 
 #: Standard deviation of a_y in ``physics`` on a calibrated car, m/s²: the model's error, not the sensor's noise.
 AY_STD = 1.0
+#: Process noise of ``physics`` on a calibrated car: PHYSICS_Q_STD with more for the axle forces, so that kinematics
+#: have more influence beyond the linear range, where the fitted tyres are least certain.
+Q_STD = (0.085, 0.12, 0.012, 0.086, 1.0, 1.0)
 #: Least driving above the low-speed limit; on line, growth of the driving from one calibration to the next, and the
 #: delay after which it applies, for gaps before its last sample may be interpolated.
 LEAST_S, ONLINE_GROWTH, ONLINE_DELAY_NS = 5.0, 1.5, 1_000_000_000
@@ -120,7 +123,7 @@ class SelfCalibration:
     @property
     def noise(self) -> FilterNoise:
         """The noise of ``physics`` that belongs to it."""
-        return FilterNoise(r_std={"ay_m_s2": max(AY_STD, self.vehicle_file.sensors.ay_std_m_s2)})
+        return FilterNoise(q_std=Q_STD, r_std={"ay_m_s2": max(AY_STD, self.vehicle_file.sensors.ay_std_m_s2)})
 
     @property
     def text(self) -> str:

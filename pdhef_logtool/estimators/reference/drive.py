@@ -361,9 +361,9 @@ def _speed(t: FloatArray, speed: FloatArray, knot_s: FloatArray) -> FloatArray:
 def _add_gnss(rows: FloatArray, signals: Signals, knot_s: FloatArray) -> None:
     """Put each new GNSS velocity at its nearest knot with its offset in time; the last one of several."""
     velocity = signals.gnss_velocity_m_s
-    if not len(velocity):
-        return
     good = np.flatnonzero(np.isfinite(velocity).all(axis=1))
+    if not good.size:
+        return
     new = np.ones(len(good), dtype=np.bool_)
     new[1:] = (velocity[good[1:]] != velocity[good[:-1]]).any(axis=1)
     good = good[new]

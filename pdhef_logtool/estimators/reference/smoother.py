@@ -248,6 +248,7 @@ def _cauchy(variance, residual, trusted):  # type: ignore[no-untyped-def]
     return variance * (1.0 + residual * residual / (variance * CAUCHY * CAUCHY)) if trusted else variance
 
 
+# positional: compiled code takes no keywords at no cost.
 @njit(cache=True)
 def _measure(x, p, point, row, rear_m, store, k, used, iteration):  # type: ignore[no-untyped-def]
     """Update with all measurements of a knot; ``point`` is where they are linearised."""
