@@ -7,7 +7,6 @@ used, and the car has a note of it.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -21,7 +20,6 @@ from pdhef_logtool.car.parts import (
     Fit,
     FittedPhysics,
     FittedValues,
-    HistoryLine,
     Intervals,
     LearntOn,
     Noise,
@@ -41,7 +39,7 @@ from pdhef_logtool.residual_model.bundle import (
     ModelBundle,
     load_bundle,
 )
-from pdhef_logtool.storage.documents import read_json, read_text, read_toml, validated
+from pdhef_logtool.storage.documents import read_json, read_toml, validated
 
 VEHICLE_FILE, FIT_FILE, NOISE_FILE, NETWORK_FILE = "vehicle.toml", "fit.toml", "noise.toml", "network.toml"
 INTERVALS_FILE, UNSURE_FILE, HISTORY_FILE = "intervals.json", "intervals-unsure.json", "history.jsonl"
@@ -391,18 +389,3 @@ def load_intervals(path: Path) -> Intervals:
     return validated(
         Intervals, raw, str(file), VehicleError, expected="the entries of a file of pdhef learn --stages intervals"
     )
-
-
-def read_history(folder: Path) -> list[dict[str, Any]]:
-    """Return the lines of a car's history, oldest first; none without. Raises VehicleError for a damaged one."""
-    path = folder / HISTORY_FILE
-    if not path.is_file():
-        return []
-    expected = "lines that commands wrote"
-    try:
-        lines = [json.loads(line) for line in read_text(path).splitlines() if line.strip()]
-    except (OSError, ValueError, RecursionError) as error:
-        raise VehicleError(expected=expected, got=str(error), where=str(path)) from None
-    for number, line in enumerate(lines, start=1):
-        validated(HistoryLine, line, f"{path}, line {number}", VehicleError, expected=expected)
-    return lines
