@@ -87,6 +87,10 @@ BIAS_WALK_STD = (0.004, 0.00008, 0.00002)
 #: Spread of the force scale (docs/method.md#adaptation).
 FORCE_SCALE_STD = 0.05
 
+#: Beyond this share of the grip an axle is not linear, and tyre models are least certain; the share is that of the last
+#: ``LIMIT_TIME_S``, s (docs/method.md#limit).
+LINEAR_SHARE, LIMIT_TIME_S = 0.36, 0.5
+
 #: The column of a block of points that contains the centre.
 _CENTRE = AY_BIAS
 #: How many places there are behind the first whole vector.
@@ -229,6 +233,16 @@ def _process_noise(q_std, ax_known, dt, layout, q):  # type: ignore[no-untyped-d
         q[FORCE_SCALE] += FORCE_SCALE_STD**2 * (1.0 - math.exp(-2.0 * dt / FORCE_SCALE_TIME_S))
     if layout.bank >= 0:
         q[BANK] += _BANK_STD**2 * (1.0 - math.exp(-2.0 * dt / BANK_TIME_S))
+
+
+@_compiled
+def _limit_factor(x, friction, dt, limit_gain, p, memory):  # type: ignore[no-untyped-def]
+    """Return the factor on the process noise of the axle forces: 1 in the linear range, more beyond it."""
+    most = friction * (p.front_D_n + p.rear_D_n) / p.mass_kg
+    used = abs(x[FRONT] + x[REAR]) / most
+    memory[base.M_GRIP] = max(used, memory[base.M_GRIP] * math.exp(-dt / LIMIT_TIME_S))
+    beyond = max(0.0, memory[base.M_GRIP] - LINEAR_SHARE)
+    return 1.0 + limit_gain * beyond * beyond
 
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
@@ -377,7 +391,7 @@ def _write_prediction(m, x, P, steer, rate_vy, places, p, predicted):  # type: i
 
 # positional: as _predict.
 @njit(cache=True)
-def _filter(window, tuning, layout, p, f, estimate, out, links):  # type: ignore[no-untyped-def]
+def _filter(window, tuning, limit_gain, layout, p, f, estimate, out, links):  # type: ignore[no-untyped-def]
     """Run over one window; ``estimate`` is moved in place. ``links`` are of length 0 where nobody asks for them."""
     dt, steer, ax, ay, yaw_rate, speed, friction, residual_rate, extra_r = window
     q_std, r_std, initial_std, standstill_std, _, _, scale, rules = tuning
@@ -397,6 +411,7 @@ def _filter(window, tuning, layout, p, f, estimate, out, links):  # type: ignore
     _, _, _, z_hat, S, _, nu, at_gate, given, use = base.make_work(base.MEASUREMENTS)
     index, root, w = np.empty(base.MEASUREMENTS, np.int64), np.empty_like(S), np.empty_like(nu)
     noise, constants = (q_std, aligned(ROOM), scale), _make_constants()
+    front_std, rear_std = q_std[FRONT], q_std[REAR]
     factored = False  # whether L is the factor of P
     for k in range(dt.shape[0]):
         sample = base.Sample(dt[k], steer[k], ax[k], ay[k], yaw_rate[k], speed[k], friction[k])
@@ -412,6 +427,9 @@ def _filter(window, tuning, layout, p, f, estimate, out, links):  # type: ignore
             if not factored:
                 wide_root(P, places, there, L)
             factored = False
+            if limit_gain > 0.0:
+                factor = _limit_factor(x, over.friction, now.dt, limit_gain, p, memory)
+                q_std[FRONT], q_std[REAR] = factor * front_std, factor * rear_std
             _draw(x, L, scale, constants, points)
             if linked:
                 _keep_before(points, x, P, places, before, out_cross[k])
@@ -511,6 +529,7 @@ class PhysicsFilter(base.LinkedFilter):
 
     vehicle: VehicleParameters
     q_std: tuple[float, ...] = PHYSICS_Q_STD
+    limit_gain: float = 0.0
     r_std: tuple[float, float, float] | None = None
     use_speed: bool = True
     slip_gate: bool = True
@@ -571,7 +590,7 @@ class PhysicsFilter(base.LinkedFilter):
         out: base.Posterior,
         links: base.LinkColumns,
     ) -> None:
-        _filter(window, tuning, *self.parameters, estimate, out, links)
+        _filter(window, tuning, self.limit_gain, *self.parameters, estimate, out, links)
 
     def _predict_kernel(
         self, pending: base.PendingPredictions, start: base.PredictionStart, predicted: base.Predicted
