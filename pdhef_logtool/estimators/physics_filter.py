@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pdhef_logtool.car.nominal_model import ModelParameters, dynamic_share, model_parameters
-from pdhef_logtool.car.parts import PHYSICS, FilterNoise
+from pdhef_logtool.car.parts import LIMIT_GAIN, PHYSICS, FilterNoise
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, corrected_anew
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.compiled.vectors import (
@@ -87,8 +87,8 @@ BIAS_WALK_STD = (0.004, 0.00008, 0.00002)
 #: Spread of the force scale (docs/method.md#adaptation).
 FORCE_SCALE_STD = 0.05
 
-#: Beyond this share of the grip an axle is not linear, and tyre models are least certain; the share is that of the last
-#: ``LIMIT_TIME_S``, s (docs/method.md#limit).
+#: Beyond this share of the grip, the largest of about the last ``LIMIT_TIME_S``, tyre models are least certain
+#: (docs/method.md#limit).
 LINEAR_SHARE, LIMIT_TIME_S = 0.36, 0.5
 
 #: The column of a block of points that contains the centre.
@@ -516,6 +516,7 @@ class PhysicsFilter(base.LinkedFilter):
     vehicle : parameters; ``physics`` states which parts it has, ``sensors`` gives R unless ``r_std`` does, and the
         priors of the biases.
     q_std : process 1-sigma per √s of [v_x, v_y, r, b_ax, f_f, f_r], forces over mass in m/s².
+    limit_gain : growth of the process noise of the axle forces beyond the linear range; 0: none.
     r_std : 1-sigma of [a_y, r, v_x].
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
     slip_gate : leave out the speed of wheels that spin or lock (:mod:`~.speed_slip`).
@@ -525,7 +526,7 @@ class PhysicsFilter(base.LinkedFilter):
 
     algorithm = "physics-filter"
     version = 1
-    options = ("slip_gate", "standstill")
+    options = ("slip_gate", "standstill", "limit_gain")
 
     vehicle: VehicleParameters
     q_std: tuple[float, ...] = PHYSICS_Q_STD
@@ -605,12 +606,16 @@ class PhysicsFilter(base.LinkedFilter):
 def physics_filter(
     vehicle: VehicleParameters, noise: FilterNoise | None = None, *, use_speed: bool = True
 ) -> PhysicsFilter:
-    """Return the filter with a noise; what that leaves out is :data:`PHYSICS_Q_STD` and the sensors' noise."""
+    """Return the filter with a noise; what that leaves out is :data:`PHYSICS_Q_STD` and the sensors' noise.
+
+    A car without any has :data:`LIMIT_GAIN`.
+    """
     if noise is None:
-        return PhysicsFilter(vehicle, use_speed=use_speed)
+        return PhysicsFilter(vehicle, limit_gain=LIMIT_GAIN, use_speed=use_speed)
     return PhysicsFilter(
         vehicle,
         q_std=(*noise.q_std, *PHYSICS_Q_STD[len(noise.q_std) :]),
+        limit_gain=noise.limit_gain,
         r_std=noise.measurement_std(vehicle.sensors),
         use_speed=use_speed,
     )
