@@ -45,7 +45,11 @@ def compare(
     metric: Annotated[str | None, Option(help="Metric of sideslip over the whole drive. Default: rmse.")] = None,
     cluster: Annotated[
         str | None,
-        Option(metavar="KEY", help="Group of dependent drives for the bootstrap: car, day, or a metadata key."),
+        Option(
+            metavar="KEY",
+            help="Groups of dependent drives: car, day, route, a metadata key, or none. Default: the dependence by "
+            "day, car and route is estimated.",
+        ),
     ] = None,
     allow_unpaired: Annotated[
         bool, Option("--allow-unpaired", help="Accept drives that only one run contains.")

@@ -6,7 +6,7 @@ import math
 
 from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.results.changed_signals import ChangedSignal
-from pdhef_logtool.results.comparing import ComparedFigure, Comparison
+from pdhef_logtool.results.comparing import INDEPENDENT, ComparedFigure, Comparison
 from pdhef_logtool.results.paired_change import LEAST_CLUSTERS
 from pdhef_logtool.results.sink import TRUTH
 
@@ -39,16 +39,19 @@ def verdict_text(found: Comparison) -> str:
     if any(math.isfinite(d) for d in detectable):
         told += f"; a worsening of {percent(max(d for d in detectable if math.isfinite(d)))} would have shown"
     elif detectable:
-        told += f", as they are too few: at least {LEAST_CLUSTERS} drives (clusters) are needed"
+        told += (
+            f": too few independent drives (at least {LEAST_CLUSTERS} drives or clusters; a design effect reduces "
+            "their number)"
+        )
     return told
 
 
 def notes_of(found: Comparison) -> list[str]:
     """Return what must be known of the figures that were asked for, a line each."""
     notes = []
-    if found.cluster:
-        notes.append(f"in brackets: clusters by {found.cluster}, which are drawn whole")
     for one in found.figures:
+        if one.drives and not found.equal:
+            notes.append(f"{one.figure.label}: {dependence_text(one, found.cluster)}")
         notes += [f"{one.figure.label}: {note}" for note in one.notes]
         if one.neither and one.drives:
             notes.append(f"{one.figure.label}: {one.neither} drives have it on neither side")
@@ -58,6 +61,26 @@ def notes_of(found: Comparison) -> list[str]:
                 f"{one.figure.label}: the smallest worsening that so many drives show in 4 of 5 cases: {least}"
             )
     return notes
+
+
+def dependence_text(one: ComparedFigure, cluster: str | None) -> str:
+    """Return the design effect of the drives and what is known of its causes."""
+    of = one.change.dependence
+    if cluster == INDEPENDENT:
+        return "drives are taken as independent (--cluster none)"
+    if cluster is not None:
+        return f"design effect {of.design_effect:.2g} of {one.change.clusters} clusters by {cluster}"
+    groups = [f"{count} {name}s" for name, count in of.levels if count > 1]
+    if not groups:
+        return "independent drives assumed: days, cars and routes are not recorded, or are the same in all drives"
+    among = f"{one.change.drives} drives of {', '.join(groups)}"
+    if of.design_effect == 1.0:
+        return f"design effect 1 ({among}): no dependence found"
+    effective = one.change.drives / of.design_effect
+    return (
+        f"design effect {of.design_effect:.2g} by {' and '.join(of.by)}: {among} have the evidence of "
+        f"{effective:.0f} independent drives"
+    )
 
 
 def interval_text(one: ComparedFigure) -> str:
