@@ -35,7 +35,7 @@ class Dependence:
     Attributes
     ----------
     design_effect : variance of a mean relative to independent drives, at least 1.
-    freedom : degrees of freedom of the estimate; infinite where no dependence was found.
+    freedom : degrees of freedom of the estimate; infinite where no dependence is found.
     by : factors whose drives resemble one another, the strongest first.
     levels : number of different values of each factor that has two or more.
     """
@@ -68,13 +68,13 @@ def dependence(scores: FloatArray, factors: Factors) -> Dependence:
     if not np.any(x):
         return Dependence(levels=levels)
     single = {name: _excess(x, [part]) for name, part in parts.items()}
-    found = {name: excess for name, excess in single.items() if excess > 0.0}
-    if not found:
+    contributing = {name: excess for name, excess in single.items() if excess > 0.0}
+    if not contributing:
         return Dependence(levels=levels)
-    excess = max(*found.values(), _excess(x, list(parts.values())), 0.0)
+    excess = max(*contributing.values(), _excess(x, list(parts.values())), 0.0)
     total = 1.0 + excess
-    freedom = min(_freedom(parts[name]) for name in found) * total / excess
-    return Dependence(total, freedom, tuple(sorted(found, key=lambda name: (-found[name], name))), levels)
+    freedom = min(_freedom(parts[name]) for name in contributing) * total / excess
+    return Dependence(total, freedom, tuple(sorted(contributing, key=lambda name: (-contributing[name], name))), levels)
 
 
 def _excess(x: FloatArray, parts: Sequence[IntArray]) -> float:

@@ -98,20 +98,20 @@ def paired_change(
     lower, upper = float(ascending[(n - 1) // 2]), float(ascending[n // 2])
     median = lower if lower == upper else 0.5 * (lower + upper)
     above = (ratios > median).astype(np.float64) - (ratios < median)
-    found = dependence(above, {"cluster": clusters} if clusters is not None else factors or {})
-    votes = sign_p(ratios, found)
+    effect = dependence(above, {"cluster": clusters} if clusters is not None else factors or {})
+    votes = sign_p(ratios, effect)
     if groups < LEAST_CLUSTERS:
-        return PairedChange(n, groups, median, nan, nan, nan, nan, nan, votes, found)
-    (low, high), (least, most) = (_bounds(ascending, share, found) for share in (0.975, 0.95))
-    return PairedChange(n, groups, median, low, high, least, most, (most - least) / (2 * _BOUND_95), votes, found)
+        return PairedChange(n, groups, median, nan, nan, nan, nan, nan, votes, effect)
+    (low, high), (least, most) = (_bounds(ascending, share, effect) for share in (0.975, 0.95))
+    return PairedChange(n, groups, median, low, high, least, most, (most - least) / (2 * _BOUND_95), votes, effect)
 
 
-def _bounds(ascending: FloatArray, share: float, found: Dependence) -> tuple[float, float]:
+def _bounds(ascending: FloatArray, share: float, effect: Dependence) -> tuple[float, float]:
     """Return the one-sided bounds of the median at a probability: the sign test inverted, NaN where none exists."""
     n = len(ascending)
-    if n < _LEAST_EFFECTIVE * found.design_effect:
+    if n < _LEAST_EFFECTIVE * effect.design_effect:
         return math.nan, math.nan
-    place = 0.5 * (n - 1) - 0.5 * quantile(share, found.freedom) * math.sqrt(n * found.design_effect)
+    place = 0.5 * (n - 1) - 0.5 * quantile(share, effect.freedom) * math.sqrt(n * effect.design_effect)
     return _at(ascending, max(place, 0.0)), -_at(-ascending[::-1], max(place, 0.0))
 
 
@@ -139,17 +139,17 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return corrected
 
 
-def sign_p(ratios: FloatArray, found: Dependence | None = None) -> float:
+def sign_p(ratios: FloatArray, effect: Dependence | None = None) -> float:
     """Return the two-sided p-value of the sign test, which ignores ratios of 0; with a design effect by Student's t."""
     up, down = int(np.count_nonzero(ratios > 0)), int(np.count_nonzero(ratios < 0))
     n = up + down
     if n == 0:
         return 1.0
-    if found is not None and found.design_effect > 1.0:
+    if effect is not None and effect.design_effect > 1.0:
         from scipy.special import stdtr
 
-        excess = max(abs(up - down) - 1.0, 0.0) / math.sqrt(n * found.design_effect)
-        return min(1.0, 2.0 * float(stdtr(found.freedom, -excess)))
+        excess = max(abs(up - down) - 1.0, 0.0) / math.sqrt(n * effect.design_effect)
+        return min(1.0, 2.0 * float(stdtr(effect.freedom, -excess)))
     log_half = n * math.log(2.0)
     tail = sum(
         math.exp(math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1) - log_half)
