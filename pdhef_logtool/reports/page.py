@@ -75,6 +75,7 @@ def _environment() -> Environment:
         "number": number,
         "degrees": degrees,
         "percent": percent,
+        "change": change,
         "stamp": stamp,
         "seconds": seconds,
         "unit": unit,
@@ -145,6 +146,11 @@ def degrees(value_rad: float | None) -> str:
 def percent(share: float | None) -> str:
     """Return a share in percent."""
     return DASH if share is None or not math.isfinite(share) else f"{share:.1%}"
+
+
+def change(share: float | None) -> str:
+    """Return a relative change in percent with its sign."""
+    return DASH if share is None or not math.isfinite(share) else f"{share:+.1%}"
 
 
 def seconds(value_s: float | None) -> str:

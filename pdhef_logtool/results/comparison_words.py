@@ -7,6 +7,7 @@ import math
 from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.results.changed_signals import ChangedSignal
 from pdhef_logtool.results.comparing import INDEPENDENT, ComparedFigure, Comparison
+from pdhef_logtool.results.dependence import Dependence
 from pdhef_logtool.results.paired_change import LEAST_CLUSTERS
 from pdhef_logtool.results.sink import TRUTH
 
@@ -67,19 +68,24 @@ def dependence_text(one: ComparedFigure, cluster: str | None) -> str:
     """Return the design effect of the drives and what is known of its causes."""
     of = one.change.dependence
     if cluster == INDEPENDENT:
-        return "drives are taken as independent (--cluster none)"
+        return "Drives are taken as independent (--cluster none)."
     if cluster is not None:
-        return f"design effect {of.design_effect:.2g} of {one.change.clusters} clusters by {cluster}"
+        return f"Design effect {of.design_effect:.2g} of {one.change.clusters} clusters by {cluster}."
+    return design_effect_text(of, one.change.drives)
+
+
+def design_effect_text(of: Dependence, drives: int) -> str:
+    """Return a sentence on the dependence of drives of one day, car or route."""
     groups = [f"{count} {name}s" for name, count in of.levels if count > 1]
     if not groups:
-        return "independent drives assumed: days, cars and routes are not recorded, or are the same in all drives"
-    among = f"{one.change.drives} drives of {', '.join(groups)}"
+        return "Drives are taken as independent: days, cars and routes are the same in all drives, or not recorded."
+    among = f"{drives} drives of {', '.join(groups)}"
     if of.design_effect == 1.0:
-        return f"design effect 1 ({among}): no dependence found"
-    effective = one.change.drives / of.design_effect
+        return f"Design effect 1: no dependence between {among}."
+    effective = drives / of.design_effect
     return (
-        f"design effect {of.design_effect:.2g} by {' and '.join(of.by)}: {among} have the evidence of "
-        f"{effective:.0f} independent drives"
+        f"Design effect {of.design_effect:.2g} by {' and '.join(of.by)}: {among} have the evidence of "
+        f"{effective:.0f} independent drives."
     )
 
 
