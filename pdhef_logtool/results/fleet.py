@@ -458,7 +458,11 @@ def cause_and_remedy(reason: str) -> tuple[str, str]:
     if not got or "expected " not in expected:
         return reason, ""
     cause, _, remedy = rest.rpartition("; ") if "; " in rest else (rest, "", "")
-    return f"{cause[:1].upper()}{cause[1:]} (expected: {expected.rpartition('expected ')[2]}).", remedy
+    return f"{_sentence(cause)} (expected: {expected.rpartition('expected ')[2]}).", _sentence(remedy)
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def grouped(found: Sequence[tuple[str, str]]) -> tuple[Failures, ...]:

@@ -241,7 +241,7 @@ def test_a_failure_is_read_as_cause_and_remedy() -> None:
     cut = "a.mcap: expected sensors, got a damaged log: it ends at byte 3. /imu has no messages; copy it again"
     assert cause_and_remedy(cut) == (
         "A damaged log: it ends at byte 3. /imu has no messages (expected: sensors).",
-        "copy it again",
+        "Copy it again",
     )
     assert cause_and_remedy("expected a log, got 3 bytes") == ("3 bytes (expected: a log).", "")
     assert cause_and_remedy("the worker was killed; 2 tries") == ("the worker was killed; 2 tries", "")
