@@ -21,6 +21,7 @@ from pdhef_logtool.cli import (
     panels,
     reporting,
     running,
+    serving,
     simulating,
     stopping,
 )
@@ -49,7 +50,7 @@ app = typer.Typer(
     epilog="Exit codes: 0 ok, 1 failure, 2 usage, 3 finished but some input was lost, a check or some logs failed, "
     "4 a threshold or regression gate failed, 130 interrupted (Ctrl-C), 141 stdout was closed early, 143 terminated.",
 )
-for _group in (inspecting, running, reporting, comparing, simulating, learning, compiling):
+for _group in (inspecting, running, reporting, comparing, serving, simulating, learning, compiling):
     app.registered_commands += _group.commands.registered_commands
 
 
