@@ -134,16 +134,18 @@ class Library:
     def same_drive(self, log: OpenedLog) -> dict[str, OpenedLog]:
         """Return the drive in each run: by the content of its signals, else by its name."""
         digest = log.entry.get("signals_sha256")
-        found = {}
+        by_run = {}
         for name, logs in self.logs.items():
-            same = (other for other in logs.values() if digest and other.entry.get("signals_sha256") == digest)
-            if (one := logs.get(log.label) or next(same, None)) is not None:
-                found[name] = one
-        return found
+            match = logs.get(log.label)
+            if digest and (match is None or match.entry.get("signals_sha256") != digest):
+                match = next((other for other in logs.values() if other.entry.get("signals_sha256") == digest), match)
+            if match is not None:
+                by_run[name] = match
+        return by_run
 
 
 def _names(runs: Sequence[OpenedRun]) -> list[str]:
-    """Return the last part of each run's place, with a number where several are equal."""
+    """Return the name of each run's folder, with a number where several are equal."""
     names: list[str] = []
     for run in runs:
         name = Path(run.place).name or "run"
@@ -289,7 +291,7 @@ def _drive(library: Library, log: OpenedLog, signal: str, chosen: Sequence[str])
     """Return the page of one drive: a signal of any tracks of any run, in one figure."""
     signal = signal if signal in SCORED_SIGNALS else "sideslip_rad"
     logs = library.same_drive(log)
-    files = {name: path for name, one in logs.items() if (path := one.file(ESTIMATES_FILE)) is not None}
+    files = {name: path for name, match in logs.items() if (path := match.file(ESTIMATES_FILE)) is not None}
     offered = [(name, track) for name, path in files.items() for track in list_estimators(path)]
     truth = [place for place in offered if place[1] == TRUTH][:1]
     usual = [*truth, *((name, track) for name, track in offered if track == logs[name].main())]
@@ -297,7 +299,7 @@ def _drive(library: Library, log: OpenedLog, signal: str, chosen: Sequence[str])
     charts = Charts()
     if wanted:
         _add_tracks(charts, signal, [(name, track, files[name]) for name, track in wanted[:_MOST_TRACKS]])
-    rows = library.table.filter(library.table["drive"].is_in([one.label for one in logs.values()]))
+    rows = library.table.filter(library.table["drive"].is_in([match.label for match in logs.values()]))
     return _page(
         "served_drive.html",
         charts,
@@ -312,9 +314,9 @@ def _drive(library: Library, log: OpenedLog, signal: str, chosen: Sequence[str])
         rows=[_row(row) for row in rows.iter_rows(named=True) if logs.get(row["run"], log).label == row["drive"]],
         heads=[*TEXTS, *map(_head, FIGURES)],
         reports=[
-            (name, f"/run/{quote(name, safe='')}/logs/{quote(one.label, safe='')}/report.html")
-            for name, one in logs.items()
-            if one.file(PAGE_FILE) is not None
+            (name, f"/run/{quote(name, safe='')}/logs/{quote(match.label, safe='')}/report.html")
+            for name, match in logs.items()
+            if match.file(PAGE_FILE) is not None
         ],
     )
 

@@ -113,8 +113,8 @@ class _Test:
 
 def breakdowns(drives: Sequence[BreakdownDrive], by: Sequence[str] = ()) -> tuple[Breakdown, ...]:
     """Return the drives by each key that separates them, the strongest evidence first; ``by`` names keys, in order."""
-    known = dict.fromkeys(key for d in drives for key in d.keys)
-    values = {key: _values(key, drives) for key in by or known}
+    all_keys = dict.fromkeys(key for d in drives for key in d.keys)
+    values = {key: _values(key, drives) for key in by or all_keys}
     if not by:
         counts = {key: len({v for v in of if v is not None}) for key, of in values.items()}
         values = {key: of for key, of in values.items() if 2 <= counts[key] <= min(MOST_VALUES, len(drives) - 1)}
@@ -231,9 +231,9 @@ def _values(key: str, drives: Sequence[BreakdownDrive]) -> list[str | None]:
     finite = np.array([x for x in numbers if math.isfinite(x)])
     if len(finite) == sum(counts.values()):
         edges = np.unique(np.quantile(finite, np.linspace(0.0, 1.0, _QUARTERS + 1)))
-        at = np.clip(np.searchsorted(edges, numbers, side="right") - 1, 0, max(len(edges) - 2, 0))
+        quarter = np.clip(np.searchsorted(edges, numbers, side="right") - 1, 0, max(len(edges) - 2, 0))
         names = [f"{a:.4g} to {b:.4g}" for a, b in pairwise(edges)] or [f"{edges[0]:.4g}"]
-        return [names[i] if math.isfinite(x) else None for i, x in zip(at, numbers, strict=True)]
+        return [names[i] if math.isfinite(x) else None for i, x in zip(quarter, numbers, strict=True)]
     common = {value for value, _ in counts.most_common(MOST_VALUES)}
     rest = f"{len(counts) - MOST_VALUES} others"
     return [t if t is None or t in common else rest for t in texts]

@@ -57,7 +57,7 @@ class FleetDrive:
     seconds : length. main : the selected estimate's estimator, empty without one.
     truth : whether its sideslip is scored against an independent ground truth. unscored : why not, else empty.
     errors : RMSE by estimator and signal, where the ground truth is independent of both.
-    nis, d2, naive_d2 : what needs no truth: NIS over its degrees of freedom and d2 of the answer, d2 of sideslip 0.
+    nis, d2, naive_d2 : without ground truth: NIS and v̇_y residual of the selected estimate, v̇_y residual of sideslip 0.
     verdict : of sideslip: ``better``, ``worse`` and so on. coverage : of the 95 % confidence interval.
     failed_checks : those that count. lost : what could not be used, empty for nothing. keys : what it can be given by.
     factors : day, car and route, None where not stated.
@@ -298,10 +298,10 @@ def _figures(run: OpenedRun) -> dict[str, dict[tuple[str, str, str], float]]:
         )
         .select("log", "estimator", "signal", "metric", "value")
     )
-    found: dict[str, dict[tuple[str, str, str], float]] = {}
+    values: dict[str, dict[tuple[str, str, str], float]] = {}
     for log, estimator, signal, metric, value in rows.collect().iter_rows():
-        found.setdefault(log, {})[estimator, signal, metric] = math.nan if value is None else value
-    return found
+        values.setdefault(log, {})[estimator, signal, metric] = math.nan if value is None else value
+    return values
 
 
 def _drive(log: OpenedLog, report: Mapping[str, Any], figures: Mapping[tuple[str, str, str], float]) -> FleetDrive:
@@ -349,7 +349,7 @@ def _keys(log: OpenedLog, report: Mapping[str, Any], main: str) -> dict[str, str
     friction = report.get("friction") or {}
     car = log.entry.get("car") or {}
     source = str(friction.get("source", ""))
-    own = {
+    from_log = {
         "car": car.get("name") or report["vehicle"]["name"],
         "log format": report["log"]["kind"],
         "answer": main,
@@ -359,9 +359,9 @@ def _keys(log: OpenedLog, report: Mapping[str, Any], main: str) -> dict[str, str
         "month": (factors_of(log.entry, report)["day"] or "")[:7],
     }
     parts = str(log.entry.get("folder") or "").split("/")[:_MOST_FOLDERS]
-    own |= {"folder" if i == 0 else f"folder {i + 1}": "/".join(parts[: i + 1]) for i in range(len(parts))}
-    told = {str(k): str(v) for k, v in (report.get("metadata") or {}).items()}
-    return {**told, **{k: v for k, v in own.items() if v}}
+    from_log |= {"folder" if i == 0 else f"folder {i + 1}": "/".join(parts[: i + 1]) for i in range(len(parts))}
+    from_metadata = {str(k): str(v) for k, v in (report.get("metadata") or {}).items()}
+    return {**from_metadata, **{k: v for k, v in from_log.items() if v}}
 
 
 def _length(seconds: float) -> str:
@@ -465,10 +465,10 @@ def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def grouped(found: Sequence[tuple[str, str]]) -> tuple[Failures, ...]:
-    """Return reasons with their logs, the most frequent first; numbers and places do not tell reasons apart."""
+def grouped(failures: Sequence[tuple[str, str]]) -> tuple[Failures, ...]:
+    """Return reasons with their logs, the most frequent first; numbers and places do not distinguish reasons."""
     members: dict[str, tuple[str, dict[str, None]]] = {}
-    for label, reason in found:
+    for label, reason in failures:
         text = _without_place(reason)
         members.setdefault(_NUMBER.sub("", text), (text, {}))[1][label] = None
     groups = [Failures(text, len(labels), tuple(labels)[:NAMED]) for text, labels in members.values()]
