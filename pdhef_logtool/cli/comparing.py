@@ -13,7 +13,7 @@ from pdhef_logtool.cli import console, options, panels
 from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
-    from pdhef_logtool.results.gate import Gate
+    from pdhef_logtool.results.gate import Figure, Gate
 
 commands = typer.Typer()
 #: Room around events: a threshold that is crossed to and fro is one event; a clip shows how it came about.
@@ -87,7 +87,7 @@ def _gate(
     file: Path | None, max_regression: str | None, estimator: str | None, metric: str | None, *, allow_unpaired: bool
 ) -> Gate:
     """Return the figures that the options ask for; raises UsageError."""
-    from pdhef_logtool.results.gate import MAIN, Figure, Gate, figure_problems, load_gate, share_of
+    from pdhef_logtool.results.gate import Gate, load_gate
 
     single = {"--max-regression": max_regression, "--estimator": estimator, "--metric": metric}
     given = [name for name, value in single.items() if value is not None]
@@ -98,13 +98,20 @@ def _gate(
             )
         gate = load_gate(file)
         return Gate(gate.figures, gate.allow_unpaired or allow_unpaired)
+    return Gate((figure_asked(max_regression, estimator, metric),), allow_unpaired)
+
+
+def figure_asked(max_regression: str | None, estimator: str | None, metric: str | None) -> Figure:
+    """Return the figure that options ask for; raises UsageError."""
+    from pdhef_logtool.results.gate import MAIN, Figure, figure_problems, share_of
+
     limit = None if max_regression is None else share_of(max_regression)
     if max_regression is not None and limit is None:
         raise UsageError(expected="a share such as 5% or 0.05", got=max_regression, where="--max-regression")
     figure = Figure(metric=metric or "rmse", estimator=estimator or MAIN, limit=limit)
     if problems := figure_problems(figure.signal, figure.metric, figure.segment):
         raise UsageError(expected="a figure; lower is better", got="; ".join(problems), where="--metric")
-    return Gate((figure,), allow_unpaired)
+    return figure
 
 
 @options.command(
