@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.padding import Padding
 from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options, panels
@@ -71,6 +70,8 @@ def trend(
 
 
 def _render(result: Trend, out: Console) -> None:
+    from rich.padding import Padding
+
     from pdhef_logtool.results.comparison_words import change_text
     from pdhef_logtool.results.trend import mark, shown_median
 
