@@ -30,7 +30,7 @@ from pdhef_logtool.mapping import (
     merge_losses,
 )
 from pdhef_logtool.records.checks import Check
-from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.errors import EstimatorError, MappingError, PdhefError, UsageError
 from pdhef_logtool.records.ledger import SampleCount, damage
 from pdhef_logtool.records.signals import Loss, Signals, join_signals
 from pdhef_logtool.records.steps import MAX_PREDICTION_S
@@ -346,7 +346,9 @@ def read_drive(
         friction = friction_of(plan, car.vehicle, options)
         if friction.note:
             remarks.append(friction.note)
-    except BaseException:
+    except BaseException as error:
+        if isinstance(error, MappingError | EstimatorError):
+            name_damage(error, opened.lost)
         opened.close()
         raise
     return Drive(log_input.stem, opened, car, options, plan, chosen, notes, friction, tell, remarks)
@@ -394,6 +396,16 @@ def one_log(argument: LogPlace | str, options: ReadOptions = _AS_IT_IS) -> LogIn
 def lost_texts(losses: Iterable[Loss]) -> tuple[str, ...]:
     """Return what of the input is gone, in words."""
     return tuple(f"{x.what} ({x.where})" for x in losses if x.severity == "lost")
+
+
+def name_damage(error: PdhefError, losses: Iterable[Loss]) -> None:
+    """Add the damage of a log to an error, as its probable cause: a file that is cut contains no mapped fields."""
+    lost = [x for x in losses if x.severity == "lost"]
+    if not lost:
+        return
+    error.got = f"a damaged log: {'; '.join(x.what for x in lost[:2])}. {error.got[:1].upper()}{error.got[1:]}"
+    if any(x.kind == "truncated" for x in lost):
+        error.remedy = f"the file is cut: copy the recording again. If it is complete, {error.remedy or 'report it'}"
 
 
 def no_samples(path: LogPlace) -> EstimatorError:
