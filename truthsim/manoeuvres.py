@@ -405,7 +405,9 @@ def _steady_circle(request: Request) -> Plan:
     """ISO 4138: a circle of constant radius at constant speed, driven closed loop."""
     a_y = request.scale * 0.5 * request.friction * GRAVITY_M_S2
     x = np.arange(int((request.speed_m_s * request.duration_s + 50.0) / PATH_STEP_M)) * PATH_STEP_M
-    curvature = a_y / request.speed_m_s**2 * np.clip((x / request.speed_m_s - _CIRCLE_STRAIGHT_S) / _CIRCLE_EASE_S, 0, 1)
+    curvature = (
+        a_y / request.speed_m_s**2 * np.clip((x / request.speed_m_s - _CIRCLE_STRAIGHT_S) / _CIRCLE_EASE_S, 0, 1)
+    )
     course = integrate_course(curvature, PATH_STEP_M)
     path = np.concatenate([course, np.full((x.size, 1), request.speed_m_s)], axis=1)
     return Plan(

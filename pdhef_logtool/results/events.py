@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdhef_logtool.evaluation.segments import RUN_GAP_S
+from pdhef_logtool.evaluation.smoothing import RUN_GAP_S
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.results.expression import ERRORS, FLAGS, OPERATIONS, SPEED, Column, Condition, Node, Number

@@ -18,7 +18,7 @@ from pdhef_logtool.drive.truth import (
     truth_at,
     yaw_rate_channel,
 )
-from pdhef_logtool.evaluation.segments import smooth
+from pdhef_logtool.evaluation.smoothing import smooth
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import fit_clocks, load_mapping, read_signals
 
