@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.evaluation.blocks import blocks_with_halo, row_blocks
+from pdhef_logtool.evaluation.blocks import blocks_with_halo
 from pdhef_logtool.evaluation.smoothing import RUN_GAP_S, last_known, runs, smooth
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 
@@ -122,7 +122,7 @@ class ManoeuvreRules:
     turn_m_s2: float = 1.2
     turn_s: float = 1.5
     turn_speed: float = 0.05
-    brake_m_s2: float = 1.5
+    brake_m_s2: float = 1.7
     gentle_brake_m_s2: float = 0.65
     brake_share: float = 0.48
     power_off_m_s2: float = 0.28
@@ -168,9 +168,9 @@ def find_manoeuvres(signals: Signals, vehicle: VehicleParameters, rules: Manoeuv
         part = signals.rows(first, end)
         from_ns, to_ns = int(part.stamps_ns[a - first]), int(part.stamps_ns[b - 1 - first])
         for run in _runs_of(part, wheelbase_m, zeros, rules):
-            for one in _manoeuvres_of(run, rules):
-                if one.end_ns > from_ns and one.start_ns <= to_ns:
-                    _join(by_name.setdefault(one.name, []), one)
+            for driven in _manoeuvres_of(run, rules):
+                if driven.end_ns > from_ns and driven.start_ns <= to_ns:
+                    _join(by_name.setdefault(driven.name, []), driven)
     return sorted((m for ones in by_name.values() for m in ones), key=lambda m: m.start_ns)
 
 
@@ -230,7 +230,7 @@ class _Swing:
 
     start: int
     end: int
-    at: int
+    row: int
     sign: int
     peak: float
     half_s: float
@@ -258,18 +258,19 @@ def _zeros(signals: Signals, wheelbase_m: float, rules: ManoeuvreRules) -> tuple
     Of the steering the median of what turning does not explain; of the gyro the median with the wheels straight.
     """
     parts = []
-    for a, b in row_blocks(len(signals)):
+    for first, a, b, _ in blocks_with_halo(signals, RUN_GAP_S, 0):
+        speed = _speed(signals.rows(first, b))[a - first :]
         part = signals.rows(a, b)
-        speed, rate = _speed(part), part.yaw_rate_rad_s
+        rate = part.yaw_rate_rad_s
         straight = (np.abs(rate * speed) < rules.straight_m_s2) & (speed > rules.least_speed_m_s)
-        rows = np.flatnonzero(straight)[::_ZERO_EVERY]
+        rows = np.flatnonzero(straight & (np.arange(a, b) % _ZERO_EVERY == 0))
         gain = _gain(speed[rows], wheelbase_m, rules)
         parts.append(
             np.stack([part.steer_rad[rows] - rate[rows] * speed[rows] / gain, part.steer_rad[rows], rate[rows]])
         )
     left, steer, rates = np.concatenate(parts, axis=1)
-    known = left[np.isfinite(left)]
-    zero = float(np.median(known)) if known.size else 0.0
+    finite = left[np.isfinite(left)]
+    zero = float(np.median(finite)) if finite.size else 0.0
     ahead = rates[np.abs(steer - zero) < rules.wheels_straight_rad]
     return zero, float(np.median(ahead)) if ahead.size else 0.0
 
@@ -279,12 +280,12 @@ def _runs_of(signals: Signals, wheelbase_m: float, zeros: tuple[float, float], r
     stamps = signals.stamps_ns
     speed, yaw_rate = _speed(signals), signals.yaw_rate_rad_s - zeros[1]
     steer = signals.steer_rad - zeros[0]
-    if not np.isfinite(steer).any():  # the path's curvature stands for the steering
+    if not np.isfinite(steer).any():  # curvature of the path instead
         with np.errstate(divide="ignore", invalid="ignore"):
             steer = yaw_rate * speed / _gain(speed, wheelbase_m, rules)
-    known = np.isfinite(speed) & np.isfinite(yaw_rate) & np.isfinite(steer) & (speed > rules.least_speed_m_s)
-    for a, b in runs(stamps, _bridged(stamps, known)):
-        rows = np.flatnonzero(known[a:b]) + a
+    finite = np.isfinite(speed) & np.isfinite(yaw_rate) & np.isfinite(steer) & (speed > rules.least_speed_m_s)
+    for a, b in runs(stamps, _bridged(stamps, finite)):
+        rows = np.flatnonzero(finite[a:b]) + a
         start = -(-int(stamps[rows[0]]) // _STEP_NS)
         count = int(stamps[rows[-1]]) // _STEP_NS - start + 1
         if count * _STEP_S < 1.0:
@@ -303,13 +304,13 @@ def _on_grid(
     """Return the run whose speed, steering and yaw rate (``columns`` [N]) are known at ``rows``; ``span`` in steps."""
     grid = (span[0] + np.arange(span[1], dtype=np.int64)) * _STEP_NS
     zero_ns = int(signals.stamps_ns[rows[0]])
-    at, to = (signals.stamps_ns[rows] - zero_ns) * 1e-9, (grid - zero_ns) * 1e-9
+    times, to = (signals.stamps_ns[rows] - zero_ns) * 1e-9, (grid - zero_ns) * 1e-9
 
     def smoothed(values: FloatArray, cutoff_hz: float) -> FloatArray:
-        known = np.isfinite(values[rows])
-        if not known.any():
+        finite = np.isfinite(values[rows])
+        if not finite.any():
             return np.zeros(len(to))
-        return smooth(grid, np.interp(to, at[known], values[rows][known]), cutoff_hz, _STEP_NS)
+        return smooth(grid, np.interp(to, times[finite], values[rows][finite]), cutoff_hz, _STEP_NS)
 
     speed, steer, rate = columns
     v, r = smoothed(speed, 2.0), smoothed(rate, 3.0)
@@ -326,10 +327,10 @@ def _on_grid(
     )
 
 
-def _bridged(stamps_ns: IntArray, known: BoolArray) -> BoolArray:
+def _bridged(stamps_ns: IntArray, finite: BoolArray) -> BoolArray:
     """Fill holes that are shorter than the gap which ends a run."""
-    rows = np.flatnonzero(known)
-    filled = known.copy()
+    rows = np.flatnonzero(finite)
+    filled = finite.copy()
     for i in np.flatnonzero(np.diff(rows) > 1):
         if stamps_ns[rows[i + 1]] - stamps_ns[rows[i]] <= RUN_GAP_S * 1e9:
             filled[rows[i] : rows[i + 1]] = True
@@ -339,19 +340,19 @@ def _bridged(stamps_ns: IntArray, known: BoolArray) -> BoolArray:
 def _manoeuvres_of(run: _Run, rules: ManoeuvreRules) -> list[Manoeuvre]:
     """Return the manoeuvres of a run; where two overlap, the earlier rule of this list is right."""
     swings = _swings(run, rules)
-    found: list[tuple[str, int, int]] = []
+    spans: list[tuple[str, int, int]] = []
     taken = np.zeros(len(run), dtype=np.bool_)
     for rule in (_long_repeated, _lane_changes, _repeated, _two_swings, _slowing, _steps, _ramps):
         for name, start, end in rule(run, swings, rules):
             a, b = max(start, 0), min(end, len(run))
             if b - a > 1 and not taken[a:b].any():
                 taken[a:b] = True
-                found.append((name, a, b))
+                spans.append((name, a, b))
     for name, start, end in _circles(run, rules):
         free = ~taken[start:end]
         if free.all():
-            found.append((name, start, end))
-    return [_measured(run, *one) for one in sorted(found, key=lambda f: f[1])]
+            spans.append((name, start, end))
+    return [_measured(run, *span) for span in sorted(spans, key=lambda f: f[1])]
 
 
 def _measured(run: _Run, name: str, a: int, b: int) -> Manoeuvre:
@@ -381,11 +382,11 @@ def _swings(run: _Run, rules: ManoeuvreRules) -> list[_Swing]:
     for sign in (1, -1):
         side = sign * demand
         for a, b in runs(stamps, side > rules.swing_m_s2):
-            at = a + int(np.argmax(side[a:b]))
-            if side[at] >= rules.least_peak_m_s2:
-                half = side[a:b] >= 0.5 * side[at]
+            row = a + int(np.argmax(side[a:b]))
+            if side[row] >= rules.least_peak_m_s2:
+                half = side[a:b] >= 0.5 * side[row]
                 first, last = int(np.argmax(half)), len(half) - int(np.argmax(half[::-1]))
-                swings.append(_Swing(a, b, at, sign, float(side[at]), (last - first) * _STEP_S))
+                swings.append(_Swing(a, b, row, sign, float(side[row]), (last - first) * _STEP_S))
     return sorted(swings, key=lambda s: s.start)
 
 
@@ -491,40 +492,40 @@ def _side_lane_m(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> 
     return float(speed[offset > 0.5 * peak].sum()) * _STEP_S if is_one else 0.0
 
 
-def _straight_before(run: _Run, at: int, rules: ManoeuvreRules) -> bool:
+def _straight_before(run: _Run, row: int, rules: ManoeuvreRules) -> bool:
     """Return whether the car ran straight before a row, which at the run's start is taken for granted."""
-    before = run.turn[max(at - round(rules.straight_s / _STEP_S), 0) : max(at, 1)]
+    before = run.turn[max(row - round(rules.straight_s / _STEP_S), 0) : max(row, 1)]
     return bool(np.mean(np.abs(before)) < rules.straight_m_s2)
 
 
 def _two_swings(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
     """Sine steer, sine with dwell and fishhook: from straight ahead, two swings to opposite sides, equally high."""
-    for one, two in pairwise(swings):
-        close = (two.start - one.end) * _STEP_S <= 0.5 * rules.swing_gap_s
-        low, high = sorted((one.peak, two.peak))
-        if not close or one.sign == two.sign or low < rules.equal_peaks * high or high < rules.strong_m_s2:
+    for first, second in pairwise(swings):
+        close = (second.start - first.end) * _STEP_S <= 0.5 * rules.swing_gap_s
+        low, high = sorted((first.peak, second.peak))
+        if not close or first.sign == second.sign or low < rules.equal_peaks * high or high < rules.strong_m_s2:
             continue
-        if not _straight_before(run, one.start, rules):
+        if not _straight_before(run, first.start, rules):
             continue
-        longer_s, period_s = two.half_s - one.half_s, 3.0 * one.half_s
-        if one.half_s <= rules.fishhook_first_s and two.half_s >= max(rules.fishhook_s, 2.0 * one.half_s):
-            yield "fishhook", one.start, two.end
+        longer_s, period_s = second.half_s - first.half_s, 3.0 * first.half_s
+        if first.half_s <= rules.fishhook_first_s and second.half_s >= max(rules.fishhook_s, 2.0 * first.half_s):
+            yield "fishhook", first.start, second.end
         elif not rules.sine_hz[0] <= 1.0 / period_s <= rules.sine_hz[1]:
             continue
-        elif rules.dwell_s[0] <= longer_s <= rules.dwell_s[1] and _has_dwell(run, one, two):
-            yield "sine-with-dwell", one.start, two.end
-        elif min(one.half_s, two.half_s) >= rules.sine_equal * max(one.half_s, two.half_s):
-            yield "sine-steer", one.start, two.end
+        elif rules.dwell_s[0] <= longer_s <= rules.dwell_s[1] and _has_dwell(run, first, second):
+            yield "sine-with-dwell", first.start, second.end
+        elif min(first.half_s, second.half_s) >= rules.sine_equal * max(first.half_s, second.half_s):
+            yield "sine-steer", first.start, second.end
 
 
-def _has_dwell(run: _Run, one: _Swing, two: _Swing) -> bool:
+def _has_dwell(run: _Run, first: _Swing, second: _Swing) -> bool:
     """Return whether the second swing is held near its peak for longer than the first."""
 
     def held(swing: _Swing) -> int:
         side = np.abs(run.steer[swing.start : swing.end])
         return int((side >= 0.85 * side.max()).sum())
 
-    return held(two) - held(one) >= 10
+    return held(second) - held(first) >= 10
 
 
 # ---- steps, ramps, circles, slowing in a turn ----
@@ -558,19 +559,19 @@ def _steps(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterat
 def _ramps(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
     """Ramp steer: the angle grows along a line for seconds, from straight ahead, at one speed."""
     for swing in swings:
-        at = swing.start + int(np.argmax(np.abs(run.steer[swing.start : swing.end]))) + 1
-        speed = run.speed[swing.start : at]
+        row = swing.start + int(np.argmax(np.abs(run.steer[swing.start : swing.end]))) + 1
+        speed = run.speed[swing.start : row]
         n = int(np.argmin(np.append(np.abs(speed / speed[0] - 1.0) <= rules.ramp_speed, False)))
-        at = swing.start + n
+        row = swing.start + n
         if n * _STEP_S < rules.ramp_s or not _straight_before(run, swing.start, rules):
             continue
-        side = swing.sign * run.steer[swing.start : at]
+        side = swing.sign * run.steer[swing.start : row]
         t = np.linspace(-1.0, 1.0, n)
         slope = float((t * side).mean() / (t * t).mean())
         misfit = np.sqrt(np.mean((side - side.mean() - slope * t) ** 2))
-        rises = slope > 0.0 and 2.0 * slope >= 0.6 * side[-1] and side[-1] * run.gain[at - 1] >= rules.ramp_m_s2
-        if rises and misfit <= rules.ramp_misfit * 2.0 * slope + 0.5 * rules.slack_m_s2 / run.gain[at - 1]:
-            yield "ramp-steer", swing.start, at
+        rises = slope > 0.0 and 2.0 * slope >= 0.6 * side[-1] and side[-1] * run.gain[row - 1] >= rules.ramp_m_s2
+        if rises and misfit <= rules.ramp_misfit * 2.0 * slope + 0.5 * rules.slack_m_s2 / run.gain[row - 1]:
+            yield "ramp-steer", swing.start, row
 
 
 def _circles(run: _Run, rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
@@ -596,13 +597,13 @@ def _slowing(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iter
     if n < pre + ahead + lag:
         return
     total = np.concatenate([[0.0], np.cumsum(run.ax)])
-    at = np.arange(pre, n - ahead - lag)
-    before = (total[at] - total[at - pre]) / pre
-    change = (total[at + lag + ahead] - total[at + lag]) / ahead - before
-    stamps = at.astype(np.int64) * _STEP_NS
+    rows = np.arange(pre, n - ahead - lag)
+    before = (total[rows] - total[rows - pre]) / pre
+    change = (total[rows + lag + ahead] - total[rows + lag]) / ahead - before
+    stamps = rows.astype(np.int64) * _STEP_NS
     for a, b in runs(stamps, change < -rules.power_off_m_s2):
         row = a + int(np.argmin(change[a:b]))
-        onset = _onset(run, int(at[row]), float(before[row]), float(change[row]), pre)
+        onset = _onset(run, int(rows[row]), float(before[row]), float(change[row]), pre)
         fall, turn = -float(change[row]), float(np.mean(np.abs(run.turn[onset - pre : onset])))
         if turn < rules.turn_m_s2 or not _steady_before(run, onset, pre, ahead, rules):
             continue
@@ -612,10 +613,10 @@ def _slowing(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iter
             yield "brake-in-turn" if braked else "power-off-in-turn", onset - pre, end
 
 
-def _onset(run: _Run, at: int, before: float, change: float, pre: int) -> int:
-    """Return the row near ``at`` at which a_x falls through a quarter of its change."""
-    here = run.ax[at : at + 40] < before + 0.25 * change
-    return max(at + (int(np.argmax(here)) if here.any() else 0), pre)
+def _onset(run: _Run, row: int, before: float, change: float, pre: int) -> int:
+    """Return the row near ``row`` at which a_x falls through a quarter of its change."""
+    here = run.ax[row : row + 40] < before + 0.25 * change
+    return max(row + (int(np.argmax(here)) if here.any() else 0), pre)
 
 
 def _steady_before(run: _Run, onset: int, pre: int, ahead: int, rules: ManoeuvreRules) -> bool:
