@@ -11,6 +11,7 @@ from rich.padding import Padding
 from rich.text import Text
 
 from pdhef_logtool.cli.console import table
+from pdhef_logtool.cli.plan_tables import plan_line, render_plan
 from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison
 from pdhef_logtool.results.comparison_words import (
@@ -22,7 +23,7 @@ from pdhef_logtool.results.comparison_words import (
     percent,
     verdict_text,
 )
-from pdhef_logtool.results.junit import Case, cases_bytes
+from pdhef_logtool.results.junit import Case, cases_bytes, plan_cases
 from pdhef_logtool.storage.files import write_bytes
 
 if TYPE_CHECKING:
@@ -57,6 +58,9 @@ def render_comparison(found: Comparison, console: Console) -> None:
     console.print(Text.assemble("\n", ("Verdict: ", "bold"), verdict_text(found)))
     for line in found.failures:
         _line(f"gate closed: {line}", console)
+    if found.requirements is not None:
+        console.print(Text.assemble("\n", ("Plan on B: ", "bold"), plan_line(found.requirements)))
+        render_plan(found.requirements, console)
 
 
 def _line(text: str, console: Console) -> None:
@@ -131,7 +135,8 @@ def write_comparison_junit(path: Path, found: Comparison) -> None:
     reason = "; ".join(found.unpaired)
     partners = "drives without partner"
     cases.append(Case("compare", "drives", "every drive has a partner", partners, bool(lost), reason, reason or None))
-    write_bytes(path, cases_bytes({"compare": cases}))
+    plan = {} if found.requirements is None else plan_cases(found.requirements)
+    write_bytes(path, cases_bytes({**plan, "compare": cases}))
 
 
 def _figure_case(one: ComparedFigure, found: Comparison) -> Case:

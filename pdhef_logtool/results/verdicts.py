@@ -1,4 +1,4 @@
-"""The verdict of a drive, a sentence a signal: the selected estimate against the best physics and the thresholds.
+"""The verdict of a drive, a sentence a signal: the selected estimate against the best physics.
 
 Written from the figures of a report, like :mod:`~pdhef_logtool.results.selected_estimate`, which has the other
 sentences: how the estimate was selected, its interval, what was assumed, what to do next.
@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from pdhef_logtool.evaluation.bootstrap import Interval
 from pdhef_logtool.evaluation.standing import JUDGED_SIGNALS, LEAST_BLOCKS, Standing
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS, read_unit
 from pdhef_logtool.results.selected_estimate import NO_SIDESLIP_RAD, SAME
-
-if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.thresholds import Verdict
 
 #: ``same``: the interval of the difference lies within
 #: :data:`~pdhef_logtool.results.selected_estimate.SAME` of the rival's error.
@@ -24,21 +21,13 @@ if TYPE_CHECKING:
 Outcome: TypeAlias = Literal["better", "worse", "same", "undecided", "alone", "none"]
 
 
-def verdicts_of(
-    report: Mapping[str, Any], main: str, standings: Sequence[Standing], limits: Sequence[Verdict]
-) -> list[dict[str, Any]]:
+def verdicts_of(report: Mapping[str, Any], main: str, standings: Sequence[Standing]) -> list[dict[str, Any]]:
     """Return the verdicts of a report's document, one a signal, with the figures behind the words."""
     by_signal = {s.signal: s for s in standings}
-    return [
-        _verdict(report, main, signal, by_signal.get(signal), [v for v in limits if v.threshold.signal == signal])
-        for signal in JUDGED_SIGNALS
-    ]
+    return [_verdict(report, main, signal, by_signal.get(signal)) for signal in JUDGED_SIGNALS]
 
 
-def _verdict(
-    report: Mapping[str, Any], main: str, signal: str, found: Standing | None, limits: Sequence[Verdict]
-) -> dict[str, Any]:
-    own = [v for v in limits if v.estimator == main and v.outcome in ("pass", "fail")]
+def _verdict(report: Mapping[str, Any], main: str, signal: str, found: Standing | None) -> dict[str, Any]:
     outcome: Outcome = "none"
     if why := _why_none(report, main, signal, found):
         text = f"no verdict: {why}"
@@ -46,7 +35,7 @@ def _verdict(
     else:
         assert found is not None and found.rmse is not None
         outcome = _outcome(found)
-        text = "; ".join([_error(found), _against(found, outcome), *_limits(found, own)])
+        text = "; ".join([_error(found), _against(found, outcome)])
     return {
         "signal": signal,
         "estimator": main,
@@ -56,7 +45,6 @@ def _verdict(
         "rival": None if found is None else found.rival,
         "rival_rmse": None if found is None else found.rival_rmse,
         "difference": None if found is None else _figures(found.difference),
-        "limits": [{"text": v.threshold.label, "outcome": v.outcome, "value": v.value} for v in own],
     }
 
 
@@ -140,21 +128,6 @@ def _against(found: Standing, outcome: Outcome) -> str:
     low, high = (_number(x * factor, sign="+") for x in (difference.low, difference.high))
     between = f"95 % CI of the difference {low} to {high}{unit}"
     return f"{how}, difference not significant: {between}" if outcome == "undecided" else f"{how}: {between}"
-
-
-def _limits(found: Standing, limits: Sequence[Verdict]) -> list[str]:
-    """Return what is stated of the thresholds; of a limit of the RMSE also whether the interval reaches beyond it."""
-    said = []
-    for verdict in limits:
-        limit = verdict.threshold
-        text = f"{'within' if verdict.outcome == 'pass' else 'exceeds'} the limit {limit.label}"
-        rmse = found.rmse
-        if (limit.metric, limit.segment) == ("rmse", "all") and limit.maximum is not None and rmse is not None:
-            at = limit.maximum * limit.factor
-            if math.isfinite(rmse.low) and rmse.low < at < rmse.high:
-                text += ", which lies within the interval"
-        said.append(text)
-    return said
 
 
 def _number(value: float, sign: str = "-") -> str:

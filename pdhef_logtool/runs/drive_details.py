@@ -16,7 +16,6 @@ from pdhef_logtool.evaluation.operating_space import operating_space
 from pdhef_logtool.evaluation.reasons import SensorFault, sensor_faults
 from pdhef_logtool.evaluation.segments import moving_mask
 from pdhef_logtool.evaluation.standing import standings
-from pdhef_logtool.evaluation.thresholds import Verdict
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -40,7 +39,6 @@ def drive_details(
     main: str,
     read: _Read,
     signals: Signals,
-    limits: Sequence[Verdict],
     *,
     brief: bool = False,
 ) -> DriveDetails:
@@ -49,7 +47,7 @@ def drive_details(
     Parameters
     ----------
     ready : the estimators that ran. main : the name of the answer. read : returns the track of a name, ``truth`` too.
-    signals : what the estimators saw. limits : how the figures are against the thresholds.
+    signals : what the estimators saw.
     brief : without innovations and error budget, for which estimators run once more.
     """
     truth, slow = read(TRUTH), drive.car.vehicle.low_speed_blend_m_s
@@ -66,7 +64,6 @@ def drive_details(
         faults=next((f for e in asked if (f := _faults(read, e.name)) is not None), None),
         innovations=[] if sample is None else channel_innovations(asked, sample),
         standings=[] if truth is None else standings(main, _rivals(ready, by_name[main]), read, truth, slow),
-        limits=limits,
         error_budget=no_budget(_LEFT_OUT) if brief else _budget(drive, by_name.get(PHYSICS), read, signals),
         operating_space=operating_space(signals, truth, answer, slow),
         metadata=_metadata(drive),
