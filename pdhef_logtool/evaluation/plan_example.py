@@ -89,8 +89,8 @@ def converted(path: Path) -> str:
 
 
 def _tables(raw: Mapping[str, Any], key: str) -> Sequence[Mapping[str, Any]]:
-    found = raw.get(key, [])
-    return [t for t in found if isinstance(t, dict)] if isinstance(found, list) else []
+    tables = raw.get(key, [])
+    return [t for t in tables if isinstance(t, dict)] if isinstance(tables, list) else []
 
 
 def _toml(entries: Mapping[str, Any]) -> Iterator[str]:

@@ -74,18 +74,18 @@ def requirement_blocks(
 
     ``main`` : the selected estimate, of requirements that name no estimator.
     """
-    found: list[RequirementBlocks] = []
+    results: list[RequirementBlocks] = []
     for requirement in requirements:
         name = requirement.estimator or main
-        if any(b.of == requirement.measured for b in found) or name is None or not _has_blocks(requirement, drive):
+        if any(b.of == requirement.measured for b in results) or name is None or not _has_blocks(requirement, drive):
             continue
         named = [name, *([requirement.baseline] if requirement.baseline not in (None, RUN) else [])]
         tracks = [drive.read(n) for n in named if n is not None]
         if all(track is not None and len(track) == len(drive.truth) for track in tracks):
             blocks = _blocks(requirement, name, [t for t in tracks if t is not None], drive, most)
             if blocks is not None:
-                found.append(blocks)
-    return found
+                results.append(blocks)
+    return results
 
 
 def _has_blocks(requirement: Requirement, drive: ScoredDrive) -> bool:
@@ -182,10 +182,10 @@ def _summands(
 
 def from_document(documents: Sequence[Mapping[str, object]]) -> list[RequirementBlocks]:
     """Return the blocks of a report.json; those of another version are left out."""
-    found = []
+    results = []
     for document in documents:
         try:
-            found.append(RequirementBlocks(**document))  # type: ignore[arg-type]
+            results.append(RequirementBlocks(**document))  # type: ignore[arg-type]
         except TypeError:
             continue
-    return found
+    return results

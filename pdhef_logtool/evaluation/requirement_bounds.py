@@ -80,15 +80,15 @@ def _deviations(top: FloatArray, below: FloatArray, power: float, centre: float,
     n = len(top)
     rng = np.random.default_rng(_SEED)
     step = max(1, _AT_ONCE // n)
-    found = []
+    parts = []
     for start in range(0, _RESAMPLES, step):
         m = min(step, _RESAMPLES - start)
         counts = rng.multinomial(n, np.full(n, 1.0 / n), size=m).astype(np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = (counts @ top) / (counts @ below)
             statistic = power * np.log(ratio) if log else ratio
-            found.append((statistic - centre) / _error(top, below, counts, power, log=log))
-    deviations = np.concatenate(found)
+            parts.append((statistic - centre) / _error(top, below, counts, power, log=log))
+    deviations = np.concatenate(parts)
     usable = deviations[np.isfinite(deviations)]
     return usable if usable.size else np.zeros(1)
 

@@ -24,7 +24,7 @@ from pdhef_logtool.records.signals import FloatArray
 Outcome: TypeAlias = Literal["PASS", "FAIL", "INCONCLUSIVE"]
 #: A margin relative to an estimated reference is at least so many of its standard deviations.
 REFERENCE_SDS = 2.0
-#: A share of drives below this says nothing.
+#: A share of drives below this is not shown.
 _SHARE_SHOWN = 0.5
 #: More driving than this many times that of now is no advice.
 _MOST_TIMES = 30.0
@@ -95,11 +95,16 @@ class RequirementVerdict:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict as JSON-able values."""
-        own = asdict(self)
-        del own["requirement"]
+        values = asdict(self)
+        del values["requirement"]
         requirement = {**asdict(self.requirement), "label": self.requirement.label, "unit": self.requirement.unit}
         requirement["title"] = self.requirement.title or self.requirement.label
-        return {**requirement, "at_least": self.requirement.metric in AT_LEAST, "bound": self.requirement.bound, **own}
+        return {
+            **requirement,
+            "at_least": self.requirement.metric in AT_LEAST,
+            "bound": self.requirement.bound,
+            **values,
+        }
 
 
 def judge(requirement: Requirement, drives: Sequence[DriveValue], missing: str = "") -> RequirementVerdict:
@@ -112,19 +117,19 @@ def judge(requirement: Requirement, drives: Sequence[DriveValue], missing: str =
     """
     exposure = _exposure(drives)
     estimated = bool(drives) and math.isfinite(drives[0].std)
-    found, basis, units, block_s = _statistic(requirement, drives)
+    bounded, basis, units, block_s = _statistic(requirement, drives)
     sd = _reference_sd(requirement, drives) if estimated else 0.0
     bound, at_least = requirement.bound, requirement.metric in AT_LEAST
     worst = _worst(requirement, drives)
     notes = _notes(requirement, drives, basis, block_s, estimated)
-    outcome, reason, to_do = _decide(requirement, found, exposure, sd, basis, missing)
-    value = found.value if math.isfinite(found.value) else None
+    outcome, reason, to_do = _decide(requirement, bounded, exposure, sd, basis, missing)
+    value = bounded.value if math.isfinite(bounded.value) else None
     margin = None if value is None else (value - bound if at_least else bound - abs(value))
     return RequirementVerdict(
         requirement,
         outcome,
         value,
-        *(x if math.isfinite(x) else None for x in (found.low, found.high)),
+        *(x if math.isfinite(x) else None for x in (bounded.low, bounded.high)),
         margin,
         exposure,
         tuple(dict.fromkeys(d.estimator for d in drives)),
@@ -187,14 +192,14 @@ def _statistic(
         return Bounded(total.value, nan, nan, 0), "blocks", 0, None
     columns = [np.concatenate([np.asarray(getattr(b, key)) for b in blocks]) for key in ("n", "value", "baseline")]
     units = len(columns[0])
-    found = _pooled(requirement, columns[0], columns[1], columns[2] if requirement.baseline else None)
-    bounded = found if units >= LEAST_BLOCKS else Bounded(found.value, nan, nan, units)
+    bounded = _pooled(requirement, columns[0], columns[1], columns[2] if requirement.baseline else None)
+    bounded = bounded if units >= LEAST_BLOCKS else Bounded(bounded.value, nan, nan, units)
     return Bounded(total.value, bounded.low, bounded.high, units), "blocks", units, max(b.block_s for b in blocks)
 
 
 def _pooled(requirement: Requirement, weights: FloatArray, values: FloatArray, others: FloatArray | None) -> Bounded:
     metric = requirement.metric
-    found = pooled(
+    bounded = pooled(
         weights.astype(np.float64),
         values.astype(np.float64),
         others,
@@ -203,19 +208,19 @@ def _pooled(requirement: Requirement, weights: FloatArray, values: FloatArray, o
         level=requirement.confidence,
     )
     if metric == "bias":  # limited in size
-        low = 0.0 if found.low <= 0.0 <= found.high else min(abs(found.low), abs(found.high))
-        return Bounded(abs(found.value), low, max(abs(found.low), abs(found.high)), found.units)
+        low = 0.0 if bounded.low <= 0.0 <= bounded.high else min(abs(bounded.low), abs(bounded.high))
+        return Bounded(abs(bounded.value), low, max(abs(bounded.low), abs(bounded.high)), bounded.units)
     if metric in AT_LEAST:
-        return Bounded(found.value, max(found.low, 0.0), min(found.high, 1.0), found.units)
-    return found
+        return Bounded(bounded.value, max(bounded.low, 0.0), min(bounded.high, 1.0), bounded.units)
+    return bounded
 
 
 def _typical_ratio(ratios: FloatArray, level: float) -> Bounded:
-    """Return the geometric mean of the drives' ratios to another run: each drive is its own yardstick."""
+    """Return the geometric mean of the drives' ratios to another run: each drive is its values yardstick."""
     with np.errstate(divide="ignore"):
         logs = np.log(ratios)
-    found = pooled(np.ones(len(logs)), logs, None, squares=False, positive=False, level=level)
-    return Bounded(*(math.exp(x) for x in (found.value, found.low, found.high)), len(logs))
+    bounded = pooled(np.ones(len(logs)), logs, None, squares=False, positive=False, level=level)
+    return Bounded(*(math.exp(x) for x in (bounded.value, bounded.low, bounded.high)), len(logs))
 
 
 def _reference_sd(requirement: Requirement, drives: Sequence[DriveValue]) -> float:
@@ -237,27 +242,29 @@ def _worst(requirement: Requirement, drives: Sequence[DriveValue]) -> str | None
 
 
 def _decide(
-    requirement: Requirement, found: Bounded, exposure: Exposure, sd: float, basis: str, missing: str
+    requirement: Requirement, bounded: Bounded, exposure: Exposure, sd: float, basis: str, missing: str
 ) -> tuple[Outcome, str, str]:
     """Return outcome, reason and next step."""
     unit, bound, at_least = requirement.unit, requirement.bound, requirement.metric in AT_LEAST
     where = "" if requirement.segment == "all" else f" of {requirement.segment}"
-    if not exposure.drives or not math.isfinite(found.value):
+    if not exposure.drives or not math.isfinite(bounded.value):
         return "INCONCLUSIVE", missing or "no drive has this metric", _what_to_record(requirement)
     if lacking := _lacking(requirement, exposure):
         return "INCONCLUSIVE", f"too little driving: {'; '.join(w for w, _ in lacking)}", _more(lacking, where)
-    unbounded = requirement.quantile is not None and math.isinf(found.high) and found.low <= bound
-    if unbounded or not (math.isfinite(found.low) or math.isfinite(found.high)):
-        return "INCONCLUSIVE", *_too_few(requirement, found, basis, where)
-    good, bad = (found.low >= bound, found.high < bound) if at_least else (found.high <= bound, found.low > bound)
-    bounds = f"{shown(found.low, unit)} to {shown(found.high, unit)}"
-    interval = f"{shown(found.value, unit)} ({100.0 * requirement.confidence:.4g} % CI {bounds})"
+    unbounded = requirement.quantile is not None and math.isinf(bounded.high) and bounded.low <= bound
+    if unbounded or not (math.isfinite(bounded.low) or math.isfinite(bounded.high)):
+        return "INCONCLUSIVE", *_too_few(requirement, bounded, basis, where)
+    good, bad = (
+        (bounded.low >= bound, bounded.high < bound) if at_least else (bounded.high <= bound, bounded.low > bound)
+    )
+    bounds = f"{shown(bounded.low, unit)} to {shown(bounded.high, unit)}"
+    interval = f"{shown(bounded.value, unit)} ({100.0 * requirement.confidence:.4g} % CI {bounds})"
     if requirement.statistic == WORST_DRIVE:
         share = (0.5 * (1.0 - requirement.confidence)) ** (1.0 / exposure.drives)
-        interval = f"worst of {exposure.drives} drives: {shown(found.value, unit)}"
+        interval = f"worst of {exposure.drives} drives: {shown(bounded.value, unit)}"
         if good and share > _SHARE_SHOWN:
             interval += f"; at least {share:.0%} of drives like these are within it, with this confidence"
-    distance = abs(bound - found.value)
+    distance = abs(bound - bounded.value)
     if (good or bad) and distance < REFERENCE_SDS * sd:
         sds = f"{REFERENCE_SDS:g} standard deviations of the estimated reference ({shown(sd, unit)})"
         reason = f"{interval}; the limit is closer than {sds}"
@@ -267,7 +274,7 @@ def _decide(
     if bad:
         place = "the worst drive" if exposure.drives > 1 else "the largest error"
         return "FAIL", interval, f"look at {place} first"
-    return "INCONCLUSIVE", f"{interval} includes the limit", _decisive(requirement, found, exposure, where)
+    return "INCONCLUSIVE", f"{interval} includes the limit", _decisive(requirement, bounded, exposure, where)
 
 
 def _lacking(requirement: Requirement, exposure: Exposure) -> list[tuple[str, str]]:
@@ -277,12 +284,12 @@ def _lacking(requirement: Requirement, exposure: Exposure) -> list[tuple[str, st
         ("minutes", requirement.exposure_minutes, exposure.minutes, "{:.1f}"),
         ("km", requirement.exposure_km, exposure.km, "{:.1f}"),
     )
-    found = []
+    lacking = []
     for word, needed, has, layout in needs:
         if needed > 0.0 and (has is None or has < needed):
-            known = "an unknown number" if has is None else layout.format(has)
-            found.append((f"{known} of {needed:g} {word}", f"{layout.format(needed - (has or 0.0))} {word}"))
-    return found
+            has_words = "an unknown number" if has is None else layout.format(has)
+            lacking.append((f"{has_words} of {needed:g} {word}", f"{layout.format(needed - (has or 0.0))} {word}"))
+    return lacking
 
 
 def _more(lacking: Sequence[tuple[str, str]], where: str) -> str:
@@ -296,26 +303,26 @@ def _what_to_record(requirement: Requirement) -> str:
     return f"record drives{where} with ground truth of {requirement.signal}"
 
 
-def _too_few(requirement: Requirement, found: Bounded, basis: str, where: str) -> tuple[str, str]:
+def _too_few(requirement: Requirement, bounded: Bounded, basis: str, where: str) -> tuple[str, str]:
     """Return why there is no interval, and what to drive."""
-    value = shown(found.value, requirement.unit)
+    value = shown(bounded.value, requirement.unit)
     if requirement.quantile is not None:
         least = least_drives(requirement.quantile, requirement.confidence)
-        more = f"drive {least - found.units} more drives{where}"
-        return f"{value}; no confidence interval from {found.units} drives", more
-    if basis == "blocks" and not found.units:
+        more = f"drive {least - bounded.units} more drives{where}"
+        return f"{value}; no confidence interval from {bounded.units} drives", more
+    if basis == "blocks" and not bounded.units:
         return f"{value}; this run kept no blocks for this requirement", "run the logs again with this plan"
-    reason = f"{value}; no confidence interval from {found.units} blocks of driving{where}, it needs {LEAST_BLOCKS}"
-    seconds = (LEAST_BLOCKS - found.units) * 10
+    reason = f"{value}; no confidence interval from {bounded.units} blocks of driving{where}, it needs {LEAST_BLOCKS}"
+    seconds = (LEAST_BLOCKS - bounded.units) * 10
     return reason, f"drive at least {seconds} s more{where}, better {LEAST_DRIVES} drives or more"
 
 
-def _decisive(requirement: Requirement, found: Bounded, exposure: Exposure, where: str) -> str:
+def _decisive(requirement: Requirement, bounded: Bounded, exposure: Exposure, where: str) -> str:
     """Return how much driving would decide, if value and spread stay: the interval narrows with its square root."""
     bound = requirement.bound
-    distance = abs(bound - found.value)
-    beyond = found.value > bound
-    width = found.value - found.low if beyond else found.high - found.value
+    distance = abs(bound - bounded.value)
+    beyond = bounded.value > bound
+    width = bounded.value - bounded.low if beyond else bounded.high - bounded.value
     if not math.isfinite(width) or distance <= 0.0 or (times := (width / distance) ** 2) > _MOST_TIMES:
         return "the value is at the limit: more driving will hardly decide"
     more = f"about {math.ceil(times)} times as much driving{where} would decide, if value and spread stay the same"

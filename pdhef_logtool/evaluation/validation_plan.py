@@ -65,7 +65,7 @@ class Requirement:
 
     @property
     def measured(self) -> str:
-        """What is measured of a drive, whatever the limit: requirements that share it share its blocks."""
+        """What is measured of a drive, independent of the limit: requirements with equal values share blocks."""
         of = self.estimator or "selected"
         against = "" if self.baseline in (None, RUN) else f" / {self.baseline}"
         return f"{self.signal} {self.metric} {self.segment} {of}{against}"
@@ -236,13 +236,13 @@ def _read(raw: object, where: str, problems: list[str]) -> Requirement | None:
         )
     if len(problems) > before:
         return None
-    found = _QUANTILE.fullmatch(table.statistic)
+    matches = _QUANTILE.fullmatch(table.statistic)
     rest = {"title", "segment", "manoeuvre", "limit", "limit_deg", "limit_deg_s"}
     return Requirement(
         title=table.title or "",
         segment=segment,
         limit=limit,
-        quantile=None if found is None else float(found[1]),
+        quantile=None if matches is None else float(matches[1]),
         **table.model_dump(exclude=rest),
     )
 
@@ -262,20 +262,20 @@ def _limit(table: RequirementTable, where: str, problems: list[str]) -> float | 
         "limit_deg": (table.limit_deg, "rad", 1.0 / DEGREES),
         "limit_deg_s": (table.limit_deg_s, "rad/s", 1.0 / DEGREES),
     }
-    found = {key: entry for key, entry in given.items() if entry[0] is not None}
+    matches = {key: entry for key, entry in given.items() if entry[0] is not None}
     if table.baseline is None:
         if table.max_ratio is not None:
             problems.append(f"{where}.max_ratio: needs a baseline, for example baseline = 'zero'")
-        elif len(found) != 1:
+        elif len(matches) != 1:
             problems.append(f"{where}: give one of limit, limit_deg, limit_deg_s, or baseline with max_ratio")
     else:
-        if found:
-            problems.append(f"{where}: give {next(iter(found))} or baseline, not both")
+        if matches:
+            problems.append(f"{where}: give {next(iter(matches))} or baseline, not both")
         if table.max_ratio is None:
             problems.append(f"{where}.max_ratio: is missing, for example 1.0")
         if registered()[table.metric].best != "lower":
             problems.append(f"{where}.baseline: {table.metric} has no ratio; use a metric such as rmse")
-    for key, (value, needed, factor) in found.items():
+    for key, (value, needed, factor) in matches.items():
         if needed != unit:
             problems.append(f"{where}.{key}: {table.signal} {table.metric} is in {unit}, not in {needed}")
         elif value is not None and table.baseline is None:

@@ -67,8 +67,8 @@ class Figures:
 
     def of(self, log: str, name: str, requirement: Requirement, metric: str) -> tuple[float, int] | None:
         """Return a figure of a requirement's signal and segment, None without a finite one."""
-        found = self.values.get((log, name, requirement.signal, requirement.segment, metric))
-        return found if found is not None and math.isfinite(found[0]) else None
+        figure = self.values.get((log, name, requirement.signal, requirement.segment, metric))
+        return figure if figure is not None and math.isfinite(figure[0]) else None
 
     def main(self, drive: JudgedDrive) -> str | None:
         """Return the estimator of a drive that is judged by default."""
@@ -140,14 +140,14 @@ def plan_verdicts(
     figures : of the drives. against : figures of run A, and its drive by the label of this run's, for requirements
         with another run as baseline.
     """
-    found = []
+    verdicts = []
     for requirement in plan.requirements:
         measured = {d.log: _measured(requirement, figures, d, against) for d in drives}
         by_truth = [v for truth, _ in measured.values() if (v := truth) is not None]
         values = by_truth or [v for _, estimated in measured.values() if (v := estimated) is not None]
         missing = "" if values else _why_missing(requirement, figures, drives, against)
-        found.append(judge(requirement, values, missing))
-    return PlanVerdicts(plan, tuple(found), strict)
+        verdicts.append(judge(requirement, values, missing))
+    return PlanVerdicts(plan, tuple(verdicts), strict)
 
 
 def _measured(
@@ -199,21 +199,21 @@ class _Baseline:
     def value(self, requirement: Requirement, metric: str) -> float | None:
         if self.figures is None or self.drive is None or self.name is None:
             return None
-        found = self.figures.of(self.drive.log, self.name, requirement, metric)
-        return None if found is None else found[0]
+        figure = self.figures.of(self.drive.log, self.name, requirement, metric)
+        return None if figure is None else figure[0]
 
 
 def _value(
     requirement: Requirement, figures: Figures, drive: JudgedDrive, name: str, metric: str, other: _Baseline
 ) -> DriveValue | None:
-    found = figures.of(drive.log, name, requirement, metric)
+    figure = figures.of(drive.log, name, requirement, metric)
     baseline = other.value(requirement, metric)
-    if found is None or (other.needed and baseline is None):
+    if figure is None or (other.needed and baseline is None):
         return None
     std = figures.of(drive.log, name, requirement, "reference_std") if metric == "reference_rms" else None
     if metric == "reference_rms" and std is None:
         return None
-    value, n = found
+    value, n = figure
     estimated = std is not None
     blocks = next((b for b in drive.blocks if b.of == requirement.measured and b.estimated == estimated), None)
     blocks = _paired(blocks, other) if requirement.baseline == RUN else blocks
@@ -230,11 +230,11 @@ def _exposure(
     """Return seconds and metres behind a figure: of its blocks, else the segment's in proportion to its stamps."""
     if blocks is not None:
         return math.fsum(blocks.seconds), math.fsum(blocks.metres)
-    found = []
+    amounts = []
     for metric in ("exposure_s", "exposure_m"):
         whole = figures.values.get((drive.log, SENSORS, "state", requirement.segment, metric))
-        found.append(math.nan if whole is None or not whole[1] else whole[0] * min(n / whole[1], 1.0))
-    return found[0], found[1]
+        amounts.append(math.nan if whole is None or not whole[1] else whole[0] * min(n / whole[1], 1.0))
+    return amounts[0], amounts[1]
 
 
 def _paired(blocks: RequirementBlocks | None, other: _Baseline) -> RequirementBlocks | None:
