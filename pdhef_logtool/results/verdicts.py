@@ -113,7 +113,7 @@ def _error(standing: Standing) -> str:
 
 def _against(standing: Standing, outcome: Outcome) -> str:
     if outcome == "alone":
-        return "no filter without a network ran for comparison"
+        return "no other filter without a network ran for comparison"
     unit, factor = _unit(standing.signal)
     assert standing.rival_rmse is not None and standing.difference is not None and standing.rmse is not None
     beside = f"{standing.rival} ({_number(standing.rival_rmse * factor)}{unit})"
