@@ -16,6 +16,10 @@ from pdhef_logtool.records.signals import FloatArray
 #: Fewer drives: blocks within them are drawn instead. Fewer blocks: no bounds.
 LEAST_DRIVES, LEAST_BLOCKS = 5, 6
 _RESAMPLES, _SEED = 2000, 0
+#: More units than this are drawn in groups.
+_MOST_UNITS = 1000
+#: Logarithm of the ratio of a bound to its value: two units that differ a lot give any.
+_MOST_LOG = 50.0
 #: Resamples times units that are in memory at once.
 _AT_ONCE = 1 << 21
 
@@ -51,15 +55,19 @@ def pooled(
         return Bounded(value, nan, nan, n)
     if positive and total <= 0.0:
         return Bounded(0.0, 0.0, 0.0, n)
+    if n > _MOST_UNITS:  # neighbours are drawn together
+        groups = np.arange(n) * _MOST_UNITS // n
+        top, below = (np.bincount(groups, weights=column) for column in (top, below))
     log = positive
-    error = float(_error(top, below, np.ones((1, n)), power, log=log)[0])
+    error = float(_error(top, below, np.ones((1, len(top))), power, log=log)[0])
     if error == 0.0:
         return Bounded(value, value, value, n)
     deviations = _deviations(top, below, power, math.log(ratio) * power if log else ratio, log=log)
     tail = 0.5 * (1.0 - level)
     least, most = np.quantile(deviations, [tail, 1.0 - tail])
     if log:
-        return Bounded(value, value * math.exp(-most * error), value * math.exp(-least * error), n)
+        low, high = (value * float(np.exp(np.clip(-d * error, -_MOST_LOG, _MOST_LOG))) for d in (most, least))
+        return Bounded(value, low, high, n)
     return Bounded(value, value - float(most) * error, value - float(least) * error, n)
 
 

@@ -220,7 +220,7 @@ def _typical_ratio(ratios: FloatArray, level: float) -> Bounded:
     with np.errstate(divide="ignore"):
         logs = np.log(ratios)
     bounded = pooled(np.ones(len(logs)), logs, None, squares=False, positive=False, level=level)
-    return Bounded(*(math.exp(x) for x in (bounded.value, bounded.low, bounded.high)), len(logs))
+    return Bounded(*(float(np.exp(x)) for x in (bounded.value, bounded.low, bounded.high)), len(logs))
 
 
 def _reference_sd(requirement: Requirement, drives: Sequence[DriveValue]) -> float:
@@ -300,7 +300,7 @@ def _what_to_record(requirement: Requirement) -> str:
     where = "" if requirement.segment == "all" else f" with {requirement.segment}"
     if requirement.baseline == RUN:
         return "compare with another run: pdhef compare A B --plan PLAN"
-    return f"record drives{where} with ground truth of {requirement.signal}"
+    return f"record drives{where} with ground truth"
 
 
 def _too_few(requirement: Requirement, bounded: Bounded, basis: str, where: str) -> tuple[str, str]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.evaluation.metrics import MetricRow
@@ -13,7 +13,7 @@ from pdhef_logtool.evaluation.metrics.sensor_residuals import SENSORS
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks, from_document
 from pdhef_logtool.evaluation.requirement_bounds import LEAST_DRIVES
 from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, RequirementVerdict, gates, judge
-from pdhef_logtool.evaluation.validation_plan import RUN, Requirement, ValidationPlan, names_of
+from pdhef_logtool.evaluation.validation_plan import POOLED, RUN, Requirement, ValidationPlan, names_of
 from pdhef_logtool.records.tracks import REFERENCE
 from pdhef_logtool.results.sink import TRUTH
 
@@ -28,11 +28,14 @@ _Key = tuple[str, str, str, str, str]
 
 @dataclass(frozen=True, slots=True)
 class JudgedDrive:
-    """A drive of a run: its label, selected estimate (None: that of its only recorded estimate), and blocks."""
+    """A drive of a run: its label, and its selected estimate (None: its only recorded estimate).
+
+    ``read_blocks`` returns its blocks of time; called where too few drives are scored for a bootstrap over drives.
+    """
 
     log: str
     main: str | None
-    blocks: Sequence[RequirementBlocks] = ()
+    read_blocks: Callable[[], Sequence[RequirementBlocks]] = tuple
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,11 +123,6 @@ def blocks_of(report: Mapping[str, Any] | None) -> list[RequirementBlocks]:
     return from_document((report or {}).get("requirement_blocks") or ())
 
 
-def needs_blocks(logs: int) -> bool:
-    """Return whether so few logs get their bounds from blocks."""
-    return logs < LEAST_DRIVES
-
-
 def plan_verdicts(
     plan: ValidationPlan,
     figures: Figures,
@@ -145,6 +143,9 @@ def plan_verdicts(
         measured = {d.log: _measured(requirement, figures, d, against) for d in drives}
         by_truth = [v for truth, _ in measured.values() if (v := truth) is not None]
         values = by_truth or [v for _, estimated in measured.values() if (v := estimated) is not None]
+        if requirement.statistic == POOLED and len(values) < LEAST_DRIVES:
+            by_label = {d.log: d for d in drives}
+            values = [_with_blocks(requirement, v, by_label[v.log], against) for v in values]
         missing = "" if values else _why_missing(requirement, figures, drives, against)
         verdicts.append(judge(requirement, values, missing))
     return PlanVerdicts(plan, tuple(verdicts), strict)
@@ -214,22 +215,38 @@ def _value(
     if metric == "reference_rms" and std is None:
         return None
     value, n = figure
-    estimated = std is not None
-    blocks = next((b for b in drive.blocks if b.of == requirement.measured and b.estimated == estimated), None)
-    blocks = _paired(blocks, other) if requirement.baseline == RUN else blocks
-    seconds, metres = _exposure(requirement, figures, drive, n, blocks)
+    seconds, metres = _exposure(requirement, figures, drive, n)
     return DriveValue(
         drive.log, name, value, n, baseline, seconds, metres,
-        math.nan if std is None else std[0], blocks, same=other.needed and value == baseline,
+        math.nan if std is None else std[0], same=other.needed and value == baseline,
     )  # fmt: skip
 
 
-def _exposure(
-    requirement: Requirement, figures: Figures, drive: JudgedDrive, n: int, blocks: RequirementBlocks | None
-) -> tuple[float, float]:
-    """Return seconds and metres behind a figure: of its blocks, else the segment's in proportion to its stamps."""
-    if blocks is not None:
-        return math.fsum(blocks.seconds), math.fsum(blocks.metres)
+def _with_blocks(
+    requirement: Requirement,
+    value: DriveValue,
+    drive: JudgedDrive,
+    against: tuple[Figures, Mapping[str, JudgedDrive]] | None,
+) -> DriveValue:
+    """Return the metric of a drive with its blocks, which also state the exposure."""
+    estimated = math.isfinite(value.std)
+    blocks = _blocks_of(requirement, drive, estimated=estimated)
+    if requirement.baseline == RUN:
+        partner = None if against is None else against[1].get(drive.log)
+        theirs = None if partner is None else _blocks_of(requirement, partner, estimated=estimated)
+        blocks = _paired(blocks, theirs)
+    if blocks is None:
+        return value
+    return replace(value, blocks=blocks, seconds=math.fsum(blocks.seconds), metres=math.fsum(blocks.metres))
+
+
+def _blocks_of(requirement: Requirement, drive: JudgedDrive, *, estimated: bool) -> RequirementBlocks | None:
+    measured = requirement.measured
+    return next((b for b in drive.read_blocks() if b.of == measured and b.estimated == estimated), None)
+
+
+def _exposure(requirement: Requirement, figures: Figures, drive: JudgedDrive, n: int) -> tuple[float, float]:
+    """Return seconds and metres behind a figure: those of the segment, in proportion to its scored stamps."""
     amounts = []
     for metric in ("exposure_s", "exposure_m"):
         whole = figures.values.get((drive.log, SENSORS, "state", requirement.segment, metric))
@@ -237,16 +254,9 @@ def _exposure(
     return amounts[0], amounts[1]
 
 
-def _paired(blocks: RequirementBlocks | None, other: _Baseline) -> RequirementBlocks | None:
+def _paired(blocks: RequirementBlocks | None, theirs: RequirementBlocks | None) -> RequirementBlocks | None:
     """Return blocks with those of run A as baseline, where both have them."""
-    from dataclasses import replace
-
-    theirs = (
-        None
-        if other.drive is None or blocks is None
-        else next((b for b in other.drive.blocks if b.of == blocks.of and b.block_s == blocks.block_s), None)
-    )
-    if blocks is None or theirs is None:
+    if blocks is None or theirs is None or blocks.block_s != theirs.block_s:
         return None
     by_number = dict(zip(theirs.number, theirs.value, strict=True))
     kept = [i for i, number in enumerate(blocks.number) if number in by_number]

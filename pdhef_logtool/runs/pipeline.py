@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,7 @@ from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.intervals import TrackCalibrator
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, Skipped, all_specs, runnable
+from pdhef_logtool.evaluation.requirement_bounds import LEAST_DRIVES
 from pdhef_logtool.evaluation.validation_plan import default_plan
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
 from pdhef_logtool.mapping import Mapping, merge_losses
@@ -81,6 +83,7 @@ from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder, check
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
     from pdhef_logtool.evaluation.metrics import MetricRow
+    from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
     from pdhef_logtool.evaluation.validation_plan import ValidationPlan
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
     from pdhef_logtool.results.selected_estimate import MainFacts
@@ -231,16 +234,13 @@ def judge(
     """
     from pdhef_logtool.results.plan_verdicts import (
         JudgedDrive,
-        blocks_of,
         figures_of_file,
         figures_of_rows,
-        needs_blocks,
         plan_verdicts,
     )
 
     done = [r for r in results if r.outcome.failed is None or r.document is not None]
-    few = needs_blocks(len(done))
-    drives = [JudgedDrive(r.outcome.log, r.outcome.main, blocks_of(r.report) if few else ()) for r in done]
+    drives = [JudgedDrive(r.outcome.log, r.outcome.main, partial(_blocks, r)) for r in done]
     if metrics is None:
         figures = figures_of_rows(row for r in done for row in r.rows)
     else:
@@ -248,6 +248,13 @@ def judge(
 
         figures = figures_of_file(pl.scan_parquet(metrics), plan, [d.main for d in drives])
     return plan_verdicts(plan, figures, drives, strict=strict)
+
+
+@lru_cache(maxsize=LEAST_DRIVES)
+def _blocks(result: LogResult) -> list[RequirementBlocks]:
+    from pdhef_logtool.results.plan_verdicts import blocks_of
+
+    return blocks_of(result.report)
 
 
 def write_verdicts(junit: Path | None, verdicts: PlanVerdicts, results: Sequence[LogResult]) -> None:
@@ -442,7 +449,7 @@ def _requirements(job: _Job, main: str, scored: Evaluation, store: TrackStore, *
         slow, dependent = drive.car.vehicle.low_speed_blend_m_s, frozenset(drive.plan.dependent)
         tracks = ScoredDrive(store.read, base, scored.masks, slow, dependent, estimated=truth is None)
         blocks = requirement_blocks(job.validation.requirements, main, tracks, _BRIEF_BLOCKS if brief else MOST_BLOCKS)
-    judged = JudgedDrive(drive.name, main, blocks)
+    judged = JudgedDrive(drive.name, main, lambda: blocks)
     return RequirementFacts(plan_verdicts(job.validation, figures_of_rows(scored.rows), [judged]), blocks)
 
 

@@ -318,7 +318,7 @@ class _Scoring:
         """Return the verdicts of the plan on the log."""
         from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_rows, plan_verdicts
 
-        judged = JudgedDrive(log, None, blocks)
+        judged = JudgedDrive(log, None, lambda: blocks)
         return RequirementFacts(plan_verdicts(self.validation, figures_of_rows(rows), [judged]), blocks)
 
     def _events(self, truth: StateTrack, signals: Signals, recorded: Sequence[RecordedEstimate]) -> list[Event]:

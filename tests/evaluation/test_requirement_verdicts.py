@@ -159,4 +159,4 @@ def test_without_any_figure_the_reason_is_given() -> None:
     verdict = judge(LIMIT, [], "no ground truth of sideslip_rad")
     assert (verdict.outcome, verdict.value, verdict.margin) == ("INCONCLUSIVE", None, None)
     assert verdict.reason == "no ground truth of sideslip_rad"
-    assert verdict.next == "record drives with ground truth of sideslip_rad"
+    assert verdict.next == "record drives with ground truth"
