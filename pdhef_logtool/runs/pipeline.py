@@ -460,17 +460,18 @@ def _choose_estimators(
     Candidates for the selected estimate run in any case. Raises EstimatorError if no requested estimator can.
     """
     names = config.estimators or default_names(car, drive.available)
-    options = Options(drive.options.use_speed)
-    estimators, skipped = runnable(names, car, drive.available, options)
+    options, refused = Options(drive.options.use_speed), drive.plan.refused
+    estimators, skipped = runnable(names, car, drive.available, options, refused)
     requested = frozenset(e.name for e in estimators)
     more = [name for name in candidates(car, drive.available) if name not in requested]
-    estimators += runnable(more, car, drive.available, options)[0] if more else []
+    estimators += runnable(more, car, drive.available, options, refused)[0] if more else []
     if not requested:
         raise EstimatorError(
             expected="at least one estimator that can run",
             got="; ".join(f"{s.name}: {s.reason}" for s in skipped),
             where=str(drive.path),
-            remedy="map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)",
+            remedy="; ".join(f"{reason}, or --waive it" for reason in refused.values())
+            or "map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)",
         )
     return estimators, skipped, requested
 

@@ -16,6 +16,8 @@ from pdhef_logtool.drive.truth import LatencyEstimate, TruthTrack
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import Channel
 
+#: Aspects whose failure means that a channel is not the signal that it is mapped to.
+_MISREAD = frozenset({"sign", "unit", "axis", "mounting", "range"})
 _BADNESS = {"passed": 0, "undecided": 1, "failed": 2}
 
 
@@ -63,6 +65,16 @@ def check_drive(
         return checks
     faults = (fault_check(name, share) for name, share in shares.items())
     return (*(c for c in faults if c.verdict == "failed"), *checks_of(measure(sound, truth, derived)))
+
+
+def misread_channels(checks: Sequence[Check], waived: Sequence[str] = ()) -> dict[str, str]:
+    """Return by subject why nothing may be computed from it: a failed check that no one has waived, and its remedy."""
+    found: dict[str, str] = {}
+    for check in checks:
+        subject, _, aspect = check.name.rpartition(".")
+        if check.verdict == "failed" and aspect in _MISREAD and check.name not in waived:
+            found.setdefault(subject, f"check {check.name} failed: {check.remedy}")
+    return found
 
 
 def _all_checks(drive: CheckedDrive) -> tuple[Check, ...]:
