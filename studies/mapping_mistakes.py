@@ -16,6 +16,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.mounting import scaled_source, survey_log
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -29,7 +30,8 @@ FACTORS = {"x57.3": 57.3, "/57.3": 1 / 57.3, "x9.81": 9.81, "/9.81": 1 / 9.81, "
 AXIS = "axis"
 KINDS = (*FACTORS, AXIS)
 SAMPLES = ("dlc", "fishhook", "step", "sweep", "road")
-#: Read instead of a signal.
+#: Read instead of a signal; two axes of an accelerometer, and of a velocity, are exchanged.
+EXCHANGED = {"ax_m_s2", "ay_m_s2", "truth.vx_m_s", "truth.vy_m_s"}
 OTHER = {
     "ax_m_s2": "ay_m_s2",
     "ay_m_s2": "ax_m_s2",
@@ -82,7 +84,9 @@ def mistaken(mapping: Mapping, subject: str, kind: str) -> Mapping | None:
             other = _source(mapping, OTHER[subject])
             if other is None:
                 return None
-            wrong = replace(other, name=source.name, scale=1.0 if isinstance(other.scale, tuple) else abs(other.scale))
+            wrong = replace(other, name=source.name)
+            if subject in EXCHANGED:
+                (truth if name.startswith("truth.") else signals)[other.name] = replace(source, name=other.name)
         else:
             wrong = scaled_source(source, FACTORS[kind])
         (truth if name.startswith("truth.") else signals)[wrong.name] = wrong
@@ -100,7 +104,7 @@ def verdict(checks: Sequence[Check], members: Sequence[str], subject: str, kind:
         else:
             found = [float(m[1]) for c in failed for m in _UNDOES.finditer(c.remedy)]
             wanted = (1.0 / FACTORS[kind], scale)
-            right = any(abs(f / w - 1.0) < 0.05 for f in found for w in wanted)
+            right = any(abs(f / w - 1.0) < 0.05 for f in found[:1] for w in wanted)
         return "named" if right else "stopped"
     others = {c.subject for c in checks if c.verdict == "failed" and c.subject not in related}
     if others:
@@ -144,7 +148,10 @@ def main(arguments: Sequence[str]) -> int:
     counts: Counter[str] = Counter()
     for path in [Path(a) for a in arguments if a != "-v"] or [samples / f"{name}.mcap" for name in SAMPLES]:
         file = path.parent / f"{path.name}.signals.toml"
-        for found in outcomes(path, default_vehicle(), load_mapping(file) if file.exists() else None):
+        vehicle = path.parent / ("vehicle_mu03.toml" if path.stem == "sweep" else "vehicle.toml")
+        vehicle = vehicle if vehicle.exists() else path.parent / f"{path.name}.vehicle.toml"
+        car = Car.load(vehicle).vehicle if vehicle.exists() else default_vehicle()
+        for found in outcomes(path, car, load_mapping(file) if file.exists() else None):
             counts[found.verdict] += 1
             if found.verdict != "named":
                 print(f"{found.log} {found.signal} {found.kind}: {found.verdict}")

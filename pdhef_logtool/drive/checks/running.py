@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.checks.by_relations import relation_checks
@@ -57,14 +58,16 @@ def check_drive(
         )
         return _all_checks(drive)
 
-    checks = checks_of(measure(signals, truth, derived) if measured is None else measured)
+    checks = checks_of(measure(signals, truth, derived, vehicle) if measured is None else measured)
     if all(check.verdict != "failed" for check in checks):
         return checks
     sound, shares = without_faulty_samples(signals, vehicle or default_vehicle())
     if not shares:
         return checks
     faults = (fault_check(name, share) for name, share in shares.items())
-    return (*(c for c in faults if c.verdict == "failed"), *checks_of(measure(sound, truth, derived)))
+    again = measure(sound, truth, derived, vehicle)
+    again = again if measured is None else replace(again, scales=measured.scales)
+    return (*(c for c in faults if c.verdict == "failed"), *checks_of(again))
 
 
 def misread_channels(checks: Sequence[Check], waived: Sequence[str] = ()) -> dict[str, str]:
