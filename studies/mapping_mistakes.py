@@ -26,7 +26,15 @@ from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.checks import Check
 
 #: What a mapping's scale is wrong by, or for an axis the one that is read instead.
-FACTORS = {"x57.3": 57.3, "/57.3": 1 / 57.3, "x9.81": 9.81, "/9.81": 1 / 9.81, "x3.6": 3.6, "/3.6": 1 / 3.6, "sign": -1.0}
+FACTORS = {
+    "x57.3": 57.3,
+    "/57.3": 1 / 57.3,
+    "x9.81": 9.81,
+    "/9.81": 1 / 9.81,
+    "x3.6": 3.6,
+    "/3.6": 1 / 3.6,
+    "sign": -1.0,
+}
 AXIS = "axis"
 KINDS = (*FACTORS, AXIS)
 SAMPLES = ("dlc", "fishhook", "step", "sweep", "road")
@@ -125,9 +133,7 @@ def outcomes(path: Path, vehicle: VehicleParameters, mapping: Mapping | None = N
         log.close()
 
 
-def _outcome(
-    log: DriveLog, right: Mapping, subject: str, kind: str, vehicle: VehicleParameters
-) -> Iterator[Outcome]:
+def _outcome(log: DriveLog, right: Mapping, subject: str, kind: str, vehicle: VehicleParameters) -> Iterator[Outcome]:
     wrong = mistaken(right, subject, kind)
     if wrong is None:
         return

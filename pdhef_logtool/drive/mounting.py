@@ -463,7 +463,9 @@ def _rescaled(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span
     if factors:
         sound, shares = without_faulty_samples(survey.channels.signals, survey.vehicle)
         if shares:
-            factors = explained_factors(measure(sound, vehicle=survey.vehicle), mounting_is_known=survey.is_mounted, most=1)
+            factors = explained_factors(
+                measure(sound, vehicle=survey.vehicle), mounting_is_known=survey.is_mounted, most=1
+            )
     signals, notes = dict(mapping.signals), list(mapping.notes)
     for name, (factor, evidence) in factors.items():
         if name in signals:

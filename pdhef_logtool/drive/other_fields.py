@@ -17,7 +17,7 @@ from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import PdhefError
 
-_MISREAD = (".sign", ".unit", ".axis", ".mounting", ".range", ".frame", ".level")
+_MISREAD = (".sign", ".unit", ".axis", ".mounting", ".magnitude", ".frame", ".level")
 
 
 def with_other_fields(
@@ -33,24 +33,25 @@ def with_other_fields(
     if mapping.origin != "file" or not failed:
         return tuple(checks)
     doubted = {c.subject for c in checks if c.verdict != "passed" and c.name.endswith(_MISREAD)}
-    others = _others(log, mapping, doubted)
-    if not others:
-        return tuple(checks)
-    corrected = _replaced(mapping, others)
-    try:
-        again = checks_of(corrected)
-    except PdhefError:  # the other fields cannot be read
-        return tuple(checks)
-    still = {c.name for c in again if c.verdict == "failed"}
-    if {c.subject for c in again if c.name in still} & others.keys() or not len(still) < len(failed):
+    differing = _others(log, mapping)
+    for others in ({n: s for n, s in differing.items() if n in doubted}, differing):
+        try:
+            again = checks_of(_replaced(mapping, others)) if others else ()
+        except PdhefError:  # the other fields cannot be read
+            continue
+        still = {c.name for c in again if c.verdict == "failed"}
+        wrong = {c.subject for c in again if c.name in still}
+        if others and not wrong & others.keys() and len(still) < len(failed):
+            break
+    else:
         return tuple(checks)
     told = tuple(_check(name, source, checks) for name, source in others.items())
     kept = (c for c in checks if c.subject not in others and not (c.verdict == "failed" and c.name not in still))
     return (*told, *kept)
 
 
-def _others(log: DriveLog, mapping: Mapping, doubted: set[str]) -> dict[str, SignalSource]:
-    """Return by doubted signal the source that recognition reads it from, where that is another one."""
+def _others(log: DriveLog, mapping: Mapping) -> dict[str, SignalSource]:
+    """Return by signal the source that recognition reads it from, where that is another one."""
     try:
         recognised = auto_map(log).mapping
     except PdhefError:
@@ -60,7 +61,7 @@ def _others(log: DriveLog, mapping: Mapping, doubted: set[str]) -> dict[str, Sig
     return {
         name: replace(other, latency_s=source.latency_s)
         for name, source, other in pairs
-        if name in doubted and other is not None and (other.topic, other.paths) != (source.topic, source.paths)
+        if other is not None and (other.topic, other.paths) != (source.topic, source.paths)
     }
 
 
@@ -71,8 +72,8 @@ def _replaced(mapping: Mapping, others: dict[str, SignalSource]) -> Mapping:
 
 
 def _check(name: str, source: SignalSource, checks: Sequence[Check]) -> Check:
-    mine = [c for c in checks if c.subject == name and c.verdict != "passed"]
-    evidence = next((c.evidence for c in mine if c.verdict == "failed"), mine[0].evidence)
+    doubts = [c for verdict in ("failed", "undecided") for c in checks if (c.subject, c.verdict) == (name, verdict)]
+    evidence = doubts[0].evidence if doubts else "it contradicts others that fail"
     field = str(list(source.field)).replace("'", '"') if isinstance(source.field, tuple) else f'"{source.field}"'
     lines = f'topic = "{source.topic}", field = {field}, scale = {_shown(source.scale)}'
     check = AXIS.failed(f"{evidence}; with {source.label} all checks of it pass", name, signal_name=name)

@@ -370,9 +370,7 @@ def _setup_of(
     start_ns, end_ns = slice_ns
     first = _as_far_as_decided(log, options)
     until_ns = min(end_ns, first.end_ns)
-    return setup_of(
-        plan_drive(first, mapping, vehicle, start_ns, until_ns, clock=options.clock, waived=options.waived)
-    )
+    return setup_of(plan_drive(first, mapping, vehicle, start_ns, until_ns, clock=options.clock, waived=options.waived))
 
 
 def _as_far_as_decided(log: DriveLog, options: ReadOptions) -> DriveLog:

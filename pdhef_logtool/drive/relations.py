@@ -278,7 +278,7 @@ def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
 
 def _is_told(name: str, relations: Sequence[Relation]) -> bool:
     mine = [r for r in relations if name in r.powers and r.tells]
-    others = [factor for factor, _ in _units(name.removeprefix("truth."))]
+    others = [factor for factor, _ in units_of(name.removeprefix("truth."))]
     holds = bool(mine) and bool(others) and all(r.accepts() for r in mine)
     return holds and all(any(not r.accepts(f ** r.powers[name]) for r in mine) for f in others)
 
@@ -311,9 +311,7 @@ def _nearest(relations: Sequence[Relation], explanations: Sequence[tuple[Mistake
     best: dict[frozenset[str], float] = {}
     for chosen, misfit in zip(explanations, misfits, strict=True):
         best[_signals(chosen)] = min(misfit, best.get(_signals(chosen), np.inf))
-    return [
-        e for e, m in zip(explanations, misfits, strict=True) if not m - best[_signals(e)] > CLEARLY_NEARER
-    ]
+    return [e for e, m in zip(explanations, misfits, strict=True) if not m - best[_signals(e)] > CLEARLY_NEARER]
 
 
 def _signals(chosen: tuple[Mistake, ...]) -> frozenset[str]:
@@ -337,7 +335,7 @@ def known_mistakes(names: Sequence[str], together: Sequence[tuple[str, ...]] = (
     out: list[Mistake] = []
     for name in names:
         bare = name.removeprefix("truth.")
-        units = _units(bare)
+        units = units_of(bare)
         out += [Mistake({name: factor}, f"{name} {words}", "unit") for factor, words in units]
         out += _foreign((name,), units)
         out.append(Mistake({name: -1.0}, f"{name} has the wrong sign", "sign"))
@@ -349,31 +347,37 @@ def known_mistakes(names: Sequence[str], together: Sequence[tuple[str, ...]] = (
         present = [n for n in group if n in names]
         for size in range(2, len(present) + 1):
             for part in combinations(present, size):
-                words = f"{' and '.join(part)} have the wrong sign"
+                words = f"{_together(part)} have the wrong sign"
                 # A sensor is mounted upside down or backwards, or ground truth has another convention; speeds count
                 # ahead.
                 if not _NEVER_TURNED & set(part):
                     out.append(Mistake(dict.fromkeys(part, -1.0), words, "sign"))
-                shared = dict(_units(part[0].removeprefix("truth.")))
+                shared = dict(units_of(part[0].removeprefix("truth.")))
                 for name in part[1:]:
-                    units_of_name = dict(_units(name.removeprefix("truth.")))
+                    units_of_name = dict(units_of(name.removeprefix("truth.")))
                     shared = {f: text for f, text in shared.items() if f in units_of_name}
-                words = " and ".join(part)
+                words = _together(part)
                 out += [Mistake(dict.fromkeys(part, f), f"{words}: each {text}", "unit") for f, text in shared.items()]
                 out += _foreign(part, list(shared.items()))
     return out
+
+
+def _together(names: Sequence[str]) -> str:
+    """Return signals in words; the wheel speeds and their mean as one."""
+    wheels = [n for n in names if n.startswith("wheel_speed")]
+    return "wheel speeds" if len(wheels) == len(names) > 2 else " and ".join(names)
 
 
 def _foreign(names: Sequence[str], own: Sequence[tuple[float, str]]) -> list[Mistake]:
     """Return the mistakes by factors of units that other quantities have."""
     factors = [f for size in _FOREIGN for f in (size, 1.0 / size)]
     strange = [f for f in factors if all(abs(np.log(f / other)) > CLEARLY_NEARER for other, _ in own)]
-    words = " and ".join(names)
+    words = _together(names)
     text = "{} is off by a factor of {:.4g}"
     return [Mistake(dict.fromkeys(names, f), text.format(words, 1.0 / f), "unit", foreign=True) for f in strange]
 
 
-def _units(name: str) -> list[tuple[float, str]]:
+def units_of(name: str) -> list[tuple[float, str]]:
     """Return by what a signal is off where its unit is taken for another, and how that is stated."""
     to_radians = [(DEGREE, "is in degrees"), (1.0 / DEGREE, "was converted from degrees twice")]
     of_speeds = [(1.0 / 3.6, "is in km/h"), (3.6, "was converted from km/h twice"), (0.44704, "is in mph")]
@@ -493,7 +497,9 @@ def _moving(columns: Mapping[str, FloatArray], speed: FloatArray) -> BoolArray:
     return moving_at(speed, 0.0) if any(c.size and c.std() > least for c, least in finite) else moving
 
 
-def _lengths(speed: FloatArray, vehicle: VehicleParameters | None) -> tuple[tuple[str, tuple[float, float], float], ...]:
+def _lengths(
+    speed: FloatArray, vehicle: VehicleParameters | None
+) -> tuple[tuple[str, tuple[float, float], float], ...]:
     """Return by steering signal the plausible effective wheelbases, m, and the typical one."""
     finite = np.abs(speed[np.isfinite(speed)])
     if vehicle is not None:

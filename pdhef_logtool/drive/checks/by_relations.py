@@ -22,8 +22,13 @@ from pdhef_logtool.drive.relations import (
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import GNSS
 
-_STEERINGS = ("steer_rad", "steering_wheel_rad")
 _LACKS_WHEELBASE = "needs the wheelbase of a vehicle file, or speeds that only full-size vehicles reach"
+_LACKS_SIDESLIP = "needs sideslip that changes fast"
+#: What a drive lacks that shows the sign of a signal and not its unit.
+_LACKS_FOR_UNIT = {
+    **dict.fromkeys(("steer_rad", "steering_wheel_rad"), _LACKS_WHEELBASE),
+    **dict.fromkeys(("truth.vy_m_s", "truth.sideslip_rad"), _LACKS_SIDESLIP),
+}
 _LACKS = {
     "ax_m_s2": "speeding up and braking, on straights",
     "speed_m_s": "a wheel speed, an accelerometer or ground truth to compare with, and speeding up or bends",
@@ -66,13 +71,20 @@ def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Che
     checks: list[Check] = []
     for name in names:
         # A wheel that contradicts others does so through the mean of the wheels, which is the speed.
-        through = WHEEL_SPEEDS if name in culprits and name.startswith("wheel_speed_") else name
+        blamed = culprits | likeliest.keys() | others.keys()
+        through = WHEEL_SPEEDS if name in blamed and name.startswith("wheel_speed_") else name
         mine = [r for r in relations if name in r.powers or through in r.powers]
         unrelated = [r for r in mine if r.unrelated and not _is_cleared(name, r, relations)]
-        judged = _judged(name, [r for r in mine if r.tells], explained)
+        judged = _judged(name, _of(name, [r for r in mine if r.tells]), explained)
         checks += [_unrelated(name, r) for r in unrelated[:1]]
         checks += judged or ([] if unrelated else [_not_excited(name, mine)])
     return tuple(checks)
+
+
+def _of(name: str, relations: list[Relation]) -> list[Relation]:
+    """Return the relations without those of a wheel to the mean of the wheels, if others are left."""
+    others = [r for r in relations if not {name, WHEEL_SPEEDS} >= set(r.powers)]
+    return others if others and any(not r.accepts() for r in others) else relations
 
 
 class _Explained(NamedTuple):
@@ -102,8 +114,9 @@ def _judged(name: str, relations: Sequence[Relation], explained: _Explained) -> 
     if good or (bad and explained.is_explained):
         usable = relations if explained.is_explained else good
         best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
-        if explained.is_explained and name in _STEERINGS and not any(r.decides_unit for r in usable):
-            return [SIGN.passed(best.evidence, name), UNIT.undecided(best.evidence, name, _LACKS_WHEELBASE)]
+        lacks = _LACKS_FOR_UNIT.get(name)
+        if explained.is_explained and lacks and not any(r.decides_unit for r in usable):
+            return [SIGN.passed(best.evidence, name), UNIT.undecided(best.evidence, name, lacks)]
         return [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
     return [_contradicted(name, bad[0], explained.culprits)] if bad else []
 
