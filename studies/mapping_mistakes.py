@@ -1,7 +1,7 @@
 """Eight kinds of mistakes in a mapping x every signal: how many are named with the right remedy.
 
-``python -m studies.mapping_mistakes [LOG ...]`` counts them over logs, by default the sample logs. A mistake is *named* if
-a failed check of its signal has the factor or the axis that undoes it in its remedy, *stopped* if a check of its
+``python -m studies.mapping_mistakes [LOG ...]`` counts them over logs, by default the sample logs. A mistake is *named*
+if a failed check of its signal has the factor or the axis that undoes it in its remedy, *stopped* if a check of its
 signal fails with another remedy, *open* if the checks of its signal are undecided, *silent* if they pass, and *other*
 if another signal fails instead.
 """
@@ -26,15 +26,8 @@ from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.checks import Check
 
 #: What a mapping's scale is wrong by, or for an axis the one that is read instead.
-FACTORS = {
-    "x57.3": 57.3,
-    "/57.3": 1 / 57.3,
-    "x9.81": 9.81,
-    "/9.81": 1 / 9.81,
-    "x3.6": 3.6,
-    "/3.6": 1 / 3.6,
-    "sign": -1.0,
-}
+_UNITS = {"57.3": 57.3, "9.81": 9.81, "3.6": 3.6}
+FACTORS = {f"x{n}": f for n, f in _UNITS.items()} | {f"/{n}": 1.0 / f for n, f in _UNITS.items()} | {"sign": -1.0}
 AXIS = "axis"
 KINDS = (*FACTORS, AXIS)
 SAMPLES = ("dlc", "fishhook", "step", "sweep", "road")

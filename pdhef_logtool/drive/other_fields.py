@@ -1,4 +1,4 @@
-"""Whether a mapping file reads a field where the log has another that is right: recognition names it, the drive decides.
+"""Whether a mapping file reads a wrong field: recognition names another one of the log, and the drive decides.
 
 A signal with a wrong unit still goes with the others; one that is read from another field often does too, by chance or
 because both move in bends. So each suspicion is tested: the signals of which recognition reads other fields are read

@@ -104,6 +104,7 @@ STALE_FILES = (SETUP_FILE, PAGE_FILE, METRICS_FILE, ESTIMATES_FILE, RECORDING_FI
 _SILENT = "{} has no valid row although the car moves"
 _NO_COPY = "annotated.mcap contains the tool's topics only: a log of kind {} has no messages to copy"
 _ALL_SILENT = "no estimator has a valid row although the car moves"
+_MAP_THEM = "map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)"
 _NEVER_MOVES = "the car is never faster than {:g} m/s: there is nothing to score"
 #: Units of ground truth quantities that have no channel of their own name.
 _DERIVED_UNITS = {"position_m": "m"}
@@ -470,8 +471,7 @@ def _choose_estimators(
             expected="at least one estimator that can run",
             got="; ".join(f"{s.name}: {s.reason}" for s in skipped),
             where=str(drive.path),
-            remedy="; ".join(f"{reason}, or --waive it" for reason in refused.values())
-            or "map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)",
+            remedy=next((f"{reason} (or --waive it)" for reason in refused.values()), _MAP_THEM),
         )
     return estimators, skipped, requested
 

@@ -16,6 +16,7 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, auto_map, mapping_to_toml
+from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import Channel
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
@@ -90,7 +91,11 @@ def test_what_uses_a_signal_with_a_wrong_unit_is_stopped(
         assert found.plan.refused
         assert subject not in found.available or subject == "wheel_speeds"
         assert all(re.search(r"scale = (1|0\.9999)", text) for text in found.plan.refused.values())
-    assert run_with(path, wrong, tmp_path / "out") == code
+    if code == 1:
+        with pytest.raises(EstimatorError, match=r"multiply its scale in the mapping by 57\.2958"):
+            run_with(path, wrong, tmp_path / "out")
+    else:
+        assert run_with(path, wrong, tmp_path / "out") == code
 
 
 def test_a_waived_check_stops_nothing(sample_logs_dir: Path) -> None:
