@@ -28,6 +28,7 @@ from pdhef_logtool.logs.formats import (
     log_suffixes,
     recognised_format,
     what_is_a_log,
+    without_general,
 )
 from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.reduced_log import ReducedLog, reduced_record
@@ -206,6 +207,7 @@ def _open_folder(path: Path, meter: Meter) -> DriveLog:
     if is_log_folder(path):
         return _open_rosbag2_folder(path, meter)
     logs = [p for p in sorted(path.iterdir()) if p.is_file() and looks_like_log(p)]
+    logs = [p for p in logs if p.name in without_general({log.name for log in logs})]
     if len(logs) != 1:
         got = "a folder without a log" if not logs else f"a folder of {len(logs)} logs without metadata.yaml"
         raise LogError(

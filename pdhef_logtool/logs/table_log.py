@@ -40,12 +40,17 @@ class Table:
 
     @classmethod
     def of_arrays(
-        cls, name: str, stamps_ns: IntArray, columns: Mapping[str, NDArray[Any]], units: Mapping[str, str] | None = None
+        cls,
+        name: str,
+        stamps_ns: IntArray,
+        columns: Mapping[str, NDArray[Any]],
+        units: Mapping[str, str] | None = None,
+        type_name: str = "",
     ) -> Table:
         """Return a table of numbers [N] that are in memory, with the unit of each column where one is known."""
         units = units or {}
         fields = tuple(FieldInfo(path, "number", unit=units.get(path, "")) for path in columns)
-        return cls(name, stamps_ns, fields, lambda path, rows: columns[path][rows])
+        return cls(name, stamps_ns, fields, lambda path, rows: columns[path][rows], type_name)
 
 
 class TableLog(DriveLog):
