@@ -70,6 +70,10 @@ FORMATS = (
     LogFormat("a CSV file", f"{__package__}.text_logs:open_csv", (".csv", ".tsv"), is_general=True),
     LogFormat("a Parquet file", f"{__package__}.array_logs:open_parquet", (".parquet",), b"PAR1", is_general=True),
     LogFormat("a MAT file", f"{__package__}.array_logs:open_mat", (".mat",), b"MATLAB ", is_general=True),
+    LogFormat("an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), b"MDF     "),
+    LogFormat("an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), b"UnFinMF "),
+    LogFormat("a BLF file", f"{__package__}.can_logs:open_blf", (".blf",), b"LOGG"),
+    LogFormat("an ASC file", f"{__package__}.can_logs:open_asc", (".asc",)),
 )
 
 
@@ -104,4 +108,4 @@ def without_general(names: set[str]) -> set[str]:
 
 def what_is_a_log() -> str:
     """Return the formats in words."""
-    return f"{', '.join(f.title for f in _every_format())} or a rosbag2 folder"
+    return f"{', '.join(dict.fromkeys(f.title for f in _every_format()))} or a rosbag2 folder"

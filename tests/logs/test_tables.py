@@ -112,7 +112,7 @@ def test_any_numbers_come_back(
 
 
 def test_columns_at_another_rate_have_their_own_clock_and_repeated_names_a_number(tmp_path: Path) -> None:
-    rows = [f"{t:.2f},{a},{v if i % 10 == 0 else ''},{2 * a}" for i, (t, a, v) in enumerate(zip(TIME_S, AY, SPEED))]
+    rows = [f"{t:.2f},{AY[i]},{SPEED[i] if i % 10 == 0 else ''},{2 * AY[i]}" for i, t in enumerate(TIME_S)]
     with closing(_log(tmp_path / "a.csv", "\n".join(["t,ay,speed,ay", *rows]).encode())) as log:
         assert [(t.name, t.messages) for t in log.topics] == [("csv", N), ("csv_2", N // 10)]
         read = log.read({"csv": ["ay", "ay_2"], "csv_2": ["speed"]})
@@ -183,7 +183,7 @@ def vbo(clock: list[str], *, units: str = "g\n\n°/s\n", created: str = "11/04/2
     head = f"File created on {created}\n\n[header]\n" + "\n".join(titles) + f"\n\n[channel units]\n{units}\n"
     head += "[comments]\nLog Rate (Hz) : 100.00\n\n[column names]\nsats time lat long\n\n[data]\n"
     rows = [
-        f"018 {t} +3608.246{i % 10} -1086.979{i % 10} {72.0 + i * 0.01:07.3f} 231.56  0.0 +3608.2 {AY[i] / 9.81:+.6E} 20 1.0 "
+        f"018 {t} +3608.246{i % 10} -1086.979{i % 10} {72.0 + i * 0.01:07.3f} 231.56  0.0 +3608.2 {AY[i]:+.6E} 20 1.0 "
         for i, t in enumerate(clock)
     ]
     return (head + "\n".join(rows) + "\n").replace("\n", "\r\n").encode("latin-1")
@@ -233,9 +233,8 @@ def test_a_parquet_file_with_units_nulls_and_structs(tmp_path: Path) -> None:
         pa.field("gnss_speed", pa.float64()),
         pa.field("driver", pa.string()),
     ]
-    times = pa.array((NOON_NS + np.round(TIME_S * 1e9).astype(np.int64)).astype("datetime64[ns]")).cast(
-        pa.timestamp("us")
-    )
+    stamps = NOON_NS + np.round(TIME_S * 1e9).astype(np.int64)
+    times = pa.array(stamps.astype("datetime64[ns]")).cast(pa.timestamp("us"))
     columns = [times, pa.array(SPEED.astype(np.float32)), imu, pa.array(gnss), pa.array(["me"] * N)]
     pq.write_table(pa.Table.from_arrays(columns, schema=pa.schema(fields)), tmp_path / "a.parquet")
     with closing(open_log(tmp_path / "a.parquet")) as log:
