@@ -5,8 +5,10 @@ A group of bus logging becomes a topic ``can`` of raw frames.
 
 from __future__ import annotations
 
+import gc
 import logging
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
@@ -36,11 +38,9 @@ def open_mdf(file: LogFile) -> TableLog:
     logging.getLogger("asammdf").setLevel(logging.CRITICAL)
     losses: list[Loss] = []
     with file.meter.running(file.path.stat().st_size):
-        try:
-            source = asammdf.MDF(str(file.path), use_display_names=False)
-        except Exception as error:
-            got = f"damage before the first channel: {describe_damage(error)[1]}"
-            raise LogError(expected="an MDF file with readable channels", got=got, where=str(file.place)) from error
+        source, got = _opened(asammdf, file)
+        if source is None:
+            raise LogError(expected="an MDF file with readable channels", got=got, where=str(file.place))
         groups = [Group(source, number) for number in range(len(source.groups))]
         names = unique(group.name for group in groups)
         tables = []
@@ -61,6 +61,22 @@ def open_mdf(file: LogFile) -> TableLog:
 
     opened = LogFile(file.path, file.place, file.meter, close, file.cut)
     return TableLog(opened, f"mdf-{str(source.version)[:1]}", tables, losses)
+
+
+def _opened(asammdf: Any, file: LogFile) -> tuple[Any, str]:
+    """Return the file, or None and why it cannot be opened."""
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None  # the end of a half-opened object is an error there
+    source, got = None, ""
+    try:
+        try:
+            source = asammdf.MDF(str(file.path), use_display_names=False)
+        except Exception as error:  # noqa: BLE001  any error of a damaged file
+            got = describe_damage(error)[1]
+        if source is None:
+            gc.collect()
+    finally:
+        sys.unraisablehook = hook
+    return source, got
 
 
 class Group:

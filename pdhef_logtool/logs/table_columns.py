@@ -136,7 +136,7 @@ def field_name(text: str) -> str:
     """Return the name of a column as every format of messages takes it: ASCII letters, digits and ``_``."""
     text = unicodedata.normalize("NFKD", text.partition("\\")[0].translate(_LATIN)).encode("ascii", "ignore").decode()
     name = re.sub(r"[\W_]+", "_", text).strip("_") or "column"
-    return f"_{name}" if name[0].isdigit() else name
+    return f"n_{name}" if name[0].isdigit() else name
 
 
 def unique(names: Iterable[str]) -> list[str]:

@@ -162,7 +162,7 @@ def test_names_and_units_of_titles() -> None:
     assert split_unit("yaw rate_[°/s]") == ("yaw rate", "°/s")
     assert field_name("Lat._Vel.") == "Lat_Vel"
     assert field_name("Längsbeschl.\\CCP:1") == "Laengsbeschl"
-    assert field_name("2nd gear") == "_2nd_gear"
+    assert field_name("2nd gear") == "n_2nd_gear"
 
 
 def test_stamps_of_numbers() -> None:
