@@ -164,11 +164,11 @@ def _variables(file: LogFile, losses: list[Loss]) -> Iterator[tuple[str, NDArray
 
     data = file.path.read_bytes()
     order = ">" if data[126:128] == b"MI" else "<"
-    at = _MAT_HEAD
-    while at + 8 <= len(data):
-        kind, size = struct.unpack_from(f"{order}II", data, at)
-        element = data[at : at + 8 + size]
-        at += 8 + size + (0 if kind == _COMPRESSED else -size % 8)
+    offset = _MAT_HEAD
+    while offset + 8 <= len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, offset)
+        element = data[offset : offset + 8 + size]
+        offset += 8 + size + (0 if kind == _COMPRESSED else -size % 8)
         try:
             if len(element) < 8 + size:
                 raise ValueError("the file ends inside of it")
@@ -208,15 +208,15 @@ def _leaves(path: str, value: Any, depth: int) -> Iterator[tuple[str, NDArray[An
 def _hdf5_variables(file: LogFile, losses: list[Loss]) -> Iterator[tuple[str, NDArray[Any]]]:
     """Yield the arrays of a MAT file of version 7.3 by path; a dataset that cannot be read is a loss."""
     h5py = extra("h5py", "MAT files of version 7.3", file.place)
-    found: list[tuple[str, Callable[[], NDArray[Any]]]] = []
+    datasets: list[tuple[str, Callable[[], NDArray[Any]]]] = []
 
     def visit(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset) and not name.startswith("#") and item.dtype.kind in "iufb":
-            found.append((name, lambda: item[()]))
+            datasets.append((name, lambda: item[()]))
 
     with h5py.File(Path(file.path), "r") as source:
         source.visititems(visit)
-        for name, load in found:
+        for name, load in datasets:
             try:
                 yield name, np.asarray(load())
             except Exception as error:  # noqa: BLE001  any error of a damaged chunk

@@ -20,7 +20,7 @@ from pdhef_logtool.records.signals import IntArray, Loss
 CAN_TYPE = "can/msg/Frame"
 #: Of CAN FD.
 _MOST_BYTES = 64
-#: Frames between two looks at the time that reading takes.
+#: Frames between two checks of the reading time.
 _METERED = 4096
 
 

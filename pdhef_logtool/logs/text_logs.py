@@ -71,12 +71,12 @@ def open_vbo(file: LogFile) -> TableLog:
     """Open a VBO file; raises LogError where a section is missing."""
     with file.meter.running(file.path.stat().st_size):
         text = file.path.read_bytes().decode("latin-1").replace("\r\n", "\n")
-        head, found, data = text.partition("[data]\n")
+        head, mark, data = text.partition("[data]\n")
         sections = {
             n.lower(): b.strip("\n").split("\n") for n, b in re.findall(r"^\[([^\]\n]*)\]\n([^\[]*)", head, re.M)
         }
         titles = [t.strip() for t in sections.get("header", ()) if t.strip()]
-        if not found or not titles:
+        if not mark or not titles:
             got = "a file without them"
             raise LogError(expected="a VBO file with [header] and [data]", got=got, where=str(file.place))
         fields = unique(field_name(title) for title in titles)
@@ -112,7 +112,8 @@ def _layout(lines: Sequence[str], where: str) -> tuple[str, list[str], list[str]
     rows = [_cells(line, separator) for line in head]
     width = max((len(row) for row in rows[-20:]), default=0)
     first = next((i for i, row in enumerate(rows) if len(row) == width > 1 and _is_values(row)), 0)
-    above = [row for row in rows[:first] if len(row) == width]
+    widths = {width, width - 1} if first and not rows[first][-1].strip() else {width}  # rows may end with a separator
+    above = [row for row in rows[:first] if len(row) in widths]
     if not above:
         got = "none" if first else "no row of numbers below it"
         raise LogError(expected="a CSV file with a row of column names", got=got, where=where)
@@ -126,7 +127,7 @@ def _cells(line: str, separator: str) -> list[str]:
     line = line.strip().lstrip("#").strip() if separator == " " else line.strip("\r ").lstrip("#")
     if separator == " ":
         return line.split()
-    return next(csv.reader([line.removesuffix(separator)], delimiter=separator), [])
+    return next(csv.reader([line], delimiter=separator), [])
 
 
 def _is_values(cells: Sequence[str]) -> bool:
@@ -145,13 +146,13 @@ def _columns(
     ended = not lines or not lines[-1]
     if separator == " ":
         lines = [" ".join(line.split()) for line in lines]
-    rows = [line.removesuffix(separator) for line in lines if line and not line.startswith("#")]
+    rows = [line for line in lines if line and not line.startswith("#")]
     if not any('"' in row for row in rows[:_HEAD_LINES]):
-        kept = [row for row in rows if row.count(separator) == len(names) - 1]
-        # A trailing separator belongs to an empty last cell where the header has one more.
-        kept = kept or [row for line in lines if (row := line) and row.count(separator) == len(names) - 1]
+        more = len(names) - 1  # and maybe one at the end of a row
+        fits = [more in (n := row.count(separator), n - row.endswith(separator)) for row in rows]
+        kept = [row for row, fit in zip(rows, fits, strict=True) if fit]
         wrong = len(rows) - len(kept)
-        if wrong and not ended and rows[-1].count(separator) != len(names) - 1:
+        if wrong and not ended and not fits[-1]:
             losses.append(Loss("truncated", "the last row is incomplete", where, count=1))
             wrong -= 1
         if wrong:
