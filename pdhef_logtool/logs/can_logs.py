@@ -6,43 +6,20 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pdhef_logtool.logs.can_decoding import Frames
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.log_file import LogFile
-from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.resource_limits import Meter
 from pdhef_logtool.logs.table_columns import extra, number_stamps
-from pdhef_logtool.logs.table_log import Table, TableLog
+from pdhef_logtool.logs.table_log import TableLog
 from pdhef_logtool.records.errors import LogError
-from pdhef_logtool.records.signals import IntArray, Loss
+from pdhef_logtool.records.signals import Loss
 
-CAN_TYPE = "can/msg/Frame"
 #: Of CAN FD.
 _MOST_BYTES = 64
 #: Frames between two checks of the reading time.
 _METERED = 4096
-
-
-def frame_table(name: str, stamps_ns: IntArray, parts: dict[str, NDArray[Any]], data: NDArray[np.uint8]) -> Table:
-    """Return frames as a table.
-
-    Parameters
-    ----------
-    parts : by name, [N]: ``id``, ``length`` (bytes), ``is_extended``, and what else is known of a frame.
-    data : [N, k], zero behind the length.
-    """
-    names = [f"data[{i}]" for i in range(data.shape[1])]
-
-    def load(path: str, rows: slice) -> NDArray[Any]:
-        if path in parts:
-            return parts[path][rows]
-        past = np.arange(data.shape[1]) >= parts["length"][rows, np.newaxis]
-        values = np.where(past, np.nan, data[rows])
-        return values if path == "data" else values[:, names.index(path)]
-
-    fields = tuple(FieldInfo(path, "number") for path in (*parts, *names))
-    return Table(name, stamps_ns, fields, load, CAN_TYPE)
 
 
 def open_blf(file: LogFile) -> TableLog:
@@ -89,8 +66,8 @@ def _open(file: LogFile, reader: str, kind: str) -> TableLog:
         payload = np.frombuffer(bytes(data), np.uint8).reshape(-1, _MOST_BYTES)[:, : max(widest, 1)]
         clock = number_stamps(np.asarray(stamps), "s")
         order = np.argsort(clock, kind="stable")
-        table = frame_table("can", clock[order], dict(zip(names, parts[order].T, strict=True)), payload[order])
-        return TableLog(file, kind, [table], losses)
+        frames = Frames(clock[order], dict(zip(names, parts[order].T, strict=True)), payload[order])
+        return TableLog(file, kind, [frames.table("can")], losses, [frames])
 
 
 def _messages(reader: Any, meter: Meter) -> Iterator[Any]:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.can_logs import frame_table
+from pdhef_logtool.logs.can_decoding import Frames
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.message_schema import FieldInfo
@@ -43,10 +43,11 @@ def open_mdf(file: LogFile) -> TableLog:
             raise LogError(expected="an MDF file with readable channels", got=got, where=str(file.place))
         groups = [Group(source, number) for number in range(len(source.groups))]
         names = unique(group.name for group in groups)
-        tables = []
+        tables: list[Table] = []
+        frames: list[Frames] = []
         for name, group in zip(names, groups, strict=True):
             try:
-                tables += group.tables(name)
+                tables += group.tables(name, frames)
             except Exception as error:  # noqa: BLE001  any error of a damaged block
                 what = f"the channel group cannot be read: {describe_damage(error)[1]}"
                 losses.append(Loss("bad-group", what, name))
@@ -60,7 +61,7 @@ def open_mdf(file: LogFile) -> TableLog:
         release()
 
     opened = LogFile(file.path, file.place, file.meter, close, file.cut)
-    return TableLog(opened, f"mdf-{str(source.version)[:1]}", tables, losses)
+    return TableLog(opened, f"mdf-{str(source.version)[:1]}", tables, losses, frames)
 
 
 def _opened(asammdf: Any, file: LogFile) -> tuple[Any, str]:
@@ -103,8 +104,8 @@ class Group:
         """Return whether it contains raw CAN frames."""
         return any(channel.name == _FRAMES for channel in self._group.channels)
 
-    def tables(self, name: str) -> Iterator[Table]:
-        """Yield the table of the group; none for a group without samples or times."""
+    def tables(self, name: str, frames: list[Frames]) -> Iterator[Table]:
+        """Yield the table of the group, none without samples or times; raw CAN frames are added to ``frames``."""
         master = self._source.masters_db.get(self._number)
         if master is None or not self._group.channel_group.cycles_nr:
             return
@@ -113,7 +114,8 @@ class Group:
             parts = {part: self._frames(end)[order].astype(np.int64) for part, end in _PARTS.items() if self._has(end)}
             data = np.atleast_2d(self._frames("DataBytes"))[order].astype(np.uint8)
             parts.setdefault("length", np.full(len(stamps), data.shape[1]))
-            yield frame_table(name, stamps, parts, data)
+            frames.append(Frames(stamps, parts, data))
+            yield frames[-1].table(name)
             return
         indices = [i for i in range(len(self._group.channels)) if i != master]
         titles = unique(field_name(self._group.channels[i].name) for i in indices)

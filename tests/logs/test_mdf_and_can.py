@@ -116,6 +116,11 @@ def _check_can(path: Path, tmp_path: Path, kind: str) -> None:
         assert [(t.name, t.messages) for t in log.topics] == [("can", 2 * N)]
         found = read_signals(log, load_mapping(tmp_path / "m.toml"), {}, log.start_ns, log.end_ns)
         assert log.lost == ()
+    with closing(open_log(path, msgs=tmp_path / "car.dbc")) as log:
+        assert [(t.name, t.messages) for t in log.topics] == [("can", 2 * N), ("Motion", N)]
+        assert {f.path: f.unit for f in log.fields("Motion")} == {"AccelY": "g", "Speed": "km/h"}
+        decoded = log.read({"Motion": ["AccelY"]})["Motion"].fields["AccelY"]
+        np.testing.assert_allclose(decoded, np.round(AY, 3), atol=1e-12)
     ay, speed = found.signals["ay_m_s2"], found.signals["speed_m_s"]
     np.testing.assert_allclose(ay.values, np.round(AY, 3) * 9.80665, atol=1e-9)
     np.testing.assert_allclose(speed.values, np.round(SPEED, 2) / 3.6, atol=1e-9)
@@ -129,6 +134,30 @@ def test_raw_can_is_decoded_by_the_dbc_of_the_mapping(suffix: str, kind: str, tm
         for message in frames():
             writer.on_message_received(message)
     _check_can(path, tmp_path, kind)
+
+
+def test_multiplexed_signals_have_a_table_for_each_selector(tmp_path: Path) -> None:
+    dbc = (
+        DBC.partition("BO_ 291")[0]
+        + """BO_ 5 Mux: 2 A
+ SG_ Sel M : 0|8@1+ (1,0) [0|0] "" A
+ SG_ First m0 : 8|8@1+ (1,0) [0|0] "deg" A
+ SG_ Second m1 : 8|8@1+ (2,0) [0|0] "km/h" A
+"""
+    )
+    (tmp_path / "m").mkdir()
+    (tmp_path / "m" / "mux.dbc").write_text(dbc)
+    with can.BLFWriter(str(tmp_path / "a.blf")) as writer:
+        for i in range(40):
+            ours = {"arbitration_id": 5, "is_extended_id": False, "data": bytes([i % 2, i]), "channel": 0}
+            writer.on_message_received(can.Message(timestamp=1.7e9 + i * 0.01, **ours))
+            ours |= {"is_extended_id": True, "data": bytes([i % 2])}
+            writer.on_message_received(can.Message(timestamp=1.7e9 + i * 0.01 + 1e-3, **ours))
+    with closing(open_log(tmp_path / "a.blf", msgs=tmp_path / "m")) as log:
+        assert {t.name: t.messages for t in log.topics} == {"can": 80, "Mux": 40, "Mux_Sel_0": 20, "Mux_Sel_1": 20}
+        read = log.read({"Mux_Sel_0": ["First"], "Mux_Sel_1": ["Second"]})
+    assert read["Mux_Sel_0"].fields["First"].tolist() == list(range(0, 40, 2))
+    assert read["Mux_Sel_1"].fields["Second"].tolist() == [2 * i for i in range(1, 40, 2)]
 
 
 def test_a_cut_blf_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
