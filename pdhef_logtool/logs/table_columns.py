@@ -211,6 +211,7 @@ def text_stamps(texts: Series) -> IntArray:
     import polars as pl
 
     texts = texts.str.strip_chars().str.replace(",", ".").str.replace(" ", "T")
+    texts = texts.str.replace(r"^(\d\d)\.(\d\d)\.(\d{4})", "$3-$2-$1")
     first = next((t for t in texts.drop_nulls().head(100) if t), "")
     if "-" not in first and "/" not in first:
         parts = texts.str.split_exact(":", 2).struct.unnest()

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 #: Lines at the start of a CSV file in which its header must be.
 _HEAD_LINES = 200
 _NUMBER = re.compile(r"\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?\s*")
-_TIME_TEXT = re.compile(r"\s*(\d{4}-\d\d-\d\d([T ].*)?|\d{1,2}:\d\d:\d\d([.,]\d+)?Z?)\s*")
+_TIME_TEXT = re.compile(r"\s*(\d\d\.\d\d\.\d{4}.*|\d{4}-\d\d-\d\d([T ].*)?|\d{1,2}:\d\d:\d\d([.,]\d+)?Z?)\s*")
 _EMPTY = frozenset({"", "nan", "null", "none", "na", "n/a", "-"})
 _TRUTHS = {"true": 1.0, "false": 0.0}
 
@@ -170,11 +170,11 @@ def _column(texts: Series) -> NDArray[Any] | Series:
     """Return a column as numbers float64 [N], NaN where a cell has none; as it is where it contains texts."""
     import polars as pl
 
-    texts = texts.str.strip_chars()
+    texts = points = texts.str.strip_chars()
     if texts.head(1000).str.contains(",", literal=True).any():
         plain = texts.str.replace_all(".", "", literal=True).str.replace(",", ".", literal=True)
-        texts = pl.select(pl.when(texts.str.contains(",", literal=True)).then(plain).otherwise(texts)).to_series()
-    numbers = texts.cast(pl.Float64, strict=False)
+        points = pl.select(pl.when(texts.str.contains(",", literal=True)).then(plain).otherwise(texts)).to_series()
+    numbers = points.cast(pl.Float64, strict=False)
     given = texts.filter(~texts.str.to_lowercase().is_in(list(_EMPTY)))
     if given.len() == 0:
         return np.full(len(texts), np.nan)

@@ -61,6 +61,17 @@ DIALECTS = {
     "iso": (_csv(_iso("Z"), _HEAD).encode(), NOON_NS),
     "iso-without-zone": (_csv([t.replace("T", " ") for t in _iso()], _HEAD).encode(), NOON_NS),
     "iso-offset": (_csv(_iso("+02:00"), _HEAD).encode(), NOON_NS - 7200 * 10**9),
+    "german-date": (
+        _csv([f"01.05.2024 {t.partition('T')[2]}" for t in _iso()], "Time;ay [m/s²];speed [km/h]", ";", comma=True)
+        .replace("01,05,2024", "01.05.2024")
+        .encode(),
+        NOON_NS,
+    ),
+    "motec": (
+        '"Format","MoTeC CSV File"\n"Venue","a track"\n\n"Time","ay","speed"\n"s","m/s²","km/h"\n\n\n'.encode()
+        + "\n".join(f'"{t:.2f}","{a:.4f}","{v:.3f}"' for t, a, v in zip(TIME_S, AY, SPEED, strict=True)).encode(),
+        RELATIVE_NS,
+    ),
     "date-and-time": (_csv([t.replace("T", ",") for t in _iso()], "Date," + _HEAD).encode(), NOON_NS),
     "clock": (_csv([t.partition("T")[2] for t in _iso()], _HEAD).encode(), RELATIVE_NS + 12 * 3600 * 10**9),
     "gps-week": (
