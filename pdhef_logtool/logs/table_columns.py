@@ -32,76 +32,12 @@ _MISSING_SHARE = 0.01
 
 #: Spellings of units that are separated from the name of a column, without spaces and in lower case.
 _UNITS = frozenset(
-    [
-        "g",
-        "mg",
-        "m/s²",
-        "m/s^2",
-        "m/s2",
-        "m/s**2",
-        "m/s/s",
-        "mps2",
-        "m/s",
-        "m/sec",
-        "mps",
-        "km/h",
-        "kmh",
-        "kph",
-        "kmph",
-        "mph",
-        "kn",
-        "kt",
-        "kts",
-        "knots",
-        "deg",
-        "°",
-        "degree",
-        "degrees",
-        "rad",
-        "radians",
-        "mrad",
-        "deg/s",
-        "°/s",
-        "dps",
-        "deg/sec",
-        "degps",
-        "rad/s",
-        "rad/sec",
-        "radps",
-        "mdps",
-        "rpm",
-        "1/min",
-        "u/min",
-        "min",
-        "'",
-        "s",
-        "sec",
-        "seconds",
-        "ms",
-        "us",
-        "µs",
-        "ns",
-        "m",
-        "cm",
-        "mm",
-        "km",
-        "%",
-        "bar",
-        "pa",
-        "kpa",
-        "n",
-        "nm",
-        "v",
-        "mv",
-        "a",
-        "°c",
-        "degc",
-        "c",
-        "hz",
-        "kg",
-        "-",
-        "1",
-    ]
+    re.split(
+        ",",
+        "g,mg,m/s²,m/s^2,m/s2,m/s**2,m/s/s,mps2,m/s,m/sec,mps,km/h,kmh,kph,kmph,mph,kn,kt,kts,knots,deg,°,degree,degrees,"
+        "rad,radians,mrad,deg/s,°/s,dps,deg/sec,degps,rad/s,rad/sec,radps,mdps,rpm,1/min,u/min,min,',s,sec,seconds,ms,us,"
+        "µs,ns,m,cm,mm,km,%,bar,pa,kpa,n,nm,v,mv,a,°c,degc,c,hz,kg,-,1",
+    )
 )
 _BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]([^\[\](){}<>]*)[\])}>]$")
 _LATIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss"})
@@ -253,9 +189,7 @@ def stamps_of(sheet: Sheet, where: str) -> tuple[IntArray, frozenset[str]]:
     week, seconds = (next((names[n] for n in names if p.fullmatch(n)), None) for p in (_WEEK, _WEEK_TIME))
     if week is not None and seconds is not None:
         return gps_stamps(_numbers(sheet.columns[week]), _numbers(sheet.columns[seconds])), frozenset({week, seconds})
-    clocks = [name for n, name in names.items() if _TIME.fullmatch(n)]
-    clocks = [n for n in reversed(clocks) if _is_clock(sheet.columns[n])]
-    clocks = clocks or [name for n, name in names.items() if _TIME_LIKE.search(n) and _ascends(sheet.columns[name])]
+    clocks = _clocks(sheet, names)
     if not clocks:
         raise LogError(
             expected="a column of times (time, t, timestamp; s, ms, ISO 8601, or GPS week and seconds)",
@@ -264,16 +198,23 @@ def stamps_of(sheet: Sheet, where: str) -> tuple[IntArray, frozenset[str]]:
             remedy="name the column of times so",
         )
     column = sheet.columns[clocks[0]]
-    if isinstance(column, np.ndarray):
-        if column.dtype.kind == "M":
-            return placed(column.astype("datetime64[ns]").astype(np.int64)), frozenset(clocks[:1])
-        unit = sheet.units.get(clocks[0], "") or snake(clocks[0]).rpartition("_")[2]
-        return number_stamps(column.astype(np.float64), unit), frozenset(clocks[:1])
-    date = next((names[n] for n in names if _DATE.fullmatch(n)), None)
-    dates = None if date is None else sheet.columns[date]
-    if dates is not None and not isinstance(dates, np.ndarray) and "-" not in str(column[0]):
-        return text_stamps(dates + "T" + column), frozenset({clocks[0], str(date)})
-    return text_stamps(column), frozenset(clocks[:1])
+    date = next((names[n] for n in names if _DATE.fullmatch(n)), "")
+    dates = sheet.columns.get(date)
+    if not isinstance(column, np.ndarray):
+        if dates is None or isinstance(dates, np.ndarray) or "-" in str(column[0]):
+            return text_stamps(column), frozenset(clocks[:1])
+        return text_stamps(dates + "T" + column), frozenset({clocks[0], date})
+    if column.dtype.kind == "M":
+        return placed(column.astype("datetime64[ns]").astype(np.int64)), frozenset(clocks[:1])
+    unit = sheet.units.get(clocks[0], "") or snake(clocks[0]).rpartition("_")[2]
+    return number_stamps(column.astype(np.float64), unit), frozenset(clocks[:1])
+
+
+def _clocks(sheet: Sheet, names: Mapping[str, str]) -> list[str]:
+    """Return the columns with times, the best first; ``names`` are all columns by their names in lower case."""
+    clocks = [name for n, name in names.items() if _TIME.fullmatch(n)]
+    clocks = [n for n in reversed(clocks) if _is_clock(sheet.columns[n])]
+    return clocks or [name for n, name in names.items() if _TIME_LIKE.search(n) and _ascends(sheet.columns[name])]
 
 
 def _is_clock(column: NDArray[Any] | Series) -> bool:
@@ -284,9 +225,8 @@ def _is_clock(column: NDArray[Any] | Series) -> bool:
 
 def _ascends(column: NDArray[Any] | Series) -> bool:
     """Return whether a column contains numbers that never step back."""
-    return (
-        isinstance(column, np.ndarray) and len(column) > 1 and bool((np.diff(column.astype(np.float64)) >= 0.0).all())
-    )
+    is_number = isinstance(column, np.ndarray) and column.dtype.kind in "iuf" and len(column) > 1
+    return is_number and bool((np.diff(np.asarray(column, np.float64)) >= 0.0).all())
 
 
 def _numbers(column: NDArray[Any] | Series) -> FloatArray:

@@ -103,12 +103,7 @@ def _decoded(data: bytes) -> str:
 def _layout(lines: Sequence[str], where: str) -> tuple[str, list[str], list[str], int]:
     """Return delimiter, titles, units and the number of the first row of values."""
     head = lines[:_HEAD_LINES]
-    sample = [line for line in head if line.strip()][-20:]
-    counts = {s: [line.count(s) for line in sample] for s in (";", "\t", "|", ",")}
-    separator = next((s for s, n in counts.items() if n and min(n) > 0 and max(n) == min(n)), "")
-    separator = separator or max(counts, key=lambda s: sum(counts[s]))
-    if not any(counts[separator]):
-        separator = " "
+    separator = _separator([line for line in head if line.strip()][-20:])
     rows = [_cells(line, separator) for line in head]
     width = max((len(row) for row in rows[-20:]), default=0)
     first = next((i for i, row in enumerate(rows) if len(row) == width > 1 and _is_values(row)), 0)
@@ -121,6 +116,14 @@ def _layout(lines: Sequence[str], where: str) -> tuple[str, list[str], list[str]
     if len(above) > 1 and all(not c or is_unit(c) for c in cells) and any(cells):
         return separator, above[-2], above[-1], first
     return separator, above[-1], [], first
+
+
+def _separator(lines: Sequence[str]) -> str:
+    """Return the delimiter of which all lines have equally many; else the most frequent; a space without any."""
+    counts = {s: [line.count(s) for line in lines] for s in (";", "\t", "|", ",")}
+    regular = next((s for s, n in counts.items() if n and min(n) > 0 and max(n) == min(n)), "")
+    frequent = max(counts, key=lambda s: sum(counts[s]))
+    return regular or (frequent if any(counts[frequent]) else " ")
 
 
 def _cells(line: str, separator: str) -> list[str]:
