@@ -128,8 +128,8 @@ def _mat_tables(arrays: Mapping[str, Mapping[str, NDArray[Any]]], where: str, lo
             text = f"{', '.join([*sheet.columns][:5])} ({length} values) have no times of their length"
             losses.append(Loss("no-clock", text, where, severity="note"))
             continue
-        columns = {n: v for n, v in sheet.columns.items() if (struct_, length) not in clocks or n not in clock[1]}
-        rows += [(Sheet(sheet.name, columns, {}), clock[0])] if columns else []
+        signals = {n: v for n, v in sheet.columns.items() if (struct_, length) not in clocks or n not in clock[1]}
+        rows += [(Sheet(sheet.name, signals, {}), clock[0])] if signals else []
     for name, (sheet, stamps) in zip(unique(sheet.name for sheet, _ in rows), rows, strict=True):
         yield from tables_of(Sheet(name, sheet.columns, {}), where, losses, stamps)
 

@@ -9,8 +9,10 @@ import re
 from contextlib import closing
 from dataclasses import astuple
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo, windows
 from pdhef_logtool.logs.open_log import open_log
@@ -90,7 +92,7 @@ def _write_tables(writer: McapLogWriter, log: DriveLog) -> None:
         )
 
 
-def _stored(values: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+def _stored(values: NDArray[Any]) -> NDArray[Any]:
     """Return a column, or bytes [N, k] with zeros behind the length of a frame."""
     return values if values.ndim == 1 else np.nan_to_num(values).astype(np.uint8)
 

@@ -428,7 +428,7 @@ _STATED_UNIT = re.compile(r"^\s*[\w/\[\]<=]+\s+(\w+)\s*#\s*\[([^\[\]\s]{1,12})\]
 def stated_units(definition: bytes) -> dict[str, str]:
     """Return the units by field that comments of a ROS 2 message's own fields give: ``float64 speed  # [km/h]``."""
     main_type = definition.decode(errors="replace").partition("\n===")[0]
-    return dict(match.groups() for match in _STATED_UNIT.finditer(main_type))
+    return {match[1]: match[2] for match in _STATED_UNIT.finditer(main_type)}
 
 
 _PART = re.compile(r"([^.\[\]]+)|\[(\d*)\]|\.")

@@ -185,7 +185,7 @@ def stamps_of(sheet: Sheet, where: str) -> tuple[IntArray, frozenset[str]]:
     ------
     LogError : no column contains times.
     """
-    names = {snake(name): name for name in reversed(sheet.columns)}
+    names = {snake(name): name for name in reversed([*sheet.columns])}
     week, seconds = (next((names[n] for n in names if p.fullmatch(n)), None) for p in (_WEEK, _WEEK_TIME))
     if week is not None and seconds is not None:
         return gps_stamps(_numbers(sheet.columns[week]), _numbers(sheet.columns[seconds])), frozenset({week, seconds})
@@ -225,8 +225,9 @@ def _is_clock(column: NDArray[Any] | Series) -> bool:
 
 def _ascends(column: NDArray[Any] | Series) -> bool:
     """Return whether a column contains numbers that never step back."""
-    is_number = isinstance(column, np.ndarray) and column.dtype.kind in "iuf" and len(column) > 1
-    return is_number and bool((np.diff(np.asarray(column, np.float64)) >= 0.0).all())
+    if not isinstance(column, np.ndarray) or column.dtype.kind not in "iuf":
+        return False
+    return len(column) > 1 and bool((np.diff(column.astype(np.float64)) >= 0.0).all())
 
 
 def _numbers(column: NDArray[Any] | Series) -> FloatArray:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -132,13 +133,15 @@ _GROUPS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
 
 def writers() -> Iterator[tuple[str, Callable[[Sequence[Topic], Path], Path]]]:
     """Yield the containers and their writers, which return the path with the suffix."""
-    for name, (suffix, write) in _TABLES.items():
-        yield name, lambda topics, path, w=write, s=suffix: _written(path, s, lambda p: w(p, *_columns(topics)))
-    for name, (suffix, put) in _GROUPS.items():
-        yield name, lambda topics, path, w=put, s=suffix: _written(path, s, lambda p: w(p, topics))
+    for name in (*_TABLES, *_GROUPS):
+        yield name, partial(_write, name)
 
 
-def _written(path: Path, suffix: str, write: Callable[[Path], None]) -> Path:
-    path = path.with_suffix(suffix)
-    write(path)
-    return path
+def _write(container: str, topics: Sequence[Topic], path: Path) -> Path:
+    if container in _GROUPS:
+        suffix, put = _GROUPS[container]
+        put(path.with_suffix(suffix), topics)
+    else:
+        suffix, write = _TABLES[container]
+        write(path.with_suffix(suffix), *_columns(topics))
+    return path.with_suffix(suffix)
