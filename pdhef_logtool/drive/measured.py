@@ -83,12 +83,12 @@ def measure(
     """
     columns, speed_name = drive_columns(signals, truth or {}, derived)
     topics = {n: c.source.split(".")[0] for n, c in signals.items()}
-    known = None if vehicle in (None, default_vehicle()) else vehicle
+    validated = None if vehicle in (None, default_vehicle()) else vehicle
     scales: dict[str, float | tuple[float, ...]] = {}
     if mapping is not None:
         scales |= {n: s.scale for n, s in mapping.signals.items()}
         scales |= {f"truth.{n}": s.scale for n, s in mapping.truth.items()}
-    return Measured(columns, speed_name, tuple(measured_relations(columns, speed_name, known)), topics, scales)
+    return Measured(columns, speed_name, tuple(measured_relations(columns, speed_name, validated)), topics, scales)
 
 
 def drive_columns(
