@@ -75,7 +75,7 @@ class Query:
     def of(cls, given: Mapping[str, str]) -> Query:
         """Return the query of an address; a value that cannot be used is its default."""
         texts = {key: given[key] for key in ("name", "run", "car", "outcome") if key in given}
-        sort = given.get("sort", cls.sort)
+        sort = given.get("sort")
         return cls(
             **texts,
             estimator=given.get("estimator") or SELECTED,
