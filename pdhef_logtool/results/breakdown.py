@@ -107,8 +107,8 @@ class _Test:
     def effect(self, p: float, level: float) -> Effect:
         """Return it with a corrected p-value, and the interval at a level (0.05: 95 %)."""
         width = quantile(1.0 - 0.5 * level, self.freedom) * self.error
-        bounds = (self.difference + factor * width for factor in (0.0, -1.0, 1.0))
-        return Effect(*(math.expm1(min(x, _LARGEST_LOG)) for x in bounds), p)
+        low, high = self.difference - width, min(self.difference + width, _LARGEST_LOG)
+        return Effect(math.expm1(self.difference), math.expm1(low), math.expm1(high), p)
 
 
 def breakdowns(drives: Sequence[BreakdownDrive], by: Sequence[str] = ()) -> tuple[Breakdown, ...]:
