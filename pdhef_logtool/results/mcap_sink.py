@@ -67,7 +67,7 @@ _LEVEL = 1
 _POSE_STEP_NS = 50_000_000
 #: Between two points of the map.
 _PATH_STEP_NS = 1_000_000_000
-#: Steps of the tracks that nobody asked for by name, of which the shortest is taken that leaves the file small enough.
+#: Steps of the tracks without a name in --estimators: the shortest that leaves the file small enough is taken.
 _STEPS_NS = tuple(round(s * 1e9) for s in (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0))
 #: Of the map of a track.
 _MOST_POSES = 1000
@@ -186,15 +186,15 @@ class AnnotatedMcapSink(Sink):
         self._first_ns = min(self._first_ns or int(track.stamps_ns[0]), int(track.stamps_ns[0]))
         if len(track.reason) == len(track):
             self._reasons.setdefault(track.name, ReasonIntervals()).append(track.stamps_ns, track.reason)
-        known = track.valid & np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
-        on_path = on_path[known[on_path]]
+        has_pose = track.valid & np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
+        on_path = on_path[has_pose[on_path]]
         self._paths.setdefault(track.name, []).append(
             np.stack([track.x_m[on_path], track.y_m[on_path], track.yaw_rad[on_path]], axis=1)
         )
         fields = plotted_fields(track, truth, self._min_speed_m_s)
         return [
             _state_batch(track, stated),
-            _odometry_batch(track, posed[known[posed]]),
+            _odometry_batch(track, posed[has_pose[posed]]),
             _plot_batch(track, plotted, fields),
         ]
 

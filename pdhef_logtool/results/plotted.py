@@ -38,8 +38,8 @@ def plotted_fields(track: StateTrack, truth: StateTrack | None, min_speed_m_s: f
     """Return the fields [N] of ``pdhef_msgs/msg/PlottedEstimate`` but its header; of the ground truth no errors."""
     fast = np.hypot(track.vx_m_s, track.vy_m_s) >= min_speed_m_s
     slip, rate = (
-        np.where(known, DEGREES * getattr(track, column), np.nan)
-        for column, known in (("sideslip_rad", track.valid & fast), ("yaw_rate_rad_s", track.valid))
+        np.where(is_drawn, DEGREES * getattr(track, column), np.nan)
+        for column, is_drawn in (("sideslip_rad", track.valid & fast), ("yaw_rate_rad_s", track.valid))
     )
     slip_half, rate_half = (
         NORMAL_95 * DEGREES * np.asarray(getattr(track, std)) for std in ("sideslip_std_rad", "yaw_rate_std_rad_s")
