@@ -54,8 +54,8 @@ def test_a_page_draws_all_figures_zooms_all_of_them_and_says_nothing(browser, tm
     file = page_of(write_run(tmp_path, drive_tracks(60.0, NAMES)))
     opened(browser, file)
     places = browser.value("document.querySelectorAll('[data-figure]').length")
-    assert browser.value("document.querySelectorAll('.canvas canvas').length") == places == 11
-    browser.drag(".u-over", 0.1, 0.2)
+    assert browser.value("document.querySelectorAll('.canvas canvas').length") == places == 12
+    browser.drag('[data-figure="sideslip"] .u-over', 0.1, 0.2)
     browser.value(_DRAWN)
     low, high = (float(s) for s in browser.value("document.querySelector('.range').textContent").split()[0:3:2])
     assert (low, high) == pytest.approx((6.0, 12.0), abs=0.3)
@@ -93,7 +93,7 @@ def test_hostile_names_run_nothing(browser, tmp_path):
         "document.querySelectorAll('script[type]').length + 3"
     )
     browser.value("document.querySelectorAll('.toggles input').forEach(n => n.click())")
-    browser.drag(".u-over", 0.1, 0.2)
+    browser.drag('[data-figure="sideslip"] .u-over', 0.1, 0.2)
     time.sleep(0.2)
     assert browser.messages == []
     assert len(browser.requests) == 1
