@@ -215,7 +215,9 @@ def open_run(output: Path | str) -> OpenedRun:
         if not (folder / name).is_file():
             got = f"a folder without {name}" if folder.is_dir() else "no such folder"
             where = str(folder) if mirror is None else mirror.objects.shown
-            raise OutputError(expected="the outputs of a run", got=got, where=where, remedy=_REMEDY)
+            raise OutputError(
+                expected="the outputs of a run", got=got, where=where, remedy=_REMEDY, missing=not folder.is_dir()
+            )
     what, path = "the run.json of a run", folder / RUN_FILE
     document = read_sealed(path, what, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)
     if document.get("format") != "pdhef.run":
