@@ -18,6 +18,7 @@ from pdhef_logtool.evaluation.requirement_bounds import (
     pooled,
     quantile,
 )
+from pdhef_logtool.evaluation.units import AY_NOTE
 from pdhef_logtool.evaluation.validation_plan import AT_LEAST, POOLED, RUN, SQUARES, WORST_DRIVE, Requirement, shown
 from pdhef_logtool.records.signals import FloatArray
 
@@ -312,7 +313,8 @@ def _too_few(requirement: Requirement, bounded: Bounded, basis: str, where: str)
         return f"{value}; no confidence interval from {bounded.units} drives", more
     if basis == "blocks" and not bounded.units:
         return f"{value}; this run kept no blocks for this requirement", "run the logs again with this plan"
-    reason = f"{value}; no confidence interval from {bounded.units} blocks of driving{where}, it needs {LEAST_BLOCKS}"
+    blocks = "1 block" if bounded.units == 1 else f"{bounded.units} blocks"
+    reason = f"{value}; no confidence interval from {blocks} of driving{where}, it needs {LEAST_BLOCKS}"
     seconds = (LEAST_BLOCKS - bounded.units) * 10
     return reason, f"drive at least {seconds} s more{where}, better {LEAST_DRIVES} drives or more"
 
@@ -343,6 +345,8 @@ def _notes(
         )
     if estimated:
         notes.append("errors are relative to the estimated reference: no ground truth")
+    if requirement.signal == "ay_m_s2":
+        notes.append(AY_NOTE)
     if drives and all(d.same for d in drives):
         notes.append(f"{drives[0].estimator} equals {requirement.baseline} in these drives (residual gain 0)")
     return notes

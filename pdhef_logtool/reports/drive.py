@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pdhef_logtool.evaluation.units import LABELS
+from pdhef_logtool.evaluation.units import AY_NOTE, LABELS
 from pdhef_logtool.logs.byte_account import checksum_text
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.reports.charts import Charts
@@ -116,6 +116,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         faults=report.get("faults"),
         innovations=report.get("innovations") or (),
         metadata=report.get("metadata") or {},
+        ay_note=AY_NOTE,
         over_time=OVER_TIME,
         in_plane=IN_PLANE,
     )

@@ -236,7 +236,10 @@ def _add_filter(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles)
 
 
 def _add_motion(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> None:
-    for key, title, unit in (("speed", "Speed, longitudinal", "m/s"), ("ay", "Lateral acceleration", "m/s²")):
+    for key, title, unit in (
+        ("speed", "Speed, longitudinal", "m/s"),
+        ("ay", "Lateral acceleration: specific force of the estimate, ground truth as in the table", "m/s²"),
+    ):
         if lines := _lines(series, roles, key, (TRUTH, roles.main)):
             charts.time(key, title, unit, lines, resolution=_SEEN, height=120)
 
