@@ -58,7 +58,7 @@ def pooled(
         return Bounded(0.0, 0.0, 0.0, n)
     if n > _MOST_UNITS:  # neighbours are drawn together
         groups = np.arange(n) * _MOST_UNITS // n
-        top, below = (np.bincount(groups, weights=column) for column in (top, below))
+        top, below = (np.bincount(groups, weights=c).astype(np.float64) for c in (top, below))
     log = positive
     error = float(_error(top, below, np.ones((1, len(top))), power, log=log)[0])
     if error == 0.0:

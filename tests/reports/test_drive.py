@@ -350,6 +350,6 @@ def test_the_command_says_what_it_wrote_and_where_no_browser_is(tmp_path, monkey
 @pytest.mark.slow
 def test_a_folder_that_is_no_run_is_one_line_and_is_not_made(tmp_path):
     result = called("report", str(tmp_path / "nothing"))
-    assert result.returncode == 1
+    assert result.returncode == 2
     assert "pdhef run LOG -o OUT writes one" in result.stderr
     assert not (tmp_path / "nothing").exists()

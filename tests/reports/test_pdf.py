@@ -30,7 +30,7 @@ def test_the_document_has_a_cover_contents_verdicts_figures_and_hashes_but_no_po
     page = pdf_page(run)
     text = text_of(page)
     order = ["Validation of 1 drive", "Prepared by", "Without positions", "Contents",
-             "Plan plan.toml: 1 FAIL, 1 PASS (this drive alone)", "Inputs and versions"]  # fmt: skip
+             "Plan plan.toml: 1 FAIL, 1 PASS (this drive alone)", "sha256 of the file, of its signals"]  # fmt: skip
     assert [text.find(part) for part in order] == sorted(text.find(part) for part in order) and -1 not in map(
         text.find, order
     )
