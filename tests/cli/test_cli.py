@@ -98,7 +98,7 @@ def test_run_prints_a_table_on_stdout_and_warnings_on_stderr(sample_logs_dir: Pa
     )  # fmt: skip
     assert result.returncode == 0
     assert "phy-ukf" in result.stdout
-    assert "default sedan (no car given)" in result.stdout
+    assert "default sedan (no car given)" in " ".join(result.stdout.split())
     assert "warning" not in result.stdout + result.stderr  # nothing here may be wrong
     assert "truth" in result.stdout
     assert all(len(line) <= 160 for line in result.stdout.splitlines() if "outputs in" not in line)
