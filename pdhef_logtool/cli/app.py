@@ -16,13 +16,16 @@ from pdhef_logtool.cli import (
     comparing,
     compiling,
     console,
+    converting,
     inspecting,
     learning,
     panels,
     reporting,
     running,
+    serving,
     simulating,
     stopping,
+    trending,
     validation,
 )
 from pdhef_logtool.cli.removed_commands import replaced_option, replacement
@@ -45,12 +48,24 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
-    help="Estimate sideslip on recorded drives (MCAP, rosbag1, rosbag2), score it against ground truth, and annotate "
-    "the logs.",
+    help="Estimate sideslip on recorded drives (MCAP, rosbag, MDF, VBO, CSV, MAT, ...), score it against ground "
+    "truth, and annotate the logs.",
     epilog="Exit codes: 0 ok, 1 failure, 2 usage, 3 finished but some input was lost, a check or some logs failed, "
     "4 a requirement or regression gate failed, 130 interrupted (Ctrl-C), 141 stdout was closed early, 143 terminated.",
 )
-for _group in (inspecting, running, validation, reporting, comparing, simulating, learning, compiling):
+for _group in (
+    inspecting,
+    running,
+    validation,
+    reporting,
+    comparing,
+    trending,
+    serving,
+    simulating,
+    learning,
+    converting,
+    compiling,
+):
     app.registered_commands += _group.commands.registered_commands
 
 

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 INPUT, ESTIMATION, OUTPUT, WORK, SETTINGS = "Input", "Estimation", "Output", "Processes", "Settings"
 
 Log = Annotated[
-    str, Argument(metavar="LOG", help="MCAP file, rosbag1 file, rosbag2 folder, .db3 file, or URL of a file.")
+    str,
+    Argument(metavar="LOG", help="Log file (MCAP, rosbag, MDF, CSV, VBO, MAT, ...), rosbag2 folder, or URL of a file."),
 ]
 Logs = Annotated[
     list[str], Argument(metavar="LOG", help="Log files, folders with logs, glob patterns, URLs, or @list.txt.")

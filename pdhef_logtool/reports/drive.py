@@ -14,6 +14,7 @@ from pdhef_logtool.reports.drive_figures import DriveFigures, Roles, drive_figur
 from pdhef_logtool.reports.drive_tables import by_segment, consistency, definitions, disagreements, residuals, scores
 from pdhef_logtool.reports.first_screen import next_steps, plan_head, tested_drive
 from pdhef_logtool.reports.page import render
+from pdhef_logtool.results.fleet import cause_and_remedy
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
 from pdhef_logtool.results.run_report import reasons_line
 
@@ -66,7 +67,8 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
     """
     report = log.report()
     if report is None or not isinstance(report.get("log"), dict):
-        return DrivePage(render("failed.html", label=log.label, outcome=log.outcome, back=back), Charts())
+        cause, remedy = cause_and_remedy(log.outcome.removeprefix("failed: "))
+        return DrivePage(render("failed.html", label=log.label, cause=cause, remedy=remedy, back=back), Charts())
     figures, why_none, wrong = None, "", ""
     roles = roles_of(report)
     low_speed = report["vehicle"].get("low_speed_blend_m_s")

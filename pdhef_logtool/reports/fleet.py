@@ -1,4 +1,4 @@
-"""The page of a whole run: how its drives are spread, who ranks where, where nobody drove, what failed."""
+"""The page of a whole run: errors over drives, ranking, effects of conditions, operating range, failures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from pdhef_logtool.reports.charts import Charts, Cloud, Interval
 from pdhef_logtool.reports.colours import INK, PLAIN, colour
 from pdhef_logtool.reports.first_screen import next_steps, plan_head, tested_run
 from pdhef_logtool.reports.page import render
-from pdhef_logtool.results.fleet import ANSWER, JUDGED, LEAST_DRIVES, Distribution, Fleet, Space, read_fleet
+from pdhef_logtool.results.breakdown import LEAST_DRIVES
+from pdhef_logtool.results.comparison_words import design_effect_text
+from pdhef_logtool.results.fleet import ANSWER, JUDGED, Distribution, Fleet, Space, read_fleet
 from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
 
 #: Keys of the figures of the page.
@@ -66,7 +68,7 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
     fleet = read_fleet(run, by)
     pages = {log.label for log in run.logs if log.file(PAGE_FILE) is not None}
     mains = {d.main for d in fleet.scored}
-    shown = [b for b in fleet.breakdowns if by or b.explains > 0.0][: None if by else _MOST_KEYS]
+    shown = [b for b in fleet.breakdowns if by or any(g.effect for g in b.groups)][: None if by else _MOST_KEYS]
     charts = Charts()
     _add_figures(charts, fleet)
     html = render(
@@ -83,7 +85,11 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
         answer=next((d for d in fleet.distributions if (d.estimator, d.signal) == (ANSWER, JUDGED)), None),
         rows=_rows(_told(fleet)),
         mains={ANSWER} if len(mains) > 1 else mains,
+        names=list(dict.fromkeys(d.estimator for d in fleet.distributions if d.estimator != ANSWER)),
+        ranked=any(r.place is not None for r in fleet.ranking),
+        dependence=design_effect_text(fleet.dependence, len(fleet.scored)),
         breakdowns=shown,
+        comparisons=sum(b.comparisons for b in fleet.breakdowns),
         idle_keys=[b.key for b in fleet.breakdowns if b not in shown],
         space=None if fleet.space is None else _space_rows(fleet.space),
         held=sorted(fleet.drives, key=lambda d: d.label)[:MOST_ROWS],
@@ -154,7 +160,8 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
 def _rival(fleet: Fleet) -> str | None:
     """Return the estimator that the selected one is drawn against: physics if it ran, else the best of the others."""
     mains = {d.main for d in fleet.scored}
-    names = [r.estimator for r in fleet.ranking if {r.estimator} != mains]
+    judged = sorted((d for d in fleet.distributions if d.signal == JUDGED), key=lambda d: d.median.value)
+    names = [d.estimator for d in judged if d.estimator != ANSWER and {d.estimator} != mains]
     return "physics" if "physics" in names else next(iter(names), None)
 
 

@@ -75,7 +75,8 @@ class RunConfig:
     window_s : length of the windows in which a log is processed, in s. Results do not depend on it.
     clock : ``arrival`` (a sample is available from its arrival on) or ``stamp`` (from its stamp on; not causal).
     budget : factor on the limits of memory and time for reading a log.
-    msgs : folder, zip file or wheel with .msg files of types that a log does not define.
+    msgs : folder, zip file or wheel with .msg files of types that a log does not define; or a DBC file, or a folder of
+        them, for raw CAN frames in BLF, ASC and MDF files.
     plan : validation plan (plan.toml); None = the default plan, which decides no exit code.
     network : network folder, ``default``, ``many-cars`` or ``none``; None = the car's.
     intervals : intervals file, ``none``, or ``unsure`` (wide intervals, for a car that may have changed); None = the

@@ -112,6 +112,7 @@ _BRIEF_BLOCKS = 12
 _SILENT = "{} has no valid row although the car moves"
 _NO_COPY = "annotated.mcap contains the tool's topics only: a log of kind {} has no messages to copy"
 _ALL_SILENT = "no estimator has a valid row although the car moves"
+_MAP_THEM = "map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)"
 _NEVER_MOVES = "the car is never faster than {:g} m/s: there is nothing to score"
 #: Units of ground truth quantities that have no channel of their own name.
 _DERIVED_UNITS = {"position_m": "m"}
@@ -502,17 +503,17 @@ def _choose_estimators(
     Candidates for the selected estimate run in any case. Raises EstimatorError if no requested estimator can.
     """
     names = config.estimators or default_names(car, drive.available)
-    options = Options(drive.options.use_speed)
-    estimators, skipped = runnable(names, car, drive.available, options)
+    options, refused = Options(drive.options.use_speed), drive.plan.refused
+    estimators, skipped = runnable(names, car, drive.available, options, refused)
     requested = frozenset(e.name for e in estimators)
     more = [name for name in candidates(car, drive.available) if name not in requested]
-    estimators += runnable(more, car, drive.available, options)[0] if more else []
+    estimators += runnable(more, car, drive.available, options, refused)[0] if more else []
     if not requested:
         raise EstimatorError(
             expected="at least one estimator that can run",
             got="; ".join(f"{s.name}: {s.reason}" for s in skipped),
             where=str(drive.path),
-            remedy="map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)",
+            remedy=next((f"{reason} (or --waive it)" for reason in refused.values()), _MAP_THEM),
         )
     return estimators, skipped, requested
 

@@ -73,6 +73,7 @@ from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.blocks import SegmentMasks
+    from pdhef_logtool.evaluation.manoeuvres import Manoeuvre
     from pdhef_logtool.evaluation.metrics import MetricRow
     from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
     from pdhef_logtool.evaluation.validation_plan import ValidationPlan
@@ -187,6 +188,8 @@ class _Scoring:
 
     def score(self, drive: Drive, outputs: OutputFolder | None) -> LogResult:
         """Read, compare and, with a folder, write."""
+        from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
+
         plan = drive.plan
         self.reporter.progress(drive.name, 0.1)
         recorded, losses = self._read_estimates(drive)
@@ -195,14 +198,15 @@ class _Scoring:
         ledger = sample_ledger(drive.log, plan, counts)
         self.reporter.progress(drive.name, 0.6)
         signals = _read_sensors(drive)
+        manoeuvres = [] if signals is None else find_manoeuvres(signals, self.car.vehicle)
         all_losses = merge_losses([drive.losses, losses, truth_losses, damage(ledger)])
         self.reporter.progress(drive.name, 0.8)
         scored_ns = np.unique(np.concatenate([r.track.stamps_ns for r in recorded]))
         plan = self._with_dependence(plan, recorded)
-        rows, dependent, blocks = self._figures(drive, plan, recorded, truth, signals)
+        rows, dependent, blocks = self._figures(drive, plan, recorded, truth, signals, manoeuvres)
         drive.plan = plan = replace(plan, dependent={**dependent, **plan.dependent})
         truth_track = truth_at(truth, scored_ns, plan.truth_latency_s, standstill_m_s=self.car.vehicle.standstill_m_s)
-        events = self._events(truth_track, signals_at(signals, scored_ns), recorded)
+        events = self._events(truth_track, signals_at(signals, scored_ns), recorded, manoeuvres)
         samples |= drive.samples
         for r in recorded:
             samples |= r.samples
@@ -259,6 +263,7 @@ class _Scoring:
         recorded: Sequence[RecordedEstimate],
         truth: TruthTrack,
         signals: Signals | None,
+        manoeuvres: Sequence[Manoeuvre],
     ) -> tuple[list[MetricRow], dict[str, str], list[RequirementBlocks]]:
         """Score each estimate at its own stamps; return what of the derived ground truth equals an estimate besides.
 
@@ -274,7 +279,8 @@ class _Scoring:
             at_stamps = truth_at(
                 truth, r.track.stamps_ns, plan.truth_latency_s, standstill_m_s=self.car.vehicle.standstill_m_s
             )
-            masks = segment_masks(signals_at(signals, r.track.stamps_ns), at_stamps, self.car.vehicle)
+            seen = signals_at(signals, r.track.stamps_ns)
+            masks = segment_masks(seen, at_stamps, self.car.vehicle, manoeuvres)
             same = {
                 name: f"the ground truth's {name} equals that of the estimate {r.track.name}"
                 for name in SCORED_SIGNALS
@@ -321,11 +327,17 @@ class _Scoring:
         judged = JudgedDrive(log, None, lambda: blocks)
         return RequirementFacts(plan_verdicts(self.validation, figures_of_rows(rows), [judged]), blocks)
 
-    def _events(self, truth: StateTrack, signals: Signals, recorded: Sequence[RecordedEstimate]) -> list[Event]:
+    def _events(
+        self,
+        truth: StateTrack,
+        signals: Signals,
+        recorded: Sequence[RecordedEstimate],
+        manoeuvres: Sequence[Manoeuvre],
+    ) -> list[Event]:
         from pdhef_logtool.evaluation.segments import segment_masks
 
-        masks = segment_masks(signals, truth, self.car.vehicle)
-        events = segment_events(truth, masks) + [e for r in recorded for e in diverged_events(r.track)]
+        masks = segment_masks(signals, truth, self.car.vehicle, manoeuvres)
+        events = segment_events(truth, masks, manoeuvres) + [e for r in recorded for e in diverged_events(r.track)]
         return sorted(events, key=in_time)
 
 

@@ -112,13 +112,13 @@ def test_anchors_of_anchors_are_not_written_out(tmp_path: Path, key: str) -> Non
 
 
 def test_a_dbc_that_is_none_is_a_wrong_mapping(tmp_path: Path) -> None:
-    from pdhef_logtool.mapping.can_frames import _load_dbc
+    from pdhef_logtool.logs.can_decoding import load_dbc
 
     (tmp_path / "folder.dbc").mkdir()
     (tmp_path / "text.dbc").write_text("no DBC")
     for name in ("folder.dbc", "text.dbc", "none.dbc"):
         with pytest.raises(PdhefError) as caught:
-            _load_dbc(tmp_path / name)
+            load_dbc(tmp_path / name)
         assert caught.value.exit_code == EXIT_USAGE
 
 
