@@ -53,7 +53,7 @@ def write_pdf(run: OpenedRun, *, positions: bool = False) -> Path:
     ------
     OutputError : There is no Chromium, it fails, or the file cannot be written.
     """
-    browser = next((found for name in _BROWSERS if (found := shutil.which(name))), None)
+    browser = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
     target = run.folder / PDF_FILE
     if browser is None:
         raise OutputError(

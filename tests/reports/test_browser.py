@@ -188,6 +188,7 @@ def test_figures_are_drawn_when_the_page_has_loaded_and_in_browsers_without_stre
     source = f"delete window.DecompressionStream; {at_load}"
     script = browser.call("Page.addScriptToEvaluateOnNewDocument", source=source)
     opened(browser, file)
+    assert browser.value("document.querySelectorAll('.canvas:not([role=img]), .canvas:not([aria-label])').length") == 0
     assert int(browser.value("window.drawnAtLoad")) == browser.value(
         "document.querySelectorAll('[data-figure]').length"
     )
