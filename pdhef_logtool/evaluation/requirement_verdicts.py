@@ -131,7 +131,8 @@ def judge(requirement: Requirement, drives: Sequence[DriveValue], missing: str =
         requirement,
         outcome,
         value,
-        *(x if math.isfinite(x) else None for x in (bounded.low, bounded.high)),
+        bounded.low if math.isfinite(bounded.low) else None,
+        bounded.high if math.isfinite(bounded.high) else None,
         margin,
         exposure,
         tuple(dict.fromkeys(d.estimator for d in drives)),
@@ -236,7 +237,8 @@ def _typical_ratio(ratios: FloatArray, level: float) -> Bounded:
     with np.errstate(divide="ignore"):
         logs = np.log(ratios)
     bounded = pooled(np.ones(len(logs)), logs, None, squares=False, positive=False, level=level)
-    return Bounded(*(float(np.exp(x)) for x in (bounded.value, bounded.low, bounded.high)), len(logs))
+    value, low, high = (float(np.exp(x)) for x in (bounded.value, bounded.low, bounded.high))
+    return Bounded(value, low, high, len(logs))
 
 
 def _reference_sd(requirement: Requirement, drives: Sequence[DriveValue]) -> float:

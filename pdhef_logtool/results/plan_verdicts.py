@@ -260,7 +260,8 @@ def _paired(blocks: RequirementBlocks | None, theirs: RequirementBlocks | None) 
         return None
     by_number = dict(zip(theirs.number, theirs.value, strict=True))
     kept = [i for i, number in enumerate(blocks.number) if number in by_number]
-    picked = {k: [getattr(blocks, k)[i] for i in kept] for k in ("number", "n", "seconds", "metres", "value")}
+    columns = ("number", "n", "seconds", "metres", "value")
+    picked: dict[str, Any] = {k: [getattr(blocks, k)[i] for i in kept] for k in columns}
     std = [blocks.std[i] for i in kept] if blocks.std else ()
     return replace(blocks, **picked, baseline=[by_number[blocks.number[i]] for i in kept], std=std)
 
