@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel, ConfigDict
 
 from pdhef_logtool.logs.discovery import RUN_FILE
-from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError
+from pdhef_logtool.records.errors import OutputError, PdhefError
 from pdhef_logtool.storage.documents import file_sha256, read_json, read_sealed, validated
 from pdhef_logtool.storage.object_store import Mirror, is_url
 
@@ -217,8 +217,8 @@ def open_run(output: Path | str) -> OpenedRun:
         if not (folder / name).is_file():
             got = f"a folder without {name}" if folder.is_dir() else "no such folder"
             where = str(folder) if mirror is None else mirror.objects.shown
-            missing = UsageError if mirror is None and not folder.exists() else OutputError
-            raise missing(expected="the outputs of a run", got=got, where=where, remedy=_REMEDY)
+            missing = mirror is None and not folder.exists()
+            raise OutputError(expected="the outputs of a run", got=got, where=where, remedy=_REMEDY, missing=missing)
     what, path = "the run.json of a run", folder / RUN_FILE
     document = read_sealed(path, what, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)
     if document.get("format") != "pdhef.run":
