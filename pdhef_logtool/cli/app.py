@@ -22,8 +22,10 @@ from pdhef_logtool.cli import (
     panels,
     reporting,
     running,
+    serving,
     simulating,
     stopping,
+    trending,
 )
 from pdhef_logtool.cli.removed_commands import replacement
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, PdhefError, UsageError
@@ -50,7 +52,10 @@ app = typer.Typer(
     epilog="Exit codes: 0 ok, 1 failure, 2 usage, 3 finished but some input was lost, a check or some logs failed, "
     "4 a threshold or regression gate failed, 130 interrupted (Ctrl-C), 141 stdout was closed early, 143 terminated.",
 )
-for _group in (inspecting, running, reporting, comparing, simulating, learning, converting, compiling):
+_GROUPS = (
+    inspecting, running, reporting, comparing, trending, serving, simulating, learning, converting, compiling,
+)  # fmt: skip
+for _group in _GROUPS:
     app.registered_commands += _group.commands.registered_commands
 
 

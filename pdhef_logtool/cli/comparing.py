@@ -13,7 +13,7 @@ from pdhef_logtool.cli import console, options, panels
 from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
-    from pdhef_logtool.results.gate import Gate
+    from pdhef_logtool.results.gate import Figure, Gate
 
 commands = typer.Typer()
 #: Room around events: a threshold that is crossed to and fro is one event; a clip shows how it came about.
@@ -45,7 +45,11 @@ def compare(
     metric: Annotated[str | None, Option(help="Metric of sideslip over the whole drive. Default: rmse.")] = None,
     cluster: Annotated[
         str | None,
-        Option(metavar="KEY", help="Group of dependent drives for the bootstrap: car, day, or a metadata key."),
+        Option(
+            metavar="KEY",
+            help="Groups of dependent drives: car, day, route, a metadata key, or none. Default: the dependence by "
+            "day, car and route is estimated.",
+        ),
     ] = None,
     allow_unpaired: Annotated[
         bool, Option("--allow-unpaired", help="Accept drives that only one run contains.")
@@ -66,24 +70,24 @@ def compare(
         [*(Path(x) for x in (a, b) if not is_url(x)), gate], [file for file in (html, junit) if file is not None]
     )
     asked = _gate(gate, max_regression, estimator, metric, allow_unpaired=allow_unpaired)
-    found = compare_runs(open_run(a), open_run(b), asked, cluster=cluster, strict=strict)
-    for line in found.damaged:
+    comparison = compare_runs(open_run(a), open_run(b), asked, cluster=cluster, strict=strict)
+    for line in comparison.damaged:
         console.warn(line)
     if junit is not None:
-        write_comparison_junit(junit, found)
+        write_comparison_junit(junit, comparison)
     if html is not None:
         from pdhef_logtool.reports.comparison import comparison_page
         from pdhef_logtool.storage.files import write_bytes
 
-        write_bytes(html, comparison_page(found))
-    console.finish(found, render_comparison, as_json)
+        write_bytes(html, comparison_page(comparison))
+    console.finish(comparison, render_comparison, as_json)
 
 
 def _gate(
     file: Path | None, max_regression: str | None, estimator: str | None, metric: str | None, *, allow_unpaired: bool
 ) -> Gate:
     """Return the figures that the options ask for; raises UsageError."""
-    from pdhef_logtool.results.gate import MAIN, Figure, Gate, figure_problems, load_gate, share_of
+    from pdhef_logtool.results.gate import Gate, load_gate
 
     single = {"--max-regression": max_regression, "--estimator": estimator, "--metric": metric}
     given = [name for name, value in single.items() if value is not None]
@@ -94,13 +98,20 @@ def _gate(
             )
         gate = load_gate(file)
         return Gate(gate.figures, gate.allow_unpaired or allow_unpaired)
+    return Gate((figure_asked(max_regression, estimator, metric),), allow_unpaired)
+
+
+def figure_asked(max_regression: str | None, estimator: str | None, metric: str | None) -> Figure:
+    """Return the figure that options ask for; raises UsageError."""
+    from pdhef_logtool.results.gate import MAIN, Figure, figure_problems, share_of
+
     limit = None if max_regression is None else share_of(max_regression)
     if max_regression is not None and limit is None:
         raise UsageError(expected="a share such as 5% or 0.05", got=max_regression, where="--max-regression")
     figure = Figure(metric=metric or "rmse", estimator=estimator or MAIN, limit=limit)
     if problems := figure_problems(figure.signal, figure.metric, figure.segment):
         raise UsageError(expected="a figure; lower is better", got="; ".join(problems), where="--metric")
-    return Gate((figure,), allow_unpaired)
+    return figure
 
 
 @options.command(
@@ -154,23 +165,23 @@ def events(
         options.local_folder(output)
     check_no_input([] if is_url(output) else [Path(output)], [] if parquet is None else [parquet])
     run = open_run(output)
-    found = find_events(run, condition, estimator=estimator, pad_s=pad_s)
-    for line in found.damaged:
+    events_found = find_events(run, condition, estimator=estimator, pad_s=pad_s)
+    for line in events_found.damaged:
         console.warn(line)
     if clip:
         from pdhef_logtool.results.clips import write_clips
 
         named = {column.track for column in condition.columns() if column.track is not None}
         named |= set() if estimator is None else {estimator}
-        found = write_clips(run, found, pad_s=pad_s, named=named, source=source, tell=console.warn)
+        events_found = write_clips(run, events_found, pad_s=pad_s, named=named, source=source, tell=console.warn)
     if parquet is not None:
-        write_events(parquet, found)
-    console.finish(found, render_events, as_json)
+        write_events(parquet, events_found)
+    console.finish(events_found, render_events, as_json)
 
 
 def _seconds(text: str) -> float:
     """Return the seconds of ``5s``, ``500ms`` or ``5``; raises UsageError."""
-    found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(ms|s)?\s*", text, re.ASCII)
-    if found is None or float(found[1]) > 1e6:
+    match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(ms|s)?\s*", text, re.ASCII)
+    if match is None or float(match[1]) > 1e6:
         raise UsageError(expected="a time such as 5s", got=text, where="--pad")
-    return float(found[1]) * (1e-3 if found[2] == "ms" else 1.0)
+    return float(match[1]) * (1e-3 if match[2] == "ms" else 1.0)

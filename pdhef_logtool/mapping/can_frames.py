@@ -346,7 +346,7 @@ def _plain_kinds(fields: tuple[FieldInfo, ...]) -> dict[str, str]:
 
 
 def _best(paths: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Return the paths whose last part bears the first of the names that any has, the least nested of them."""
+    """Return the least nested paths whose last component is the first of the names that any has."""
     for name in names:
         matches = [p for p in paths if p.rsplit(".", 1)[-1].replace("_", "").lower() == name]
         if matches:

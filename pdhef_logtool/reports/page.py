@@ -31,12 +31,13 @@ _MOST_SIGNS = 600
 DASH = "–"
 
 
-def render(template: str, charts: Charts | None = None, **texts: Any) -> bytes:
+def render(template: str, charts: Charts | None = None, *, forms: bool = False, **texts: Any) -> bytes:
     """Return a page.
 
     Parameters
     ----------
     template : file of ``templates/`` that extends ``base.html``. charts : what its ``figure(key)`` places show.
+    forms : whether the page may send forms to its own server.
     texts : what the template prints.
     """
     charts = Charts() if charts is None else charts
@@ -49,7 +50,7 @@ def render(template: str, charts: Charts | None = None, **texts: Any) -> bytes:
         .render(
             **texts,
             figure=partial(_place, charts),
-            policy=_policy(scripts, style),
+            policy=_policy(scripts, style, "'self'" if forms else "'none'"),
             scripts=[Markup(s) for s in scripts],  # noqa: S704 (files of this package)
             style=Markup(style),  # noqa: S704
             licence=Markup(_asset("UPLOT-LICENSE")),  # noqa: S704
@@ -75,6 +76,7 @@ def _environment() -> Environment:
         "number": number,
         "degrees": degrees,
         "percent": percent,
+        "change": change,
         "stamp": stamp,
         "seconds": seconds,
         "unit": unit,
@@ -97,11 +99,11 @@ def _place(charts: Charts, key: str) -> Markup:
     ).format(key, printable(charts.figures[key].heading, _MOST_SIGNS))
 
 
-def _policy(scripts: list[str], style: str) -> Markup:
+def _policy(scripts: list[str], style: str, forms: str) -> Markup:
     of_scripts = " ".join(f"'sha256-{_digest(s)}'" for s in scripts)
     return Markup(  # noqa: S704 (digests)
         f"default-src 'none'; script-src {of_scripts}; style-src 'sha256-{_digest(style)}'; img-src data:; "
-        "base-uri 'none'; form-action 'none'"
+        f"base-uri 'none'; form-action {forms}"
     )
 
 
@@ -145,6 +147,11 @@ def degrees(value_rad: float | None) -> str:
 def percent(share: float | None) -> str:
     """Return a share in percent."""
     return DASH if share is None or not math.isfinite(share) else f"{share:.1%}"
+
+
+def change(share: float | None) -> str:
+    """Return a relative change in percent with its sign."""
+    return DASH if share is None or not math.isfinite(share) else f"{share:+.1%}"
 
 
 def seconds(value_s: float | None) -> str:

@@ -1,6 +1,6 @@
-"""Scores estimates that somebody else recorded in a log: which fields they are, their stamps, truth there, figures.
+"""Scores estimates that somebody else recorded in a log: their fields, their stamps, ground truth there, figures.
 
-The scored stamps are the estimate's own. The truth is interpolated to them, its latency measured gyro to truth where
+The scored stamps are the estimate's own. Ground truth is interpolated to them, its latency measured against the gyro if
 the log has an IMU; the sensors, which only cut the drive into segments, are interpolated to them too.
 """
 
@@ -72,6 +72,7 @@ from pdhef_logtool.runs.scoring import diverged_events, in_time, segment_events
 from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder
 
 if TYPE_CHECKING:
+    from pdhef_logtool.evaluation.manoeuvres import Manoeuvre
     from pdhef_logtool.evaluation.metrics import MetricRow
 
 
@@ -181,6 +182,8 @@ class _Scoring:
 
     def score(self, drive: Drive, outputs: OutputFolder | None) -> LogResult:
         """Read, compare and, with a folder, write."""
+        from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
+
         plan = drive.plan
         self.reporter.progress(drive.name, 0.1)
         recorded, losses = self._read_estimates(drive)
@@ -189,14 +192,15 @@ class _Scoring:
         ledger = sample_ledger(drive.log, plan, counts)
         self.reporter.progress(drive.name, 0.6)
         signals = _read_sensors(drive)
+        manoeuvres = [] if signals is None else find_manoeuvres(signals, self.car.vehicle)
         all_losses = merge_losses([drive.losses, losses, truth_losses, damage(ledger)])
         self.reporter.progress(drive.name, 0.8)
         scored_ns = np.unique(np.concatenate([r.track.stamps_ns for r in recorded]))
         plan = self._with_dependence(plan, recorded)
-        rows, dependent = self._figures(drive, plan, recorded, truth, signals)
+        rows, dependent = self._figures(drive, plan, recorded, truth, signals, manoeuvres)
         drive.plan = plan = replace(plan, dependent={**dependent, **plan.dependent})
         truth_track = truth_at(truth, scored_ns, plan.truth_latency_s, standstill_m_s=self.car.vehicle.standstill_m_s)
-        events = self._events(truth_track, signals_at(signals, scored_ns), recorded)
+        events = self._events(truth_track, signals_at(signals, scored_ns), recorded, manoeuvres)
         samples |= drive.samples
         for r in recorded:
             samples |= r.samples
@@ -228,22 +232,22 @@ class _Scoring:
         losses: list[Loss] = []
         recorded = []
         for estimate in self.estimates:
-            found, lost = read_estimate(
+            recorded_estimate, lost = read_estimate(
                 drive.log, estimate, drive.plan.start_ns, drive.plan.end_ns, drive.options.window_s
             )
-            for note in found.notes:
+            for note in recorded_estimate.notes:
                 drive.tell(f"{estimate.name}: {note}")
-            recorded.append(found)
+            recorded.append(recorded_estimate)
             losses += lost
         return recorded, losses
 
     def _with_dependence(self, plan: DrivePlan, recorded: Sequence[RecordedEstimate]) -> DrivePlan:
         """Add the truth channels that one of the estimates is, as a recorded channel."""
-        found = dict(plan.dependent)
+        dependent = dict(plan.dependent)
         for r in recorded:
             same = dependent_signals(r.channels, plan.survey_truth, role=f"estimate {r.track.name}'s")
-            found |= {name: reason for name, reason in same.items() if name not in found}
-        return replace(plan, dependent=found)
+            dependent |= {name: reason for name, reason in same.items() if name not in dependent}
+        return replace(plan, dependent=dependent)
 
     def _figures(
         self,
@@ -252,6 +256,7 @@ class _Scoring:
         recorded: Sequence[RecordedEstimate],
         truth: TruthTrack,
         signals: Signals | None,
+        manoeuvres: Sequence[Manoeuvre],
     ) -> tuple[list[MetricRow], dict[str, str]]:
         """Score each estimate at its own stamps; return what of the derived ground truth equals an estimate besides."""
         from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, score_track
@@ -263,7 +268,8 @@ class _Scoring:
             at_stamps = truth_at(
                 truth, r.track.stamps_ns, plan.truth_latency_s, standstill_m_s=self.car.vehicle.standstill_m_s
             )
-            masks = segment_masks(signals_at(signals, r.track.stamps_ns), at_stamps, self.car.vehicle)
+            seen = signals_at(signals, r.track.stamps_ns)
+            masks = segment_masks(seen, at_stamps, self.car.vehicle, manoeuvres)
             same = {
                 name: f"the ground truth's {name} equals that of the estimate {r.track.name}"
                 for name in SCORED_SIGNALS
@@ -291,11 +297,17 @@ class _Scoring:
             ]
         return rows, dependent
 
-    def _events(self, truth: StateTrack, signals: Signals, recorded: Sequence[RecordedEstimate]) -> list[Event]:
+    def _events(
+        self,
+        truth: StateTrack,
+        signals: Signals,
+        recorded: Sequence[RecordedEstimate],
+        manoeuvres: Sequence[Manoeuvre],
+    ) -> list[Event]:
         from pdhef_logtool.evaluation.segments import segment_masks
 
-        masks = segment_masks(signals, truth, self.car.vehicle)
-        events = segment_events(truth, masks) + [e for r in recorded for e in diverged_events(r.track)]
+        masks = segment_masks(signals, truth, self.car.vehicle, manoeuvres)
+        events = segment_events(truth, masks, manoeuvres) + [e for r in recorded for e in diverged_events(r.track)]
         return sorted(events, key=in_time)
 
 
@@ -310,8 +322,8 @@ def _read_sensors(drive: Drive) -> Signals | None:
 
 
 def _same_column(estimate: FloatArray, truth: FloatArray) -> bool:
-    known = np.isfinite(estimate) & np.isfinite(truth)
-    return int(np.count_nonzero(known)) >= 10 and share_equal(estimate[known], truth[known]) >= SAME_SHARE
+    usable = np.isfinite(estimate) & np.isfinite(truth)
+    return int(np.count_nonzero(usable)) >= 10 and share_equal(estimate[usable], truth[usable]) >= SAME_SHARE
 
 
 def _write(
@@ -397,9 +409,9 @@ def signals_at(signals: Signals | None, stamps_ns: IntArray) -> Signals:
         if signals is None:
             return np.full(n, np.nan)
         values: FloatArray = getattr(signals, name)
-        known = np.isfinite(values)
-        at = signals.stamps_ns[known]
-        return Bracket(at, stamps_ns, gap_ns(at)).linear(values[known])
+        is_finite = np.isfinite(values)
+        stamps = signals.stamps_ns[is_finite]
+        return Bracket(stamps, stamps_ns, gap_ns(stamps)).linear(values[is_finite])
 
     return Signals(
         stamps_ns=stamps_ns,
