@@ -32,8 +32,9 @@ TruthLogs = Annotated[
     Argument(metavar="LOG", help="Logs with ground truth, folders with logs, glob patterns, URLs, or @list.txt."),
 ]
 JsonFlag = Annotated[bool, Option("--json", help="Print one JSON document instead of tables.", rich_help_panel=OUTPUT)]
-JunitFile = Annotated[
-    Path | None, Option(help="JUnit XML file for the verdicts of --thresholds.", rich_help_panel=OUTPUT)
+JunitFile = Annotated[Path | None, Option(help="JUnit XML file for the verdicts of --plan.", rich_help_panel=OUTPUT)]
+Strict = Annotated[
+    bool, Option("--strict", help="INCONCLUSIVE requirements fail, too (exit code 4).", rich_help_panel=OUTPUT)
 ]
 Split = Annotated[str | None, Option(help="Only drives of this split of a simulated set.", rich_help_panel=INPUT)]
 AnySplit = Annotated[
@@ -163,9 +164,9 @@ _OPTIONS: dict[str, Any] = {
             rich_help_panel=OUTPUT,
         ),
     ],
-    "thresholds": Annotated[
+    "plan": Annotated[
         _File,
-        Option(help="thresholds.toml with limits on metrics. Exit code 4 if one is exceeded.", rich_help_panel=OUTPUT),
+        Option(help="Validation plan (pdhef plan init). Exit code 4 if a requirement fails.", rich_help_panel=OUTPUT),
     ],
     "config_file": Annotated[
         _File,

@@ -338,7 +338,14 @@ def read_drive(
             slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
         setup = _setup_of(opened, used, car.vehicle, slice_ns, options)
         plan = plan_drive(
-            opened, used, car.vehicle, *slice_ns, require_imu=require_sensors, clock=options.clock, setup=setup
+            opened,
+            used,
+            car.vehicle,
+            *slice_ns,
+            require_imu=require_sensors,
+            clock=options.clock,
+            setup=setup,
+            waived=options.waived,
         )
         for note in plan.mapping.notes[len(used.notes) :]:
             told(note)
@@ -365,7 +372,7 @@ def _setup_of(
     start_ns, end_ns = slice_ns
     first = _as_far_as_decided(log, options)
     until_ns = min(end_ns, first.end_ns)
-    return setup_of(plan_drive(first, mapping, vehicle, start_ns, until_ns, clock=options.clock))
+    return setup_of(plan_drive(first, mapping, vehicle, start_ns, until_ns, clock=options.clock, waived=options.waived))
 
 
 def _as_far_as_decided(log: DriveLog, options: ReadOptions) -> DriveLog:
@@ -446,7 +453,10 @@ def _tell_doubts(plan: DrivePlan, options: ReadOptions, tell: Tell) -> None:
                 f"{MAX_PREDICTION_S:g} s: it is read by its stamps, and no estimate of this log is causal"
             )
     for name, reason in plan.alignment.unused:
-        tell(f"{name} is not used: {reason}")
+        if name not in plan.refused:
+            tell(f"{name} is not used: {reason}")
+    if plan.refused:
+        tell(f"not used until the failed checks are corrected or waived: {', '.join(sorted(plan.refused))}")
 
 
 def friction_of(

@@ -30,6 +30,8 @@ _FRAMES = "CAN_DataFrame"
 #: Parts of a frame by the names of the standard for bus logging.
 _PARTS = {"id": "ID", "length": "DataLength", "is_extended": "IDE", "bus": "BusChannel"}
 _LONGEST_NAME = 40
+#: Times from the start of a recording beyond this are damaged.
+_LONGEST_S = 4e9
 
 
 def open_mdf(file: LogFile) -> TableLog:
@@ -126,7 +128,7 @@ class Group:
         """Return the times in ascending order, and the rows that they are of; rows without a time are left out."""
         seconds = np.asarray(self._source.get_master(self._number), np.float64)
         start_ns = round(self._source.start_time.timestamp() * 1e6) * 1000
-        finite = np.isfinite(seconds)
+        finite = np.isfinite(seconds) & (np.abs(np.nan_to_num(seconds)) < _LONGEST_S)
         stamps = np.where(finite, np.round(np.where(finite, seconds, 0.0) * 1e9).astype(np.int64) + start_ns, NO_TIME)
         rows = np.flatnonzero(finite)
         order = rows[np.argsort(stamps[rows], kind="stable")]

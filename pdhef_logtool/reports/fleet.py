@@ -14,6 +14,7 @@ from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.reports.charts import Charts, Cloud, Interval
 from pdhef_logtool.reports.colours import INK, PLAIN, colour
+from pdhef_logtool.reports.first_screen import next_steps, plan_head, tested_run
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.breakdown import LEAST_DRIVES
 from pdhef_logtool.results.comparison_words import design_effect_text
@@ -21,12 +22,14 @@ from pdhef_logtool.results.fleet import ANSWER, JUDGED, Distribution, Fleet, Spa
 from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
 
 #: Keys of the figures of the page.
-FIGURES = ("medians", "spread", "against")
+FIGURES = ("worst", "medians", "spread", "against")
 #: Rows of tables that a run can make as long as it likes, keys that are given, and bars of a histogram at most.
 MOST_ROWS, _MOST_KEYS, _MOST_BARS = 1000, 12, 40
 #: Errors beyond this quantile of the drives are counted in the last bar.
 _MOST_SHARE = 0.98
 _LEVELS = 8
+#: Drives of the figure of the first screen, and characters of their names in it.
+_WORST, _LABEL = 10, 22
 #: Estimators with a median error beyond this many times the selected estimate's are left to the table.
 _DRAWN = 5.0
 #: The table of the operating space shows at least this far, so that what a car can do and nobody did is seen.
@@ -73,8 +76,10 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
         charts,
         fleet=fleet,
         pages=pages,
-        hours=sum(d.seconds for d in fleet.drives) / 3600.0,
-        answers=Counter(d.main for d in fleet.drives if d.main).most_common(),
+        plan=plan_head(run.document.get("plan")),
+        tested=tested_run(run.document, sum(d.seconds for d in fleet.drives) / 3600.0),
+        steps=next_steps(run.document.get("plan")),
+        worst=_worst(fleet, charts),
         verdicts=Counter(d.verdict for d in fleet.scored if d.verdict),
         paired=_paired(fleet),
         answer=next((d for d in fleet.distributions if (d.estimator, d.signal) == (ANSWER, JUDGED)), None),
@@ -93,6 +98,22 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
         run=run.document,
     )
     return FleetPage(html, charts)
+
+
+def _worst(fleet: Fleet, charts: Charts) -> tuple[str, float | None] | None:
+    """Return the drive with the largest sideslip error; add the figure that shows it among the largest."""
+    ranked = sorted(((d.error(), d) for d in fleet.scored), key=lambda pair: -(pair[0] or 0.0))
+    if not ranked:
+        return (fleet.drives[0].label, None) if fleet.logs == 1 and fleet.drives else None
+    if len(ranked) > 1:
+        degree = math.degrees(1.0)
+        bars = [
+            Interval(d.label[-_LABEL:], math.nan, (error or 0.0) * degree, math.nan, colour(d.main or ""))
+            for error, d in ranked[:_WORST]
+        ]
+        title = f"The {len(bars)} drives with the largest sideslip RMSE"
+        charts.intervals("worst", title, "°", bars, zero=0.0)
+    return ranked[0][1].label, ranked[0][0]
 
 
 def _add_figures(charts: Charts, fleet: Fleet) -> None:

@@ -20,7 +20,7 @@ from markupsafe import Markup
 
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.version import __version__
-from pdhef_logtool.reports.charts import Charts
+from pdhef_logtool.reports.charts import Charts, StripFigure, TimeFigure
 
 _HERE = Path(__file__).parent
 #: Scripts in order: ours before uPlot shows it how fine to draw.
@@ -93,10 +93,19 @@ def _place(charts: Charts, key: str) -> Markup:
     """Return where the script draws a figure; nothing where the page has none of the name."""
     if key not in charts.figures:
         return Markup()
+    chart = charts.figures[key]
+    keys = ' tabindex="0"' if isinstance(chart, TimeFigure | StripFigure) else ""
+    hint = " Keys: plus and minus zoom, arrows move, Home shows the whole drive." if keys else ""
     return Markup(
-        '<figure class="figure" data-figure="{0}"><figcaption>{1}</figcaption><div class="legend"></div>'
-        '<div class="canvas"></div></figure>'
-    ).format(key, printable(charts.figures[key].heading, _MOST_SIGNS))
+        '<figure class="figure" data-figure="{0}"><figcaption>{1}</figcaption>'
+        '<div class="legend" aria-hidden="true"></div>'
+        '<div class="canvas" role="img" aria-label="{2}"{3}></div></figure>'
+    ).format(
+        key,
+        printable(chart.heading, _MOST_SIGNS),
+        printable(charts.text(key) + hint, _MOST_SIGNS),
+        Markup(keys),  # noqa: S704 (a constant)
+    )
 
 
 def _policy(scripts: list[str], style: str, forms: str) -> Markup:

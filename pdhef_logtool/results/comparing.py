@@ -23,6 +23,7 @@ from pdhef_logtool.results.gate import MAIN, Figure, Gate
 from pdhef_logtool.results.opened_run import METRICS_FILE, OpenedLog, OpenedRun
 from pdhef_logtool.results.paired_change import PairedChange, Verdict, holm, log_ratios, paired_change
 from pdhef_logtool.results.pairing import Pair, Pairing, pair_logs
+from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.results.run_differences import run_differences
 
 if TYPE_CHECKING:
@@ -122,7 +123,7 @@ class Comparison:
     figures : those that were asked for or that the gate has. others : shown beside them; none where nothing changed.
     signals : where the tracks of the most changed drives part. followed : how many drives were looked at for it.
     damaged : files of drives that could not be read, a line each.
-    gated, allow_unpaired, strict : what closes the gate.
+    gated, allow_unpaired, strict : what closes the gate. requirements : verdicts of a validation plan on B.
     """
 
     a: str
@@ -141,6 +142,7 @@ class Comparison:
     gated: bool = False
     allow_unpaired: bool = False
     strict: bool = False
+    requirements: PlanVerdicts | None = None
 
     @property
     def equal(self) -> bool:
@@ -173,7 +175,7 @@ class Comparison:
         if self.gated:
             reasons += [f"{f.figure.label}: {f.verdict}" for f in self.figures if f.verdict in ("worse", "no figure")]
             reasons += () if self.allow_unpaired else self.unpaired
-        if self.strict:
+        if self.strict and self.requirements is None:
             refused = ("inconclusive",) if self.gated else ("inconclusive", "no figure")
             reasons += [
                 f"{f.figure.label}: {f.verdict}, which --strict refuses" for f in self.figures if f.verdict in refused
@@ -183,7 +185,7 @@ class Comparison:
     @property
     def exit_code(self) -> int:
         """4 where the gate is closed, 3 for damaged files and for drives without partner and no gate, else 0."""
-        if self.failures:
+        if self.failures or (self.requirements is not None and self.requirements.closes_gate):
             return EXIT_GATE
         if self.damaged:
             return EXIT_PARTIAL
@@ -199,6 +201,7 @@ class Comparison:
             "verdict": self.verdict,
             "exit_code": self.exit_code,
             "failures": self.failures,
+            "plan": None if self.requirements is None else self.requirements.to_dict(),
             "differences": self.differences,
             "pairs": dict(self.pairs),
             "only_a": self.only_a,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.drive.reading import Drive
-from pdhef_logtool.evaluation.blocks import row_blocks
+from pdhef_logtool.evaluation.blocks import SegmentMasks, row_blocks
 from pdhef_logtool.records.signals import BoolArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import TRUTH, Event, ManoeuvreEvent
@@ -28,7 +28,7 @@ class Evaluation:
     ----------
     rows, events : figures, and events in order of time.
     reasons : by estimator, why it did not use its sensors as usual.
-    silent : estimators without a valid row although the car moves. moves : whether it does.
+    silent : estimators without a valid row although the car moves. moves : whether it does. masks : of the segments.
     """
 
     rows: list[MetricRow]
@@ -36,6 +36,7 @@ class Evaluation:
     reasons: dict[str, tuple[ReasonFacts, ...] | None]
     silent: tuple[str, ...]
     moves: bool
+    masks: SegmentMasks
 
 
 def evaluate(
@@ -82,7 +83,7 @@ def evaluate(
         reasons[name] = summarise_reasons(track)
         events += diverged_events(track)
     rows += [row for of_one in of_drive.values() for row in of_one]
-    return Evaluation(rows, sorted(events, key=in_time), reasons, tuple(silent), bool(moving.any()))
+    return Evaluation(rows, sorted(events, key=in_time), reasons, tuple(silent), bool(moving.any()), masks)
 
 
 def in_time(event: Event) -> tuple[int, int, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import pytest
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.results.comparing import Comparison, compare_runs
 from pdhef_logtool.results.comparison_words import notes_of
-from pdhef_logtool.results.gate import Figure, Gate, gate_from_dict
+from pdhef_logtool.results.gate import Figure, Gate
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.storage.documents import jsonable
 from tests.results.made_run import digest, entry, row, write_estimates, write_run
@@ -137,13 +138,13 @@ def test_each_figure_of_a_gate_has_its_limit_and_floor(tmp_path: Path) -> None:
     others = [row(label, 0.5, signal="vy_m_s", unit="m/s") for label in TEN]
     worse = [row(label, 0.6, signal="vy_m_s", unit="m/s") for label in TEN]
     a, b = write_run(tmp_path / "a", TEN, rows=others), write_run(tmp_path / "b", _scaled(1.2), rows=worse)
-    figures = [
-        {"max_regression": "25%"},
-        {"signal": "vy_m_s", "max_regression": 0.1},
-        {"metric": "max_abs", "max_regression": 0},
-        {"segment": "all", "estimator": "pd-hef", "max_regression": 0.01, "floor": 30.0, "unit": "deg"},
-    ]
-    found = _compare(a, b, gate_from_dict({"figure": figures}, where="gate.toml"))
+    figures = (
+        Figure(limit=0.25),
+        Figure("vy_m_s", limit=0.1),
+        Figure(metric="max_abs", limit=0.0),
+        Figure(estimator="pd-hef", limit=0.01, floor=math.radians(30.0)),
+    )
+    found = _compare(a, b, Gate(figures))
     assert [f.verdict for f in found.figures] == ["not worse", "worse", "no figure", "not worse"]
     assert found.failures == ("vy_m_s rmse (all): worse", "sideslip_rad max_abs (all): no figure")
     assert "lateral_1s_m" not in {f.figure.signal for f in found.others}  # there is no such figure
@@ -245,23 +246,3 @@ def test_no_pair_and_unknown_names_are_errors(tmp_path: Path) -> None:
     (tmp_path / "c" / "metrics.parquet").write_bytes(b"PAR1 no")
     with pytest.raises(OutputError, match=r"metrics\.parquet: expected a readable Parquet file"):
         _compare(a, c)
-
-
-@pytest.mark.parametrize(
-    ("raw", "problem"),
-    [
-        ({}, "give at least one"),
-        ({"figure": [{}]}, "max_regression: is missing"),
-        ({"figure": [{"max_regression": "much"}]}, "a share such as '5%' or 0.05"),
-        ({"figure": [{"max_regression": -0.1}]}, "a share such as"),
-        ({"figure": [{"max_regression": 0.1, "metric": "coverage95"}]}, "metric = coverage95"),
-        ({"figure": [{"max_regression": 0.1, "signal": "beta"}]}, "signal = beta"),
-        ({"figure": [{"max_regression": 0.1, "floor": 1.0, "unit": "m"}]}, "is in rad or deg, not 'm'"),
-        ({"figure": [{"max_regression": 0.1}] * 2}, "is there twice"),
-        ({"figure": [{"max_regression": 0.1}], "allow_unpaird": True}, "did you mean allow_unpaired"),
-    ],
-)
-def test_a_wrong_gate_file_is_refused_with_every_problem(raw: dict[str, Any], problem: str) -> None:
-    with pytest.raises(UsageError, match=r"gate\.toml") as error:
-        gate_from_dict(raw, where="gate.toml")
-    assert problem in str(error.value)

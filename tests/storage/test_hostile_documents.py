@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.car.car import SHIPPED_CARS, Car, load_intervals
-from pdhef_logtool.evaluation.thresholds import load_thresholds
+from pdhef_logtool.evaluation.validation_plan import load_plan
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping.mapping_file import load_mapping
 from pdhef_logtool.records.errors import EXIT_USAGE, LogError, PdhefError, UsageError
@@ -26,7 +26,7 @@ _LOADERS: dict[str, Callable[[Path], Any]] = {
     "mapping.toml": load_mapping,
     "vehicle.toml": Car.load,
     "pdhef.toml": lambda path: load_config(path, {}),
-    "thresholds.toml": load_thresholds,
+    "plan.toml": load_plan,
     "intervals.json": load_intervals,
     "model.json": lambda path: load_network(path.parent, "residual"),
     "linear_regression.json": load_linear_model,
