@@ -18,20 +18,8 @@ from tests.command_line import called
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = (
-    *(
-        "inspect",
-        "map",
-        "run",
-        "metrics",
-        "report",
-        "compare",
-        "events",
-        "trend",
-        "serve",
-        "view",
-        "convert",
-        "compile",
-    ),
+    *("inspect", "map", "run", "metrics", "plan", "report", "compare", "events", "trend", "serve", "view"),
+    *("convert", "compile"),
     *("simulate", "simulate suite", "simulate conditions"),
     *("learn", "extract", "train", "retrain"),
 )
