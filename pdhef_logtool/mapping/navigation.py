@@ -63,7 +63,7 @@ def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
     fields = log.fields(topic.name, quiet=True)
     meanings = {f.path: meaning_of(topic.name, topic.type_name, f.path, f.unit) for f in fields if f.kind == "number"}
     first = {m.quantity: (path, m.scale) for path, m in reversed([*meanings.items()]) if m is not None}
-    if not {"speed", "course", "latitude", "longitude"} <= set(first) or first["speed"][1] is None:
+    if not {"speed", "course", "latitude", "longitude"} <= set(first):
         return {}
     pieces, stamp = Pieces(log), stamp_path_of(fields)
     samples = pieces.read({topic.name: [path for path, _ in first.values()]})
@@ -78,7 +78,7 @@ def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
         (c for c in clockwise if seen is not None and direction is not None and _off(seen, direction, *c) < NEAR_RAD),
         None,
     )
-    if convention is None:
+    if convention is None or scale is None:
         return {}
     return {
         "gnss_speed_m_s": SignalSource("gnss_speed_m_s", topic.name, speed, stamp, scale),
