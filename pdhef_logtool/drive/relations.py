@@ -217,7 +217,7 @@ def smallest_explanations(relations: Sequence[Relation], mistakes: Sequence[Mist
     for size in range(1, MAX_MISTAKES + 1):
         explanations = [
             chosen
-            for chosen in combinations(useful, size)
+            for chosen in combinations([m for m in useful if size == 1 or not m.foreign], size)
             if len({n for m in chosen for n in m.factors}) == sum(len(m.factors) for m in chosen)
             and all(r.accepts(float(np.prod([m.acts_on(r) for m in chosen]))) for r in telling)
         ]
