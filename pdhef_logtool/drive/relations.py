@@ -116,9 +116,13 @@ class Relation:
     @property
     def is_close(self) -> bool:
         """Return whether a gain that is not plausible is off by less than known mistakes make, or hardly known."""
+        return abs(self.correlation) < CLOSE_CORRELATION or self.is_near
+
+    @property
+    def is_near(self) -> bool:
+        """Return whether a gain is off by less than known mistakes make: a car that slides, a sensor that saturates."""
         low, high = self.expected
-        wide = replace(self, expected=(low / CLOSE, high * CLOSE))
-        return abs(self.correlation) < CLOSE_CORRELATION or wide.accepts()
+        return replace(self, expected=(low / CLOSE, high * CLOSE)).accepts()
 
     @property
     def is_vague(self) -> bool:

@@ -49,8 +49,9 @@ def _levels(drive: CheckedDrive) -> Iterator[Check]:
         bias = sensors.ax_bias_m_s2 if name == "ax_m_s2" else sensors.ay_bias_m_s2
         check = _level(name, float(np.mean(rest[use])) - bias, float(np.mean(columns[name][use])) - bias)
         # A drive in circles has a mean too: without the yaw rate and the speed only all of gravity is gravity.
+        is_known |= name == "ax_m_s2" and speed is not None
         is_gravity = is_known or abs(float(np.mean(rest[use]))) > GRAVITY_ALONE_M_S2
-        if (driving_is_known and is_gentle_enough) or (check.name == f"{name}.axis" and is_gravity):
+        if (driving_is_known and is_known and is_gentle_enough) or (check.name == f"{name}.axis" and is_gravity):
             yield check
 
 
