@@ -41,7 +41,7 @@ _NOT_PHYSICS = {"name", "truth_position_m", "gnss_antenna_position_m"}
 
 
 def physics_sha256(vehicle: VehicleParameters) -> str:
-    """Return the digest of what a vehicle file says of physics and sensors, whatever its name, layout and comments.
+    """Return the digest of physics and sensors of a vehicle file; name, layout and comments do not count.
 
     Entries at their defaults count as absent: one that a later version adds makes no car stale.
     """
@@ -90,17 +90,17 @@ class FittedValues(Record):
     physics: PhysicsParts | None = None
 
     @classmethod
-    def between(cls, own: VehicleParameters, fitted: VehicleParameters) -> FittedValues:
-        """Return the entries of ``fitted`` that are another vehicle's than ``own``."""
-        same = {k: None for k in cls.model_fields if getattr(fitted, k) == getattr(own, k)}
+    def between(cls, datasheet: VehicleParameters, fitted: VehicleParameters) -> FittedValues:
+        """Return the entries of ``fitted`` that are another vehicle's than ``datasheet``."""
+        same = {k: None for k in cls.model_fields if getattr(fitted, k) == getattr(datasheet, k)}
         return cls.of(fitted).model_copy(update=same)
 
     @classmethod
     def of(cls, fitted: VehicleParameters) -> FittedValues:
         """Return all entries of a vehicle."""
-        found = {k: getattr(fitted, k) for k in cls.model_fields}
-        found["sensors"] = FittedSensors(**{k: getattr(fitted.sensors, k) for k in FittedSensors.model_fields})
-        return cls(**found)
+        values = {k: getattr(fitted, k) for k in cls.model_fields}
+        values["sensors"] = FittedSensors(**{k: getattr(fitted.sensors, k) for k in FittedSensors.model_fields})
+        return cls(**values)
 
     def applied_to(self, vehicle: VehicleParameters) -> VehicleParameters:
         """Return the vehicle with these values in place of its own."""
@@ -108,6 +108,11 @@ class FittedValues(Record):
         if self.sensors is not None:
             update["sensors"] = vehicle.sensors.model_copy(update=self.sensors.model_dump())
         return vehicle.model_copy(update=update)
+
+
+#: ``limit_gain`` of cars whose physics nobody identified; from 3 to 20 the error of simulated fishhooks and sines with
+#: dwell falls slowly (docs/method.md#limit).
+LIMIT_GAIN = 6.0
 
 
 class FilterNoise(Record):
@@ -118,6 +123,7 @@ class FilterNoise(Record):
     q_std : per square root of second, of v_x, v_y and yaw rate, and of the a_x bias if it is not left out; for
         ``physics`` also of the two axle forces. Empty: the filter's own.
     r_std : by measurement; what is left out is the filter's own.
+    limit_gain : growth of the process noise of the axle forces of ``physics`` beyond the linear range; 0: none.
     physics_sha256 : of the physics that it belongs to.
     score_deg : in ``pdhef learn --stages noise``, lower is better; None where nothing was compared. trial : its number.
     """
@@ -126,13 +132,14 @@ class FilterNoise(Record):
     r_std: dict[Annotated[str, one_of(MEASUREMENTS), Field(json_schema_extra={"enum": [*MEASUREMENTS]})], Positive] = (
         Field(default_factory=dict)
     )
+    limit_gain: NonNegative = 0.0
     physics_sha256: Sha256 | None = None
     score_deg: Positive | None = None
     trial: int | None = None
 
     def measurement_std(self, sensors: Sensors) -> tuple[float, float, float]:
         """Return the 1-sigma of a_y, yaw rate and speed; what it leaves out is the sensors'."""
-        ay, rate, speed = (self.r_std.get(m, own) for m, own in zip(MEASUREMENTS, sensors.measurement_std, strict=True))
+        ay, rate, speed = (self.r_std.get(m, std) for m, std in zip(MEASUREMENTS, sensors.measurement_std, strict=True))
         return ay, rate, speed
 
     @model_validator(mode="after")
@@ -347,5 +354,7 @@ class HistoryLine(Record):
 
 def noise_sha256(noise: Mapping[str, FilterNoise]) -> str:
     """Return the digest of the noise values alone, by filter."""
-    values = {name: [list(n.q_std), dict(n.r_std)] for name, n in noise.items()}
+    values = {
+        name: [list(n.q_std), dict(n.r_std), *([n.limit_gain] if n.limit_gain else [])] for name, n in noise.items()
+    }
     return digest(values)

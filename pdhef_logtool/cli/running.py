@@ -34,10 +34,6 @@ def _list_estimators(show: bool) -> None:
         raise typer.Exit
 
 
-#: Thresholds that failed, of which each is given.
-_MOST_VERDICTS = 50
-
-
 @options.command(
     commands,
     "pdhef run drive.mcap -o out",
@@ -46,7 +42,7 @@ _MOST_VERDICTS = 50
     "pdhef run fleet/ -o out --cars cars.toml",
     "pdhef run s3://bucket/day/ -o out --annotate sidecar",
     "pdhef run drive.mcap -o out --start +60s --end end-5s --json",
-    "pdhef run logs/ -o out --thresholds limits.toml --junit out/gate.xml",
+    "pdhef run logs/ -o out --plan plan.toml --junit out/plan.xml",
     "pdhef run fleet/ -o out --jobs 8 --keep metrics",
     "pdhef run fleet/ new/ -o out --jobs 8 --resume",
     "pdhef run fleet/ -o out --only drive_0312",
@@ -59,7 +55,7 @@ _MOST_VERDICTS = 50
     "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).\n\n"
     'cars.toml, with paths relative to it: [folders] "fleet/golf" = "cars/golf"; [logs] "run_*.mcap" = '
     '"mini.toml"; [metadata.vehicle_id] "WVW-1" = "cars/golf"; default = "saloon" above them.',
-    shared="cars estimators annotate keep cache clock setup setup_from_s friction thresholds network calibrate "
+    shared="cars estimators annotate keep cache clock setup setup_from_s friction plan network calibrate "
     "reference gnss waived",
     car="Car of the logs (default: a sedan)",
 )
@@ -73,6 +69,7 @@ def run(  # positional: one an option of the command line
     ],
     config: RunConfig,
     junit: options.JunitFile = None,
+    strict: options.Strict = False,
     report: Annotated[
         bool, Option(help="Write HTML reports: report.html per log and for the run.", rich_help_panel=options.OUTPUT)
     ] = True,
@@ -114,7 +111,9 @@ def run(  # positional: one an option of the command line
 
     schedule = Schedule(jobs, ray, resume, retry, only or ())
     with console.reporter() as reporter:
-        result = run_logs(logs, output, config, schedule=schedule, junit=junit, report=report, reporter=reporter)
+        result = run_logs(
+            logs, output, config, schedule=schedule, junit=junit, report=report, strict=strict, reporter=reporter
+        )
     _finish(result, as_json)
 
 
@@ -125,13 +124,13 @@ def run(  # positional: one an option of the command line
     "  --estimate vx_m_s=/esc/state.speed --name esc",
     "pdhef metrics drive.mcap --estimate /pdhef/phy_ukf/state \\",
     "  --truth /ins/odometry --car mycar -o out",
-    "pdhef metrics drive.mcap -m mapping.toml --thresholds limits.toml --json",
+    "pdhef metrics drive.mcap -m mapping.toml --plan plan.toml --json",
     panel=panels.RUN,
     notes="Signals of nav_msgs/Odometry, geometry_msgs/Twist*Stamped and pdhef_msgs/VehicleStateEstimate are "
     "recognised by type. Other topics need SIGNAL=, one of vx_m_s, vy_m_s, yaw_rate_rad_s, sideslip_rad, ay_m_s2, "
     "their *_std_*, valid. A mapping file can contain scales, offsets, signs and several estimators, one table "
     "[estimates.NAME.SIGNAL] per signal.",
-    shared="thresholds",
+    shared="plan",
     car="Car of the log (position of the ground truth, friction, lowest speed)",
 )
 def metrics(
@@ -156,6 +155,7 @@ def metrics(
         Path | None, Option("--output", "-o", help="Output folder for tables and report. Default: print only.")
     ] = None,
     junit: options.JunitFile = None,
+    strict: options.Strict = False,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Score an estimate that the log contains, with the metrics of pdhef run."""
@@ -170,6 +170,7 @@ def metrics(
             name=name,
             output=output,
             junit=junit,
+            strict=strict,
             reporter=reporter,
         )
     _finish(result, as_json)
@@ -226,21 +227,18 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
         console.show(replace(summary, output=result.place or summary.output), render_fleet, as_json)
     else:
         console.show(result, render_run, as_json)
-        for one in result.results:
-            if one.outcome.failed is not None and one.report is not None:  # of the others the tables state it
-                console.error(f"pdhef: {one.outcome.log}: {one.outcome.failed}")
-    failed = [v for v in result.verdicts if v.failed]
-    for verdict in failed[:_MOST_VERDICTS]:
-        where = f"{verdict.log}: {verdict.estimator}: {verdict.threshold.label}"
-        console.error(f"pdhef: threshold failed: {where}: {verdict.reason}")
-    if len(failed) > _MOST_VERDICTS:
-        console.error(
-            f"pdhef: {len(failed) - _MOST_VERDICTS} more of {len(result.verdicts)} thresholds failed (--junit)"
-        )
-    if failed and not result.is_fleet:
-        for one in result.results:
-            if one.outcome.outcome != "ok":
-                console.error(f"pdhef: {one.outcome.log} besides {one.outcome.outcome}")
+        for entry in result.results:
+            if entry.outcome.failed is not None and entry.report is not None:  # of the others the tables state it
+                console.error(f"pdhef: {entry.outcome.log}: {entry.outcome.failed}")
+    plan = result.requirements
+    if plan is not None and plan.closes_gate:
+        for verdict in plan.verdicts:
+            if verdict.outcome == "FAIL" or (plan.strict and verdict.outcome == "INCONCLUSIVE"):
+                where = f"{verdict.requirement.id} ({verdict.requirement.label})"
+                console.error(f"pdhef: {verdict.outcome}: {where}: {verdict.reason}")
+        for entry in result.results if not result.is_fleet else ():
+            if entry.outcome.outcome != "ok":
+                console.error(f"pdhef: {entry.outcome.log} besides {entry.outcome.outcome}")
     raise typer.Exit(result.exit_code)
 
 
@@ -263,16 +261,16 @@ def find_recordings(output: Path, logs: Sequence[str]) -> list[Path]:
         return [output]
     if not logs and (output / RECORDING_FILE).is_file():
         return [output / RECORDING_FILE]
-    found = {one.label: path for one in open_run(output).logs if (path := one.file(RECORDING_FILE)) is not None}
-    missing = [name for name in logs if name not in found]
-    if not found or missing:
+    recordings = {log.label: path for log in open_run(output).logs if (path := log.file(RECORDING_FILE)) is not None}
+    missing = [name for name in logs if name not in recordings]
+    if not recordings or missing:
         raise OutputError(
             expected=f"a log named {missing[0]}" if missing else RECORDING_FILE,
-            got=", ".join(found) or "none",
+            got=", ".join(recordings) or "none",
             where=str(output),
-            remedy="" if found else "pdhef run LOG -o OUT --keep full writes one",
+            remedy="" if recordings else "pdhef run LOG -o OUT --keep full writes one",
         )
-    return [found[name] for name in dict.fromkeys(logs)] if logs else list(found.values())
+    return [recordings[name] for name in dict.fromkeys(logs)] if logs else list(recordings.values())
 
 
 def open_viewer(recordings: Sequence[Path], *, web: bool) -> int:

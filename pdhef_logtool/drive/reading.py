@@ -30,14 +30,14 @@ from pdhef_logtool.mapping import (
     merge_losses,
 )
 from pdhef_logtool.records.checks import Check
-from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.errors import EstimatorError, MappingError, PdhefError, UsageError
 from pdhef_logtool.records.ledger import SampleCount, damage
 from pdhef_logtool.records.signals import Loss, Signals, join_signals
 from pdhef_logtool.records.steps import MAX_PREDICTION_S
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
 Tell = Callable[[str], None]
-#: Makes the mapping that is read with from the log and the mapping in effect; may tell something.
+#: Makes the mapping that is read with from the log and the mapping in effect; may print a message.
 Adjust = Callable[[DriveLog, Mapping, Tell], Mapping]
 
 #: Signals, ground truth and what is computed of them may take this much memory, of all drives of a command together.
@@ -183,10 +183,10 @@ class Drive:
     @property
     def losses(self) -> tuple[Loss, ...]:
         """What could not be used; complete once all windows were read. Files are named without their folder."""
-        found = merge_losses(
+        merged = merge_losses(
             [self.log.lost, () if self._reader is None else self._reader.losses, damage(self.sample_ledger)]
         )
-        return tuple(replace(x, where=self.without_folder(x.where)) for x in found)
+        return tuple(replace(x, where=self.without_folder(x.where)) for x in merged)
 
     @property
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:
@@ -208,7 +208,7 @@ class Drive:
         return () if self._reader is None else self._reader.ledger()
 
     def tell(self, text: str) -> None:
-        """State what a user must know of this drive, and keep it in the notes."""
+        """Report a note to the user, and add it to the notes of this drive."""
         self.notes.append(text)
         self._tell(f"{self.name}: {text}")
 
@@ -284,7 +284,7 @@ def read_drive(
     log : a file, folder or URL; a :class:`LogInput` brings the name that the drive has beside others, and may bring
         a slice.
     car : or what :meth:`Car.load` takes. mapping : or its file; None recognises types.
-    tell : called with ``NAME: text`` for all that a user must know of the drive; :attr:`Drive.notes` has it too.
+    tell : called with ``NAME: text`` for each note to the user; :attr:`Drive.notes` contains them too.
     adjust : changes the mapping in effect.
     require_sensors : False reads a log without an IMU, or without any recognised signal, for its ground truth alone.
 
@@ -353,7 +353,9 @@ def read_drive(
         friction = friction_of(plan, car.vehicle, options)
         if friction.note:
             remarks.append(friction.note)
-    except BaseException:
+    except BaseException as error:
+        if isinstance(error, MappingError | EstimatorError):
+            name_damage(error, opened.lost)
         opened.close()
         raise
     return Drive(log_input.stem, opened, car, options, plan, chosen, notes, friction, tell, remarks)
@@ -401,6 +403,16 @@ def one_log(argument: LogPlace | str, options: ReadOptions = _AS_IT_IS) -> LogIn
 def lost_texts(losses: Iterable[Loss]) -> tuple[str, ...]:
     """Return what of the input is gone, in words."""
     return tuple(f"{x.what} ({x.where})" for x in losses if x.severity == "lost")
+
+
+def name_damage(error: PdhefError, losses: Iterable[Loss]) -> None:
+    """Add the damage of a log to an error, as its probable cause: a file that is cut contains no mapped fields."""
+    lost = [x for x in losses if x.severity == "lost"]
+    if not lost:
+        return
+    error.got = f"a damaged log: {'; '.join(x.what for x in lost[:2])}. {error.got[:1].upper()}{error.got[1:]}"
+    if any(x.kind == "truncated" for x in lost):
+        error.remedy = f"the file is cut: copy the recording again. If it is complete, {error.remedy or 'report it'}"
 
 
 def no_samples(path: LogPlace) -> EstimatorError:

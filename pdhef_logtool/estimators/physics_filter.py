@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pdhef_logtool.car.nominal_model import ModelParameters, dynamic_share, model_parameters
-from pdhef_logtool.car.parts import PHYSICS, FilterNoise
+from pdhef_logtool.car.parts import LIMIT_GAIN, PHYSICS, FilterNoise
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, corrected_anew
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.compiled.vectors import (
@@ -72,7 +72,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
 
 #: Process noise, 1-sigma per square root of second, of [v_x, v_y, r, b_ax, f_f, f_r] where the car has none of its own,
-#: and where identification looks for it. By innovation likelihood over simulated drives, as that of ``phy-ukf``, with
+#: and where identification searches it. By innovation likelihood over simulated drives, as that of ``phy-ukf``, with
 #: lag, load transfer and biases, and frozen: ``studies.defaults.tune_physics_q`` finds 0.078, 0.13, 0.01, 0.062, 0.39.
 PHYSICS_Q_STD = (0.085, 0.12, 0.012, 0.086, 0.41, 0.41)
 #: 1-sigma of the axles' forces over the mass at the start, and at a standstill, m/s².
@@ -86,6 +86,10 @@ _BANK_STD = 0.02
 BIAS_WALK_STD = (0.004, 0.00008, 0.00002)
 #: Spread of the force scale (docs/method.md#adaptation).
 FORCE_SCALE_STD = 0.05
+
+#: Beyond this share of the grip, the largest of about the last ``LIMIT_TIME_S``, tyre models are least certain
+#: (docs/method.md#limit).
+LINEAR_SHARE, LIMIT_TIME_S = 0.36, 0.5
 
 #: The column of a block of points that contains the centre.
 _CENTRE = AY_BIAS
@@ -151,26 +155,26 @@ def _moments(points, scale, q, constants, x, P, whole):  # type: ignore[no-untyp
     weight = 0.5 / scale
     per_weight = 1.0 / math.sqrt(weight)
     for j in range(AY_BIAS):
-        at = j * WIDTH
-        centre = points[at + _CENTRE]
+        row = j * WIDTH
+        centre = points[row + _CENTRE]
         about = spread(centre)
-        a, b, c = load(points, at) - about, load(points, at + LANES) - about, load(points, at + 2 * LANES) - about
+        a, b, c = load(points, row) - about, load(points, row + LANES) - about, load(points, row + 2 * LANES) - about
         moved = weight * total(a + b + c)
-        store(points, at, a)
-        store(points, at + LANES, b + spread(per_weight * moved) * load(constants.centre, 0))
-        store(points, at + 2 * LANES, c)
+        store(points, row, a)
+        store(points, row + LANES, b + spread(per_weight * moved) * load(constants.centre, 0))
+        store(points, row + 2 * LANES, c)
         x[j] = centre + moved
     share = spread(weight)
     for i in range(PLACES if whole else base.MOTION):
-        at = i * ROOM
+        row = i * ROOM
         product = share * inner_products(points, WIDTH, i * WIDTH, 0, LANES)
-        store(P, at, product + spread(q[i]) * load(constants.unit, ROOM - i))
+        store(P, row, product + spread(q[i]) * load(constants.unit, ROOM - i))
         if whole:
             product = share * inner_products(points, WIDTH, i * WIDTH, LANES * WIDTH, _REST)
             if i >= AY_BIAS:  # no point shows the covariance of the sensors' biases with each other, and it stays
-                kept = load(constants.biases, 0) * load(P, at + LANES)
+                kept = load(constants.biases, 0) * load(P, row + LANES)
                 product = load(constants.others, 0) * product + kept
-            store(P, at + LANES, product + spread(q[i]) * load(constants.unit, ROOM - i + LANES))
+            store(P, row + LANES, product + spread(q[i]) * load(constants.unit, ROOM - i + LANES))
 
 
 @_inlined
@@ -178,8 +182,8 @@ def _keep_before(points, x, P, places, before, cross):  # type: ignore[no-untype
     """Write what drawn points differ from their centre x, and of the cross covariance [n, n] the sensors' biases."""
     for j in range(PLACES):
         centre = spread(x[j] if j < AY_BIAS else 0.0)
-        for at in range(j * WIDTH, (j + 1) * WIDTH, LANES):
-            store(before, at, load(points, at) - centre)
+        for offset in range(j * WIDTH, (j + 1) * WIDTH, LANES):
+            store(before, offset, load(points, offset) - centre)
     for a in range(places.shape[0]):
         for b in range(places.shape[0]):
             cross[a, b] = P[places[a], places[b]]
@@ -193,8 +197,8 @@ def _cross(before, points, scale, places, cross):  # type: ignore[no-untyped-def
     """
     weight = 0.5 / scale
     for i in range(places.shape[0]):
-        at = places[i] * WIDTH
-        a, b, c = load(before, at), load(before, at + LANES), load(before, at + 2 * LANES)
+        offset = places[i] * WIDTH
+        a, b, c = load(before, offset), load(before, offset + LANES), load(before, offset + 2 * LANES)
         for j in range(places.shape[0]):
             to = places[j] * WIDTH
             if places[i] < AY_BIAS or places[j] < AY_BIAS:
@@ -229,6 +233,16 @@ def _process_noise(q_std, ax_known, dt, layout, q):  # type: ignore[no-untyped-d
         q[FORCE_SCALE] += FORCE_SCALE_STD**2 * (1.0 - math.exp(-2.0 * dt / FORCE_SCALE_TIME_S))
     if layout.bank >= 0:
         q[BANK] += _BANK_STD**2 * (1.0 - math.exp(-2.0 * dt / BANK_TIME_S))
+
+
+@_compiled
+def _limit_factor(x, friction, dt, limit_gain, p, memory):  # type: ignore[no-untyped-def]
+    """Return the factor on the process noise of the axle forces: 1 in the linear range, more beyond it."""
+    most = friction * (p.front_D_n + p.rear_D_n) / p.mass_kg
+    used = abs(x[FRONT] + x[REAR]) / most
+    memory[base.M_GRIP] = max(used, memory[base.M_GRIP] * math.exp(-dt / LIMIT_TIME_S))
+    beyond = max(0.0, memory[base.M_GRIP] - LINEAR_SHARE)
+    return 1.0 + limit_gain * beyond * beyond
 
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
@@ -274,10 +288,10 @@ def _measure(x, P, steer, rate_vy, layout, p, f, row, z_hat, S, Pxz):  # type: i
             high = high + spread(row[b]) * load(P, b * ROOM + LANES)
     store(Pxz, base.Z_AY * ROOM, low)
     store(Pxz, base.Z_AY * ROOM + LANES, high)
-    for at in (0, LANES):
-        rate = load(P, YAW_RATE * ROOM + at) + load(P, RATE_BIAS * ROOM + at)
-        store(Pxz, base.Z_YAW_RATE * ROOM + at, rate)
-        store(Pxz, base.Z_SPEED * ROOM + at, load(P, VX * ROOM + at))
+    for offset in (0, LANES):
+        rate = load(P, YAW_RATE * ROOM + offset) + load(P, RATE_BIAS * ROOM + offset)
+        store(Pxz, base.Z_YAW_RATE * ROOM + offset, rate)
+        store(Pxz, base.Z_SPEED * ROOM + offset, load(P, VX * ROOM + offset))
     of_ay, of_rate, of_speed = 0.0, 0.0, 0.0
     for b in range(PLACES):
         if row[b] != 0.0:
@@ -302,16 +316,16 @@ def _update(x, P, nu, S, Pxz, use, index, root, w, gain):  # type: ignore[no-unt
     gain[:, :] = 0.0
     w[used:] = 0.0
     for i in range(used):
-        for at in (0, LANES):
-            of = load(Pxz, index[i] * ROOM + at)
+        for offset in (0, LANES):
+            of = load(Pxz, index[i] * ROOM + offset)
             for j in range(i):
-                of = of - spread(root[i, j]) * load(gain, j * ROOM + at)
-            store(gain, i * ROOM + at, spread(1.0 / root[i, i]) * of)
-    for at in (0, LANES):
-        a, b, c = load(gain, at), load(gain, ROOM + at), load(gain, 2 * ROOM + at)
-        store(x, at, load(x, at) + spread(w[0]) * a + spread(w[1]) * b + spread(w[2]) * c)
+                of = of - spread(root[i, j]) * load(gain, j * ROOM + offset)
+            store(gain, i * ROOM + offset, spread(1.0 / root[i, i]) * of)
+    for offset in (0, LANES):
+        a, b, c = load(gain, offset), load(gain, ROOM + offset), load(gain, 2 * ROOM + offset)
+        store(x, offset, load(x, offset) + spread(w[0]) * a + spread(w[1]) * b + spread(w[2]) * c)
         for i in range(PLACES):
-            to = i * ROOM + at
+            to = i * ROOM + offset
             left = load(P, to) - spread(gain[0, i]) * a - spread(gain[1, i]) * b - spread(gain[2, i]) * c
             store(P, to, left)
     return nis, used, log_likelihood
@@ -320,10 +334,10 @@ def _update(x, P, nu, S, Pxz, use, index, root, w, gain):  # type: ignore[no-unt
 @_compiled
 def _finite(x, P):  # type: ignore[no-untyped-def]
     """Return whether state and variances are numbers; so are all covariances then."""
-    found = 0.0
+    total = 0.0
     for i in range(PLACES):
-        found += x[i] + P[i, i]
-    return math.isfinite(found)
+        total += x[i] + P[i, i]
+    return math.isfinite(total)
 
 
 @_compiled
@@ -377,7 +391,7 @@ def _write_prediction(m, x, P, steer, rate_vy, places, p, predicted):  # type: i
 
 # positional: as _predict.
 @njit(cache=True)
-def _filter(window, tuning, layout, p, f, estimate, out, links):  # type: ignore[no-untyped-def]
+def _filter(window, tuning, limit_gain, layout, p, f, estimate, out, links):  # type: ignore[no-untyped-def]
     """Run over one window; ``estimate`` is moved in place. ``links`` are of length 0 where nobody asks for them."""
     dt, steer, ax, ay, yaw_rate, speed, friction, residual_rate, extra_r = window
     q_std, r_std, initial_std, standstill_std, _, _, scale, rules = tuning
@@ -397,6 +411,7 @@ def _filter(window, tuning, layout, p, f, estimate, out, links):  # type: ignore
     _, _, _, z_hat, S, _, nu, at_gate, given, use = base.make_work(base.MEASUREMENTS)
     index, root, w = np.empty(base.MEASUREMENTS, np.int64), np.empty_like(S), np.empty_like(nu)
     noise, constants = (q_std, aligned(ROOM), scale), _make_constants()
+    front_std, rear_std = q_std[FRONT], q_std[REAR]
     factored = False  # whether L is the factor of P
     for k in range(dt.shape[0]):
         sample = base.Sample(dt[k], steer[k], ax[k], ay[k], yaw_rate[k], speed[k], friction[k])
@@ -412,6 +427,9 @@ def _filter(window, tuning, layout, p, f, estimate, out, links):  # type: ignore
             if not factored:
                 wide_root(P, places, there, L)
             factored = False
+            if limit_gain > 0.0:
+                factor = _limit_factor(x, over.friction, now.dt, limit_gain, p, memory)
+                q_std[FRONT], q_std[REAR] = factor * front_std, factor * rear_std
             _draw(x, L, scale, constants, points)
             if linked:
                 _keep_before(points, x, P, places, before, out_cross[k])
@@ -498,6 +516,7 @@ class PhysicsFilter(base.LinkedFilter):
     vehicle : parameters; ``physics`` states which parts it has, ``sensors`` gives R unless ``r_std`` does, and the
         priors of the biases.
     q_std : process 1-sigma per √s of [v_x, v_y, r, b_ax, f_f, f_r], forces over mass in m/s².
+    limit_gain : growth of the process noise of the axle forces beyond the linear range; 0: none.
     r_std : 1-sigma of [a_y, r, v_x].
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
     slip_gate : leave out the speed of wheels that spin or lock (:mod:`~.speed_slip`).
@@ -507,10 +526,11 @@ class PhysicsFilter(base.LinkedFilter):
 
     algorithm = "physics-filter"
     version = 1
-    options = ("slip_gate", "standstill")
+    options = ("slip_gate", "standstill", "limit_gain")
 
     vehicle: VehicleParameters
     q_std: tuple[float, ...] = PHYSICS_Q_STD
+    limit_gain: float = 0.0
     r_std: tuple[float, float, float] | None = None
     use_speed: bool = True
     slip_gate: bool = True
@@ -547,8 +567,8 @@ class PhysicsFilter(base.LinkedFilter):
         if layout.sensor_bias >= 0:
             of_ay, of_rate, of_steer = BIAS_WALK_STD
             initial[layout.steer_bias], walk[layout.steer_bias] = s.steer_bias_std_rad, of_steer
-            for at, std, of in ((0, s.ay_bias_std_m_s2, of_ay), (1, s.yaw_rate_bias_std_rad_s, of_rate)):
-                initial[layout.sensor_bias + at], walk[layout.sensor_bias + at] = std, of
+            for bias, std, of in ((0, s.ay_bias_std_m_s2, of_ay), (1, s.yaw_rate_bias_std_rad_s, of_rate)):
+                initial[layout.sensor_bias + bias], walk[layout.sensor_bias + bias] = std, of
         return base.make_tuning(
             self.vehicle,
             walk.tolist(),
@@ -571,7 +591,7 @@ class PhysicsFilter(base.LinkedFilter):
         out: base.Posterior,
         links: base.LinkColumns,
     ) -> None:
-        _filter(window, tuning, *self.parameters, estimate, out, links)
+        _filter(window, tuning, self.limit_gain, *self.parameters, estimate, out, links)
 
     def _predict_kernel(
         self, pending: base.PendingPredictions, start: base.PredictionStart, predicted: base.Predicted
@@ -586,12 +606,16 @@ class PhysicsFilter(base.LinkedFilter):
 def physics_filter(
     vehicle: VehicleParameters, noise: FilterNoise | None = None, *, use_speed: bool = True
 ) -> PhysicsFilter:
-    """Return the filter with a noise; what that leaves out is :data:`PHYSICS_Q_STD` and the sensors' noise."""
+    """Return the filter with a noise; what that leaves out is :data:`PHYSICS_Q_STD` and the sensors' noise.
+
+    A car without any has :data:`LIMIT_GAIN`.
+    """
     if noise is None:
-        return PhysicsFilter(vehicle, use_speed=use_speed)
+        return PhysicsFilter(vehicle, limit_gain=LIMIT_GAIN, use_speed=use_speed)
     return PhysicsFilter(
         vehicle,
         q_std=(*noise.q_std, *PHYSICS_Q_STD[len(noise.q_std) :]),
+        limit_gain=noise.limit_gain,
         r_std=noise.measurement_std(vehicle.sensors),
         use_speed=use_speed,
     )
@@ -600,12 +624,12 @@ def physics_filter(
 def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:
     """Return ``physics`` of a car, with what was found through it and its noise where the car has them.
 
-    A car of which nothing was found has no part: a static single track with the sensors' noise. What tuned noise leaves
+    A car without identified parts has none: a static single track with the sensors' noise. What tuned noise leaves
     out of the process noise is what was found through the filter.
     """
     vehicle, noise = car.physics_vehicle, car.noise.get(PHYSICS)
     if noise is not None and car.fitted_physics is not None:
         fitted = car.fitted_physics.noise.q_std
         noise = noise.model_copy(update={"q_std": (*noise.q_std, *fitted[len(noise.q_std) :])})
-    found = physics_filter(vehicle, noise, use_speed=use_speed)
-    return found if vehicle == car.vehicle else replace(found, read_with=car.vehicle)
+    physics = physics_filter(vehicle, noise, use_speed=use_speed)
+    return physics if vehicle == car.vehicle else replace(physics, read_with=car.vehicle)

@@ -1,30 +1,26 @@
-"""Which figures two runs are compared by, and how much worse each may become: strict reading of gate.toml."""
+"""Which figures two runs are compared by, and how much worse each may become."""
 
 from __future__ import annotations
 
 import math
 import re
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
-
-from pydantic import BaseModel, ConfigDict, Field
 
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.segments import SEGMENTS
-from pdhef_logtool.evaluation.thresholds import unit_of
 from pdhef_logtool.evaluation.units import LABELS, SIGNALS
+from pdhef_logtool.evaluation.validation_plan import RUN, ValidationPlan
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.storage.documents import checked, read_toml, unknown
+from pdhef_logtool.storage.documents import unknown
 
-#: What represents A's main estimator of each drive.
+#: Name for the selected estimate of each drive in A.
 MAIN = "main"
 _SHARE = re.compile(r"\s*([0-9]*\.?[0-9]+)\s*(%?)\s*")
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A figure of metrics.parquet, of which less is better.
+    """A figure of metrics.parquet whose lower value is better.
 
     ``estimator``: a name on both sides, or :data:`MAIN`. ``limit``: the share by which it may become worse, None where
     nothing is asked of it. ``floor``: figures below count as the floor, in the unit of metrics.parquet.
@@ -39,7 +35,7 @@ class Figure:
 
     @property
     def label(self) -> str:
-        """``sideslip_rad rmse (all)``, with the estimator unless it is the main one, for tables and test reports."""
+        """``sideslip_rad rmse (all)``, with the estimator unless it is the selected one, for tables and reports."""
         of = "" if self.estimator == MAIN else f" of {self.estimator}"
         return f"{self.signal} {self.metric} ({self.segment}){of}"
 
@@ -59,83 +55,44 @@ class Gate:
     allow_unpaired: bool = False
 
 
-_Name = Annotated[str, Field(min_length=1)]
-
-
-class _FigureTable(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
-    signal: _Name = "sideslip_rad"
-    metric: _Name = "rmse"
-    segment: _Name = "all"
-    estimator: _Name = MAIN
-    max_regression: str | float | int
-    floor: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
-    unit: _Name | None = None
-
-
-def load_gate(path: Path) -> Gate:
-    """Read gate.toml.
+def gate_of(plan: ValidationPlan) -> Gate:
+    """Return the requirements of a plan on the ratio to another run as the figures of a comparison.
 
     Raises
     ------
-    UsageError
-        The file is missing, is no TOML, or contains wrong, unknown or missing entries; all are named.
+    UsageError : The plan has no such requirement.
     """
-    return gate_from_dict(read_toml(path, "a gate TOML file", UsageError), where=str(path))
+    figures = tuple(
+        Figure(r.signal, r.metric, r.segment, r.estimator or MAIN, max(r.bound - 1.0, 0.0))
+        for r in plan.requirements
+        if r.baseline == RUN
+    )
+    if not figures:
+        raise UsageError(expected='a requirement with baseline = "run"', got="none", where=plan.file)
+    return Gate(figures)
 
 
-def gate_from_dict(raw: dict[str, Any], *, where: str) -> Gate:
-    """Build a gate from parsed TOML; raises UsageError with every problem in one line."""
-    known = ("allow_unpaired", "figure")
-    problems = [unknown(key, known) for key in raw if key not in known]
-    allowed = raw.get("allow_unpaired", False)
-    if not isinstance(allowed, bool):
-        problems.append("allow_unpaired: should be true or false")
-    tables = raw.get("figure", [])
-    if not isinstance(tables, list) or not tables:
-        problems.append("figure: give at least one [[figure]] table")
-        tables = []
-    figures = [_read_figure(table, f"figure[{i}]", problems) for i, table in enumerate(tables)]
-    labels = [f.label for f in figures if f is not None]
-    problems += [f"figure: {label} is there twice" for label in sorted(set(labels)) if labels.count(label) > 1]
-    if problems:
-        raise UsageError(
-            expected="the entries of gate.toml", got="; ".join(problems), where=where, remedy="see docs/compare.md"
-        )
-    return Gate(tuple(f for f in figures if f is not None), bool(allowed))
-
-
-def _read_figure(raw: object, where: str, problems: list[str]) -> Figure | None:
-    table = checked(_FigureTable, raw, where, problems)
-    if table is None:
-        return None
-    before = len(problems)
-    problems += figure_problems(table.signal, table.metric, table.segment, f"{where}.")
-    limit = share_of(table.max_regression)
-    if limit is None:
-        problems.append(f"{where}.max_regression: should be a share such as '5%' or 0.05, got {table.max_regression!r}")
-    if len(problems) > before or limit is None:
-        return None
-    _, factor = unit_of(table.signal, table.metric, table.unit, where, problems)
-    return Figure(table.signal, table.metric, table.segment, table.estimator, limit, table.floor * factor)
+def figures_of(plan: ValidationPlan) -> tuple[Figure, ...]:
+    """Return what the requirements of a plan measure, where lower is better, without limits."""
+    figures = [Figure(r.signal, r.metric, r.segment, r.estimator or MAIN) for r in plan.requirements]
+    return tuple(dict.fromkeys(f for f in figures if not figure_problems(f.signal, f.metric, f.segment))) or (Figure(),)
 
 
 def figure_problems(signal: str, metric: str, segment: str, where: str = "") -> list[str]:
     """Return what is wrong with the words of a figure."""
     # Less is better, and 0 is best: those that a ratio states something of.
-    compared = tuple(name for name, one in registered().items() if one.best == "lower")
+    compared = tuple(name for name, metric in registered().items() if metric.best == "lower")
     choices = (("signal", signal, tuple(SIGNALS)), ("metric", metric, compared), ("segment", segment, SEGMENTS))
-    return [f"{where}{key} = {unknown(value, known)}" for key, value, known in choices if value not in known]
+    return [f"{where}{key} = {unknown(value, allowed)}" for key, value, allowed in choices if value not in allowed]
 
 
 def share_of(text: str | float) -> float | None:
     """Return the share that ``5%``, ``0.05`` or a number represents; None for what is none, or above 10."""
     if isinstance(text, str):
-        found = _SHARE.fullmatch(text)
-        if found is None:
+        match = _SHARE.fullmatch(text)
+        if match is None:
             return None
-        share = float(found[1]) / (100.0 if found[2] else 1.0)
+        share = float(match[1]) / (100.0 if match[2] else 1.0)
     else:
         share = float(text)
     return share if math.isfinite(share) and 0.0 <= share <= 10.0 else None
