@@ -145,9 +145,9 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
     parts = [
         _turned(f, hand * w, np.where(part, speed, np.nan), best.rotation[2], references) for part in halves(len(speed))
     ]
-    known = [p for p in parts if p is not None]
-    agree = all(p.correlation >= PART_CORRELATION and np.allclose(nearest_step(p.rotation), step) for p in known)
-    is_long = len(known) == len(parts) or best.correlation >= ASKEW_CORRELATION
+    fitted = [p for p in parts if p is not None]
+    agree = all(p.correlation >= PART_CORRELATION and np.allclose(nearest_step(p.rotation), step) for p in fitted)
+    is_long = len(fitted) == len(parts) or best.correlation >= ASKEW_CORRELATION
     return found if agree and is_long else replace(found, confident=False)
 
 
