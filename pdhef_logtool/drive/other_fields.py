@@ -1,8 +1,8 @@
 """Whether a mapping file reads a wrong field: recognition names another one of the log, and the drive decides.
 
 A signal with a wrong unit still goes with the others; one that is read from another field often does too, by chance or
-because both move in bends. Each suspicion is tested: such signals are read from the fields that recognition reads, and only if
-all checks of them then pass, and fewer fail than before, the checks name those fields.
+because both move in bends. Each suspicion is tested: such signals are read from the fields that recognition reads, and
+only if all checks of them then pass, and fewer fail than before, the checks name those fields.
 """
 
 from __future__ import annotations
