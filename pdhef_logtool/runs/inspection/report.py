@@ -111,7 +111,7 @@ class ClockReport:
 
 @dataclass(frozen=True, slots=True)
 class SignalReport:
-    """One mapped signal in SI units, cleaned. Vectors have NaN statistics.
+    """One mapped signal in SI units, cleaned. Statistics of vectors are those of their length.
 
     ``gaps`` counts steps of more than 5 median steps and 0.1 s; ``dropped`` samples by kind.
     """
@@ -397,8 +397,7 @@ def _gather(channels: MappedChannels, gathered: dict[tuple[str, str], _Gathered]
                 # Stamps at the seam of two windows may be out of order by the jitter of their delays.
                 stamps = stamps[stamps > entry.steps.last_ns]
             entry.steps.add(stamps)
-            if channel.values.ndim == 1:
-                entry.values.add(channel.values)
+            entry.values.add(channel.values if channel.values.ndim == 1 else np.linalg.norm(channel.values, axis=1))
 
 
 # ------------------------------------------------------------------------------------------------ reports
