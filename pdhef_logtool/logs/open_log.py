@@ -186,7 +186,7 @@ def _open_plain(file: LogFile) -> Container | DriveLog:
     log_format = recognised_format(head, file.path.name)
     if log_format is None:
         got, remedy = "a file that is none of these" if head else "an empty file", _REMEDY
-        if head.startswith(LFS_POINTER):
+        if head.startswith(LFS_POINTER[:HEAD_BYTES]):
             got, remedy = "a pointer of Git LFS in place of the recording", "git lfs pull in its repository"
         raise LogError(expected=what_is_a_log(), got=got, where=str(file.place), remedy=remedy)
     opened = log_format.open(file)
