@@ -361,7 +361,7 @@ def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
     """Return a report of a few kB, of many drives: figures that tables show, and no list that grows with the log.
 
     All figures are in metrics.parquet. Of topics those that were mapped stay, of algorithms all but the noise, of
-    segments the sideslip answer's own, and of the rest the first :data:`_MOST_LISTED`.
+    segments the sideslip answer's own, and of the rest the first :data:`_MOST_LISTED`; the verdicts are in run.json.
     """
     answer = report["answer"]
     names = {answer["main"], answer["naive"], PHYSICS} if answer else set()
@@ -369,7 +369,7 @@ def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
     if space := report.get("operating_space"):
         first["operating_space"] = {**space, "cells": [*map(_rounded, space["cells"])]}
     return {
-        **{key: value for key, value in report.items() if key not in ("innovations", "error_budget")},
+        **{key: value for key, value in report.items() if key not in ("innovations", "error_budget", "plan")},
         **first,
         "log": {**report["log"], "topics": [t for t in report["log"]["topics"] if t["mapped"]]},
         "estimators": [_brief_estimator(e, names) for e in report["estimators"]],
