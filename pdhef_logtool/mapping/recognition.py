@@ -13,6 +13,7 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.candidates import Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
+from pdhef_logtool.mapping.clocks import with_usable_stamps
 from pdhef_logtool.mapping.gnss_signals import HEADING, gnss_signals
 from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, length_of, speed_over_ground
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
@@ -250,6 +251,7 @@ def auto_map(
         notes=tuple(draft.notes),
         checks=weighed.checks,
     )
+    mapping = with_usable_stamps(log, mapping)
     return AutoMapping(mapping, tuple(draft.ambiguities), missing_signals(mapping), weighed.candidates)
 
 
