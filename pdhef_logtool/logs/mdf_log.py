@@ -90,9 +90,9 @@ def _repaired(path: Path, folder: Path) -> Path | None:
         return None
     copy = folder / path.name
     shutil.copyfile(path, copy)
-    with copy.open("r+b") as file:
-        file.seek(cut[-1] + 8)
-        file.write((size - cut[-1]).to_bytes(8, "little"))
+    with copy.open("r+b") as repaired:
+        repaired.seek(cut[-1] + 8)
+        repaired.write((size - cut[-1]).to_bytes(8, "little"))
     return copy
 
 
