@@ -194,6 +194,7 @@ class ReportFacts:
     truth: TruthFacts
     vehicle_file: str | None = None
     vehicle_proven: bool = False
+    sensors: Mapping[str, float] = field(default_factory=dict)
     assumed: Sequence[AssumedValue] = ()
     setup: Mapping[str, Any] | None = None
     low_speed_m_s: float | None = None
@@ -216,12 +217,16 @@ class ReportFacts:
 
 @dataclass(frozen=True, slots=True)
 class CarFacts:
-    """The car that a log of a run had: folder or file (None: none was given), vehicle, digests of physics, network."""
+    """The car that a log of a run had: folder or file (None: none was given), vehicle, digests of physics, network.
+
+    ``sensors``: the entries of its sensor profile that differ from the default.
+    """
 
     file: str | None
     name: str
     sha256: str
     network_sha256: str | None
+    sensors: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,6 +298,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
             "sha256": facts.vehicle_sha256,
             "file": facts.vehicle_file,
             "proven": facts.vehicle_proven,
+            "sensors": dict(facts.sensors),
             "assumed": list(facts.assumed),
             "low_speed_blend_m_s": facts.low_speed_m_s,
         },

@@ -18,9 +18,9 @@ from tests.command_line import called
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = (
-    *("inspect", "map", "run", "metrics", "plan", "report", "compare", "events", "trend", "serve", "view", "compile"),
+    *("inspect", "map", "convert", "plan", "run", "metrics", "report", "compare", "events", "trend", "serve", "view"),
     *("simulate", "simulate suite", "simulate conditions"),
-    *("learn", "extract", "train", "retrain"),
+    *("learn", "extract", "train", "retrain", "compile"),
 )
 
 

@@ -113,8 +113,9 @@ def test_one_estimator_without_truth_has_a_page(tmp_path):
 
 
 def test_a_log_that_failed_has_a_page_with_its_reason(tmp_path):
-    page = page_of(write_run(tmp_path, [], outcome="failed: no IMU <b>"))
-    assert "no IMU &lt;b&gt;" in page
+    outcome = "failed: a.mcap: expected an IMU, got a damaged log <b>; copy it again"
+    page = page_of(write_run(tmp_path, [], outcome=outcome))
+    assert "A damaged log &lt;b&gt; (expected: an IMU)." in page and "<p>Copy it again</p>" in page
 
 
 @pytest.mark.parametrize("damage", ["absent", "cut", "empty"])

@@ -106,7 +106,7 @@ def test_every_page_of_a_run_is_written_and_removed(tmp_path: Path) -> None:
     folder = run_of(tmp_path, drives, {"bad": "empty"})
     written = write_pages(open_run(folder), png=True)
     assert written.fleet.file == folder / "report.html"
-    assert {p.name for p in written.fleet.pictures} == {"medians.png", "spread.png", "against.png", "worst.png"}
+    assert {p.name for p in written.fleet.pictures} == {"worst.png", "medians.png", "spread.png", "against.png"}
     assert 'href="logs/bad/report.html"' in (folder / "report.html").read_text()
     assert 'href="../../report.html"' in (folder / "logs" / "bad" / "report.html").read_text()
     assert written.to_dict()["page"] == str(folder / "report.html")
