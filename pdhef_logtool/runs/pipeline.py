@@ -479,7 +479,8 @@ def files_of(folder: Path) -> dict[str, str]:
 
 def _car_facts(car: Car) -> CarFacts:
     network = None if car.network is None else car.network.sha256
-    return CarFacts(car.file_name, car.vehicle.name, car.physics_sha256, network)
+    sensors = car.vehicle.sensors.model_dump(exclude_defaults=True)
+    return CarFacts(car.file_name, car.vehicle.name, car.physics_sha256, network, sensors)
 
 
 def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
@@ -707,12 +708,9 @@ def report_facts(
         vehicle_sha256=car.physics_sha256,
         vehicle_file=car.file_name,
         vehicle_proven=car.has_evidence,
+        sensors=car.vehicle.sensors.model_dump(),
         assumed=drive.car.assumed,
-        setup={
-            "source": drive.setup_source,
-            "decided_s": plan.decided_s,
-            "causal_from_s": drive.causal_from_s,
-        },
+        setup={"source": drive.setup_source, "decided_s": plan.decided_s, "causal_from_s": drive.causal_from_s},
         low_speed_m_s=car.vehicle.low_speed_blend_m_s,
         estimators=list(estimators),
         truth=TruthFacts(
