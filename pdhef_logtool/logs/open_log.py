@@ -91,7 +91,9 @@ def _opened(path: LogPlace, meter: Meter, wanted: Wanted) -> DriveLog:
         elif path.is_dir():
             return _open_folder(path, meter)
         elif not path.exists():
-            raise LogError(expected=what_is_a_log(), got="no such file", where=str(path), remedy="check the path")
+            raise LogError(
+                expected=what_is_a_log(), got="no such file", where=str(path), remedy="check the path", missing=True
+            )
         else:
             opened = _open_file(path, meter)
     except OSError as error:
