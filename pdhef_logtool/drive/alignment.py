@@ -28,6 +28,7 @@ from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import (
     GNSS,
     GNSS_COMPONENTS,
+    GNSS_POSITION,
     WHEELS,
     BoolArray,
     Channel,
@@ -63,6 +64,8 @@ SAME_CLOCK_SHARE = 0.9
 
 
 _IMU = ("yaw_rate_rad_s", "ay_m_s2", "ax_m_s2")
+#: What only the sideslip reference uses, which is not causal: never waited for.
+_TILT_RATES = frozenset({"roll_rate_rad_s", "pitch_rate_rad_s"})
 _INPUTS = frozenset({"steer_rad", "steering_wheel_rad", "ax_m_s2", "friction"})
 
 
@@ -244,7 +247,7 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
         if p.name in usable and stamps.size:
             values, arrival = _to_grid(usable[p.name], p, stamps, _ns(_max_gap_s(plan.grid_period_s)))
             columns[p.target] = p.scale * values if p.scale != 1.0 else values
-            if not p.name.startswith(GNSS) or plan.speed_from == "GNSS":  # no causal estimator uses it otherwise
+            if p.name not in _TILT_RATES and (not p.name.startswith(GNSS) or plan.speed_from == "GNSS"):
                 np.maximum(ready, arrival, out=ready)
     ready = np.maximum.accumulate(ready)
 
@@ -275,6 +278,11 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
         available=plan.available,
         gnss_velocity_m_s=velocity[inside].copy(),
         gnss_velocity_std_m_s=column("gnss_velocity_accuracy_m_s"),
+        gnss_position_deg=np.stack([column(name) for name in GNSS_POSITION], axis=1),
+        gnss_position_std_m=column("gnss_position_accuracy_m"),
+        gnss_heading_rad=column("gnss_heading_rad"),
+        roll_rate_rad_s=column("roll_rate_rad_s"),
+        pitch_rate_rad_s=column("pitch_rate_rad_s"),
     )
 
 

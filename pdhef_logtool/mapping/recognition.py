@@ -106,6 +106,7 @@ SEVERAL_POSITIONS = {
 }
 #: What a type must have to be what its name gives; of an IMU any of them, of others all.
 _IMU_PATHS = ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z")
+_TILT_RATE_PATHS = ("angular_velocity.x", "angular_velocity.y")
 
 
 @dataclass(frozen=True, slots=True)
@@ -512,7 +513,7 @@ def _probed_paths(topic: TopicInfo) -> list[str]:
     kind = _type(topic)
     paths: list[str] = []
     if kind in IMU_TYPES:
-        paths += [*_IMU_PATHS, "linear_acceleration_covariance[0]", "angular_velocity_covariance[0]"]
+        paths += [*_IMU_PATHS, *_TILT_RATE_PATHS, "linear_acceleration_covariance[0]", "angular_velocity_covariance[0]"]
     if kind in TWIST_FIELDS:
         paths += [*(_twist(topic, "linear", axis) for axis in "xyz"), _twist(topic, "angular", "z")]
     if kind in POSE_FIELDS:
@@ -547,6 +548,9 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
         draft.notes.append(f"{imu.name} provides no angular rate (covariance -1)")
     elif draft.is_given(imu.name, "angular_velocity.z"):
         draft.take(draft.signals, "yaw_rate_rad_s", imu.name, "angular_velocity.z")
+        for name, axis in (("roll_rate_rad_s", "x"), ("pitch_rate_rad_s", "y")):
+            if _span(draft.values(imu.name, f"angular_velocity.{axis}")) > 0.0:  # fillers are constant
+                draft.take(draft.signals, name, imu.name, f"angular_velocity.{axis}")
 
 
 def _map_steering(draft: _Draft, topics: list[TopicInfo]) -> None:

@@ -23,10 +23,24 @@ WHEELBASE_M = 2.7
 LONGEST_IMU_GAP_S = 0.25
 #: Speed of standstill.
 STANDSTILL_M_S = 0.1
-#: 1-sigma of GNSS velocity without a stated accuracy, and its growth with acceleration (receivers filter).
-GNSS_STD_M_S, GNSS_LAG_S = 0.05, 0.01
+#: 1-sigma of GNSS velocity without a stated accuracy, its growth with acceleration (receivers filter), and with roll
+#: rate, whose antenna moves on an arm of this uncertainty.
+GNSS_STD_M_S, GNSS_LAG_S, ROLL_ARM_M = 0.05, 0.01, 0.3
+#: Roll per lateral acceleration of a usual car, where no roll rate is measured.
+ROLL_PER_AY_RAD_S2_M = 0.0075
+#: Correlation of roll rate with the change of a_y, and range of its gain, that prove its sign.
+LEAST_ROLL_CORRELATION, ROLL_GAINS_RAD_S2_M = 0.3, (0.0005, 0.03)
+#: 1-sigma of the gains of accelerometers whose tilt is known; of the IMU's mounting; of the first position.
+TILT_GAIN_STD, IMU_YAW_STD_RAD, FIRST_POSITION_M = 0.02, 0.015, 10.0
+#: White and correlated 1-sigma of a position: with carrier phase, and of a single receiver.
+RTK_M, SINGLE_M, RTK_ACCURACY_M = (0.01, 0.01), (0.3, 2.0), 0.1
+EARTH_RADIUS_M = 6_378_137.0
+#: Half of the time over which accelerations are averaged that gains multiply, s.
+SLOW_S = 0.1
 #: Speed from which on a course is known; the time over which it turns, and the turn below which it may differ.
 LEAST_COURSE_SPEED_M_S, TURN_S, LEAST_TURN_RAD = 3.0, 2.0, 0.2
+#: Uncertainty of the axle law up to which a course is that of the car, but for some degrees.
+COURSE_LAW_RAD = math.radians(1.5)
 #: A jump of GNSS velocity against the IMU within one interval, m/s, that is rejected if one back follows in this time.
 JUMP_M_S, JUMP_BACK_S = 0.3, 60.0
 MAX_ITERATIONS, TOLERANCE_M_S, UNSETTLED_M_S = 8, 2e-3, 0.05
@@ -112,21 +126,27 @@ _PARAMETERS = (
     (s.LAW_ANGLE, "rear axle angle", "rad"),
     (s.REAR_AXLE, "rear axle distance error", "m"),
     (s.ROLL_GAIN, "roll gain of a_y", "1"),
+    (s.AX_GAIN, "pitch gain of a_x", "1"),
+    (s.IMU_YAW, "IMU yaw", "rad"),
     (s.SPEED_SCALE, "speed scale error", "1"),
     (s.IMU_X, "accelerometer x", "m"),
+    (s.IMU_Y, "accelerometer y", "m"),
     (s.YAW_RATE_BIAS, "yaw rate bias", "rad/s"),
     (s.YAW_RATE_GAIN, "yaw rate gain error", "1"),
     (s.ANTENNA_X, "antenna x", "m"),
     (s.ANTENNA_Y, "antenna y", "m"),
     (s.GNSS_DELAY, "GNSS delay", "s"),
-    (s.ANTENNA_ROLL, "antenna height times roll gradient", "s^2"),
+    (s.ANTENNA_HEIGHT, "antenna height over the roll axis", "m"),
 )
 
 
-def _priors(prior: ReferencePrior, n: int) -> tuple[FloatArray, FloatArray]:
-    """Return mean and 1-sigma of the first state, [n] each; v_x, v_y and heading are set by :func:`refer`."""
+def _priors(prior: ReferencePrior, n: int, *, tilts: bool) -> tuple[FloatArray, FloatArray]:
+    """Return mean and 1-sigma of the first state, [n] each; v_x, v_y and heading are set by :func:`refer`.
+
+    ``tilts``: roll and pitch rate give the tilt of the accelerometers, so that a_y and a_x have no gain.
+    """
     small = min(1.0, prior.wheelbase_m / WHEELBASE_M)
-    mean, std = np.zeros(s.WITH_GNSS), np.zeros(s.WITH_GNSS)
+    mean, std = np.zeros(s.WITH_POSITION), np.zeros(s.WITH_POSITION)
     x, y = prior.antenna_m
     has_antenna = math.isfinite(x)
     for entry, value, sigma in (
@@ -140,7 +160,10 @@ def _priors(prior: ReferencePrior, n: int) -> tuple[FloatArray, FloatArray]:
         (s.RATE_COMPLIANCE, 0.006 * small, 0.006 * small),
         (s.LAW_ANGLE, 0.0, math.radians(0.2)),
         (s.REAR_AXLE, 0.0, 0.05 * small),
-        (s.ROLL_GAIN, prior.ay_gain - 1.0, prior.ay_gain_std),
+        (s.ROLL_GAIN, 0.0 if tilts else prior.ay_gain - 1.0, TILT_GAIN_STD if tilts else prior.ay_gain_std),
+        (s.AX_GAIN, 0.0 if tilts else 0.02, TILT_GAIN_STD if tilts else 0.02),
+        (s.IMU_YAW, 0.0, IMU_YAW_STD_RAD),
+        (s.IMU_Y, 0.0, 0.2 * small),
         (s.SPEED_SCALE, 0.0, 0.02),
         (s.IMU_X, prior.imu_x_m, prior.imu_x_std_m),
         (s.YAW_RATE_BIAS, prior.yaw_rate_bias_rad_s, 0.005),
@@ -151,7 +174,9 @@ def _priors(prior: ReferencePrior, n: int) -> tuple[FloatArray, FloatArray]:
         (s.ANTENNA_X, x if has_antenna else 0.0, (0.1 if has_antenna else 0.7) * small),
         (s.ANTENNA_Y, y if has_antenna else 0.0, (0.1 if has_antenna else 0.5) * small),
         (s.GNSS_DELAY, 0.0, 0.06),
-        (s.ANTENNA_ROLL, 0.009 * small, 0.006 * small),
+        (s.ANTENNA_HEIGHT, 1.2 * small, 0.6 * small),
+        (s.EAST, 0.0, FIRST_POSITION_M),
+        (s.NORTH, 0.0, FIRST_POSITION_M),
     ):
         mean[entry], std[entry] = value, sigma
     return mean[:n], std[:n]
@@ -164,29 +189,36 @@ def refer(signals: Signals, prior: ReferencePrior, *, use_gnss: bool = True) -> 
     """
     stamps_ns, rows = knots(signals, prior)
     with_gnss = use_gnss and course_follows_gyro(rows)
-    noise = accelerometer_noise(signals)
-    alone = _smooth(rows, prior, noise, s.WITHOUT_GNSS)
-    best = alone
-    gnss_share = np.zeros(len(rows))
+    noise = sensor_noise(signals)
+    alone = best = _smooth(rows, prior, noise, s.WITHOUT_GNSS)
     if with_gnss:
         rows = without_jumps(rows, alone.states)
-        best = _smooth(rows, prior, noise, s.WITH_GNSS)
-        gnss_share = np.clip(1.0 - best.covariance[:, 2] / np.maximum(alone.covariance[:, 2], 1e-12), 0.0, 1.0)
+        aided = rows.copy()
+        aided[aided[:, s.LENGTH] > 0.0, s.SPEED] = np.nan  # the same measurement
+        has_position = np.isfinite(rows[:, s.POSITION_EAST]).any()
+        best = _smooth(aided, prior, noise, s.WITH_POSITION if has_position else s.WITH_GNSS)
+    gnss_share = np.clip(1.0 - best.covariance[:, 2] / np.maximum(alone.covariance[:, 2], 1e-12), 0.0, 1.0)
     vx, vy = best.states[:, s.VX], best.states[:, s.VY]
     law_m_s = np.where(rows[:, s.LAW_STD] > 0.0, rows[:, s.LAW_STD] * np.abs(vx), np.inf)
     law = np.clip(alone.covariance[:, 2] / np.maximum((1.0 + s.LAW_WHITE**2) * law_m_s**2, 1e-12), 0.0, 1.0)
-    rate = rows[:, s.YAW_RATE] * (1.0 - best.states[:, s.YAW_RATE_GAIN]) - best.states[:, s.YAW_RATE_BIAS]
-    x = best.states[:, s.IMU_X]
-    ax = rows[:, s.AX] - best.states[:, s.AX_BIAS] + x * rate**2
-    ay = rows[:, s.AY] * (1.0 - best.states[:, s.ROLL_GAIN]) - best.states[:, s.AY_BIAS]
-    ay -= x * rows[:, s.YAW_ACCELERATION]
-    parameters = _parameters(best, prior)
+    rate, ax, ay = corrected_inputs(best.states, rows)
+    parameters = _parameters(best, prior, tilts=bool(rows[0, s.TILT]))
     refused = _refusal(best, parameters)
     valid = (rows[:, s.GAP] == 0.0) & (sideslip_std(vx, vy, best.covariance) < LARGEST_STD_RAD)
     return SideslipReference(
         stamps_ns, vx, vy, rate, ax + vy * rate, ay - vx * rate, best.covariance, law * (1.0 - gnss_share), gnss_share,
         valid & (not refused), parameters, with_gnss, refused,
     )  # fmt: skip
+
+
+def corrected_inputs(states: FloatArray, rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return yaw rate and accelerations of the CG at the knots [K], without the estimated errors of the sensors."""
+    rate = rows[:, s.YAW_RATE] * (1.0 - states[:, s.YAW_RATE_GAIN]) - states[:, s.YAW_RATE_BIAS]
+    x, y, yaw, turning = states[:, s.IMU_X], states[:, s.IMU_Y], states[:, s.IMU_YAW], rows[:, s.YAW_ACCELERATION]
+    slow_ax, slow_ay = rows[:, s.SLOW_AX], rows[:, s.SLOW_AY]
+    ax = rows[:, s.AX] - states[:, s.AX_GAIN] * slow_ax - yaw * slow_ay - states[:, s.AX_BIAS]
+    ay = rows[:, s.AY] - states[:, s.ROLL_GAIN] * slow_ay + yaw * slow_ax - states[:, s.AY_BIAS]
+    return rate, ax + x * rate**2 + y * turning, ay - x * turning + y * rate**2
 
 
 def sideslip_std(vx: FloatArray, vy: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -203,14 +235,18 @@ class _Smoothed:
     moved_m_s: float
 
 
-def _smooth(rows: FloatArray, prior: ReferencePrior, noise: float, n: int) -> _Smoothed:
-    mean, std = _priors(prior, n)
+def _smooth(rows: FloatArray, prior: ReferencePrior, noise: FloatArray, n: int) -> _Smoothed:
+    mean, std = _priors(prior, n, tilts=bool(rows[0, s.TILT]))
     speed = rows[:, s.SPEED]
     first = np.flatnonzero(np.isfinite(speed))
     mean[s.VX] = speed[first[0]] if first.size else 0.0
     mean[s.VY] = prior.rear_m * rows[0, s.YAW_RATE]
-    if n == s.WITH_GNSS:
+    if n >= s.WITH_GNSS:
         mean[s.HEADING], std[s.HEADING] = first_heading(rows)
+    if n == s.WITH_POSITION:
+        k = int(np.flatnonzero(np.isfinite(rows[:, s.POSITION_EAST]))[0])
+        std[s.EAST_OFFSET] = std[s.NORTH_OFFSET] = rows[k, s.POSITION_OFFSET_STD]
+        std[s.EAST] = std[s.NORTH] = FIRST_POSITION_M + 60.0 * k / RATE_HZ
     states, covariance, last, moved, _ = s.smooth(
         1.0 / RATE_HZ, rows, prior.rear_m, mean, std**2, noise, MAX_ITERATIONS, TOLERANCE_M_S
     )
@@ -228,9 +264,9 @@ def first_heading(rows: FloatArray) -> tuple[float, float]:
     return course - turned, 0.2
 
 
-def _parameters(smoothed: _Smoothed, prior: ReferencePrior) -> tuple[ReferenceParameter, ...]:
+def _parameters(smoothed: _Smoothed, prior: ReferencePrior, *, tilts: bool) -> tuple[ReferenceParameter, ...]:
     n = smoothed.states.shape[1]
-    mean, std = _priors(prior, n)
+    mean, std = _priors(prior, n, tilts=tilts)
     value, sigma = smoothed.states[-1], np.sqrt(np.maximum(smoothed.last_variance, 0.0))
     return tuple(
         ReferenceParameter(
@@ -257,20 +293,26 @@ def _refusal(smoothed: _Smoothed, parameters: tuple[ReferenceParameter, ...]) ->
     return ""
 
 
-def accelerometer_noise(signals: Signals) -> float:
-    """Return the white noise of the lateral accelerometer in m/s²/√Hz from its third differences, at least 0.02.
+def sensor_noise(signals: Signals) -> FloatArray:
+    """Return the white noise of a_x, a_y in m/s²/√Hz, at least 0.02, and of the gyro in rad/s/√Hz, at least 0.0007."""
+    columns = (signals.ax_m_s2, 0.02), (signals.ay_m_s2, 0.02), (signals.yaw_rate_rad_s, 0.0007)
+    return np.array([white_noise(signals.stamps_ns, values, least) for values, least in columns])
+
+
+def white_noise(stamps_ns: IntArray, values: FloatArray, least: float) -> float:
+    """Return the white noise of a sensor [N] per √Hz from its third differences.
 
     Samples that repeat the one before are left out: sensors may repeat values.
     """
-    good = np.isfinite(signals.ay_m_s2)
-    values, stamps = signals.ay_m_s2[good], signals.stamps_ns[good]
+    good = np.isfinite(values)
+    values, stamps = values[good], stamps_ns[good]
     changed = np.flatnonzero(np.diff(values, prepend=math.inf) != 0.0)
     values, stamps = values[changed], stamps[changed]
     if len(values) < 8:
-        return 0.02
+        return least
     third = np.abs(np.diff(values, 3))
     sample_std = 1.4826 * float(np.median(third)) / math.sqrt(20.0)
-    return max(0.02, sample_std * math.sqrt(float(np.median(np.diff(stamps))) * 1e-9))
+    return max(least, sample_std * math.sqrt(float(np.median(np.diff(stamps))) * 1e-9))
 
 
 def knots(signals: Signals, prior: ReferencePrior) -> tuple[IntArray, FloatArray]:
@@ -280,31 +322,76 @@ def knots(signals: Signals, prior: ReferencePrior) -> tuple[IntArray, FloatArray
     knot_s = np.arange(0.0, t[-1] + 0.5 * h, h)
     rows = np.full((len(knot_s), s.INPUTS), np.nan)
     gap = np.zeros(len(knot_s), dtype=np.bool_)
-    for values, mean, value, derivative in (
-        (signals.ax_m_s2, s.MEAN_AX, s.AX, None),
-        (signals.ay_m_s2 - prior.ay_bias_m_s2, s.MEAN_AY, s.AY, s.AY_RATE),
-        (signals.yaw_rate_rad_s, s.MEAN_YAW_RATE, s.YAW_RATE, s.YAW_ACCELERATION),
+    for values, mean, value, derivative, slow in (
+        (signals.ax_m_s2, s.MEAN_AX, s.AX, None, s.SLOW_AX),
+        (signals.ay_m_s2 - prior.ay_bias_m_s2, s.MEAN_AY, s.AY, s.AY_RATE, s.SLOW_AY),
+        (signals.yaw_rate_rad_s, s.MEAN_YAW_RATE, s.YAW_RATE, s.YAW_ACCELERATION, None),
     ):
         if mean == s.MEAN_AX and np.isfinite(values).sum() < 2:
             values = _from_speed(t, signals.speed_m_s)
         integral, missing = _integral(t, values)
         gap |= missing(knot_s) & (mean != s.MEAN_AX)
-        rows[:, mean] = np.diff(integral(knot_s), prepend=integral(knot_s[:1] - h)) / h
+        rows[:, mean] = (integral(knot_s) - integral(knot_s - h)) / h
         rows[:, value] = (integral(knot_s + 0.5 * h) - integral(knot_s - 0.5 * h)) / h
         if derivative is not None:
             rows[:, derivative] = (integral(knot_s + h) - 2.0 * integral(knot_s) + integral(knot_s - h)) / h**2
+        if slow is not None:
+            rows[:, slow] = (integral(knot_s + SLOW_S) - integral(knot_s - h - SLOW_S)) / (h + 2.0 * SLOW_S)
+    rows[:, s.MEAN_YAW_ACCELERATION] = np.diff(rows[:, s.YAW_RATE], prepend=rows[0, s.YAW_RATE]) / h
     rows[:, s.GAP] = gap
     rows[:, s.SPEED] = _speed(t, signals.speed_m_s, knot_s)
     rows[:, s.SPEED_STD] = 0.15 + 0.01 * np.abs(np.nan_to_num(rows[:, s.SPEED])) + 0.05 * np.abs(rows[:, s.AX])
-    linear = LINEAR_AY_M_S2 * min(1.0, prior.friction / LINEAR_FRICTION)
-    ay, ay_rate = np.abs(rows[:, s.AY]), np.abs(rows[:, s.AY_RATE])
-    law = np.radians(
-        LAW_DEG[0] + LAW_DEG[1] * ay + LAW_DEG[2] * ay_rate + LAW_DEG[3] * np.maximum(ay - linear, 0.0) ** 2
-    )
-    rows[:, s.LAW_STD] = np.where(gap, 0.0, law)
+    rows[:, s.LENGTH] = is_length(signals)
+    rows[:, s.LAW_STD] = np.where(gap, 0.0, law_std(rows, prior.friction))
     rows[:, s.STANDSTILL] = rows[:, s.SPEED] < STANDSTILL_M_S
+    _add_tilt(rows, signals, t, knot_s)
     _add_gnss(rows, signals, knot_s)
     return signals.stamps_ns[0] + np.rint(knot_s * 1e9).astype(np.int64), rows
+
+
+def law_std(rows: FloatArray, friction: float) -> FloatArray:
+    """Return the 1-sigma of the axle law [K] in rad."""
+    linear = LINEAR_AY_M_S2 * min(1.0, friction / LINEAR_FRICTION)
+    ay, ay_rate = np.abs(rows[:, s.AY]), np.abs(rows[:, s.AY_RATE])
+    beyond = np.maximum(ay - linear, 0.0) ** 2
+    return np.radians(LAW_DEG[0] + LAW_DEG[1] * ay + LAW_DEG[2] * ay_rate + LAW_DEG[3] * beyond)
+
+
+def is_length(signals: Signals) -> bool:
+    """Return whether the speed is the length of GNSS velocity, and no measurement of its own."""
+    length = np.hypot(*signals.gnss_velocity_m_s.T)
+    both = np.isfinite(length) & np.isfinite(signals.speed_m_s)
+    return bool(both.any()) and bool(np.abs(length - signals.speed_m_s)[both].max() < 1e-6)
+
+
+def _add_tilt(rows: FloatArray, signals: Signals, t: FloatArray, knot_s: FloatArray) -> None:
+    """Put roll and pitch rate without their means into the rows, where roll rate follows the change of a_y."""
+    h = 1.0 / RATE_HZ
+    rows[:, [s.TILT, s.MEAN_ROLL_RATE, s.MEAN_PITCH_RATE]] = 0.0
+    rows[:, s.ROLL_RATE] = ROLL_PER_AY_RAD_S2_M * rows[:, s.AY_RATE]
+    if not all(np.isfinite(v).sum() > 0.9 * len(t) for v in (signals.roll_rate_rad_s, signals.pitch_rate_rad_s)):
+        return
+    means = []
+    for values in (signals.roll_rate_rad_s, signals.pitch_rate_rad_s):
+        integral, _ = _integral(t, values - np.nanmedian(values))
+        means.append((integral(knot_s) - integral(knot_s - h)) / h)
+        at_knots = (integral(knot_s + 0.5 * h) - integral(knot_s - 0.5 * h)) / h
+        means.append(at_knots)
+    roll, roll_at, pitch, pitch_at = means
+    signs = ((roll_at, rows[:, s.AY_RATE]), (-pitch_at, np.gradient(rows[:, s.SLOW_AX], h)))
+    if not all(follows(rate, change) for rate, change in signs):
+        return
+    rows[:, s.TILT], rows[:, s.MEAN_ROLL_RATE], rows[:, s.MEAN_PITCH_RATE] = 1.0, roll, pitch
+    rows[:, s.ROLL_RATE] = roll_at
+
+
+def follows(rate: FloatArray, change: FloatArray) -> bool:
+    """Return whether an angular rate [K] is that of a body which leans by what an acceleration changes by [K]."""
+    if rate.std() == 0.0 or change.std() == 0.0:
+        return False
+    correlation = float(np.corrcoef(rate, change)[0, 1])
+    gain = correlation * float(rate.std() / change.std())
+    return correlation > LEAST_ROLL_CORRELATION and ROLL_GAINS_RAD_S2_M[0] < gain < ROLL_GAINS_RAD_S2_M[1]
 
 
 def _integral(t: FloatArray, values: FloatArray):  # type: ignore[no-untyped-def]
@@ -373,7 +460,30 @@ def _add_gnss(rows: FloatArray, signals: Signals, knot_s: FloatArray) -> None:
     rows[k, s.GNSS_OFFSET] = t - knot_s[k]
     acceleration = np.hypot(rows[k, s.AX], rows[k, s.AY])
     stated = np.nan_to_num(signals.gnss_velocity_std_m_s[good])
-    rows[k, s.GNSS_STD] = np.hypot(np.maximum(stated, GNSS_STD_M_S), GNSS_LAG_S * acceleration)
+    white = np.hypot(np.maximum(stated, GNSS_STD_M_S), GNSS_LAG_S * acceleration)
+    rows[k, s.GNSS_STD] = np.hypot(white, ROLL_ARM_M * rows[k, s.ROLL_RATE])
+    _add_position(rows, signals, knot_s)
+
+
+def _add_position(rows: FloatArray, signals: Signals, knot_s: FloatArray) -> None:
+    """Put positions, in m from the first, at their nearest knots; they share the delay of the velocity."""
+    good = np.flatnonzero(np.isfinite(signals.gnss_position_deg).all(axis=1))
+    if not good.size:
+        return
+    latitude, longitude = np.radians(signals.gnss_position_deg[good]).T
+    t = (signals.stamps_ns[good] - signals.stamps_ns[0]) * 1e-9
+    k = np.minimum(np.rint(t * RATE_HZ).astype(np.int64), len(knot_s) - 1)
+    north, east = latitude - latitude[0], np.cos(latitude[0]) * (longitude - longitude[0])
+    used = np.isfinite(rows[k, s.GNSS_EAST])
+    stated = np.nan_to_num(signals.gnss_position_std_m[good], nan=SINGLE_M[1])
+    for column, values in (
+        (s.POSITION_EAST, EARTH_RADIUS_M * east),
+        (s.POSITION_NORTH, EARTH_RADIUS_M * north),
+        (s.POSITION_STD, np.where(stated < RTK_ACCURACY_M, np.maximum(stated, RTK_M[0]), SINGLE_M[0])),
+    ):
+        rows[k[used], column] = values[used]
+    typical = float(np.median(stated))
+    rows[:, s.POSITION_OFFSET_STD] = max(typical, RTK_M[1]) if typical < RTK_ACCURACY_M else max(typical, SINGLE_M[1])
 
 
 def course_follows_gyro(rows: FloatArray) -> bool:
@@ -381,7 +491,9 @@ def course_follows_gyro(rows: FloatArray) -> bool:
 
     A course that turns with the gyro or, on a straight drive, not at all is accepted: only sideslip separates the two.
     """
-    sampled = np.flatnonzero(np.hypot(rows[:, s.GNSS_EAST], rows[:, s.GNSS_NORTH]) > LEAST_COURSE_SPEED_M_S)
+    moves = np.hypot(rows[:, s.GNSS_EAST], rows[:, s.GNSS_NORTH]) > LEAST_COURSE_SPEED_M_S
+    rolls = moves & (rows[:, s.LAW_STD] > 0.0) & (rows[:, s.LAW_STD] < COURSE_LAW_RAD)
+    sampled = np.flatnonzero(rolls if rolls.sum() > 0.2 * moves.sum() else moves)
     if sampled.size < 2:
         return False
     course = np.unwrap(np.arctan2(rows[sampled, s.GNSS_NORTH], rows[sampled, s.GNSS_EAST]))
@@ -391,8 +503,8 @@ def course_follows_gyro(rows: FloatArray) -> bool:
     if not first.size:
         return False
     by_course, by_gyro = course[later[first]] - course[first], turned[later[first]] - turned[first]
-    apart = float(np.sqrt(np.mean((by_course - by_gyro) ** 2)))
-    return apart < 0.5 * max(float(np.sqrt(np.mean(by_gyro**2))), LEAST_TURN_RAD)
+    apart = np.angle(np.exp(1j * (by_course - by_gyro)))
+    return float(np.median(np.abs(apart))) < 0.5 * max(float(np.median(np.abs(by_gyro))), LEAST_TURN_RAD)
 
 
 def without_jumps(rows: FloatArray, states: FloatArray) -> FloatArray:
