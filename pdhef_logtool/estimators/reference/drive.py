@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdhef_logtool.estimators.reference import smoother as s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+
+ComplexArray: TypeAlias = NDArray[np.complex128]
 
 #: Knots per second.
 RATE_HZ = 20.0
@@ -21,28 +24,43 @@ LAW_DEG = (0.15, 0.06, 0.04, 1.5)
 WHEELBASE_M = 2.7
 #: An interval without a sample this long has no IMU.
 LONGEST_IMU_GAP_S = 0.25
+#: White noise of accelerometers, m/s²/√Hz, and of the gyro, rad/s/√Hz, at least.
+LEAST_NOISE_M_S2, LEAST_NOISE_RAD_S = 0.02, 0.0007
 #: Speed of standstill.
 STANDSTILL_M_S = 0.1
+#: A car that stands turns, accelerates (with bank and grade) and moves over ground by less.
+STILL_RAD_S, STILL_M_S2, STILL_GNSS_M_S = 0.03, 2.0, 1.0
 #: 1-sigma of GNSS velocity without a stated accuracy, its growth with acceleration (receivers filter), and with roll
 #: rate, whose antenna moves on an arm of this uncertainty.
 GNSS_STD_M_S, GNSS_LAG_S, ROLL_ARM_M = 0.05, 0.01, 0.3
-#: Roll per lateral acceleration of a usual car, where no roll rate is measured.
-ROLL_PER_AY_RAD_S2_M = 0.0075
-#: Correlation of roll rate with the change of a_y, and range of its gain, that prove its sign.
-LEAST_ROLL_CORRELATION, ROLL_GAINS_RAD_S2_M = 0.3, (0.0005, 0.03)
+#: Roll per lateral acceleration and pitch per longitudinal one of a usual car.
+ROLL_PER_AY_RAD_S2_M, PITCH_PER_AX_RAD_S2_M = 0.0075, 0.004
+#: Correlation of roll and pitch rate with those of a usual car that decides their signs.
+LEAST_SIGN_CORRELATION = 0.3
+#: 1-sigma of the distance of the rear axle, and of the gain of the gyro.
+REAR_AXLE_STD_M, YAW_RATE_GAIN_STD = 0.1, 0.003
 #: 1-sigma of the gains of accelerometers whose tilt is known; of the IMU's mounting; of the first position.
 TILT_GAIN_STD, IMU_YAW_STD_RAD, FIRST_POSITION_M = 0.02, 0.015, 10.0
+#: 1-sigma of the lateral position of an antenna.
+ANTENNA_Y_STD_M = 0.5
 #: White and correlated 1-sigma of a position: with carrier phase, and of a single receiver.
 RTK_M, SINGLE_M, RTK_ACCURACY_M = (0.01, 0.01), (0.3, 2.0), 0.1
 EARTH_RADIUS_M = 6_378_137.0
 #: Half of the time over which accelerations are averaged that gains multiply, s.
-SLOW_S = 0.1
+SLOW_S = 0.25
 #: Speed from which on a course is known; the time over which it turns, and the turn below which it may differ.
-LEAST_COURSE_SPEED_M_S, TURN_S, LEAST_TURN_RAD = 3.0, 2.0, 0.2
+LEAST_COURSE_SPEED_M_S, TURN_S, LEAST_TURN_RAD, LEAST_COURSES = 3.0, 2.0, 0.2, 3
 #: Uncertainty of the axle law up to which a course is that of the car, but for some degrees.
 COURSE_LAW_RAD = math.radians(1.5)
 #: A jump of GNSS velocity against the IMU within one interval, m/s, that is rejected if one back follows in this time.
 JUMP_M_S, JUMP_BACK_S = 0.3, 60.0
+#: Delays of GNSS that are tried, and the share of the cost of none that proves one; time of an unknown heading.
+DELAYS_S = tuple(round(0.02 * i, 2) for i in range(-5, 31))
+CLEAR_COST, HEADING_WINDOW_S = 0.7, 20.0
+#: Smaller delays are left to the smoother. Half of the time over which a course is averaged.
+SMALL_DELAY_S, COURSE_S = 0.06, 10.0
+#: Wheel speed that GNSS contradicts by more is that of a wheel that locks, spins or is dragged across.
+WHEEL_ERROR_M_S = 2.0
 MAX_ITERATIONS, TOLERANCE_M_S, UNSETTLED_M_S = 8, 2e-3, 0.05
 #: A parameter further than this from its prior mean, in 1-sigmas of the prior, refuses the drive. Lengths and the gain
 #: of the gyro have narrow priors (bank in bends has the same effect) and limits of 0.45 m, 0.3 m and 3 %.
@@ -159,20 +177,22 @@ def _priors(prior: ReferencePrior, n: int, *, tilts: bool) -> tuple[FloatArray, 
         (s.YAW_COMPLIANCE, 0.003, 0.004),
         (s.RATE_COMPLIANCE, 0.006 * small, 0.006 * small),
         (s.LAW_ANGLE, 0.0, math.radians(0.2)),
-        (s.REAR_AXLE, 0.0, 0.05 * small),
+        (s.REAR_AXLE, 0.0, REAR_AXLE_STD_M * small),
         (s.ROLL_GAIN, 0.0 if tilts else prior.ay_gain - 1.0, TILT_GAIN_STD if tilts else prior.ay_gain_std),
         (s.AX_GAIN, 0.0 if tilts else 0.02, TILT_GAIN_STD if tilts else 0.02),
         (s.IMU_YAW, 0.0, IMU_YAW_STD_RAD),
         (s.IMU_Y, 0.0, 0.2 * small),
+        (s.ROLL_RATE_BIAS, 0.0, 0.01),
+        (s.PITCH_RATE_BIAS, 0.0, 0.01),
         (s.SPEED_SCALE, 0.0, 0.02),
         (s.IMU_X, prior.imu_x_m, prior.imu_x_std_m),
         (s.YAW_RATE_BIAS, prior.yaw_rate_bias_rad_s, 0.005),
-        (s.YAW_RATE_GAIN, 0.0, 0.003),
+        (s.YAW_RATE_GAIN, 0.0, YAW_RATE_GAIN_STD),
         (s.HEADING, 0.0, 0.3),
         (s.EAST_ERROR, 0.0, s.RECEIVER_M_S),
         (s.NORTH_ERROR, 0.0, s.RECEIVER_M_S),
         (s.ANTENNA_X, x if has_antenna else 0.0, (0.1 if has_antenna else 0.7) * small),
-        (s.ANTENNA_Y, y if has_antenna else 0.0, (0.1 if has_antenna else 0.5) * small),
+        (s.ANTENNA_Y, y if has_antenna else 0.0, (0.1 if has_antenna else ANTENNA_Y_STD_M) * small),
         (s.GNSS_DELAY, 0.0, 0.06),
         (s.ANTENNA_HEIGHT, 1.2 * small, 0.6 * small),
         (s.EAST, 0.0, FIRST_POSITION_M),
@@ -189,17 +209,18 @@ def refer(signals: Signals, prior: ReferencePrior, *, use_gnss: bool = True) -> 
     """
     stamps_ns, rows = knots(signals, prior)
     with_gnss = use_gnss and course_follows_gyro(rows)
-    noise = sensor_noise(signals)
+    noise = sensor_noise(signals, rows)
     alone = best = _smooth(rows, prior, noise, s.WITHOUT_GNSS)
     if with_gnss:
-        rows = without_jumps(rows, alone.states)
-        aided = rows.copy()
-        aided[aided[:, s.LENGTH] > 0.0, s.SPEED] = np.nan  # the same measurement
+        rows[:, s.GNSS_OFFSET] -= scanned_delay(rows)
+        rows = without_jumps(rows)
+        aided = with_gnss_speed(rows)
         has_position = np.isfinite(rows[:, s.POSITION_EAST]).any()
-        best = _smooth(aided, prior, noise, s.WITH_POSITION if has_position else s.WITH_GNSS)
+        guess = first_guess(rows, alone.states)
+        best = _smooth(aided, prior, noise, s.WITH_POSITION if has_position else s.WITH_GNSS, guess)
     gnss_share = np.clip(1.0 - best.covariance[:, 2] / np.maximum(alone.covariance[:, 2], 1e-12), 0.0, 1.0)
     vx, vy = best.states[:, s.VX], best.states[:, s.VY]
-    law_m_s = np.where(rows[:, s.LAW_STD] > 0.0, rows[:, s.LAW_STD] * np.abs(vx), np.inf)
+    law_m_s = np.where(rows[:, s.LAW_STD] > 0.0, rows[:, s.LAW_STD] * np.hypot(vx, vy), np.inf)
     law = np.clip(alone.covariance[:, 2] / np.maximum((1.0 + s.LAW_WHITE**2) * law_m_s**2, 1e-12), 0.0, 1.0)
     rate, ax, ay = corrected_inputs(best.states, rows)
     parameters = _parameters(best, prior, tilts=bool(rows[0, s.TILT]))
@@ -209,6 +230,25 @@ def refer(signals: Signals, prior: ReferencePrior, *, use_gnss: bool = True) -> 
         stamps_ns, vx, vy, rate, ax + vy * rate, ay - vx * rate, best.covariance, law * (1.0 - gnss_share), gnss_share,
         valid & (not refused), parameters, with_gnss, refused,
     )  # fmt: skip
+
+
+def with_gnss_speed(rows: FloatArray) -> FloatArray:
+    """Return the inputs with the speed left out where it is that of GNSS, or less certain where GNSS differs.
+
+    Wheels that lock, spin or roll across the direction of travel show another speed than GNSS.
+    """
+    aided = rows.copy()
+    aided[aided[:, s.LENGTH] > 0.0, s.SPEED] = np.nan
+    sampled = np.flatnonzero(np.isfinite(rows[:, s.GNSS_EAST]))
+    over_ground = np.hypot(rows[sampled, s.GNSS_EAST], rows[sampled, s.GNSS_NORTH])
+    k = np.arange(len(rows))
+    difference = np.abs(rows[:, s.SPEED]) - np.interp(k, sampled, over_ground)
+    apart = np.max(np.abs([np.interp(k + i, k, difference) for i in (-2, 0, 2)]), axis=0)
+    after = np.minimum(np.searchsorted(sampled, k), sampled.size - 1)
+    near = np.minimum(np.abs(sampled[after] - k), np.abs(sampled[np.maximum(after - 1, 0)] - k)) < RATE_HZ
+    aided[near & (apart > WHEEL_ERROR_M_S), s.SPEED] = np.nan
+    aided[:, s.SPEED_STD] = np.where(near, np.hypot(rows[:, s.SPEED_STD], apart), rows[:, s.SPEED_STD])
+    return aided
 
 
 def corrected_inputs(states: FloatArray, rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -235,33 +275,64 @@ class _Smoothed:
     moved_m_s: float
 
 
-def _smooth(rows: FloatArray, prior: ReferencePrior, noise: FloatArray, n: int) -> _Smoothed:
+def _smooth(
+    rows: FloatArray, prior: ReferencePrior, noise: FloatArray, n: int, velocity: FloatArray | None = None
+) -> _Smoothed:
+    """Smooth with n states, of which ``velocity`` [K, 3] are v_x, v_y and heading to begin with, if given."""
     mean, std = _priors(prior, n, tilts=bool(rows[0, s.TILT]))
     speed = rows[:, s.SPEED]
     first = np.flatnonzero(np.isfinite(speed))
     mean[s.VX] = speed[first[0]] if first.size else 0.0
     mean[s.VY] = prior.rear_m * rows[0, s.YAW_RATE]
     if n >= s.WITH_GNSS:
-        mean[s.HEADING], std[s.HEADING] = first_heading(rows)
+        mean[s.HEADING], std[s.HEADING] = (0.0, math.pi) if velocity is None else (velocity[0, 2], 0.3)
     if n == s.WITH_POSITION:
         k = int(np.flatnonzero(np.isfinite(rows[:, s.POSITION_EAST]))[0])
         std[s.EAST_OFFSET] = std[s.NORTH_OFFSET] = rows[k, s.POSITION_OFFSET_STD]
         std[s.EAST] = std[s.NORTH] = FIRST_POSITION_M + 60.0 * k / RATE_HZ
+    guess = np.empty((0, n))
+    if velocity is not None:
+        guess = np.tile(mean, (len(rows), 1))
+        guess[:, [s.VX, s.VY, s.HEADING]] = velocity
     states, covariance, last, moved, _ = s.smooth(
-        1.0 / RATE_HZ, rows, prior.rear_m, mean, std**2, noise, MAX_ITERATIONS, TOLERANCE_M_S
+        1.0 / RATE_HZ, rows, prior.rear_m, mean, std**2, noise, guess, MAX_ITERATIONS, TOLERANCE_M_S
     )
     return _Smoothed(states, covariance, last, moved)
 
 
-def first_heading(rows: FloatArray) -> tuple[float, float]:
-    """Return the heading at the first knot from the first course of a car that moves, with its 1-sigma."""
-    fast = np.flatnonzero(np.hypot(rows[:, s.GNSS_EAST], rows[:, s.GNSS_NORTH]) > LEAST_COURSE_SPEED_M_S)
-    if not fast.size:
-        return 0.0, math.pi
-    k = int(fast[0])
-    turned = float(rows[: k + 1, s.MEAN_YAW_RATE].sum()) / RATE_HZ
-    course = math.atan2(rows[k, s.GNSS_NORTH], rows[k, s.GNSS_EAST])
-    return course - turned, 0.2
+def first_guess(rows: FloatArray, alone: FloatArray) -> FloatArray:
+    """Return v_x, v_y and heading [K, 3] by GNSS, gyro and course; where there is no GNSS, those without it.
+
+    The heading is that of the gyro and turned to the course where the car rolls without much slip. ``alone`` [K, n]:
+    states without GNSS.
+    """
+    k = np.arange(len(rows))
+    gyro = np.cumsum(rows[:, s.MEAN_YAW_RATE] - alone[:, s.YAW_RATE_BIAS]) / RATE_HZ
+    sampled = np.flatnonzero(np.isfinite(rows[:, s.GNSS_EAST]))
+    velocity = rows[sampled, s.GNSS_EAST] + 1j * rows[sampled, s.GNSS_NORTH]
+    rolls = sampled[rolls_freely(rows)[sampled]]
+    rolls = rolls if rolls.size else sampled
+    course = np.angle(np.interp(rolls, sampled, velocity)) - gyro[rolls]
+    around = np.cumsum(np.concatenate([[0.0], np.exp(1j * course)]))
+    n = max(1, round(COURSE_S * RATE_HZ / max(1.0, float(np.median(np.diff(rolls))) if rolls.size > 1 else 1.0)))
+    i = np.arange(rolls.size)
+    offset = np.unwrap(np.angle(around[np.minimum(i + n, rolls.size)] - around[np.maximum(i - n, 0)]))
+    heading = gyro + np.interp(k, rolls, offset)
+    body = np.interp(k, sampled, velocity) * np.exp(-1j * heading)
+    after = np.minimum(np.searchsorted(sampled, k), sampled.size - 1)
+    near = np.minimum(np.abs(sampled[after] - k), np.abs(sampled[np.maximum(after - 1, 0)] - k)) <= RATE_HZ
+    vx, vy = np.where(near, body.real, alone[:, s.VX]), np.where(near, body.imag, alone[:, s.VY])
+    return np.stack([vx, vy, heading], axis=1)
+
+
+def rolls_freely(rows: FloatArray) -> BoolArray:
+    """Return where the car moves forward with little slip [K], so that its course is its heading but for some degrees.
+
+    Wheel speed, where there is one, agrees with GNSS: it is not sideways.
+    """
+    over_ground = np.hypot(rows[:, s.GNSS_EAST], rows[:, s.GNSS_NORTH])
+    rolls = (over_ground > LEAST_COURSE_SPEED_M_S) & (rows[:, s.LAW_STD] > 0.0) & (rows[:, s.LAW_STD] < COURSE_LAW_RAD)
+    return rolls & ~(np.abs(rows[:, s.SPEED] - over_ground) > WHEEL_ERROR_M_S)
 
 
 def _parameters(smoothed: _Smoothed, prior: ReferencePrior, *, tilts: bool) -> tuple[ReferenceParameter, ...]:
@@ -293,10 +364,23 @@ def _refusal(smoothed: _Smoothed, parameters: tuple[ReferenceParameter, ...]) ->
     return ""
 
 
-def sensor_noise(signals: Signals) -> FloatArray:
-    """Return the white noise of a_x, a_y in m/s²/√Hz, at least 0.02, and of the gyro in rad/s/√Hz, at least 0.0007."""
-    columns = (signals.ax_m_s2, 0.02), (signals.ay_m_s2, 0.02), (signals.yaw_rate_rad_s, 0.0007)
-    return np.array([white_noise(signals.stamps_ns, values, least) for values, least in columns])
+def sensor_noise(signals: Signals, rows: FloatArray) -> FloatArray:
+    """Return the white noise of a_x, a_y in m/s²/√Hz, at least 0.02, and of the gyro in rad/s/√Hz, at least 0.0007.
+
+    The larger of the samples' and that of the means between knots: vibration of the body is not white.
+    """
+    columns = (
+        (signals.ax_m_s2, s.MEAN_AX, LEAST_NOISE_M_S2),
+        (signals.ay_m_s2, s.MEAN_AY, LEAST_NOISE_M_S2),
+        (signals.yaw_rate_rad_s, s.MEAN_YAW_RATE, LEAST_NOISE_RAD_S),
+    )
+    stamps_ns = np.rint(np.arange(len(rows)) * (1e9 / RATE_HZ)).astype(np.int64)
+    return np.array(
+        [
+            max(white_noise(signals.stamps_ns, values, least), white_noise(stamps_ns, rows[:, mean], least))
+            for values, mean, least in columns
+        ]
+    )
 
 
 def white_noise(stamps_ns: IntArray, values: FloatArray, least: float) -> float:
@@ -322,7 +406,7 @@ def knots(signals: Signals, prior: ReferencePrior) -> tuple[IntArray, FloatArray
     knot_s = np.arange(0.0, t[-1] + 0.5 * h, h)
     rows = np.full((len(knot_s), s.INPUTS), np.nan)
     gap = np.zeros(len(knot_s), dtype=np.bool_)
-    for values, mean, value, derivative, slow in (
+    for values, mean, value, derivative, averaged in (
         (signals.ax_m_s2, s.MEAN_AX, s.AX, None, s.SLOW_AX),
         (signals.ay_m_s2 - prior.ay_bias_m_s2, s.MEAN_AY, s.AY, s.AY_RATE, s.SLOW_AY),
         (signals.yaw_rate_rad_s, s.MEAN_YAW_RATE, s.YAW_RATE, s.YAW_ACCELERATION, None),
@@ -335,17 +419,20 @@ def knots(signals: Signals, prior: ReferencePrior) -> tuple[IntArray, FloatArray
         rows[:, value] = (integral(knot_s + 0.5 * h) - integral(knot_s - 0.5 * h)) / h
         if derivative is not None:
             rows[:, derivative] = (integral(knot_s + h) - 2.0 * integral(knot_s) + integral(knot_s - h)) / h**2
-        if slow is not None:
-            rows[:, slow] = (integral(knot_s + SLOW_S) - integral(knot_s - h - SLOW_S)) / (h + 2.0 * SLOW_S)
+        if averaged is not None:
+            rows[:, averaged] = (integral(knot_s + SLOW_S) - integral(knot_s - h - SLOW_S)) / (h + 2.0 * SLOW_S)
     rows[:, s.MEAN_YAW_ACCELERATION] = np.diff(rows[:, s.YAW_RATE], prepend=rows[0, s.YAW_RATE]) / h
     rows[:, s.GAP] = gap
     rows[:, s.SPEED] = _speed(t, signals.speed_m_s, knot_s)
     rows[:, s.SPEED_STD] = 0.15 + 0.01 * np.abs(np.nan_to_num(rows[:, s.SPEED])) + 0.05 * np.abs(rows[:, s.AX])
     rows[:, s.LENGTH] = is_length(signals)
+    rows[:, s.UNSIGNED] = not (signals.speed_m_s < -STANDSTILL_M_S).any()
+    if rows[0, s.LENGTH]:  # of the antenna
+        rows[:, s.SPEED_STD] = np.hypot(rows[:, s.SPEED_STD], ANTENNA_Y_STD_M * rows[:, s.YAW_RATE])
     rows[:, s.LAW_STD] = np.where(gap, 0.0, law_std(rows, prior.friction))
-    rows[:, s.STANDSTILL] = rows[:, s.SPEED] < STANDSTILL_M_S
     _add_tilt(rows, signals, t, knot_s)
     _add_gnss(rows, signals, knot_s)
+    rows[:, s.STANDSTILL] = standstill(rows)
     return signals.stamps_ns[0] + np.rint(knot_s * 1e9).astype(np.int64), rows
 
 
@@ -357,6 +444,14 @@ def law_std(rows: FloatArray, friction: float) -> FloatArray:
     return np.radians(LAW_DEG[0] + LAW_DEG[1] * ay + LAW_DEG[2] * ay_rate + LAW_DEG[3] * beyond)
 
 
+def standstill(rows: FloatArray) -> BoolArray:
+    """Return where the car stands [K]: no speed, as of a wheel that locks, and nothing that moves."""
+    still = rows[:, s.SPEED] < STANDSTILL_M_S
+    still &= np.abs(rows[:, s.YAW_RATE]) < STILL_RAD_S
+    still &= np.hypot(rows[:, s.SLOW_AX], rows[:, s.SLOW_AY]) < STILL_M_S2
+    return still & ~(np.hypot(rows[:, s.GNSS_EAST], rows[:, s.GNSS_NORTH]) > STILL_GNSS_M_S)
+
+
 def is_length(signals: Signals) -> bool:
     """Return whether the speed is the length of GNSS velocity, and no measurement of its own."""
     length = np.hypot(*signals.gnss_velocity_m_s.T)
@@ -365,7 +460,7 @@ def is_length(signals: Signals) -> bool:
 
 
 def _add_tilt(rows: FloatArray, signals: Signals, t: FloatArray, knot_s: FloatArray) -> None:
-    """Put roll and pitch rate without their means into the rows, where roll rate follows the change of a_y."""
+    """Put roll and pitch rate into the rows with the signs that a body has which leans out of a turn and dives."""
     h = 1.0 / RATE_HZ
     rows[:, [s.TILT, s.MEAN_ROLL_RATE, s.MEAN_PITCH_RATE]] = 0.0
     rows[:, s.ROLL_RATE] = ROLL_PER_AY_RAD_S2_M * rows[:, s.AY_RATE]
@@ -373,25 +468,30 @@ def _add_tilt(rows: FloatArray, signals: Signals, t: FloatArray, knot_s: FloatAr
         return
     means = []
     for values in (signals.roll_rate_rad_s, signals.pitch_rate_rad_s):
-        integral, _ = _integral(t, values - np.nanmedian(values))
+        integral, _ = _integral(t, values)
         means.append((integral(knot_s) - integral(knot_s - h)) / h)
         at_knots = (integral(knot_s + 0.5 * h) - integral(knot_s - 0.5 * h)) / h
         means.append(at_knots)
     roll, roll_at, pitch, pitch_at = means
-    signs = ((roll_at, rows[:, s.AY_RATE]), (-pitch_at, np.gradient(rows[:, s.SLOW_AX], h)))
-    if not all(follows(rate, change) for rate, change in signs):
+    turned = rows[:, s.YAW_RATE] * rows[:, s.SLOW_AY]  # a body that rolls in a turn has a pitch rate
+    dives = ROLL_PER_AY_RAD_S2_M * turned - PITCH_PER_AX_RAD_S2_M * np.gradient(rows[:, s.SLOW_AX], h)
+    signs = [correlation(roll_at, rows[:, s.AY_RATE]), correlation(slow(pitch_at), slow(dives))]
+    if max(np.abs(signs)) < LEAST_SIGN_CORRELATION:
         return
-    rows[:, s.TILT], rows[:, s.MEAN_ROLL_RATE], rows[:, s.MEAN_PITCH_RATE] = 1.0, roll, pitch
-    rows[:, s.ROLL_RATE] = roll_at
+    roll_sign, pitch_sign = (-1.0 if c < -LEAST_SIGN_CORRELATION else 1.0 for c in signs)
+    rows[:, s.TILT], rows[:, s.ROLL_RATE] = 1.0, roll_sign * roll_at
+    rows[:, s.MEAN_ROLL_RATE], rows[:, s.MEAN_PITCH_RATE] = roll_sign * roll, pitch_sign * pitch
 
 
-def follows(rate: FloatArray, change: FloatArray) -> bool:
-    """Return whether an angular rate [K] is that of a body which leans by what an acceleration changes by [K]."""
-    if rate.std() == 0.0 or change.std() == 0.0:
-        return False
-    correlation = float(np.corrcoef(rate, change)[0, 1])
-    gain = correlation * float(rate.std() / change.std())
-    return correlation > LEAST_ROLL_CORRELATION and ROLL_GAINS_RAD_S2_M[0] < gain < ROLL_GAINS_RAD_S2_M[1]
+def slow(values: FloatArray) -> FloatArray:
+    """Return the moving mean [K] over twice ``SLOW_S``."""
+    n = round(SLOW_S * RATE_HZ)
+    return np.convolve(np.pad(values, n, mode="edge"), np.full(2 * n + 1, 1.0 / (2 * n + 1)), "valid")
+
+
+def correlation(rate: FloatArray, change: FloatArray) -> float:
+    """Return the correlation of an angular rate [K] with what an acceleration changes by [K], 0 where one is constant."""
+    return 0.0 if rate.std() == 0.0 or change.std() == 0.0 else float(np.corrcoef(rate, change)[0, 1])
 
 
 def _integral(t: FloatArray, values: FloatArray):  # type: ignore[no-untyped-def]
@@ -491,42 +591,66 @@ def course_follows_gyro(rows: FloatArray) -> bool:
 
     A course that turns with the gyro or, on a straight drive, not at all is accepted: only sideslip separates the two.
     """
-    moves = np.hypot(rows[:, s.GNSS_EAST], rows[:, s.GNSS_NORTH]) > LEAST_COURSE_SPEED_M_S
-    rolls = moves & (rows[:, s.LAW_STD] > 0.0) & (rows[:, s.LAW_STD] < COURSE_LAW_RAD)
-    sampled = np.flatnonzero(rolls if rolls.sum() > 0.2 * moves.sum() else moves)
-    if sampled.size < 2:
+    for moves in (rolls_freely(rows), np.hypot(rows[:, s.GNSS_EAST], rows[:, s.GNSS_NORTH]) > LEAST_COURSE_SPEED_M_S):
+        sampled = np.flatnonzero(moves)
+        later = np.searchsorted(sampled, sampled + round(TURN_S * RATE_HZ))
+        first = np.flatnonzero(later < sampled.size)
+        if first.size >= LEAST_COURSES:
+            break
+    else:
         return False
     course = np.unwrap(np.arctan2(rows[sampled, s.GNSS_NORTH], rows[sampled, s.GNSS_EAST]))
     turned = np.cumsum(rows[:, s.MEAN_YAW_RATE])[sampled] / RATE_HZ
-    later = np.searchsorted(sampled, sampled + round(TURN_S * RATE_HZ))
-    first = np.flatnonzero(later < sampled.size)
-    if not first.size:
-        return False
     by_course, by_gyro = course[later[first]] - course[first], turned[later[first]] - turned[first]
     apart = np.angle(np.exp(1j * (by_course - by_gyro)))
     return float(np.median(np.abs(apart))) < 0.5 * max(float(np.median(np.abs(by_gyro))), LEAST_TURN_RAD)
 
 
-def without_jumps(rows: FloatArray, states: FloatArray) -> FloatArray:
-    """Return the inputs without GNSS velocities between a jump against the IMU and one back (multipath).
+def increments(rows: FloatArray, sampled: IntArray, delay_s: float) -> tuple[ComplexArray, ComplexArray]:
+    """Return the changes of velocity between GNSS samples [M − 1], east + i north: of GNSS, and of the IMU.
 
-    A jump is seen in the speed and in the course, which need no heading: the IMU's smoothed states [K, n] give the
-    change of both between two samples.
+    ``sampled`` [M]: knots with a sample, of a velocity ``delay_s`` old. The IMU's are turned by the angle, slowly
+    varying, that fits best: its heading is unknown.
     """
+    heading = np.cumsum(rows[:, s.MEAN_YAW_RATE]) / RATE_HZ
+    turned = np.exp(1j * (heading - 0.5 * rows[:, s.MEAN_YAW_RATE] / RATE_HZ))
+    velocity = np.cumsum((rows[:, s.MEAN_AX] + 1j * rows[:, s.MEAN_AY]) * turned) / RATE_HZ
+    at = sampled + (rows[sampled, s.GNSS_OFFSET] - delay_s) * RATE_HZ
+    by_imu = np.diff(np.interp(at, np.arange(len(rows)), velocity))
+    by_gnss = np.diff(rows[sampled, s.GNSS_EAST] + 1j * rows[sampled, s.GNSS_NORTH])
+    n = round(HEADING_WINDOW_S * RATE_HZ / max(1.0, float(np.median(np.diff(sampled)))))
+    largest = 2.0 * np.median(np.abs(by_gnss)) + 0.1
+    products = by_gnss * np.conj(by_imu) * np.minimum(1.0, largest / np.maximum(np.abs(by_gnss), 1e-9)) ** 2
+    sums = np.cumsum(np.concatenate([[0.0], products]))
+    k = np.arange(len(products))
+    around = sums[np.minimum(k + n, len(products))] - sums[np.maximum(k - n, 0)]
+    return by_gnss, by_imu * np.exp(1j * np.angle(around))
+
+
+def scanned_delay(rows: FloatArray) -> float:
+    """Return how late GNSS velocity is in s: changes of the IMU's velocity that old fit its changes best."""
+    sampled = np.flatnonzero(np.isfinite(rows[:, s.GNSS_EAST]))
+    if sampled.size < 8:
+        return 0.0
+    costs = []
+    for delay_s in DELAYS_S:
+        by_gnss, by_imu = increments(rows, sampled, delay_s)
+        costs.append(float(np.minimum(np.abs(by_gnss - by_imu) ** 2, JUMP_M_S**2).sum()))
+    zero = costs[DELAYS_S.index(0.0)]
+    best = int(np.argmin(costs))
+    return DELAYS_S[best] if costs[best] < CLEAR_COST * zero and abs(DELAYS_S[best]) > SMALL_DELAY_S else 0.0
+
+
+def without_jumps(rows: FloatArray) -> FloatArray:
+    """Return the inputs without GNSS velocities between a jump against the IMU and one back (multipath)."""
     sampled = np.flatnonzero(np.isfinite(rows[:, s.GNSS_EAST]))
     if sampled.size < 3:
         return rows
-    east, north = rows[sampled, s.GNSS_EAST], rows[sampled, s.GNSS_NORTH]
-    speed, course = np.hypot(east, north), np.arctan2(north, east)
-    vx, vy = states[sampled, s.VX], states[sampled, s.VY]
-    turned = np.cumsum(rows[:, s.MEAN_YAW_RATE] - states[:, s.YAW_RATE_BIAS])[sampled] / RATE_HZ
-    along = np.diff(speed - np.hypot(vx, vy))
-    change = np.angle(np.exp(1j * np.diff(course - turned - np.arctan2(vy, vx))))
-    across = np.where(np.minimum(speed[1:], speed[:-1]) > LEAST_COURSE_SPEED_M_S, speed[1:] * change, 0.0)
-    jump = (along + 1j * across) * np.exp(1j * course[1:])
-    limit = (
-        JUMP_M_S + 0.02 * np.hypot(rows[sampled[1:], s.AX], rows[sampled[1:], s.AY]) + 0.2 * np.diff(sampled) / RATE_HZ
-    )
+    by_gnss, by_imu = increments(rows, sampled, 0.0)
+    jump = by_gnss - by_imu
+    limit = JUMP_M_S + 0.02 * np.hypot(rows[sampled[1:], s.AX], rows[sampled[1:], s.AY])
+    limit += 0.5 * np.diff(sampled) / RATE_HZ
+    limit += np.abs(np.diff(rows[sampled, s.YAW_RATE])) + np.abs(np.diff(rows[sampled, s.ROLL_RATE]))
     candidates = np.flatnonzero(np.abs(jump) > limit)
     rejected = np.zeros(sampled.size, dtype=np.bool_)
     for i, first in enumerate(candidates):

@@ -6,7 +6,7 @@ antenna; with positions also those and their error.
 
     v̇_x = a_x + v_y r,   v̇_y = a_y − v_x r                               (kinematics of a plane body)
     ḃ_x = −g q + r b_y,  ḃ_y = g p − r b_x                                (tilt, where roll rate p, pitch rate q exist)
-    v_y − l_r r = −(κ a_r + k₂ ṙ) |v_x| − k₃ ȧ_y + β₀ v_x + S v_x (d + w) (axle law in the linear range)
+    v_y − l_r r = −(κ a_r + k₂ ṙ) |v_x| − k₃ ȧ_y + β₀ v_x + S |v| (d + w)  (axle law in the linear range)
 
 with the rear axle's lateral acceleration a_r, the lag k₃ of tyre relaxation and body roll, and S, the law's
 uncertainty, which grows beyond the linear range. Gains multiply accelerations after a low pass: their noise would pass
@@ -23,13 +23,14 @@ import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
 
-#: Entries of the state. Those up to AX_GAIN always, those up to ANTENNA_HEIGHT with GNSS velocity, then positions.
+#: Entries of the state. Those up to PITCH_RATE_BIAS always, those up to ANTENNA_HEIGHT with GNSS velocity, then positions.
 VX, VY, AX_BIAS, AY_BIAS, LAW_ERROR = 0, 1, 2, 3, 4
 COMPLIANCE, YAW_COMPLIANCE, LAW_ANGLE, REAR_AXLE, ROLL_GAIN, SPEED_SCALE, IMU_X = 5, 6, 7, 8, 9, 10, 11
 YAW_RATE_BIAS, YAW_RATE_GAIN, RATE_COMPLIANCE, IMU_Y, IMU_YAW, AX_GAIN = 12, 13, 14, 15, 16, 17
-HEADING, EAST_ERROR, NORTH_ERROR, ANTENNA_X, ANTENNA_Y, GNSS_DELAY, ANTENNA_HEIGHT = 18, 19, 20, 21, 22, 23, 24
-EAST, NORTH, EAST_OFFSET, NORTH_OFFSET = 25, 26, 27, 28
-WITHOUT_GNSS, WITH_GNSS, WITH_POSITION = 18, 25, 29
+ROLL_RATE_BIAS, PITCH_RATE_BIAS = 18, 19
+HEADING, EAST_ERROR, NORTH_ERROR, ANTENNA_X, ANTENNA_Y, GNSS_DELAY, ANTENNA_HEIGHT = 20, 21, 22, 23, 24, 25, 26
+EAST, NORTH, EAST_OFFSET, NORTH_OFFSET = 27, 28, 29, 30
+WITHOUT_GNSS, WITH_GNSS, WITH_POSITION = 20, 27, 31
 #: Entries whose transition is more than a decay, by their row of the Jacobian.
 DENSE = (VX, VY, AX_BIAS, AY_BIAS, HEADING, EAST, NORTH)
 #: Columns of the inputs at the knots: means over the interval before the knot, values at it, and 1-sigmas.
@@ -37,8 +38,8 @@ MEAN_AX, MEAN_AY, MEAN_YAW_RATE, YAW_RATE, AX, AY, YAW_ACCELERATION, AY_RATE = 0
 SPEED, SPEED_STD, LAW_STD, GNSS_EAST, GNSS_NORTH, GNSS_OFFSET, GNSS_STD = 8, 9, 10, 11, 12, 13, 14
 GAP, STANDSTILL, MEAN_YAW_ACCELERATION, SLOW_AX, SLOW_AY = 15, 16, 17, 18, 19
 ROLL_RATE, MEAN_ROLL_RATE, MEAN_PITCH_RATE, TILT, LENGTH = 20, 21, 22, 23, 24
-POSITION_EAST, POSITION_NORTH, POSITION_STD, POSITION_OFFSET_STD = 25, 26, 27, 28
-INPUTS = 29
+POSITION_EAST, POSITION_NORTH, POSITION_STD, POSITION_OFFSET_STD, UNSIGNED = 25, 26, 27, 28, 29
+INPUTS = 30
 
 #: Time constants of the accelerometer biases (tilt, bank), the law's error and the receiver's error, s.
 BIAS_S, LAW_S, RECEIVER_S = 6.0, 2.0, 5.0
@@ -182,8 +183,11 @@ def _transition(x, point, step_s, row, dense):  # type: ignore[no-untyped-def]
     new[2], new[3] = kept * point[AX_BIAS], kept * point[AY_BIAS]
     if tilts:
         dense[2, AY_BIAS], dense[3, AX_BIAS] = h * rate, -h * rate
-        new[2] += h * (rate * point[AY_BIAS] - GRAVITY_M_S2 * row[MEAN_PITCH_RATE])
-        new[3] += h * (GRAVITY_M_S2 * row[MEAN_ROLL_RATE] - rate * point[AX_BIAS])
+        dense[2, PITCH_RATE_BIAS], dense[3, ROLL_RATE_BIAS] = h * GRAVITY_M_S2, -h * GRAVITY_M_S2
+        pitch_rate = row[MEAN_PITCH_RATE] - point[PITCH_RATE_BIAS]
+        roll_rate = row[MEAN_ROLL_RATE] - point[ROLL_RATE_BIAS]
+        new[2] += h * (rate * point[AY_BIAS] - GRAVITY_M_S2 * pitch_rate)
+        new[3] += h * (GRAVITY_M_S2 * roll_rate - rate * point[AX_BIAS])
     if n >= WITH_GNSS:
         dense[4, HEADING], dense[4, YAW_RATE_BIAS], dense[4, YAW_RATE_GAIN] = 1.0, -h, -h * row[MEAN_YAW_RATE]
         new[4] = point[HEADING] + rate * h
@@ -260,10 +264,11 @@ def _axle_law(point, row, rear_m, h):  # type: ignore[no-untyped-def]
     vx = point[VX]
     speed, sign = abs(vx), 1.0 if vx >= 0.0 else -1.0
     slip = point[COMPLIANCE] * acceleration + point[YAW_COMPLIANCE] * row[YAW_ACCELERATION]
+    error_m_s = row[LAW_STD] * math.hypot(vx, point[VY])
     h[:] = 0.0
-    h[VX] = slip * sign - point[LAW_ANGLE] - row[LAW_STD] * point[LAW_ERROR]
+    h[VX] = slip * sign - point[LAW_ANGLE]
     h[VY] = 1.0
-    h[LAW_ERROR] = -row[LAW_STD] * vx
+    h[LAW_ERROR] = -error_m_s
     h[COMPLIANCE] = acceleration * speed
     h[YAW_COMPLIANCE] = row[YAW_ACCELERATION] * speed
     h[RATE_COMPLIANCE] = row[AY_RATE]
@@ -272,7 +277,7 @@ def _axle_law(point, row, rear_m, h):  # type: ignore[no-untyped-def]
     h[YAW_RATE_BIAS] = length
     h[YAW_RATE_GAIN] = length * row[YAW_RATE]
     lag = point[RATE_COMPLIANCE] * row[AY_RATE]
-    return point[VY] - length * rate + slip * speed + lag - (point[LAW_ANGLE] + row[LAW_STD] * point[LAW_ERROR]) * vx
+    return point[VY] - length * rate + slip * speed + lag - point[LAW_ANGLE] * vx - error_m_s * point[LAW_ERROR]
 
 
 @njit(cache=True)
@@ -338,15 +343,15 @@ def structure(n, step_s):  # type: ignore[no-untyped-def]
 
 # positional: compiled code takes no keywords at no cost.
 @njit(cache=True)
-def _measure(x, p, point, row, rear_m, store, k, used, iteration):  # type: ignore[no-untyped-def]
-    """Update with all measurements of a knot; ``point`` is where they are linearised."""
+def _measure(x, p, point, row, rear_m, store, k, used, trusted):  # type: ignore[no-untyped-def]
+    """Update with all measurements of a knot; ``point``, where they are linearised, is ``trusted`` to judge them."""
     n = x.shape[0]
     h = np.zeros(n)
     m = 0
-    trusted = iteration > 1
     if row[LAW_STD] > 0.0:
         value = _axle_law(point, row, rear_m, h)
-        r = (LAW_WHITE * row[LAW_STD] * point[VX]) ** 2 + LAW_FLOOR_M_S**2
+        r = (LAW_WHITE * row[LAW_STD] * math.hypot(point[VX], point[VY])) ** 2 + LAW_FLOOR_M_S**2
+        r = _cauchy(r, value, trusted)
         _update(x, p, h, -value - _dot(h, x - point), r, store, k, m)
         m += 1
     if row[SPEED] == row[SPEED]:
@@ -356,8 +361,9 @@ def _measure(x, p, point, row, rear_m, store, k, used, iteration):  # type: igno
             length = max(value, 0.1)
             h[VX], h[VY] = point[VX] / length, point[VY] / length
         else:
-            value = (1.0 + point[SPEED_SCALE]) * point[VX]
-            h[VX], h[SPEED_SCALE] = 1.0 + point[SPEED_SCALE], point[VX]
+            sign = -1.0 if point[VX] < 0.0 and row[UNSIGNED] > 0.0 else 1.0
+            value = sign * (1.0 + point[SPEED_SCALE]) * point[VX]
+            h[VX], h[SPEED_SCALE] = sign * (1.0 + point[SPEED_SCALE]), sign * point[VX]
         r = _cauchy(row[SPEED_STD] ** 2, row[SPEED] - value, trusted)
         _update(x, p, h, row[SPEED] - value - _dot(h, x - point), r, store, k, m)
         m += 1
@@ -388,14 +394,15 @@ def _measure(x, p, point, row, rear_m, store, k, used, iteration):  # type: igno
 
 
 @njit(cache=True)
-def smooth(step_s, rows, rear_m, start, start_variance, noise, iterations, tolerance_m_s):  # type: ignore[no-untyped-def]
+def smooth(step_s, rows, rear_m, start, start_variance, noise, guess, iterations, tolerance_m_s):  # type: ignore[no-untyped-def]
     """Smooth a drive over its knots.
 
     Parameters
     ----------
     step_s : between knots. rows : inputs [K, INPUTS]. rear_m : distance of the rear axle from the CG.
     start, start_variance : first state and its variances [n]; n is ``WITHOUT_GNSS``, ``WITH_GNSS`` or ``WITH_POSITION``.
-    noise : white, of a_x, a_y in m/s²/√Hz, of the gyro in rad/s/√Hz. iterations : at most. tolerance_m_s : of v_y between iterations, rms.
+    noise : white, of a_x, a_y in m/s²/√Hz, of the gyro in rad/s/√Hz. guess : states [K, n] about which
+    the first iteration linearises, [0, n]: about its own. iterations : at most. tolerance_m_s : of v_y between iterations, rms.
 
     Returns
     -------
@@ -408,30 +415,32 @@ def smooth(step_s, rows, rear_m, start, start_variance, noise, iterations, toler
     dense = np.zeros((knots, len(DENSE), n))
     store = np.zeros((knots, 8, 2 * n + 2))
     used = np.zeros(knots, np.int64)
-    smoothed = np.empty((knots, n))
+    guessed = guess.shape[0] > 0
+    smoothed = guess.copy() if guessed else np.empty((knots, n))
     moved = np.inf
     dense_row, decay = structure(n, step_s)
     done = 0
     for iteration in range(iterations):
         x = start.copy()
+        trusted = iteration > 1 or guess.shape[0] > 0
         p = np.diag(start_variance)
         scratch = np.empty((n, n))
         for k in range(knots):
             if k:
-                point = smoothed[k - 1] if iteration else x.copy()
+                point = smoothed[k - 1] if guessed else x.copy()
                 _transition(x, point, step_s, rows[k], dense[k])
                 _propagate(scratch, x, p, dense[k], dense_row, decay)
                 p, scratch = scratch, p
                 _add_process_noise(p, point, step_s, rows[k], rows[k - 1], noise)
-            point = smoothed[k] if iteration else x.copy()
-            _measure(x, p, point, rows[k], rear_m, store, k, used, iteration)
+            point = smoothed[k] if guessed else x.copy()
+            _measure(x, p, point, rows[k], rear_m, store, k, used, trusted)
             filtered[k] = x
             variance[k] = p
         pull = np.zeros(n)
         information = np.zeros((n, n))
         total = 0.0
         for k in range(knots - 1, -1, -1):
-            before = smoothed[k, VY] if iteration else filtered[k, VY]
+            before = smoothed[k, VY] if guessed else filtered[k, VY]
             change = _times(variance[k], pull)
             for i in range(n):
                 smoothed[k, i] = filtered[k, i] - change[i]
@@ -443,6 +452,7 @@ def smooth(step_s, rows, rear_m, start, start_variance, noise, iterations, toler
                 pull -= h * (weighted + e / s)
             if k:
                 _pull_vector(pull, dense[k], dense_row, decay)
+        guessed = True
         moved = math.sqrt(total / knots)
         done = iteration
         if iteration > 2 and moved < tolerance_m_s:
