@@ -128,7 +128,8 @@ def _with_receiver(mapping: Mapping) -> Mapping:
         )
         for to, axis in (("east", "x"), ("north", "y"))
     }
-    return replace(mapping, signals={**mapping.signals, **gnss, **rates})
+    others = {name: source for name, source in mapping.signals.items() if name != "speed_m_s"}
+    return replace(mapping, signals={**others, **gnss, **rates})
 
 
 def simulated_drive(spec: DriveSpec, vehicle: VehicleParameters | None = None) -> ScoredDrive:

@@ -41,8 +41,8 @@ LEAST_SIGN_CORRELATION = 0.3
 REAR_AXLE_STD_M, YAW_RATE_GAIN_STD = 0.1, 0.003
 #: 1-sigma of the gains of accelerometers whose tilt is known; of the IMU's mounting; of the first position.
 TILT_GAIN_STD, IMU_YAW_STD_RAD, FIRST_POSITION_M = 0.02, 0.015, 10.0
-#: 1-sigma of the lateral position of an antenna.
-ANTENNA_Y_STD_M = 0.5
+#: 1-sigma of the lateral position of an antenna, and its factor in a speed over ground: the error lasts.
+ANTENNA_Y_STD_M, LENGTH_FACTOR = 0.5, 4.0
 #: White and correlated 1-sigma of a position: with carrier phase, and of a single receiver.
 RTK_M, SINGLE_M, RTK_ACCURACY_M = (0.01, 0.01), (0.3, 2.0), 0.1
 EARTH_RADIUS_M = 6_378_137.0
@@ -428,7 +428,7 @@ def knots(signals: Signals, prior: ReferencePrior) -> tuple[IntArray, FloatArray
     rows[:, s.LENGTH] = is_length(signals)
     rows[:, s.UNSIGNED] = not (signals.speed_m_s < -STANDSTILL_M_S).any()
     if rows[0, s.LENGTH]:  # of the antenna
-        rows[:, s.SPEED_STD] = np.hypot(rows[:, s.SPEED_STD], ANTENNA_Y_STD_M * rows[:, s.YAW_RATE])
+        rows[:, s.SPEED_STD] = np.hypot(rows[:, s.SPEED_STD], LENGTH_FACTOR * ANTENNA_Y_STD_M * rows[:, s.YAW_RATE])
     rows[:, s.LAW_STD] = np.where(gap, 0.0, law_std(rows, prior.friction))
     _add_tilt(rows, signals, t, knot_s)
     _add_gnss(rows, signals, knot_s)
