@@ -48,8 +48,10 @@ RTK_M, SINGLE_M, RTK_ACCURACY_M = (0.01, 0.01), (0.3, 2.0), 0.1
 EARTH_RADIUS_M = 6_378_137.0
 #: Half of the time over which accelerations are averaged that gains multiply, s.
 SLOW_S = 0.25
-#: Speed from which on a course is known; the time over which it turns, and the turn below which it may differ.
-LEAST_COURSE_SPEED_M_S, TURN_S, LEAST_TURN_RAD, LEAST_COURSES = 3.0, 2.0, 0.2, 3
+#: Speed from which on a course is known.
+LEAST_COURSE_SPEED_M_S = 3.0
+#: Time over which GNSS and IMU change, and the change below which they may differ.
+CHANGE_S, LEAST_CHANGE_M_S = 0.5, 0.5
 #: Uncertainty of the axle law up to which a course is that of the car, but for some degrees.
 COURSE_LAW_RAD = math.radians(1.5)
 #: A jump of GNSS velocity against the IMU within one interval, m/s, that is rejected if one back follows in this time.
@@ -208,11 +210,11 @@ def refer(signals: Signals, prior: ReferencePrior, *, use_gnss: bool = True) -> 
     ``signals`` [N] need a_y and yaw rate, and speed or GNSS velocity.
     """
     stamps_ns, rows = knots(signals, prior)
-    with_gnss = use_gnss and course_follows_gyro(rows)
+    rows[:, s.GNSS_OFFSET] -= scanned_delay(rows)
+    with_gnss = use_gnss and gnss_follows_imu(rows)
     noise = sensor_noise(signals, rows)
     alone = best = _smooth(rows, prior, noise, s.WITHOUT_GNSS)
     if with_gnss:
-        rows[:, s.GNSS_OFFSET] -= scanned_delay(rows)
         rows = without_jumps(rows)
         aided = with_gnss_speed(rows)
         has_position = np.isfinite(rows[:, s.POSITION_EAST]).any()
@@ -586,24 +588,19 @@ def _add_position(rows: FloatArray, signals: Signals, knot_s: FloatArray) -> Non
     rows[:, s.POSITION_OFFSET_STD] = max(typical, RTK_M[1]) if typical < RTK_ACCURACY_M else max(typical, SINGLE_M[1])
 
 
-def course_follows_gyro(rows: FloatArray) -> bool:
-    """Return whether the GNSS course turns as the gyro does; not if its axes are swapped or those of the body.
+def gnss_follows_imu(rows: FloatArray) -> bool:
+    """Return whether GNSS velocity changes as the IMU has it; not if its axes are swapped or those of the body.
 
-    A course that turns with the gyro or, on a straight drive, not at all is accepted: only sideslip separates the two.
+    Where the car hardly accelerates there is no contradiction.
     """
-    for moves in (rolls_freely(rows), np.hypot(rows[:, s.GNSS_EAST], rows[:, s.GNSS_NORTH]) > LEAST_COURSE_SPEED_M_S):
-        sampled = np.flatnonzero(moves)
-        later = np.searchsorted(sampled, sampled + round(TURN_S * RATE_HZ))
-        first = np.flatnonzero(later < sampled.size)
-        if first.size >= LEAST_COURSES:
-            break
-    else:
+    sampled = np.flatnonzero(np.isfinite(rows[:, s.GNSS_EAST]))
+    sampled = sampled[np.diff(sampled // round(CHANGE_S * RATE_HZ), prepend=-1) > 0]
+    if sampled.size < 3:
         return False
-    course = np.unwrap(np.arctan2(rows[sampled, s.GNSS_NORTH], rows[sampled, s.GNSS_EAST]))
-    turned = np.cumsum(rows[:, s.MEAN_YAW_RATE])[sampled] / RATE_HZ
-    by_course, by_gyro = course[later[first]] - course[first], turned[later[first]] - turned[first]
-    apart = np.angle(np.exp(1j * (by_course - by_gyro)))
-    return float(np.median(np.abs(apart))) < 0.5 * max(float(np.median(np.abs(by_gyro))), LEAST_TURN_RAD)
+    by_gnss, by_imu = increments(rows, sampled, 0.0)
+    changes = np.abs(by_imu) >= min(np.median(np.abs(by_imu)), LEAST_CHANGE_M_S)
+    typical = max(float(np.median(np.abs(by_imu[changes]))), LEAST_CHANGE_M_S)
+    return float(np.median(np.abs(by_gnss - by_imu)[changes])) < 0.5 * typical
 
 
 def increments(rows: FloatArray, sampled: IntArray, delay_s: float) -> tuple[ComplexArray, ComplexArray]:
