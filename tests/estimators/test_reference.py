@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.estimators.reference import drive as reference
-from pdhef_logtool.estimators.reference import smoother
+from pdhef_logtool.estimators.reference import inputs, smoother
 from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference, refer, sideslip_std
 from pdhef_logtool.estimators.reference.estimator import steps_at
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -209,7 +208,10 @@ def test_spans_cover_a_drive_once():
 
 
 @settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 10_000), size=st.sampled_from([smoother.WITHOUT_GNSS, smoother.WITH_GNSS, smoother.WITH_POSITION]))
+@given(
+    seed=st.integers(0, 10_000),
+    size=st.sampled_from([smoother.WITHOUT_GNSS, smoother.WITH_GNSS, smoother.WITH_POSITION]),
+)
 def test_sparse_products_equal_dense_ones(seed, size):
     rng = np.random.default_rng(seed)
     root = rng.standard_normal((size, size))
@@ -306,7 +308,7 @@ def test_the_noise_of_a_sensor_that_repeats_its_samples_is_that_of_the_new_ones(
     rng = np.random.default_rng(0)
     noise = np.repeat(0.2 * rng.standard_normal(500), 4)
     held = replace(SLALOM.signals.rows(0, 2000), ay_m_s2=noise)
-    found = reference.white_noise(held.stamps_ns, held.ay_m_s2, 0.0)
+    found = inputs.white_noise(held.stamps_ns, held.ay_m_s2, 0.0)
     assert found == pytest.approx(0.2 * np.sqrt(0.04), rel=0.15)
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
 
-#: Entries of the state. Those up to PITCH_RATE_BIAS always, those up to ANTENNA_HEIGHT with GNSS velocity, then positions.
+#: Entries of the state: up to PITCH_RATE_BIAS always, to ANTENNA_HEIGHT with GNSS velocity, all with positions.
 VX, VY, AX_BIAS, AY_BIAS, LAW_ERROR = 0, 1, 2, 3, 4
 COMPLIANCE, YAW_COMPLIANCE, LAW_ANGLE, REAR_AXLE, ROLL_GAIN, SPEED_SCALE, IMU_X = 5, 6, 7, 8, 9, 10, 11
 YAW_RATE_BIAS, YAW_RATE_GAIN, RATE_COMPLIANCE, IMU_Y, IMU_YAW, AX_GAIN = 12, 13, 14, 15, 16, 17
@@ -192,7 +192,7 @@ def _transition(x, point, step_s, row, dense):  # type: ignore[no-untyped-def]
         dense[4, HEADING], dense[4, YAW_RATE_BIAS], dense[4, YAW_RATE_GAIN] = 1.0, -h, -h * row[MEAN_YAW_RATE]
         new[4] = point[HEADING] + rate * h
     if n == WITH_POSITION:
-        _move(point, h, ax, ay, rate, dense, new)
+        _move(point, h, ax, ay, dense, new)
     for j in range(n):
         away = x[j] - point[j]
         for q in range(dense.shape[0]):
@@ -212,8 +212,8 @@ def _transition(x, point, step_s, row, dense):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _move(point, h, ax, ay, rate, dense, new):  # type: ignore[no-untyped-def]
-    """Put the new position of the CG and its Jacobian into rows 5 and 6; velocity and acceleration turn with the car."""
+def _move(point, h, ax, ay, dense, new):  # type: ignore[no-untyped-def]
+    """Put the new position of the CG and its Jacobian into rows 5 and 6."""
     c, s = math.cos(point[HEADING]), math.sin(point[HEADING])
     forward, left = point[VX], point[VY]
     new[5] = point[EAST] + h * (c * forward - s * left) + 0.5 * h * h * (c * ax - s * ay)
@@ -400,9 +400,10 @@ def smooth(step_s, rows, rear_m, start, start_variance, noise, guess, iterations
     Parameters
     ----------
     step_s : between knots. rows : inputs [K, INPUTS]. rear_m : distance of the rear axle from the CG.
-    start, start_variance : first state and its variances [n]; n is ``WITHOUT_GNSS``, ``WITH_GNSS`` or ``WITH_POSITION``.
-    noise : white, of a_x, a_y in m/s²/√Hz, of the gyro in rad/s/√Hz. guess : states [K, n] about which
-    the first iteration linearises, [0, n]: about its own. iterations : at most. tolerance_m_s : of v_y between iterations, rms.
+    start, start_variance : first state and its variances [n], of ``WITHOUT_GNSS``, ``WITH_GNSS`` or ``WITH_POSITION``.
+    noise : white, of a_x, a_y in m/s²/√Hz, of the gyro in rad/s/√Hz.
+    guess : states [K, n] about which the first iteration linearises; [0, n]: about its own.
+    iterations : at most. tolerance_m_s : of v_y between iterations, rms.
 
     Returns
     -------
