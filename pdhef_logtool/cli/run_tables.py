@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pdhef_logtool.cli.console import cell, table
+from pdhef_logtool.cli.plan_tables import render_plan
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.geometry import DEGREES
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from pdhef_logtool.evaluation.metrics.metric import Metric
-    from pdhef_logtool.evaluation.thresholds import Verdict
     from pdhef_logtool.results.run_report import LogOutcome
     from pdhef_logtool.results.summary import RunSummary
     from pdhef_logtool.runs.pipeline import RunResult
@@ -94,8 +94,8 @@ def render_run(result: RunResult, console: Console) -> None:
         console.print()
     for log_result, report in reports_by_log:
         _render_log(log_result.outcome, report, console, alike)
-    if result.verdicts:
-        _render_verdicts(result.verdicts, console)
+    if result.requirements is not None:
+        render_plan(result.requirements, console)
     failed = [r for r, report in reports_by_log if report is None]
     lost = [r for r in result.results if r.outcome.lost]
     if len(result.results) > 1 or failed:
@@ -145,16 +145,6 @@ def _print_outputs(output: Path | str, console: Console) -> None:
     page = Path(output) / PAGE_FILE
     shown = f"; open {page} in a browser" if page.is_file() else ""
     console.print(f"outputs in {output}{shown}", soft_wrap=True)
-
-
-def _render_verdicts(verdicts: Sequence[Verdict], console: Console) -> None:
-    judged = table("threshold", "estimator", "log", ">value", ">margin", "verdict", fold=3)
-    for v in verdicts:
-        mark = "" if v.independent else " †"
-        value, margin = ("-" if x is None else f"{x:.4g}" for x in (v.value, v.margin))
-        judged.add_row(v.threshold.label + mark, v.estimator, v.log, value, margin, v.outcome)
-    console.print(judged)
-    console.print(f"{len(verdicts)} verdicts, {sum(v.failed for v in verdicts)} failed\n")
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,12 +50,12 @@ def earlier(column: FloatArray, by_s: float) -> FloatArray:
     return column if by_s == 0.0 else np.interp(cell, np.arange(column.shape[0]), column, left=np.nan, right=np.nan)
 
 
-def moving_at(speed: FloatArray) -> BoolArray:
+def moving_at(speed: FloatArray, least_m_s: float = MIN_MOVING_M_S) -> BoolArray:
     """Return where the car drives: by the drive's own fast speeds, so that a 1:10 car counts as a car does."""
     finite = np.abs(speed[np.isfinite(speed)])
     if finite.shape[0] == 0:
         return np.zeros(speed.shape[0], np.bool_)
-    limit = max(MIN_MOVING_M_S, MOVING_SHARE * float(np.quantile(finite, 0.9)))
+    limit = max(least_m_s, MOVING_SHARE * float(np.quantile(finite, 0.9)))
     with np.errstate(invalid="ignore"):
         return np.asarray(np.abs(speed) > limit, dtype=np.bool_)
 

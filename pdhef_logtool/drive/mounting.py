@@ -8,7 +8,7 @@ so, by complex regression, and its fit gives whether all of it is accepted.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -31,6 +31,7 @@ from pdhef_logtool.drive.frames import (
     rotation_text,
 )
 from pdhef_logtool.drive.measured import Measured, measure
+from pdhef_logtool.drive.other_fields import with_other_fields
 from pdhef_logtool.drive.relations import gentle_at, steering_references, units_told, yaw_references
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
@@ -44,7 +45,7 @@ from pdhef_logtool.drive.truth import (
     yaw_rate_channel,
 )
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, read_signals
+from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, fit_clocks, read_signals
 from pdhef_logtool.mapping.frames import Placement, placement_of
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
 from pdhef_logtool.records.checks import Check
@@ -285,7 +286,7 @@ def _level_only(rest: FloatArray) -> FloatArray:
 class Survey:
     """The first minutes of a log as its mapping reads them, the IMU turned into the car where that is certain.
 
-    ``vehicle``: from the vehicle file, or the default car.
+    ``vehicle``: from the vehicle file, or the default car. ``reread``: completes the checks of a mapping file.
     """
 
     mapping: Mapping
@@ -299,6 +300,7 @@ class Survey:
     mounting: Mounting | None = None
     placed: Placement | None = None
     framed: Check | None = None
+    reread: Callable[[tuple[Check, ...]], tuple[Check, ...]] | None = None
 
     @property
     def mounted(self) -> tuple[Check, ...]:
@@ -336,7 +338,8 @@ class Survey:
                 k if c.verdict == "undecided" and c.name in settled else c
                 for c, k in zip(drive_checks, passed, strict=True)
             )
-        return (*self.mounted, *self._of_names(drive_checks), *drive_checks)
+        checks = (*self.mounted, *self._of_names(drive_checks), *drive_checks)
+        return checks if self.reread is None else self.reread(checks)
 
     @cached_property
     def late(self) -> tuple[LateSensor, ...]:
@@ -389,7 +392,7 @@ def survey_log(
     channels = read_signals(log, replace(mapping, signals={**mapping.signals, **extra}), clocks, *span_ns)
     truth_plan = plan_truth(channels.truth, truth_position_m=vehicle.truth_position_m) if channels.truth else None
     truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
-    measured = measure(channels.signals, channels.truth, truth)
+    measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     # The input of an estimator must not depend on ground truth: with it, a mounting is only checked.
     mounting = find_mounting(measured.without_truth(), triads, mapping)
     blind = mounting is not None and mounting.confident
@@ -406,10 +409,18 @@ def survey_log(
         mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
         channels = read_signals(log, mapping, clocks, *span_ns)
         mounting = replace(mounting, named=mounting.rows)
-        measured = measure(channels.signals, channels.truth, truth)
+        measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     latency = truth_latency(channels, truth)
     survey = Survey(mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, placed, framed)
-    return _rescaled(survey, log, clocks, span_ns) if rescale and mapping.origin == "auto" else survey
+    if not rescale:
+        return survey
+    if mapping.origin == "auto":
+        return _rescaled(survey, log, clocks, span_ns)
+
+    def checks_of(other: Mapping) -> tuple[Check, ...]:
+        return survey_log(log, other, fit_clocks(log, other, *span_ns), span_ns, vehicle, rescale=False).checks
+
+    return replace(survey, reread=lambda checks: with_other_fields(checks, log, mapping, checks_of))
 
 
 def _by_frames(
@@ -452,7 +463,9 @@ def _rescaled(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span
     if factors:
         sound, shares = without_faulty_samples(survey.channels.signals, survey.vehicle)
         if shares:
-            factors = explained_factors(measure(sound), mounting_is_known=survey.is_mounted, most=1)
+            factors = explained_factors(
+                measure(sound, vehicle=survey.vehicle), mounting_is_known=survey.is_mounted, most=1
+            )
     signals, notes = dict(mapping.signals), list(mapping.notes)
     for name, (factor, evidence) in factors.items():
         if name in signals:

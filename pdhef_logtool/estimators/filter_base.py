@@ -80,7 +80,8 @@ M_INITIALISED, M_STEER, M_AX, M_AX_KNOWN, M_FRICTION, M_STEER_AGE, M_STILL, M_SP
 M_RATE_VY, M_RATE_R = 9, 10  # residual of the step before
 M_REJECTED = 11  # and the two after it, one a measurement: time since the first sample of an unbroken rejection
 M_SPEED = 14  # last speed sample
-MEMORY = 15
+M_GRIP = 15  # largest recent share of the grip that is used, decaying (``physics`` only)
+MEMORY = 16
 #: What M_REJECTED contains at the first rejected sample itself; 0 is "the last sample was accepted".
 JUST_REJECTED_S = 1e-9
 

@@ -228,8 +228,9 @@ def auto_map(
         f"{t.name} ({_type(t)}) has no messages" for t in log.topics if not t.messages and _is_well_known(t)
     ]
     draft.notes += [
-        f'{t.name} contains raw CAN frames: describe them in a mapping file with [can] dbc = ["car.dbc"]'
+        f"{t.name} contains raw CAN frames: describe them by --set msgs=car.dbc, or in a mapping file with [can]"
         for t in topics
+        if not any(o.type_name.startswith("can/msg/") and o.name != t.name for o in topics)
         if "can" in _words(f"{t.name} {t.type_name}") and holds_frames(t.name, log.fields(t.name, quiet=True))
     ]
     _map_imu(draft, topics)

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pdhef_logtool.car.assumed_values import AssumedValue
-    from pdhef_logtool.evaluation.thresholds import Verdict
+    from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
+    from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
 #: Columns of a figure in the report.
 _METRIC_COLUMNS = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
@@ -137,7 +138,7 @@ class DriveDetails:
     """What a report's page shows and no table contains, of a drive that a run estimated.
 
     ``faults`` of the sensors, None where no estimator detects them. ``innovations`` by channel.
-    ``standings`` of the selected estimate, empty without ground truth; ``limits``: how it is against the thresholds.
+    ``standings`` of the selected estimate, empty without ground truth.
     ``error_budget`` has a reason where there is none. ``operating_space``: the cells that the drive was in.
     ``metadata`` : what the log states of itself.
     """
@@ -145,10 +146,17 @@ class DriveDetails:
     faults: Sequence[SensorFault] | None
     innovations: Sequence[Any]
     standings: Sequence[Standing]
-    limits: Sequence[Verdict]
     error_budget: Any
     operating_space: Sequence[Cell]
     metadata: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class RequirementFacts:
+    """The verdicts of the validation plan on one drive alone, and the blocks of time that they are drawn from."""
+
+    verdicts: PlanVerdicts
+    blocks: Sequence[RequirementBlocks] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +171,7 @@ class ReportFacts:
     ``reference``: what came of the sideslip reference, None where it was not asked for.
     ``file_bytes``: what became of the bytes of each file; ``samples``: of the samples of each mapped source.
     ``checks``: plausibility of signals, ground truth and vehicle file. ``details``: None where nothing was estimated.
+    ``requirements``: None where there is nothing to judge.
     """
 
     log: LogFacts
@@ -189,6 +198,7 @@ class ReportFacts:
     remarks: Sequence[str] = ()
     main: MainFacts | None = None
     checks: Sequence[Check] = ()
+    requirements: RequirementFacts | None = None
     details: DriveDetails | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
 
@@ -310,6 +320,9 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
         "checks": list(facts.checks),
         "versions": dict(facts.versions),
     }
+    if facts.requirements is not None:
+        document["plan"] = facts.requirements.verdicts.to_dict()
+        document["requirement_blocks"] = list(facts.requirements.blocks)
     document = {key: jsonable(value) for key, value in document.items()}
     return document | _selected(document, facts.main, facts.details)
 
@@ -322,7 +335,7 @@ def _selected(document: Mapping[str, Any], main: MainFacts | None, details: Driv
     if details is None:
         return chosen
     chosen |= _detailed(details)
-    return chosen | {"verdicts": verdicts_of({**document, **chosen}, main.name, details.standings, details.limits)}
+    return chosen | {"verdicts": verdicts_of({**document, **chosen}, main.name, details.standings)}
 
 
 def _detailed(details: DriveDetails) -> dict[str, Any]:
@@ -396,6 +409,7 @@ def build_run(
     outcomes: Iterable[LogOutcome],
     remaining: int = 0,
     files: Mapping[str, str] | None = None,
+    plan: PlanVerdicts | None = None,
 ) -> dict[str, Any]:
     """Return the document of run.json (schemas/run.schema.json), sealed.
 
@@ -405,7 +419,7 @@ def build_run(
     config : the configuration in effect, as JSON-able values.
     model : ``name`` and ``sha256`` of the network; None when none ran, or not the same for all.
     outcomes : one a log. remaining : logs that are not done, for the run was ended.
-    files : sha256 by name of the files beside run.json that commands read back.
+    files : sha256 by name of the files beside run.json that commands read back. plan : verdicts on all logs.
     """
     document = {
         "format": "pdhef.run",
@@ -415,6 +429,7 @@ def build_run(
         "model": None if model is None else dict(model),
         **({"remaining": remaining} if remaining else {}),
         "files": dict(files or {}),
+        "plan": None if plan is None else plan.to_dict(),
         "logs": [
             {
                 "log": o.log,

@@ -23,7 +23,7 @@ from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED_FOLDERS
 from pdhef_logtool.storage.documents import read_toml, validated
 from pdhef_logtool.storage.object_store import is_url
 
-_FILES = ("car", "cars", "mapping", "msgs", "thresholds", "network", "intervals", "setup")
+_FILES = ("car", "cars", "mapping", "msgs", "plan", "network", "intervals", "setup")
 #: Settings that change no result.
 _NO_RESULT = ("cache", "cache_max_gb", "allow_private_redirects", "log_timeout_s", "max_memory_mb", "full_worst")
 #: What may be in place of a file.
@@ -75,8 +75,9 @@ class RunConfig:
     window_s : length of the windows in which a log is processed, in s. Results do not depend on it.
     clock : ``arrival`` (a sample is available from its arrival on) or ``stamp`` (from its stamp on; not causal).
     budget : factor on the limits of memory and time for reading a log.
-    msgs : folder, zip file or wheel with .msg files of types that a log does not define.
-    thresholds : thresholds.toml with limits on metrics; None = no limits.
+    msgs : folder, zip file or wheel with .msg files of types that a log does not define; or a DBC file, or a folder of
+        them, for raw CAN frames in BLF, ASC and MDF files.
+    plan : validation plan (plan.toml); None = the default plan, which decides no exit code.
     network : network folder, ``default``, ``many-cars`` or ``none``; None = the car's.
     intervals : intervals file, ``none``, or ``unsure`` (wide intervals, for a car that may have changed); None = the
         car's.
@@ -113,7 +114,7 @@ class RunConfig:
     clock: Literal["arrival", "stamp"] = "arrival"
     budget: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     msgs: File | None = None
-    thresholds: File | None = None
+    plan: File | None = None
     network: File | None = None
     intervals: File | None = None
     calibrate: Calibrate = "log"

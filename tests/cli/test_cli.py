@@ -18,7 +18,7 @@ from tests.command_line import called
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = (
-    *("inspect", "map", "run", "metrics", "report", "compare", "events", "view", "compile"),
+    *("inspect", "map", "run", "metrics", "report", "compare", "events", "trend", "serve", "view", "compile"),
     *("simulate", "simulate suite", "simulate conditions"),
     *("learn", "extract", "train", "retrain"),
 )

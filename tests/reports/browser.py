@@ -120,11 +120,11 @@ class Browser:
         elif event == "Page.loadEventFired":
             self._loaded = True
 
-    def open(self, path: Path, wait_s: float = 180.0) -> None:
-        """Open a file and wait until all of its figures are drawn."""
+    def open(self, path: Path | str, wait_s: float = 180.0) -> None:
+        """Open a file or an address and wait until all of its figures are drawn."""
         self._loaded = False
         end = time.monotonic() + wait_s
-        self.call("Page.navigate", url=path.resolve().as_uri())
+        self.call("Page.navigate", url=path if isinstance(path, str) else path.resolve().as_uri())
         while not self._loaded:
             self._next(end)
         self.wait_for("document.documentElement.dataset.drawn !== undefined", end - time.monotonic())

@@ -59,16 +59,16 @@ def words(folder: Path, **options: Any) -> str:
 
 def test_a_run_with_everything_says_everything(tmp_path: Path) -> None:
     drives: dict[str, dict[str, Any]] = {
-        f"d{i}": {"errors": (0.001 * (1 + i), 0.0015 * (1 + i)), "metadata": {"road": "ab"[i // 4]}} for i in range(8)
+        f"d{i}": {"errors": (0.001 * (1 + i), 0.0015 * (1 + i)), "metadata": {"road": "ab"[i // 5]}} for i in range(10)
     }
     drives["blind"] = {"truth": {"available": False, "not_independent": []}}
     page = words(run_of(tmp_path, drives, {"bad": "/x/bad.mcap: expected a log, got 3 bytes"}))
-    assert "9 with a report" in page and "8 scored" in page and "1 of 10 logs failed" in page
+    assert "11 with a report" in page and "10 scored" in page and "1 of 12 logs failed" in page
     assert "50.0% above the selected estimate" in page and "the selected estimate is better" in page
     assert '<a href="logs/d7/report.html">d7</a>' in page
-    assert "the log has no ground truth" in page and "expected a log, got 3 bytes" in page
+    assert "the log has no ground truth" in page and "3 bytes (expected: a log)." in page
     assert "<h3>road" in page
-    assert 'class="empty"' in page and "14 min" in page
+    assert 'class="empty"' in page and "16 min" in page
     for key in ("medians", "spread", "against"):
         assert f'data-figure="{key}"' in page
 

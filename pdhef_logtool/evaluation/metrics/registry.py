@@ -22,6 +22,7 @@ MODULES = (
     "disagreement",
     "reference",
     "sensor_residuals",
+    "exposure",
     "independence",
 )
 

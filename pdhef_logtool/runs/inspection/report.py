@@ -7,13 +7,14 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from collections.abc import Mapping as MappingABC
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.drive.checks.running import misread_channels
 from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_proposals
 from pdhef_logtool.logs.byte_account import checksummed_share
@@ -187,7 +188,10 @@ class Inspection:
     @property
     def uses(self) -> MappingABC[str, str]:
         """What the log is good for (``can``), and what it lacks for sideslip (``sideslip_needs``, may be empty)."""
-        return uses_of(self.mapping)
+        refused = misread_channels(self.checks)
+        signals = {n: s for n, s in self.mapping.signals.items() if n not in refused}
+        truth = {n: s for n, s in self.mapping.truth.items() if f"truth.{n}" not in refused}
+        return uses_of(replace(self.mapping, signals=signals, truth=truth))
 
     @property
     def duration_s(self) -> float:
