@@ -56,7 +56,7 @@ def _list_estimators(show: bool) -> None:
     'cars.toml, with paths relative to it: [folders] "fleet/golf" = "cars/golf"; [logs] "run_*.mcap" = '
     '"mini.toml"; [metadata.vehicle_id] "WVW-1" = "cars/golf"; default = "saloon" above them.',
     shared="cars estimators annotate keep cache clock setup setup_from_s friction plan network calibrate "
-    "reference gnss waived",
+    "reference gnss no_position waived",
     car="Car of the logs (default: a sedan)",
 )
 def run(  # positional: one an option of the command line

@@ -13,7 +13,7 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.candidates import Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
-from pdhef_logtool.mapping.gnss_signals import gnss_signals
+from pdhef_logtool.mapping.gnss_signals import gnss_signals, has_heading, receiver_signals
 from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, length_of, speed_over_ground
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
@@ -351,14 +351,22 @@ def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
 
 
 def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
-    """Take GNSS velocity as a sensor: of ground truth without heading, else of a receiver that is not ground truth."""
+    """Take GNSS as a sensor: of ground truth without heading, else of a receiver that is not ground truth."""
     draft.signals |= gnss_signals(draft.signals, draft.truth)
+    instruments = {_device(source.topic) for source in draft.truth.values()} if has_heading(draft.truth) else set()
+    topics = [t for t in topics if not _words(t.name) & TRUTH_WORDS and _device(t.name) not in instruments]
+    found = [
+        receiver_signals(t.name, stamp_path_of(fields), {f.path for f in fields})
+        for t in topics
+        if not _type(t).startswith(NO_SENSORS) and (fields := draft.log.fields(t.name, quiet=True))
+    ]
+    for signals in sorted(found, key=lambda s: not has_gnss(s)):
+        if has_gnss(signals) if not has_gnss(draft.signals) else not set(signals) & set(draft.signals):
+            draft.signals |= signals
     if has_gnss(draft.signals):
         return
-    used = {source.topic for source in draft.truth.values()}
     for topic in topics:
-        words = _words(topic.name)
-        if topic.name in used or words & TRUTH_WORDS or not words & NAVIGATION_WORDS:
+        if topic.name in instruments or not _words(topic.name) & NAVIGATION_WORDS:
             continue
         if _type(topic) not in TWIST_FIELDS or _type(topic) in BODY_TWIST_TYPES:
             continue
@@ -366,7 +374,13 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
         if _looks_like_body_frame(*(draft.values(topic.name, path) for path in paths)) is False:
             for name, path in zip(("gnss_velocity_east_m_s", "gnss_velocity_north_m_s"), paths, strict=True):
                 draft.take(draft.signals, name, topic.name, path)
+            draft.signals |= next((s for s in found if s and not has_gnss(s)), {})
             return
+
+
+def _device(topic: str) -> str:
+    """Return what topics of one instrument have in common: the name without its last part."""
+    return topic.rpartition("/")[0] or topic
 
 
 def _is_well_known(topic: TopicInfo) -> bool:

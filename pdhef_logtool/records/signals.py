@@ -83,6 +83,8 @@ GNSS = "gnss_"
 GNSS_COMPONENTS = frozenset({"gnss_velocity_east_m_s", "gnss_velocity_north_m_s"})
 #: GNSS position.
 GNSS_POSITION = ("gnss_latitude_deg", "gnss_longitude_deg")
+#: Signals and ground truth that state a place.
+POSITIONS = frozenset({*GNSS_POSITION, "lat_deg", "lon_deg", "alt_m", "x_m", "y_m", "ecef_position_m"})
 _GNSS_POLAR = frozenset({"gnss_speed_m_s", "gnss_course_rad"})
 #: Signals the alignment's output carries as one column each.
 ALIGNED_SIGNALS = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "friction")

@@ -85,6 +85,7 @@ class AnnotatedMcapSink(Sink):
     shown : of the tracks whose pose is written at every stamp; of others every 50 ms. None: all.
     thin : both state and pose of the others are written every :data:`LONG_STEP_NS` alone.
     span_ns : only what of it was recorded in [start, end); None: all of it.
+    left_out : topics of the source that are not copied; its attachments and metadata are not either. None: all are.
 
     Raises
     ------
@@ -100,7 +101,9 @@ class AnnotatedMcapSink(Sink):
         shown: Container[str] | None = None,
         thin: bool = False,
         span_ns: tuple[int, int] | None = None,
+        left_out: Container[str] | None = None,
     ) -> None:
+        self._copies_rest = left_out is None
         self._source = None if source is None else source.messages
         self._names, self._shown, self._thin = names, shown, thin
         self._last_ns: dict[str, int] = {}  # of the tracks that are not shown
@@ -114,7 +117,7 @@ class AnnotatedMcapSink(Sink):
             return
         try:
             channels = register_channels(
-                self._writer, self._source, leave_out=lambda topic: topic.startswith(NAMESPACE)
+                self._writer, self._source, leave_out=lambda t: t.startswith(NAMESPACE) or t in (left_out or ())
             )
         except BaseException:
             self._writer.abort()
@@ -144,7 +147,7 @@ class AnnotatedMcapSink(Sink):
         try:
             self._write_window()
             self._writer.write([], raws=self._raws_before(None))
-            if self._source is not None:
+            if self._source is not None and self._copies_rest:
                 for attachment in iterate_attachments(self._source):
                     if not _is_our_report(attachment):
                         self._writer.attachment(*astuple(attachment))

@@ -37,8 +37,9 @@ from pdhef_logtool.records.errors import (
 )
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
+from pdhef_logtool.records.signals import POSITIONS, SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
 from pdhef_logtool.records.tracks import REFERENCE
+from pdhef_logtool.results.no_position import WithoutPosition, topics_with_position
 from pdhef_logtool.results.opened_run import (
     ESTIMATES_FILE,
     LOGS,
@@ -556,16 +557,27 @@ def _open_sinks(
             names = None if config.estimators else first
             unnamed = config.estimators == (ALL_ESTIMATORS,)
             thin = unnamed and drive.plan.end_ns - drive.plan.start_ns > LONGEST_WHOLE_NS
-            sinks.append(AnnotatedMcapSink(change.file("annotated.mcap"), source, names, shown=first, thin=thin))
+            left_out = _left_out(drive) if config.no_position else None
+            file = change.file("annotated.mcap")
+            sinks.append(AnnotatedMcapSink(file, source, names, shown=first, thin=thin, left_out=left_out))
             layouts = change.file("foxglove.json"), change.file("plotjuggler.xml")
             sinks.append(LayoutsSink(*layouts, names, colours))
         if config.kept == "full":
             sinks.append(_recording(change, drive, config, car, shown, output, colours))
-        yield sinks
+        yield [WithoutPosition(sink) for sink in sinks] if config.no_position else sinks
     except BaseException:
         for sink in sinks:
             sink.abort()
         raise
+
+
+def _left_out(drive: Drive) -> frozenset[str]:
+    """Return the topics that ``--no-position`` keeps out of the copy, and note them."""
+    places = [s for n, s in (drive.plan.mapping.truth | drive.plan.mapping.signals).items() if n in POSITIONS]
+    topics = topics_with_position(drive.log, {s.topic for s in places})
+    if topics:
+        drive.remarks.append(f"--no-position: {', '.join(sorted(topics))} not copied, attachments and metadata neither")
+    return topics
 
 
 def _recording(  # positional: what `_open_sinks` takes
