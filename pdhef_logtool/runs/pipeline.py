@@ -72,6 +72,7 @@ from pdhef_logtool.results.run_report import (
 from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, Shown, Sink
 from pdhef_logtool.runs.config import Keep, RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
+from pdhef_logtool.runs.reference_audit import audit_truth
 from pdhef_logtool.runs.referencing import DriveReference, reference_of
 from pdhef_logtool.runs.scoring import Evaluation, evaluate, in_time
 from pdhef_logtool.runs.selection import candidates, choose_main, contradiction, default_names
@@ -371,9 +372,21 @@ def _score(job: _Job, store: TrackStore, signals: Signals) -> Evaluation:
     if drive.friction.bank is not None:
         observable = friction_events(drive.friction, signals)
         scored = replace(scored, events=sorted([*scored.events, *observable], key=in_time))
+    _audit(job, store)
     if against := contradiction(scored.rows):
         drive.notes.append(f"WARNING: {against.text}")  # the selected estimate's text gives the consequence
     return scored
+
+
+def _audit(job: _Job, store: TrackStore) -> None:
+    """Compare the ground truth of sideslip with the reference, and note where they contradict each other."""
+    truth, reference = store.read(TRUTH), store.read(REFERENCE)
+    if truth is None or reference is None or job.reference is None:
+        return
+    found = audit_truth(truth, reference, job.drive.car.vehicle.low_speed_blend_m_s)
+    job.reference.document["ground_truth"] = list(found)
+    for text in found:
+        job.drive.tell(text)
 
 
 def _without(

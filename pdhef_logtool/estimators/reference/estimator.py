@@ -11,7 +11,7 @@ import numpy as np
 from pdhef_logtool.estimators.reference.drive import SideslipReference, sideslip_std
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import Extrapolation, StepColumns
-from pdhef_logtool.records.tracks import REFERENCE, StateTrack, make_track
+from pdhef_logtool.records.tracks import INDEPENDENT_SHARE, REFERENCE, StateTrack, make_track
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,6 +60,7 @@ class ReferenceEstimator:
             share_law=shares[:, 0],
             share_kinematics=shares[:, 1],
             share_gnss=shares[:, 2],
+            independent=np.where(np.isnan(shares[:, 2]), np.nan, shares[:, 2] > INDEPENDENT_SHARE),
             valid=ahead.usable,
         )
 
