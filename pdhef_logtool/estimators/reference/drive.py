@@ -41,6 +41,7 @@ class ReferencePrior:
     ``rear_m``, ``wheelbase_m``: geometry. ``friction``: of the road, for the end of the linear range. ``imu_x_m``,
     ``ay_gain``, ``ay_bias_m_s2``, ``yaw_rate_bias_rad_s``: errors of the sensors as the log was read, with 1-sigmas of
     the first two. ``antenna_m``: position x, y of the antenna from the CG, NaN if unknown.
+    ``speed_over_ground``: the speed is the length of a velocity over ground, not that of wheels.
     """
 
     rear_m: float
@@ -53,6 +54,7 @@ class ReferencePrior:
     ay_bias_m_s2: float = 0.0
     yaw_rate_bias_rad_s: float = 0.0
     antenna_m: tuple[float, float] = (math.nan, math.nan)
+    speed_over_ground: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +173,7 @@ def refer(signals: Signals, prior: ReferencePrior, *, use_gnss: bool = True) -> 
 
     ``signals`` [N] need a_y and yaw rate, and speed or GNSS velocity.
     """
-    stamps_ns, rows = knots(signals, prior.friction, prior.ay_bias_m_s2)
+    stamps_ns, rows = knots(signals, prior.friction, prior.ay_bias_m_s2, speed_over_ground=prior.speed_over_ground)
     rows[:, s.GNSS_OFFSET] -= scanned_delay(rows)
     with_gnss = use_gnss and gnss_follows_imu(rows)
     noise = sensor_noise(signals, rows)

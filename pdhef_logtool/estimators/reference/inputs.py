@@ -75,8 +75,13 @@ def white_noise(stamps_ns: IntArray, values: FloatArray, least: float) -> float:
     return max(least, sample_std * math.sqrt(float(np.median(np.diff(stamps))) * 1e-9))
 
 
-def knots(signals: Signals, friction: float, ay_bias_m_s2: float) -> tuple[IntArray, FloatArray]:
-    """Return the stamps of the knots [K] and the smoother's inputs [K, INPUTS] there; a_y without its known bias."""
+def knots(
+    signals: Signals, friction: float, ay_bias_m_s2: float, *, speed_over_ground: bool = False
+) -> tuple[IntArray, FloatArray]:
+    """Return the stamps of the knots [K] and the smoother's inputs [K, INPUTS] there; a_y without its known bias.
+
+    ``speed_over_ground``: the speed is the length of a velocity, as it is where it equals that of GNSS.
+    """
     t = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
     h = 1.0 / RATE_HZ
     knot_s = np.arange(0.0, t[-1] + 0.5 * h, h)
@@ -101,7 +106,7 @@ def knots(signals: Signals, friction: float, ay_bias_m_s2: float) -> tuple[IntAr
     rows[:, s.GAP] = gap
     rows[:, s.SPEED] = _speed(t, signals.speed_m_s, knot_s)
     rows[:, s.SPEED_STD] = 0.15 + 0.01 * np.abs(np.nan_to_num(rows[:, s.SPEED])) + 0.05 * np.abs(rows[:, s.AX])
-    rows[:, s.LENGTH] = is_length(signals)
+    rows[:, s.LENGTH] = speed_over_ground or is_length(signals)
     rows[:, s.UNSIGNED] = not (signals.speed_m_s < -STANDSTILL_M_S).any()
     if rows[0, s.LENGTH]:  # of the antenna
         rows[:, s.SPEED_STD] = np.hypot(rows[:, s.SPEED_STD], LENGTH_FACTOR * ANTENNA_Y_STD_M * rows[:, s.YAW_RATE])
