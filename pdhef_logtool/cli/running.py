@@ -129,8 +129,9 @@ def run(  # positional: one an option of the command line
     notes="Signals of nav_msgs/Odometry, geometry_msgs/Twist*Stamped and pdhef_msgs/VehicleStateEstimate are "
     "recognised by type. Other topics need SIGNAL=, one of vx_m_s, vy_m_s, yaw_rate_rad_s, sideslip_rad, ay_m_s2, "
     "their *_std_*, valid. A mapping file can contain scales, offsets, signs and several estimators, one table "
-    "[estimates.NAME.SIGNAL] per signal.",
-    shared="plan",
+    "[estimates.NAME.SIGNAL] per signal. Without ground truth the estimates are compared with the sideslip reference "
+    "of the log's IMU and GNSS, which --reference on does beside ground truth.",
+    shared="plan reference gnss",
     car="Car of the log (position of the ground truth, friction, lowest speed)",
 )
 def metrics(

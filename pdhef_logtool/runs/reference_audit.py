@@ -70,7 +70,7 @@ def _blocks(truth: StateTrack, reference: StateTrack, low_speed_m_s: float) -> _
     sums = np.zeros((len(ids), 3))
     np.add.at(sums, inverse, np.concatenate(parts))
     means = sums / counts[:, None]
-    return _Blocks(ids * BLOCK_S, means[:, 0], means[:, 1], means[:, 2])
+    return _Blocks(np.asarray(ids * BLOCK_S, dtype=np.float64), means[:, 0], means[:, 1], means[:, 2])
 
 
 def _runs(flags: BoolArray, start_s: FloatArray) -> IntArray:
