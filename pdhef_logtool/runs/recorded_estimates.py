@@ -190,8 +190,7 @@ class _Scoring:
         self.reporter.progress(drive.name, 0.1)
         recorded, losses = self._read_estimates(drive)
         self.reporter.progress(drive.name, 0.3)
-        read = read_truth(drive.log, plan, drive.options.window_s) if drive.mapping.truth else (None, (), {}, {})
-        truth, truth_losses, samples, counts = read
+        truth, truth_losses, samples, counts = self._read_truth(drive)
         ledger = sample_ledger(drive.log, plan, counts)
         self.reporter.progress(drive.name, 0.6)
         signals = _read_sensors(drive)
@@ -216,11 +215,8 @@ class _Scoring:
         )  # fmt: skip
         read = {s.topic for e in self.estimates for s in e.signals.values()}
         topics = [replace(t, mapped=t.mapped or t.name in read) for t in facts.log.topics]
-        latency = (
-            []
-            if plan.latency is not None or truth is None
-            else ["no gyro to measure the ground truth's latency with: taken as 0"]
-        )
+        unknown = truth is not None and plan.latency is None
+        latency = ["no gyro to measure the ground truth's latency with: taken as 0"] if unknown else []
         facts = replace(
             facts,
             log=replace(facts.log, topics=topics),
@@ -239,6 +235,14 @@ class _Scoring:
         self.reporter.progress(drive.name, 1.0)
         files = {} if folder is None else files_of(folder)
         return LogResult(replace(outcome_of(drive, all_losses), files=files), folder, report, tuple(rows))
+
+    def _read_truth(
+        self, drive: Drive
+    ) -> tuple[TruthTrack | None, tuple[Loss, ...], dict[str, int], dict[tuple[Role, str], Counter[str]]]:
+        """Return what :func:`read_truth` does, nothing where no ground truth is mapped."""
+        if not drive.mapping.truth:
+            return None, (), {}, {}
+        return read_truth(drive.log, drive.plan, drive.options.window_s)
 
     def _reference(self, drive: Drive, *, scored: bool) -> ReferenceEstimator | None:
         """Return the sideslip reference of the sensors: without ground truth, or beside it where asked for."""
