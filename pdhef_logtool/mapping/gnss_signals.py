@@ -144,12 +144,12 @@ def receiver_signals(topic: str, stamp: str, paths: Collection[str]) -> dict[str
                 continue
             if any(f"{base}{name}" in there for name in receiver.heading):
                 return {}
-            found = {
+            sources = {
                 name: SignalSource(name, topic, f"{base}{path}", stamp, scale, offset)
                 for name, path, scale, offset in receiver.signals
                 if f"{base}{path}" in there
             }
-            return _with_covariance(found, topic, stamp, base) if _is_fix(receiver) else found
+            return _with_covariance(sources, topic, stamp, base) if _is_fix(receiver) else sources
     return {}
 
 
@@ -157,8 +157,8 @@ def _is_fix(receiver: Receiver) -> bool:
     return "position_covariance_type" in receiver.fields
 
 
-def _with_covariance(found: dict[str, SignalSource], topic: str, stamp: str, base: str) -> dict[str, SignalSource]:
+def _with_covariance(sources: dict[str, SignalSource], topic: str, stamp: str, base: str) -> dict[str, SignalSource]:
     """Add the position's 1-sigma of a NavSatFix: the root of the mean variance to the east and north."""
     paths = tuple(f"{base}position_covariance[{i}]" for i in (0, 4))
     accuracy = SignalSource(_POSITION_ACCURACY, topic, paths, stamp, (0.5, 0.5), combine="root")
-    return {**found, _POSITION_ACCURACY: accuracy}
+    return {**sources, _POSITION_ACCURACY: accuracy}

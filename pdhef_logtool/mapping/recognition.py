@@ -355,12 +355,12 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
     draft.signals |= gnss_signals(draft.signals, draft.truth)
     instruments = {_device(source.topic) for source in draft.truth.values()} if has_heading(draft.truth) else set()
     topics = [t for t in topics if not _words(t.name) & TRUTH_WORDS and _device(t.name) not in instruments]
-    found = [
+    receivers = [
         receiver_signals(t.name, stamp_path_of(fields), {f.path for f in fields})
         for t in topics
         if not _type(t).startswith(NO_SENSORS) and (fields := draft.log.fields(t.name, quiet=True))
     ]
-    for signals in sorted(found, key=lambda s: not has_gnss(s)):
+    for signals in sorted(receivers, key=lambda s: not has_gnss(s)):
         if has_gnss(signals) if not has_gnss(draft.signals) else not set(signals) & set(draft.signals):
             draft.signals |= signals
     if has_gnss(draft.signals):
@@ -374,12 +374,12 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
         if _looks_like_body_frame(*(draft.values(topic.name, path) for path in paths)) is False:
             for name, path in zip(("gnss_velocity_east_m_s", "gnss_velocity_north_m_s"), paths, strict=True):
                 draft.take(draft.signals, name, topic.name, path)
-            draft.signals |= next((s for s in found if s and not has_gnss(s)), {})
+            draft.signals |= next((s for s in receivers if s and not has_gnss(s)), {})
             return
 
 
 def _device(topic: str) -> str:
-    """Return what topics of one instrument have in common: the name without its last part."""
+    """Return the name that topics of one instrument share: all but its last element."""
     return topic.rpartition("/")[0] or topic
 
 

@@ -57,7 +57,7 @@ class WithoutPosition(Sink):
 def topics_with_position(log: DriveLog, mapped: Container[str]) -> frozenset[str]:
     """Return the topics that may contain a place: ``mapped`` as one, by type or fields, and those that are not decoded.
 
-    Raw CAN frames count: nobody can tell without a DBC.
+    Raw CAN frames are among them: without a DBC their content is unknown.
     """
     return frozenset(t.name for t in log.topics if t.name in mapped or _may_contain_place(log, t))
 

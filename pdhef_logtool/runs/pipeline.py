@@ -383,9 +383,9 @@ def _audit(job: _Job, store: TrackStore) -> None:
     truth, reference = store.read(TRUTH), store.read(REFERENCE)
     if truth is None or reference is None or job.reference is None:
         return
-    found = audit_truth(truth, reference, job.drive.car.vehicle.low_speed_blend_m_s)
-    job.reference.document["ground_truth"] = list(found)
-    for text in found:
+    contradictions = audit_truth(truth, reference, job.drive.car.vehicle.low_speed_blend_m_s)
+    job.reference.document["ground_truth"] = list(contradictions)
+    for text in contradictions:
         job.drive.tell(text)
 
 

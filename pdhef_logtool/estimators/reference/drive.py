@@ -225,7 +225,7 @@ class _Smoothed:
 def _smooth(
     rows: FloatArray, prior: ReferencePrior, noise: FloatArray, n: int, velocity: FloatArray | None = None
 ) -> _Smoothed:
-    """Smooth with n states, of which ``velocity`` [K, 3] are v_x, v_y and heading to begin with, if given."""
+    """Smooth with n states; ``velocity`` [K, 3], if given, is a first estimate of v_x, v_y and heading."""
     mean, std = _priors(prior, n, tilts=bool(rows[0, s.TILT]))
     speed = rows[:, s.SPEED]
     first = np.flatnonzero(np.isfinite(speed))

@@ -109,8 +109,8 @@ def increments(rows: FloatArray, sampled: IntArray, delay_s: float) -> tuple[Com
     heading = np.cumsum(rows[:, s.MEAN_YAW_RATE]) / RATE_HZ
     turned = np.exp(1j * (heading - 0.5 * rows[:, s.MEAN_YAW_RATE] / RATE_HZ))
     velocity = np.cumsum((rows[:, s.MEAN_AX] + 1j * rows[:, s.MEAN_AY]) * turned) / RATE_HZ
-    at = sampled + (rows[sampled, s.GNSS_OFFSET] - delay_s) * RATE_HZ
-    by_imu = np.diff(np.interp(at, np.arange(len(rows)), velocity))
+    place = sampled + (rows[sampled, s.GNSS_OFFSET] - delay_s) * RATE_HZ
+    by_imu = np.diff(np.interp(place, np.arange(len(rows)), velocity))
     by_gnss = np.diff(rows[sampled, s.GNSS_EAST] + 1j * rows[sampled, s.GNSS_NORTH])
     n = round(HEADING_WINDOW_S * RATE_HZ / max(1.0, float(np.median(np.diff(sampled)))))
     largest = 2.0 * np.median(np.abs(by_gnss)) + 0.1

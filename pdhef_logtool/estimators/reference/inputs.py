@@ -22,7 +22,7 @@ LONGEST_IMU_GAP_S = 0.25
 LEAST_NOISE_M_S2, LEAST_NOISE_RAD_S = 0.02, 0.0007
 #: Speed of standstill.
 STANDSTILL_M_S = 0.1
-#: A car that stands turns, accelerates (with bank and grade) and moves over ground by less.
+#: At standstill, yaw rate, acceleration (bank and grade) and speed over ground are smaller.
 STILL_RAD_S, STILL_M_S2, STILL_GNSS_M_S = 0.03, 2.0, 1.0
 #: 1-sigma of GNSS velocity without a stated accuracy, its growth with acceleration (receivers filter), and with roll
 #: rate, whose antenna moves on an arm of this uncertainty.
@@ -126,7 +126,7 @@ def law_std(rows: FloatArray, friction: float) -> FloatArray:
 
 
 def standstill(rows: FloatArray) -> BoolArray:
-    """Return where the car stands [K]: no speed, as of a wheel that locks, and nothing that moves."""
+    """Return the knots at standstill [K]: no speed, as wheels that lock show too, and no motion."""
     still = rows[:, s.SPEED] < STANDSTILL_M_S
     still &= np.abs(rows[:, s.YAW_RATE]) < STILL_RAD_S
     still &= np.hypot(rows[:, s.SLOW_AX], rows[:, s.SLOW_AY]) < STILL_M_S2
