@@ -26,6 +26,7 @@ import numpy as np
 
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import (
+    ALIGNED_SIGNALS,
     GNSS,
     GNSS_COMPONENTS,
     GNSS_POSITION,
@@ -66,6 +67,8 @@ SAME_CLOCK_SHARE = 0.9
 _IMU = ("yaw_rate_rad_s", "ay_m_s2", "ax_m_s2")
 #: What only the sideslip reference uses, which is not causal: never waited for.
 _TILT_RATES = frozenset({"roll_rate_rad_s", "pitch_rate_rad_s"})
+#: Columns that only the reference uses, with their own names.
+_ALONE = ("gnss_heading_rad", *sorted(_TILT_RATES))
 _INPUTS = frozenset({"steer_rad", "steering_wheel_rad", "ax_m_s2", "friction"})
 
 
@@ -263,27 +266,18 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
     else:
         speed = columns.get("speed_m_s", missing)
 
-    def column(name: str) -> FloatArray:
-        return columns.get(name, missing)[inside].copy()
-
+    made = {name: columns.get(name, missing)[inside].copy() for name in (*ALIGNED_SIGNALS, *_ALONE)}
+    made["speed_m_s"] = speed[inside].copy()
     return Signals(
         stamps_ns=stamps[inside].copy(),
         ready_ns=ready[inside].copy(),
-        steer_rad=column("steer_rad"),
-        ax_m_s2=column("ax_m_s2"),
-        ay_m_s2=column("ay_m_s2"),
-        yaw_rate_rad_s=column("yaw_rate_rad_s"),
-        speed_m_s=speed[inside].copy(),
-        friction=column("friction"),
         wheel_speed_m_s=wheels[inside].copy(),
         available=plan.available,
         gnss_velocity_m_s=velocity[inside].copy(),
-        gnss_velocity_std_m_s=column("gnss_velocity_accuracy_m_s"),
-        gnss_position_deg=np.stack([column(name) for name in GNSS_POSITION], axis=1),
-        gnss_position_std_m=column("gnss_position_accuracy_m"),
-        gnss_heading_rad=column("gnss_heading_rad"),
-        roll_rate_rad_s=column("roll_rate_rad_s"),
-        pitch_rate_rad_s=column("pitch_rate_rad_s"),
+        gnss_velocity_std_m_s=columns.get("gnss_velocity_accuracy_m_s", missing)[inside].copy(),
+        gnss_position_deg=np.stack([columns.get(name, missing)[inside] for name in GNSS_POSITION], axis=1),
+        gnss_position_std_m=columns.get("gnss_position_accuracy_m", missing)[inside].copy(),
+        **made,
     )
 
 

@@ -45,8 +45,8 @@ class ReferenceEstimator:
 
     def predict(self, steps: ReferenceSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Return the track of the steps, each at its own stamp."""
-        columns = (c[ahead.step] for c in (steps.values, steps.covariance, steps.shares))
-        return self._track(ReferenceSteps(*columns, valid=ahead.usable), stamps_ns)
+        values, covariance, shares = (c[ahead.step] for c in (steps.values, steps.covariance, steps.shares))
+        return self._track(ReferenceSteps(values, covariance, shares, ahead.usable), stamps_ns)
 
     def at(self, stamps_ns: IntArray) -> StateTrack:
         """Return the track at any stamps [N]."""
