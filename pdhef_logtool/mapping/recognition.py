@@ -363,18 +363,21 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
     for signals in sorted(receivers, key=lambda s: not has_gnss(s)):
         if has_gnss(signals) if not has_gnss(draft.signals) else not set(signals) & set(draft.signals):
             draft.signals |= signals
-    if has_gnss(draft.signals):
-        return
+    if not has_gnss(draft.signals):
+        _map_twist(draft, topics)
+        if has_gnss(draft.signals):
+            draft.signals |= next((signals for signals in receivers if signals and not has_gnss(signals)), {})
+
+
+def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
+    """Take GNSS velocity of a twist over ground."""
     for topic in topics:
-        if topic.name in instruments or not _words(topic.name) & NAVIGATION_WORDS:
-            continue
-        if _type(topic) not in TWIST_FIELDS or _type(topic) in BODY_TWIST_TYPES:
+        if _type(topic) not in TWIST_FIELDS or _type(topic) in BODY_TWIST_TYPES or not _is_truth(topic):
             continue
         paths = tuple(_twist(topic, "linear", axis) for axis in "xy")
         if _looks_like_body_frame(*(draft.values(topic.name, path) for path in paths)) is False:
             for name, path in zip(("gnss_velocity_east_m_s", "gnss_velocity_north_m_s"), paths, strict=True):
                 draft.take(draft.signals, name, topic.name, path)
-            draft.signals |= next((s for s in receivers if s and not has_gnss(s)), {})
             return
 
 
