@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.mapping.gnss_signals import receiver_signals
+from pdhef_logtool.mapping.recognition import auto_map
+from tests.fake_drive_log import FakeLog, FakeTopic
 
 STAMP = np.arange(200, dtype=np.int64) * 100_000_000 + 1_700_000_000_000_000_000
 NAV_PVT = ("vel_n", "vel_e", "g_speed", "h_acc", "s_acc", "fix_type", "lat", "lon")
@@ -52,3 +54,39 @@ def test_the_accuracy_of_a_fix_is_the_root_of_its_variances():
     accuracy = receiver_signals("/fix", "log_time", paths)["gnss_position_accuracy_m"]
     assert (accuracy.combine, accuracy.scale) == ("root", (0.5, 0.5))
     assert accuracy.paths == ("position_covariance[0]", "position_covariance[4]")
+
+
+def _log(**topics):
+    rng = np.random.default_rng(0)
+    imu = {
+        f"{part}.{axis}": rng.standard_normal(200)
+        for part in ("linear_acceleration", "angular_velocity")
+        for axis in "xyz"
+    }
+    contents = {"/imu": FakeTopic("sensor_msgs/msg/Imu", STAMP, imu)}
+    for name, (type_name, fields) in topics.items():
+        contents[f"/{name.replace('__', '/')}"] = FakeTopic(
+            type_name, STAMP, {f: rng.standard_normal(200) for f in fields}
+        )
+    return FakeLog(contents)
+
+
+def test_a_receiver_is_mapped_with_its_quality_and_rates_of_the_imu():
+    signals = auto_map(_log(gps__pvt=("ublox_msgs/msg/NavPVT", NAV_PVT))).mapping.signals
+    assert signals["gnss_velocity_east_m_s"].label == "/gps/pvt.vel_e"
+    assert {"gnss_fix_type", "gnss_velocity_accuracy_m_s", "gnss_position_accuracy_m"} <= set(signals)
+    assert signals["roll_rate_rad_s"].field == "angular_velocity.x"
+    assert signals["pitch_rate_rad_s"].field == "angular_velocity.y"
+
+
+def test_an_instrument_that_is_ground_truth_is_no_sensor():
+    log = _log(
+        truth__twist=("geometry_msgs/msg/TwistStamped", ("twist.linear.x", "twist.linear.y", "twist.angular.z")),
+        truth__pvt=("ublox_msgs/msg/NavPVT", NAV_PVT),
+    )
+    assert not [name for name in auto_map(log).mapping.signals if name.startswith("gnss_")]
+
+
+def test_a_heading_of_two_antennas_is_never_mapped_by_itself():
+    fields = (*NAV_PVT, "heading")
+    assert "gnss_heading_rad" not in auto_map(_log(gps__pvt=("vendor_msgs/msg/Pvt", fields))).mapping.signals
