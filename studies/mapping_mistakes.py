@@ -137,7 +137,7 @@ def _outcome(log: DriveLog, right: Mapping, subject: str, kind: str, vehicle: Ve
     assert source is not None
     scale = source.scale if isinstance(source.scale, float | int) else 1.0
     shown = tuple(c for c in checks if c.verdict != "passed")
-    yield Outcome(log.path.stem, subject, kind, verdict(checks, members, subject, kind, scale), shown)
+    yield Outcome(Path(str(log.path)).stem, subject, kind, verdict(checks, members, subject, kind, scale), shown)
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -21,7 +21,7 @@ STYLES = {"PASS": "green", "FAIL": "bold red", "INCONCLUSIVE": "dim"}
 
 def plan_line(plan_result: PlanVerdicts) -> Text:
     """Return how many requirements passed, failed and are inconclusive."""
-    counts = Counter(v.outcome for v in plan_result.verdicts)
+    counts = Counter[str](v.outcome for v in plan_result.verdicts)
     parts = [Text(f"{counts[outcome]} {outcome}", style) for outcome, style in STYLES.items() if counts[outcome]]
     name = f"plan {plan_result.plan.file}" if plan_result.plan.file else "default plan, no gate"
     return Text.assemble(Text(", ").join(parts), f" ({name})")

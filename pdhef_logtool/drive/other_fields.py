@@ -1,8 +1,8 @@
 """Whether a mapping file reads a wrong field: recognition names another one of the log, and the drive decides.
 
 A signal with a wrong unit still goes with the others; one that is read from another field often does too, by chance or
-because both move in bends. So each suspicion is tested: the signals of which recognition reads other fields are read
-from those, and only if all checks of them then pass, and fewer fail than before, the mapping is told so.
+because both move in bends. Each suspicion is tested: such signals are read from the fields that recognition reads, and
+only if all checks of them then pass, and fewer fail than before, the checks name those fields.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ def with_other_fields(
             break
     else:
         return tuple(checks)
-    told = tuple(_check(name, source, checks) for name, source in others.items())
+    renamed = tuple(_check(name, source, checks) for name, source in others.items())
     kept = (c for c in checks if c.subject not in others and not (c.verdict == "failed" and c.name not in still))
-    return (*told, *kept)
+    return (*renamed, *kept)
 
 
 def _others(log: DriveLog, mapping: Mapping) -> dict[str, SignalSource]:

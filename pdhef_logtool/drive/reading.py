@@ -30,7 +30,7 @@ from pdhef_logtool.mapping import (
     merge_losses,
 )
 from pdhef_logtool.records.checks import Check
-from pdhef_logtool.records.errors import EstimatorError, MappingError, PdhefError, UsageError
+from pdhef_logtool.records.errors import EstimatorError, MappingError, UsageError
 from pdhef_logtool.records.ledger import SampleCount, damage
 from pdhef_logtool.records.signals import Loss, Signals, join_signals
 from pdhef_logtool.records.steps import MAX_PREDICTION_S
@@ -354,8 +354,7 @@ def read_drive(
         if friction.note:
             remarks.append(friction.note)
     except BaseException as error:
-        if isinstance(error, MappingError | EstimatorError):
-            name_damage(error, opened.lost)
+        _name_damage(error, opened)
         opened.close()
         raise
     return Drive(log_input.stem, opened, car, options, plan, chosen, notes, friction, tell, remarks)
@@ -405,10 +404,11 @@ def lost_texts(losses: Iterable[Loss]) -> tuple[str, ...]:
     return tuple(f"{x.what} ({x.where})" for x in losses if x.severity == "lost")
 
 
-def name_damage(error: PdhefError, losses: Iterable[Loss]) -> None:
+def _name_damage(error: BaseException, log: DriveLog) -> None:
     """Add the damage of a log to an error, as its probable cause: a file that is cut contains no mapped fields."""
-    lost = [x for x in losses if x.severity == "lost"]
-    if not lost:
+    if not isinstance(error, MappingError | EstimatorError) or not (
+        lost := [x for x in log.lost if x.severity == "lost"]
+    ):
         return
     error.got = f"a damaged log: {'; '.join(x.what for x in lost[:2])}. {error.got[:1].upper()}{error.got[1:]}"
     if any(x.kind == "truncated" for x in lost):

@@ -71,7 +71,7 @@ _TYPICAL = (*(f for t in (TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M) for f 
 CLEARLY_NEARER = 0.25
 #: A range of gains that is narrower rules out all units but one; wider ones are lengths of any car.
 DECIDES_UNIT, SAME_QUANTITY = 13.0, 4.0
-#: Factors between units that are met in mappings, whatever the quantity: degrees, g, km/h.
+#: Factors between units that mappings confuse for any quantity: degrees, g, km/h.
 _FOREIGN = (1.0 / DEGREE, GRAVITY_M_S2, 3.6)
 #: No more mistakes than this are looked for at once.
 MAX_MISTAKES = 2
@@ -116,9 +116,13 @@ class Relation:
     @property
     def is_close(self) -> bool:
         """Return whether a gain that is not plausible is off by less than known mistakes make, or hardly known."""
+        return abs(self.correlation) < CLOSE_CORRELATION or self.is_near
+
+    @property
+    def is_near(self) -> bool:
+        """Return whether a gain is off by less than known mistakes make: a car that slides, a sensor that saturates."""
         low, high = self.expected
-        wide = replace(self, expected=(low / CLOSE, high * CLOSE))
-        return abs(self.correlation) < CLOSE_CORRELATION or wide.accepts()
+        return replace(self, expected=(low / CLOSE, high * CLOSE)).accepts()
 
     @property
     def is_vague(self) -> bool:
@@ -217,7 +221,7 @@ def smallest_explanations(relations: Sequence[Relation], mistakes: Sequence[Mist
     for size in range(1, MAX_MISTAKES + 1):
         explanations = [
             chosen
-            for chosen in combinations(useful, size)
+            for chosen in combinations([m for m in useful if size == 1 or not m.foreign], size)
             if len({n for m in chosen for n in m.factors}) == sum(len(m.factors) for m in chosen)
             and all(r.accepts(float(np.prod([m.acts_on(r) for m in chosen]))) for r in telling)
         ]
@@ -368,12 +372,12 @@ def _together(names: Sequence[str]) -> str:
     return "wheel speeds" if len(wheels) == len(names) > 2 else " and ".join(names)
 
 
-def _foreign(names: Sequence[str], own: Sequence[tuple[float, str]]) -> list[Mistake]:
+def _foreign(names: Sequence[str], units: Sequence[tuple[float, str]]) -> list[Mistake]:
     """Return the mistakes by factors of units that other quantities have."""
     factors = [f for size in _FOREIGN for f in (size, 1.0 / size)]
-    strange = [f for f in factors if all(abs(np.log(f / other)) > CLEARLY_NEARER for other, _ in own)]
+    strange = [f for f in factors if all(abs(np.log(f / other)) > CLEARLY_NEARER for other, _ in units)]
     words = _together(names)
-    text = "{} is off by a factor of {:.4g}"
+    text = f"{{}} {'are' if words.endswith('speeds') else 'is'} off by a factor of {{:.4g}}"
     return [Mistake(dict.fromkeys(names, f), text.format(words, 1.0 / f), "unit", foreign=True) for f in strange]
 
 
@@ -470,6 +474,8 @@ def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace
         text = f"{prefix}ax_m_s2 against the derivative of the speed"
         with np.errstate(invalid="ignore"):
             straight = moving if yaw is None else moving & (np.abs(yaw * pace) < STRAIGHT_M_S2)
+        if yaw is not None and not moving_at(pace).any():  # in no known unit
+            straight = gentle_at(yaw * pace, moving)
         # A pitching body moves a_x without any change of the speed, and noise the derivative of a satellite's.
         moves = None if pace_name == "truth.vx_m_s" else MOVES_M_S2
         reference = derivative(pace)

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import stdtrit
 
 from pdhef_logtool.records.signals import FloatArray
 
@@ -18,8 +19,8 @@ LEAST_DRIVES, LEAST_BLOCKS = 5, 6
 _RESAMPLES, _SEED = 2000, 0
 #: More units than this are drawn in groups.
 _MOST_UNITS = 1000
-#: Logarithm of the ratio of a bound to its value: two units that differ a lot give any.
-_MOST_LOG = 50.0
+#: Largest studentised deviation, in quantiles of Student's t: of few units some resamples have nearly no spread.
+_MOST_DEVIATION = 2.0
 #: Resamples times units that are in memory at once.
 _AT_ONCE = 1 << 21
 
@@ -57,17 +58,17 @@ def pooled(
         return Bounded(0.0, 0.0, 0.0, n)
     if n > _MOST_UNITS:  # neighbours are drawn together
         groups = np.arange(n) * _MOST_UNITS // n
-        top, below = (np.bincount(groups, weights=column) for column in (top, below))
+        top, below = (np.bincount(groups, weights=c).astype(np.float64) for c in (top, below))
     log = positive
     error = float(_error(top, below, np.ones((1, len(top))), power, log=log)[0])
     if error == 0.0:
         return Bounded(value, value, value, n)
     deviations = _deviations(top, below, power, math.log(ratio) * power if log else ratio, log=log)
     tail = 0.5 * (1.0 - level)
-    least, most = np.quantile(deviations, [tail, 1.0 - tail])
+    most_deviation = _MOST_DEVIATION * float(stdtrit(len(top) - 1, 1.0 - tail))
+    least, most = np.clip(np.quantile(deviations, [tail, 1.0 - tail]), -most_deviation, most_deviation)
     if log:
-        low, high = (value * float(np.exp(np.clip(-d * error, -_MOST_LOG, _MOST_LOG))) for d in (most, least))
-        return Bounded(value, low, high, n)
+        return Bounded(value, value * math.exp(-most * error), value * math.exp(-least * error), n)
     return Bounded(value, value - float(most) * error, value - float(least) * error, n)
 
 

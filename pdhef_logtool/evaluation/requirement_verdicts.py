@@ -18,6 +18,7 @@ from pdhef_logtool.evaluation.requirement_bounds import (
     pooled,
     quantile,
 )
+from pdhef_logtool.evaluation.units import AY_NOTE
 from pdhef_logtool.evaluation.validation_plan import AT_LEAST, POOLED, RUN, SQUARES, WORST_DRIVE, Requirement, shown
 from pdhef_logtool.records.signals import FloatArray
 
@@ -117,7 +118,8 @@ def judge(requirement: Requirement, drives: Sequence[DriveValue], missing: str =
     """
     exposure = _exposure(drives)
     estimated = bool(drives) and math.isfinite(drives[0].std)
-    bounded, basis, units, block_s = _statistic(requirement, drives)
+    statistic = _statistic(requirement, drives)
+    bounded, basis, units, block_s = statistic.bounded, statistic.basis, statistic.units, statistic.block_s
     sd = _reference_sd(requirement, drives) if estimated else 0.0
     bound, at_least = requirement.bound, requirement.metric in AT_LEAST
     worst = _worst(requirement, drives)
@@ -129,7 +131,8 @@ def judge(requirement: Requirement, drives: Sequence[DriveValue], missing: str =
         requirement,
         outcome,
         value,
-        *(x if math.isfinite(x) else None for x in (bounded.low, bounded.high)),
+        bounded.low if math.isfinite(bounded.low) else None,
+        bounded.high if math.isfinite(bounded.high) else None,
         margin,
         exposure,
         tuple(dict.fromkeys(d.estimator for d in drives)),
@@ -163,38 +166,52 @@ def _ratios(drives: Sequence[DriveValue]) -> FloatArray:
         return np.where(values == others, 1.0, values / others)
 
 
-def _statistic(
-    requirement: Requirement, drives: Sequence[DriveValue]
-) -> tuple[Bounded, Literal["drives", "blocks"], int, float | None]:
-    """Return the statistic with its bounds, what they are drawn from, how many units, and the length of a block."""
-    level, nan = requirement.confidence, math.nan
+@dataclass(frozen=True, slots=True)
+class _Statistic:
+    """A statistic with its bounds, what they are drawn from, how many units, and the length of a block."""
+
+    bounded: Bounded
+    basis: Literal["drives", "blocks"] = "drives"
+    units: int = 0
+    block_s: float | None = None
+
+
+def _statistic(requirement: Requirement, drives: Sequence[DriveValue]) -> _Statistic:
+    """Return the statistic of a requirement over drives, with bounds from drives or from blocks within them."""
+    count = len(drives)
     if requirement.statistic != POOLED:
-        values = _ratios(drives)
-        if requirement.quantile is not None:
-            return quantile(values, requirement.quantile, level), "drives", len(drives), None
-        sign = -1.0 if requirement.metric in AT_LEAST else 1.0
-        largest = float(sign * np.max(sign * np.abs(values))) if len(values) else nan
-        return Bounded(largest, largest, largest, len(drives)), "drives", len(drives), None
-    if len(drives) >= LEAST_DRIVES or not drives:
-        weights, values = (np.array([getattr(d, key) for d in drives], dtype=np.float64) for key in ("n", "value"))
-        others = np.array([d.baseline for d in drives], dtype=np.float64) if requirement.baseline else None
-        if requirement.baseline == RUN:
-            return _typical_ratio(_ratios(drives), level), "drives", len(drives), None
-        return _pooled(requirement, weights, values, others), "drives", len(drives), None
-    blocks = [d.blocks for d in drives if d.blocks is not None]
-    total = _pooled(
-        requirement,
-        np.array([d.n for d in drives], dtype=np.float64),
-        np.array([d.value for d in drives]),
-        np.array([d.baseline for d in drives], dtype=np.float64) if requirement.baseline else None,
-    )
-    if len(blocks) < len(drives):
-        return Bounded(total.value, nan, nan, 0), "blocks", 0, None
-    columns = [np.concatenate([np.asarray(getattr(b, key)) for b in blocks]) for key in ("n", "value", "baseline")]
+        return _Statistic(_of_drives(requirement, _ratios(drives)), units=count)
+    if count >= LEAST_DRIVES and requirement.baseline == RUN:
+        return _Statistic(_typical_ratio(_ratios(drives), requirement.confidence), units=count)
+    weights, values = (np.array([getattr(d, key) for d in drives], dtype=np.float64) for key in ("n", "value"))
+    others = np.array([d.baseline for d in drives], dtype=np.float64) if requirement.baseline else None
+    total = _pooled(requirement, weights, values, others)
+    if count >= LEAST_DRIVES or not count:
+        return _Statistic(total, units=count)
+    return _from_blocks(requirement, total, [d.blocks for d in drives])
+
+
+def _of_drives(requirement: Requirement, values: FloatArray) -> Bounded:
+    """Return a quantile of the drives, or the worst one, which has no bounds beside itself."""
+    if requirement.quantile is not None:
+        return quantile(values, requirement.quantile, requirement.confidence)
+    if not len(values):
+        return Bounded(math.nan, math.nan, math.nan, 0)
+    worst = np.min if requirement.metric in AT_LEAST else np.max
+    largest = float(worst(np.abs(values)))
+    return Bounded(largest, largest, largest, len(values))
+
+
+def _from_blocks(requirement: Requirement, total: Bounded, blocks: Sequence[RequirementBlocks | None]) -> _Statistic:
+    """Return the statistic ``total`` of few drives with bounds from the blocks of time within them."""
+    nan, present = math.nan, [b for b in blocks if b is not None]
+    if len(present) < len(blocks):
+        return _Statistic(Bounded(total.value, nan, nan, 0), "blocks")
+    columns = [np.concatenate([np.asarray(getattr(b, key)) for b in present]) for key in ("n", "value", "baseline")]
     units = len(columns[0])
     bounded = _pooled(requirement, columns[0], columns[1], columns[2] if requirement.baseline else None)
-    bounded = bounded if units >= LEAST_BLOCKS else Bounded(bounded.value, nan, nan, units)
-    return Bounded(total.value, bounded.low, bounded.high, units), "blocks", units, max(b.block_s for b in blocks)
+    low, high = (bounded.low, bounded.high) if units >= LEAST_BLOCKS else (nan, nan)
+    return _Statistic(Bounded(total.value, low, high, units), "blocks", units, max(b.block_s for b in present))
 
 
 def _pooled(requirement: Requirement, weights: FloatArray, values: FloatArray, others: FloatArray | None) -> Bounded:
@@ -220,7 +237,8 @@ def _typical_ratio(ratios: FloatArray, level: float) -> Bounded:
     with np.errstate(divide="ignore"):
         logs = np.log(ratios)
     bounded = pooled(np.ones(len(logs)), logs, None, squares=False, positive=False, level=level)
-    return Bounded(*(float(np.exp(x)) for x in (bounded.value, bounded.low, bounded.high)), len(logs))
+    value, low, high = (float(np.exp(x)) for x in (bounded.value, bounded.low, bounded.high))
+    return Bounded(value, low, high, len(logs))
 
 
 def _reference_sd(requirement: Requirement, drives: Sequence[DriveValue]) -> float:
@@ -245,36 +263,52 @@ def _decide(
     requirement: Requirement, bounded: Bounded, exposure: Exposure, sd: float, basis: str, missing: str
 ) -> tuple[Outcome, str, str]:
     """Return outcome, reason and next step."""
-    unit, bound, at_least = requirement.unit, requirement.bound, requirement.metric in AT_LEAST
     where = "" if requirement.segment == "all" else f" of {requirement.segment}"
     if not exposure.drives or not math.isfinite(bounded.value):
         return "INCONCLUSIVE", missing or "no drive has this metric", _what_to_record(requirement)
     if lacking := _lacking(requirement, exposure):
         return "INCONCLUSIVE", f"too little driving: {'; '.join(w for w, _ in lacking)}", _more(lacking, where)
-    unbounded = requirement.quantile is not None and math.isinf(bounded.high) and bounded.low <= bound
-    if unbounded or not (math.isfinite(bounded.low) or math.isfinite(bounded.high)):
+    if _without_bounds(requirement, bounded):
         return "INCONCLUSIVE", *_too_few(requirement, bounded, basis, where)
-    good, bad = (
-        (bounded.low >= bound, bounded.high < bound) if at_least else (bounded.high <= bound, bounded.low > bound)
-    )
-    bounds = f"{shown(bounded.low, unit)} to {shown(bounded.high, unit)}"
-    interval = f"{shown(bounded.value, unit)} ({100.0 * requirement.confidence:.4g} % CI {bounds})"
-    if requirement.statistic == WORST_DRIVE:
-        share = (0.5 * (1.0 - requirement.confidence)) ** (1.0 / exposure.drives)
-        interval = f"worst of {exposure.drives} drives: {shown(bounded.value, unit)}"
-        if good and share > _SHARE_SHOWN:
-            interval += f"; at least {share:.0%} of drives like these are within it, with this confidence"
-    distance = abs(bound - bounded.value)
-    if (good or bad) and distance < REFERENCE_SDS * sd:
-        sds = f"{REFERENCE_SDS:g} standard deviations of the estimated reference ({shown(sd, unit)})"
-        reason = f"{interval}; the limit is closer than {sds}"
-        return "INCONCLUSIVE", reason, f"record drives{where} with ground truth: a two-antenna INS or an optical sensor"
-    if good:
-        return "PASS", interval, ""
-    if bad:
-        place = "the worst drive" if exposure.drives > 1 else "the largest error"
-        return "FAIL", interval, f"look at {place} first"
-    return "INCONCLUSIVE", f"{interval} includes the limit", _decisive(requirement, bounded, exposure, where)
+    outcome = _outcome(requirement, bounded)
+    interval = _interval(requirement, bounded, exposure, outcome)
+    if outcome == "INCONCLUSIVE":
+        return outcome, f"{interval} includes the limit", _decisive(requirement, bounded, exposure, where)
+    if abs(requirement.bound - bounded.value) < REFERENCE_SDS * sd:
+        sds = f"{REFERENCE_SDS:g} standard deviations of the estimated reference ({shown(sd, requirement.unit)})"
+        to_do = f"record drives{where} with ground truth: a two-antenna INS or an optical sensor"
+        return "INCONCLUSIVE", f"{interval}; the limit is closer than {sds}", to_do
+    if outcome == "PASS":
+        return outcome, interval, ""
+    place = "the worst drive" if exposure.drives > 1 else "the largest error"
+    return outcome, interval, f"look at {place} first"
+
+
+def _without_bounds(requirement: Requirement, bounded: Bounded) -> bool:
+    """Return whether there are too few units for the bound that decides."""
+    if requirement.quantile is not None and math.isinf(bounded.high):
+        return bounded.low <= requirement.bound
+    return not (math.isfinite(bounded.low) or math.isfinite(bounded.high))
+
+
+def _outcome(requirement: Requirement, bounded: Bounded) -> Outcome:
+    low, high, bound = bounded.low, bounded.high, requirement.bound
+    if requirement.metric in AT_LEAST:
+        return "PASS" if low >= bound else "FAIL" if high < bound else "INCONCLUSIVE"
+    return "PASS" if high <= bound else "FAIL" if low > bound else "INCONCLUSIVE"
+
+
+def _interval(requirement: Requirement, bounded: Bounded, exposure: Exposure, outcome: Outcome) -> str:
+    """Return the statistic with its interval in words."""
+    value, unit = shown(bounded.value, requirement.unit), requirement.unit
+    if requirement.statistic != WORST_DRIVE:
+        bounds = f"{shown(bounded.low, unit)} to {shown(bounded.high, unit)}"
+        return f"{value} ({100.0 * requirement.confidence:.4g} % CI {bounds})"
+    share = (0.5 * (1.0 - requirement.confidence)) ** (1.0 / exposure.drives)
+    text = f"worst of {exposure.drives} drives: {value}"
+    if outcome != "PASS" or share <= _SHARE_SHOWN:
+        return text
+    return f"{text}; at least {share:.0%} of drives like these are within it, with this confidence"
 
 
 def _lacking(requirement: Requirement, exposure: Exposure) -> list[tuple[str, str]]:
@@ -312,7 +346,8 @@ def _too_few(requirement: Requirement, bounded: Bounded, basis: str, where: str)
         return f"{value}; no confidence interval from {bounded.units} drives", more
     if basis == "blocks" and not bounded.units:
         return f"{value}; this run kept no blocks for this requirement", "run the logs again with this plan"
-    reason = f"{value}; no confidence interval from {bounded.units} blocks of driving{where}, it needs {LEAST_BLOCKS}"
+    blocks = "1 block" if bounded.units == 1 else f"{bounded.units} blocks"
+    reason = f"{value}; no confidence interval from {blocks} of driving{where}, it needs {LEAST_BLOCKS}"
     seconds = (LEAST_BLOCKS - bounded.units) * 10
     return reason, f"drive at least {seconds} s more{where}, better {LEAST_DRIVES} drives or more"
 
@@ -343,6 +378,8 @@ def _notes(
         )
     if estimated:
         notes.append("errors are relative to the estimated reference: no ground truth")
+    if requirement.signal == "ay_m_s2":
+        notes.append(AY_NOTE)
     if drives and all(d.same for d in drives):
         notes.append(f"{drives[0].estimator} equals {requirement.baseline} in these drives (residual gain 0)")
     return notes

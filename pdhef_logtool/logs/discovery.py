@@ -146,7 +146,10 @@ def identity_of(log: LogInput) -> str:
         except OSError as error:
             got = error.strerror or str(error)
             remedy = "check the path and its permissions"
-            raise LogError(expected="a readable log", got=got, where=str(log.path), remedy=remedy) from error
+            missing = isinstance(error, FileNotFoundError)
+            raise LogError(
+                expected="a readable log", got=got, where=str(log.path), remedy=remedy, missing=missing
+            ) from error
     from pdhef_logtool.logs.remote_source import RemoteSource
 
     source = RemoteSource(log.path, head_bytes=1)

@@ -37,7 +37,7 @@ class LogFormat:
     opener : ``package.module:function``, which opens a :class:`LogFile` as a log, or as a container of messages, and
         raises LogError for a file that is none of this format.
     suffixes : by which a search through folders takes files for logs.
-    magic : first bytes of every file; empty: a file is recognised by its suffix.
+    magic : first bytes of every file, or several possible ones; empty: a file is recognised by its suffix.
     needs_suffix : whether files of other formats begin with the same bytes, so that the suffix must match too.
     is_general : whether such files often contain something else: a search through folders ignores them where logs of
         other formats are beside them.
@@ -46,7 +46,7 @@ class LogFormat:
     title: str
     opener: str
     suffixes: tuple[str, ...]
-    magic: bytes = b""
+    magic: bytes | tuple[bytes, ...] = b""
     needs_suffix: bool = False
     is_general: bool = False
 
@@ -70,8 +70,7 @@ FORMATS = (
     LogFormat("a CSV file", f"{__package__}.text_logs:open_csv", (".csv", ".tsv"), is_general=True),
     LogFormat("a Parquet file", f"{__package__}.array_logs:open_parquet", (".parquet",), b"PAR1", is_general=True),
     LogFormat("a MAT file", f"{__package__}.array_logs:open_mat", (".mat",), b"MATLAB ", is_general=True),
-    LogFormat("an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), b"MDF     "),
-    LogFormat("an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), b"UnFinMF "),
+    LogFormat("an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), (b"MDF     ", b"UnFinMF ")),
     LogFormat("a BLF file", f"{__package__}.can_logs:open_blf", (".blf",), b"LOGG"),
     LogFormat("an ASC file", f"{__package__}.can_logs:open_asc", (".asc",)),
 )
@@ -108,4 +107,4 @@ def without_general(names: set[str]) -> set[str]:
 
 def what_is_a_log() -> str:
     """Return the formats in words."""
-    return f"{', '.join(dict.fromkeys(f.title for f in _every_format()))} or a rosbag2 folder"
+    return f"{', '.join(f.title for f in _every_format())} or a rosbag2 folder"

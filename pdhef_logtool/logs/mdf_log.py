@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import gc
 import logging
+import mmap
 import re
+import shutil
 import sys
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,11 +28,15 @@ from pdhef_logtool.logs.table_columns import NO_TIME, extra, field_name, placed,
 from pdhef_logtool.logs.table_log import Table, TableLog
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import IntArray, Loss
+from pdhef_logtool.storage.files import scratch_folder
 
 _FRAMES = "CAN_DataFrame"
 #: Parts of a frame by the names of the standard for bus logging.
 _PARTS = {"id": "ID", "length": "DataLength", "is_extended": "IDE", "bus": "BusChannel"}
+_DATA_BLOCK = re.compile(rb"##(?:DT|SD|DV)\0{4}")
 _LONGEST_NAME = 40
+#: Times from the start of a recording beyond this are damaged.
+_LONGEST_S = 4e9
 
 
 def open_mdf(file: LogFile) -> TableLog:
@@ -38,8 +45,13 @@ def open_mdf(file: LogFile) -> TableLog:
     logging.getLogger("asammdf").setLevel(logging.CRITICAL)
     losses: list[Loss] = []
     with file.meter.running(file.path.stat().st_size):
-        source, got = _opened(asammdf, file)
+        source, got = _opened(asammdf, file.path)
+        copies = ExitStack()
+        if source is None and (copy := _repaired(file.path, Path(copies.enter_context(scratch_folder())))):
+            source, got = _opened(asammdf, copy)
+            losses.append(Loss("truncated", "the last block of data is incomplete", str(file.place)))
         if source is None:
+            copies.close()
             raise LogError(expected="an MDF file with readable channels", got=got, where=str(file.place))
         groups = [Group(source, number) for number in range(len(source.groups))]
         names = unique(group.name for group in groups)
@@ -53,24 +65,42 @@ def open_mdf(file: LogFile) -> TableLog:
                 losses.append(Loss("bad-group", what, name))
     if not tables:
         source.close()
+        copies.close()
         raise LogError(expected="a channel group with times", got="none that can be read", where=str(file.place))
     release = file.release
 
     def close() -> None:
         source.close()
+        copies.close()
         release()
 
     opened = LogFile(file.path, file.place, file.meter, close, file.cut)
     return TableLog(opened, f"mdf-{str(source.version)[:1]}", tables, losses, frames)
 
 
-def _opened(asammdf: Any, file: LogFile) -> tuple[Any, str]:
+def _repaired(path: Path, folder: Path) -> Path | None:
+    """Return a copy of a version 4 file whose last block of data has the length that is left; None if none is cut."""
+    size = path.stat().st_size
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        starts = [m.start() for m in _DATA_BLOCK.finditer(data) if m.start() + 16 <= size]
+        cut = [start for start in starts if start + int.from_bytes(data[start + 8 : start + 16], "little") > size]
+    if not cut:
+        return None
+    copy = folder / path.name
+    shutil.copyfile(path, copy)
+    with copy.open("r+b") as file:
+        file.seek(cut[-1] + 8)
+        file.write((size - cut[-1]).to_bytes(8, "little"))
+    return copy
+
+
+def _opened(asammdf: Any, path: Path) -> tuple[Any, str]:
     """Return the file, or None and why it cannot be opened."""
     hook, sys.unraisablehook = sys.unraisablehook, lambda _: None  # the end of a half-opened object is an error there
     source, got = None, ""
     try:
         try:
-            source = asammdf.MDF(str(file.path), use_display_names=False)
+            source = asammdf.MDF(str(path), use_display_names=False)
         except Exception as error:  # noqa: BLE001  any error of a damaged file
             got = describe_damage(error)[1]
         if source is None:
@@ -126,7 +156,7 @@ class Group:
         """Return the times in ascending order, and the rows that they are of; rows without a time are left out."""
         seconds = np.asarray(self._source.get_master(self._number), np.float64)
         start_ns = round(self._source.start_time.timestamp() * 1e6) * 1000
-        finite = np.isfinite(seconds)
+        finite = np.isfinite(seconds) & (np.abs(np.nan_to_num(seconds)) < _LONGEST_S)
         stamps = np.where(finite, np.round(np.where(finite, seconds, 0.0) * 1e9).astype(np.int64) + start_ns, NO_TIME)
         rows = np.flatnonzero(finite)
         order = rows[np.argsort(stamps[rows], kind="stable")]

@@ -41,6 +41,8 @@ from pdhef_logtool.storage.documents import read_text
 from pdhef_logtool.storage.files import scratch_folder
 
 _REMEDY = "give the recording itself"
+#: What a repository contains in place of a large file that was not fetched.
+LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 #: Kinds of logs by container format, as a file and as a folder.
 _KINDS = {"mcap": "mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}
 _FOLDER_KINDS = {**_KINDS, "mcap": "rosbag2-mcap"}
@@ -89,7 +91,9 @@ def _opened(path: LogPlace, meter: Meter, wanted: Wanted) -> DriveLog:
         elif path.is_dir():
             return _open_folder(path, meter)
         elif not path.exists():
-            raise LogError(expected=what_is_a_log(), got="no such file", where=str(path), remedy="check the path")
+            raise LogError(
+                expected=what_is_a_log(), got="no such file", where=str(path), remedy="check the path", missing=True
+            )
         else:
             opened = _open_file(path, meter)
     except OSError as error:
@@ -183,8 +187,10 @@ def _open_plain(file: LogFile) -> Container | DriveLog:
     head = _head_of(file.path)
     log_format = recognised_format(head, file.path.name)
     if log_format is None:
-        got = "a file that is none of these" if head else "an empty file"
-        raise LogError(expected=what_is_a_log(), got=got, where=str(file.place), remedy=_REMEDY)
+        got, remedy = "a file that is none of these" if head else "an empty file", _REMEDY
+        if head.startswith(LFS_POINTER[:HEAD_BYTES]):
+            got, remedy = "a pointer of Git LFS in place of the recording", "git lfs pull in its repository"
+        raise LogError(expected=what_is_a_log(), got=got, where=str(file.place), remedy=remedy)
     opened = log_format.open(file)
     if isinstance(opened, Container) and file.path != file.place:
         opened.on_close(file.release)

@@ -119,7 +119,7 @@ def _layout(lines: Sequence[str], where: str) -> tuple[str, list[str], list[str]
 
 
 def _separator(lines: Sequence[str]) -> str:
-    """Return the delimiter of which all lines have equally many; else the most frequent; a space without any."""
+    """Return the delimiter that every line contains equally often, otherwise the most frequent one, or a space."""
     counts = {s: [line.count(s) for line in lines] for s in (";", "\t", "|", ",")}
     regular = next((s for s, n in counts.items() if n and min(n) > 0 and max(n) == min(n)), "")
     frequent = max(counts, key=lambda s: sum(counts[s]))

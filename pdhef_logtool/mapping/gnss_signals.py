@@ -16,12 +16,12 @@ _DEGREE = 0.017453292519943295
 _COURSE = (-_DEGREE, 1.5707963267948966)
 _EAST, _NORTH = "gnss_velocity_east_m_s", "gnss_velocity_north_m_s"
 #: Ground truth with one of these states a heading, or motion that needs one.
-_HEADING = frozenset({"quat_wxyz", "yaw_rad", "vy_m_s", "sideslip_rad"})
+HEADING = frozenset({"quat_wxyz", "yaw_rad", "vy_m_s", "sideslip_rad"})
 
 
 def has_heading(truth: Collection[str]) -> bool:
     """Return whether ground truth contains a heading, or motion that needs one."""
-    return bool(_HEADING & set(truth))
+    return bool(HEADING & set(truth))
 
 
 def gnss_signals(signals: Mapping[str, SignalSource], truth: Mapping[str, SignalSource]) -> dict[str, SignalSource]:

@@ -323,6 +323,7 @@ _QUANTITIES: tuple[tuple[_Rule, _Quantity | None], ...] = tuple(
     for text, quantity in (
         (".roll|.pitch !@accelerates", None),
         ("@steers @rate|@accelerates|.velocity|.speed|.vel|.column|.motor", None),
+        ("@around @steers velocity|vel !.angle|.ang|.rad|.deg|.position|.pos|.delta", None),
         ("@steers @road", ("steering", "road", "angle")),
         ("@steers @hand", ("steering", "wheel", "angle")),
         ("@steers", ("steering", "", "angle")),

@@ -13,12 +13,13 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.candidates import Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
+from pdhef_logtool.mapping.clocks import with_usable_stamps
 from pdhef_logtool.mapping.gnss_signals import gnss_signals, has_heading, receiver_signals
 from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, length_of, speed_over_ground
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.naming import is_command
-from pdhef_logtool.mapping.navigation import navigation_truth
+from pdhef_logtool.mapping.navigation import named_gnss, navigation_truth
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.mapping.weighing import Weighed, weigh
@@ -251,6 +252,7 @@ def auto_map(
         notes=tuple(draft.notes),
         checks=weighed.checks,
     )
+    mapping = with_usable_stamps(log, mapping)
     return AutoMapping(mapping, tuple(draft.ambiguities), missing_signals(mapping), weighed.candidates)
 
 
@@ -378,6 +380,10 @@ def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
         if _looks_like_body_frame(*(draft.values(topic.name, path) for path in paths)) is False:
             for name, path in zip(("gnss_velocity_east_m_s", "gnss_velocity_north_m_s"), paths, strict=True):
                 draft.take(draft.signals, name, topic.name, path)
+            return
+    for topic in topics:
+        if _role(topic) == "navigation" and not _is_well_known(topic) and (named := named_gnss(draft.log, topic)):
+            draft.signals |= named
             return
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pdhef_logtool.evaluation.units import LABELS
+from pdhef_logtool.evaluation.units import AY_NOTE, LABELS
 from pdhef_logtool.logs.byte_account import checksum_text
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.reports.charts import Charts
@@ -97,7 +97,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         roles=roles,
         plan=plan_head(report.get("plan")),
         tested=tested_drive(report, log.outcome),
-        steps=next_steps(report.get("plan"), ((report.get("answer") or {}).get("texts") or {}).get("next") or ""),
+        steps=next_steps(report.get("plan"), _next_of_estimate(report)),
         identical=[] if roles is None else identical_to(report, roles.main),
         verdicts=verdicts_of(report),
         drawn=figures,
@@ -118,6 +118,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         faults=report.get("faults"),
         innovations=report.get("innovations") or (),
         metadata=report.get("metadata") or {},
+        ay_note=AY_NOTE,
         over_time=OVER_TIME,
         in_plane=IN_PLANE,
     )
@@ -138,6 +139,11 @@ def roles_of(report: Mapping[str, Any]) -> Roles | None:
     is_other = rival_of_verdict in names and rival_of_verdict not in identical
     rival = rival_of_verdict if is_other else _best_physics(report, others, main)
     return Roles(main, rival, tuple(n for n in names if n not in (main, rival)))
+
+
+def _next_of_estimate(report: Mapping[str, Any]) -> str:
+    answer = report.get("answer") or {}
+    return str((answer.get("texts") or {}).get("next") or "")
 
 
 def identical_to(report: Mapping[str, Any], main: str) -> list[str]:

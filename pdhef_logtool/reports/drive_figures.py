@@ -236,7 +236,10 @@ def _add_filter(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles)
 
 
 def _add_motion(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> None:
-    for key, title, unit in (("speed", "Speed, longitudinal", "m/s"), ("ay", "Lateral acceleration", "m/s²")):
+    for key, title, unit in (
+        ("speed", "Speed, longitudinal", "m/s"),
+        ("ay", "Lateral acceleration: specific force of the estimate, ground truth as in the table", "m/s²"),
+    ):
         if lines := _lines(series, roles, key, (TRUTH, roles.main)):
             charts.time(key, title, unit, lines, resolution=_SEEN, height=120)
 
@@ -312,15 +315,15 @@ def _add_worst(
 
 def _add_path(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> str:
     """Add the dead-reckoned path, aligned with that of the ground truth; return its drift in words."""
-    truth, own = (series[n].path.thinned(_MOST_POINTS) for n in (TRUTH, roles.main))
+    truth, estimate = (series[n].path.thinned(_MOST_POINTS) for n in (TRUTH, roles.main))
     if truth.shape[1] < 2 or max(np.ptp(truth[1]), np.ptp(truth[2])) < _LEAST_PATH_M:
         return ""
-    common, at_truth, at_own = np.intersect1d(truth[0], own[0], return_indices=True)
+    common, at_truth, at_own = np.intersect1d(truth[0], estimate[0], return_indices=True)
     clouds = [Cloud(TRUTH, colour(TRUTH), truth[1], truth[2], _seconds(truth[0], charts), line=True)]
     if len(common) < 2:
         charts.points("path", "Path of the ground truth", "m east", "m north", clouds, equal=True)
         return ""
-    target, source = truth[1:, at_truth], own[1:, at_own]
+    target, source = truth[1:, at_truth], estimate[1:, at_own]
     aligned = _aligned(source, target)
     apart = np.hypot(*(aligned - target))
     length = float(np.hypot(*np.diff(target, axis=1)).sum())
@@ -344,14 +347,14 @@ def _aligned(source: FloatArray, target: FloatArray) -> FloatArray:
     return np.asarray(rotated + target.mean(axis=1, keepdims=True), dtype=np.float64)
 
 
-def _by_error(aligned: FloatArray, at_ns: FloatArray, own: DriveSeries, charts: Charts) -> list[Cloud]:
+def _by_error(aligned: FloatArray, at_ns: FloatArray, estimate: DriveSeries, charts: Charts) -> list[Cloud]:
     """Return the path [2, K] in three classes of the absolute sideslip error."""
     assert charts.grid is not None
-    largest = own.error.largest
+    largest = estimate.error.largest
     cell = np.clip((at_ns - charts.grid.start_ns) // charts.grid.cell_ns, 0, len(largest) - 1).astype(np.int64)
     error = np.nan_to_num(largest[cell], nan=0.0)
     if not (error > 0.0).any():
-        return [Cloud(own.name, colour(own.name), aligned[0], aligned[1], _seconds(at_ns, charts))]
+        return [Cloud(estimate.name, colour(estimate.name), aligned[0], aligned[1], _seconds(at_ns, charts))]
     first, second = (float(f"{q:.1g}") for q in np.quantile(error[error > 0.0], (0.5, 0.9)))
     edges = (0.0, first, second, np.inf)
     names = (f"error below {first:g}°", f"{first:g} to {second:g}°", f"above {second:g}°")

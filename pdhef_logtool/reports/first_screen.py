@@ -136,9 +136,9 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60.0:.1f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
 
 
-def versions(found: Mapping[str, str]) -> str:
+def versions(installed: Mapping[str, str]) -> str:
     """Return the versions that a first screen names."""
-    return ", ".join(f"{name} {found[name]}" for name in _VERSIONS if name in found)
+    return ", ".join(f"{name} {installed[name]}" for name in _VERSIONS if name in installed)
 
 
 def _day(stamp_ns: int) -> str:
@@ -193,9 +193,9 @@ def tested_run(run: Mapping[str, Any], hours: float) -> list[tuple[str, str]]:
     cars = Counter(str((log.get("car") or {}).get("name")) for log in logs if log.get("car"))
     mains = Counter(str(log["main"]) for log in logs if log.get("main"))
 
-    def counted(found: Mapping[str, int]) -> str:
-        named = [f"{printable(k)} ({n})" if len(found) > 1 else printable(k) for k, n in [*found.items()][:5]]
-        return ", ".join(named) + (f" and {len(found) - 5} more" if len(found) > 5 else "")
+    def counted(counts: Mapping[str, int]) -> str:
+        named = [f"{printable(k)} ({n})" if len(counts) > 1 else printable(k) for k, n in [*counts.items()][:5]]
+        return ", ".join(named) + (f" and {len(counts) - 5} more" if len(counts) > 5 else "")
 
     failed = sum(str(log.get("outcome", "")).startswith("failed") for log in logs)
     lost = sum(str(log.get("outcome", "")).startswith("lost") for log in logs)

@@ -99,7 +99,7 @@ def _place(charts: Charts, key: str) -> Markup:
     return Markup(
         '<figure class="figure" data-figure="{0}"><figcaption>{1}</figcaption>'
         '<div class="legend" aria-hidden="true"></div>'
-        '<div class="canvas" role="img" aria-label="{2}"{3}></div></figure>'
+        '<div class="canvas" aria-label="{2}"{3}></div></figure>'
     ).format(
         key,
         printable(chart.heading, _MOST_SIGNS),

@@ -42,7 +42,7 @@ SELECTED = "selected"
 #: Rows on one page, points of a distribution, and tracks in one figure at most.
 _ROWS, _POINTS, _MOST_TRACKS = 200, 400, 12
 _DASHES: tuple[tuple[int, ...], ...] = ((), (6, 3), (2, 2), (8, 3, 2, 3))
-_COLOURS = ("#0072b2", "#b2182b", "#00795a", "#7a5195", "#a05a00", "#1a1a1a")
+_COLOURS = ("#0072b2", "#b2182b", "#00795a", "#7a5195", "#a05a00", "#6b7785")
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
@@ -75,7 +75,7 @@ class Query:
     def of(cls, given: Mapping[str, str]) -> Query:
         """Return the query of an address; a value that cannot be used is its default."""
         texts = {key: given[key] for key in ("name", "run", "car", "outcome") if key in given}
-        sort = given.get("sort", cls.sort)
+        sort = given.get("sort")
         return cls(
             **texts,
             estimator=given.get("estimator") or SELECTED,

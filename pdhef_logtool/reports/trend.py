@@ -14,15 +14,11 @@ from pdhef_logtool.results.trend import Trend, mark, shown_median
 def trend_page(trend: Trend) -> bytes:
     """Return the page of a trend, a whole HTML file."""
     charts = Charts()
-    intervals = [
-        Interval(
-            row.run,
-            *(100.0 * math.expm1(getattr(row.first.change, key)) for key in ("low", "median", "high")),
-            FAULT if row.regression else PLAIN,
-        )
-        for row in trend.rows
-        if row.first is not None and row.first.drives
-    ]
+    intervals = []
+    for row in trend.rows:
+        if row.first is not None and row.first.drives:
+            low, middle, high = (100.0 * math.expm1(getattr(row.first.change, k)) for k in ("low", "median", "high"))
+            intervals.append(Interval(row.run, low, middle, high, FAULT if row.regression else PLAIN))
     if intervals:
         title = f"{trend.figure.label}: median change relative to the first run, 95 % interval"
         charts.intervals("changes", title, "%", intervals, zero=0.0)

@@ -26,8 +26,8 @@ SIGNIFICANT = 0.05
 #: Values of a key that are listed one by one; numbers beyond them are listed by quarters.
 MOST_VALUES = 12
 _QUARTERS = 4
-#: Factors that a key is a part of, and does not need to be separated from.
-_OWN = {"month": "day"}
+#: Log ratios above are shown as this one.
+_LARGEST_LOG = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +107,7 @@ class _Test:
     def effect(self, p: float, level: float) -> Effect:
         """Return it with a corrected p-value, and the interval at a level (0.05: 95 %)."""
         width = quantile(1.0 - 0.5 * level, self.freedom) * self.error
-        low, high = self.difference - width, self.difference + width
+        low, high = self.difference - width, min(self.difference + width, _LARGEST_LOG)
         return Effect(math.expm1(self.difference), math.expm1(low), math.expm1(high), p)
 
 
@@ -148,31 +148,37 @@ def _tests(key: str, drives: Sequence[BreakdownDrive], values: Sequence[str | No
     factors = {
         f: of
         for f, of in factors.items()
-        if _OWN.get(key, key) != f and not np.array_equal(numbered(of), part) and len({v for v in of if v}) > 1
+        if key != f and not np.array_equal(numbered(of), part) and len({v for v in of if v}) > 1
     }
     return {value: _test(logs, names == value, factors) for value in dict.fromkeys(v for v in values if v is not None)}
 
 
 def _test(logs: FloatArray, inside: BoolArray, factors: Mapping[str, Sequence[str | None]]) -> _Test | str:
+    scores, weights = np.zeros(len(logs)), np.zeros(len(logs))
     means, variances, freedoms = [], [], []
-    for side in (inside, ~inside):
+    for side, sign in ((inside, 1.0), (~inside, -1.0)):
         n = int(np.count_nonzero(side))
         if n < LEAST_DRIVES:
             other = "" if side is inside else " with another value"
             return f"{n} scored drives{other}, at least {LEAST_DRIVES} are needed"
-        of_side = {f: [v for v, use in zip(of, side, strict=True) if use] for f, of in factors.items()}
-        for name, of in of_side.items():
-            if len(set(of)) == 1 and of[0] is not None:
+        for name, of in factors.items():
+            values = {v for v, use in zip(of, side, strict=True) if use}
+            if len(values) == 1 and None not in values:
                 where = "its drives" if side is inside else "the other drives"
                 return f"{where} are all of one {name}: the two cannot be separated"
-        x = logs[side]
-        depends = dependence(x - x.mean(), of_side)
-        means.append(float(x.mean()))
-        variances.append(float(x.var(ddof=1)) / n * depends.design_effect)
-        freedoms.append(1.0 / (1.0 / (n - 1) + 1.0 / depends.freedom))
-    total = sum(variances)
-    freedom = total**2 / sum(v**2 / f for v, f in zip(variances, freedoms, strict=True)) if total > 0.0 else math.inf
-    return _Test(means[0] - means[1], math.sqrt(total), freedom)
+        spread = float(logs[side].std(ddof=1))
+        means.append(float(logs[side].mean()))
+        scores[side] = (logs[side] - means[-1]) / (spread or 1.0)
+        weights[side] = sign * spread / n
+        variances.append(spread**2 / n)
+        freedoms.append(n - 1.0)
+    variance = sum(variances)
+    if variance == 0.0:
+        return _Test(means[0] - means[1], 0.0, math.inf)
+    drives = dependence(scores, factors, weights)
+    uncertain = sum(v**2 / f for v, f in zip(variances, freedoms, strict=True)) / variance**2
+    freedom = 1.0 / (uncertain + (0.0 if math.isinf(drives.freedom) else 1.0 / drives.freedom))
+    return _Test(means[0] - means[1], math.sqrt(variance * drives.design_effect), freedom)
 
 
 def _corrected(tests: Mapping[tuple[str, str], _Test | str]) -> dict[tuple[str, str], Effect | str]:

@@ -35,6 +35,13 @@ WORST = 20
 _MOST_FOLDERS = 3
 #: Labels that a group of failures names, and groups that are given.
 NAMED, _MOST_GROUPS = 10, 50
+#: Remedies by the start of what a supervisor states of a worker.
+_REMEDIES = {
+    "nothing heard": "Allow more time: --set log_timeout_s=SECONDS.",
+    "the worker was killed": "If memory was short, use fewer --jobs; pdhef inspect LOG shows the size of the log.",
+    "there was no more memory": "Use fewer --jobs, or a machine with more memory.",
+    "took more than": "Allow more memory: --set max_memory_mb=MB.",
+}
 _PLACE = re.compile(r"\s*\([^()]*\)\s*$")
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
@@ -456,7 +463,7 @@ def cause_and_remedy(reason: str) -> tuple[str, str]:
     """
     expected, got, rest = reason.partition(", got ")
     if not got or "expected " not in expected:
-        return reason, ""
+        return _sentence(reason), next((remedy for start, remedy in _REMEDIES.items() if reason.startswith(start)), "")
     cause, _, remedy = rest.rpartition("; ") if "; " in rest else (rest, "", "")
     return f"{_sentence(cause)} (expected: {expected.rpartition('expected ')[2]}).", _sentence(remedy)
 

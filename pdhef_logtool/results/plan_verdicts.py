@@ -260,7 +260,8 @@ def _paired(blocks: RequirementBlocks | None, theirs: RequirementBlocks | None) 
         return None
     by_number = dict(zip(theirs.number, theirs.value, strict=True))
     kept = [i for i, number in enumerate(blocks.number) if number in by_number]
-    picked = {k: [getattr(blocks, k)[i] for i in kept] for k in ("number", "n", "seconds", "metres", "value")}
+    columns = ("number", "n", "seconds", "metres", "value")
+    picked: dict[str, Any] = {k: [getattr(blocks, k)[i] for i in kept] for k in columns}
     std = [blocks.std[i] for i in kept] if blocks.std else ()
     return replace(blocks, **picked, baseline=[by_number[blocks.number[i]] for i in kept], std=std)
 
@@ -274,20 +275,18 @@ def _why_missing(
     """Return why no drive has the metric of a requirement."""
     if requirement.baseline == RUN and against is None:
         return "the baseline is another run: pdhef compare A B --plan PLAN"
-    names = {d.log: requirement.estimator or figures.main(d) for d in drives}
-    if drives and all(name is None for name in names.values()):
+    names = {d.log: name for d in drives if (name := requirement.estimator or figures.main(d))}
+    if not names:
         return "there are several recorded estimates: name one with estimator" if figures.names else "no estimate"
-    scored = [log for log, n in names.items() if n and figures.of(log, n, requirement, requirement.metric)]
-    if scored and all(
-        (log, names[log], requirement.signal, "all", NOT_INDEPENDENT) in figures.values for log in scored
-    ):
+    scored = [log for log, name in names.items() if figures.of(log, name, requirement, requirement.metric)]
+    tainted = [log for log in scored if (log, names[log], requirement.signal, "all", NOT_INDEPENDENT) in figures.values]
+    if scored and len(tainted) == len(scored):
         return "the ground truth is an input of the estimator: not an independent check"
     if scored and requirement.baseline not in (None, RUN):
         return f"{requirement.baseline} has no such value: add it to --estimators"
-    of_all = [
-        n for log, n in names.items() if n and (log, n, requirement.signal, "all", requirement.metric) in figures.values
-    ]
-    if of_all and requirement.segment != "all":
+    if requirement.segment != "all" and any(
+        (log, name, requirement.signal, "all", requirement.metric) in figures.values for log, name in names.items()
+    ):
         return f"no scored driving in {requirement.segment}"
     if requirement.estimator is not None and not any(requirement.estimator in n for n in figures.names.values()):
         return f"{requirement.estimator} did not run: add it to --estimators"

@@ -183,6 +183,7 @@ class ReportFacts:
     truth: TruthFacts
     vehicle_file: str | None = None
     vehicle_proven: bool = False
+    sensors: Mapping[str, float] = field(default_factory=dict)
     assumed: Sequence[AssumedValue] = ()
     setup: Mapping[str, Any] | None = None
     low_speed_m_s: float | None = None
@@ -205,12 +206,16 @@ class ReportFacts:
 
 @dataclass(frozen=True, slots=True)
 class CarFacts:
-    """The car that a log of a run had: folder or file (None: none was given), vehicle, digests of physics, network."""
+    """The car that a log of a run had: folder or file (None: none was given), vehicle, digests of physics, network.
+
+    ``sensors``: the entries of its sensor profile that differ from the default.
+    """
 
     file: str | None
     name: str
     sha256: str
     network_sha256: str | None
+    sensors: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,6 +287,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
             "sha256": facts.vehicle_sha256,
             "file": facts.vehicle_file,
             "proven": facts.vehicle_proven,
+            "sensors": dict(facts.sensors),
             "assumed": list(facts.assumed),
             "low_speed_blend_m_s": facts.low_speed_m_s,
         },
@@ -355,7 +361,7 @@ def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
     """Return a report of a few kB, of many drives: figures that tables show, and no list that grows with the log.
 
     All figures are in metrics.parquet. Of topics those that were mapped stay, of algorithms all but the noise, of
-    segments the sideslip answer's own, and of the rest the first :data:`_MOST_LISTED`.
+    segments the sideslip answer's own, and of the rest the first :data:`_MOST_LISTED`; the verdicts are in run.json.
     """
     answer = report["answer"]
     names = {answer["main"], answer["naive"], PHYSICS} if answer else set()
@@ -363,7 +369,7 @@ def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
     if space := report.get("operating_space"):
         first["operating_space"] = {**space, "cells": [*map(_rounded, space["cells"])]}
     return {
-        **{key: value for key, value in report.items() if key not in ("innovations", "error_budget")},
+        **{key: value for key, value in report.items() if key not in ("innovations", "error_budget", "plan")},
         **first,
         "log": {**report["log"], "topics": [t for t in report["log"]["topics"] if t["mapped"]]},
         "estimators": [_brief_estimator(e, names) for e in report["estimators"]],

@@ -271,7 +271,7 @@ def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]
     """Return what would help, the most important first."""
     vehicle, steps = report["vehicle"], []
     if any(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks", ())):
-        steps.append("correct the failed checks above, or waive them by name")
+        steps.append("correct the failed checks below, or waive them by name")
     lacks = {e["reason"] for e in report["estimators"] if e["name"] == "physics" and e["outcome"] == "skipped"}
     steps += [f"map the missing signals ({reason}): pdhef map LOG" for reason in lacks]
     if vehicle["file"] is None:

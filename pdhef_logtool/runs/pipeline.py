@@ -69,7 +69,7 @@ from pdhef_logtool.results.run_report import (
     tool_versions,
     write_json,
 )
-from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, Shown, Sink
+from pdhef_logtool.results.sink import TRUTH, Event, Shown, Sink
 from pdhef_logtool.runs.config import Keep, RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 from pdhef_logtool.runs.reference_audit import audit_truth
@@ -340,7 +340,7 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
         left_out = frozenset(e.name for e in job.ready) - job.requested - {main.name}
         job, scored, main = _without(left_out, job, scored, main)
         shown = _shown(main, [e.name for e in job.ready])
-        sinks = opened.enter_context(_open_sinks(change, job, config, shown, outputs.path))
+        sinks = opened.enter_context(_open_sinks(change, job, config, shown, outputs.path, len(signals)))
         _write(store, sinks, left_out | frozenset(causality.failed))
         if intervals.warning:
             drive.tell(intervals.warning)
@@ -493,7 +493,8 @@ def files_of(folder: Path) -> dict[str, str]:
 
 def _car_facts(car: Car) -> CarFacts:
     network = None if car.network is None else car.network.sha256
-    return CarFacts(car.file_name, car.vehicle.name, car.physics_sha256, network)
+    sensors = car.vehicle.sensors.model_dump(exclude_defaults=True)
+    return CarFacts(car.file_name, car.vehicle.name, car.physics_sha256, network, sensors)
 
 
 def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
@@ -548,11 +549,15 @@ def _causal_from_ns(drive: Drive, estimators: Sequence[Estimator]) -> dict[str, 
 
 @contextmanager
 def _open_sinks(
-    change: FolderTransaction, job: _Job, config: RunConfig, shown: Shown, output: Path
+    change: FolderTransaction, job: _Job, config: RunConfig, shown: Shown, output: Path, rows: int
 ) -> Iterator[list[Sink]]:
-    """Yield the outputs of a run that are fed window by window; on an exception they are aborted."""
+    """Yield the outputs of a run that are fed window by window; on an exception they are aborted.
+
+    ``rows`` : stamps of a track.
+    """
+    from pdhef_logtool.mapping.recognition import FIX_TYPES
     from pdhef_logtool.results.layouts import LayoutsSink
-    from pdhef_logtool.results.mcap_sink import AnnotatedMcapSink
+    from pdhef_logtool.results.mcap_sink import AnnotatedMcapSink, thinned_step_ns
     from pdhef_logtool.results.parquet_sink import EstimatesSink
 
     sinks: list[Sink] = []
@@ -567,14 +572,29 @@ def _open_sinks(
             if source is not None and source.messages is None:
                 drive.remarks.append(_NO_COPY.format(source.kind))
             first = frozenset({shown.main, TRUTH})
-            names = None if config.estimators else first
-            unnamed = config.estimators == (ALL_ESTIMATORS,)
-            thin = unnamed and drive.plan.end_ns - drive.plan.start_ns > LONGEST_WHOLE_NS
-            left_out = _left_out(drive) if config.no_position else None
-            file = change.file("annotated.mcap")
-            sinks.append(AnnotatedMcapSink(file, source, names, shown=first, thin=thin, left_out=left_out))
+            is_named = bool(config.estimators) and config.estimators != (ALL_ESTIMATORS,)
+            step_ns = thinned_step_ns(
+                sum(ledger.size for ledger in drive.byte_ledgers),
+                rows=rows,
+                others=len(job.ready) - 1,
+                span_ns=drive.plan.end_ns - drive.plan.start_ns,
+            )
+            annotated = AnnotatedMcapSink(
+                change.file("annotated.mcap"),
+                source,
+                shown=first,
+                others_step_ns=None if is_named else step_ns,
+                min_speed_m_s=car.vehicle.low_speed_blend_m_s,
+                left_out=_left_out(drive) if config.no_position else None,
+            )
+            sinks.append(annotated)
             layouts = change.file("foxglove.json"), change.file("plotjuggler.xml")
-            sinks.append(LayoutsSink(*layouts, names, colours))
+            fixes = (
+                [t.name for t in drive.log.topics if t.type_name.replace("/msg/", "/") in FIX_TYPES]
+                if source is not None and not config.no_position
+                else []
+            )
+            sinks.append(LayoutsSink(*layouts, None, colours, shown=first, fixes=fixes))
         if config.kept == "full":
             sinks.append(_recording(change, drive, config, car, shown, output, colours))
         yield [WithoutPosition(sink) for sink in sinks] if config.no_position else sinks
@@ -712,12 +732,9 @@ def report_facts(
         vehicle_sha256=car.physics_sha256,
         vehicle_file=car.file_name,
         vehicle_proven=car.has_evidence,
+        sensors=car.vehicle.sensors.model_dump(),
         assumed=drive.car.assumed,
-        setup={
-            "source": drive.setup_source,
-            "decided_s": plan.decided_s,
-            "causal_from_s": drive.causal_from_s,
-        },
+        setup={"source": drive.setup_source, "decided_s": plan.decided_s, "causal_from_s": drive.causal_from_s},
         low_speed_m_s=car.vehicle.low_speed_blend_m_s,
         estimators=list(estimators),
         truth=TruthFacts(

@@ -110,7 +110,7 @@ def score_log(
     PdhefError : There is no estimate, no ground truth, or nothing of the log can be used.
     """
     log_input = one_log(argument, config.read_options)
-    car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
+    car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS, sensors=config.sensor_profile)
     mapping = mapping_of(config.mapping)
     validation = read_validation_plan(config, junit)
     if config.car is None:

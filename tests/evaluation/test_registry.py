@@ -76,7 +76,7 @@ def test_figures_are_in_parquet_json_and_mcap(toy: str, result: RunResult) -> No
     assert row["value"] in [m["value"] for m in report["metrics"] if m["metric"] == toy]
     with (folder / "annotated.mcap").open("rb") as file:
         (record,) = (m.metadata for m in make_reader(file).iter_metadata() if m.name == "pdhef.metrics")
-    assert record[f"physics/sideslip_rad/all/{toy}"] == f"{row['value']!r} rad n={row['n']}"
+    assert record[f"physics/sideslip_rad/all/{toy}"] == f"{row['value']:.9g} rad n={row['n']}"
 
 
 def test_it_has_a_column_in_the_terminal_and_on_the_page_with_its_definition(toy: str, result: RunResult) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import sys
 from contextlib import closing
 from pathlib import Path
@@ -106,6 +107,56 @@ def test_a_cut_mdf_gives_what_is_readable_or_one_line(tmp_path: Path) -> None:
         done = called("inspect", tmp_path / "cut.mf4", "--json")
         assert done.returncode in (1, 3), share
         assert "internal error" not in done.stderr
+
+
+def _metadata_first(rows: int) -> bytes:
+    """An MDF 4.10 as recorders write it: one group with time and AccY [g], whose data are the last block."""
+    samples = np.zeros(rows, [("t", "<f8"), ("a", "<f8")])
+    samples["t"], samples["a"] = TIME_S[:rows], AY[:rows]
+    stamp = struct.pack("<QhhB", START_NS, 0, 0, 0)
+    about = b"<FHcomment><TX>x</TX><tool_id>x</tool_id><tool_vendor>x</tool_vendor></FHcomment>\0"
+
+    def channel(kind: int, sync: int, offset: int) -> bytes:
+        return struct.pack("<BBBBIIIIBxHdddddd", kind, sync, 4, 0, offset, 64, 0, 0, 0, 0, *[0.0] * 6)
+
+    at: dict[str, int] = {}
+    for _ in range(2):  # the first pass finds the addresses
+        blocks = {
+            "HD": (["DG", "FH", "", "", "", ""], stamp + bytes(19)),
+            "FH": (["", "MD"], stamp + bytes(3)),
+            "MD": ([], about),
+            "DG": (["", "CG", "DT", ""], bytes(8)),
+            "CG": (["", "CN", "TX", "", "", ""], struct.pack("<QQHHIII", 0, rows, 0, 0, 0, 16, 0)),
+            "TX": ([], b"IMU\0"),
+            "TX1": ([], b"time\0"),
+            "TX2": ([], b"AccY\0"),
+            "TX3": ([], b"g\0"),
+            "CN": (["CN2", "", "TX1", "", "", "", "", ""], channel(2, 1, 0)),
+            "CN2": (["", "", "TX2", "", "", "", "TX3", ""], channel(0, 0, 8)),
+            "DT": ([], samples.tobytes()),
+        }
+        out = bytearray(b"MDF     4.10    test".ljust(28, b"\0") + struct.pack("<H", 410)).ljust(64, b"\0")
+        for name, (links, data) in blocks.items():
+            at[name] = len(out)
+            head = struct.pack("<4s4xQQ", f"##{name[:2]}".encode(), 24 + 8 * len(links) + len(data), len(links))
+            out += head + struct.pack(f"<{len(links)}Q", *(at.get(n, 0) for n in links)) + data
+            out += bytes(-len(out) % 8)
+    return bytes(out)
+
+
+def test_an_mdf_that_ends_within_its_data_is_read_so_far(tmp_path: Path) -> None:
+    data = _metadata_first(N)
+    (tmp_path / "a.mf4").write_bytes(data)
+    (tmp_path / "b.mf4").write_bytes(data[: -16 * 100 - 5])
+    with closing(open_log(tmp_path / "a.mf4")) as log:
+        assert log.lost == ()
+        np.testing.assert_array_equal(log.read({"IMU": ["AccY"]})["IMU"].fields["AccY"], AY)
+    with closing(open_log(tmp_path / "b.mf4")) as log:
+        assert [(x.kind, x.severity) for x in log.lost] == [("truncated", "lost")]
+        read = log.read({"IMU": ["AccY"]})["IMU"].fields["AccY"]
+    np.testing.assert_array_equal(read, AY[: len(read)])
+    assert N - 102 <= len(read) <= N - 100
+    assert called("inspect", tmp_path / "b.mf4").returncode == 3
 
 
 def _check_can(path: Path, tmp_path: Path, kind: str) -> None:

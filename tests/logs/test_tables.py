@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
+from pdhef_logtool import inspect_log
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
@@ -312,6 +313,31 @@ def test_a_damaged_variable_costs_only_itself(tmp_path: Path) -> None:
     with closing(_log(tmp_path / "c.mat", cut)) as log:
         assert [f.path for f in log.fields("mat")] == ["ay"]
     assert called("inspect", tmp_path / "c.mat").returncode == 3
+
+
+@pytest.mark.parametrize(("turned_deg", "recognised"), [(0.0, True), (3.0, True), (90.0, False), (180.0, False)])
+def test_speed_and_course_of_a_receiver_are_gnss_signals_if_the_path_agrees(
+    turned_deg: float, recognised: bool, tmp_path: Path
+) -> None:
+    time_s = np.arange(0.0, 60.0, 0.1)
+    course = 0.4 * np.sin(0.1 * time_s) + 0.8  # clockwise from north, 15 m/s
+    north, east = (np.cumsum(15.0 * 0.1 * f(course)) for f in (np.cos, np.sin))
+    gnss = {
+        "time": time_s,
+        "latitude": 60.0 + north / 111_195.0,
+        "longitude": 18.0 + east / (111_195.0 * np.cos(np.radians(60.0))),
+        "speed_kmh": np.full(len(time_s), 54.0),
+        "course_deg": np.degrees(course) + turned_deg,
+    }
+    savemat(tmp_path / "a.mat", {"gnss": gnss, "imu": {"time": time_s, "yaw_rate_degps": -np.gradient(course, 0.1)}})
+    signals = inspect_log(tmp_path / "a.mat").mapping.signals
+    if not recognised:
+        assert "gnss_course_rad" not in signals
+        return
+    source = signals["gnss_course_rad"]
+    assert (source.topic, source.field, source.offset) == ("gnss", "course_deg", pytest.approx(np.pi / 2.0))
+    assert source.scale == pytest.approx(-np.pi / 180.0)
+    assert signals["gnss_speed_m_s"].scale == pytest.approx(1.0 / 3.6)
 
 
 # ------------------------------------------------------------------------------------------------ searching

@@ -254,3 +254,11 @@ def test_in_a_browser_forms_and_links_work_and_nothing_runs(folders: Sequence[Pa
         assert browser.value("document.querySelectorAll('[data-figure=tracks] canvas').length") >= 1
         assert browser.messages == []
         assert all(url.startswith((f"http://127.0.0.1:{port}/", "data:")) for url in browser.requests)
+
+
+def test_a_run_in_which_all_logs_failed_is_shown(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "a", {}, entries=[entry("bad", outcome="failed: cut", main=None, car=None)])
+    with serving(folder) as port:
+        get = getter(port)
+        assert drives_of(get("/")[2]) == ["bad"] and 'class="failed"' in get("/")[2]
+        assert get("/drive/a/bad")[0] == 200 and get("/drives.csv")[0] == 200

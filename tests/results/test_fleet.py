@@ -244,4 +244,6 @@ def test_a_failure_is_read_as_cause_and_remedy() -> None:
         "Copy it again",
     )
     assert cause_and_remedy("expected a log, got 3 bytes") == ("3 bytes (expected: a log).", "")
-    assert cause_and_remedy("the worker was killed; 2 tries") == ("the worker was killed; 2 tries", "")
+    cause, remedy = cause_and_remedy("nothing heard for 2 s, 2 tries; last heard: before it hangs")
+    assert cause.startswith("Nothing heard for 2 s") and "log_timeout_s" in remedy
+    assert cause_and_remedy("something else") == ("Something else", "")

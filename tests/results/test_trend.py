@@ -63,6 +63,17 @@ def test_equal_and_unrelated_runs_are_no_regressions(tmp_path: Path) -> None:
     assert "no common drive" in trend_page(found).decode()
 
 
+def test_runs_in_which_logs_failed_are_rows_too(tmp_path: Path) -> None:
+    bad = entry("bad", outcome="failed: cut", main=None)
+    a = write_run(tmp_path / "a", {}, entries=[bad])
+    b = write_run(tmp_path / "b", {"d": 0.1}, entries=[entry("d"), bad])
+    found = of([a, b, b])
+    assert [(r.failed, r.scored) for r in found.rows] == [(1, 0), (1, 1), (1, 1)] and found.regressions == ()
+    assert "no common drive with the figure" in trend_page(found).decode()
+    with pytest.raises(UsageError, match="an estimator of these runs: pd-hef, got pd-hof"):
+        trend_of([open_run(b), open_run(b)], Figure(estimator="pd-hof"))
+
+
 def test_a_drive_whose_estimator_has_seen_the_ground_truth_is_not_in_the_median(tmp_path: Path) -> None:
     flags = [row("d1", 1.0, metric="not_independent")]
     a = write_run(tmp_path / "a", {"d0": 0.1, "d1": 9.0}, rows=flags)

@@ -48,12 +48,22 @@ def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int 
     if chosen is None or len(chosen) > most or not all(m.is_exact for m in chosen):
         return {}
     bad = [r for r in relations if r.tells and not r.accepts()]
+    if all(r.is_near for r in bad):
+        return {}
     factor_by_name = {}
     for mistake in chosen:
         for name, factor in mistake.factors.items():
             evidence = next((r.evidence for r in bad if name in r.powers), "")
             factor_by_name[name] = (factor, f"{mistake.words}: {evidence}")
     return factor_by_name
+
+
+def is_wrong_by(measured: Measured, name: str, factor: float) -> bool | None:
+    """Return whether the relations of a signal that count are plausible after a factor and not before; None: none."""
+    mine = [r for r in measured.relations if name in r.powers and r.tells]
+    if not mine:
+        return None
+    return all(r.accepts(factor ** r.powers[name]) for r in mine) and not all(r.accepts() for r in mine)
 
 
 def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Check, ...]:

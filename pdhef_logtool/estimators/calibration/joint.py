@@ -56,7 +56,7 @@ ITERATIONS, DERIVATIVE_STEP, MAX_STEP, LEAST_GAIN = 40, 0.02, 1.0, 1e-3
 PARTS = ("lag", "roll", "bank")
 #: Cornering stiffness over axle load of any car, 1/rad, front and rear, and the standard deviations of the logarithm
 #: about it and about the file's value. The compliance of the steering makes front axles softer.
-USUAL_STIFFNESS, USUAL_STIFFNESS_STD, FILE_STIFFNESS_STD = (13.0, 19.0), 0.3, 0.5
+USUAL_STIFFNESS, USUAL_STIFFNESS_STD, FILE_STIFFNESS_STD = (13.5, 18.0), 0.35, 0.5
 #: Usual share of gravity in a_y by body roll, rad/(m/s²), where the file has none (3 degrees per g).
 USUAL_ROLL_GRADIENT = 0.005
 

@@ -660,6 +660,7 @@
     for (const node of document.querySelectorAll("[data-figure]")) {
       const data = page.figures[node.dataset.figure];
       const figure = { data, place: node.querySelector(".canvas"), legend: node.querySelector(".legend") };
+      figure.place.setAttribute("role", "img");
       if (data.kind === "time" || data.kind === "strip") figure.place.addEventListener("keydown", keyed);
       figures.push(figure);
       if (data.kind === "time" || data.kind === "strip") timed.push(figure);
