@@ -335,9 +335,9 @@ for 1:10 cars). Command: `python -m studies.reference`.
 
 RMSE and ± (RMS of the reference's own standard deviation) in degrees; coverage of its 95 % interval (nominal 95 %);
 share of the stamps where it is valid, and the RMSE there. *refused*: no stamp is valid, for the reason given. GNSS
-*{made}* of recorded drives is made from their ground truth. Some 15
-variants of its constants were compared on simulated drives, and these recorded ones were seen meanwhile: their figures are
-development figures. The ground truth of the RAV4 is turned by about 0.8°, that of the Polaris by 0.5 to 2.3°.
+*{made}* of recorded drives is made from their ground truth. Some 15 variants of the constants were compared on
+simulated drives, and the recorded drives were seen meanwhile: their figures are development figures. The ground truth
+of the RAV4 is turned by about 0.8°, that of the Polaris by 0.5 to 2.3°.
 
 ## Recorded drives
 {recorded}
