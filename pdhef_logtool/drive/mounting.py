@@ -604,6 +604,9 @@ def turned_signals(
     for i, name in enumerate(MOUNTED):
         if name in signals:
             signals[name] = (rates if i == 2 else accelerations).turned(signals[name], mounting.rows[i])
+    for i, name in enumerate(("roll_rate_rad_s", "pitch_rate_rad_s")):
+        if name in signals:
+            signals[name] = rates.turned(signals[name], mounting.hand * mounting.rotation[i])
     return signals
 
 

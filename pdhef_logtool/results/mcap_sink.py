@@ -117,6 +117,7 @@ class AnnotatedMcapSink(Sink):
         truth 20 states. None: as above.
     min_speed_m_s : sideslip is not plotted below.
     span_ns : only what of it was recorded in [start, end); None: all of it.
+    left_out : topics of the source that are not copied; its attachments and metadata are not either. None: all are.
 
     Raises
     ------
@@ -133,7 +134,9 @@ class AnnotatedMcapSink(Sink):
         others_step_ns: int | None = None,
         min_speed_m_s: float = 1.0,
         span_ns: tuple[int, int] | None = None,
+        left_out: Container[str] | None = None,
     ) -> None:
+        self._copies_rest = left_out is None
         self._source = None if source is None else source.messages
         self._names, self._shown, self._others_step_ns = names, shown, others_step_ns
         self._min_speed_m_s = min_speed_m_s
@@ -151,7 +154,7 @@ class AnnotatedMcapSink(Sink):
             return
         try:
             channels = register_channels(
-                self._writer, self._source, leave_out=lambda topic: topic.startswith(NAMESPACE)
+                self._writer, self._source, leave_out=lambda t: t.startswith(NAMESPACE) or t in (left_out or ())
             )
         except BaseException:
             self._writer.abort()
@@ -208,7 +211,7 @@ class AnnotatedMcapSink(Sink):
             self._writer.write([], raws=self._raws_before(None))
             self._write_paths()
             self._write_log(log_lines(report, events, self._reasons))
-            if self._source is not None:
+            if self._source is not None and self._copies_rest:
                 for attachment in iterate_attachments(self._source):
                     if not _is_our_report(attachment):
                         self._writer.attachment(*astuple(attachment))
