@@ -1,4 +1,4 @@
-"""The places of the largest errors of a drive, which a person looks at first."""
+"""The places of the largest errors of a drive, at least a second apart."""
 
 from __future__ import annotations
 
