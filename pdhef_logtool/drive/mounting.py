@@ -141,14 +141,17 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
     mounting = Mounting(_snapped(best), named, best.evidence, best.sign > 0.0 or best.along, hand)
     if not mounting.confident or mounting.is_as_named:
         return mounting
-    step = nearest_step(best.rotation)
     parts = [
         _turned(f, hand * w, np.where(part, speed, np.nan), best.rotation[2], references) for part in halves(len(speed))
     ]
-    fitted = [p for p in parts if p is not None]
+    return mounting if _parts_agree(best, parts) else replace(mounting, confident=False)
+
+
+def _parts_agree(whole: _Turn, parts: Sequence[_Turn | None]) -> bool:
+    """Return whether the parts of a drive show the same step; of a short drive, all of it must correlate closely."""
+    step, fitted = nearest_step(whole.rotation), [p for p in parts if p is not None]
     agree = all(p.correlation >= PART_CORRELATION and np.allclose(nearest_step(p.rotation), step) for p in fitted)
-    is_long = len(fitted) == len(parts) or best.correlation >= ASKEW_CORRELATION
-    return mounting if agree and is_long else replace(mounting, confident=False)
+    return agree and (len(fitted) == len(parts) or whole.correlation >= ASKEW_CORRELATION)
 
 
 def _named_rows(mapping: Mapping, accelerations: Triad, rates: Triad) -> FloatArray:

@@ -315,12 +315,8 @@ def read_drive(
 
     opened = open_log(log_input.path, options.limits, options.msgs, wanted=Wanted(frozenset()))
     try:
-        chosen = choose_mapping(
-            _as_far_as_decided(opened, options),
-            mapping,
-            prefer_truth=options.prefer_truth,
-            require_signals=require_sensors,
-        )
+        undecided, prefer = _as_far_as_decided(opened, options), options.prefer_truth
+        chosen = choose_mapping(undecided, mapping, prefer_truth=prefer, require_signals=require_sensors)
         for ambiguity in chosen.ambiguities:
             told(str(ambiguity))
         remarks += chosen.remarks
@@ -338,15 +334,9 @@ def read_drive(
             slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
         setup = _setup_of(opened, used, car.vehicle, slice_ns, options)
         plan = plan_drive(
-            opened,
-            used,
-            car.vehicle,
-            *slice_ns,
-            require_imu=require_sensors,
-            clock=options.clock,
-            setup=setup,
+            opened, used, car.vehicle, *slice_ns, require_imu=require_sensors, clock=options.clock, setup=setup,
             waived=options.waived,
-        )
+        )  # fmt: skip
         for note in plan.mapping.notes[len(used.notes) :]:
             told(note)
         _tell_doubts(plan, options, told)

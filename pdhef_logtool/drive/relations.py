@@ -219,12 +219,8 @@ def smallest_explanations(relations: Sequence[Relation], mistakes: Sequence[Mist
     names = {n for r in failed for n in r.powers}
     useful = [m for m in mistakes if names & set(m.factors)]
     for size in range(1, MAX_MISTAKES + 1):
-        explanations = [
-            chosen
-            for chosen in combinations([m for m in useful if size == 1 or not m.foreign], size)
-            if len({n for m in chosen for n in m.factors}) == sum(len(m.factors) for m in chosen)
-            and all(r.accepts(float(np.prod([m.acts_on(r) for m in chosen]))) for r in telling)
-        ]
+        candidates = combinations([m for m in useful if size == 1 or not m.foreign], size)
+        explanations = [chosen for chosen in candidates if _explains(chosen, telling)]
         if explanations:
             near = _nearest(relations, explanations)
             simplest = min(_cost(chosen) for chosen in near)
@@ -233,23 +229,25 @@ def smallest_explanations(relations: Sequence[Relation], mistakes: Sequence[Mist
     return []
 
 
+def _explains(chosen: Sequence[Mistake], telling: Sequence[Relation]) -> bool:
+    """Return whether mistakes of different signals make all relations plausible."""
+    signals = [n for m in chosen for n in m.factors]
+    is_distinct = len(set(signals)) == len(signals)
+    return is_distinct and all(r.accepts(float(np.prod([m.acts_on(r) for m in chosen]))) for r in telling)
+
+
 def contradicting(relations: Sequence[Relation]) -> set[str]:
     """Return the signals that must be wrong where relations contradict one another and no mistake explains it.
 
     As few as possible, and of them those that the fewest other relations show to be right; the wheels are one.
     """
-    bad = [r for r in relations if r.tells and not r.accepts()]
-    good = [r for r in relations if r.tells and r.accepts() and len({_sensor(n) for n in r.powers}) > 1]
-    sets = [{_sensor(n) for n in r.powers} for r in bad]
-    names = sorted({n for s in sets for n in s})
-    best: tuple[int, tuple[str, ...]] | None = None
-    for size in range(1, min(len(names), MAX_CULPRITS) + 1):
-        for chosen in combinations(names, size):
-            if all(s & set(chosen) for s in sets):
-                cost = size + sum(bool({_sensor(n) for n in r.powers} & set(chosen)) for r in good)
-                if best is None or cost < best[0]:
-                    best = cost, chosen
-    culprits = set(names if best is None else best[1])
+    telling = [(r.accepts(), {_sensor(n) for n in r.powers}) for r in relations if r.tells]
+    bad = [sensors for accepted, sensors in telling if not accepted]
+    good = [sensors for accepted, sensors in telling if accepted and len(sensors) > 1]
+    names = sorted(set().union(*bad))
+    sizes = range(1, min(len(names), MAX_CULPRITS) + 1)
+    possible = [set(c) for size in sizes for c in combinations(names, size) if all(s & set(c) for s in bad)]
+    culprits = min(possible, key=lambda c: len(c) + sum(bool(s & c) for s in good), default=set(names))
     return {n for r in relations for n in r.powers if _sensor(n) in culprits}
 
 

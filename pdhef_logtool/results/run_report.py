@@ -302,19 +302,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
             "assumed": list(facts.assumed),
             "low_speed_blend_m_s": facts.low_speed_m_s,
         },
-        "estimators": [
-            {
-                "name": e.name,
-                "causal": e.causal,
-                "outcome": "failed" if e.failed else "ran" if e.skipped is None else "skipped",
-                "reason": e.failed or e.skipped,
-                "algorithm": e.algorithm,
-                "notes": list(e.notes),
-                "intervals": list(e.intervals),
-                "reasons": None if e.reasons is None else list(e.reasons),
-            }
-            for e in facts.estimators
-        ],
+        "estimators": [_estimator(e) for e in facts.estimators],
         "truth": {
             "available": bool(facts.truth.quantities),
             **jsonable(facts.truth),
@@ -342,6 +330,19 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
         document["requirement_blocks"] = list(facts.requirements.blocks)
     document = {key: jsonable(value) for key, value in document.items()}
     return document | _selected(document, facts.main, facts.details)
+
+
+def _estimator(facts: EstimatorFacts) -> dict[str, Any]:
+    return {
+        "name": facts.name,
+        "causal": facts.causal,
+        "outcome": "failed" if facts.failed else "ran" if facts.skipped is None else "skipped",
+        "reason": facts.failed or facts.skipped,
+        "algorithm": facts.algorithm,
+        "notes": list(facts.notes),
+        "intervals": list(facts.intervals),
+        "reasons": None if facts.reasons is None else list(facts.reasons),
+    }
 
 
 def _selected(document: Mapping[str, Any], main: MainFacts | None, details: DriveDetails | None) -> dict[str, Any]:

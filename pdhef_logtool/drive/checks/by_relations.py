@@ -122,13 +122,17 @@ def _judged(name: str, relations: Sequence[Relation], explained: _Explained) -> 
     if name in explained.culprits and bad:
         return [_unexplained(name, bad)]
     if good or (bad and explained.is_explained):
-        usable = relations if explained.is_explained else good
-        best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
-        lacks = _LACKS_FOR_UNIT.get(name)
-        if explained.is_explained and lacks and not any(r.decides_unit for r in usable):
-            return [SIGN.passed(best.evidence, name), UNIT.undecided(best.evidence, name, lacks)]
-        return [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
+        return _passed(name, relations if explained.is_explained else good, is_explained=explained.is_explained)
     return [_contradicted(name, bad[0], explained.culprits)] if bad else []
+
+
+def _passed(name: str, usable: Sequence[Relation], *, is_explained: bool) -> list[Check]:
+    """Return passed sign and unit checks; the unit is undecided where no relation decides it."""
+    best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
+    lacks = _LACKS_FOR_UNIT.get(name)
+    if is_explained and lacks and not any(r.decides_unit for r in usable):
+        return [SIGN.passed(best.evidence, name), UNIT.undecided(best.evidence, name, lacks)]
+    return [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
 
 
 def _mistakes_by_signal(

@@ -12,6 +12,7 @@ from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind
 from pdhef_logtool.drive.columns import derivative, independent_samples, median_known
 from pdhef_logtool.drive.relations import gentle_at
 from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.signals import BoolArray, FloatArray
 
 #: What of an accelerometer's mean driving does not explain. Grade and crossfall of a whole drive are 3 % at most
 #: (0.3 m/s^2), a production sensor's bias less than that; 0.8 m/s^2 is a tilt of 4.7 degrees, half of g another axis.
@@ -29,14 +30,7 @@ def _levels(drive: CheckedDrive) -> Iterator[Check]:
     for name in ("ax_m_s2", "ay_m_s2"):
         if name not in columns:
             continue
-        driven, at_ease = np.zeros_like(columns[name]), np.ones(columns[name].shape[0], np.bool_)
-        if speed is not None and yaw is not None:
-            # Where the car slides, speed and yaw rate no longer show what accelerates it.
-            at_ease = gentle_at(yaw * speed, at_ease) & gentle_at(columns[name] - median_known(columns[name]), at_ease)
-        if speed is not None and name == "ax_m_s2":
-            driven = derivative(speed)
-        elif speed is not None and yaw is not None:
-            driven = yaw * speed
+        driven, at_ease = _driven(name, columns[name], speed, yaw)
         rest = columns[name] - driven
         finite = np.isfinite(rest)
         is_known = speed is not None and yaw is not None and bool(np.nanstd(yaw) > 0.0)
@@ -53,6 +47,21 @@ def _levels(drive: CheckedDrive) -> Iterator[Check]:
         is_gravity = is_known or abs(float(np.mean(rest[use]))) > GRAVITY_ALONE_M_S2
         if (driving_is_known and is_known and is_gentle_enough) or (check.name == f"{name}.axis" and is_gravity):
             yield check
+
+
+def _driven(
+    name: str, measured: FloatArray, speed: FloatArray | None, yaw_rate: FloatArray | None
+) -> tuple[FloatArray, BoolArray]:
+    """Return the acceleration that speed and yaw rate show [N], 0 without them, and where the driving is gentle [N]."""
+    driven, at_ease = np.zeros_like(measured), np.ones(measured.shape[0], np.bool_)
+    if speed is not None and yaw_rate is not None:
+        # Where the car slides, speed and yaw rate no longer show what accelerates it.
+        at_ease = gentle_at(yaw_rate * speed, at_ease) & gentle_at(measured - median_known(measured), at_ease)
+    if speed is not None and name == "ax_m_s2":
+        driven = derivative(speed)
+    elif speed is not None and yaw_rate is not None:
+        driven = yaw_rate * speed
+    return driven, at_ease
 
 
 def _level(name: str, rest: float, mean: float) -> Check:
