@@ -25,6 +25,8 @@ from pdhef_logtool.car.parts import (
     Intervals,
     LearntOn,
     Noise,
+    Taught,
+    TaughtParameter,
     Trust,
     noise_sha256,
     physics_sha256,
@@ -46,6 +48,7 @@ from pdhef_logtool.storage.documents import read_json, read_text, read_toml, val
 VEHICLE_FILE, FIT_FILE, NOISE_FILE, NETWORK_FILE = "vehicle.toml", "fit.toml", "noise.toml", "network.toml"
 INTERVALS_FILE, UNSURE_FILE, HISTORY_FILE = "intervals.json", "intervals-unsure.json", "history.jsonl"
 NETWORK_FOLDER = "network"
+TAUGHT_FILE = "taught.json"
 #: The car that comes with the package, by name.
 SHIPPED_CARS = {"saloon": Path(__file__).parents[1] / "models" / "default"}
 #: Instead of a file: intervals as the estimators give them; the wide ones, for a car that may not be as its file says.
@@ -100,6 +103,7 @@ class Car:
     own : physics and sensors as the person's file has them.
     noise : of filters, by the name of :data:`~.parts.NOISY_FILTERS`; only what belongs to ``vehicle``.
     fitted_physics : what identification found through ``physics``, None without.
+    taught : prior and residual from drives with ground truth, for the calibration of every later drive; None without.
     network, network_name, network_folder : the residual network, None without; trust : what was found of it.
     intervals : calibrated 95 % intervals, None without.
     learnt_on : drives that ``vehicle`` was identified on.
@@ -118,6 +122,7 @@ class Car:
     intervals: Intervals | None = None
     learnt_on: tuple[LearntOn, ...] = ()
     fitted_physics: FittedPhysics | None = None
+    taught: Taught | None = None
     self_calibrated: WithoutTruth | None = None
     assumed: tuple[AssumedValue, ...] = ()
     source: Path | None = None
@@ -256,6 +261,11 @@ class Car:
         return "other noise" if found is not None and found.noise_sha256 not in (None, noise) else ""
 
     @property
+    def taught_prior(self) -> tuple[TaughtParameter, ...]:
+        """Prior of the calibration from drives with ground truth; empty without."""
+        return () if self.taught is None else self.taught.parameters
+
+    @property
     def has_evidence(self) -> bool:
         """Whether driving has shown this vehicle to be right: it was fitted, or its network was tried with it."""
         fitted = bool(self.learnt_on) or self.fitted_physics is not None
@@ -330,7 +340,12 @@ def _with_parts(car: Car, folder: Path) -> Car:
     if stale := [n for n, of_filter in noise.items() if not car.owns_noise(n, of_filter)]:
         notes.append(_stale(f"noise of {', '.join(stale)}", "it belongs to other physics", "noise"))
     noise = {**car.noise, **{n: of_filter for n, of_filter in noise.items() if n not in stale}}
-    return replace(car, noise=noise, trust=_part(folder / NETWORK_FILE, Trust) or car.trust, notes=tuple(notes))
+    taught = _part(folder / TAUGHT_FILE, Taught)
+    if taught is not None and taught.physics_sha256 != physics_sha256(car.own):
+        notes.append(_stale(TAUGHT_FILE, f"{VEHICLE_FILE} has changed since", "teach"))
+        taught = None
+    trust = _part(folder / NETWORK_FILE, Trust) or car.trust
+    return replace(car, noise=noise, trust=trust, taught=taught, notes=tuple(notes))
 
 
 def _stale(what: str, why: str, stage: str) -> str:
