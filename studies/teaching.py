@@ -185,7 +185,7 @@ def taught_of(teaching: Teaching, car: Car) -> Taught:
         physics_sha256=car.physics_sha256,
         parameters=teaching.parameters,
         residual=teaching.ladder.model,
-        calibrated_share=teaching.calibrated_share,
+        calibrated=teaching.calibrated,
         evidence=teaching.evidence,
     )
 

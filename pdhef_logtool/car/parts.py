@@ -220,7 +220,7 @@ class Taught(Record):
     physics_sha256 : of the vehicle file that it is about.
     parameters : prior of the calibration of every later drive. residual : of the sideslip after it; None: none is
         worth its uncertainty.
-    calibrated_share : of the driving of ``residual``, that the drives calibrated as later drives do.
+    calibrated : whether the drives of ``residual`` calibrated their car; else it is one of the vehicle file.
     figures : evidence and what to drive next.
     """
 
@@ -229,7 +229,7 @@ class Taught(Record):
     physics_sha256: Sha256
     parameters: Annotated[tuple[TaughtParameter, ...], Field(strict=False)] = ()
     residual: LadderModel | None = None
-    calibrated_share: Annotated[float, Field(ge=0, le=1)] = 0.0
+    calibrated: bool = True
     evidence: str = ""
     drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
     figures: dict[str, Any] = Field(default_factory=dict)

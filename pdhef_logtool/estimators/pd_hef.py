@@ -17,8 +17,6 @@ from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_s
 
 #: The preset that takes what the car was taught.
 PRESET = "pd-hef"
-#: Share of the teaching drives that calibrated their car, above which the residual is one of a calibrated car.
-CALIBRATED_SHARE = 0.5
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
@@ -33,10 +31,10 @@ def build(name: str, car: Car, options: Options) -> AdaptivePhysics | CorrectedP
     taught = car.taught
     if name == PRESET and options.trust is None and taught is not None and taught.residual is not None:
         physics = AdaptivePhysics(of_car(car, use_speed=options.use_speed), name=name)
-        if (car.fitted_physics is None) == (taught.calibrated_share < CALIBRATED_SHARE):
+        if (car.fitted_physics is not None) == taught.calibrated:
             return CorrectedPhysics(physics, taught.residual, name, notes=(taught.evidence,))
-        why = "its drives calibrated their car, this one does not" if taught.calibrated_share else "not calibrated"
-        return replace(physics, notes=(f"residual gain 0: {why}",))
+        state, other = ("calibrated", "not calibrated") if taught.calibrated else ("not calibrated", "calibrated")
+        return replace(physics, notes=(f"residual gain 0: it belongs to a {state} car, this drive has one {other}",))
     return _with_network(name, car, options)
 
 

@@ -71,11 +71,11 @@ class OpenedDrive:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Teaching:
-    """What drives taught: prior, residual, share of calibrated driving, evidence of both, and what to drive next."""
+    """What drives taught: prior, residual, whether its drives calibrated their car, evidence of both, and what to drive next."""
 
     parameters: tuple[TaughtParameter, ...]
     ladder: LadderFit
-    calibrated_share: float
+    calibrated: bool
     prior_test: Interval | None
     drives: tuple[dict[str, Any], ...]
     more: tuple[str, ...]
@@ -123,7 +123,7 @@ def teach(task: Task) -> StageOutput:
         physics_sha256=task.car.physics_sha256,
         parameters=taught.parameters,
         residual=taught.ladder.model,
-        calibrated_share=taught.calibrated_share,
+        calibrated=taught.calibrated,
         evidence=taught.evidence,
         drives=tuple(r.learnt_on for r in records if not r.left_out),
         figures=figures,
@@ -163,8 +163,12 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
     calibrations = [_calibration(d, parameters) for d in drives]
     progress("fitting the residual", 0.8)
     lacks = [lacking_of(d, c) for d, c in zip(drives, calibrations, strict=True)]
-    ladder = fit_ladder(lacks, seed=seed)
-    calibrated = [d.driving.seconds for d, c in zip(drives, calibrations, strict=True) if not c.refused]
+    seconds = {False: 0.0, True: 0.0}
+    for drive, calibration in zip(drives, calibrations, strict=True):
+        seconds[not calibration.refused] += drive.driving.seconds
+    calibrated = seconds[True] >= seconds[False]  # a residual of one kind of physics is none of the other
+    fitted = [lack for lack, c in zip(lacks, calibrations, strict=True) if calibrated is not bool(c.refused)]
+    ladder = fit_ladder(fitted, seed=seed)
     lines = []
     for drive, calibration, lack in zip(drives, calibrations, lacks, strict=True):
         correction = None if ladder.model is None else ladder.model.evaluate(lack.features)
@@ -183,8 +187,7 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
                 "corrected_without_constant_deg": after_free,
             }
         )
-    share = math.fsum(calibrated) / max(math.fsum(d.driving.seconds for d in drives), 1e-9)
-    return Teaching(parameters, ladder, share, test, tuple(lines), _more(drives, ladder))
+    return Teaching(parameters, ladder, calibrated, test, tuple(lines), _more(drives, ladder))
 
 
 def _calibration(drive: OpenedDrive, parameters: Sequence[TaughtParameter]) -> SelfCalibration:
@@ -267,7 +270,7 @@ def figures_of(taught: Teaching) -> dict[str, Any]:
         "seconds": round(ladder.seconds, 1),
         "blocks": ladder.blocks,
         "rungs": [asdict(t) for t in ladder.trials],
-        "calibrated_share": taught.calibrated_share,
+        "calibrated": taught.calibrated,
         "prior_used": bool(taught.parameters),
         "prior_against_untaught_deg": [None if math.isnan(x) else math.degrees(x) for x in bounds],
         "parameters": [p.model_dump() for p in taught.parameters],
