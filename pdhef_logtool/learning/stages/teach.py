@@ -31,7 +31,7 @@ from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_differe
 from pdhef_logtool.evaluation.comparison import end_to_end
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.car.taught_prior import slopes_of, taught_parameters
-from pdhef_logtool.learning.drives import DriveRecord, no_drive, no_true_sideslip, record_of
+from pdhef_logtool.learning.drives import TEACH, DriveRecord, no_drive, no_true_sideslip, record_of
 from pdhef_logtool.learning.split import TRAINING
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.logs.discovery import LogInput
@@ -43,7 +43,6 @@ from pdhef_logtool.residual_model.ladder_fit import LadderFit, TaughtDrive, corr
 from pdhef_logtool.residual_model.slow_features import SlowFeatures
 from pdhef_logtool.runs.self_calibrating import lacking, read_driving, self_calibrated
 
-TEACH = "teach"
 #: Least driving with ground truth, and length from which on little more is gained (docs/learn.md).
 LEAST_S, ENOUGH_S = 20.0, 150.0
 #: A filter settles before its error counts.
@@ -71,7 +70,7 @@ class OpenedDrive:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Teaching:
-    """What drives taught: prior, residual, whether its drives calibrated their car, evidence of both, and what to drive next."""
+    """What drives taught: prior, residual, whether its drives calibrated their car, evidence, what to drive next."""
 
     parameters: tuple[TaughtParameter, ...]
     ladder: LadderFit
@@ -258,11 +257,7 @@ def _more(drives: Sequence[OpenedDrive], ladder: LadderFit) -> tuple[str, ...]:
 def figures_of(taught: Teaching) -> dict[str, Any]:
     """Return the figures as JSON-able values."""
     test, ladder = taught.prior_test, taught.ladder
-    bounds = (
-        None
-        if test is None
-        else [None if math.isnan(x) else math.degrees(x) for x in (test.value, test.low, test.high)]
-    )
+    bounds = () if test is None else (test.value, test.low, test.high)
     return {
         "evidence": taught.evidence,
         "rung": ladder.rung,
