@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import Taught
+from pdhef_logtool.car.taught import Taught
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 from pdhef_logtool.estimators.latency_compensation import run_window

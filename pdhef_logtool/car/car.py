@@ -25,12 +25,11 @@ from pdhef_logtool.car.parts import (
     Intervals,
     LearntOn,
     Noise,
-    Taught,
-    TaughtParameter,
     Trust,
     noise_sha256,
     physics_sha256,
 )
+from pdhef_logtool.car.taught import Taught, TaughtParameter
 from pdhef_logtool.car.toml_files import VehicleFile, read_vehicle_file
 from pdhef_logtool.car.vehicle import Record, VehicleParameters, default_vehicle
 from pdhef_logtool.records.errors import UsageError, VehicleError

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.parts import FilterNoise, TaughtParameter
+from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
 from pdhef_logtool.estimators.calibration.joint import (

@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pdhef_logtool.car.descent import descend
-from pdhef_logtool.car.parts import TaughtParameter
+from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, STIFFNESS_TYRE_SHAPE, AxleTyre, Tyres, VehicleParameters
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
 from pdhef_logtool.estimators.calibration.single_track import (

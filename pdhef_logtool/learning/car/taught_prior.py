@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pdhef_logtool.car.parts import TaughtParameter
+from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.calibration.driving import Driving
 from pdhef_logtool.estimators.calibration.joint import (

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.car import FIT_FILE, TAUGHT_FILE, Car
-from pdhef_logtool.car.parts import PHYSICS, Taught, TaughtParameter
+from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.car.store import Change
+from pdhef_logtool.car.taught import Taught, TaughtParameter
 from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.reading import Drive, WholeDrive
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
