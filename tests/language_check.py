@@ -4,8 +4,8 @@
 
 Areas: documentation (pages written by hand), help (texts of the command line), messages (other literals with a space,
 HTML templates), comments (with docstrings), names (of variables and parameters). An area fails with more hits than
-``language_limits.json`` allows; ``--lower`` writes the present counts where they are smaller. Code spans, code blocks
-and names with an underscore, which are contracts of files and commands, do not count.
+``language_limits.json`` allows; ``--lower`` writes the present counts where they are smaller. Code spans, code blocks,
+names with an underscore, which are contracts of files and commands, and names of parameters in docstrings do not count.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ LIMITS = Path(__file__).with_name("language_limits.json")
 AREAS = ("documentation", "help", "messages", "comments", "names")
 #: Retired phrase (a regular expression, whole words, any case), and what to write instead.
 PHRASES = {
-    r"(?<!ground )(?<!ground-)truth(?! channel|\.\w|\])": "ground truth",
+    r"(?<!ground )(?<!ground-)(?<!')truth(?! channel|\.\w|\])": "ground truth",
     r"the answer|main (estimator|estimate|one)": "selected estimate",
     r"bands?": "confidence interval",
     r"(?<!order )holds?": "contains, coverage, limits ...",
@@ -75,7 +75,8 @@ class Hit(NamedTuple):
 def in_text(area: str, place: str, text: str) -> Iterator[Hit]:
     """Yield the retired phrases of a text."""
     text = re.sub(r"\s+", " ", text)
-    text = re.sub(r"`+[^`]*`+|https?://\S+|\b(docs|pdhef_logtool|studies)/\S+|\bpdhef [a-z]+", " ", text)
+    code_or_parameter = r"`+[^`]*`+|https?://\S+|\b(docs|pdhef_logtool|studies)/\S+|\bpdhef [a-z]+|\b\w+(, \w+)* : "
+    text = re.sub(code_or_parameter, " ", text)
     for pattern, better in RETIRED.items():
         for match in pattern.finditer(text):
             around = text[max(match.start() - 40, 0) : match.end() + 40].replace("\n", " ")

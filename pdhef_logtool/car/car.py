@@ -50,7 +50,7 @@ NETWORK_FOLDER = "network"
 TAUGHT_FILE = "taught.json"
 #: The car that comes with the package, by name.
 SHIPPED_CARS = {"saloon": Path(__file__).parents[1] / "models" / "default"}
-#: Instead of a file: intervals as the estimators give them; the wide ones, for a car that may not be as its file says.
+#: Instead of a file: intervals as the estimators give them: wide, for a car that may differ from its vehicle file.
 NO_INTERVALS, UNSURE = "none", "unsure"
 #: Digits of a hash that are shown.
 SHOWN_DIGITS = 12
@@ -75,10 +75,10 @@ class AllowedTrust:
 class WithoutTruth:
     """The vehicle as driving without ground truth calibrated it, for the log that it is about.
 
-    ``told_friction`` : whether the signals' friction is one that the calibration knew too; an estimate, made with the
-    file as it is, is none. ``noise`` : of ``physics``. ``note`` : what a reader of the report must know.
-    ``varied`` : the vehicle one posterior 1-sigma away, in directions that are independent. ``driven_d2_m_s`` : d2 of
-    ``physics`` on the log as far as it goes with the driving, NaN where that cannot be told. ``earlier`` : what applied
+    ``told_friction`` : whether the signals' friction was given to the calibration too; an estimate, made with the
+    file as it is, is none. ``noise`` : of ``physics``. ``note`` : a warning for the reader of the report.
+    ``varied`` : the vehicle one posterior 1-sigma away, in independent directions. ``driven_d2_m_s`` : v̇_y residual of
+    ``physics`` on the log, the part that correlates with the driving, NaN if unknown. ``earlier`` : what applied
     before, in time order, where the log calibrates its car as it goes on; each applies from its ``since_ns``.
     """
 
@@ -99,11 +99,11 @@ class Car:
     Attributes
     ----------
     vehicle : physics and sensors, what identification found included.
-    own : physics and sensors as the person's file has them.
+    datasheet : physics and sensors as the person's file has them.
     noise : of filters, by the name of :data:`~.parts.NOISY_FILTERS`; only what belongs to ``vehicle``.
     fitted_physics : what identification found through ``physics``, None without.
     taught : prior and residual from drives with ground truth, for the calibration of every later drive; None without.
-    network, network_name, network_folder : the residual network, None without; trust : what was found of it.
+    network, network_name, network_folder : the residual network, None without; trust : evidence for it.
     intervals : calibrated 95 % intervals, None without.
     learnt_on : drives that ``vehicle`` was identified on.
     self_calibrated : the vehicle as the log that is run calibrated it, None without; for the estimators that take it.
@@ -112,7 +112,7 @@ class Car:
     """
 
     vehicle: VehicleParameters
-    own: VehicleParameters
+    datasheet: VehicleParameters
     noise: Mapping[str, FilterNoise] = field(default_factory=dict)
     network: ModelBundle | None = None
     network_name: str = NO_MODEL
@@ -171,10 +171,10 @@ class Car:
                 f"{NETWORK_FILE} allows no residual gain: it was fitted with {other}; "
                 "pdhef learn --stages gain creates it again"
             )
-        own = intervals is None and folder is not None and (folder / INTERVALS_FILE).is_file()
-        if intervals is None and not own and car.varied_physics:
+        has_intervals_file = intervals is None and folder is not None and (folder / INTERVALS_FILE).is_file()
+        if intervals is None and not has_intervals_file and car.varied_physics:
             car = replace(car, intervals=None)  # what its own drives left open states more than another car's intervals
-        if own and selected is not None and selected.physics_sha256 != car.physics_sha256:
+        if has_intervals_file and selected is not None and selected.physics_sha256 != car.physics_sha256:
             stale.append(
                 f"{INTERVALS_FILE} was made with other physics; pdhef learn --stages intervals creates it again"
             )
@@ -194,8 +194,8 @@ class Car:
     @property
     def physics_vehicle(self) -> VehicleParameters:
         """The vehicle as ``physics`` has it: with the values that were found through it, else every filter's."""
-        found = self.fitted_physics
-        return self.vehicle if found is None else found.values.applied_to(self.own)
+        fitted = self.fitted_physics
+        return self.vehicle if fitted is None else fitted.values.applied_to(self.datasheet)
 
     @property
     def varied_physics(self) -> tuple[VehicleParameters, ...]:
@@ -224,40 +224,40 @@ class Car:
     @property
     def tried_with(self) -> tuple[str, str]:
         """Digests of the physics and of the noise that ``pd-hef`` runs with: what evidence for its network is about."""
-        return self.physics_of(PHYSICS), noise_sha256({n: one for n, one in self.noise.items() if n == PHYSICS})
+        return self.physics_of(PHYSICS), noise_sha256({n: noise for n, noise in self.noise.items() if n == PHYSICS})
 
     @property
     def allowed_trust(self) -> AllowedTrust:
         """How far ``pd-hef`` may follow the network on this car, and why (docs/method.md#gain).
 
-        Innovations do not tell whether a network helps on a car that it has never seen: drives with truth do. Evidence
+        Innovations do not show whether a network helps on a car without training data; ground truth does. Evidence
         counts for the network, physics and noise that it was found with; a part written by hand names none of them.
         """
-        found = self.trust
-        if found is None or not found.has_evidence:
+        trust = self.trust
+        if trust is None or not trust.has_evidence:
             why = f"no evidence that this network helps on {self.vehicle.name}"
             return AllowedTrust(0.0, f"{why}; a drive with ground truth and pdhef learn --stages gain give it")
         here = "" if self.network is None else self.network.sha256
-        if found.network_sha256 is not None and found.network_sha256 != here:
+        if trust.network_sha256 is not None and trust.network_sha256 != here:
             return AllowedTrust(
                 0.0,
-                f"the car's evidence is about network {found.network_sha256[:SHOWN_DIGITS]}, this one is "
+                f"the car's evidence is about network {trust.network_sha256[:SHOWN_DIGITS]}, this one is "
                 f"{here[:SHOWN_DIGITS]}; pdhef learn --stages gain tries it",
             )
         if other := self._other_than_tried:
             return AllowedTrust(
                 0.0, f"the car's evidence was found with {other}; pdhef learn --stages gain creates it again"
             )
-        return AllowedTrust(found.trust_cap, found.evidence)
+        return AllowedTrust(trust.trust_cap, trust.evidence)
 
     @property
     def _other_than_tried(self) -> str:
         """What of the car is another than the network was tried with; empty if nothing is."""
-        found = self.trust
+        trust = self.trust
         physics, noise = self.tried_with
-        if found is not None and found.physics_sha256 not in (None, physics):
+        if trust is not None and trust.physics_sha256 not in (None, physics):
             return "other physics"
-        return "other noise" if found is not None and found.noise_sha256 not in (None, noise) else ""
+        return "other noise" if trust is not None and trust.noise_sha256 not in (None, noise) else ""
 
     @property
     def taught_prior(self) -> tuple[TaughtParameter, ...]:
@@ -274,45 +274,45 @@ class Car:
     @property
     def calibrated_car(self) -> Car:
         """The car with the vehicle that the log calibrated, for its estimators; itself without a calibration."""
-        found = self.self_calibrated
-        if found is None:
+        calibrated = self.self_calibrated
+        if calibrated is None:
             return self
-        physics = FittedPhysics(values=FittedValues.of(found.vehicle), noise=found.noise)
-        car = replace(self.with_vehicle(found.vehicle), fitted_physics=physics, self_calibrated=None)
-        return car.with_noise(PHYSICS, found.noise)
+        physics = FittedPhysics(values=FittedValues.of(calibrated.vehicle), noise=calibrated.noise)
+        car = replace(self.with_vehicle(calibrated.vehicle), fitted_physics=physics, self_calibrated=None)
+        return car.with_noise(PHYSICS, calibrated.noise)
 
     def with_fit(self, fit: Fit) -> Car:
         """Return the car as identification found it; what was found of a network with other tyres counts no more."""
-        vehicle = fit.values.applied_to(self.own)
-        found = replace(self, vehicle=vehicle, fitted_physics=fit.physics)
+        vehicle = fit.values.applied_to(self.datasheet)
+        fitted_car = replace(self, vehicle=vehicle, fitted_physics=fit.physics)
         how = "(calibrated without ground truth)" if fit.without_truth else "(identified)"
-        if vehicle != self.own and not vehicle.name.endswith(how):
+        if vehicle != self.datasheet and not vehicle.name.endswith(how):
             vehicle = vehicle.model_copy(update={"name": f"{vehicle.name} {how}"})
-        noise = {n: one for n, one in self.noise.items() if found.owns_noise(n, one)} | fit.filter
+        noise = {n: noise for n, noise in self.noise.items() if fitted_car.owns_noise(n, noise)} | fit.filter
         if fit.physics is not None:
             noise[PHYSICS] = fit.physics.noise
-        trust = self.trust if vehicle == self.own else None
-        return replace(found, vehicle=vehicle, noise=noise, trust=trust, learnt_on=fit.drives)
+        trust = self.trust if vehicle == self.datasheet else None
+        return replace(fitted_car, vehicle=vehicle, noise=noise, trust=trust, learnt_on=fit.drives)
 
     def with_noise(self, name: str, noise: FilterNoise) -> Car:
         """Return the car with another noise of one filter."""
         return replace(self, noise={**self.noise, name: noise})
 
     def with_vehicle(self, vehicle: VehicleParameters) -> Car:
-        """Return the car with other physics, made wrong on purpose, and everything else as it is, its trust too.
+        """Return the car with other physics, made wrong on purpose; the rest, residual gain included, stays.
 
-        What was found through ``physics`` stays but for the entries that are changed: it would put the right ones back.
+        What was identified through ``physics`` stays, except the changed entries: it would restore the right ones.
         """
         trust, physics = self.trust, self.fitted_physics
         other = {k: v for k, v in vehicle if v != getattr(self.vehicle, k)}
         if physics is not None:
-            told = {k: None for k in FittedValues.model_fields if k in other}
-            values, *varied = (v.model_copy(update=told) for v in (physics.values, *physics.varied))
+            overridden = {k: None for k in FittedValues.model_fields if k in other}
+            values, *varied = (v.model_copy(update=overridden) for v in (physics.values, *physics.varied))
             physics = physics.model_copy(update={"values": values, "varied": tuple(varied)})
         if trust is not None and trust.physics_sha256 == self.tried_with[0]:
             trust = trust.model_copy(update={"physics_sha256": None})
-        own = self.own.model_copy(update=other)
-        return replace(self, vehicle=vehicle, own=own, trust=trust, fitted_physics=physics)
+        datasheet = self.datasheet.model_copy(update=other)
+        return replace(self, vehicle=vehicle, datasheet=datasheet, trust=trust, fitted_physics=physics)
 
 
 def _file_of(source: Path | None, folder: Path | None) -> VehicleFile:
@@ -330,7 +330,7 @@ def _with_parts(car: Car, folder: Path) -> Car:
     """Return the car with the parts of its folder that are not stale: fit, noise and residual gain."""
     notes: list[str] = []
     fit = _part(folder / FIT_FILE, Fit)
-    if fit is not None and fit.physics_sha256 == physics_sha256(car.own):
+    if fit is not None and fit.physics_sha256 == physics_sha256(car.datasheet):
         car = car.with_fit(fit)
     elif fit is not None:
         notes.append(_stale(FIT_FILE, f"{VEHICLE_FILE} has changed since", "identify"))
@@ -340,7 +340,7 @@ def _with_parts(car: Car, folder: Path) -> Car:
         notes.append(_stale(f"noise of {', '.join(stale)}", "it belongs to other physics", "noise"))
     noise = {**car.noise, **{n: of_filter for n, of_filter in noise.items() if n not in stale}}
     taught = _part(folder / TAUGHT_FILE, Taught)
-    if taught is not None and taught.physics_sha256 != physics_sha256(car.own):
+    if taught is not None and taught.physics_sha256 != physics_sha256(car.datasheet):
         notes.append(_stale(TAUGHT_FILE, f"{VEHICLE_FILE} has changed since", "teach"))
         taught = None
     trust = _part(folder / NETWORK_FILE, Trust) or car.trust

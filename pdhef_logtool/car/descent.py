@@ -45,19 +45,19 @@ def descend(
     least_gain : function of errors: decrease of the cost below which the search ends.
     derivative_step, max_step : step of θ for derivatives, and the largest step of the search.
     """
-    found = errors(theta)
-    value = cost(found, theta)
+    values_here = errors(theta)
+    value = cost(values_here, theta)
     damping = 1e-2
     normal = np.eye(theta.size)
     for _ in range(iterations):
-        at = scaled(found, found)
-        jac = np.empty((at.size, theta.size))
+        residuals = scaled(values_here, values_here)
+        jac = np.empty((residuals.size, theta.size))
         for i in range(theta.size):
             moved = theta.copy()
             moved[i] += derivative_step
-            jac[:, i] = (scaled(errors(moved), found) - at) / derivative_step
+            jac[:, i] = (scaled(errors(moved), values_here) - residuals) / derivative_step
         normal = jac.T @ jac + np.eye(theta.size)
-        gradient = jac.T @ at + theta
+        gradient = jac.T @ residuals + theta
         gain = 0.0
         for _ in range(_TRIES):
             step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
@@ -66,10 +66,10 @@ def descend(
             new = cost(there, theta + step)
             if new < value:
                 gain = value - new
-                theta, found, value = theta + step, there, new
+                theta, values_here, value = theta + step, there, new
                 damping = max(damping / _LESS, 1e-5)
                 break
             damping *= _MORE
-        if gain <= 0.0 or gain < least_gain(found):
+        if gain <= 0.0 or gain < least_gain(values_here):
             break
-    return Descent(theta, normal, value), found
+    return Descent(theta, normal, value), values_here

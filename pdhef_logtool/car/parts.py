@@ -41,7 +41,7 @@ _NOT_PHYSICS = {"name", "truth_position_m", "gnss_antenna_position_m"}
 
 
 def physics_sha256(vehicle: VehicleParameters) -> str:
-    """Return the digest of what a vehicle file says of physics and sensors, whatever its name, layout and comments.
+    """Return the digest of physics and sensors of a vehicle file; name, layout and comments do not count.
 
     Entries at their defaults count as absent: one that a later version adds makes no car stale.
     """
@@ -90,17 +90,17 @@ class FittedValues(Record):
     physics: PhysicsParts | None = None
 
     @classmethod
-    def between(cls, own: VehicleParameters, fitted: VehicleParameters) -> FittedValues:
-        """Return the entries of ``fitted`` that are another vehicle's than ``own``."""
-        same = {k: None for k in cls.model_fields if getattr(fitted, k) == getattr(own, k)}
+    def between(cls, datasheet: VehicleParameters, fitted: VehicleParameters) -> FittedValues:
+        """Return the entries of ``fitted`` that are another vehicle's than ``datasheet``."""
+        same = {k: None for k in cls.model_fields if getattr(fitted, k) == getattr(datasheet, k)}
         return cls.of(fitted).model_copy(update=same)
 
     @classmethod
     def of(cls, fitted: VehicleParameters) -> FittedValues:
         """Return all entries of a vehicle."""
-        found = {k: getattr(fitted, k) for k in cls.model_fields}
-        found["sensors"] = FittedSensors(**{k: getattr(fitted.sensors, k) for k in FittedSensors.model_fields})
-        return cls(**found)
+        values = {k: getattr(fitted, k) for k in cls.model_fields}
+        values["sensors"] = FittedSensors(**{k: getattr(fitted.sensors, k) for k in FittedSensors.model_fields})
+        return cls(**values)
 
     def applied_to(self, vehicle: VehicleParameters) -> VehicleParameters:
         """Return the vehicle with these values in place of its own."""
@@ -132,7 +132,7 @@ class FilterNoise(Record):
 
     def measurement_std(self, sensors: Sensors) -> tuple[float, float, float]:
         """Return the 1-sigma of a_y, yaw rate and speed; what it leaves out is the sensors'."""
-        ay, rate, speed = (self.r_std.get(m, own) for m, own in zip(MEASUREMENTS, sensors.measurement_std, strict=True))
+        ay, rate, speed = (self.r_std.get(m, std) for m, std in zip(MEASUREMENTS, sensors.measurement_std, strict=True))
         return ay, rate, speed
 
     @model_validator(mode="after")

@@ -85,7 +85,7 @@ def check_output(source: Car, output: Path) -> None:
 def vehicle_file(car: Car) -> bytes:
     """Return the bytes of a car's vehicle.toml; the default car has none, so that one is made."""
     if car.source is None:
-        return vehicle_toml(car.own, "The default car of pdhef.").encode()
+        return vehicle_toml(car.datasheet, "The default car of pdhef.").encode()
     return (car.source / VEHICLE_FILE if car.source.is_dir() else car.source).read_bytes()
 
 

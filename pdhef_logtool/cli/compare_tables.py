@@ -32,30 +32,31 @@ if TYPE_CHECKING:
 _MOST_DRIVES, _MOST_SIGNALS = 5, 8
 
 
-def render_comparison(found: Comparison, console: Console) -> None:
+def render_comparison(comparison: Comparison, console: Console) -> None:
     """Print a comparison, the verdict last."""
-    console.print(Text.assemble(("A ", "bold"), found.a, ("  B ", "bold"), found.b), soft_wrap=True)
-    _line(paired_text(found), console)
-    for line in found.unpaired:
+    console.print(Text.assemble(("A ", "bold"), comparison.a, ("  B ", "bold"), comparison.b), soft_wrap=True)
+    _line(paired_text(comparison), console)
+    for line in comparison.unpaired:
         _line(f"without partner: {line}", console)
-    if found.differences:
+    if comparison.differences:
         console.print("\nWhat else differs", style="bold")
-        for line in found.differences:
+        for line in comparison.differences:
             _line(line, console)
-    if found.changed:
+    if comparison.changed:
         console.print(
-            f"\n{found.changed} of {sum(found.pairs.values())} drives have a figure that is not the same bit for bit"
+            f"\n{comparison.changed} of {sum(comparison.pairs.values())} drives "
+            "have a figure that is not the same bit for bit"
         )
-    if found.figures and not found.equal:
-        _print_figures(found, console)
-    if any(f.drives for f in found.figures) and not found.equal:
-        _print_drives(found.figures[0], console)
-    if found.signals:
-        _print_signals(found, console)
-    if found.others:
-        _print_others(found.others, console)
-    console.print(Text.assemble("\n", ("Verdict: ", "bold"), verdict_text(found)))
-    for line in found.failures:
+    if comparison.figures and not comparison.equal:
+        _print_figures(comparison, console)
+    if any(f.drives for f in comparison.figures) and not comparison.equal:
+        _print_drives(comparison.figures[0], console)
+    if comparison.signals:
+        _print_signals(comparison, console)
+    if comparison.others:
+        _print_others(comparison.others, console)
+    console.print(Text.assemble("\n", ("Verdict: ", "bold"), verdict_text(comparison)))
+    for line in comparison.failures:
         _line(f"gate closed: {line}", console)
 
 
@@ -63,25 +64,25 @@ def _line(text: str, console: Console) -> None:
     console.print(Padding(text, (0, 0, 0, 2), expand=False))
 
 
-def _print_figures(found: Comparison, console: Console) -> None:
+def _print_figures(comparison: Comparison, console: Console) -> None:
     made = table("\nfigure", ">\ndrives", ">median\nchange", ">95 %\ninterval", ">\nmay be", "\nverdict", fold=1)
-    for one in found.figures:
-        limit = one.figure.limit
+    for row in comparison.figures:
+        limit = row.figure.limit
         may_be = "-" if limit is None else percent(limit)
-        interval = interval_text(one)
-        drives = str(one.change.drives) + (f" ({one.change.clusters})" if found.cluster else "")
-        made.add_row(one.figure.label, drives, percent(math.expm1(one.change.median)), interval, may_be, one.verdict)
+        interval = interval_text(row)
+        drives = str(row.change.drives) + (f" ({row.change.clusters})" if comparison.cluster else "")
+        made.add_row(row.figure.label, drives, percent(math.expm1(row.change.median)), interval, may_be, row.verdict)
     console.print()
     console.print(made)
-    for note in notes_of(found):
+    for note in notes_of(comparison):
         _line(note, console)
 
 
-def _print_drives(one: ComparedFigure, console: Console) -> None:
-    changed = [d for d in one.drives if d.a != d.b]
+def _print_drives(figure: ComparedFigure, console: Console) -> None:
+    changed = [d for d in figure.drives if d.a != d.b]
     if not changed:
         return
-    unit, factor = read_unit(one.unit)
+    unit, factor = read_unit(figure.unit)
     shown = changed if len(changed) <= 2 * _MOST_DRIVES else [*changed[:_MOST_DRIVES], *changed[-_MOST_DRIVES:]]
     made = table("drive", f">A {unit}", f">B {unit}", ">change", fold=1)
     for place, drive in enumerate(shown):
@@ -90,33 +91,34 @@ def _print_drives(one: ComparedFigure, console: Console) -> None:
         name = drive.drive if drive.drive == drive.drive_b else f"{drive.drive} ({drive.drive_b} in B)"
         change = "-" if drive.change is None else percent(drive.change)
         made.add_row(name, f"{drive.a * factor:.4g}", f"{drive.b * factor:.4g}", change)
-    console.print(f"\nDrives by {one.figure.label}, worst first", style="bold")
+    console.print(f"\nDrives by {figure.figure.label}, worst first", style="bold")
     console.print(made)
 
 
-def _print_signals(found: Comparison, console: Console) -> None:
+def _print_signals(comparison: Comparison, console: Console) -> None:
     made = table("drive", "track", "signal", ">first, s", ">stamps", ">largest", fold=3)
-    shown = one_signal_a_drive(found)
-    for one in shown[:_MOST_SIGNALS]:
+    shown = one_signal_a_drive(comparison)
+    for row in shown[:_MOST_SIGNALS]:
         made.add_row(
-            one.drive, one.track, one.signal, f"{one.first_s:.2f}", f"{one.stamps}/{one.of}", largest_text(one)
+            row.drive, row.track, row.signal, f"{row.first_s:.2f}", f"{row.stamps}/{row.of}", largest_text(row)
         )
     console.print(
-        f"\nWhere the tracks part ({found.followed} of {found.changed} changed drives looked at)", style="bold"
+        f"\nWhere the tracks part ({comparison.followed} of {comparison.changed} changed drives looked at)",
+        style="bold",
     )
     console.print(made)
-    if more := len(found.signals) - len(shown[:_MOST_SIGNALS]):
+    if more := len(comparison.signals) - len(shown[:_MOST_SIGNALS]):
         _line(f"{more} more signals of these drives in --json", console)
 
 
 def _print_others(others: Sequence[ComparedFigure], console: Console) -> None:
     made = table("beside it, no gate", ">drives", ">median", ">p (Holm)", "", fold=1)
-    for one in others:
-        p = 1.0 if one.corrected_p is None else one.corrected_p
+    for figure in others:
+        p = 1.0 if figure.corrected_p is None else figure.corrected_p
         made.add_row(
-            f"{one.figure.signal} {one.figure.metric} ({one.figure.segment})",
-            str(one.change.drives),
-            percent(math.expm1(one.change.median)),
+            f"{figure.figure.signal} {figure.figure.metric} ({figure.figure.segment})",
+            str(figure.change.drives),
+            percent(math.expm1(figure.change.median)),
             f"{p:.2g}",
             "changed" if p < 0.05 else "",
         )
@@ -124,19 +126,19 @@ def _print_others(others: Sequence[ComparedFigure], console: Console) -> None:
     console.print(made)
 
 
-def write_comparison_junit(path: Path, found: Comparison) -> None:
+def write_comparison_junit(path: Path, comparison: Comparison) -> None:
     """Write the verdicts of the figures, and of the drives' partners, as JUnit XML; raises OutputError."""
-    cases = [_figure_case(one, found) for one in found.figures]
-    lost = () if found.allow_unpaired or not found.gated else found.unpaired
-    reason = "; ".join(found.unpaired)
+    cases = [_figure_case(row, comparison) for row in comparison.figures]
+    lost = () if comparison.allow_unpaired or not comparison.gated else comparison.unpaired
+    reason = "; ".join(comparison.unpaired)
     partners = "drives without partner"
     cases.append(Case("compare", "drives", "every drive has a partner", partners, bool(lost), reason, reason or None))
     write_bytes(path, cases_bytes({"compare": cases}))
 
 
-def _figure_case(one: ComparedFigure, found: Comparison) -> Case:
-    closed = [line for line in found.failures if line.startswith(f"{one.figure.label}: ")]
-    median = percent(math.expm1(one.change.median))
-    limit = "no limit" if one.figure.limit is None else f"limit {percent(one.figure.limit)}"
-    told = f"{one.verdict}: median {median} (95 %: {interval_text(one)}) of {one.change.drives} drives, {limit}"
-    return Case("compare", one.figure.estimator, one.figure.label, one.verdict, bool(closed), told, told)
+def _figure_case(row: ComparedFigure, comparison: Comparison) -> Case:
+    closed = [line for line in comparison.failures if line.startswith(f"{row.figure.label}: ")]
+    median = percent(math.expm1(row.change.median))
+    limit = "no limit" if row.figure.limit is None else f"limit {percent(row.figure.limit)}"
+    text = f"{row.verdict}: median {median} (95 %: {interval_text(row)}) of {row.change.drives} drives, {limit}"
+    return Case("compare", row.figure.estimator, row.figure.label, row.verdict, bool(closed), text, text)

@@ -66,17 +66,17 @@ def compare(
         [*(Path(x) for x in (a, b) if not is_url(x)), gate], [file for file in (html, junit) if file is not None]
     )
     asked = _gate(gate, max_regression, estimator, metric, allow_unpaired=allow_unpaired)
-    found = compare_runs(open_run(a), open_run(b), asked, cluster=cluster, strict=strict)
-    for line in found.damaged:
+    comparison = compare_runs(open_run(a), open_run(b), asked, cluster=cluster, strict=strict)
+    for line in comparison.damaged:
         console.warn(line)
     if junit is not None:
-        write_comparison_junit(junit, found)
+        write_comparison_junit(junit, comparison)
     if html is not None:
         from pdhef_logtool.reports.comparison import comparison_page
         from pdhef_logtool.storage.files import write_bytes
 
-        write_bytes(html, comparison_page(found))
-    console.finish(found, render_comparison, as_json)
+        write_bytes(html, comparison_page(comparison))
+    console.finish(comparison, render_comparison, as_json)
 
 
 def _gate(
@@ -154,23 +154,23 @@ def events(
         options.local_folder(output)
     check_no_input([] if is_url(output) else [Path(output)], [] if parquet is None else [parquet])
     run = open_run(output)
-    found = find_events(run, condition, estimator=estimator, pad_s=pad_s)
-    for line in found.damaged:
+    events_found = find_events(run, condition, estimator=estimator, pad_s=pad_s)
+    for line in events_found.damaged:
         console.warn(line)
     if clip:
         from pdhef_logtool.results.clips import write_clips
 
         named = {column.track for column in condition.columns() if column.track is not None}
         named |= set() if estimator is None else {estimator}
-        found = write_clips(run, found, pad_s=pad_s, named=named, source=source, tell=console.warn)
+        events_found = write_clips(run, events_found, pad_s=pad_s, named=named, source=source, tell=console.warn)
     if parquet is not None:
-        write_events(parquet, found)
-    console.finish(found, render_events, as_json)
+        write_events(parquet, events_found)
+    console.finish(events_found, render_events, as_json)
 
 
 def _seconds(text: str) -> float:
     """Return the seconds of ``5s``, ``500ms`` or ``5``; raises UsageError."""
-    found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(ms|s)?\s*", text, re.ASCII)
-    if found is None or float(found[1]) > 1e6:
+    match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(ms|s)?\s*", text, re.ASCII)
+    if match is None or float(match[1]) > 1e6:
         raise UsageError(expected="a time such as 5s", got=text, where="--pad")
-    return float(found[1]) * (1e-3 if found[2] == "ms" else 1.0)
+    return float(match[1]) * (1e-3 if match[2] == "ms" else 1.0)

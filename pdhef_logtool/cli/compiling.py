@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.workers.supervisor import Tell
 
 commands = typer.Typer()
-#: Parts beside those of the estimators: a simulated drive, and a run of one with a car of which nothing is known.
+#: Parts beside those of the estimators: a simulated drive, and a run of it with a car without data.
 _SIMULATION, _UNKNOWN_CAR = "simulation", "unknown car"
 _DRIVE = "banked-road"
 

@@ -55,8 +55,8 @@ def inspect(
         raise UsageError(expected="one log", got=f"{log} and {topic}", where="LOG", remedy="a topic goes with --fields")
     place = one_place(log, private_redirects=config.allow_private_redirects)
     if fields:
-        found = fields_of_log(place, topic, budget=reading.limits, msgs=reading.msgs)
-        console.finish(found, render_fields, as_json, exit_code=EXIT_OK)
+        topic_fields = fields_of_log(place, topic, budget=reading.limits, msgs=reading.msgs)
+        console.finish(topic_fields, render_fields, as_json, exit_code=EXIT_OK)
     inspection = inspect_log(
         place,
         config.mapping,

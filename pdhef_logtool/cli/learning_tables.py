@@ -53,13 +53,13 @@ def render_learning(result: LearnResult, console: Console) -> None:
 
 def _identification(figures: Mapping[str, Any], console: Console) -> None:
     """Print the identified parameters with their uncertainty, and the error of the filter with them."""
-    if found := figures.get("self_calibration"):
+    if calibration := figures.get("self_calibration"):
         parameters = table("parameter", ">value", ">± 1 sd", ">prior", ">± 1 sd", "unit")
-        for p in found["parameters"]:
+        for p in calibration["parameters"]:
             spread = [f"{100.0 * s:.0f} %" if p["log"] else f"{s:.2g}" for s in (p["sd"], p["prior_sd"])]
             parameters.add_row(p["name"], f"{p['value']:.5g}", spread[0], f"{p['prior']:.4g}", spread[1], p["unit"])
         console.print(parameters)
-        console.print(f"  {found['text']}")
+        console.print(f"  {calibration['text']}")
         return
     parameters = table("parameter", ">value", ">95 % interval", ">prior", "unit", "")
     for p in figures["parameters"]:
@@ -174,8 +174,8 @@ def render_extraction(result: ExtractResult, console: Console) -> None:
     if shown:
         console.print(drives)
     splits = result.manifest["splits"].items()
-    told = (f"{name}: {s['drives']} drives, {s['usable_rows']} usable rows" for name, s in splits)
-    console.print(", ".join(told))
+    split_texts = (f"{name}: {s['drives']} drives, {s['usable_rows']} usable rows" for name, s in splits)
+    console.print(", ".join(split_texts))
     _print_cells(result.manifest["cells"], result.manifest["choice"], console)
     console.print(f"dataset in {result.output}", soft_wrap=True)
 
@@ -231,20 +231,20 @@ def render_retraining(result: RetrainResult, console: Console) -> None:
     """Print what the candidate identified on, how it compares on the drives of the gate, and the verdict."""
     from pdhef_logtool.results.gate import Figure
 
-    found = result.document
-    _print_cells(found["cells"], None, console)
-    console.print(", ".join(f"{role}: {count}" for role, count in found["drives_by_role"].items()) + " drives")
+    document = result.document
+    _print_cells(document["cells"], None, console)
+    console.print(", ".join(f"{role}: {count}" for role, count in document["drives_by_role"].items()) + " drives")
     shown = table("figure", ">drives", ">median change", ">95 % interval", "verdict", fold=1)
-    for one in found["comparison"]["figures"]:
-        figure = Figure(one["signal"], one["metric"], one["segment"], one["estimator"])
-        median, low, high = ("-" if one[k] is None else f"{100.0 * one[k]:+.1f} %" for k in ("median", "low", "high"))
-        shown.add_row(figure.label, str(one["drives"]), median, f"{low} to {high}", one["verdict"])
+    for row in document["comparison"]["figures"]:
+        figure = Figure(row["signal"], row["metric"], row["segment"], row["estimator"])
+        median, low, high = ("-" if row[k] is None else f"{100.0 * row[k]:+.1f} %" for k in ("median", "low", "high"))
+        shown.add_row(figure.label, str(row["drives"]), median, f"{low} to {high}", row["verdict"])
     console.print("the candidate against the car as it is, on the drives of the gate")
     console.print(shown)
-    if found["judged"] > 1:
+    if document["judged"] > 1:
         console.print(
-            f"{found['judged']} candidates were judged on these drives: the more there are, the less it shows"
+            f"{document['judged']} candidates were judged on these drives: the more there are, the less it shows"
         )
-    for reason in found["reasons"]:
+    for reason in document["reasons"]:
         console.print(f"rejected: {reason}")
     console.print(f"{'accepted' if result.accepted else 'rejected'}: {result.folder}", soft_wrap=True)

@@ -231,8 +231,8 @@ def command(
         options = [Parameter(key, Parameter.KEYWORD_ONLY, default=None, annotation=o) for key, o in taken.items()]
         parameters: list[Parameter] = []
         for key, parameter in given.items():
-            own = parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=hints[key])
-            parameters += options if key == "config" else [own]
+            argument = parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=hints[key])
+            parameters += options if key == "config" else [argument]
         run_command.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
         run_command.__annotations__ = {p.name: p.annotation for p in parameters}
         return group.command(name, epilog=epilog, cls=PanelCommand, rich_help_panel=panel)(run_command)

@@ -1,4 +1,4 @@
-"""What ``pdhef run`` and ``pdhef metrics`` print: the answer in words, a table, what to look at, the verdicts."""
+"""What ``pdhef run`` and ``pdhef metrics`` print: the selected estimate in words, a table, files to view, verdicts."""
 
 from __future__ import annotations
 
@@ -82,8 +82,8 @@ _TEXTS = {
 
 def render_run(result: RunResult, console: Console) -> None:
     """Print the selected estimate of each log, or of several in one table, and where the outputs are."""
-    told = [(r, all_printable(r.report)) for r in result.results]
-    reports = [report for _, report in told if report is not None]
+    reports_by_log = [(r, all_printable(r.report)) for r in result.results]
+    reports = [report for _, report in reports_by_log if report is not None]
     alike = None
     if len(reports) > 1 and all(report["answer"] for report in reports):
         alike = _Alike.of(reports)
@@ -92,11 +92,11 @@ def render_run(result: RunResult, console: Console) -> None:
         for remark, logs in alike.remarks.items():
             _print_indented(f"note: {remark} ({', '.join(logs)})", console)
         console.print()
-    for one, report in told:
-        _render_log(one.outcome, report, console, alike)
+    for log_result, report in reports_by_log:
+        _render_log(log_result.outcome, report, console, alike)
     if result.verdicts:
         _render_verdicts(result.verdicts, console)
-    failed = [r for r, report in told if report is None]
+    failed = [r for r, report in reports_by_log if report is None]
     lost = [r for r in result.results if r.outcome.lost]
     if len(result.results) > 1 or failed:
         done = f"{len(result.results) - len(failed)} done, {len(failed)} failed, {len(lost)} with input lost"
@@ -195,10 +195,10 @@ def _render_log(outcome: LogOutcome, report: _Report | None, console: Console, a
     if alike is not None:
         scored = _figures(report).get((answer["main"], "sideslip_rad", "all", "rmse")) is not None
         texts = {
-            key: "; ".join(own)
+            key: "; ".join(clauses_here)
             for key, text in texts.items()
             if not (scored and key in ("result", "band"))
-            and (own := [c for c in _clauses(key, text) if c not in _clauses(key, alike.texts.get(key, ""))])
+            and (clauses_here := [c for c in _clauses(key, text) if c not in _clauses(key, alike.texts.get(key, ""))])
         }
     elif answer is not None:
         texts = {**texts, "next": texts.get("next", "nothing is needed; pdhef view OUTPUT shows the drive")}
@@ -264,8 +264,8 @@ def _losses(report: _Report) -> Iterable[str]:
     """Yield what of the input was lost, then what else is known of it; what several channels share is once."""
     where: dict[tuple[str, str, str], list[str]] = {}
     for loss in sorted(report["losses"], key=lambda x: x["severity"] != "lost"):
-        told = loss["count"] is None or loss["kind"] == "gap" or str(loss["count"]) in loss["what"].split()
-        what = loss["what"] if told else f"{loss['count']} × {loss['what']}"
+        has_count = loss["count"] is None or loss["kind"] == "gap" or str(loss["count"]) in loss["what"].split()
+        what = loss["what"] if has_count else f"{loss['count']} × {loss['what']}"
         span = ""
         if loss["start_ns"] is not None and loss["end_ns"] is not None:
             start = report["log"]["start_ns"]
@@ -276,8 +276,8 @@ def _losses(report: _Report) -> Iterable[str]:
         yield f"{word}: {what} ({', '.join(places[:_MOST_PLACES])}{more}{span})"
 
 
-def _below(report: _Report, told: Container[str], *, tabled: bool) -> Iterable[str]:
-    """Yield what belongs below the table: its marks, what did not run, what happened, and remarks not yet ``told``."""
+def _below(report: _Report, above: Container[str], *, tabled: bool) -> Iterable[str]:
+    """Yield what belongs below the table: its marks, what did not run, what happened, and remarks not yet ``above``."""
     shown = _shown(report)
     if tabled and report["truth"]["not_independent"]:
         yield "† the ground truth is an input or the estimate itself: no independent check"
@@ -292,17 +292,17 @@ def _below(report: _Report, told: Container[str], *, tabled: bool) -> Iterable[s
     yield from (f"{e['name']} {e['reason']}" for e in report["estimators"] if e["outcome"] == "failed")
     happened: dict[str, list[str]] = {}
     for estimator in shown:
-        for found in (diverged_line(report, estimator["name"]), reasons_line(estimator, report["log"]["start_ns"])):
-            if found:
-                happened.setdefault(found, []).append(estimator["name"])
-    for found, names in happened.items():
-        yield f"{', '.join(names)}: {found}"
+        for event in (diverged_line(report, estimator["name"]), reasons_line(estimator, report["log"]["start_ns"])):
+            if event:
+                happened.setdefault(event, []).append(estimator["name"])
+    for event, names in happened.items():
+        yield f"{', '.join(names)}: {event}"
     yield from _losses(report)
-    yield from (f"note: {remark}" for remark in report["remarks"] if remark not in told)
+    yield from (f"note: {remark}" for remark in report["remarks"] if remark not in above)
 
 
 def _shown(report: _Report) -> list[Mapping[str, Any]]:
-    """Return the estimators that a person is shown: the selected estimate first, or those that know the future last."""
+    """Return the estimators that a person is shown: the selected estimate first, or those that are not causal last."""
     answer = report["answer"]
     ran = {e["name"]: e for e in report["estimators"] if e["outcome"] == "ran"}
     if answer is not None and not answer["named"]:
@@ -412,7 +412,7 @@ def _look_at(report: _Report, inside: float | None, main: str) -> str:
     """Return what of a log a person should look at, in a few words; ``main`` where the logs' main estimators differ."""
     failed = sum(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks") or [])
     scored = any(m["signal"] == "sideslip_rad" and m["metric"] == "rmse" for m in report["metrics"])
-    found = [
+    hints = [
         f"by {main}" if main else "",
         f"{failed} check{'s' * (failed > 1)} failed" if failed else "",
         "input lost" if any(x["severity"] == "lost" for x in report["losses"]) else "",
@@ -420,4 +420,4 @@ def _look_at(report: _Report, inside: float | None, main: str) -> str:
         "diverged" if diverged_line(report, report["answer"]["main"]) else "",
         "interval too narrow" if inside is not None and inside < NEARLY_HOLDS else "",
     ]
-    return ", ".join(filter(None, found))
+    return ", ".join(filter(None, hints))

@@ -34,7 +34,7 @@ def _list_estimators(show: bool) -> None:
         raise typer.Exit
 
 
-#: Thresholds that failed, of which each is given.
+#: Failed thresholds that are printed one by one.
 _MOST_VERDICTS = 50
 
 
@@ -226,9 +226,9 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
         console.show(replace(summary, output=result.place or summary.output), render_fleet, as_json)
     else:
         console.show(result, render_run, as_json)
-        for one in result.results:
-            if one.outcome.failed is not None and one.report is not None:  # of the others the tables state it
-                console.error(f"pdhef: {one.outcome.log}: {one.outcome.failed}")
+        for entry in result.results:
+            if entry.outcome.failed is not None and entry.report is not None:  # of the others the tables state it
+                console.error(f"pdhef: {entry.outcome.log}: {entry.outcome.failed}")
     failed = [v for v in result.verdicts if v.failed]
     for verdict in failed[:_MOST_VERDICTS]:
         where = f"{verdict.log}: {verdict.estimator}: {verdict.threshold.label}"
@@ -238,9 +238,9 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
             f"pdhef: {len(failed) - _MOST_VERDICTS} more of {len(result.verdicts)} thresholds failed (--junit)"
         )
     if failed and not result.is_fleet:
-        for one in result.results:
-            if one.outcome.outcome != "ok":
-                console.error(f"pdhef: {one.outcome.log} besides {one.outcome.outcome}")
+        for entry in result.results:
+            if entry.outcome.outcome != "ok":
+                console.error(f"pdhef: {entry.outcome.log} besides {entry.outcome.outcome}")
     raise typer.Exit(result.exit_code)
 
 
@@ -263,16 +263,16 @@ def find_recordings(output: Path, logs: Sequence[str]) -> list[Path]:
         return [output]
     if not logs and (output / RECORDING_FILE).is_file():
         return [output / RECORDING_FILE]
-    found = {one.label: path for one in open_run(output).logs if (path := one.file(RECORDING_FILE)) is not None}
-    missing = [name for name in logs if name not in found]
-    if not found or missing:
+    recordings = {log.label: path for log in open_run(output).logs if (path := log.file(RECORDING_FILE)) is not None}
+    missing = [name for name in logs if name not in recordings]
+    if not recordings or missing:
         raise OutputError(
             expected=f"a log named {missing[0]}" if missing else RECORDING_FILE,
-            got=", ".join(found) or "none",
+            got=", ".join(recordings) or "none",
             where=str(output),
-            remedy="" if found else "pdhef run LOG -o OUT --keep full writes one",
+            remedy="" if recordings else "pdhef run LOG -o OUT --keep full writes one",
         )
-    return [found[name] for name in dict.fromkeys(logs)] if logs else list(found.values())
+    return [recordings[name] for name in dict.fromkeys(logs)] if logs else list(recordings.values())
 
 
 def open_viewer(recordings: Sequence[Path], *, web: bool) -> int:

@@ -134,8 +134,8 @@ def suite(
             processes=jobs,
             progress=report.progress,
         )
-    told = ("splits", "written", "dropped_draws")
-    _tell_of_set(manifest, output, told, console.print_json if as_json else console.print_facts)
+    shown_keys = ("splits", "written", "dropped_draws")
+    _tell_of_set(manifest, output, shown_keys, console.print_json if as_json else console.print_facts)
 
 
 @options.command(

@@ -1,4 +1,4 @@
-"""A hash of what a log's channels say, whatever container, other topics, file name or windows they were read in."""
+"""A hash of the content of a log's channels, independent of container, other topics, file name and windows."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ class EvenGrid:
 
 
 class _Line:
-    """Fits a line to values on a grid [N] of which the same ones are known; the bits are those of ``np.polyfit``."""
+    """Fits a line to values on a grid [N] where the same ones are finite; the bits are those of ``np.polyfit``."""
 
     def __init__(self, is_known: BoolArray) -> None:
         n = is_known.shape[0]
@@ -114,7 +114,7 @@ def find_shift(grid: CommonGrid, max_shift_s: float) -> Shift:
     if grid.both < 2 or not all(np.nan_to_num(values, nan=0.0).any() for values in (grid.a, grid.b)):
         return Shift(float("nan"), float("nan"), False)
     rough, error = _rough_correlations(grid.a, grid.b, reach)
-    # Candidates: all that rounding may have put behind the largest, and what cannot be told without the exact sums.
+    # Candidates: all that rounding may have put behind the largest, and what only the exact sums can decide.
     near = ~(rough + error < np.nanmax(rough - error, initial=-np.inf))
     exact = {k: _correlation(grid.a, grid.b, k) for k in (np.flatnonzero(near) - reach).tolist()}
     finite = [k for k, value in exact.items() if np.isfinite(value)]

@@ -65,7 +65,7 @@ def gravity_agrees(placed: Placement, force: FloatArray) -> str:
 
 
 def frames_check(placed: Placement, shown: FloatArray | None, evidence: str, force: FloatArray) -> Check | None:
-    """Compare frames against the rotation [3, 3] that the drive shows, else with gravity; None where neither tells."""
+    """Compare frames against the rotation [3, 3] that the drive shows, else with gravity; None without both."""
     said = f"the recorded frames ({_named(placed)}): {rotation_text(placed_rotation(placed))}"
     apart = None if shown is None else _between_deg(placed.rotation, shown)
     tilt = _tilt_deg(placed, force)

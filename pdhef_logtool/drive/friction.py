@@ -53,7 +53,7 @@ class FrictionSource:
     note : what a user must be given before the run; empty: nothing.
     constant : given to all estimators; None leaves the signals' own (and the vehicle file's where they have none).
     bank : estimates it; None where nothing is estimated.
-    factor : by which what topic or option tell is made wrong on purpose, for training (docs/method.md#limits).
+    factor : error made on purpose in the friction of topic or option, for training (docs/method.md#limits).
     stamps, observable_stamps : of the windows so far.
     """
 
@@ -138,7 +138,7 @@ def friction_source(
     Parameters
     ----------
     choice : of :func:`parse_friction`. available : signals that the log provides. topic : of its friction, ``/a.b``.
-    factor : on what topic or option tell; a vehicle file must come with its own friction made wrong already.
+    factor : on the friction of topic or option; a vehicle file must contain its wrong friction already.
 
     Raises
     ------

@@ -145,7 +145,7 @@ def _named_rows(mapping: Mapping, accelerations: Triad, rates: Triad) -> FloatAr
 class _Turn:
     """A rotation for one choice of the vertical, and how well it explains the drive.
 
-    ``sign``: correlation of the yaw rate with another measurement of it, 0: none tells. ``along``: the speed alone says
+    ``sign``: correlation of the yaw rate with another measurement of it, 0: none. ``along``: the speed alone shows
     which way is forward.
     """
 
@@ -302,7 +302,7 @@ class Survey:
 
     @property
     def mounted(self) -> tuple[Check, ...]:
-        """Whether each of the IMU's signals is read from the axis that the drive says, and what frames say of it."""
+        """Whether each of the IMU's signals is read from the axis that the drive shows, and what frames state of it."""
         framed = () if self.framed is None else (self.framed,)
         if self.mounting is None:
             return framed
@@ -340,7 +340,7 @@ class Survey:
 
     @cached_property
     def late(self) -> tuple[LateSensor, ...]:
-        """The sensors whose stamps are late by what the signals alone say; a sensor that fails for a while is none."""
+        """The sensors whose stamps are late as the signals alone show; a sensor that fails for a while is none."""
         sensors = late_sensors(self.channels.signals)
         if not sensors:
             return ()

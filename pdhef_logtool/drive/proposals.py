@@ -32,7 +32,7 @@ LEAST_LEVER_M = 0.3 * LEVER_M
 LEAST_AY_DELAY_S = 0.015
 #: Beyond, it is no gain but a unit.
 MOST_GAIN = 0.25
-#: As well as recorded frames know a place.
+#: Accuracy of places in recorded frames.
 FRAMES_M = 0.15
 
 

@@ -37,7 +37,7 @@ from pdhef_logtool.records.steps import MAX_PREDICTION_S
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
 Tell = Callable[[str], None]
-#: Makes the mapping that is read with from the log and the mapping in effect; may tell something.
+#: Makes the mapping that is read with from the log and the mapping in effect; may print a message.
 Adjust = Callable[[DriveLog, Mapping, Tell], Mapping]
 
 #: Signals, ground truth and what is computed of them may take this much memory, of all drives of a command together.
@@ -183,10 +183,10 @@ class Drive:
     @property
     def losses(self) -> tuple[Loss, ...]:
         """What could not be used; complete once all windows were read. Files are named without their folder."""
-        found = merge_losses(
+        merged = merge_losses(
             [self.log.lost, () if self._reader is None else self._reader.losses, damage(self.sample_ledger)]
         )
-        return tuple(replace(x, where=self.without_folder(x.where)) for x in found)
+        return tuple(replace(x, where=self.without_folder(x.where)) for x in merged)
 
     @property
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:
@@ -208,7 +208,7 @@ class Drive:
         return () if self._reader is None else self._reader.ledger()
 
     def tell(self, text: str) -> None:
-        """State what a user must know of this drive, and keep it in the notes."""
+        """Report a note to the user, and add it to the notes of this drive."""
         self.notes.append(text)
         self._tell(f"{self.name}: {text}")
 
@@ -284,7 +284,7 @@ def read_drive(
     log : a file, folder or URL; a :class:`LogInput` brings the name that the drive has beside others, and may bring
         a slice.
     car : or what :meth:`Car.load` takes. mapping : or its file; None recognises types.
-    tell : called with ``NAME: text`` for all that a user must know of the drive; :attr:`Drive.notes` has it too.
+    tell : called with ``NAME: text`` for each note to the user; :attr:`Drive.notes` contains them too.
     adjust : changes the mapping in effect.
     require_sensors : False reads a log without an IMU, or without any recognised signal, for its ground truth alone.
 

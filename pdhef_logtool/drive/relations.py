@@ -40,7 +40,7 @@ SIDESLIP_RANGE = (0.3, 3.0)
 #: Slip of a rear axle at 1 m/s^2: cornering stiffness over load is 4 to 40 per rad, and much less where a model car
 #: drifts. It gives a sign, no unit.
 COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
-#: Of ground truth ahead of the rear axle. Ground truth that stands near that axle gives no information: its lever may
+#: Of ground truth ahead of the rear axle. Ground truth that is near that axle gives no information: its lever may
 #: be of any sign.
 REAR_LEVER_M = (1.0, 12.0)
 #: What is left of sideslip beside a_y must move by more: a good ground truth is not surer of it, nor is a road flatter.

@@ -1,8 +1,8 @@
 """A cache of reduced logs, in a folder or an object store: a log that was read once is only asked for what it is.
 
-An entry is known by the source's identity and by all that decides what of it is kept: mapping, truth, definitions,
-budget and version. It appears when it is complete, so that several processes may share a cache; one that is damaged is
-regenerated.
+The key of an entry is the source's identity and all that decides what of it is kept: mapping, ground truth,
+definitions, resource limits and version. It appears when it is complete, so that several processes may share a cache;
+a damaged entry is regenerated.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pdhef_logtool.storage.object_store import ObjectFolder, is_url
 
 #: A process examines what a cache contains each time that it has added this share of what it may contain.
 _LOOK_SHARE = 0.05
-#: Bytes that this process adds to a cache before it looks again.
+#: Bytes that this process adds to a cache before it checks its size again.
 _left_bytes: dict[str, float] = {}
 _DAMAGED = "its reduced log in the cache is damaged and is written again"
 
@@ -51,7 +51,7 @@ class SlimCache:
     def standing_in(self, log: LogInput, warn: Callable[[str], None] = lambda _text: None) -> Iterator[LogInput]:
         """Yield the reduced log of a log with the log's name and slice, made if it is not there.
 
-        A log of which there can be none is yielded as it is, and so is each one when the cache cannot be written;
+        A log that cannot be reduced is yielded as it is, and so is each log when the cache cannot be written;
         ``warn`` is given that, and which entry was damaged.
         """
         with scratch_folder() as scratch:

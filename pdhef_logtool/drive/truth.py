@@ -257,7 +257,7 @@ def truth_at(
 
     Returns
     -------
-    StateTrack "truth" with ``stamps_ns``; NaN and ``valid`` False outside the data and across steps of more than
+    StateTrack ``truth`` with ``stamps_ns``; NaN and ``valid`` False outside the data and across steps of more than
     ``truth.max_gap_s``. Sideslip is recomputed from the interpolated velocities where both are known.
     """
     track = truth.track

@@ -66,7 +66,7 @@ class DrivePlan:
 
     Attributes
     ----------
-    survey_truth : the truth's channels that it was decided on.
+    survey_truth : channels of the ground truth that it was decided on.
     latency : of the ground truth against the sensors; None without ground truth yaw rate or gyro.
     dependent : ground truth quantities that are an input of the estimators, with the reason.
     derivation : by ground truth quantity, how it is derived.
@@ -92,8 +92,8 @@ class DrivePlan:
     @property
     def truth_latency_s(self) -> float:
         """Latency that all estimators' comparison with ground truth uses; 0 unless it is out of its own uncertainty."""
-        known = self.latency is not None and abs(self.latency.latency_s) > 2.0 * self.latency.std_error_s
-        return self.latency.latency_s if known and self.latency is not None else 0.0
+        is_significant = self.latency is not None and abs(self.latency.latency_s) > 2.0 * self.latency.std_error_s
+        return self.latency.latency_s if is_significant and self.latency is not None else 0.0
 
     @property
     def has_truth_pose(self) -> bool:
@@ -206,9 +206,9 @@ def with_gyro_delay(mapping: Mapping, vehicle: VehicleParameters) -> Mapping:
 class DriveReader:
     """Reads a planned drive once from start to end; ``losses``, ``samples`` and ``counts`` grow while it does.
 
-    A drive of a single window keeps it for whoever asks again. ``counts`` are those of
-    :class:`~pdhef_logtool.mapping.channels.MappedChannels`, of all windows so far; ``hashes`` by role what the channels
-    held, complete once all windows were read.
+    A drive of a single window keeps it for the next request. ``counts`` are those of
+    :class:`~pdhef_logtool.mapping.channels.MappedChannels`, of all windows so far; ``hashes`` of the channels' content,
+    complete once all windows were read.
     """
 
     log: DriveLog
@@ -292,12 +292,12 @@ class DriveReader:
 
     def _hash(self, signals: dict[str, Channel], truth: dict[str, Channel], start_ns: int, end_ns: int | None) -> None:
         """Hash the samples with stamps in [start_ns, end_ns), which no later window changes."""
-        for channels, sources, found in (
+        for channels, sources, accumulator in (
             (signals, self.plan.mapping.signals, self.hashes["signal"]),
             (truth, self.plan.mapping.truth, self.hashes["truth"]),
         ):
             for name, channel in channels.items():
-                found.add(channel.between(start_ns, end_ns), round(sources[name].latency_s * 1e9))
+                accumulator.add(channel.between(start_ns, end_ns), round(sources[name].latency_s * 1e9))
 
     def ledger(self) -> tuple[SampleCount, ...]:
         """Return what became of every sample of the mapped topics; empty until all windows were read."""
@@ -308,9 +308,9 @@ class DriveReader:
     ) -> DriveWindow:
         plan = self.plan
         aligned = correct_signals(align(signals, plan.alignment, start_ns, end_ns), plan.vehicle)
-        found = count_late(signals, plan.alignment, start_ns, end_ns)
-        late = [Loss("late", _LATE, signals[n].source, start_ns, end_ns, count, "note") for n, count in found.items()]
-        for name, count in found.items():
+        counts = count_late(signals, plan.alignment, start_ns, end_ns)
+        late = [Loss("late", _LATE, signals[n].source, start_ns, end_ns, count, "note") for n, count in counts.items()]
+        for name, count in counts.items():
             self.counts["signal", name]["late"] += count
         self.losses = merge_losses([self.losses, late, _impossible(aligned)])
         at_stamps = None
@@ -345,9 +345,9 @@ def sample_ledger(
         if role == "signal" and name not in aligned:
             dropped[_NOT_NEEDED], used = used, 0
         clock = plan.clocks.get(clock_key(source), ClockModel())
-        known = {reason: n for reason, n in sorted(dropped.items()) if n}
+        reasons = {reason: n for reason, n in sorted(dropped.items()) if n}
         stamp = "log_time" if clock.unusable else source.stamp
-        samples.append(SampleCount(role, name, source.label, stamp, total, used, known))
+        samples.append(SampleCount(role, name, source.label, stamp, total, used, reasons))
     return tuple(samples)
 
 

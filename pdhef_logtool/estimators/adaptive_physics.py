@@ -1,9 +1,9 @@
-"""``physics`` and ``pd-hef``: the physics filter with trust times a network's residual, and an adaptive mechanism.
+"""``physics`` and ``pd-hef``: the physics filter with residual gain times a network's residual, adaptive.
 
-There is one set of noise, that of the car's physics: trust scales the residual only, and ``physics`` is trust 0 without
-a network. The mechanism (docs/method.md#adaptation) does not read model error as noise.
+There is one set of noise, that of the car's physics: the gain scales the residual only, and ``physics`` has gain 0 and
+no network. The mechanism (docs/method.md#adaptation) does not read model error as noise.
 
-Bottom layer: :mod:`~.sensor_faults` looks at a_y and yaw rate alone. What it finds goes into every filter here, the
+Bottom layer: :mod:`~.sensor_faults` checks a_y and yaw rate alone. What it finds goes into every filter here, the
 parallel one too, and keeps bad samples from the network.
 
 Top layer: a bank of filters on one pass of the network, each a hypothesis of what the car's model lacks. F1 lacks
@@ -15,7 +15,7 @@ measurements, forgotten within seconds, the weight of filter i is
 
 which is multiple-model estimation (Magill 1965) for what comes and goes. A cure has a filter where the car's driving
 has shown that it is worth having (:mod:`~pdhef_logtool.learning.car.physics_fit`), and nowhere else: a state more
-always fits something. A car of which nothing was found has F1 alone. The output is the mixture of all, its covariance
+always fits something. A car without identified parts has F1 alone. The output is the mixture of all, its covariance
 with their differences.
 """
 
@@ -223,7 +223,7 @@ class AdaptivePhysics:
     Parameters
     ----------
     physics : the car's filter with its parts and noise.
-    network : what its model lacks, None without; trust : share of that which all filters take, in [0, 1].
+    network : what its model lacks, None without; trust : residual gain of all filters, in [0, 1].
     adaptive : False leaves the mechanism out: no detector, and the car's filter alone, with its cures as states.
     notes : what the report states of it, such as the reason for its residual gain.
     """
@@ -252,7 +252,7 @@ class AdaptivePhysics:
         return tuple(replace(self.physics, vehicle=v, read_with=self.physics.read_with or vehicle) for v in vehicles)
 
     def inputs(self, signals: Signals, state: InputState | None) -> tuple[CheckedInputs, InputState]:
-        """Return what the filters take: checked signals with the residual at trust 1; and the state."""
+        """Return what the filters take: checked signals with the residual at gain 1; and the state."""
         if self.adaptive:
             return check_inputs(self.physics, self.network, signals, state)
         rate, after = residual_rate(self.physics, self.network, signals, state)
@@ -266,25 +266,25 @@ class AdaptivePhysics:
         filters = self.filters
         before: Sequence[FilterState | None] = c.filters if c else [None] * len(filters)
         runs = [f.run(faults.filtered, b, rate, faults.extra_r) for f, b in zip(filters, before, strict=True)]
-        steps = tuple(one for one, _ in runs)
+        steps = tuple(filter_steps for filter_steps, _ in runs)
         gathered, evidence = gather_evidence(steps, c.filters if c else None, c.evidence if c else None)
-        weights = weigh(gathered, np.stack([one.valid for one in steps], axis=1))
+        weights = weigh(gathered, np.stack([filter_steps.valid for filter_steps in steps], axis=1))
         raised = r_scale(faults.extra_r, self.physics.measurement_std)
         after = AdaptiveState(inputs, tuple(state for _, state in runs), evidence)
         return MixtureSteps(steps, weights, raised, faults.reason), after
 
     def predict(self, steps: MixtureSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate each filter's steps and mix them (see :class:`~.base.ModelPredictor`)."""
-        at, tracks = ahead.step, []
-        for h, (one, of_one) in enumerate(zip(self.filters, steps.filters, strict=True)):
-            weighed = of_one.valid[at] & (steps.weights[at, h] > 0.0)
-            tracks.append(one.predict(of_one, replace(ahead, usable=ahead.usable & weighed), stamps_ns))
-        track = mix(steps.weights[at], tracks) if len(tracks) > 1 else tracks[0]
+        step, tracks = ahead.step, []
+        for h, (physics_filter, of_one) in enumerate(zip(self.filters, steps.filters, strict=True)):
+            weighed = of_one.valid[step] & (steps.weights[step, h] > 0.0)
+            tracks.append(physics_filter.predict(of_one, replace(ahead, usable=ahead.usable & weighed), stamps_ns))
+        track = mix(steps.weights[step], tracks) if len(tracks) > 1 else tracks[0]
         columns: dict[str, Any] = {"network_trust": np.where(track.valid, self.trust, np.nan)}
         if self.adaptive:
-            columns["r_scale"] = np.where(track.valid, steps.r_scale[at], 1.0)
-            columns["mixture_weight"] = np.where(track.valid, 1.0 - steps.weights[at, 0], np.nan)
-            columns["reason"] = np.where(ahead.arrived, steps.reason[at], 0)
+            columns["r_scale"] = np.where(track.valid, steps.r_scale[step], 1.0)
+            columns["mixture_weight"] = np.where(track.valid, 1.0 - steps.weights[step, 0], np.nan)
+            columns["reason"] = np.where(ahead.arrived, steps.reason[step], 0)
         return replace(track, name=self.name, **columns)
 
 

@@ -135,7 +135,7 @@ def look_ahead_of(estimator: Estimator) -> float:
 
 
 def run_steps(estimator: Estimator, signals: Signals, state: Any | None, ahead: Signals | None) -> tuple[Any, Any]:
-    """Run one window; only an estimator that looks ahead gets what follows."""
+    """Run one window; only an estimator that is not causal gets what follows."""
     if isinstance(estimator, LookingAhead):
         return estimator.run(signals, state, ahead)
     return estimator.run(signals, state)
@@ -164,5 +164,5 @@ def linear_track(name: str, steps: Steps, ahead: Extrapolation, stamps_ns: IntAr
 
 
 def notes_of(estimator: Estimator) -> tuple[str, ...]:
-    """Return what a reader of the report must know of an estimator; only some have something to state."""
+    """Return the notes on an estimator for the reader of the report; most have none."""
     return tuple(getattr(estimator, "notes", ()))

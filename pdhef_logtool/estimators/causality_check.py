@@ -1,7 +1,7 @@
 """Check in every run that an estimator which declares itself causal does not look ahead.
 
 The harness compensates latency (:mod:`~.latency_compensation`), so that an estimate can only see the future through its
-steps: step k of a causal estimator is the same, whatever follows sample k. The check runs a window again from the same
+steps: step k of a causal estimator is the same for any samples after k. The check runs a window again from the same
 state with the samples behind a few stamps masked, and compares the steps before them.
 """
 
@@ -71,11 +71,11 @@ def largest_change(a: Any, b: Any) -> float:
 def _change(a: Any, b: Any) -> float:
     if a.shape != b.shape:
         return np.inf
-    known = np.isfinite(a) & np.isfinite(b)
-    if not np.array_equal(a[~known], b[~known], equal_nan=True):
+    is_finite = np.isfinite(a) & np.isfinite(b)
+    if not np.array_equal(a[~is_finite], b[~is_finite], equal_nan=True):
         return np.inf
-    difference = np.abs(a[known].astype(float) - b[known].astype(float))
-    size = max(float(np.abs(a[known]).max(initial=0.0)), np.finfo(float).tiny)
+    difference = np.abs(a[is_finite].astype(float) - b[is_finite].astype(float))
+    size = max(float(np.abs(a[is_finite]).max(initial=0.0)), np.finfo(float).tiny)
     return float(difference.max(initial=0.0)) / size
 
 

@@ -1,6 +1,6 @@
 """What filters that heed sensor faults start from: checked signals, and the network's residual made of them.
 
-The detector looks at the window, the parallel filter runs on what it leaves, and the network sees that filter's
+The detector checks the window, the parallel filter runs on what it leaves, and the network sees that filter's
 prediction in place of a bad sample. Without a network there is no parallel filter and no residual.
 """
 
@@ -30,7 +30,7 @@ class InputState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedInputs:
-    """What the detector found, and the network's residual rate [N, 2] in m/s² and rad/s², trust not yet applied."""
+    """What the detector found, and the network's residual rate [N, 2] in m/s² and rad/s², at gain 1."""
 
     faults: SensorFaults
     rate: FloatArray
@@ -72,7 +72,7 @@ def residual_rate(
     state: InputState | None,
     faults: SensorFaults | None = None,
 ) -> tuple[FloatArray, InputState]:
-    """Return the network's residual rate [N, 2] in m/s² and rad/s², 0 without a network; trust is not yet applied."""
+    """Return the network's residual rate [N, 2] in m/s² and rad/s², at gain 1; 0 without a network."""
     if network is None:
         return np.zeros((len(signals), 2)), InputState(None)
     features, steps, after = run_features(

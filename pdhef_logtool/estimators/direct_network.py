@@ -1,4 +1,4 @@
-"""``pure-lstm``: a network that says v_y itself, from what the hybrid filter's network sees, with no filter behind it.
+"""``pure-lstm``: a network that outputs v_y itself, from the inputs of the hybrid filter's network, without a filter.
 
 The paper's Pure-LSTM with the same information as PD-HEF: sensors, the parallel physics filter's outputs and friction.
 v_x is that filter's, the yaw rate the gyro's. At the scored stamp is what the sensors state of the latency:
@@ -27,22 +27,22 @@ if TYPE_CHECKING:
 _VX, _AX, _AY, _RATE = (FEATURES.index(n) for n in ("vx_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"))
 
 
-def direct_steps(vehicle: VehicleParameters, features: FloatArray, vy_m_s: FloatArray, known: BoolArray) -> Steps:
+def direct_steps(vehicle: VehicleParameters, features: FloatArray, vy_m_s: FloatArray, usable: BoolArray) -> Steps:
     """Return the steps of an estimator whose only own output is v_y; the other quantities are the features'.
 
     Parameters
     ----------
     vehicle : its roll gradient gives the planar a_y.
-    features : [K, f] of :func:`~.parallel_physics.run_features`. vy_m_s : [K]. known : [K], where both are known.
+    features : [K, f] of :func:`~.parallel_physics.run_features`. vy_m_s : [K]. usable : [K], where both are known.
     """
     values, rates = np.full((len(features), 4), np.nan), np.zeros((len(features), 4))
-    vx, yaw_rate, vy = features[known, _VX], features[known, _RATE], vy_m_s[known]
-    ay = features[known, _AY] / (1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2)
-    values[known, VX], values[known, VY] = vx, vy
-    values[known, YAW_RATE], values[known, AY] = yaw_rate, ay
-    rates[known, VX] = features[known, _AX] + vy * yaw_rate
-    rates[known, VY] = ay - vx * yaw_rate
-    return Steps(values, rates, known)
+    vx, yaw_rate, vy = features[usable, _VX], features[usable, _RATE], vy_m_s[usable]
+    ay = features[usable, _AY] / (1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2)
+    values[usable, VX], values[usable, VY] = vx, vy
+    values[usable, YAW_RATE], values[usable, AY] = yaw_rate, ay
+    rates[usable, VX] = features[usable, _AX] + vy * yaw_rate
+    rates[usable, VY] = ay - vx * yaw_rate
+    return Steps(values, rates, usable)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,8 +82,8 @@ class DirectNetwork:
         )
         starts = ~np.isfinite(physics.prior[:, 0])
         output, network = self.network.run(features, starts, state.network if state else None)
-        known = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
-        return direct_steps(self.vehicle, features, output[:, 0], known), DirectState(after, network)
+        usable = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
+        return direct_steps(self.vehicle, features, output[:, 0], usable), DirectState(after, network)
 
 
 def build(name: str, car: Car, options: Options) -> DirectNetwork:

@@ -100,8 +100,8 @@ def error_terms(
     if state is not None:
         steps = state.waiting.joined(steps)
     released = release(steps.ready_ns, signals.stamps_ns)
-    known = np.where(released.arrived[:, None], steps.terms[released.row], 0.0)
-    grip = known[:, 0]
+    arrived_terms = np.where(released.arrived[:, None], steps.terms[released.row], 0.0)
+    grip = arrived_terms[:, 0]
     terms = np.stack(
         [
             np.full(count, FLOOR_RAD),
@@ -109,8 +109,8 @@ def error_terms(
             _known(np.abs(track.sideslip_rad)),
             GRIP_RAD * grip,
             GRIP2_RAD * grip**2,
-            known[:, 1],
-            known[:, 2],
+            arrived_terms[:, 1],
+            arrived_terms[:, 2],
             _known(np.abs(track.sideslip_rad)) * _column(track, track.mixture_weight),
             np.abs(_column(track, track.bank_rad)),
         ],

@@ -1,6 +1,6 @@
 """Base of the unscented filters: everything at a step that does not depend on state and model.
 
-These functions reset after a time gap, hold missing inputs, start the filter, gate samples, hold a standstill, detect
+These functions reset after a time gap, keep missing inputs, start the filter, gate samples, stop it at rest, detect
 divergence and make the track of predicted steps. The first entries of every state are [v_x, v_y, r, b_ax]; a filter may
 append others, and :class:`Tuning` has noise, initial and standstill 1-sigma of each. A filter's own file moves sigma
 points and predicts measurements. The loop of its kernel is
@@ -611,8 +611,8 @@ def predicted_track(
 
     ``named`` gives the entries of the state that have a column in the track.
     """
-    at, x, covariance = ahead.step, predicted.x, predicted.P
-    usable = ahead.usable & np.isfinite(x[:, VX]) & rolls_forward(x[:, VX], steps.inputs[at, U_SPEED])
+    step, x, covariance = ahead.step, predicted.x, predicted.P
+    usable = ahead.usable & np.isfinite(x[:, VX]) & rolls_forward(x[:, VX], steps.inputs[step, U_SPEED])
     return make_track(
         name,
         stamps_ns,
@@ -623,11 +623,11 @@ def predicted_track(
         covariance=covariance,
         sideslip_std_rad=sideslip_std(x[:, VX], x[:, VY], covariance),
         r_scale=np.ones(len(stamps_ns)),
-        nis=np.where(usable, steps.nis[at], np.nan),
-        nis_dof=np.where(usable, steps.nis_dof[at], 0.0),
-        friction=np.where(usable, steps.inputs[at, U_FRICTION], np.nan),
+        nis=np.where(usable, steps.nis[step], np.nan),
+        nis_dof=np.where(usable, steps.nis_dof[step], 0.0),
+        friction=np.where(usable, steps.inputs[step, U_FRICTION], np.nan),
         valid=usable,
-        diverged=usable & steps.diverged[at],
+        diverged=usable & steps.diverged[step],
         **{column: np.where(usable, x[:, i], np.nan) for column, i in named.items()},
     )
 

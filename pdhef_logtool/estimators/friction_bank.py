@@ -2,7 +2,7 @@
 
 Every filter j of the bank has the state [v_y, r] at its own friction μ_j, and the speed and held inputs of one
 ``phy-ukf`` beside the bank. It is an extended Kalman filter on the nominal model, a_y corrected for body roll, R at
-model-error level: below some four tenths of the grip a model error says more than friction does, and must not move it.
+model-error level: below some four tenths of the grip a model error has more effect than friction, and must not move it.
 
 The weights follow w_j ∝ (w_j^f · prior_j^(1−f)) · L_j^η with f = exp(−Δt/τ): what was seen is forgotten with the time
 constant τ, and where nothing shows frictions apart the dry prior comes back. L_j is the likelihood of the innovations
@@ -59,7 +59,7 @@ BOUND_SHARE, BOUND_SMOOTHING_S = 0.9, 0.1
 #: Friction is observable where the 1-sigma of the weights is below this; that of the prior is 0.23.
 OBSERVABLE_STD = 0.12
 
-#: A speed that changes by this much more or less than a_x + v_y r says, smoothed over the time beside it (no hill is so
+#: A speed that changes by this much more or less than a_x + v_y r, smoothed over the time beside it (no hill is so
 #: steep), is that of wheels that spin or lock; the bank then waits for the last time.
 WHEEL_SLIP_M_S2, WHEEL_SLIP_SMOOTHING_S, WHEEL_SLIP_WAIT_S = 3.0, 0.2, 2.0
 
@@ -108,8 +108,7 @@ def _advance(v, vy, r, steer, friction, dt, n, p):  # type: ignore[no-untyped-de
 def _step(x, P, over, now, friction, dt, p):  # type: ignore[no-untyped-def]
     """Take one filter over a step, x [2] and P [3] (vv, vr, rr) in place; return its log-likelihood, not normalised.
 
-    ``over`` are speed and steering that hold over the step, ``now`` those at its end, a_y and yaw rate, either of which
-    may be NaN.
+    ``over`` are speed and steering over the step, ``now`` those at its end, a_y and yaw rate; the last two may be NaN.
     """
     v, steer = over
     v_now, steer_now, ay, yaw_rate = now
@@ -241,9 +240,9 @@ class FrictionBank:
 
     @property
     def _speed_filter(self) -> PhysicsUkf:
-        told = self.vehicle.model_copy(update={"friction": USUAL_FRICTION})
-        # The bank looks for slipping wheels itself and waits.
-        return PhysicsUkf(told, use_speed=self.use_speed, slip_gate=False)
+        vehicle = self.vehicle.model_copy(update={"friction": USUAL_FRICTION})
+        # The bank detects slipping wheels itself and waits.
+        return PhysicsUkf(vehicle, use_speed=self.use_speed, slip_gate=False)
 
     @property
     def ay_per_friction(self) -> float:

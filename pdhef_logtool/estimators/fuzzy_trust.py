@@ -1,4 +1,4 @@
-"""The paper's fuzzy scheduler: trust in the network from two signs that the model fails (Eq 24, 25, Table 2).
+"""The paper's fuzzy scheduler: residual gain from two signs that the model fails (Eq 24, 25, Table 2).
 
 Inputs are E_ay = |a_y,m − a_y,nom| and I_dyn = |a_y,m| / (μ g), each in three overlapping sets. The paper gives Table 2
 and no set; docs/method.md#paper-adaptation fixes the sets: triangles with shoulders whose tops are at the constants
@@ -18,7 +18,7 @@ DEVIATION_TOPS_M_S2 = (0.3, 1.0, 2.5)
 INTENSITY_TOPS = (0.3, 0.6, 0.85)
 #: Table 2: rows I_dyn small, medium, large; columns E_ay small, medium, large.
 RULES = ((0.1, 0.2, 0.3), (0.3, 0.5, 0.7), (0.5, 0.8, 0.9))
-#: Trust where nothing is known: the rule of the undisturbed drive.
+#: Residual gain where nothing is known: the rule of the undisturbed drive.
 NOMINAL_TRUST = RULES[0][0]
 
 

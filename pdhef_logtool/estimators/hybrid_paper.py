@@ -62,7 +62,7 @@ PROCESS_NOISE_GAIN = 3.0
 #: Undisturbed norm of R in the paper's Figure 20; a_y has nearly all of it, so that it is the variance of a_y, m²/s⁴.
 PAPER_R_NORM = 0.1
 
-# Behind the entries of the shell's memory: β, and C of Eq 22 a measurement.
+# Behind the entries of the filter base's memory: β, and C of Eq 22 a measurement.
 M_TRUST, M_INNOVATION = base.MEMORY, base.MEMORY + 1
 MEMORY = M_INNOVATION + base.MEASUREMENTS
 
@@ -84,7 +84,7 @@ class PaperState:
 
     physics: FilterState
     network: NetworkCarry
-    own: base.FilterState
+    filter_state: base.FilterState
 
 
 class Parallel(NamedTuple):
@@ -107,10 +107,10 @@ def _propagate(chi, over, rate, dt, p, points):  # type: ignore[no-untyped-def]
     set_points(chi, over.steer, over.ax, (0.0, 0.0), points)
     advance_points(points, over.friction, dt, substeps(chi[0, base.VX], dt, over.friction, p), p)
     for i in range(chi.shape[0]):
-        at = place(i)
-        chi[i, base.VX] = points[at + AT_VX]
-        chi[i, base.VY] = points[at + AT_VY] + share * rate_vy
-        chi[i, base.YAW_RATE] = points[at + AT_YAW_RATE] + share * rate_r
+        place_i = place(i)
+        chi[i, base.VX] = points[place_i + AT_VX]
+        chi[i, base.VY] = points[place_i + AT_VY] + share * rate_vy
+        chi[i, base.YAW_RATE] = points[place_i + AT_YAW_RATE] + share * rate_r
 
 
 @njit(cache=True)
@@ -133,7 +133,7 @@ def _filter(window, tuning, r0, p, parallel, estimate, out, adapted):  # type: i
     """Run over one window; ``estimate`` is moved in place.
 
     Where the prior of the parallel filter is missing it starts, and this filter with it. ``r0`` [3] is R_0, and
-    ``adapted`` trust and scale of R at each step, [K] each.
+    ``adapted`` residual gain and scale of R at each step, [K] each.
     """
     dt, _, _, ay, yaw_rate, speed, _, rate, _ = window
     q_std, _, initial_std, _, wm, wc, scale, rules = tuning
@@ -313,8 +313,8 @@ class PaperHybridUkf:
         )
         starts = ~np.isfinite(physics.prior[:, base.VX])
         rate, network = self.network.run(features, starts, state.network if state else None)
-        steps, own = self._filter_steps(signals, physics, rate, state.own if state else None)
-        return steps, PaperState(after, network, own)
+        steps, filter_state = self._filter_steps(signals, physics, rate, state.filter_state if state else None)
+        return steps, PaperState(after, network, filter_state)
 
     def predict(self, steps: PaperSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate steps with the nominal model and the residual held (see :class:`~.base.ModelPredictor`)."""

@@ -57,13 +57,13 @@ class TrackCalibrator:
     algorithms : by name, the algorithm that ran, then others whose intervals apply to it. Intervals are looked up by
         the identity of the algorithm; differences of noise, parameters and network are reported.
     of_car : whether the intervals were calibrated for this car, not for the shipped one.
-    own : by name, the note for intervals that are not changed.
+    fixed_notes : by name, the note for intervals that are not changed.
     posterior : by name, the function that widens intervals where the car has none.
     """
 
     intervals: Intervals | None
     algorithms: Mapping[str, Sequence[Algorithm]]
-    own: Mapping[str, str] = field(default_factory=dict)
+    fixed_notes: Mapping[str, str] = field(default_factory=dict)
     posterior: Mapping[str, Widening] = field(default_factory=dict)
     of_car: bool = True
     _carries: dict[str, FeatureState] = field(default_factory=dict)
@@ -73,13 +73,13 @@ class TrackCalibrator:
         """Return the next window of a track with calibrated intervals; unchanged without an entry."""
         if np.isfinite(track.sideslip_std_rad).any():
             self._has_interval.add(track.name)
-        found = self._found(track.name)
-        if self.intervals is None or found is None:
+        matched = self._found(track.name)
+        if self.intervals is None or matched is None:
             return self.posterior[track.name](track, signals) if track.name in self.posterior else track
         track, self._carries[track.name] = calibrated(
             track,
             signals,
-            found[0].inflation,
+            matched[0].inflation,
             self.intervals.roll_gradient_rad_per_m_s2,
             self._carries.get(track.name),
         )
@@ -89,10 +89,10 @@ class TrackCalibrator:
         """Return the report's notes on an estimator's intervals; empty without intervals."""
         if name not in self._has_interval:
             return ()
-        if name in self.own:
-            return (self.own[name],)
-        found = self._found(name)
-        if self.intervals is None or found is None:
+        if name in self.fixed_notes:
+            return (self.fixed_notes[name],)
+        matched = self._found(name)
+        if self.intervals is None or matched is None:
             other = self.mismatch(name)
             return (
                 POSTERIOR_NOTE if name in self.posterior else "intervals not calibrated",
@@ -100,7 +100,7 @@ class TrackCalibrator:
             )
         made = self.intervals
         of = f"wrong by {made.spread:g}" if made.spread > 0.0 else "as given"
-        then, now = found[0].algorithm, found[1]
+        then, now = matched[0].algorithm, matched[1]
         others = [
             what
             for what, differs in (
@@ -165,16 +165,16 @@ def inflated(track: StateTrack, terms: FloatArray, inflation: Inflation) -> Stat
     """Scale a track's standard deviations and covariance; ``terms`` [N, 9]. NaN stays NaN."""
     from pdhef_logtool.estimators.error_features import grip_share
 
-    own = track.sideslip_std_rad
+    sideslip_std = track.sideslip_std_rad
     sideslip = combined(terms, _ordered(inflation.sideslip, SIDESLIP_TERMS))
     sideslip = np.minimum(sideslip * grip_factor(grip_share(terms), inflation.grip_factors), MAX_SIDESLIP_STD_RAD)
-    sideslip = np.where(np.isfinite(own), sideslip, np.nan)
+    sideslip = np.where(np.isfinite(sideslip_std), sideslip, np.nan)
     covariance = track.covariance
     if covariance.shape[0]:
         rate_std = track.yaw_rate_std_rad_s
         rate = combined(yaw_rate_terms(terms, rate_std), _ordered(inflation.yaw_rate, YAW_RATE_TERMS))
         scale = np.ones((len(track), 3))
-        scale[:, 1] = inflation.vy_factor * _ratio(sideslip, own)
+        scale[:, 1] = inflation.vy_factor * _ratio(sideslip, sideslip_std)
         scale[:, 2] = _ratio(rate, rate_std)
         covariance = covariance * scale[:, :, None] * scale[:, None, :]
     return replace(track, sideslip_std_rad=sideslip, covariance=covariance)
@@ -196,8 +196,8 @@ def grip_factor(share: FloatArray, factors: Sequence[float]) -> FloatArray:
 
 def yaw_rate_terms(terms: FloatArray, rate_std: FloatArray) -> FloatArray:
     """Return the yaw rate's terms [N, 3] from the sideslip's terms and the estimator's standard deviation [N]."""
-    known = np.where(np.isfinite(rate_std), rate_std, 0.0)
-    return np.stack([terms[:, 0], known, terms[:, SIDESLIP_TERMS.index("yaw_rate")]], axis=1)
+    finite_std = np.where(np.isfinite(rate_std), rate_std, 0.0)
+    return np.stack([terms[:, 0], finite_std, terms[:, SIDESLIP_TERMS.index("yaw_rate")]], axis=1)
 
 
 def _ratio(new: FloatArray, old: FloatArray) -> FloatArray:

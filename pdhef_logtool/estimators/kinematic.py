@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.estimators.presets import Options
 
 #: Time constant of the leak, s. A pure integrator drifts by bias · time (0.08 m/s² gives 24 m/s in five minutes).
-#: Chosen against the truth of simulated drives by ``studies.defaults.tune_kinematic_leak``, which is to its advantage.
+#: Tuned to ground truth of simulated drives by ``studies.defaults.tune_kinematic_leak``, which is to its advantage.
 LEAK_S = 0.7
 STANDSTILL_SPEED_M_S = 0.05
 
@@ -28,20 +28,20 @@ def _kinematic(sensors, leak_s, state, values, rates, valid):  # type: ignore[no
     # state: v_x, age of the speed sample, v_y, v̇_y of the step before
     for k in range(dt.shape[0]):
         advance_speed(state, dt[k], ax[k], speed[k])
-        known = math.isfinite(state[0]) and math.isfinite(yaw_rate[k]) and math.isfinite(ay[k])
+        is_complete = math.isfinite(state[0]) and math.isfinite(yaw_rate[k]) and math.isfinite(ay[k])
         if not dt[k] <= RESTART_GAP_S or not math.isfinite(state[2]) or abs(state[0]) < STANDSTILL_SPEED_M_S:
             state[2] = 0.0
             state[3] = 0.0
         else:
             state[2] += state[3] * dt[k]
-        vy_dot = ay[k] - state[0] * yaw_rate[k] - state[2] / leak_s if known else 0.0
+        vy_dot = ay[k] - state[0] * yaw_rate[k] - state[2] / leak_s if is_complete else 0.0
         state[3] = vy_dot
         values[k, VX] = state[0]
         values[k, VY] = state[2]
         values[k, YAW_RATE] = yaw_rate[k]
         values[k, AY] = ay[k]
         rates[k, VY] = vy_dot
-        valid[k] = known
+        valid[k] = is_complete
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ A sample arrives later than it was measured. What a receiver has at a scored sta
 and those of all steps before it, had arrived by t (``Signals.ready_ns``). The estimate at t is that step extrapolated
 over the whole latency t - t_k. An estimator returns steps and has no part in this choice.
 
-An estimator that looks ahead is not causal: it has each step at the step's own stamp.
+An estimator that reads later samples is not causal: it has each step at the step's own stamp.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def run_window(
     Parameters
     ----------
     before : state that the previous window returned, None at the start of a log.
-    ahead : signals that follow the window, for an estimator that looks ahead.
+    ahead : signals that follow the window, for an estimator that is not causal.
     causality : checks the steps of an estimator that declares itself causal.
 
     Raises

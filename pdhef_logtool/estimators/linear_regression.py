@@ -58,7 +58,7 @@ class LinearRegression:
             signals,
             state.physics if state else None,
         )
-        known = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
+        usable = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
         starts = ~np.isfinite(physics.prior[:, VX])
         before_ns = state.last_stamp_ns if state else None
         sideslip = np.zeros(1) if state is None else state.sideslip.copy()
@@ -68,7 +68,7 @@ class LinearRegression:
         low_pass(beta, dt, self.model.low_pass_hz, sideslip, beta)
         # Sideslip is an angle of the velocity: beyond 80 degrees the line has left its range.
         vy = features[:, 0] * np.tan(np.clip(beta[:, 0], -1.4, 1.4))
-        steps = direct_steps(self.vehicle, features, vy, known)
+        steps = direct_steps(self.vehicle, features, vy, usable)
         return steps, RegressionState(after, sideslip, last_stamp_ns(signals.stamps_ns, before_ns))
 
 

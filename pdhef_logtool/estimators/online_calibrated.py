@@ -111,7 +111,7 @@ class OnlineBand:
         """Return the next window of a track [N] with wider 1-sigmas of sideslip and v_y."""
         if not len(signals):
             return track
-        if signals is not self._window:  # tracks of one window share its parts, by which the bands recognise it
+        if signals is not self._window:  # tracks of one window share its parts, which identify it for the intervals
             self._window, spans = signals, _spans(_stage_of(signals.stamps_ns, self.stages))
             self._parts = [(number, first, last, signals.rows(first, last)) for number, first, last in spans]
         parts = []

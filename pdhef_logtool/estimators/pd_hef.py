@@ -1,6 +1,6 @@
-"""``pd-hef`` and its variants: ``physics`` of the car plus trust times what the network states that it lacks.
+"""``pd-hef`` and its variants: ``physics`` of the car plus residual gain times the network's residual.
 
-The trust is what the car's evidence allows; without a network or evidence it is 0, and ``pd-hef`` is ``physics``.
+The gain is what the car's evidence allows; without a network or evidence it is 0, and ``pd-hef`` is ``physics``.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """``phy-ukf``: the pure physics unscented Kalman filter on the nominal single-track model (docs/method.md#filter).
 
 State [v_x, v_y, r, b_ax]; b_ax is a slow bias of the longitudinal accelerometer (grade, pitch). Measurements
-[a_y, r, v_x], each of which may be missing at any step. Without options this is the paper's physics baseline and
+[a_y, r, v_x]; each may be missing at any step. Without options this is the paper's physics baseline and
 frozen: R at sensor level from the vehicle file, Q by innovation likelihood (``studies/defaults/tune_physics_q.py``).
 Everything that is not the model is in :mod:`~.filter_base`.
 """
@@ -72,10 +72,10 @@ def _propagate(chi, over, rate, dt, p, points):  # type: ignore[no-untyped-def]
     set_points(chi, over.steer, over.ax, (share * rate_vy, share * rate_r), points)
     advance_points(points, over.friction, dt, substeps(chi[0, 0], dt, over.friction, p), p)
     for i in range(chi.shape[0]):
-        at = place(i)
-        chi[i, base.VX] = points[at + AT_VX]
-        chi[i, base.VY] = points[at + AT_VY] + share * rate_vy
-        chi[i, base.YAW_RATE] = points[at + AT_YAW_RATE] + share * rate_r
+        place_i = place(i)
+        chi[i, base.VX] = points[place_i + AT_VX]
+        chi[i, base.VY] = points[place_i + AT_VY] + share * rate_vy
+        chi[i, base.YAW_RATE] = points[place_i + AT_YAW_RATE] + share * rate_r
 
 
 @njit(cache=True)
@@ -88,12 +88,12 @@ def set_points(chi, steer, ax, more, points):  # type: ignore[no-untyped-def]
     s = chi.shape[0]
     for column in range(place_count(points)):
         i = column if column < s else 0
-        at = place(column)
-        points[at + AT_VX] = chi[i, base.VX]
-        points[at + AT_VY] = chi[i, base.VY] + more_vy
-        points[at + AT_YAW_RATE] = chi[i, base.YAW_RATE] + more_r
-        points[at + AT_STEER] = steer
-        points[at + AT_AX] = ax - chi[i, base.AX_BIAS]
+        column_place = place(column)
+        points[column_place + AT_VX] = chi[i, base.VX]
+        points[column_place + AT_VY] = chi[i, base.VY] + more_vy
+        points[column_place + AT_YAW_RATE] = chi[i, base.YAW_RATE] + more_r
+        points[column_place + AT_STEER] = steer
+        points[column_place + AT_AX] = ax - chi[i, base.AX_BIAS]
 
 
 @njit(cache=True)
@@ -103,8 +103,8 @@ def measure_sigma_points(chi, steer, friction, rate_vy, p, points, zeta):  # typ
     set_points(chi, steer, 0.0, (0.0, 0.0), points)
     measure_points(points, friction, p)
     for i in range(chi.shape[0]):
-        at = place(i)
-        zeta[i, base.Z_AY] = points[at + AT_AY] + residual
+        place_i = place(i)
+        zeta[i, base.Z_AY] = points[place_i + AT_AY] + residual
         zeta[i, base.Z_YAW_RATE] = chi[i, base.YAW_RATE]
         zeta[i, base.Z_SPEED] = chi[i, base.VX]
 

@@ -72,7 +72,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
 
 #: Process noise, 1-sigma per square root of second, of [v_x, v_y, r, b_ax, f_f, f_r] where the car has none of its own,
-#: and where identification looks for it. By innovation likelihood over simulated drives, as that of ``phy-ukf``, with
+#: and where identification searches it. By innovation likelihood over simulated drives, as that of ``phy-ukf``, with
 #: lag, load transfer and biases, and frozen: ``studies.defaults.tune_physics_q`` finds 0.078, 0.13, 0.01, 0.062, 0.39.
 PHYSICS_Q_STD = (0.085, 0.12, 0.012, 0.086, 0.41, 0.41)
 #: 1-sigma of the axles' forces over the mass at the start, and at a standstill, m/s².
@@ -151,26 +151,26 @@ def _moments(points, scale, q, constants, x, P, whole):  # type: ignore[no-untyp
     weight = 0.5 / scale
     per_weight = 1.0 / math.sqrt(weight)
     for j in range(AY_BIAS):
-        at = j * WIDTH
-        centre = points[at + _CENTRE]
+        row = j * WIDTH
+        centre = points[row + _CENTRE]
         about = spread(centre)
-        a, b, c = load(points, at) - about, load(points, at + LANES) - about, load(points, at + 2 * LANES) - about
+        a, b, c = load(points, row) - about, load(points, row + LANES) - about, load(points, row + 2 * LANES) - about
         moved = weight * total(a + b + c)
-        store(points, at, a)
-        store(points, at + LANES, b + spread(per_weight * moved) * load(constants.centre, 0))
-        store(points, at + 2 * LANES, c)
+        store(points, row, a)
+        store(points, row + LANES, b + spread(per_weight * moved) * load(constants.centre, 0))
+        store(points, row + 2 * LANES, c)
         x[j] = centre + moved
     share = spread(weight)
     for i in range(PLACES if whole else base.MOTION):
-        at = i * ROOM
+        row = i * ROOM
         product = share * inner_products(points, WIDTH, i * WIDTH, 0, LANES)
-        store(P, at, product + spread(q[i]) * load(constants.unit, ROOM - i))
+        store(P, row, product + spread(q[i]) * load(constants.unit, ROOM - i))
         if whole:
             product = share * inner_products(points, WIDTH, i * WIDTH, LANES * WIDTH, _REST)
             if i >= AY_BIAS:  # no point shows the covariance of the sensors' biases with each other, and it stays
-                kept = load(constants.biases, 0) * load(P, at + LANES)
+                kept = load(constants.biases, 0) * load(P, row + LANES)
                 product = load(constants.others, 0) * product + kept
-            store(P, at + LANES, product + spread(q[i]) * load(constants.unit, ROOM - i + LANES))
+            store(P, row + LANES, product + spread(q[i]) * load(constants.unit, ROOM - i + LANES))
 
 
 @_inlined
@@ -178,8 +178,8 @@ def _keep_before(points, x, P, places, before, cross):  # type: ignore[no-untype
     """Write what drawn points differ from their centre x, and of the cross covariance [n, n] the sensors' biases."""
     for j in range(PLACES):
         centre = spread(x[j] if j < AY_BIAS else 0.0)
-        for at in range(j * WIDTH, (j + 1) * WIDTH, LANES):
-            store(before, at, load(points, at) - centre)
+        for offset in range(j * WIDTH, (j + 1) * WIDTH, LANES):
+            store(before, offset, load(points, offset) - centre)
     for a in range(places.shape[0]):
         for b in range(places.shape[0]):
             cross[a, b] = P[places[a], places[b]]
@@ -193,8 +193,8 @@ def _cross(before, points, scale, places, cross):  # type: ignore[no-untyped-def
     """
     weight = 0.5 / scale
     for i in range(places.shape[0]):
-        at = places[i] * WIDTH
-        a, b, c = load(before, at), load(before, at + LANES), load(before, at + 2 * LANES)
+        offset = places[i] * WIDTH
+        a, b, c = load(before, offset), load(before, offset + LANES), load(before, offset + 2 * LANES)
         for j in range(places.shape[0]):
             to = places[j] * WIDTH
             if places[i] < AY_BIAS or places[j] < AY_BIAS:
@@ -274,10 +274,10 @@ def _measure(x, P, steer, rate_vy, layout, p, f, row, z_hat, S, Pxz):  # type: i
             high = high + spread(row[b]) * load(P, b * ROOM + LANES)
     store(Pxz, base.Z_AY * ROOM, low)
     store(Pxz, base.Z_AY * ROOM + LANES, high)
-    for at in (0, LANES):
-        rate = load(P, YAW_RATE * ROOM + at) + load(P, RATE_BIAS * ROOM + at)
-        store(Pxz, base.Z_YAW_RATE * ROOM + at, rate)
-        store(Pxz, base.Z_SPEED * ROOM + at, load(P, VX * ROOM + at))
+    for offset in (0, LANES):
+        rate = load(P, YAW_RATE * ROOM + offset) + load(P, RATE_BIAS * ROOM + offset)
+        store(Pxz, base.Z_YAW_RATE * ROOM + offset, rate)
+        store(Pxz, base.Z_SPEED * ROOM + offset, load(P, VX * ROOM + offset))
     of_ay, of_rate, of_speed = 0.0, 0.0, 0.0
     for b in range(PLACES):
         if row[b] != 0.0:
@@ -302,16 +302,16 @@ def _update(x, P, nu, S, Pxz, use, index, root, w, gain):  # type: ignore[no-unt
     gain[:, :] = 0.0
     w[used:] = 0.0
     for i in range(used):
-        for at in (0, LANES):
-            of = load(Pxz, index[i] * ROOM + at)
+        for offset in (0, LANES):
+            of = load(Pxz, index[i] * ROOM + offset)
             for j in range(i):
-                of = of - spread(root[i, j]) * load(gain, j * ROOM + at)
-            store(gain, i * ROOM + at, spread(1.0 / root[i, i]) * of)
-    for at in (0, LANES):
-        a, b, c = load(gain, at), load(gain, ROOM + at), load(gain, 2 * ROOM + at)
-        store(x, at, load(x, at) + spread(w[0]) * a + spread(w[1]) * b + spread(w[2]) * c)
+                of = of - spread(root[i, j]) * load(gain, j * ROOM + offset)
+            store(gain, i * ROOM + offset, spread(1.0 / root[i, i]) * of)
+    for offset in (0, LANES):
+        a, b, c = load(gain, offset), load(gain, ROOM + offset), load(gain, 2 * ROOM + offset)
+        store(x, offset, load(x, offset) + spread(w[0]) * a + spread(w[1]) * b + spread(w[2]) * c)
         for i in range(PLACES):
-            to = i * ROOM + at
+            to = i * ROOM + offset
             left = load(P, to) - spread(gain[0, i]) * a - spread(gain[1, i]) * b - spread(gain[2, i]) * c
             store(P, to, left)
     return nis, used, log_likelihood
@@ -320,10 +320,10 @@ def _update(x, P, nu, S, Pxz, use, index, root, w, gain):  # type: ignore[no-unt
 @_compiled
 def _finite(x, P):  # type: ignore[no-untyped-def]
     """Return whether state and variances are numbers; so are all covariances then."""
-    found = 0.0
+    total = 0.0
     for i in range(PLACES):
-        found += x[i] + P[i, i]
-    return math.isfinite(found)
+        total += x[i] + P[i, i]
+    return math.isfinite(total)
 
 
 @_compiled
@@ -547,8 +547,8 @@ class PhysicsFilter(base.LinkedFilter):
         if layout.sensor_bias >= 0:
             of_ay, of_rate, of_steer = BIAS_WALK_STD
             initial[layout.steer_bias], walk[layout.steer_bias] = s.steer_bias_std_rad, of_steer
-            for at, std, of in ((0, s.ay_bias_std_m_s2, of_ay), (1, s.yaw_rate_bias_std_rad_s, of_rate)):
-                initial[layout.sensor_bias + at], walk[layout.sensor_bias + at] = std, of
+            for bias, std, of in ((0, s.ay_bias_std_m_s2, of_ay), (1, s.yaw_rate_bias_std_rad_s, of_rate)):
+                initial[layout.sensor_bias + bias], walk[layout.sensor_bias + bias] = std, of
         return base.make_tuning(
             self.vehicle,
             walk.tolist(),
@@ -600,12 +600,12 @@ def physics_filter(
 def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:
     """Return ``physics`` of a car, with what was found through it and its noise where the car has them.
 
-    A car of which nothing was found has no part: a static single track with the sensors' noise. What tuned noise leaves
+    A car without identified parts has none: a static single track with the sensors' noise. What tuned noise leaves
     out of the process noise is what was found through the filter.
     """
     vehicle, noise = car.physics_vehicle, car.noise.get(PHYSICS)
     if noise is not None and car.fitted_physics is not None:
         fitted = car.fitted_physics.noise.q_std
         noise = noise.model_copy(update={"q_std": (*noise.q_std, *fitted[len(noise.q_std) :])})
-    found = physics_filter(vehicle, noise, use_speed=use_speed)
-    return found if vehicle == car.vehicle else replace(found, read_with=car.vehicle)
+    physics = physics_filter(vehicle, noise, use_speed=use_speed)
+    return physics if vehicle == car.vehicle else replace(physics, read_with=car.vehicle)

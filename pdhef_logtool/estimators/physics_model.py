@@ -86,7 +86,7 @@ class Layout(NamedTuple):
             "ay_bias_m_s2": self.sensor_bias,
             "yaw_rate_bias_rad_s": self.sensor_bias + 1 if self.sensor_bias >= 0 else -1,
         }
-        return {name: at for name, at in places.items() if at >= 0}
+        return {name: place for name, place in places.items() if place >= 0}
 
 
 @njit(cache=True)
@@ -106,7 +106,7 @@ def spread_layout(layout):  # type: ignore[no-untyped-def]
 def places_of(layout):  # type: ignore[no-untyped-def]
     """Return where each entry of a state [n] is in one in which every part has its place, [n]."""
     places = np.arange(layout.size)
-    for at, place, width in (
+    for position, place, width in (
         (layout.roll, ROLL, 2),
         (layout.bank, BANK, 1),
         (layout.force_scale, FORCE_SCALE, 1),
@@ -114,8 +114,8 @@ def places_of(layout):  # type: ignore[no-untyped-def]
         (layout.sensor_bias, AY_BIAS, 2),
     ):
         for i in range(width):
-            if at >= 0:
-                places[at + i] = place + i
+            if position >= 0:
+                places[position + i] = place + i
     return places
 
 
@@ -140,12 +140,12 @@ class PhysicsParameters(NamedTuple):
 def layout_of(vehicle: VehicleParameters) -> Layout:
     """Return where the states of a car's parts are."""
     parts = vehicle.physics
-    at = CORE
+    size = CORE
     places = []
     for has, width in ((parts.roll, 2), (parts.bank, 1), (parts.force_scale, 1), (parts.biases, 1), (parts.biases, 2)):
-        places.append(at if has else -1)
-        at += width if has else 0
-    return Layout(at, *places)
+        places.append(size if has else -1)
+        size += width if has else 0
+    return Layout(size, *places)
 
 
 def physics_parameters(vehicle: VehicleParameters) -> PhysicsParameters:
@@ -341,13 +341,13 @@ def advance(points, count, over, dt, n, layout, p, f):  # type: ignore[no-untype
         here = min(count - first, WIDTH)
         block[:] = 0.0
         for i in range(layout.size):
-            at = places[i] * WIDTH
-            block[at : at + WIDTH] = points[i, first]
-            block[at : at + here] = points[i, first : first + here]
+            offset = places[i] * WIDTH
+            block[offset : offset + WIDTH] = points[i, first]
+            block[offset : offset + here] = points[i, first : first + here]
         advance_block(block, here, vx, over, dt, n, spread_layout(layout), p, f)
         for i in range(layout.size):
-            at = places[i] * WIDTH
-            points[i, first : first + here] = block[at : at + here]
+            offset = places[i] * WIDTH
+            points[i, first : first + here] = block[offset : offset + here]
 
 
 @njit(cache=True)

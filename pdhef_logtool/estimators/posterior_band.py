@@ -1,4 +1,4 @@
-"""95 % bands of an identified car: what the drives that it was identified on leave open of its parameters.
+"""95 % confidence intervals of an identified car, from the spread of its parameters after identification.
 
     s² = (k_o s_own)² + Σ_i (v_y,i − v_y)² / v_x² + w²
 
@@ -60,7 +60,7 @@ class PosteriorBand:
 
 
 def posterior_band(car: Car, *, use_speed: bool = True) -> PosteriorBand | None:
-    """Return the band of a car; None where identification has kept no posterior, or its log has calibrated it."""
+    """Return the intervals of a car; None where identification has kept no posterior, or its log has calibrated it."""
     if car.self_calibrated is not None or not car.varied_physics:
         return None
     physics, none = of_car(car, use_speed=use_speed), dict.fromkeys(CURES, False)

@@ -7,7 +7,7 @@ Their variance of sideslip is their own, what the parameters leave open, and wha
 
     s² = s_own² + s_car² + (Σ_i (2 (v_y,i − v_y))² + (lateral kinematic consistency / 2)²) / v_x²,
 
-where v_y,i is that of the physics filter on the vehicle one posterior 1-sigma away in direction i, and d2 is that of
+where v_y,i is that of the physics filter on the vehicle one posterior 1-sigma away in direction i, and d² that of
 the whole log as far as it goes with the driving. The posterior is doubled, for the directions are only the five that
 move the sideslip most. s_car is what no parameter of a single track explains: nearly constant within a drive, it
 differs between drives and cars. That of v_y is the same sum as a velocity.
@@ -57,25 +57,25 @@ class CalibratedBand:
 
     def add(self, track: StateTrack, signals: Signals) -> StateTrack:
         """Return the next window of a track [N] with wider 1-sigmas of sideslip and v_y."""
-        found = self.calibration
+        calibration = self.calibration
         if signals is not self._window:
-            given, before = of_friction(signals, found), self._states or [None] * len(self._filters)
+            given, before = of_friction(signals, calibration), self._states or [None] * len(self._filters)
             runs = [run_window(f, given, b) for f, b in zip(self._filters, before, strict=True)]
             self._window, self._vy = signals, [t.vy_m_s for t, _ in runs]
             self._states = tuple(state for _, state in runs)
-        d2 = found.driven_d2_m_s
+        d2 = calibration.driven_d2_m_s
         contradicted = np.hypot(CAR_STD_RAD * track.vx_m_s, D2_SHARE * d2 if math.isfinite(d2) else 0.0)
         away = [self._vy[0] + POSTERIOR_SHARE * (vy - self._vy[0]) for vy in self._vy] if self._vy else []
-        return widened(track, away, contradicted, found.vehicle.low_speed_blend_m_s, own_share=1.0)
+        return widened(track, away, contradicted, calibration.vehicle.low_speed_blend_m_s, own_share=1.0)
 
     @property
     def _filters(self) -> tuple[PhysicsFilter, ...]:
         """The physics filter on the calibrated vehicle and on its variations; none without variations."""
         from pdhef_logtool.estimators.physics_filter import physics_filter
 
-        found = self.calibration
-        vehicles = (found.vehicle, *found.varied) if found.varied else ()
-        return tuple(replace(physics_filter(v, found.noise), read_with=self.read_with) for v in vehicles)
+        calibration = self.calibration
+        vehicles = (calibration.vehicle, *calibration.varied) if calibration.varied else ()
+        return tuple(replace(physics_filter(v, calibration.noise), read_with=self.read_with) for v in vehicles)
 
 
 def of_friction(signals: Signals, calibration: WithoutTruth) -> Signals:
@@ -159,8 +159,8 @@ def widened(
     covariance = track.covariance
     if covariance.shape[0]:
         scale = np.ones((len(track), 3))  # row and column alike, so that correlations stay
-        own = covariance[:, 1, 1]
-        positive = own > 0.0
-        scale[positive, 1] = np.sqrt(own_share**2 + (added * speed**2)[positive] / own[positive])
+        vy_variance = covariance[:, 1, 1]
+        positive = vy_variance > 0.0
+        scale[positive, 1] = np.sqrt(own_share**2 + (added * speed**2)[positive] / vy_variance[positive])
         covariance = covariance * scale[:, :, None] * scale[:, None, :]
     return replace(track, sideslip_std_rad=std, covariance=covariance)

@@ -217,9 +217,9 @@ def _asked(c, nats):  # type: ignore[no-untyped-def]
 def _weigh_burst(c, e, s0, moving):  # type: ignore[no-untyped-def]
     """Add the evidence of a squared difference for a burst, and update the usual level."""
     age = c[C_AGE]
-    known = c[C_LEVEL_S] > FIRST_GUESS_S
+    level_is_known = c[C_LEVEL_S] > FIRST_GUESS_S
     beyond = e > max(BEYOND_SIGMA * BEYOND_SIGMA * s0 * s0, HEALTHY_FACTOR * HEALTHY_FACTOR * c[C_LEVEL])
-    nats = NATS_BEYOND if beyond and moving and known else NATS_WITHIN
+    nats = NATS_BEYOND if beyond and moving and level_is_known else NATS_WITHIN
     # Faster samples are not independent: road and body motion are slower.
     nats *= min(1.0, age * SAMPLES_PER_S)
     asked = _asked(c, BURST_NATS)
@@ -232,7 +232,7 @@ def _weigh_burst(c, e, s0, moving):  # type: ignore[no-untyped-def]
         return
     c[C_LEVEL_S] += age
     rate = math.log(2.0) / (1.0 - SHARE_HEALTHY) * max(1.0 / LEARNING_S, 1.0 / c[C_LEVEL_S])
-    if not known:
+    if not level_is_known:
         rate = FIRST_GAIN / c[C_LEVEL_S]
     level = max(c[C_LEVEL], 0.01 * s0 * s0)
     c[C_LEVEL] = level * math.exp(rate * age * ((1.0 if e > level else 0.0) - SHARE_HEALTHY))
@@ -347,27 +347,27 @@ def _stuck(c, z, dt, moving, turning):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _judge_witness(c, own, one, other, least, band, dt):  # type: ignore[no-untyped-def]
-    """Update whether a channel is dead: its yaw rate ``own`` against the two other measures, rad/s.
+def _judge_witness(c, yaw_rate, measured, other, least, band, dt):  # type: ignore[no-untyped-def]
+    """Update whether a channel is dead: its ``yaw_rate`` against the two other measures, rad/s.
 
     A healthy channel may disagree for a while, in a spin or with a wrong model, but then it changes, or reads a large
     value at the limit of grip. A dead one stays within ``band`` and near zero while both others turn.
     """
-    if abs(own - c[C_ANCHOR]) > band:
-        c[C_ANCHOR] = own
+    if abs(yaw_rate - c[C_ANCHOR]) > band:
+        c[C_ANCHOR] = yaw_rate
         c[C_DEAD_S] = 0.0
         c[C_SILENT_LEFT_S] = 0.0
         c[C_SILENT_RIGHT_S] = 0.0
-    weakest = min(abs(one), abs(other))
-    agree = one * other > 0.0 and weakest > least
-    reading = own if one > 0.0 else -own
+    weakest = min(abs(measured), abs(other))
+    agree = measured * other > 0.0 and weakest > least
+    reading = yaw_rate if measured > 0.0 else -yaw_rate
     silent = agree and abs(reading) < DEAD_SHARE * weakest
     c[C_DEAD_S] = c[C_DEAD_S] + dt if silent else 0.0
     if silent:
-        c[C_SILENT_LEFT_S if one > 0.0 else C_SILENT_RIGHT_S] += dt
+        c[C_SILENT_LEFT_S if measured > 0.0 else C_SILENT_RIGHT_S] += dt
     speaks = agree and reading > ALIVE_SHARE * weakest
     c[C_ALIVE_S] = c[C_ALIVE_S] + dt if speaks else 0.0
-    quiet = max(abs(one), abs(other), abs(own)) < QUIET_RAD_S
+    quiet = max(abs(measured), abs(other), abs(yaw_rate)) < QUIET_RAD_S
     c[C_QUIET_S] = c[C_QUIET_S] + dt if quiet else 0.0
     if c[C_DEAD_S] >= DEAD_AFTER_S:
         c[C_DEAD] = 1.0
@@ -387,10 +387,10 @@ def _open_loop(w, steer, friction, dt, p):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _detect(window, default_friction, s0, p, channels, w, found):  # type: ignore[no-untyped-def]
+def _detect(window, default_friction, s0, p, channels, w, output):  # type: ignore[no-untyped-def]
     """Process one window; ``dt[k]`` ends at step k, NaN = start of a log. Memories are updated in place."""
     dt, steer, ay, yaw_rate, speed, friction = window
-    extra, noise, reason, usable = found
+    extra, noise, reason, usable = output
     for k in range(dt.shape[0]):
         step = dt[k] if math.isfinite(dt[k]) else 0.0
         mask, raised = 0, False
@@ -403,8 +403,8 @@ def _detect(window, default_friction, s0, p, channels, w, found):  # type: ignor
             w[W_SPEED], w[W_SPEED_AGE] = abs(speed[k]), 0.0
         else:
             w[W_SPEED_AGE] += step
-        known = w[W_SPEED_AGE] <= SPEED_HOLD_S
-        moving = not known or w[W_SPEED] > STUCK_SPEED_M_S
+        speed_is_fresh = w[W_SPEED_AGE] <= SPEED_HOLD_S
+        moving = not speed_is_fresh or w[W_SPEED] > STUCK_SPEED_M_S
         for i in range(CHANNELS):
             z = ay[k] if i == AY else yaw_rate[k]
             c = channels[i]
@@ -443,7 +443,7 @@ def _detect(window, default_friction, s0, p, channels, w, found):  # type: ignor
 
         mu = friction[k] if math.isfinite(friction[k]) else w[W_FRICTION] if w[W_FRICTION] > 0.0 else default_friction
         w[W_FRICTION] = mu
-        if known and w[W_SPEED] > WITNESS_SPEED_M_S and math.isfinite(steer[k]):
+        if speed_is_fresh and w[W_SPEED] > WITNESS_SPEED_M_S and math.isfinite(steer[k]):
             v = w[W_SPEED]
             if w[W_SETTLED_S] == 0.0:
                 w[W_VY], w[W_R] = 0.0, 0.0
@@ -458,8 +458,8 @@ def _detect(window, default_friction, s0, p, channels, w, found):  # type: ignor
             w[W_SMOOTH_AY] += gain * (modelled / v - w[W_SMOOTH_AY])
             for i in range(CHANNELS):
                 if math.isfinite(usable[k, i]):
-                    own = usable[k, i] / v if i == AY else usable[k, i]
-                    channels[i, C_SMOOTH] += gain * (own - channels[i, C_SMOOTH])
+                    rate = usable[k, i] / v if i == AY else usable[k, i]
+                    channels[i, C_SMOOTH] += gain * (rate - channels[i, C_SMOOTH])
             clear = math.isfinite(usable[k, AY]) and math.isfinite(usable[k, YAW_RATE])
             if clear and not raised and w[W_SETTLED_S] >= WITNESS_SETTLED_S:
                 of_ay, of_r = channels[AY, C_SMOOTH], channels[YAW_RATE, C_SMOOTH]

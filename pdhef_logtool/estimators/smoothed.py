@@ -7,7 +7,7 @@ backward goes each of them, from the last step that is seen,
     x^s_k = x_k + G_k (x^s_{k+1} − x_{k+1|k})
     P^s_k = P_k + G_k (P^s_{k+1} − P_{k+1|k}) G_kᵀ
 
-with C from the sigma points of the step before Q is added and they are drawn anew (Särkkä 2008). The network's residual
+with C from the sigma points of the step before Q is added and they are redrawn (Särkkä 2008). The network's residual
 is a known input of the step, so that it is in x_{k+1|k} and needs no term of its own. The process noise is what
 identification found for smoothing, another one than the filter's (:func:`for_smoothing`).
 
@@ -98,23 +98,23 @@ def _gain(cross, predicted_P, k, first, work):  # type: ignore[no-untyped-def]
             gain[i, j] = cross[k, j, i] if i >= first else 0.0
     wide_root(A, every[first:], counts, L)
     for i in range(first, n):  # forward, then backward substitution with P = L Lᵀ
-        at = i * ROOM
-        low, high = load(gain, at), load(gain, at + LANES)
+        offset = i * ROOM
+        low, high = load(gain, offset), load(gain, offset + LANES)
         for j in range(first, i):
             share = spread(L[i, j])
             low, high = low - share * load(gain, j * ROOM), high - share * load(gain, j * ROOM + LANES)
         per = spread(1.0 / L[i, i])
-        store(gain, at, per * low)
-        store(gain, at + LANES, per * high)
+        store(gain, offset, per * low)
+        store(gain, offset + LANES, per * high)
     for i in range(n - 1, first - 1, -1):
-        at = i * ROOM
-        low, high = load(gain, at), load(gain, at + LANES)
+        offset = i * ROOM
+        low, high = load(gain, offset), load(gain, offset + LANES)
         for j in range(i + 1, n):
             share = spread(L[j, i])
             low, high = low - share * load(gain, j * ROOM), high - share * load(gain, j * ROOM + LANES)
         per = spread(1.0 / L[i, i])
-        store(gain, at, per * low)
-        store(gain, at + LANES, per * high)
+        store(gain, offset, per * low)
+        store(gain, offset + LANES, per * high)
 
 
 # positional: arrays of steps with a place in them: a view for each would cost as much as the sums.
@@ -156,13 +156,13 @@ def _step_back(forward, k, links, following, xs, Ps, work):  # type: ignore[no-u
         store(half, j * ROOM, low)
         store(half, j * ROOM + LANES, high)
     for a in range(n):
-        at = a * ROOM
-        low, high = load(Ps, at), load(Ps, at + LANES)
+        offset = a * ROOM
+        low, high = load(Ps, offset), load(Ps, offset + LANES)
         for j in range(n):
             of = spread(gain[j, a])
             low, high = low + of * load(half, j * ROOM), high + of * load(half, j * ROOM + LANES)
-        store(Ps, at, low)
-        store(Ps, at + LANES, high)
+        store(Ps, offset, low)
+        store(Ps, offset + LANES, high)
     for a in range(n):
         counts[a] = True
         for b in range(a):
@@ -242,19 +242,19 @@ def smooth_blocks(
     count: int,
     origin_ns: int,
     block_ns: int,
-    known: Smoothed | None = None,
+    earlier: Smoothed | None = None,
 ) -> Smoothed:
     """Return what `smooth_steps` does of all steps of the blocks that the first ``count`` steps lie in, [M ≥ count].
 
-    ``pieces`` follow each other and contain the steps at ``stamps_ns``. ``known`` [D] is what this has returned of the
-    first steps before, up to the end of a block: it is not done again.
+    ``pieces`` follow each other and contain the steps at ``stamps_ns``. ``earlier`` [D] is the result for the first
+    steps, up to the end of a block, which is not computed again.
     """
-    n, done = pieces[0].posterior.x.shape[1], 0 if known is None else len(known[0])
+    n, done = pieces[0].posterior.x.shape[1], 0 if earlier is None else len(earlier[0])
     block = (stamps_ns - origin_ns) // block_ns
     end = max(done, int(np.searchsorted(block, block[count - 1], side="right")) if count else 0)
     x, P = np.empty((end, n)), np.empty((end, n, n))
-    if known is not None:
-        x[:done], P[:done] = known
+    if earlier is not None:
+        x[:done], P[:done] = earlier
     for span in spans(stamps_ns, end, origin_ns, block_ns):
         if span[0] >= done:
             _smooth_pieces(pieces, span, x, P)
@@ -351,7 +351,7 @@ class SmoothedState:
 
 @dataclass(frozen=True, slots=True)
 class SmoothedPhysics:
-    """The car's physics filters with trust times the residual, smoothed.
+    """The car's physics filters with residual gain times the residual, smoothed.
 
     Parameters
     ----------
@@ -424,16 +424,16 @@ class SmoothedPhysics:
             runs = [
                 f.linked_steps(faults.filtered, b, rate, faults.extra_r) for f, b in zip(filters, before, strict=True)
             ]
-            steps = [one for one, _, _ in runs]
+            steps = [filter_steps for filter_steps, _, _ in runs]
             gathered, evidence = gather_evidence(steps, state.forward, state.evidence)
-            likelihood = np.stack([one.log_likelihood for one in steps], axis=1)
+            likelihood = np.stack([filter_steps.log_likelihood for filter_steps in steps], axis=1)
             starts: BoolArray = ~np.isfinite(steps[0].prior[:, VX])
             shared = SharedSteps(steps[0].stamps_ns, gathered, likelihood, starts, faults.extra_r, faults.reason)
             state = replace(
                 state,
                 forward=tuple(after for _, after, _ in runs),
                 evidence=evidence,
-                ahead=(*state.ahead, tuple(ForwardSteps(one, links) for one, _, links in runs)),
+                ahead=(*state.ahead, tuple(ForwardSteps(filter_steps, links) for filter_steps, _, links in runs)),
                 shared=shared if state.shared is None else state.shared.joined(shared),
             )
         return state
@@ -456,7 +456,7 @@ class SmoothedPhysics:
             smoothed.append(replace(posterior, x=x[:count], P=P[:count]))
         weights = np.ones((count, 1))
         if len(smoothed) > 1:
-            valid = np.stack([one.valid for one in smoothed], axis=1)
+            valid = np.stack([track.valid for track in smoothed], axis=1)
             weights = weigh(self._two_sided(shared, count, origin_ns), valid)
         raised = r_scale(shared.extra_r[:count], self.filtered.physics.measurement_std)
         return MixtureSteps(tuple(smoothed), weights, raised, shared.reason[:count]), tuple(following)
@@ -497,5 +497,5 @@ def _without(state: SmoothedState, passed: int, smoothed: tuple[Smoothed, ...]) 
     while ahead and len(ahead[0][0]) <= rest:
         rest -= len(ahead.pop(0)[0])
     if ahead:
-        ahead[0] = tuple(one.since(rest) for one in ahead[0])
+        ahead[0] = tuple(forward.since(rest) for forward in ahead[0])
     return replace(state, ahead=tuple(ahead), shared=state.shared.since(passed), smoothed=smoothed)

@@ -190,7 +190,7 @@ def _gate(window, bound, m, believed, reckoned):  # type: ignore[no-untyped-def]
             m[_RATE] = yaw_rate[k]
         # As in the filters: the mean of both ends of the step, or the finite one.
         a = m[_AX] if not has_ax else ax[k] if m[_HAS_AX] == 0.0 else 0.5 * (m[_AX] + ax[k])
-        known = has_ax or m[_HAS_AX] > 0.0
+        ax_is_known = has_ax or m[_HAS_AX] > 0.0
         m[_HAS_AX] = 1.0 if has_ax else 0.0
         if has_ax:
             m[_AX] = ax[k]
@@ -220,7 +220,7 @@ def _gate(window, bound, m, believed, reckoned):  # type: ignore[no-untyped-def]
         if not math.isfinite(z):
             continue
         if m[_STARTED] == 0.0:
-            if known:
+            if ax_is_known:
                 m[_STARTED] = 1.0
                 m[_SPEED] = z
                 m[_NOT_HEEDED] = RELEASE_S  # the first sample may be an outlier

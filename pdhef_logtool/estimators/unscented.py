@@ -2,7 +2,7 @@
 
 See docs/method.md#filter.
 
-All functions work on small float64 arrays in place of allocation where it matters, and know nothing of vehicles.
+All functions work on small float64 arrays in place of allocation where it matters, and contain no vehicle model.
 """
 
 from __future__ import annotations

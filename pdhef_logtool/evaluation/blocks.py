@@ -53,7 +53,7 @@ def median_step_ns(stamped: Signals | StateTrack) -> float:
 
 
 class HeldRows(StateTrack):
-    """Rows of a track of which each column is read once: on disk it would be read each time that it is asked for."""
+    """Rows of a track; each column is read once, as a column on disk is read at every access."""
 
     __slots__ = ("_rows",)
     _rows: StateTrack
@@ -116,7 +116,7 @@ class SegmentSums:
         self._blocks: dict[str, list[list[float]]] = {}
 
     def add(self, masks: Mapping[str, BoolArray], *columns: NDArray[np.generic]) -> None:
-        """Take a block of columns [M], of which the stamps count at which the first column is finite."""
+        """Take a block of columns [M]; the stamps count at which the first column is finite."""
         finite = np.isfinite(columns[0])
         if not finite.any():
             return

@@ -36,7 +36,7 @@ class Cell:
     """A cell of the grid that the drive was in.
 
     ``speed`` and ``ay`` number its lower edges; ``scored`` stamps of it have the mean squared sideslip error of the
-    answer, NaN without one.
+    selected estimate, NaN without one.
     """
 
     speed: int

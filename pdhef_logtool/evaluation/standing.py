@@ -1,4 +1,4 @@
-"""How the answer of a drive stands against the best physics, signal by signal, with a bootstrap of blocks of time.
+"""The selected estimate of a drive against the best physics, signal by signal, with a bootstrap of blocks of time.
 
 Errors are those of :mod:`~pdhef_logtool.evaluation.metrics`, correlated over seconds, so that whole blocks are drawn
 (:mod:`~pdhef_logtool.evaluation.bootstrap`). The best physics is the best by this drive's ground truth: a rival that

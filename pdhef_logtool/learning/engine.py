@@ -231,7 +231,7 @@ def _open(settings: LearnSettings, warn: Tell) -> Car:
     if {TEACH, IDENTIFY} & set(settings.order):
         car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
         if config.car is None:
-            warn(f"no --car: mass, geometry and priors are those of the default {car.own.name}")
+            warn(f"no --car: mass, geometry and priors are those of the default {car.datasheet.name}")
         return car
     car = open_car(config, warn)
     if {GAIN, NETWORK} & set(settings.order) and car.network is None and config.network is None:
@@ -294,7 +294,7 @@ def _learn_in_turn(task: Task, inputs: Sequence[LogInput], output: Path, *, fres
 
 def _read(inputs: Sequence[LogInput], task: Task) -> tuple[tuple[DriveRecord, ...], list[DriveTimes]]:
     """Return a record of every drive, and when each can be used."""
-    vehicle = task.car.own
+    vehicle = task.car.datasheet
 
     def read(log: LogInput) -> tuple[DriveRecord, DriveTimes | None]:
         record, drive = load_fit_drive(log, Car.of(vehicle), task.mapping, task.options)

@@ -46,7 +46,7 @@ def learning_curve(
     car = Car.load(folder, network=NO_MODEL, intervals=NO_INTERVALS)
     if car.fitted_physics is None:
         return None
-    start = car.own
+    start = car.datasheet
 
     def load(slices: Sequence[LogInput]) -> list[FitDrive]:
         drives = (load_fit_drive(s, Car.of(start), mapping, options)[1] for s in slices)

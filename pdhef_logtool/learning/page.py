@@ -101,12 +101,12 @@ def _text(value: str) -> str:
     return printable(value).replace("|", "\\|")
 
 
-def _figure(found: Sequence[Any] | None) -> str:
-    return "–" if found is None else f"{found[0]}: {found[1]:.3f}"
+def _figure(entry: Sequence[Any] | None) -> str:
+    return "–" if entry is None else f"{entry[0]}: {entry[1]:.3f}"
 
 
-def _interval(found: Sequence[float | None], sign: str = "") -> str:
-    value, low, high = found
+def _interval(entry: Sequence[float | None], sign: str = "") -> str:
+    value, low, high = entry
     if value is None:
         return "–"
     return f"{value:{sign}.3f}" if low is None else f"{value:{sign}.3f} [{low:.3f}, {high:.3f}]"

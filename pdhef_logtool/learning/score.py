@@ -45,8 +45,8 @@ def score_slices(
     columns: dict[str, list[tuple[FloatArray, BoolArray]]] = {name: [] for name in names}
     stamps: list[IntArray] = []
     skipped: dict[str, str] = {}
-    for one in slices:
-        _, drive = load_drive(one, car, mapping, options)
+    for log_slice in slices:
+        _, drive = load_drive(log_slice, car, mapping, options)
         if drive is None or drive.truth is None:
             continue
         stamps.append(drive.signals.stamps_ns)
@@ -54,9 +54,9 @@ def score_slices(
         skipped |= reasons
         for name in names:
             columns[name].append(_errors(tracks.get(name), drive, car.vehicle.low_speed_blend_m_s))
-    at = end_to_end(stamps)
+    stamps_ns = end_to_end(stamps)
     errors = {
-        name: Errors(name, np.concatenate([e for e, _ in parts]), at, np.concatenate([i for _, i in parts]))
+        name: Errors(name, np.concatenate([e for e, _ in parts]), stamps_ns, np.concatenate([i for _, i in parts]))
         for name, parts in columns.items()
         if parts and name not in skipped
     }
@@ -67,11 +67,11 @@ def _tracks(
     car: Car, names: Sequence[str], drive: WholeDrive, options: ReadOptions
 ) -> tuple[dict[str, StateTrack], dict[str, str]]:
     estimators, skipped = runnable(names, car, drive.plan.alignment.available, Options(options.use_speed))
-    found: dict[str, list[StateTrack]] = {e.name: [] for e in estimators}
+    by_estimator: dict[str, list[StateTrack]] = {e.name: [] for e in estimators}
     for window in estimate_windows(drive, estimators, drawn=False, intervals=calibrator(car, estimators)):
         for estimator, track in zip(estimators, window.tracks, strict=True):
-            found[estimator.name].append(track)
-    tracks = {name: parts[0] if len(parts) == 1 else concatenate(parts) for name, parts in found.items()}
+            by_estimator[estimator.name].append(track)
+    tracks = {name: parts[0] if len(parts) == 1 else concatenate(parts) for name, parts in by_estimator.items()}
     return tracks, {s.name: s.reason for s in skipped}
 
 

@@ -23,7 +23,7 @@ SHARES_WITH_NETWORK = {TRAINING: 0.50, NETWORK_TRAINING: 0.32, VALIDATION: 0.18}
 #: Stages that use the training part; the others use the validation part alone.
 TRAINED = {IDENTIFY, NOISE, NETWORK}
 #: Usable driving from which on the network has a part of its own, that physics was not fitted to, and still leaves
-#: the fit enough to choose the model's parts; with less it learns from the fit part.
+#: the fit enough to choose the model's parts; with less it learns from the training split.
 OWN_NETWORK_PART_S = 600.0
 #: One drive is cut into rounds of about this much usable driving, each with all parts but the test.
 ROUND_S = 240.0
@@ -55,7 +55,7 @@ class DriveTimes:
 class Split:
     """Slices of drives by part, and when they can be used.
 
-    ``times`` is empty where whole logs are given to one stage; that stage then holds out the share ``holdout`` itself.
+    ``times`` is empty where whole logs are given to one stage; that stage then leaves out the share ``holdout`` itself.
     """
 
     parts: Mapping[str, tuple[LogInput, ...]]
@@ -108,26 +108,26 @@ def split_drives(
     holdout : share of the test part: the end of each drive that is cut, or whole drives.
     """
     shares = shares_of(sum(d.seconds for d in drives), holdout, stages)
-    found: dict[str, tuple[LogInput, ...]] = dict.fromkeys(PARTS, ())
+    parts: dict[str, tuple[LogInput, ...]] = dict.fromkeys(PARTS, ())
     if len(drives) >= WHOLE_DRIVES:
-        return found | deal_drives(drives, shares)
+        return parts | deal_drives(drives, shares)
     # Short ones are cut as if they were one: each would give nothing to some parts.
     together = min(d.seconds for d in drives) < LEAST_CUT_S
-    for part, piece in (x for one in ([drives] if together else [[d] for d in drives]) for x in cut_times(one, shares)):
-        found[part] += (piece,)
-    return found
+    for part, piece in (x for log in ([drives] if together else [[d] for d in drives]) for x in cut_times(log, shares)):
+        parts[part] += (piece,)
+    return parts
 
 
 def deal_drives(drives: Sequence[DriveTimes], shares: Mapping[str, float]) -> dict[str, tuple[LogInput, ...]]:
     """Return whole drives by part: each in its turn goes to the part that lacks most of its share."""
-    found: dict[str, list[LogInput]] = {part: [] for part in shares}
+    parts: dict[str, list[LogInput]] = {part: [] for part in shares}
     total = sum(d.seconds for d in drives)
     lacks = {part: share * total for part, share in shares.items() if share > 0.0}
     for drive in drives:
         part = max(lacks, key=lambda p: lacks[p])
         lacks[part] -= drive.seconds
-        found[part].append(part_of_log(drive.log, (float(drive.usable_s[0]), float(drive.usable_s[-1]))))
-    return {part: tuple(logs) for part, logs in found.items()}
+        parts[part].append(part_of_log(drive.log, (float(drive.usable_s[0]), float(drive.usable_s[-1]))))
+    return {part: tuple(logs) for part, logs in parts.items()}
 
 
 def cut_times(drives: Sequence[DriveTimes], shares: Mapping[str, float]) -> list[tuple[str, LogInput]]:
@@ -170,13 +170,13 @@ def part_of_log(log: LogInput, span_s: tuple[float, float]) -> LogInput:
 def usable_in(times: Iterable[DriveTimes], slices: Iterable[LogInput]) -> list[DriveTimes]:
     """Return when each slice can be used."""
     by_path = {t.log.path: t for t in times}
-    found = []
-    for one in slices:
-        assert one.span_s is not None
-        whole = by_path[one.path]
-        inside = (whole.usable_s >= one.span_s[0]) & (whole.usable_s <= one.span_s[1])
-        found.append(DriveTimes(one, whole.usable_s[inside], whole.period_s))
-    return found
+    usable_times = []
+    for log_slice in slices:
+        assert log_slice.span_s is not None
+        whole = by_path[log_slice.path]
+        inside = (whole.usable_s >= log_slice.span_s[0]) & (whole.usable_s <= log_slice.span_s[1])
+        usable_times.append(DriveTimes(log_slice, whole.usable_s[inside], whole.period_s))
+    return usable_times
 
 
 def divided(drives: Sequence[DriveTimes], share: float) -> tuple[tuple[LogInput, ...], tuple[LogInput, ...]]:
@@ -194,6 +194,6 @@ def pieces_of(drives: Iterable[DriveTimes], piece_s: float) -> tuple[LogInput, .
     pieces = []
     for drive in (d for d in drives if d.usable_s.size > 1):
         count = max(1, int(drive.seconds // piece_s))
-        at = np.round(np.linspace(0, drive.usable_s.size - 1, count + 1)).astype(np.int64)
-        pieces += [part_of_log(drive.log, (float(a), float(b))) for a, b in pairwise(drive.usable_s[at])]
+        bounds = np.round(np.linspace(0, drive.usable_s.size - 1, count + 1)).astype(np.int64)
+        pieces += [part_of_log(drive.log, (float(a), float(b))) for a, b in pairwise(drive.usable_s[bounds])]
     return tuple(pieces)

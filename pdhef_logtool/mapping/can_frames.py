@@ -406,7 +406,7 @@ def _plain_kinds(fields: tuple[FieldInfo, ...]) -> dict[str, str]:
 
 
 def _best(paths: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Return the paths whose last part bears the first of the names that any has, the least nested of them."""
+    """Return the least nested paths whose last component is the first of the names that any has."""
     for name in names:
         matches = [p for p in paths if p.rsplit(".", 1)[-1].replace("_", "").lower() == name]
         if matches:
@@ -446,7 +446,7 @@ def _load_cached(path: Path, _modified_ns: int, _size: int) -> Database:
     try:
         # Overlapping signals are an error of the file, not of the signals that are asked for.
         matches = cantools.database.load_file(path, strict=False)
-    except Exception as error:  # noqa: BLE001  cantools' parsers raise whatever a malformed file leads them to.
+    except Exception as error:  # noqa: BLE001  cantools' parsers raise any exception for a malformed file.
         reason = (str(error).splitlines() or [""])[0] or type(error).__name__
         raise MappingFileError(expected=expected, got=reason, where=str(path), remedy="correct [can] dbc") from None
     if not isinstance(matches, Database):

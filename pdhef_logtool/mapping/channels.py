@@ -39,7 +39,7 @@ LOST_KINDS = frozenset({"nan", "bad-stamp"})
 class MappedChannels:
     """Channels of one window of log time; every mapped name is there, if need be with no samples.
 
-    ``counts`` has by role and name the messages ``read``, and those of them that were dropped, by reason. ``stamps``:
+    ``counts`` has by ``role`` and name the messages ``read``, and those that were dropped, by reason. ``stamps``:
     times of the topics for which they were asked for.
     """
 
@@ -152,7 +152,7 @@ def read_signals(
     Parameters
     ----------
     clocks : from :func:`pdhef_logtool.mapping.fit_clocks` over the whole span that is going to be read.
-    stamps : topics of which the times are wanted too, mapped or not.
+    stamps : topics whose times are wanted too, mapped or not.
     """
     resolved = resolve_mapping(log, mapping)
     log = with_can_signals(log, resolved)
@@ -340,7 +340,7 @@ def _apply_gate(
     hold_ns = int(GATE_HOLD_PERIODS * period_ns) if np.isfinite(period_ns) else max(0, log.end_ns - log.start_ns)
     requests: dict[str, list[str]] = {}
     request_source(log, source, requests)
-    # Truth in this window may hang on a gate message that was recorded before the window, or after it.
+    # Ground truth in this window may depend on a gate message that was recorded before the window, or after it.
     columns = log.read(requests, start_ns - hold_ns - GATE_MARGIN_NS, end_ns + GATE_MARGIN_NS)
     topic = columns.get(source.read_topic)
     stamps = np.empty(0, np.int64)

@@ -87,7 +87,7 @@ def check_mapping(mapping: Mapping, log: DriveLog) -> None:
             continue
         fields = log.fields(source.read_topic)
         if not fields:
-            continue  # The encoding carries no schema: only reading can tell.
+            continue  # The encoding carries no schema: only reading can show it.
         problems += [f"{source.name}: {text}" for text in _field_problems(source, fields)]
     if problems:
         raise MappingError(

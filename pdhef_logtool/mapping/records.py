@@ -167,7 +167,7 @@ class Mapping:
     signals, truth : by name; what an estimator may see, and what it is scored against.
     quality : gate on ground truth, if any.
     origin : ``file`` or ``auto`` (recognised types).
-    notes : sentences that the reader of a report needs to know of this mapping.
+    notes : sentences for the reader of a report about this mapping.
     can : how raw CAN frames are read, for sources whose field is ``can:<message>.<signal>``.
     estimates : estimates that somebody else recorded in the log, by estimator and quantity (``ESTIMATE_UNITS``). They
         are no part of :meth:`sources`: only ``pdhef metrics`` reads them.

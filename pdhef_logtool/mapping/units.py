@@ -19,7 +19,7 @@ from pdhef_logtool.records.signals import FloatArray
 SLOPES = (0.7, 1.4)
 #: Radii of wheels, of model cars to lorries.
 RADII_M = (0.02, 0.7)
-#: Raw speeds below tell no unit, whichever it is.
+#: Raw speeds below show no unit.
 SLOWEST = 1.0
 #: Share of gravity along +z of an upright sensor.
 MOST_TILTED = 0.9

@@ -29,7 +29,7 @@ MOST_OF_ARRAY = 32
 #: Correlations of a_y with v r, and of a_x with v̇, that are accepted; rival choices may have lower ones.
 TURNS, SPEEDS_UP = 0.92, 0.75
 LOOSE_TURNS, LOOSE_SPEEDS_UP = 0.8, 0.6
-#: How much nearer to 1 than that of any other choice their product must be.
+#: Factor by which their product must be closer to 1 than that of any other choice.
 CLEARER = 0.05
 #: v r leaves at most these shares of what r alone and what r √v leave of a_y: a steering angle makes more of a yaw rate
 #: the faster the car is, but less than in proportion, as cars understeer.

@@ -121,7 +121,7 @@ def _upward(log: DriveLog, signals: Mapping[str, SignalSource]) -> dict[str, Sig
 def _is_wanted(
     quantity: str, part: str, role: Role, signals: Mapping[str, SignalSource], truth: Mapping[str, SignalSource]
 ) -> bool:
-    """Return whether a field can fill a gap, or tell something of one that does."""
+    """Return whether a field can fill a gap, or gives information on one that does."""
     if quantity == "acceleration" and part == "z":  # shows gravity
         return not {"ax_m_s2", "ay_m_s2"} <= set(signals)
     if quantity in ("latitude", "longitude") and not {"lat_deg", "x_m"} & set(truth):  # show the path
@@ -315,7 +315,7 @@ class _Weighing:
         self.taken[name] = best
 
     def _steering_kind(self, item: Field, relation: Fit | None) -> tuple[str, bool | None]:
-        """Return the signal that a steering angle is, and whether it follows the car's turning (None: cannot tell)."""
+        """Return the signal that a steering angle is, and whether it follows the car's turning (None: unknown)."""
         kinds = {"road": ("steer_rad",), "wheel": ("steering_wheel_rad",)}.get(item.meaning.part, tuple(_STEERING_M))
         if relation is None or abs(relation.correlation) < CLEAR:
             return _steering_by_range(item, kinds, relation)

@@ -124,8 +124,8 @@ def roles_of(report: Mapping[str, Any]) -> Roles | None:
         return None
     answer = report.get("answer") or {}
     main: str = answer["main"] if answer.get("main") in names else names[0]
-    told = next((str(v.get("rival")) for v in _told(report) if v.get("signal") == "sideslip_rad"), "")
-    rival = told if told in names else _best_physics(report, ran, main)
+    rival_of_verdict = next((str(v.get("rival")) for v in _told(report) if v.get("signal") == "sideslip_rad"), "")
+    rival = rival_of_verdict if rival_of_verdict in names else _best_physics(report, ran, main)
     return Roles(main, rival, tuple(n for n in names if n not in (main, rival)))
 
 
@@ -138,9 +138,9 @@ def _best_physics(report: Mapping[str, Any], ran: Sequence[Mapping[str, Any]], m
     others = [e for e in ran if e["name"] != main]
     causal = next(e["causal"] for e in ran if e["name"] == main)
     physics: list[str] = [e["name"] for e in others if _on_physics(e) and (e["causal"] or not causal)]
-    known = [n for n in physics if errors.get(n) is not None]
-    if known:
-        return min(known, key=lambda n: float(errors[n]))
+    scored = [n for n in physics if errors.get(n) is not None]
+    if scored:
+        return min(scored, key=lambda n: float(errors[n]))
     fallback: list[str] = [*(n for n in physics if n == _PHYSICS), *physics, *(e["name"] for e in others), ""]
     return fallback[0]
 
@@ -160,18 +160,18 @@ def _told(report: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 def verdicts_of(report: Mapping[str, Any]) -> list[Verdict]:
     """Return the sentences at the head of a page; without verdicts, the words of the selected estimate."""
-    told = []
+    verdicts = []
     for v in _told(report):
         word, kind = _OUTCOMES.get(str(v.get("outcome")), (str(v.get("outcome")), ""))
-        told.append(Verdict(word, str(v.get("text", "")), kind))
+        verdicts.append(Verdict(word, str(v.get("text", "")), kind))
     answer = report.get("answer")
-    if told or answer is None:
-        return told
+    if verdicts or answer is None:
+        return verdicts
     return [Verdict("sideslip", str(answer["texts"]["result"]))]
 
 
 def _notices(report: Mapping[str, Any], figures: DriveFigures | None, low_speed: float | None) -> list[str]:
-    """Return what a reader must know before looking at the figures."""
+    """Return the warnings that a reader needs before the figures."""
     said = []
     duration = report["log"]["duration_s"]
     if duration < _SHORT_S:

@@ -50,7 +50,7 @@ class Roles:
         return tuple(n for n in (self.main, self.rival, *self.others) if n)
 
     def series(self, name: str, values: FloatArray, width: float = 1.2) -> Series:
-        """Return a line as its estimator is drawn: the answer, truth and best physics always, others by their box."""
+        """Return a line as its estimator is drawn: selected, ground truth, best physics always, others by box."""
         if name == self.main:
             return Series(name, colour(name), values, width + 0.6)
         if name not in self.others:
@@ -75,7 +75,7 @@ class Peak:
 class DriveFigures:
     """What is drawn of a drive, and what the page states beside it.
 
-    ``other``: what the answer is held against, the truth or, without one, another estimator; empty where there is none.
+    ``other``: reference of the selected estimate, ground truth or else another estimator; empty where there is none.
     ``scored``: whether any sideslip error is known. ``moves``: whether a sideslip is known at all above the low-speed
     blend. ``absent``: estimators that the report names and the file has not.
     """
@@ -133,7 +133,7 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles, low_speed
 
 
 def _reference(tracks: Tracks, roles: Roles, answer: SideslipTrack) -> Reference | None:
-    """Return the truth where it scores the answer's sideslip, else the next estimate, None where there is none."""
+    """Return ground truth where it scores the selected sideslip, else the next estimate, None where there is none."""
     if TRUTH in tracks.names:
         truth = Reference(tracks.sideslip(TRUTH), True, tracks)
         if np.isfinite(truth.whole_error(answer)).any():
@@ -152,29 +152,29 @@ def _degrees_of_freedom(report: Mapping[str, Any]) -> dict[str, float]:
 def _peaks(
     answer: SideslipTrack, reference: Reference, segments: Sequence[Mapping[str, Any]], origin_ns: int
 ) -> tuple[Peak, ...]:
-    at = reference.rows(answer.stamps_ns)
-    if at is None:
+    rows = reference.rows(answer.stamps_ns)
+    if rows is None:
         return ()
     error, stamps = reference.whole_error(answer), answer.stamps_ns
     size = np.nan_to_num(np.abs(error), nan=0.0)
     apart_ns = int(max(_APART_S * 1e9, _APART_SHARE * float(stamps[-1] - stamps[0])))
-    found: list[Peak] = []
-    while len(found) < PEAKS and size.max() > 0.0:
+    peaks: list[Peak] = []
+    while len(peaks) < PEAKS and size.max() > 0.0:
         row = int(np.argmax(size))
         stamp = int(stamps[row])
         names = [s["name"] for s in segments if s["start_ns"] <= stamp < s["end_ns"]]
-        found.append(
+        peaks.append(
             Peak(
                 stamp,
                 (stamp - origin_ns) * 1e-9,
                 float(answer.sideslip_rad[row]),
-                float(reference.track.sideslip_rad[at[row]]),
+                float(reference.track.sideslip_rad[rows[row]]),
                 float(error[row]),
                 ", ".join(dict.fromkeys(names)),
             )
         )
         size[slice(*np.searchsorted(stamps, [stamp - apart_ns, stamp + apart_ns + 1]))] = 0.0
-    return tuple(found)
+    return tuple(peaks)
 
 
 def _lines(series: Mapping[str, DriveSeries], roles: Roles, values: str, names: Sequence[str]) -> list[Series]:
@@ -182,8 +182,8 @@ def _lines(series: Mapping[str, DriveSeries], roles: Roles, values: str, names: 
     lines = []
     for name in [*(n for n in names if n != roles.main), *(n for n in names if n == roles.main)]:
         if name in series:
-            found = getattr(series[name], values)
-            drawn = found.largest if values in ("error", "r_scale") else found.values
+            data = getattr(series[name], values)
+            drawn = data.largest if values in ("error", "r_scale") else data.values
             if np.isfinite(drawn).any():
                 lines.append(roles.series(name, drawn))
     return lines

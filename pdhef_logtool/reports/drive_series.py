@@ -30,7 +30,7 @@ _OF_SIDESLIP = ("vx_m_s", "vy_m_s", "sideslip_rad", "valid")
 
 
 class Tracks:
-    """The tracks of a file. The truth counts wherever it is known, as in the figures: each quantity for itself."""
+    """The tracks of a file. Each quantity of ground truth counts wherever it is known, as in the figures."""
 
     def __init__(self, path: Path, low_speed_m_s: float) -> None:
         self._path, self.low_speed_m_s = path, low_speed_m_s
@@ -101,7 +101,7 @@ class Points:
 class DriveSeries:
     """What is drawn of one track; angles in degrees. ``error``: absolute, against what the page compares with.
 
-    Band, speed, a_y and the planes are empty but for the ground truth and the selected estimate.
+    Confidence interval, speed, a_y and the planes are empty but for the ground truth and the selected estimate.
     """
 
     def __init__(self, name: str, grid: Grid) -> None:
@@ -116,7 +116,7 @@ class DriveSeries:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """What errors are told against: the truth as the figures have it (``scored``), or another estimate as drawn."""
+    """Reference of errors: ground truth as the figures have it (``scored``), or another estimate as drawn."""
 
     track: SideslipTrack
     scored: bool
@@ -124,16 +124,16 @@ class Reference:
 
     def rows(self, stamps_ns: IntArray) -> IntArray | None:
         """Return the rows of the reference at these stamps, None where it is not at the same ones."""
-        own = self.track.stamps_ns
-        at = np.minimum(np.searchsorted(own, stamps_ns), max(len(own) - 1, 0))
-        return at if len(own) and np.array_equal(own[at], stamps_ns) else None
+        track_stamps = self.track.stamps_ns
+        rows = np.minimum(np.searchsorted(track_stamps, stamps_ns), max(len(track_stamps) - 1, 0))
+        return rows if len(track_stamps) and np.array_equal(track_stamps[rows], stamps_ns) else None
 
     def error(self, track: StateTrack) -> FloatArray:
         """Return track − reference [M] in rad; NaN where it is not known."""
-        at = self.rows(track.stamps_ns)
-        if at is None:
+        rows = self.rows(track.stamps_ns)
+        if rows is None:
             return np.full(len(track), np.nan)
-        other = self.track.at(at)
+        other = self.track.at(rows)
         if self.scored:
             return signal_error(track, other, "sideslip_rad", self.tracks.low_speed_m_s)
         ours, theirs = (self.tracks.drawn(t).sideslip_rad for t in (track, other))

@@ -70,17 +70,17 @@ def scores(report: Mapping[str, Any], roles: Roles) -> list[ScoreTable]:
     causal = {e["name"]: bool(e["causal"]) for e in report["estimators"]}
     tables = []
     for signal in SCORED_SIGNALS:
-        found = _by_estimator(report, signal)
-        order = [n for n in (roles.main, roles.rival, *roles.others) if "rmse" in found.get(n, {})]
+        figures = _by_estimator(report, signal)
+        order = [n for n in (roles.main, roles.rival, *roles.others) if "rmse" in figures.get(n, {})]
         if not order:
             continue
         shown = [
             m
             for m in registered().values()
-            if isinstance(m.function, OfSignal) and any(m.name in found[n] for n in order)
+            if isinstance(m.function, OfSignal) and any(m.name in figures[n] for n in order)
         ]
-        rows = [Score(n, causal[n], [_read(found[n], m.name) for m in shown], found[n]["rmse"]["n"]) for n in order]
-        unit = read_unit(found[order[0]]["rmse"]["unit"])[0]
+        rows = [Score(n, causal[n], [_read(figures[n], m.name) for m in shown], figures[n]["rmse"]["n"]) for n in order]
+        unit = read_unit(figures[order[0]]["rmse"]["unit"])[0]
         independent = signal not in report["truth"]["not_independent"]
         tables.append(ScoreTable(LABELS[signal], unit, independent, [m.head() for m in shown], rows))
     return sorted(tables, key=lambda t: [*LABELS.values()].index(t.name))
@@ -94,13 +94,13 @@ def definitions(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 
 def by_segment(report: Mapping[str, Any], roles: Roles) -> list[SegmentScore]:
     """Return the RMSE of sideslip by segment, the whole drive first."""
-    found: dict[str, dict[str, _Row]] = {}
+    by_segment_name: dict[str, dict[str, _Row]] = {}
     for m in report["metrics"]:
         if (m["signal"], m["metric"]) == ("sideslip_rad", "rmse") and m["estimator"] in (roles.main, roles.rival):
-            found.setdefault(m["segment"], {})[m["estimator"]] = m
+            by_segment_name.setdefault(m["segment"], {})[m["estimator"]] = m
     return [
-        SegmentScore(segment, _value(own, roles.main), _value(own, roles.rival), next(iter(own.values()))["n"])
-        for segment, own in sorted(found.items(), key=lambda item: (item[0] != "all", item[0]))
+        SegmentScore(segment, _value(rows, roles.main), _value(rows, roles.rival), next(iter(rows.values()))["n"])
+        for segment, rows in sorted(by_segment_name.items(), key=lambda item: (item[0] != "all", item[0]))
     ]
 
 
@@ -111,9 +111,9 @@ def consistency(report: Mapping[str, Any], roles: Roles | None) -> Consistency |
     shown = [
         (signal, m)
         for m in registered().values()
-        for signal, found in by_signal.items()
+        for signal, by_name in by_signal.items()
         if not isinstance(m.function, OfSignal) and m.function is not None and m.name not in _RATIO
-        if any(_read(found.get(name, {}), m.name) is not None for name in names)
+        if any(_read(by_name.get(name, {}), m.name) is not None for name in names)
     ]
     rows = []
     for name in names:
@@ -128,31 +128,31 @@ def consistency(report: Mapping[str, Any], roles: Roles | None) -> Consistency |
 
 def residuals(report: Mapping[str, Any]) -> list[Residual]:
     """Return the residuals of the sensors."""
-    found = [(s, _by_estimator(report, s).get("sensors", {})) for s in LABELS]
+    residual_metrics = [(s, _by_estimator(report, s).get("sensors", {})) for s in LABELS]
     return [
-        Residual(LABELS[s], _value(own, "residual_rms"), _value(own, "residual_bias"), own["residual_rms"]["unit"])
-        for s, own in found
-        if "residual_rms" in own
+        Residual(LABELS[s], _value(row, "residual_rms"), _value(row, "residual_bias"), row["residual_rms"]["unit"])
+        for s, row in residual_metrics
+        if "residual_rms" in row
     ]
 
 
 def disagreements(report: Mapping[str, Any], roles: Roles) -> dict[str, float]:
     """Return by how many rad RMS the sideslip of each other estimator and that of the selected estimate differ."""
-    found = {}
+    values = {}
     for m in report["metrics"]:
         first, _, second = m["estimator"].partition("~")
         if (m["metric"], m["segment"]) == ("disagreement_rms", "all") and roles.main in (first, second):
-            found[second if first == roles.main else first] = m["value"]
-    return {name: float(value) for name, value in found.items() if value is not None}
+            values[second if first == roles.main else first] = m["value"]
+    return {name: float(value) for name, value in values.items() if value is not None}
 
 
 def _by_estimator(report: Mapping[str, Any], signal: str) -> dict[str, dict[str, _Row]]:
     """Return the rows of a signal over the whole drive by estimator and metric."""
-    found: dict[str, dict[str, _Row]] = {}
+    metrics: dict[str, dict[str, _Row]] = {}
     for m in report["metrics"]:
         if (m["signal"], m["segment"]) == (signal, "all"):
-            found.setdefault(m["estimator"], {})[m["metric"]] = m
-    return found
+            metrics.setdefault(m["estimator"], {})[m["metric"]] = m
+    return metrics
 
 
 def _value(rows: Mapping[str, _Row], key: str) -> float | None:

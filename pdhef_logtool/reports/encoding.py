@@ -66,10 +66,10 @@ class Envelope:
     def add(self, stamps_ns: IntArray, values: FloatArray) -> None:
         """Take the next values [M] in order of time."""
         cell = (stamps_ns - self._grid.start_ns) // self._grid.cell_ns
-        known = np.isfinite(values) & (cell >= 0) & (cell < self._grid.cells)
-        if not known.any():
+        usable = np.isfinite(values) & (cell >= 0) & (cell < self._grid.cells)
+        if not usable.any():
             return
-        cell, values = cell[known], values[known]
+        cell, values = cell[usable], values[usable]
         before = self.values[cell[0]]
         if np.isfinite(before[0]):  # what came in the block before of the cell that both share
             cell, values = np.concatenate([[cell[0]] * 2, cell]), np.concatenate([before, values])
@@ -104,10 +104,10 @@ class FirstKnown:
     def __init__(self, grid: Grid) -> None:
         self._grid, self._last = grid, -1
 
-    def rows(self, stamps_ns: IntArray, known: NDArray[np.bool_]) -> IntArray:
+    def rows(self, stamps_ns: IntArray, is_known: NDArray[np.bool_]) -> IntArray:
         """Return the rows of the next block [M], at most one a cell."""
         cell = (stamps_ns - self._grid.start_ns) // self._grid.cell_ns
-        rows = np.flatnonzero(known & (cell > self._last) & (cell < self._grid.cells))
+        rows = np.flatnonzero(is_known & (cell > self._last) & (cell < self._grid.cells))
         if not len(rows):
             return rows
         self._last = int(cell[rows[-1]])
@@ -124,9 +124,9 @@ class Means:
 
     def add(self, stamps_ns: IntArray, values: FloatArray) -> None:
         """Take the next values [M]; unknown ones do not count."""
-        known = np.isfinite(values)
-        span = np.clip((stamps_ns[known] - self._grid.start_ns) // self._span_ns, 0, len(self._sums) - 1)
-        self._sums += np.bincount(span, weights=values[known], minlength=len(self._sums))
+        is_finite = np.isfinite(values)
+        span = np.clip((stamps_ns[is_finite] - self._grid.start_ns) // self._span_ns, 0, len(self._sums) - 1)
+        self._sums += np.bincount(span, weights=values[is_finite], minlength=len(self._sums))
         self._counts += np.bincount(span, minlength=len(self._sums))
 
     @property
@@ -156,13 +156,13 @@ def encode(values: FloatArray, resolution: float = 0.0) -> Encoded:
     ``resolution``: what nobody sees in the unit of the values; noise below it is not stored.
     """
     flat = np.ravel(values)
-    known = np.isfinite(flat)
-    inside = flat[known]
+    is_finite = np.isfinite(flat)
+    inside = flat[is_finite]
     low = float(inside.min()) if inside.size else 0.0
     span = float(inside.max()) - low if inside.size else 0.0
     step = max(span / LEVELS, resolution) or 1.0
     q = np.full(len(flat), GAP, dtype=np.uint16)
-    q[known] = np.clip(np.rint((inside - low) / step), 0, LEVELS).astype(np.uint16)
+    q[is_finite] = np.clip(np.rint((inside - low) / step), 0, LEVELS).astype(np.uint16)
     # Differences modulo 2¹⁶, their sign in the lowest bit, all low bytes before all high ones: zeros are together.
     steps = np.diff(q, prepend=np.uint16(0)).view(np.int16)
     folded = ((steps << 1) ^ (steps >> 15)).view(np.uint16)

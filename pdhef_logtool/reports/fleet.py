@@ -53,7 +53,7 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
 
     Parameters
     ----------
-    by : keys to break the drives down by; none: all that tell drives apart.
+    by : keys to break the drives down by; none: all that distinguish drives.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
     fleet = read_fleet(run, by)
     pages = {log.label for log in run.logs if log.file(PAGE_FILE) is not None}
     mains = {d.main for d in fleet.scored}
-    told = [b for b in fleet.breakdowns if by or b.explains > 0.0][: None if by else _MOST_KEYS]
+    shown = [b for b in fleet.breakdowns if by or b.explains > 0.0][: None if by else _MOST_KEYS]
     charts = Charts()
     _add_figures(charts, fleet)
     html = render(
@@ -78,8 +78,8 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
         answer=next((d for d in fleet.distributions if (d.estimator, d.signal) == (ANSWER, JUDGED)), None),
         rows=_rows(_told(fleet)),
         mains={ANSWER} if len(mains) > 1 else mains,
-        breakdowns=told,
-        idle_keys=[b.key for b in fleet.breakdowns if b not in told],
+        breakdowns=shown,
+        idle_keys=[b.key for b in fleet.breakdowns if b not in shown],
         space=None if fleet.space is None else _space_rows(fleet.space),
         held=sorted(fleet.drives, key=lambda d: d.label)[:MOST_ROWS],
         most_rows=MOST_ROWS,
@@ -113,10 +113,10 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
         charts.bars("spread", f"Drives by RMSE of the selected estimate's sideslip{beyond}", "°", edges, counts)
     rival, drives = _rival(fleet), fleet.scored
     if rival is not None:
-        own, other = (np.array([d.error(name) * degree for d in drives]) for name in (ANSWER, rival))
-        known = np.isfinite(own) & np.isfinite(other) & (own > 0.0) & (other > 0.0)
-        if np.count_nonzero(known) > 2:
-            ends = np.array([min(own[known].min(), other[known].min()), max(own[known].max(), other[known].max())])
+        ours, other = (np.array([d.error(name) * degree for d in drives]) for name in (ANSWER, rival))
+        both = np.isfinite(ours) & np.isfinite(other) & (ours > 0.0) & (other > 0.0)
+        if np.count_nonzero(both) > 2:
+            ends = np.array([min(ours[both].min(), other[both].min()), max(ours[both].max(), other[both].max())])
             charts.points(
                 "against",
                 f"A point a drive: the selected estimate has the lower error below the line, {rival} above it",
@@ -124,26 +124,26 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
                 "RMSE of the selected estimate, °",
                 [
                     Cloud("equal", PLAIN, ends, ends, line=True),
-                    Cloud("drives", INK, other[known], own[known]),
+                    Cloud("drives", INK, other[both], ours[both]),
                 ],
                 log=True,
             )
 
 
 def _rival(fleet: Fleet) -> str | None:
-    """Return the estimator that the answer is drawn against: physics where it ran, else the best of the others."""
+    """Return the estimator that the selected one is drawn against: physics if it ran, else the best of the others."""
     mains = {d.main for d in fleet.scored}
     names = [r.estimator for r in fleet.ranking if {r.estimator} != mains]
     return "physics" if "physics" in names else next(iter(names), None)
 
 
 def _told(fleet: Fleet) -> list[Distribution]:
-    """Return the distributions, the answer's first; an estimator that always is the answer stands once."""
+    """Return the distributions, the selected estimate's first; an estimator that always is selected appears once."""
     mains = {d.main for d in fleet.scored}
     if len(mains) > 1:
         return list(fleet.distributions)
-    told = [d for d in fleet.distributions if d.estimator != ANSWER]
-    return sorted(told, key=lambda d: d.estimator not in mains)
+    shown = [d for d in fleet.distributions if d.estimator != ANSWER]
+    return sorted(shown, key=lambda d: d.estimator not in mains)
 
 
 def _colour(distribution: Distribution) -> str:
@@ -165,15 +165,15 @@ def _paired(fleet: Fleet) -> str:
     rank = next((r for r in fleet.ranking if r.estimator == rival), None)
     if rank is None or rank.against_answer is None or len(fleet.scored) < 2:
         return ""
-    found = rank.against_answer
-    side = "above" if found.value >= 0.0 else "below"
-    how = f"In the median of drives the error of {rival} is {abs(found.value):.1%} {side} the selected estimate's"
-    if not math.isfinite(found.low):
+    change = rank.against_answer
+    side = "above" if change.value >= 0.0 else "below"
+    how = f"In the median of drives the error of {rival} is {abs(change.value):.1%} {side} the selected estimate's"
+    if not math.isfinite(change.low):
         return f"{how}; inconclusive with so few drives."
-    bounds = f"{how} (95 % between {found.low:+.1%} and {found.high:+.1%})"
-    if found.low > 0.0:
+    bounds = f"{how} (95 % between {change.low:+.1%} and {change.high:+.1%})"
+    if change.low > 0.0:
         return f"{bounds}: the selected estimate is better."
-    return f"{bounds}: {'the selected estimate is worse.' if found.high < 0.0 else 'no significant difference.'}"
+    return f"{bounds}: {'the selected estimate is worse.' if change.high < 0.0 else 'no significant difference.'}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,8 +192,8 @@ def _rows(distributions: Sequence[Distribution]) -> list[_Row]:
     rows = []
     for d in distributions:
         unit, factor = read_unit(d.unit)
-        told = d.median.value, d.median.low, d.median.high, d.quantile(0.1), d.quantile(0.9), float(d.values[-1])
-        rows.append(_Row(LABELS[d.signal], unit, d.estimator, d.drives, tuple(x * factor for x in told)))
+        quantiles = d.median.value, d.median.low, d.median.high, d.quantile(0.1), d.quantile(0.9), float(d.values[-1])
+        rows.append(_Row(LABELS[d.signal], unit, d.estimator, d.drives, tuple(x * factor for x in quantiles)))
     return sorted(rows, key=lambda r: [*LABELS.values()].index(r.signal))
 
 

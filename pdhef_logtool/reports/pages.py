@@ -132,7 +132,7 @@ def _write(
     try:
         page = make()
         wrong = getattr(page, "wrong", "")
-    except Exception as error:  # noqa: BLE001 (whatever a report holds, the others get their pages)
+    except Exception as error:  # noqa: BLE001 (for any defect of a report, the others get their pages)
         shown = str(error) if isinstance(error, OutputError) else f"internal error, {type(error).__name__}: {error}"
         return WrittenPage(label, None, shown)
     path = folder / PAGE_FILE

@@ -82,29 +82,29 @@ def _drawing(figure: Figure) -> Callable[[Any, _Axes, Charts], None]:
 
 def _instants(grid: Grid, start_s: float, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return seconds and values of a series on the grid, two a cell as on the page."""
-    at = np.asarray(start_s + (np.arange(2 * grid.cells) * 0.5 + 0.25) * grid.cell_s, dtype=np.float64)
-    return at, np.ravel(values) if values.ndim == 2 else np.repeat(values, 2)
+    times = np.asarray(start_s + (np.arange(2 * grid.cells) * 0.5 + 0.25) * grid.cell_s, dtype=np.float64)
+    return times, np.ravel(values) if values.ndim == 2 else np.repeat(values, 2)
 
 
 def _time(figure: TimeFigure, axes: _Axes, charts: Charts) -> None:
     grid, start = charts.grid, charts.start_s()
     assert grid is not None
     for band in figure.bands:
-        at, low = _instants(grid, start, band.low)
-        axes.fill_between(at, low, _instants(grid, start, band.high)[1], color=band.colour, alpha=0.2, linewidth=0,
+        times, low = _instants(grid, start, band.low)
+        axes.fill_between(times, low, _instants(grid, start, band.high)[1], color=band.colour, alpha=0.2, linewidth=0,
                           label=_plain(band.label))  # fmt: skip
     drawn: list[FloatArray] = []
     for line in figure.series:
         if line.group:
             continue
-        at, values = _instants(grid, start, line.values)
+        times, values = _instants(grid, start, line.values)
         drawn.append(values[np.isfinite(values)])
-        axes.plot(at, values, color=line.colour, linewidth=0.8 * line.width, label=_plain(line.label))
+        axes.plot(times, values, color=line.colour, linewidth=0.8 * line.width, label=_plain(line.label))
     if figure.log:
         axes.set_yscale("log")
-    elif drawn and (known := np.concatenate(drawn)).size:
+    elif drawn and (values_drawn := np.concatenate(drawn)).size:
         levels = [] if figure.level is None else [figure.level]
-        least, most = (float(f(np.append(known, levels))) for f in (np.min, np.max))
+        least, most = (float(f(np.append(values_drawn, levels))) for f in (np.min, np.max))
         room = 0.06 * (most - least) or 0.5
         axes.set_ylim(0.0 if least >= 0.0 > least - room else least - room, most + room)
     if figure.level is not None:
@@ -143,9 +143,9 @@ def _points(figure: PointsFigure, axes: _Axes, _: Charts) -> None:
 
 
 def _intervals(figure: IntervalsFigure, axes: _Axes, _: Charts) -> None:
-    for i, one in enumerate(figure.intervals):
-        axes.plot([one.low, one.high], [i, i], color=one.colour, linewidth=2, marker="|", markersize=8)
-        axes.plot([one.middle], [i], color=one.colour, marker="o")
+    for i, interval in enumerate(figure.intervals):
+        axes.plot([interval.low, interval.high], [i, i], color=interval.colour, linewidth=2, marker="|", markersize=8)
+        axes.plot([interval.middle], [i], color=interval.colour, marker="o")
     if figure.zero is not None:
         axes.axvline(figure.zero, color="#1a1a1a", linewidth=0.9, linestyle="--")
     axes.set_yticks(range(len(figure.intervals)), [_plain(i.label) for i in figure.intervals], fontsize=8)

@@ -11,7 +11,7 @@ import numpy as np
 from pdhef_logtool.records.signals import FloatArray
 
 #: Name and order of the features. The paper's six come first; a network for one car uses all but the last thirteen,
-#: which tell cars apart.
+#: which distinguish cars.
 FEATURES = (
     "vx_m_s",  # posterior of the physics filter
     "ay_m_s2",  # measured
@@ -84,8 +84,8 @@ def make_features(
 ) -> FloatArray:
     """Return the features [K, 28] at each step; always finite where the filter's state is.
 
-    A missing measurement is replaced by what the physics filter predicts for it, so that a dropped channel looks to
-    the network like one that agrees with physics.
+    A missing measurement is replaced by what the physics filter predicts for it, so that to the network a dropped
+    channel is like one that agrees with physics.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """The network's pass in compiled code: LSTM layers and head, in float32, a step's two sides at a time.
 
-Training has PyTorch; a run does without, and gives the same to 1e-5 (a test holds it). A step depends on those before
-it through the state alone, so that no window changes a bit. Sums are taken in one order whatever BLAS a machine has.
+Training has PyTorch; a run does without, and gives the same to 1e-5 (a test checks it). A step depends on those before
+it through the state alone, so that no window changes a bit. Sums are taken in one order with any BLAS.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def _tanh(x):  # type: ignore[no-untyped-def]
 def _add_products(_typing, x, weights, out, first):  # type: ignore[no-untyped-def]
     """Add the products of vectors x [2, K] with a block of weights [K, 32] to the columns of out [2, M] from ``first``.
 
-    Said in the compiler's own language: sums stay in registers over the loop, which of a loop in Python it does not
+    Written in the compiler's own language: sums stay in registers over the loop, which of a loop in Python it does not
     find out. ``contract`` lets a product and a sum be one instruction, where the processor has one.
     """
     if any(a.layout != "C" or a.dtype != types.float32 for a in (x, weights, out)):
@@ -66,16 +66,16 @@ def _add_products(_typing, x, weights, out, first):  # type: ignore[no-untyped-d
             context.make_array(kind)(context, builder, value)
             for kind, value in zip(signature.args[:3], args[:3], strict=True)
         )
-        rows, columns = (cgutils.unpack_tuple(builder, a.shape)[at] for a, at in ((weights, 0), (out, 1)))
+        rows, columns = (cgutils.unpack_tuple(builder, a.shape)[axis] for a, axis in ((weights, 0), (out, 1)))
         lane, vector = ir.FloatType(), ir.VectorType(ir.FloatType(), _LANES)
         number, undefined = ir.IntType(64), ir.Constant(vector, ir.Undefined)
         first_lane = ir.Constant(ir.VectorType(ir.IntType(32), _LANES), [0] * _LANES)
 
-        def place(base: Any, at: Any, add: int = 0) -> Any:
-            return builder.bitcast(builder.gep(base, [builder.add(at, number(add))]), vector.as_pointer())
+        def place(base: Any, index: Any, add: int = 0) -> Any:
+            return builder.bitcast(builder.gep(base, [builder.add(index, number(add))]), vector.as_pointer())
 
-        def load(base: Any, at: Any, add: int = 0) -> Any:
-            value = builder.load(place(base, at, add))
+        def load(base: Any, index: Any, add: int = 0) -> Any:
+            value = builder.load(place(base, index, add))
             value.align = lane.get_abi_size(context.target_data)
             return value
 
@@ -90,8 +90,8 @@ def _add_products(_typing, x, weights, out, first):  # type: ignore[no-untyped-d
             of_row = {add: load(weights.data, row, add) for add in range(0, _COLUMNS, _LANES)}
             both = []
             for side in range(SIDES):
-                at = builder.add(loop.index, builder.mul(number(side), rows))
-                value = builder.insert_element(undefined, builder.load(builder.gep(x.data, [at])), ir.IntType(32)(0))
+                index = builder.add(loop.index, builder.mul(number(side), rows))
+                value = builder.insert_element(undefined, builder.load(builder.gep(x.data, [index])), ir.IntType(32)(0))
                 both.append(builder.shuffle_vector(value, undefined, first_lane))
             for side, add, _, kept in sums:
                 product = builder.fmul(both[side], of_row[add], flags=("contract",))
@@ -191,8 +191,8 @@ class ForwardPass:
         gates, hidden = (_aligned((steps, SIDES, width)) for width in (len(self.layers[0][2]), self.hidden))
         dense = [_aligned((steps, SIDES, len(bias))) for _, bias in self.head]
         said = np.empty((len(inputs), SIDES, self.widths[-1]), dtype=np.float32)
-        for at in range(0, len(inputs), _TILE_STEPS):
-            x = np.ascontiguousarray(inputs[at : at + _TILE_STEPS], dtype=np.float32)
+        for first in range(0, len(inputs), _TILE_STEPS):
+            x = np.ascontiguousarray(inputs[first : first + _TILE_STEPS], dtype=np.float32)
             gate = gates[: len(x)]
             for (of_input, of_state, bias), (h, c) in zip(self.layers, after, strict=True):
                 _dense(x, of_input, bias, False, gate)
@@ -201,7 +201,7 @@ class ForwardPass:
             for n, ((weights, bias), out) in enumerate(zip(self.head, dense, strict=True)):
                 _dense(x, weights, bias, n + 1 < len(self.head), out[: len(x)])
                 x = np.ascontiguousarray(out[: len(x), :, : self.widths[n]])
-            said[at : at + len(x)] = x
+            said[first : first + len(x)] = x
         return said, after
 
 
@@ -210,8 +210,8 @@ def _aligned(shape: tuple[int, ...]) -> Float32Array:
     size, line = 4 * math.prod(shape), 64
     memory = np.zeros(size + line, dtype=np.uint8)
     first = -memory.ctypes.data % line
-    found: Float32Array = memory[first : first + size].view(np.float32).reshape(shape)
-    return found
+    view: Float32Array = memory[first : first + size].view(np.float32).reshape(shape)
+    return view
 
 
 def _filled(values: Float32Array) -> Float32Array:

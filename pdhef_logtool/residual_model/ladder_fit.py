@@ -55,8 +55,8 @@ class TaughtDrive:
     @property
     def usable(self) -> BoolArray:
         """Whether features and error are known, [K]."""
-        known = np.isfinite(self.lacking_rad) & np.isfinite(self.features.odd).all(axis=1)
-        return np.asarray(known & np.isfinite(self.features.even).all(axis=1), dtype=np.bool_)
+        usable = np.isfinite(self.lacking_rad) & np.isfinite(self.features.odd).all(axis=1)
+        return np.asarray(usable & np.isfinite(self.features.even).all(axis=1), dtype=np.bool_)
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,8 +158,8 @@ class _Problem:
         drives = self.kept(without)
         size = self.blocks[0].phi.size
         weights = np.zeros(size) if ridge is None else _solve(list(drives.values()), ridge)
-        own = drives.get(self.drives[block])
-        constant = 0.0 if own is None else (own.error - float(weights @ own.phi)) / own.seconds
+        trained = drives.get(self.drives[block])
+        constant = 0.0 if trained is None else (trained.error - float(weights @ trained.phi)) / trained.seconds
         return self.blocks[block].squares(weights, constant)
 
 

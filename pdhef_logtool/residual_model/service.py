@@ -39,7 +39,7 @@ class NetworkService:
         return ForwardPass.of(self.bundle.weights, self.bundle.layers, self.bundle.head)
 
     def run(self, features: FloatArray, starts: BoolArray, carry: NetworkCarry) -> tuple[FloatArray, NetworkCarry]:
-        """Return residual rates [N, 2] in m/s² and rad/s² from each step on, or v_y [N, 1] in m/s; and the carry.
+        """Return residual rates [N, 2] in m/s² and rad/s² from each step on, or v_y [N, 1] in m/s; and the state.
 
         Parameters
         ----------
@@ -47,16 +47,16 @@ class NetworkService:
         starts : [N], where a sequence begins again.
         """
         out = np.zeros((features.shape[0], OUTPUT_COUNT[self.bundle.target]))
-        known = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
-        breaks = np.logical_or(starts, ~known).astype(np.bool_)
-        breaks[1:] |= ~known[:-1]
+        usable = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
+        breaks = np.logical_or(starts, ~usable).astype(np.bool_)
+        breaks[1:] |= ~usable[:-1]
         edges = [0, *(np.flatnonzero(breaks[1:]) + 1).tolist(), features.shape[0]]
         for a, b in pairwise(edges):
             if a == b:
                 continue
             if breaks[a]:
                 carry = None
-            if known[a]:
+            if usable[a]:
                 out[a:b], carry = self._sequence(self.bundle.normalise(features[a:b]), carry)
         target_std = np.array(self.bundle.normalisation.target_std)
         limits = np.array(_LIMITS_OF[self.bundle.target])
@@ -74,7 +74,7 @@ class NetworkService:
 
 @dataclass(frozen=True)
 class RememberingNetwork(NetworkService):
-    """A network that answers the same question once: neither trust nor a filter's noise changes its features."""
+    """A network that answers the same question once: neither gain nor noise of a filter changes its features."""
 
     _known: dict[bytes, tuple[FloatArray, NetworkCarry]] = field(default_factory=dict, compare=False)
 

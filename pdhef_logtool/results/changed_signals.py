@@ -36,7 +36,7 @@ class ChangedSignal:
 
 
 def changed_signals(pair: Pair, estimator: str) -> Iterator[ChangedSignal]:
-    """Yield what differs of the truth and of an estimator, in the order of columns; nothing where a side has no track.
+    """Yield what differs of ground truth and of an estimator, by column; nothing where a side has no track.
 
     Raises
     ------
@@ -44,16 +44,16 @@ def changed_signals(pair: Pair, estimator: str) -> Iterator[ChangedSignal]:
     """
     import polars as pl
 
-    one, other = pair.a.estimates(), pair.b.estimates()
-    if one is None or other is None:
+    left, other = pair.a.estimates(), pair.b.estimates()
+    if left is None or other is None:
         return
-    columns = [c for c in _SIGNALS if c in one.collect_schema() and c in other.collect_schema()]
+    columns = [c for c in _SIGNALS if c in left.collect_schema() and c in other.collect_schema()]
     for track in (TRUTH, estimator):
         rows = [
             frame.filter(pl.col("estimator").cast(pl.String) == track).select(
                 "stamp_ns", *(pl.col(c).cast(pl.Float64).fill_nan(None) for c in columns), there=pl.lit(value=True)
             )
-            for frame in (one, other)
+            for frame in (left, other)
         ]
         joined = rows[0].join(rows[1], on="stamp_ns", how="full", coalesce=True, suffix="_b").sort("stamp_ns").collect()
         if joined["there"].any() and joined["there_b"].any():
@@ -70,17 +70,17 @@ def _changed(joined: pl.DataFrame, drive: str, track: str, column: str) -> Chang
     by = (pl.col(column) - pl.col(f"{column}_b")).abs()
     only_one = pl.col(column).is_null() != pl.col(f"{column}_b").is_null()
     apart = (by.fill_nan(0.0) > 2.0 * (step + share * pl.col(column).abs())).fill_null(value=False)
-    found = joined.select("stamp_ns", differs=missing | only_one | apart, by=by).filter("differs")
-    if not len(found):
+    differing = joined.select("stamp_ns", differs=missing | only_one | apart, by=by).filter("differs")
+    if not len(differing):
         return None
-    largest = found["by"].max()
+    largest = differing["by"].max()
     return ChangedSignal(
         drive,
         track,
         column,
-        first_ns=int(found["stamp_ns"][0]),
-        first_s=(int(found["stamp_ns"][0]) - int(joined["stamp_ns"][0])) * 1e-9,
-        stamps=len(found),
+        first_ns=int(differing["stamp_ns"][0]),
+        first_s=(int(differing["stamp_ns"][0]) - int(joined["stamp_ns"][0])) * 1e-9,
+        stamps=len(differing),
         of=len(joined),
         largest=float(largest) if isinstance(largest, float) else None,
     )

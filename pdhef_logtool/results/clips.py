@@ -25,7 +25,7 @@ _ANNOTATED = "annotated.mcap"
 
 def write_clips(
     run: OpenedRun,
-    found: FoundEvents,
+    found_events: FoundEvents,
     *,
     pad_s: float,
     named: Collection[str] = (),
@@ -47,9 +47,9 @@ def write_clips(
     """
     logs = {log.label: log for log in run.logs}
     names: list[str] = []
-    failed = found.failed
+    failed = found_events.failed
     with OutputFolder(run.folder), FolderTransaction(run.folder / CLIPS, keep=False) as change:
-        for label, events in groupby(found.events, key=lambda event: event.drive):
+        for label, events in groupby(found_events.events, key=lambda event: event.drive):
             try:
                 opened = open_log(_source_of(run, logs[label], source))
             except PdhefError as error:
@@ -66,7 +66,7 @@ def write_clips(
                 failed |= any(loss.severity == "lost" for loss in opened.lost)
             finally:
                 opened.close()
-    return replace(found, clips=tuple(names), failed=failed)
+    return replace(found_events, clips=tuple(names), failed=failed)
 
 
 def _clips_of(

@@ -86,17 +86,17 @@ class ComparedFigure:
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as JSON-able values; changes are shares: 0.05 is 5 % more."""
-        found = self.change
-        bounds = {k: math.expm1(getattr(found, k)) for k in ("median", "low", "high", "least", "most")}
+        change = self.change
+        bounds = {k: math.expm1(getattr(change, k)) for k in ("median", "low", "high", "least", "most")}
         return {
             **asdict(self.figure),
             "unit": self.unit,
             "verdict": self.verdict,
-            "drives": found.drives,
-            "clusters": found.clusters,
+            "drives": change.drives,
+            "clusters": change.clusters,
             **bounds,
             "detectable": self.detectable,
-            "sign_p": found.sign_p,
+            "sign_p": change.sign_p,
             "corrected_p": self.corrected_p,
             "only_a": self.only_a,
             "only_b": self.only_b,
@@ -165,16 +165,16 @@ class Comparison:
     @property
     def failures(self) -> tuple[str, ...]:
         """Why the gate is closed, a line each; empty: it is open, or there is none."""
-        found = []
+        reasons = []
         if self.gated:
-            found += [f"{f.figure.label}: {f.verdict}" for f in self.figures if f.verdict in ("worse", "no figure")]
-            found += () if self.allow_unpaired else self.unpaired
+            reasons += [f"{f.figure.label}: {f.verdict}" for f in self.figures if f.verdict in ("worse", "no figure")]
+            reasons += () if self.allow_unpaired else self.unpaired
         if self.strict:
-            told = ("inconclusive",) if self.gated else ("inconclusive", "no figure")
-            found += [
-                f"{f.figure.label}: {f.verdict}, which --strict refuses" for f in self.figures if f.verdict in told
+            refused = ("inconclusive",) if self.gated else ("inconclusive", "no figure")
+            reasons += [
+                f"{f.figure.label}: {f.verdict}, which --strict refuses" for f in self.figures if f.verdict in refused
             ]
-        return tuple(found)
+        return tuple(reasons)
 
     @property
     def exit_code(self) -> int:
@@ -218,7 +218,7 @@ def compare_runs(
     ----------
     gate : the figures; those without a limit are no gate.
     cluster : ``car``, ``day`` or a key of the logs' metadata: drives that share it are no independent witnesses.
-    strict : "cannot tell" closes the gate.
+    strict : an inconclusive figure closes the gate.
 
     Raises
     ------
@@ -237,7 +237,7 @@ def compare_runs(
     damaged = _Damaged()
     tables = _Tables(a, b, pairing.pairs, damaged)
     changed = tables.changed()
-    found = Comparison(
+    result = Comparison(
         a=a.place,
         b=b.place,
         pairs=Counter(pair.by for pair in pairing.pairs),
@@ -252,12 +252,12 @@ def compare_runs(
         strict=strict,
     )
     if not changed and not gated:
-        return replace(found, damaged=damaged.lines)
+        return replace(result, damaged=damaged.lines)
     clusters = None if cluster is None else _clusters(pairing, cluster, damaged)
     figures = tuple(tables.compared(gate.figures, clusters))
     tables.check_estimators(figures)
     if not changed:
-        return replace(found, figures=figures, damaged=damaged.lines)
+        return replace(result, figures=figures, damaged=damaged.lines)
     others = _corrected(tables.compared(_beside(gate.figures), clusters))
     followed = _most_changed(pairing.pairs, changed, figures[0])
     main = figures[0].figure.estimator
@@ -266,7 +266,7 @@ def compare_runs(
         with damaged.noted(pair.a, pair.b):
             signals += changed_signals(pair, tables.name_of(pair, main))
     return replace(
-        found, figures=figures, others=others, signals=tuple(signals), followed=len(followed), damaged=damaged.lines
+        result, figures=figures, others=others, signals=tuple(signals), followed=len(followed), damaged=damaged.lines
     )
 
 
@@ -294,7 +294,7 @@ class _Damaged:
 
 
 class _Tables:
-    """The figures of two runs for their pairs, of which only what is asked for is read."""
+    """The figures of two runs for their pairs; only what is asked for is read."""
 
     def __init__(self, a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair], damaged: _Damaged) -> None:
         self._runs = (a, b)
@@ -309,7 +309,7 @@ class _Tables:
         return self._main[self._pairs.index(pair)] if estimator == MAIN else estimator
 
     def changed(self) -> frozenset[str]:
-        """Return the drives of A of which any figure is not the same bit for bit."""
+        """Return the drives of A with any figure that is not the same bit for bit."""
         import polars as pl
 
         for run in self._runs:
@@ -368,16 +368,16 @@ class _Tables:
         return _of_rows(figure, both.sort("place"), clusters)
 
     def check_estimators(self, figures: Sequence[ComparedFigure]) -> None:
-        """Raise UsageError for an estimator that no drive of either run has, and for runs without a main one."""
+        """Raise UsageError for an estimator that no drive of either run has, and for runs without a selected one."""
         missing = {f.figure.estimator for f in figures if f.verdict == "no figure"}
         if any(self._main):
             missing -= {MAIN}
         if not missing:
             return
         frames = [run.metrics().select("estimator").unique().collect(engine="streaming") for run in self._runs]
-        known = {name for frame in frames for name in frame["estimator"]}
-        for name in sorted(missing - known):
-            single = sorted(k for k in known if "~" not in k and k != SENSORS)
+        estimators = {name for frame in frames for name in frame["estimator"]}
+        for name in sorted(missing - estimators):
+            single = sorted(k for k in estimators if "~" not in k and k != SENSORS)
             got = "none named, and none that is selected" if name == MAIN else name
             raise UsageError(expected=f"an estimator of these runs: {', '.join(single)}", got=got, where="--estimator")
 
@@ -402,12 +402,12 @@ def _by_parts(run: OpenedRun, query: Callable[[pl.LazyFrame], pl.LazyFrame]) -> 
     import pyarrow.parquet as pq
 
     texts = ["log", *(c for c in _FIGURE if c not in ("value", "n"))]
-    found = []
+    pieces = []
     with pq.ParquetFile(run.folder / METRICS_FILE, read_dictionary=texts) as file:
         for batch in file.iter_batches(_ROWS, columns=["log", *_FIGURE]):
             rows = pl.DataFrame(pl.from_arrow(batch)).lazy().with_columns(pl.col(texts).cast(pl.String))
-            found.append(query(rows).collect())
-    return pl.concat(found) if found else query(run.metrics()).collect()
+            pieces.append(query(rows).collect())
+    return pl.concat(pieces) if pieces else query(run.metrics()).collect()
 
 
 def _of_rows(figure: Figure, both: pl.DataFrame, clusters: Sequence[object] | None) -> ComparedFigure:
@@ -481,31 +481,31 @@ def _beside(asked: Sequence[Figure]) -> list[Figure]:
     ]
 
 
-def _corrected(found: Sequence[ComparedFigure]) -> tuple[ComparedFigure, ...]:
-    there = [f for f in found if f.drives]
+def _corrected(figures: Sequence[ComparedFigure]) -> tuple[ComparedFigure, ...]:
+    there = [f for f in figures if f.drives]
     return tuple(replace(f, corrected_p=p) for f, p in zip(there, holm([f.change.sign_p for f in there]), strict=True))
 
 
 def _most_changed(pairs: Sequence[Pair], changed: frozenset[str], figure: ComparedFigure) -> list[Pair]:
     """Return the changed pairs whose figure changed most, those without one last, at most :data:`MOST_FOLLOWED`."""
     by_drive = {d.drive: abs(float(log_ratios(np.array([d.a]), np.array([d.b]))[0])) for d in figure.drives}
-    known = [pair for pair in pairs if pair.a.label in changed]
-    return sorted(known, key=lambda pair: -by_drive.get(pair.a.label, -1.0))[:MOST_FOLLOWED]
+    changed_pairs = [pair for pair in pairs if pair.a.label in changed]
+    return sorted(changed_pairs, key=lambda pair: -by_drive.get(pair.a.label, -1.0))[:MOST_FOLLOWED]
 
 
 def _clusters(pairing: Pairing, key: str, damaged: _Damaged) -> list[object]:
     """Return what each pair is of; a drive that does not state is its own."""
-    found: list[str | None] = [None] * len(pairing.pairs)
-    known: set[str] = set()
+    clusters: list[str | None] = [None] * len(pairing.pairs)
+    keys: set[str] = set()
     for number, pair in enumerate(pairing.pairs):
         with damaged.noted(pair.a):
-            found[number] = _cluster(pair.a, key)
-            known.update((pair.a.report() or {}).get("metadata") or {})
-    if all(value is None for value in found):
+            clusters[number] = _cluster(pair.a, key)
+            keys.update((pair.a.report() or {}).get("metadata") or {})
+    if all(value is None for value in clusters):
         raise UsageError(
-            expected=f"a key of the drives: {', '.join(['car', 'day', *sorted(known)])}", got=key, where="--cluster"
+            expected=f"a key of the drives: {', '.join(['car', 'day', *sorted(keys)])}", got=key, where="--cluster"
         )
-    return [value if value is not None else ("alone", i) for i, value in enumerate(found)]
+    return [value if value is not None else ("alone", i) for i, value in enumerate(clusters)]
 
 
 def _cluster(log: OpenedLog, key: str) -> str | None:

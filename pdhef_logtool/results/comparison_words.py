@@ -14,56 +14,56 @@ _COLUMN_UNITS = {"rad": "rad", "rad_s": "rad/s", "m_s": "m/s", "m_s2": "m/s^2"}
 _BY = {"signals": "what their signals held", "content": "their files", "name": "their names alone"}
 
 
-def paired_text(found: Comparison) -> str:
+def paired_text(comparison: Comparison) -> str:
     """Return how many drives are in both runs, and by what they were known."""
-    pairs = sum(found.pairs.values())
-    by = ", ".join(f"{count} by {_BY[key]}" for key, count in found.pairs.items())
-    if len(found.pairs) == 1:
+    pairs = sum(comparison.pairs.values())
+    by = ", ".join(f"{count} by {_BY[key]}" for key, count in comparison.pairs.items())
+    if len(comparison.pairs) == 1:
         by = by.partition(" ")[2]
     return f"{pairs} drive{'s' * (pairs != 1)} in both, paired {by}"
 
 
-def verdict_text(found: Comparison) -> str:
+def verdict_text(comparison: Comparison) -> str:
     """Return the verdict in a sentence."""
-    if found.verdict == "equal":
+    if comparison.verdict == "equal":
         return "equal: all figures of all pairs are the same bit for bit"
-    told = {
+    text = {
         "worse": "B is worse",
         "better": "B is better",
         "not worse": "B is not worse",
         "equal": "no figure that was asked for changed",
         "inconclusive": "inconclusive with these drives",
         "no figure": "no drive has the figure on both sides (is there ground truth?)",
-    }[found.verdict]
-    detectable = [f.detectable for f in found.figures if f.verdict == "inconclusive"]
+    }[comparison.verdict]
+    detectable = [f.detectable for f in comparison.figures if f.verdict == "inconclusive"]
     if any(math.isfinite(d) for d in detectable):
-        told += f"; a worsening of {percent(max(d for d in detectable if math.isfinite(d)))} would have shown"
+        text += f"; a worsening of {percent(max(d for d in detectable if math.isfinite(d)))} would have shown"
     elif detectable:
-        told += f", as they are too few: at least {LEAST_CLUSTERS} drives (clusters) are needed"
-    return told
+        text += f", as they are too few: at least {LEAST_CLUSTERS} drives (clusters) are needed"
+    return text
 
 
-def notes_of(found: Comparison) -> list[str]:
+def notes_of(comparison: Comparison) -> list[str]:
     """Return what must be known of the figures that were asked for, a line each."""
     notes = []
-    if found.cluster:
-        notes.append(f"in brackets: clusters by {found.cluster}, which are drawn whole")
-    for one in found.figures:
-        notes += [f"{one.figure.label}: {note}" for note in one.notes]
-        if one.neither and one.drives:
-            notes.append(f"{one.figure.label}: {one.neither} drives have it on neither side")
-        if math.isfinite(one.detectable):
-            least = percent(one.detectable)
+    if comparison.cluster:
+        notes.append(f"in brackets: clusters by {comparison.cluster}, which are drawn whole")
+    for figure in comparison.figures:
+        notes += [f"{figure.figure.label}: {note}" for note in figure.notes]
+        if figure.neither and figure.drives:
+            notes.append(f"{figure.figure.label}: {figure.neither} drives have it on neither side")
+        if math.isfinite(figure.detectable):
+            least = percent(figure.detectable)
             notes.append(
-                f"{one.figure.label}: the smallest worsening that so many drives show in 4 of 5 cases: {least}"
+                f"{figure.figure.label}: the smallest worsening that so many drives show in 4 of 5 cases: {least}"
             )
     return notes
 
 
-def interval_text(one: ComparedFigure) -> str:
+def interval_text(figure: ComparedFigure) -> str:
     """Return the 95 % interval of the median change, a dash without."""
-    low, high = (math.expm1(x) for x in (one.change.low, one.change.high))
-    return f"{percent(low)} to {percent(high)}" if math.isfinite(one.change.low) else "-"
+    low, high = (math.expm1(x) for x in (figure.change.low, figure.change.high))
+    return f"{percent(low)} to {percent(high)}" if math.isfinite(figure.change.low) else "-"
 
 
 def unit_of_column(column: str) -> str:
@@ -72,21 +72,21 @@ def unit_of_column(column: str) -> str:
     return next((unit for end, unit in sorted(_COLUMN_UNITS.items(), reverse=True) if plain.endswith(f"_{end}")), "1")
 
 
-def one_signal_a_drive(found: Comparison) -> list[ChangedSignal]:
-    """Return the signal that was asked about of each drive, else its first, and of a truth that changed its first."""
-    asked = found.figures[0].figure.signal
+def one_signal_a_drive(comparison: Comparison) -> list[ChangedSignal]:
+    """Return the signal that was asked about of each drive, else its first, and the first of a changed ground truth."""
+    asked = comparison.figures[0].figure.signal
     shown: dict[tuple[str, bool], ChangedSignal] = {}
-    for one in found.signals:
-        key = (one.drive, one.track == TRUTH)
-        if key not in shown or (one.signal == asked and one.track != TRUTH):
-            shown[key] = one
+    for signal in comparison.signals:
+        key = (signal.drive, signal.track == TRUTH)
+        if key not in shown or (signal.signal == asked and signal.track != TRUTH):
+            shown[key] = signal
     return list(shown.values())
 
 
-def largest_text(one: ChangedSignal) -> str:
+def largest_text(signal: ChangedSignal) -> str:
     """Return the largest difference with its unit."""
-    unit, factor = read_unit(unit_of_column(one.signal))
-    return "-" if one.largest is None else f"{one.largest * factor:.3g} {unit}".strip()
+    unit, factor = read_unit(unit_of_column(signal.signal))
+    return "-" if signal.largest is None else f"{signal.largest * factor:.3g} {unit}".strip()
 
 
 def percent(share: float) -> str:

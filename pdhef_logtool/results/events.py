@@ -87,8 +87,8 @@ def find_events(
 
     Parameters
     ----------
-    estimator : what columns without a prefix are of; None: each drive's main one.
-    pad_s : events that are nearer than twice this become one.
+    estimator : what columns without a prefix are of; None: each drive's selected estimate.
+    pad_s : events closer than twice this become one.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def find_events(
     return FoundEvents(condition.text, searched, tuple(events), left_out, unreadable > 0, unreadable, lines)
 
 
-def write_events(path: Path, found: FoundEvents) -> None:
+def write_events(path: Path, events: FoundEvents) -> None:
     """Write the events as Parquet; raises OutputError."""
     import polars as pl
 
@@ -131,7 +131,7 @@ def write_events(path: Path, found: FoundEvents) -> None:
         "peak_ns": pl.Int64,
     }
     with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
-        pl.DataFrame([asdict(e) for e in found.events], schema=schema).write_parquet(file)
+        pl.DataFrame([asdict(e) for e in events.events], schema=schema).write_parquet(file)
 
 
 def _unfit(log: OpenedLog, condition: Condition, estimator: str | None) -> str | None:
@@ -148,19 +148,19 @@ def _unfit(log: OpenedLog, condition: Condition, estimator: str | None) -> str |
 
 def _check_tracks(logs: Sequence[OpenedLog], condition: Condition, estimator: str | None) -> None:
     """Raise UsageError for an estimator that none of the drives that can be read has."""
-    known = {name for log in logs if log.file(ESTIMATES_FILE) is not None for name in _tracks(log)}
-    if not known:
+    estimators = {name for log in logs if log.file(ESTIMATES_FILE) is not None for name in _tracks(log)}
+    if not estimators:
         return
     if estimator is None and not any(log.main() for log in logs):
         raise UsageError(
-            expected=f"an estimator of this run: {', '.join(sorted(known))}",
+            expected=f"an estimator of this run: {', '.join(sorted(estimators))}",
             got="none named, and none that is selected",
             where="--estimator",
         )
     asked = {c.track for c in condition.columns() if c.track is not None} | ({estimator} if estimator else set())
-    for name in sorted(asked - known - {TRUTH, None}, key=str):
+    for name in sorted(asked - estimators - {TRUTH, None}, key=str):
         raise UsageError(
-            expected=f"an estimator of this run: {', '.join(sorted(known))}",
+            expected=f"an estimator of this run: {', '.join(sorted(estimators))}",
             got=str(name),
             where="--where" if name != estimator else "--estimator",
             remedy="a minus between columns needs spaces" if "-" in str(name) else "",
@@ -196,22 +196,22 @@ def _events_of(log: OpenedLog, condition: Condition, main: str, pad_s: float) ->
     stamps, mask = rows["stamp_ns"].to_numpy(), rows["holds"].to_numpy()
     values = rows["peak"].fill_null(math.nan).to_numpy()
     log_start_ns = int((report.get("log") or {}).get("start_ns", stamps[0] if len(stamps) else 0))
-    found = []
+    events = []
     for first, last in _spans(stamps, mask, condition.least_s, pad_s):
-        at = _peak_at(values[first:last], condition.falls)
+        peak_row = _peak_at(values[first:last], condition.falls)
         start_ns, end_ns = int(stamps[first]), int(stamps[last - 1]) + 1
-        found.append(
+        events.append(
             FoundEvent(
                 log.label,
                 start_ns,
                 end_ns,
                 (start_ns - log_start_ns) * 1e-9,
                 (end_ns - log_start_ns) * 1e-9,
-                None if at is None else float(values[first + at]),
-                None if at is None else int(stamps[first + at]),
+                None if peak_row is None else float(values[first + peak_row]),
+                None if peak_row is None else int(stamps[first + peak_row]),
             )
         )
-    return found
+    return events
 
 
 def _spans(stamps_ns: IntArray, mask: BoolArray, least_s: float, pad_s: float) -> list[tuple[int, int]]:
@@ -238,12 +238,12 @@ def _peak_at(values: FloatArray, falls: bool) -> int | None:
 
 
 def _joined(frame: pl.LazyFrame, columns: Mapping[str, set[str]], main: str) -> pl.LazyFrame:
-    """Return the columns by track at the stamps of the main one, named ``track.column``; what is no number is null."""
+    """Return the columns by track at the stamps of the selected estimate, named ``track.column``; NaN is null."""
     import polars as pl
 
     def of(track: str) -> pl.LazyFrame:
-        known = [pl.col(c) if c in FLAGS else pl.col(c).cast(pl.Float64).fill_nan(None) for c in sorted(columns[track])]
-        named = [c.alias(f"{track}.{c.meta.output_name()}") for c in known]
+        typed = [pl.col(c) if c in FLAGS else pl.col(c).cast(pl.Float64).fill_nan(None) for c in sorted(columns[track])]
+        named = [c.alias(f"{track}.{c.meta.output_name()}") for c in typed]
         return frame.filter(pl.col("estimator").cast(pl.String) == track).select("stamp_ns", *named)
 
     rows = of(main)
@@ -266,8 +266,8 @@ class _Builder:
         if isinstance(node, Number):
             return pl.lit(node.value)
         if isinstance(node, Column):
-            found = self._column(node)
-            return found if node.factor == 1.0 else found * node.factor
+            column = self._column(node)
+            return column if node.factor == 1.0 else column * node.factor
         applied: pl.Expr = OPERATIONS[node.of](*(self.expression(operand) for operand in node.operands))
         return applied
 

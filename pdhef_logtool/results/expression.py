@@ -149,7 +149,7 @@ def _columns(node: Node) -> Iterator[Column]:
 
 
 def is_flag(node: Node) -> bool:
-    """Tell whether a node is true or false rather than a number."""
+    """Return whether a node is true or false rather than a number."""
     if isinstance(node, Applied):
         return node.of in ("and", "or", "not", *_COMPARISONS)
     return isinstance(node, Column) and node.name in FLAGS
@@ -265,16 +265,16 @@ class _Parser:
         return Column(track, ours, factor)
 
     def _error(self, expected: str, place: ast.expr | int) -> UsageError:
-        at = place if isinstance(place, int) else self._start + place.col_offset
-        before, after = self._text[:at], self._text[at:]
+        position = place if isinstance(place, int) else self._start + place.col_offset
+        before, after = self._text[:position], self._text[position:]
         if isinstance(place, ast.expr) and place.end_col_offset is not None:
-            got = self._text[at : self._start + place.end_col_offset][:40]
+            got = self._text[position : self._start + place.end_col_offset][:40]
         else:
             got = "".join(re.findall(r"^\s*(\w+|\S)", after)) or "the end"
         return UsageError(
             expected=expected,
             got=got,
-            where=f"--where, sign {at + 1} (here: {before[-30:]}»{after[:30]})",
+            where=f"--where, sign {position + 1} (here: {before[-30:]}»{after[:30]})",
             remedy=f"{self._guide} has the columns and what joins them",
         )
 

@@ -1,7 +1,7 @@
 """The figures of a whole run: how drives are spread, which estimator ranks where, and where nobody drove.
 
-Reports are read one after the other and metrics lazily: of a drive a few figures stay, never a series. What is said of
-an estimator is said of the drives whose truth is independent of it; those without such a truth stand apart. Drives
+Reports are read one after the other and metrics lazily: of a drive a few figures stay, never a series. The figures of
+an estimator are of the drives whose ground truth is independent of it; those without one are separate. Drives
 count as independent of one another.
 """
 
@@ -65,7 +65,7 @@ class FleetDrive:
     seconds : length. main : the selected estimate's estimator, empty without one.
     truth : whether its sideslip is scored against an independent ground truth. unscored : why not, else empty.
     errors : RMSE by estimator and signal, where the ground truth is independent of both.
-    nis, d2, naive_d2 : what needs no truth: NIS over its degrees of freedom and d2 of the answer, d2 of sideslip 0.
+    nis, d2, naive_d2 : without ground truth: NIS and v̇_y residual of the selected estimate, v̇_y residual of sideslip 0.
     verdict : of sideslip: ``better``, ``worse`` and so on. coverage : of the 95 % confidence interval.
     failed_checks : those that count. lost : what could not be used, empty for nothing. keys : what it can be given by.
     """
@@ -114,7 +114,7 @@ class Distribution:
 class Rank:
     """The place of an estimator: those that it is shown to be better than and worse than, pair by pair.
 
-    ``against_answer``: the median of its error over the answer's, less 1; None for one that is always the answer.
+    ``against_answer``: the median of its error over the selected estimate's, less 1; None if it is always selected.
     """
 
     place: int
@@ -127,7 +127,7 @@ class Rank:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Drives of which a key says the same: how many, and how many of them are scored, with the answer's error."""
+    """Drives with the same value of a key: how many, how many of them are scored, and the selected estimate's error."""
 
     value: str
     drives: int
@@ -323,10 +323,10 @@ def _figures(run: OpenedRun) -> dict[str, dict[tuple[str, str, str], float]]:
         )
         .select("log", "estimator", "signal", "metric", "value")
     )
-    found: dict[str, dict[tuple[str, str, str], float]] = {}
+    values: dict[str, dict[tuple[str, str, str], float]] = {}
     for log, estimator, signal, metric, value in rows.collect().iter_rows():
-        found.setdefault(log, {})[estimator, signal, metric] = math.nan if value is None else value
-    return found
+        values.setdefault(log, {})[estimator, signal, metric] = math.nan if value is None else value
+    return values
 
 
 def _drive(log: OpenedLog, report: Mapping[str, Any], figures: Mapping[tuple[str, str, str], float]) -> FleetDrive:
@@ -373,7 +373,7 @@ def _keys(log: OpenedLog, report: Mapping[str, Any], main: str) -> dict[str, str
     friction = report.get("friction") or {}
     car = log.entry.get("car") or {}
     source = str(friction.get("source", ""))
-    own = {
+    from_log = {
         "car": car.get("name") or report["vehicle"]["name"],
         "log format": report["log"]["kind"],
         "answer": main,
@@ -382,9 +382,9 @@ def _keys(log: OpenedLog, report: Mapping[str, Any], main: str) -> dict[str, str
         "sensor faults": _fault_text(report),
     }
     parts = str(log.entry.get("folder") or "").split("/")[:_MOST_FOLDERS]
-    own |= {"folder" if i == 0 else f"folder {i + 1}": "/".join(parts[: i + 1]) for i in range(len(parts))}
-    told = {str(k): str(v) for k, v in (report.get("metadata") or {}).items()}
-    return {**told, **{k: v for k, v in own.items() if v}}
+    from_log |= {"folder" if i == 0 else f"folder {i + 1}": "/".join(parts[: i + 1]) for i in range(len(parts))}
+    from_metadata = {str(k): str(v) for k, v in (report.get("metadata") or {}).items()}
+    return {**from_metadata, **{k: v for k, v in from_log.items() if v}}
 
 
 def _length(seconds: float) -> str:
@@ -455,19 +455,19 @@ def _share(of_logs: Median) -> Median:
 
 def _breakdowns(drives: Sequence[FleetDrive], by: Sequence[str]) -> list[Breakdown]:
     """Return the drives by each key that shows them apart, the one that explains most first; ``by`` keeps its order."""
-    known = {key: None for d in drives for key in d.keys}
-    found = []
-    for key in by or known:
+    all_keys = {key: None for d in drives for key in d.keys}
+    breakdowns = []
+    for key in by or all_keys:
         values = _told(key, drives)
         count = len({v for v in values if v is not None})
         if by or 2 <= count <= min(MOST_VALUES, len(drives) - 1):
-            found.append(_breakdown(key, drives, values))
+            breakdowns.append(_breakdown(key, drives, values))
     if by:
-        return found
+        return breakdowns
     same: dict[tuple[tuple[int, float], ...], Breakdown] = {}
-    for one in sorted(found, key=lambda b: (-b.explains if math.isfinite(b.explains) else 1.0, b.key)):
+    for breakdown in sorted(breakdowns, key=lambda b: (-b.explains if math.isfinite(b.explains) else 1.0, b.key)):
         # Two keys that part the drives alike state it once.
-        same.setdefault(tuple((g.drives, g.median.value) for g in one.groups if g.scored), one)
+        same.setdefault(tuple((g.drives, g.median.value) for g in breakdown.groups if g.scored), breakdown)
     return [*same.values()]
 
 
@@ -481,9 +481,9 @@ def _told(key: str, drives: Sequence[FleetDrive]) -> list[str | None]:
     finite = np.array([x for x in numbers if math.isfinite(x)])
     if len(finite) == sum(counts.values()):
         edges = np.unique(np.quantile(finite, np.linspace(0.0, 1.0, _QUARTERS + 1)))
-        at = np.clip(np.searchsorted(edges, numbers, side="right") - 1, 0, max(len(edges) - 2, 0))
+        bin_of = np.clip(np.searchsorted(edges, numbers, side="right") - 1, 0, max(len(edges) - 2, 0))
         names = [f"{a:.4g} to {b:.4g}" for a, b in pairwise(edges)] or [f"{edges[0]:.4g}"]
-        return [names[i] if math.isfinite(x) else None for i, x in zip(at, numbers, strict=True)]
+        return [names[i] if math.isfinite(x) else None for i, x in zip(bin_of, numbers, strict=True)]
     common = {value for value, _ in counts.most_common(MOST_VALUES)}
     rest = f"{len(counts) - MOST_VALUES} others"
     return [t if t is None or t in common else rest for t in texts]
@@ -526,10 +526,10 @@ def _explained(groups: Sequence[FloatArray]) -> float:
     return 1.0 - (within / (n - k)) / (total / (n - 1)) if total > 0.0 else 0.0
 
 
-def grouped(found: Sequence[tuple[str, str]]) -> tuple[Failures, ...]:
-    """Return reasons with their logs, the most frequent first; numbers and places do not tell reasons apart."""
+def grouped(failures: Sequence[tuple[str, str]]) -> tuple[Failures, ...]:
+    """Return reasons with their logs, the most frequent first; numbers and places do not distinguish reasons."""
     members: dict[str, tuple[str, dict[str, None]]] = {}
-    for label, reason in found:
+    for label, reason in failures:
         text = _without_place(reason)
         members.setdefault(_NUMBER.sub("", text), (text, {}))[1][label] = None
     groups = [Failures(text, len(labels), tuple(labels)[:NAMED]) for text, labels in members.values()]

@@ -17,14 +17,14 @@ from pdhef_logtool.evaluation.units import LABELS, SIGNALS
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.storage.documents import checked, read_toml, unknown
 
-#: What represents A's main estimator of each drive.
+#: Name for the selected estimate of each drive in A.
 MAIN = "main"
 _SHARE = re.compile(r"\s*([0-9]*\.?[0-9]+)\s*(%?)\s*")
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A figure of metrics.parquet, of which less is better.
+    """A figure of metrics.parquet whose lower value is better.
 
     ``estimator``: a name on both sides, or :data:`MAIN`. ``limit``: the share by which it may become worse, None where
     nothing is asked of it. ``floor``: figures below count as the floor, in the unit of metrics.parquet.
@@ -39,7 +39,7 @@ class Figure:
 
     @property
     def label(self) -> str:
-        """``sideslip_rad rmse (all)``, with the estimator unless it is the main one, for tables and test reports."""
+        """``sideslip_rad rmse (all)``, with the estimator unless it is the selected one, for tables and reports."""
         of = "" if self.estimator == MAIN else f" of {self.estimator}"
         return f"{self.signal} {self.metric} ({self.segment}){of}"
 
@@ -87,8 +87,8 @@ def load_gate(path: Path) -> Gate:
 
 def gate_from_dict(raw: dict[str, Any], *, where: str) -> Gate:
     """Build a gate from parsed TOML; raises UsageError with every problem in one line."""
-    known = ("allow_unpaired", "figure")
-    problems = [unknown(key, known) for key in raw if key not in known]
+    expected = ("allow_unpaired", "figure")
+    problems = [unknown(key, expected) for key in raw if key not in expected]
     allowed = raw.get("allow_unpaired", False)
     if not isinstance(allowed, bool):
         problems.append("allow_unpaired: should be true or false")
@@ -124,18 +124,18 @@ def _read_figure(raw: object, where: str, problems: list[str]) -> Figure | None:
 def figure_problems(signal: str, metric: str, segment: str, where: str = "") -> list[str]:
     """Return what is wrong with the words of a figure."""
     # Less is better, and 0 is best: those that a ratio states something of.
-    compared = tuple(name for name, one in registered().items() if one.best == "lower")
+    compared = tuple(name for name, metric in registered().items() if metric.best == "lower")
     choices = (("signal", signal, tuple(SIGNALS)), ("metric", metric, compared), ("segment", segment, SEGMENTS))
-    return [f"{where}{key} = {unknown(value, known)}" for key, value, known in choices if value not in known]
+    return [f"{where}{key} = {unknown(value, allowed)}" for key, value, allowed in choices if value not in allowed]
 
 
 def share_of(text: str | float) -> float | None:
     """Return the share that ``5%``, ``0.05`` or a number represents; None for what is none, or above 10."""
     if isinstance(text, str):
-        found = _SHARE.fullmatch(text)
-        if found is None:
+        match = _SHARE.fullmatch(text)
+        if match is None:
             return None
-        share = float(found[1]) / (100.0 if found[2] else 1.0)
+        share = float(match[1]) / (100.0 if match[2] else 1.0)
     else:
         share = float(text)
     return share if math.isfinite(share) and 0.0 <= share <= 10.0 else None

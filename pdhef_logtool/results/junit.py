@@ -64,9 +64,9 @@ def cases_bytes(
     root = ET.Element("testsuites", {"name": "pdhef", **_counts(everything)})
     for name, of_suite in suites.items():
         suite = ET.SubElement(root, "testsuite", {"name": _text(name), **_counts(of_suite)})
-        if own := (properties or {}).get(name):
+        if entries := (properties or {}).get(name):
             element = ET.SubElement(suite, "properties")
-            for key, value in own.items():
+            for key, value in entries.items():
                 ET.SubElement(element, "property", {"name": _text(key), "value": _text(value)})
         for case in of_suite:
             _add_case(suite, case)

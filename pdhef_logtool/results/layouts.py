@@ -18,7 +18,7 @@ from pdhef_logtool.storage.files import write_bytes
 
 @dataclass(frozen=True, slots=True)
 class _Plot:
-    """One plot: its title and the field of ``state`` that it shows; not all fields mean something for the truth."""
+    """One plot: its title and the field of ``state`` that it shows; not all fields exist for ground truth."""
 
     title: str
     field: str

@@ -136,8 +136,8 @@ class AnnotatedMcapSink(Sink):
             posed = first_of_slots(track.stamps_ns, step_ns, self._last_ns.get(track.name))
             self._last_ns[track.name] = int(track.stamps_ns[-1])
             stated = posed if self._thin else stated
-        known = track.valid & np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
-        self._window[track.name] = [_state_batch(track, stated), _odometry_batch(track, posed[known[posed]])]
+        is_finite = track.valid & np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
+        self._window[track.name] = [_state_batch(track, stated), _odometry_batch(track, posed[is_finite[posed]])]
 
     def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:  # noqa: ARG002
         """Write what is left of the source, the metrics record and report.json, and give the file its name."""
@@ -212,7 +212,7 @@ def metrics_record(report: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _is_our_report(attachment: Attachment) -> bool:
-    """Tell our report.json from somebody else's attachment of the same name."""
+    """Return whether an attachment is our report.json, not somebody else's of the same name."""
     if attachment.name != REPORT_ATTACHMENT:
         return False
     try:
@@ -263,6 +263,6 @@ def _twist_covariance(covariance: FloatArray, n: int) -> FloatArray:
     """Place [N, 3, 3] over v_x, v_y, r into [N, 36]; all zero, ROS's sign for unknown, where it is not known."""
     full = np.zeros((n, 6, 6))
     if covariance.shape[0]:
-        known: BoolArray = np.all(np.isfinite(covariance), axis=(1, 2))
-        full[:, _PLANAR[:, None], _PLANAR] = np.where(known[:, None, None], covariance, 0.0)
+        is_finite: BoolArray = np.all(np.isfinite(covariance), axis=(1, 2))
+        full[:, _PLANAR[:, None], _PLANAR] = np.where(is_finite[:, None, None], covariance, 0.0)
     return full.reshape(n, 36)

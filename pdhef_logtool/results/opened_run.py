@@ -43,7 +43,7 @@ _AGAIN = "run the log again"
 
 
 class _Checked(BaseModel):
-    """The entries that commands rely on, none of which need be there; others are not looked at."""
+    """The entries that commands use; each is optional, others are ignored."""
 
     model_config = ConfigDict(extra="ignore", strict=True)
 
@@ -137,7 +137,7 @@ class OpenedLog:
         return str(self.entry.get("main") or "")
 
     def estimates(self) -> pl.LazyFrame | None:
-        """Return estimates.parquet, of which only what is asked for is read; None where there is none."""
+        """Return estimates.parquet lazily; None where there is none."""
         import polars as pl
 
         path = self.file(ESTIMATES_FILE)
@@ -180,7 +180,7 @@ class OpenedRun:
 
 
 def _check(path: Path, sha256: str | None, remedy: str) -> None:
-    """Raise OutputError for a file that is not as it was written: by its sha256, or by what Parquet says of itself."""
+    """Raise OutputError for a file that is not as it was written: by its sha256, or by the metadata of Parquet."""
     try:
         if sha256 is None:
             if path.suffix == ".parquet":

@@ -53,10 +53,10 @@ class PairedChange:
     sign_p: float
 
     def verdict(self, limit: float = 0.0) -> Verdict:
-        """Return whether b is worse by more than ``limit`` (a share: 0.05) in a figure of which less is better.
+        """Return whether b is worse by more than ``limit`` (a share: 0.05) in a figure whose lower value is better.
 
         ``worse``: the one-sided bound is above 0 and the median above the limit. ``better``: the bound the other way is
-        below 0. ``not worse``: a change beyond the limit is excluded. Else nobody can tell.
+        below 0. ``not worse``: a change beyond the limit is excluded. Else the data do not decide.
         """
         beyond = math.log1p(limit)
         if self.least > 0.0 and self.median > beyond:
@@ -67,8 +67,8 @@ class PairedChange:
 
     def detectable(self, limit: float = 0.0) -> float:
         """Return the smallest worsening (a share) that :meth:`verdict` finds in 80 % of all cases; NaN: unknown."""
-        found = max((_BOUND_95 + _FOUND_80) * self.error, math.log1p(limit) + _FOUND_80 * self.error)
-        return math.expm1(found)
+        log_change = max((_BOUND_95 + _FOUND_80) * self.error, math.log1p(limit) + _FOUND_80 * self.error)
+        return math.expm1(log_change)
 
 
 def log_ratios(a: FloatArray, b: FloatArray, floor: float = 0.0) -> FloatArray:

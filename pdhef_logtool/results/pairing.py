@@ -28,8 +28,8 @@ class Pair:
 
     def same(self, key: str) -> bool | None:
         """Return whether an entry of run.json is the same on both sides; None where a side has none."""
-        one, other = self.a.entry.get(key), self.b.entry.get(key)
-        return None if one is None or other is None else bool(one == other)
+        left, other = self.a.entry.get(key), self.b.entry.get(key)
+        return None if left is None or other is None else bool(left == other)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,14 +44,14 @@ class Pairing:
 def pair_logs(a: Sequence[OpenedLog], b: Sequence[OpenedLog]) -> Pairing:
     """Pair the logs of two runs; a key that several logs of a side have pairs none of them."""
     left, right = list(a), list(b)
-    found: dict[str, Pair] = {}
+    pairs: dict[str, Pair] = {}
     for by, key in _KEYS:
-        one, other = _once(left, key), _once(right, key)
-        found |= {log.label: Pair(log, other[k], by) for k, log in one.items() if k in other}
-        paired = {pair.b.label for pair in found.values()}
-        left = [log for log in left if log.label not in found]
+        left_by_key, other = _once(left, key), _once(right, key)
+        pairs |= {log.label: Pair(log, other[k], by) for k, log in left_by_key.items() if k in other}
+        paired = {pair.b.label for pair in pairs.values()}
+        left = [log for log in left if log.label not in pairs]
         right = [log for log in right if log.label not in paired]
-    return Pairing(tuple(found[log.label] for log in a if log.label in found), tuple(left), tuple(right))
+    return Pairing(tuple(pairs[log.label] for log in a if log.label in pairs), tuple(left), tuple(right))
 
 
 def _once(logs: Sequence[OpenedLog], key: Callable[[OpenedLog], object]) -> dict[object, OpenedLog]:

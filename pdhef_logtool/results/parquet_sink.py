@@ -291,10 +291,10 @@ def _track_from_table(name: str, table: pa.Table) -> StateTrack:
 
     floats = {c: numbers(c) for c in TRACK_COLUMNS if c not in ("stamp_ns", *_FLAGS, *_STD_COLUMNS, *OPTIONAL_COLUMNS)}
     optional = {c: table[c] for c in OPTIONAL_COLUMNS if c in table.column_names}
-    known: dict[str, Any] = {c: v for c, v in optional.items() if v.null_count < table.num_rows}
-    known |= {c: numbers(c) for c in known if c != "reason"}
-    if "reason" in known:
-        known["reason"] = np.asarray(pc.fill_null(known["reason"], 0).to_numpy(), dtype=np.int64)
+    columns: dict[str, Any] = {c: v for c, v in optional.items() if v.null_count < table.num_rows}
+    columns |= {c: numbers(c) for c in columns if c != "reason"}
+    if "reason" in columns:
+        columns["reason"] = np.asarray(pc.fill_null(columns["reason"], 0).to_numpy(), dtype=np.int64)
     flags = {c: np.asarray(table[c].to_numpy(), dtype=np.bool_) for c in _FLAGS if c in table.column_names}
     return make_track(
         name,
@@ -302,7 +302,7 @@ def _track_from_table(name: str, table: pa.Table) -> StateTrack:
         covariance=diagonal_covariance([numbers(c) for c in _STD_COLUMNS]),
         **floats,
         **flags,
-        **known,
+        **columns,
     )
 
 

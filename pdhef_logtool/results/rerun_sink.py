@@ -104,9 +104,9 @@ class RerunSink(Sink):
     """Writes recording.rrd window by window; memory does not grow with the log but for the thinned trajectories.
 
     Each track is one entity with a row a stamp (of a drive above ten minutes 10 a second, of other estimators 5) and a
-    component a quantity, which holds value and band. Entities are named by what a track is for (``/truth``, ``/main``,
-    ``/baseline``, ``/other/1``), so that one blueprint suits all drives of a run whatever ran on them; the lines carry
-    the estimators' names. Errors are where ground truth and estimate share a stamp.
+    component a quantity, with value and confidence interval. Entities are named by what a track is for (``/truth``,
+    ``/main``, ``/baseline``, ``/other/1``), so that one blueprint suits all drives of a run with any estimators; the
+    lines have their names. Errors are where ground truth and estimate share a stamp.
 
     Parameters
     ----------
@@ -239,7 +239,7 @@ class RerunSink(Sink):
         self._draw_path(track, place, rgb)
 
     def _columns(self, track: StateTrack, plots: Sequence[_Plot]) -> dict[str, FloatArray]:
-        """Return by component what is drawn of a track, [N, 1] or, with its 95 % band, [N, 3]; NaN where unknown.
+        """Return by component what is drawn of a track, [N, 1] or, with its 95 % interval, [N, 3]; NaN where unknown.
 
         The blueprint asks for all components: what a track lacks is there as NaN.
         """
@@ -249,8 +249,8 @@ class RerunSink(Sink):
             values = np.asarray(getattr(track, plot.column), dtype=np.float64) * plot.factor
             if len(values) != len(track):
                 values = np.full(len(track), np.nan)
-            known = track.valid if plot.from_low_speed else track.valid & fast
-            drawn = [np.where(known, values, np.nan)]
+            shown = track.valid if plot.from_low_speed else track.valid & fast
+            drawn = [np.where(shown, values, np.nan)]
             if plot.std is not None and track.name != TRUTH:
                 half = STD_OF_95_PERCENT * plot.factor * np.asarray(getattr(track, plot.std))
                 drawn += [drawn[0] - half, drawn[0] + half]
@@ -285,9 +285,9 @@ class RerunSink(Sink):
                     path.strips(), colors=[colour_rgb(name, self._colours)], radii=[rr.Radius.ui_points(1.5)]
                 ),
             )
-        found = self._draw_reasons()
-        if events or found:
-            ordered = sorted([*events, *found], key=lambda e: (e.start_ns, e.end_ns, e.name))
+        reasons = self._draw_reasons()
+        if events or reasons:
+            ordered = sorted([*events, *reasons], key=lambda e: (e.start_ns, e.end_ns, e.name))
             text = rr.TextLog.columns(text=[_event_text(e) for e in ordered], level=["INFO"] * len(ordered))
             self._send("/events", np.array([e.start_ns for e in ordered], dtype=np.int64), text)
         self._log_static("/report", rr.TextDocument(report_markdown(report), media_type=rr.MediaType.MARKDOWN))
@@ -335,28 +335,28 @@ class RerunSink(Sink):
         if len(stamps_ns) == 0:
             return
         gaps = rows.gaps(stamps_ns)
-        at = np.insert(stamps_ns, gaps, rows.before(stamps_ns)[gaps] + 1)
+        times_ns = np.insert(stamps_ns, gaps, rows.before(stamps_ns)[gaps] + 1)
         sent = []
         for name, values in columns.items():
             absent = rows.bridged(name, stamps_ns, ~np.isnan(values[:, 0])) if name in sparse else None
             absent = None if absent is None else np.insert(absent, gaps, False)
             sent.append(_Column(f"{archetype}:{name}", archetype, np.insert(values, gaps, np.nan, axis=0), absent))
         rows.last_ns = int(stamps_ns[-1])
-        self._send(entity, at, sent)
+        self._send(entity, times_ns, sent)
 
     def _draw_path(self, track: StateTrack, place: str, rgb: tuple[int, int, int]) -> None:
         # North is drawn up: the y axis of Rerun's 2D views points down.
         plan = np.stack([track.x_m, -track.y_m], axis=1)
-        known = np.isfinite(plan).all(axis=1) & track.valid
-        if not known.any():
+        has_plan = np.isfinite(plan).all(axis=1) & track.valid
+        if not has_plan.any():
             return
         if track.name not in self._paths:
             self._paths[track.name] = _Trajectory(MOST_TRAJECTORY_POINTS)
             style = rr.Points2D.from_fields(colors=[rgb], radii=[rr.Radius.ui_points(5.0)], labels=[track.name])
             self._log_static(f"/plan/{place}/now", style)
-        self._paths[track.name].append(np.where(known[:, None], plan, np.nan))
+        self._paths[track.name].append(np.where(has_plan[:, None], plan, np.nan))
         slot = track.stamps_ns // (LONG_DOT_STEP_NS if self._is_long else DOT_STEP_NS)
-        shown = known & (np.diff(slot, prepend=slot[:1] - 1) != 0)
+        shown = has_plan & (np.diff(slot, prepend=slot[:1] - 1) != 0)
         if shown.any():
             points = rr.Points2D.columns(positions=plan[shown])
             self._send(f"/plan/{place}/now", track.stamps_ns[shown], points)
@@ -385,8 +385,8 @@ def _errors(track: StateTrack, truth: StateTrack | None, min_speed_m_s: float) -
     for plot in _ERRORS:
         error = np.asarray(getattr(track, plot.column))[of_track] - getattr(truth, plot.column)[of_truth]
         error = plot.factor * (wrap_angle(error) if plot.is_angle else error)
-        known = valid if plot.from_low_speed else valid & fast
-        columns[f"error_{plot.name}"][of_track, 0] = np.where(known, error, np.nan)
+        scored = valid if plot.from_low_speed else valid & fast
+        columns[f"error_{plot.name}"][of_track, 0] = np.where(scored, error, np.nan)
     return columns
 
 
@@ -466,7 +466,7 @@ class _Outlet:
 
 
 class _Column:
-    """A component [N, k] as single precision floats; rows that are ``absent`` hold nothing, neither value nor gap."""
+    """A component [N, k] as single precision floats; rows that are ``absent`` contain neither value nor gap."""
 
     def __init__(self, component: str, archetype: str, values: FloatArray, absent: BoolArray | None) -> None:
         self._descriptor = rr.ComponentDescriptor(component, archetype=archetype)
@@ -502,14 +502,14 @@ class _Rows:
         """Return the rows after more than LONGEST_BRIDGE_NS: lines must break there."""
         return np.flatnonzero(stamps_ns - self.before(stamps_ns) > LONGEST_BRIDGE_NS)
 
-    def bridged(self, name: str, stamps_ns: IntArray, known: BoolArray) -> BoolArray:
-        """Tell the unknown rows that a line goes on over: all but one that is too long after the last known one."""
+    def bridged(self, name: str, stamps_ns: IntArray, is_known: BoolArray) -> BoolArray:
+        """Return the unknown rows that a line goes on over: all but one that is too long after the last known one."""
         never = np.iinfo(np.int64).min
-        latest = np.maximum.accumulate(np.where(known, stamps_ns, self.known_ns.get(name, never)))
+        latest = np.maximum.accumulate(np.where(is_known, stamps_ns, self.known_ns.get(name, never)))
         self.known_ns[name] = int(latest[-1])
         since = np.where(latest == never, 0, stamps_ns - latest)
-        ends = ~known & (since > LONGEST_BRIDGE_NS)
-        return np.asarray(~known & ~ends, dtype=np.bool_)
+        ends = ~is_known & (since > LONGEST_BRIDGE_NS)
+        return np.asarray(~is_known & ~ends, dtype=np.bool_)
 
 
 @dataclass(slots=True)
@@ -533,8 +533,8 @@ class _Trajectory:
     def strips(self) -> list[FloatArray]:
         """Return the strips of at least two points, each [N, 2]."""
         points = np.concatenate(self.parts)
-        known = np.isfinite(points).all(axis=1)
-        pieces = np.split(points, np.flatnonzero(np.diff(known)) + 1)
+        is_finite = np.isfinite(points).all(axis=1)
+        pieces = np.split(points, np.flatnonzero(np.diff(is_finite)) + 1)
         return [p for p in pieces if len(p) > 1 and np.isfinite(p[0]).all()]
 
 
@@ -544,7 +544,7 @@ def _event_text(event: Event) -> str:
 
 
 def _blueprint() -> rrb.Blueprint:
-    """Open on the drive: sideslip with bands, yaw rate, a_y, inputs and the plan; errors, filter and report as tabs.
+    """Open on the drive: sideslip with intervals, yaw rate, a_y, inputs, the plan; errors, filter and report as tabs.
 
     It names what tracks are for and no estimator, so that it suits every drive.
     """

@@ -34,10 +34,10 @@ def _car(pairs: Sequence[Pair]) -> Iterator[str]:
     for what, key in (("car", "sha256"), ("network", "network_sha256")):
         changes: Counter[tuple[str, str]] = Counter()
         for pair in pairs:
-            one, other = (log.entry.get("car") or {} for log in (pair.a, pair.b))
-            if one.get(key) != other.get(key):
+            left, other = (log.entry.get("car") or {} for log in (pair.a, pair.b))
+            if left.get(key) != other.get(key):
                 named = what == "car"
-                changes[_car_text(one, key, named), _car_text(other, key, named)] += 1
+                changes[_car_text(left, key, named), _car_text(other, key, named)] += 1
         for (one_text, other_text), count in changes.most_common(_MOST_NAMED):
             yield f"{what}: {one_text} → {other_text}{_of(count, len(pairs))}"
         if len(changes) > _MOST_NAMED:
@@ -77,25 +77,25 @@ def _example(pair: Pair, what: str) -> str:
     try:
         with pair.a.reading(), pair.b.reading():
             reports = pair.a.report(), pair.b.report()
-            one, other = ({s["name"]: s["source"] for s in (r or {}).get(what, {}).get(key, ())} for r in reports)
+            left, other = ({s["name"]: s["source"] for s in (r or {}).get(what, {}).get(key, ())} for r in reports)
     except OutputError as error:
         return f"; {error}"
     if None in reports:
         return ""
-    for name in sorted({*one, *other}):
-        if one.get(name) != other.get(name):
-            return f"; {pair.a.label}: {name} of {one.get(name, 'nothing')} → {other.get(name, 'nothing')}"
+    for name in sorted({*left, *other}):
+        if left.get(name) != other.get(name):
+            return f"; {pair.a.label}: {name} of {left.get(name, 'nothing')} → {other.get(name, 'nothing')}"
     return ""
 
 
 def _main(pairs: Sequence[Pair]) -> Iterator[str]:
     changes = Counter((p.a.entry["main"], p.b.entry["main"]) for p in pairs if p.same("main") is False)
-    for (one, other), count in changes.most_common(_MOST_NAMED):
-        yield f"selected estimate: {one} → {other}{_of(count, len(pairs))}; that of A is compared on both sides"
+    for (before, other), count in changes.most_common(_MOST_NAMED):
+        yield f"selected estimate: {before} → {other}{_of(count, len(pairs))}; that of A is compared on both sides"
 
 
-def _entries(what: str, one: object, other: object) -> Iterator[str]:
-    a = one if isinstance(one, dict) else {}
+def _entries(what: str, before: object, other: object) -> Iterator[str]:
+    a = before if isinstance(before, dict) else {}
     b = other if isinstance(other, dict) else {}
     changed = [key for key in sorted({*a, *b}) if a.get(key) != b.get(key)]
     if changed:

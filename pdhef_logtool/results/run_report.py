@@ -136,7 +136,7 @@ class FrictionFacts:
 class DriveDetails:
     """What a report's page shows and no table contains, of a drive that a run estimated.
 
-    ``faults`` of the sensors, None where no estimator looks for them. ``innovations`` by channel.
+    ``faults`` of the sensors, None where no estimator detects them. ``innovations`` by channel.
     ``standings`` of the selected estimate, empty without ground truth; ``limits``: how it is against the thresholds.
     ``error_budget`` has a reason where there is none. ``operating_space``: the cells that the drive was in.
     ``metadata`` : what the log states of itself.
@@ -162,7 +162,7 @@ class ReportFacts:
     ``calibration``: what the drive stated of its car without ground truth, None where it was not asked.
     ``reference``: what came of the sideslip reference, None where it was not asked for.
     ``file_bytes``: what became of the bytes of each file; ``samples``: of the samples of each mapped source.
-    ``checks``: what physics says of signals, truth and vehicle file. ``details``: None where nothing was estimated.
+    ``checks``: plausibility of signals, ground truth and vehicle file. ``details``: None where nothing was estimated.
     """
 
     log: LogFacts
@@ -208,7 +208,7 @@ class LogOutcome:
     """How one log of a run ended, with which car; None where it was not read or nothing was estimated.
 
     ``failed`` is the one-line reason if nothing came out; ``lost`` states what of the log could not be used.
-    ``main``: the estimator that is the answer. ``folder`` of the log, below the one that holds all logs of the run.
+    ``main``: the estimator of the selected estimate. ``folder`` of the log, below the folder of the run.
     ``algorithms``: the identity of each estimator that ran. ``files``: sha256 by name of the files in the log's folder
     that commands read back.
     """
@@ -237,7 +237,7 @@ class LogOutcome:
 
 def tool_versions() -> dict[str, str]:
     """Return the versions of Python and of the installed distributions that decide what a run computes."""
-    return {"python": platform.python_version(), **{name: found for name in VERSIONED if (found := _installed(name))}}
+    return {"python": platform.python_version(), **{name: v for name in VERSIONED if (v := _installed(name))}}
 
 
 def run_versions() -> dict[str, str]:
@@ -328,14 +328,14 @@ def _selected(document: Mapping[str, Any], main: MainFacts | None, details: Driv
 def _detailed(details: DriveDetails) -> dict[str, Any]:
     """Return the keys that only a run writes."""
     space = {"speed_edges_m_s": SPEED_EDGES_M_S, "ay_edges_m_s2": AY_EDGES_M_S2, "cells": details.operating_space}
-    found = {
+    values = {
         "faults": details.faults,
         "innovations": details.innovations,
         "error_budget": details.error_budget,
         "operating_space": space,
         "metadata": dict(details.metadata),
     }
-    return {key: jsonable(value) for key, value in found.items()}
+    return {key: jsonable(value) for key, value in values.items()}
 
 
 def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
@@ -345,7 +345,7 @@ def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
     segments the sideslip answer's own, and of the rest the first :data:`_MOST_LISTED`.
     """
     answer = report["answer"]
-    told = {answer["main"], answer["naive"], PHYSICS} if answer else set()
+    names = {answer["main"], answer["naive"], PHYSICS} if answer else set()
     first = {key: report[key][:_MOST_LISTED] for key in ("losses", "warnings", "remarks")}
     if space := report.get("operating_space"):
         first["operating_space"] = {**space, "cells": [*map(_rounded, space["cells"])]}
@@ -353,9 +353,9 @@ def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
         **{key: value for key, value in report.items() if key not in ("innovations", "error_budget")},
         **first,
         "log": {**report["log"], "topics": [t for t in report["log"]["topics"] if t["mapped"]]},
-        "estimators": [_brief_estimator(e, told) for e in report["estimators"]],
-        "metrics": [m for m in report["metrics"] if m["estimator"] in told and _is_shown(m, answer["main"])],
-        "segments": [s for s in report["segments"] if s["name"] in {f"{n} diverged" for n in told}][:_MOST_LISTED],
+        "estimators": [_brief_estimator(e, names) for e in report["estimators"]],
+        "metrics": [m for m in report["metrics"] if m["estimator"] in names and _is_shown(m, answer["main"])],
+        "segments": [s for s in report["segments"] if s["name"] in {f"{n} diverged" for n in names}][:_MOST_LISTED],
         "ledger": {
             **report["ledger"],
             "bytes": report["ledger"]["bytes"][:_MOST_LISTED],
@@ -365,15 +365,15 @@ def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _brief_estimator(estimator: Mapping[str, Any], told: Container[str | None]) -> dict[str, Any]:
-    algorithm, own = estimator["algorithm"], estimator["name"] in told
+def _brief_estimator(estimator: Mapping[str, Any], names: Container[str | None]) -> dict[str, Any]:
+    algorithm, is_shown = estimator["algorithm"], estimator["name"] in names
     digest = None if algorithm is None else {k: v for k, v in algorithm.items() if k != "noise"}
-    kept = estimator["notes"] if own else []
-    return {**estimator, "algorithm": digest, "notes": kept, "reasons": estimator["reasons"] if own else None}
+    kept = estimator["notes"] if is_shown else []
+    return {**estimator, "algorithm": digest, "notes": kept, "reasons": estimator["reasons"] if is_shown else None}
 
 
 def _is_shown(metric: Mapping[str, Any], main: str) -> bool:
-    """Whether a brief report keeps a figure: errors of sideslip, of the answer in other signals too; d2 and NIS."""
+    """Whether a brief report keeps a figure: sideslip errors, all errors of the selected estimate, consistency, NIS."""
     signal, name = metric["signal"], metric["metric"]
     if metric["segment"] != "all":
         return signal == "sideslip_rad" and name == "rmse" and metric["segment"] in ("linear", "nonlinear")
@@ -467,8 +467,8 @@ def report_markdown(report: Mapping[str, Any]) -> str:
     lines += _bullets("Remarks", report.get("remarks", ()))
     lines += _bullets("Losses", [f"{x['what']} ({x['where']})" for x in report["losses"]])
     lines += _truth_lines(report["truth"])
-    if found := friction_line(report):
-        lines += [f"Friction: {found}", ""]
+    if friction := friction_line(report):
+        lines += [f"Friction: {friction}", ""]
     not_causal = {e["name"] for e in report["estimators"] if not e["causal"]}
     signals = dict.fromkeys(m["signal"] for m in report["metrics"])
     for signal in sorted(signals, key=lambda s: s != "sideslip_rad"):
@@ -476,8 +476,8 @@ def report_markdown(report: Mapping[str, Any]) -> str:
     lines += ["## Estimators", ""]
     for e in report["estimators"]:
         happened = [diverged_line(report, e["name"]), reasons_line(e, log["start_ns"])]
-        told = [f"skipped: {e['reason']}"] if e["reason"] else []
-        notes = "; ".join([*told, *e["notes"], *e.get("intervals", ()), *filter(None, happened)])
+        skipped = [f"skipped: {e['reason']}"] if e["reason"] else []
+        notes = "; ".join([*skipped, *e["notes"], *e.get("intervals", ()), *filter(None, happened)])
         kind = "causal" if e["causal"] else "not causal"
         lines.append(f"- **{e['name']}** ({kind})" + (f": {notes}" if notes else ""))
     lines += ["", "## Signals", ""]
@@ -567,12 +567,12 @@ def _metric_table(signal: str, rows: Sequence[Mapping[str, Any]], not_causal: se
     ]
     groups = dict.fromkeys((m["estimator"], m["segment"]) for m in rows)
     for estimator, segment in sorted(groups, key=lambda g: g[0] in not_causal):  # those are apart, below
-        own = {
+        values = {
             (m["metric"], m["unit"]): m["value"]
             for m in rows
             if m["estimator"] == estimator and m["segment"] == segment
         }
-        cells = [_number(own.get((name, unit)), factor) for name, unit, (_, factor) in shown]
+        cells = [_number(values.get((name, unit)), factor) for name, unit, (_, factor) in shown]
         mark = " (not causal)" if estimator in not_causal else ""
         lines.append(f"| {estimator}{mark} | {segment} | " + " | ".join(cells) + " |")
     return [*lines, ""]

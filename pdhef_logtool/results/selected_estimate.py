@@ -39,7 +39,7 @@ class MainFacts:
 
     Attributes
     ----------
-    name : of it. chosen_by : evidence of the car's driving, d2, or the order of the estimators. why : in words.
+    name : of it. chosen_by : evidence of the car's driving, consistency, or estimator order. why : in words.
     distrusted : whether the lateral consistency contradicts the preferred one.
     naive : what an estimate is worth anything against, None if it did not run. shown : what a person is shown; all that
         ran where the estimators were ``named``.
@@ -55,7 +55,7 @@ class MainFacts:
 
 
 def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
-    """Return the ``answer`` of a report's document: the main estimator, what was best in hindsight, and the words."""
+    """Return the ``answer`` of a report's document: the selected estimator, the best in hindsight, and the words."""
     figures = {
         (m["estimator"], m["signal"], m["metric"]): m["value"] for m in report["metrics"] if m["segment"] == "all"
     }
@@ -91,15 +91,15 @@ def _error(figures: _Figures, name: str | None) -> float | None:
 
 
 def _result(report: Report, main: MainFacts, figures: _Figures) -> str:
-    truth, own = report["truth"], _error(figures, main.name)
+    truth, rmse = report["truth"], _error(figures, main.name)
     if not truth["available"]:
         return f"Sideslip estimate: {main.name}; {_from_reference(report, main, figures)}"
-    if own is None:
+    if rmse is None:
         return f"Sideslip of {main.name} is not scored: {_why_not_scored(report, main)}{_scored_instead(main, figures)}"
-    said = [f"Sideslip RMSE of {main.name}: {degrees(own)} ({_truth_of(report, 'sideslip_rad')})"]
+    said = [f"Sideslip RMSE of {main.name}: {degrees(rmse)} ({_truth_of(report, 'sideslip_rad')})"]
     rivals = [(name, text) for name, text in (("physics", "physics"), ("zero", "zero sideslip")) if name != main.name]
     others = [(text, other) for name, text in rivals if (other := _error(figures, name)) is not None]
-    said += [_against(own, other, text) for text, other in others]
+    said += [_against(rmse, other, text) for text, other in others]
     if "sideslip_rad" in truth["not_independent"]:
         said.append("the ground truth is an input of the estimator or the estimate itself: not an independent check")
     if (measured := figures.get(("zero", "sideslip_rad", "rmse"))) is not None and measured < NO_SIDESLIP_RAD:
@@ -107,7 +107,7 @@ def _result(report: Report, main: MainFacts, figures: _Figures) -> str:
     naive = None if main.name == main.naive else _error(figures, main.naive)
     useless = (
         ". On this drive the estimate is worse than a constant"
-        if naive is not None and own > (1.0 + SAME) * naive
+        if naive is not None and rmse > (1.0 + SAME) * naive
         else ""
     )
     return ", ".join(said) + useless
@@ -128,19 +128,19 @@ def _from_reference(report: Report, main: MainFacts, figures: _Figures) -> str:
     return f"its error is unknown, because the log contains no ground truth{why}"
 
 
-def _against(own: float, other: float, text: str) -> str:
+def _against(rmse: float, other: float, text: str) -> str:
     beside = f"{text} ({degrees(other)})"
-    if other == own:
+    if other == rmse:
         return f"equal to {beside}"
-    if abs(own - other) <= SAME * other:
+    if abs(rmse - other) <= SAME * other:
         return f"equal within {SAME:.0%} to {beside}"
-    if own == 0.0 or other == 0.0:
-        return f"{'lower' if own < other else 'higher'} than {beside}"
-    times = max(own, other) / min(own, other)
+    if rmse == 0.0 or other == 0.0:
+        return f"{'lower' if rmse < other else 'higher'} than {beside}"
+    times = max(rmse, other) / min(rmse, other)
     shown = f"{times:.1f}" if times < _FEW else f"{times:.0f}"
-    if own > other:
+    if rmse > other:
         return f"{shown} times {beside}" if times > 2.0 else f"{times - 1.0:.0%} higher than {beside}"
-    return f"1/{shown} of {beside}" if times > 2.0 else f"{1.0 - own / other:.0%} lower than {beside}"
+    return f"1/{shown} of {beside}" if times > 2.0 else f"{1.0 - rmse / other:.0%} lower than {beside}"
 
 
 def _truth_of(report: Report, name: str) -> str:
@@ -166,12 +166,12 @@ def _why_not_scored(report: Report, main: MainFacts) -> str:
 
 def _scored_instead(main: MainFacts, figures: _Figures) -> str:
     shown = (("yaw_rate_rad_s", "yaw rate", DEGREES, "°/s"), ("vx_m_s", "v_x", 1.0, " m/s"))
-    found = [
+    others = [
         f"{text} {value * factor:.2f}{unit}"
         for signal, text, factor, unit in shown
         if (value := figures.get((main.name, signal, "rmse"))) is not None
     ]
-    return f". RMSE of the other signals: {', '.join(found)}" if found else ""
+    return f". RMSE of the other signals: {', '.join(others)}" if others else ""
 
 
 def _consistency(main: MainFacts, figures: _Figures) -> str:
@@ -220,9 +220,9 @@ def _band(report: Report, main: MainFacts, figures: _Figures) -> str:
 
 def _assumed(report: Report, main: MainFacts) -> list[str]:
     friction, calibration = report["friction"], report["self_calibration"]
-    own = next(e for e in report["estimators"] if e["name"] == main.name)
-    modelled = own["algorithm"] is not None and own["algorithm"]["physics_sha256"] is not None
-    said = _model(report, own["causal"]) if modelled else [f"no vehicle model ({main.name} needs none)"]
+    estimator = next(e for e in report["estimators"] if e["name"] == main.name)
+    modelled = estimator["algorithm"] is not None and estimator["algorithm"]["physics_sha256"] is not None
+    said = _model(report, estimator["causal"]) if modelled else [f"no vehicle model ({main.name} needs none)"]
     if calibration is not None and modelled:
         if calibration["refused"]:
             said.append(f"not calibrated on this log: {calibration['refused']}")
@@ -232,11 +232,11 @@ def _assumed(report: Report, main: MainFacts) -> list[str]:
         said.append(f"friction {_friction(friction)}")
     if main.distrusted:
         said.append(main.why)
-    algorithm = own["algorithm"] or {"options": {}}
+    algorithm = estimator["algorithm"] or {"options": {}}
     trust = algorithm["options"].get("trust", 0.0 if algorithm.get("algorithm") == "adaptive-physics" else None)
     if trust is not None:
-        found = f"residual gain of the network {trust:g}, from the car's validation data"
-        said.append(found if trust else "network not used: no validation data show that it helps")
+        network_text = f"residual gain of the network {trust:g}, from the car's validation data"
+        said.append(network_text if trust else "network not used: no validation data show that it helps")
     return said
 
 
@@ -293,7 +293,7 @@ def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]
 
 
 def _best_in_hindsight(report: Report, main: MainFacts, figures: _Figures) -> dict[str, Any] | None:
-    """Return the estimator with the least error by this log's truth, None without one; nothing is chosen by it."""
+    """Return the estimator with the least error against ground truth, None without it; nothing is chosen by it."""
     ran = [e["name"] for e in report["estimators"] if e["outcome"] == "ran"]
     errors = {name: error for name in ran if (error := _error(figures, name)) is not None}
     if not errors:

@@ -17,13 +17,13 @@ from pdhef_logtool.records.tracks import StateTrack
 #: Name of the track that contains the ground truth.
 TRUTH = "truth"
 
-#: A drive that takes longer is long: of it less is written than every stamp where a person only looks.
+#: A drive that takes longer is long: views for a person contain less than every stamp of it.
 LONGEST_WHOLE_NS = 600_000_000_000
 
 #: Near the end of a Rerun recording that was finished, within so many bytes.
 _RECORDING_END, _RECORDING_TAIL = b"RRF2FOOT", 64
 
-#: What numbers are rounded to in files, far below what sensors can tell: powers of two, so that last bytes are zero.
+#: What numbers are rounded to in files, far below what sensors resolve: powers of two, so that last bytes are zero.
 _STEPS = {
     "x_m": 2.0**-10,
     "y_m": 2.0**-10,
@@ -53,14 +53,14 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """The estimators that a person is shown first; ``baseline`` is what the main one is held against, if anything."""
+    """The estimators that a person is shown first; ``baseline`` is what the selected one is compared with, or None."""
 
     main: str
     baseline: str | None = None
 
 
 def rounded(name: str, values: FloatArray) -> FloatArray:
-    """Round a column as files hold it: motion to a step, what was told to single precision, else to 1.2e-4 of itself.
+    """Round a column as files contain it: motion to a step, inputs to single precision, else to 1.2e-4 of itself.
 
     The bytes that are then zero take no space in a compressed file.
     """
@@ -73,7 +73,7 @@ def rounded(name: str, values: FloatArray) -> FloatArray:
             bits = short.view(np.uint32)
             bits += np.uint32(1 << (_BITS_OUT - 1))
             bits &= np.uint32((0xFFFFFFFF << _BITS_OUT) & 0xFFFFFFFF)
-            short[np.isnan(values)] = np.nan  # some of which have become numbers
+            short[np.isnan(values)] = np.nan  # some have become numbers
         return short.astype(np.float64)
 
 
@@ -107,7 +107,7 @@ class Sink(ABC):
 
     lost: tuple[Loss, ...] = ()
 
-    def append_signals(self, signals: Signals) -> None:  # noqa: B027 (most outputs hold no inputs)
+    def append_signals(self, signals: Signals) -> None:  # noqa: B027 (most outputs contain no inputs)
         """Take what the estimators saw in this window; nothing by default."""
 
     @abstractmethod

@@ -35,7 +35,7 @@ class ErrorsOf:
 
 @dataclass(frozen=True, slots=True)
 class WorstDrive:
-    """A drive with a large error of the answer: RMSE of sideslip in rad by estimator, that of the answer first."""
+    """A drive with a large error: RMSE of sideslip in rad by estimator, that of the selected estimate first."""
 
     log: str
     main: str
@@ -76,11 +76,11 @@ def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> R
 
     errors = _sideslip_errors(run)
     answers = errors.filter(pl.col("estimator") == pl.col("main"))
-    told = [ErrorsOf(ANSWER, *_spread(answers))] if answers.height else []
+    error_rows = [ErrorsOf(ANSWER, *_spread(answers))] if answers.height else []
     for name in _RIVALS:
-        own = errors.filter(pl.col("estimator") == name)
-        if own.height and set(answers["main"].unique()) != {name}:
-            told.append(ErrorsOf(name, *_spread(own)))
+        of_estimator = errors.filter(pl.col("estimator") == name)
+        if of_estimator.height and set(answers["main"].unique()) != {name}:
+            error_rows.append(ErrorsOf(name, *_spread(of_estimator)))
     failed = [(log.label, log.outcome.partition(": ")[2]) for log in run.logs if log.outcome.startswith("failed")]
     return RunSummary(
         output=run.place,
@@ -90,7 +90,7 @@ def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> R
         lost=sum(log.outcome.startswith("lost") for log in run.logs),
         scored=answers.height,
         remaining=int(run.document.get("remaining", 0)),
-        errors=tuple(told),
+        errors=tuple(error_rows),
         worst=tuple(_worst(errors, answers)),
         failed=grouped(failed),
         checks_failed=tuple(checks_failed),
@@ -98,7 +98,7 @@ def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> R
 
 
 def _sideslip_errors(run: OpenedRun) -> pl.DataFrame:
-    """Return log, estimator, value (RMSE of sideslip in rad) and main (the answer), where the truth is independent."""
+    """Return log, estimator, value (RMSE of sideslip in rad) and main (selected), where ground truth is independent."""
     import polars as pl
 
     mains = pl.DataFrame(
@@ -107,9 +107,9 @@ def _sideslip_errors(run: OpenedRun) -> pl.DataFrame:
     )
     rows = run.metrics().filter((pl.col("segment") == "all") & (pl.col("signal") == JUDGED))
     dependent = rows.filter(pl.col("metric") == "not_independent").select("log", "estimator")
-    found = rows.filter((pl.col("metric") == "rmse") & pl.col("value").is_finite())
-    found = found.select("log", "estimator", "value").join(dependent, on=["log", "estimator"], how="anti")
-    return found.collect().join(mains, on="log").sort("log", "estimator")
+    scored = rows.filter((pl.col("metric") == "rmse") & pl.col("value").is_finite())
+    scored = scored.select("log", "estimator", "value").join(dependent, on=["log", "estimator"], how="anti")
+    return scored.collect().join(mains, on="log").sort("log", "estimator")
 
 
 def _spread(errors: pl.DataFrame) -> tuple[int, float, float, float]:
@@ -125,9 +125,9 @@ def _number(value: object) -> float:
 def _worst(errors: pl.DataFrame, answers: pl.DataFrame) -> list[WorstDrive]:
     import polars as pl
 
-    found = []
+    worst = []
     for log, main in answers.sort("value", "log", descending=[True, False]).head(WORST).select("log", "main").rows():
-        own = dict(errors.filter(pl.col("log") == log).select("estimator", "value").rows())
-        names = dict.fromkeys((main, *(name for name in _RIVALS if name in own)))
-        found.append(WorstDrive(log, main, {name: own[name] for name in names}))
-    return found
+        error_by_name = dict(errors.filter(pl.col("log") == log).select("estimator", "value").rows())
+        names = dict.fromkeys((main, *(name for name in _RIVALS if name in error_by_name)))
+        worst.append(WorstDrive(log, main, {name: error_by_name[name] for name in names}))
+    return worst

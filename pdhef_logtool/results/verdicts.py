@@ -36,46 +36,46 @@ def verdicts_of(
 
 
 def _verdict(
-    report: Mapping[str, Any], main: str, signal: str, found: Standing | None, limits: Sequence[Verdict]
+    report: Mapping[str, Any], main: str, signal: str, standing: Standing | None, limits: Sequence[Verdict]
 ) -> dict[str, Any]:
-    own = [v for v in limits if v.estimator == main and v.outcome in ("pass", "fail")]
+    decided_limits = [v for v in limits if v.estimator == main and v.outcome in ("pass", "fail")]
     outcome: Outcome = "none"
-    if why := _why_none(report, main, signal, found):
+    if why := _why_none(report, main, signal, standing):
         text = f"no verdict: {why}"
-        found = None
+        standing = None
     else:
-        assert found is not None and found.rmse is not None
-        outcome = _outcome(found)
-        text = "; ".join([_error(found), _against(found, outcome), *_limits(found, own)])
+        assert standing is not None and standing.rmse is not None
+        outcome = _outcome(standing)
+        text = "; ".join([_error(standing), _against(standing, outcome), *_limits(standing, decided_limits)])
     return {
         "signal": signal,
         "estimator": main,
         "outcome": outcome,
         "text": text,
-        "rmse": None if found is None else _figures(found.rmse),
-        "rival": None if found is None else found.rival,
-        "rival_rmse": None if found is None else found.rival_rmse,
-        "difference": None if found is None else _figures(found.difference),
-        "limits": [{"text": v.threshold.label, "outcome": v.outcome, "value": v.value} for v in own],
+        "rmse": None if standing is None else _figures(standing.rmse),
+        "rival": None if standing is None else standing.rival,
+        "rival_rmse": None if standing is None else standing.rival_rmse,
+        "difference": None if standing is None else _figures(standing.difference),
+        "limits": [{"text": v.threshold.label, "outcome": v.outcome, "value": v.value} for v in decided_limits],
     }
 
 
-def _figures(found: Interval | None) -> dict[str, Any] | None:
-    if found is None:
+def _figures(interval: Interval | None) -> dict[str, Any] | None:
+    if interval is None:
         return None
-    low, high = (x if math.isfinite(x) else None for x in (found.low, found.high))
-    return {"value": found.value, "low": low, "high": high, "blocks": found.blocks}
+    low, high = (x if math.isfinite(x) else None for x in (interval.low, interval.high))
+    return {"value": interval.value, "low": low, "high": high, "blocks": interval.blocks}
 
 
-def _why_none(report: Mapping[str, Any], main: str, signal: str, found: Standing | None) -> str:
+def _why_none(report: Mapping[str, Any], main: str, signal: str, standing: Standing | None) -> str:
     truth = report["truth"]
     if not truth["available"]:
         return "the log contains no ground truth"
     if signal in truth["not_independent"]:
         return "its ground truth is an input of the estimator or the estimate itself"
-    if found is None or found.rmse is None:
-        known = {q["name"] for q in truth["quantities"]}
-        if signal not in known:
+    if standing is None or standing.rmse is None:
+        quantities = {q["name"] for q in truth["quantities"]}
+        if signal not in quantities:
             return "the ground truth does not contain it"
         return f"its ground truth and {main} are never valid at the same time"
     if signal in ("sideslip_rad", "vy_m_s") and _without_sideslip(report):
@@ -86,19 +86,19 @@ def _why_none(report: Mapping[str, Any], main: str, signal: str, found: Standing
 def _without_sideslip(report: Mapping[str, Any]) -> bool:
     """Whether the estimate that is 0 throughout has no error worth the name."""
     wanted = ("zero", "sideslip_rad", "all", "rmse")
-    found = [m["value"] for m in report["metrics"] if tuple(m[k] for k in _KEYS) == wanted]
-    return bool(found) and found[0] is not None and found[0] < NO_SIDESLIP_RAD
+    values = [m["value"] for m in report["metrics"] if tuple(m[k] for k in _KEYS) == wanted]
+    return bool(values) and values[0] is not None and values[0] < NO_SIDESLIP_RAD
 
 
 _KEYS = ("estimator", "signal", "segment", "metric")
 
 
-def _outcome(found: Standing) -> Outcome:
-    difference = found.difference
-    if found.rival is None or difference is None:
+def _outcome(standing: Standing) -> Outcome:
+    difference = standing.difference
+    if standing.rival is None or difference is None:
         return "alone"
-    assert found.rival_rmse is not None
-    if difference.value == 0.0 or max(abs(difference.low), abs(difference.high)) <= SAME * found.rival_rmse:
+    assert standing.rival_rmse is not None
+    if difference.value == 0.0 or max(abs(difference.low), abs(difference.high)) <= SAME * standing.rival_rmse:
         return "same"
     if difference.low > 0.0:
         return "worse"
@@ -111,28 +111,28 @@ def _unit(signal: str) -> tuple[str, float]:
     return unit if unit.startswith("°") else f" {unit}", factor
 
 
-def _error(found: Standing) -> str:
-    unit, factor = _unit(found.signal)
-    assert found.rmse is not None
-    shown = _number(found.rmse.value * factor)
-    if math.isfinite(found.rmse.low):
-        low, high = _number(found.rmse.low * factor), _number(found.rmse.high * factor)
+def _error(standing: Standing) -> str:
+    unit, factor = _unit(standing.signal)
+    assert standing.rmse is not None
+    shown = _number(standing.rmse.value * factor)
+    if math.isfinite(standing.rmse.low):
+        low, high = _number(standing.rmse.low * factor), _number(standing.rmse.high * factor)
         between = f" (95 % CI {low} to {high}{unit})"
     else:
-        between = f" (no CI: it needs {LEAST_BLOCKS} blocks of {found.block_s:g} s)"
-    return f"RMSE of {found.estimator}: {shown}{unit}{between}"
+        between = f" (no CI: it needs {LEAST_BLOCKS} blocks of {standing.block_s:g} s)"
+    return f"RMSE of {standing.estimator}: {shown}{unit}{between}"
 
 
-def _against(found: Standing, outcome: Outcome) -> str:
+def _against(standing: Standing, outcome: Outcome) -> str:
     if outcome == "alone":
         return "no filter without a network ran for comparison"
-    unit, factor = _unit(found.signal)
-    assert found.rival_rmse is not None and found.difference is not None and found.rmse is not None
-    beside = f"{found.rival} ({_number(found.rival_rmse * factor)}{unit})"
+    unit, factor = _unit(standing.signal)
+    assert standing.rival_rmse is not None and standing.difference is not None and standing.rmse is not None
+    beside = f"{standing.rival} ({_number(standing.rival_rmse * factor)}{unit})"
     if outcome == "same":
-        return f"{'equal to' if found.difference.value == 0.0 else 'no relevant difference to'} {beside}"
-    difference = found.difference
-    share = abs(difference.value) / found.rival_rmse if found.rival_rmse else math.inf
+        return f"{'equal to' if standing.difference.value == 0.0 else 'no relevant difference to'} {beside}"
+    difference = standing.difference
+    share = abs(difference.value) / standing.rival_rmse if standing.rival_rmse else math.inf
     by = f"{share:.0%} " if share < 10.0 else ""
     how = f"{by}{'lower' if difference.value < 0.0 else 'higher'} than {beside}"
     if not math.isfinite(difference.low):
@@ -142,16 +142,16 @@ def _against(found: Standing, outcome: Outcome) -> str:
     return f"{how}, difference not significant: {between}" if outcome == "undecided" else f"{how}: {between}"
 
 
-def _limits(found: Standing, limits: Sequence[Verdict]) -> list[str]:
+def _limits(standing: Standing, limits: Sequence[Verdict]) -> list[str]:
     """Return what is stated of the thresholds; of a limit of the RMSE also whether the interval reaches beyond it."""
     said = []
     for verdict in limits:
         limit = verdict.threshold
         text = f"{'within' if verdict.outcome == 'pass' else 'exceeds'} the limit {limit.label}"
-        rmse = found.rmse
+        rmse = standing.rmse
         if (limit.metric, limit.segment) == ("rmse", "all") and limit.maximum is not None and rmse is not None:
-            at = limit.maximum * limit.factor
-            if math.isfinite(rmse.low) and rmse.low < at < rmse.high:
+            bound = limit.maximum * limit.factor
+            if math.isfinite(rmse.low) and rmse.low < bound < rmse.high:
                 text += ", which lies within the interval"
         said.append(text)
     return said

@@ -126,17 +126,17 @@ class RunCars:
         if by_name is not None:
             return self.read(self._place(by_name))
         by_folder = self._by_folder(log)
-        found = {} if by_folder is None else {f"folder {by_folder[0]}": by_folder[1]}
+        matches = {} if by_folder is None else {f"folder {by_folder[0]}": by_folder[1]}
         if table.metadata:
             mapping = mapping_of(self.config.mapping)
             with cached(log, mapping, self.config.read_options, self.warn) as (read_from, _):
                 has = log_metadata(read_from.path, self.config.read_options.limits)
-            found |= {f"{k} {has[k]}": cars[has[k]] for k, cars in table.metadata.items() if has.get(k) in cars}
-        cars = {self._place(car) for car in found.values()}
+            matches |= {f"{k} {has[k]}": cars[has[k]] for k, cars in table.metadata.items() if has.get(k) in cars}
+        cars = {self._place(car) for car in matches.values()}
         if len(cars) > 1:
             raise UsageError(
                 expected="one car a log",
-                got="; ".join(f"{car} by {why}" for why, car in found.items()),
+                got="; ".join(f"{car} by {why}" for why, car in matches.items()),
                 where=str(log.path),
                 remedy=f"name the log under [logs] of {self.config.cars}",
             )
@@ -175,7 +175,7 @@ def car_record(car: Car) -> dict[str, Any]:
     """
     network = None if car.network is None else [Path(car.network_name).name, car.network.sha256]
     parts = {
-        "the car's physics": [car.vehicle.model_dump(mode="json"), car.own.model_dump(mode="json")],
+        "the car's physics": [car.vehicle.model_dump(mode="json"), car.datasheet.model_dump(mode="json")],
         "the car's fit": [_plain(car.fitted_physics), [_plain(d) for d in car.learnt_on]],
         "the car's noise": {name: _plain(noise) for name, noise in car.noise.items()},
         "the network": network,

@@ -48,9 +48,9 @@ def drive_details(
 
     Parameters
     ----------
-    ready : the estimators that ran. main : the name of the answer. read : returns the track of a name, ``truth`` too.
+    ready : the estimators that ran. main : name of the selected estimate. read : returns the track of a name.
     signals : what the estimators saw. limits : how the figures are against the thresholds.
-    brief : without innovations and error budget, for which estimators run once more.
+    brief : without innovations and error decomposition, for which estimators run once more.
     """
     truth, slow = read(TRUTH), drive.car.vehicle.low_speed_blend_m_s
     answer = read(main)
@@ -79,14 +79,14 @@ def _faults(read: _Read, name: str) -> tuple[SensorFault, ...] | None:
 
 
 def _rivals(ready: Sequence[Estimator], main: Estimator) -> list[str]:
-    """Return the estimators on the car's model alone that the answer is held against; none sees more of the log."""
-    found = []
+    """Return the estimators on the car's model alone to compare the selected one with; none sees more of the log."""
+    rivals = []
     for estimator in ready:
         algorithm = resolve(estimator)
         physics = algorithm.physics_sha256 is not None and algorithm.network_sha256 is None
         if physics and estimator.name != main.name and (estimator.causal or not main.causal):
-            found.append(estimator.name)
-    return found
+            rivals.append(estimator.name)
+    return rivals
 
 
 def _budget(drive: Drive, physics: Estimator | None, read: _Read, signals: Signals) -> ErrorBudget:
@@ -109,8 +109,8 @@ def _squared_error(track: StateTrack, truth: StateTrack, low_speed_m_s: float) -
 
 
 def _metadata(drive: Drive) -> dict[str, str]:
-    """Return what the log says of itself by key, and by ``record.key`` where records differ, as far as it is short."""
-    found = drive.log.metadata()
-    found = {k: v for k, v in found.items() if k.partition(".")[2] not in found or found[k.partition(".")[2]] != v}
-    short = {printable(k, _MOST_SIGNS): v for k, v in sorted(found.items()) if len(v) <= _MOST_SIGNS}
+    """Return the log's metadata by key, and by ``record.key`` where records differ, as far as it is short."""
+    texts = drive.log.metadata()
+    texts = {k: v for k, v in texts.items() if k.partition(".")[2] not in texts or texts[k.partition(".")[2]] != v}
+    short = {printable(k, _MOST_SIGNS): v for k, v in sorted(texts.items()) if len(v) <= _MOST_SIGNS}
     return {k: printable(v) for k, v in [*short.items()][:_MOST_METADATA]}

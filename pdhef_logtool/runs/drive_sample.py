@@ -42,16 +42,16 @@ class DriveSample:
 
     def half(self, parity: int) -> DriveSample:
         """Return every second block, and before each what a filter settles on."""
-        stamps, own = self.signals.stamps_ns, (self.block >= 0) & (self.block % 2 == parity)
-        keep = own.copy()
-        for number in np.unique(self.block[own]):
+        stamps, in_half = self.signals.stamps_ns, (self.block >= 0) & (self.block % 2 == parity)
+        keep = in_half.copy()
+        for number in np.unique(self.block[in_half]):
             first = int(np.argmax(self.block == number))
             keep[np.searchsorted(stamps, stamps[first] - round(SETTLE_S * 1e9)) : first] = True
         spans = np.flatnonzero(np.diff(keep, prepend=False, append=False)).reshape(-1, 2).tolist()
         return DriveSample(
             join_signals([self.signals.rows(a, b) for a, b in spans]),
             None if self.truth is None else concatenate([self.truth.rows(a, b) for a, b in spans]),
-            np.where(own, self.block, -1)[keep],
+            np.where(in_half, self.block, -1)[keep],
         )
 
 
@@ -60,16 +60,16 @@ def sample_drive(signals: Signals, truth: StateTrack | None, weight: FloatArray)
 
     ``weight`` is NaN at stamps that do not count; None where fewer do than there are blocks.
     """
-    at = np.flatnonzero(np.isfinite(weight))
-    if at.size < BLOCKS:
+    finite_index = np.flatnonzero(np.isfinite(weight))
+    if finite_index.size < BLOCKS:
         return None
     stamps = np.concatenate([signals.rows(a, b).stamps_ns for a, b in row_blocks(len(signals))])
     step_s = float(np.median(np.diff(stamps))) * 1e-9
-    want = min(MOST_STAMPS // BLOCKS, at.size // BLOCKS, max(1, int(SECONDS / BLOCKS / step_s)))
+    want = min(MOST_STAMPS // BLOCKS, finite_index.size // BLOCKS, max(1, int(SECONDS / BLOCKS / step_s)))
     spans: list[tuple[int, int, int]] = []
-    done, gathered = 0, np.concatenate([[0.0], np.cumsum(weight[at])])
-    for a, b in pairwise(np.linspace(0, at.size, BLOCKS + 1).astype(np.int64).tolist()):
-        begin = max(int(at[a + np.argmax(gathered[a + want : b + 1] - gathered[a : b + 1 - want])]), done)
+    done, gathered = 0, np.concatenate([[0.0], np.cumsum(weight[finite_index])])
+    for a, b in pairwise(np.linspace(0, finite_index.size, BLOCKS + 1).astype(np.int64).tolist()):
+        begin = max(int(finite_index[a + np.argmax(gathered[a + want : b + 1] - gathered[a : b + 1 - want])]), done)
         lead = max(int(np.searchsorted(stamps, stamps[begin] - round(SETTLE_S * 1e9))), done)
         done = min(begin + want, len(stamps))
         spans.append((lead, begin, done))

@@ -124,7 +124,7 @@ class ErrorBudget:
 
 
 def no_budget(reason: str) -> ErrorBudget:
-    """Return the budget of a drive that has none."""
+    """Return the error decomposition of a drive that has none."""
     return ErrorBudget(reason, 0.0, float("nan"), ())
 
 
@@ -209,24 +209,24 @@ def _regressed(error: FloatArray, sensitivity: FloatArray, rate: float) -> Float
 
     ``rate``: samples that count as one error each, for neighbours are alike.
     """
-    known = np.isfinite(error) & np.isfinite(sensitivity).all(axis=1)
-    if not known.any():
+    usable = np.isfinite(error) & np.isfinite(sensitivity).all(axis=1)
+    if not usable.any():
         return np.zeros(sensitivity.shape[1])
-    error, sensitivity = error[known], sensitivity[known]
+    error, sensitivity = error[usable], sensitivity[usable]
     weight = rate / max(float(np.mean(error**2)), 1e-12)
     normal = weight * sensitivity.T @ sensitivity + np.eye(sensitivity.shape[1])
-    found = np.linalg.solve(normal, -weight * sensitivity.T @ error)
-    return np.clip(found, -_MOST_SPREADS, _MOST_SPREADS)
+    coefficients = np.linalg.solve(normal, -weight * sensitivity.T @ error)
+    return np.clip(coefficients, -_MOST_SPREADS, _MOST_SPREADS)
 
 
 def _rms(values: FloatArray) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else 0.0
+    finite = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(finite**2))) if finite.size else 0.0
 
 
 def _friction(case: _Case, share: float) -> _Case:
-    told = case.signals.friction
-    friction = np.where(np.isfinite(told), told, case.vehicle.assumed_friction) * (1.0 + share)
+    friction_signal = case.signals.friction
+    friction = np.where(np.isfinite(friction_signal), friction_signal, case.vehicle.assumed_friction) * (1.0 + share)
     return case.with_signals(friction=np.clip(friction, *POSSIBLE_FRICTION))
 
 
@@ -259,22 +259,22 @@ def _least_roll(case: _Case) -> float:
 
 def _late_steering(case: _Case, delay_s: float) -> _Case:
     steer, stamps = case.signals.steer_rad, case.signals.stamps_ns
-    known = np.isfinite(steer)
-    if not known.any():
+    is_finite = np.isfinite(steer)
+    if not is_finite.any():
         return case
-    at = (stamps - stamps[0]) * 1e-9
-    earlier = np.interp(at + delay_s, at[known], steer[known])
-    return case.with_signals(steer_rad=np.where(known, earlier, np.nan))
+    time_s = (stamps - stamps[0]) * 1e-9
+    earlier = np.interp(time_s + delay_s, time_s[is_finite], steer[is_finite])
+    return case.with_signals(steer_rad=np.where(is_finite, earlier, np.nan))
 
 
 def _late_truth(case: _Case, delay_s: float) -> _Case:
     truth = case.truth
-    at = (truth.stamps_ns - truth.stamps_ns[0]) * 1e-9
-    known = np.isfinite(truth.sideslip_rad)
-    if not known.any():
+    time_s = (truth.stamps_ns - truth.stamps_ns[0]) * 1e-9
+    is_finite = np.isfinite(truth.sideslip_rad)
+    if not is_finite.any():
         return case
-    moved = np.interp(at + delay_s, at[known], np.unwrap(truth.sideslip_rad[known]))
-    return replace(case, truth=replace(truth, sideslip_rad=np.where(known, moved, np.nan)))
+    moved = np.interp(time_s + delay_s, time_s[is_finite], np.unwrap(truth.sideslip_rad[is_finite]))
+    return replace(case, truth=replace(truth, sideslip_rad=np.where(is_finite, moved, np.nan)))
 
 
 #: Spreads: friction that is given or estimated, and the priors' about a vehicle file and a car's sensors.

@@ -174,9 +174,9 @@ def _track(
 
 
 def _interpolated(channel: Channel, stamps_ns: IntArray) -> FloatArray:
-    known = _without_nan(channel)
-    bracket = Bracket(known.stamps_ns, stamps_ns, gap_ns(known.stamps_ns))
-    return bracket.angle(known.values) if channel.name == "sideslip_rad" else bracket.linear(known.values)
+    finite = _without_nan(channel)
+    bracket = Bracket(finite.stamps_ns, stamps_ns, gap_ns(finite.stamps_ns))
+    return bracket.angle(finite.values) if channel.name == "sideslip_rad" else bracket.linear(finite.values)
 
 
 def gap_ns(stamps_ns: IntArray) -> int:

@@ -52,7 +52,7 @@ def estimate_windows(
 
     Parameters
     ----------
-    watched : complete ``diverged`` by the watch on wrong branches. drawn : dead-reckon poses.
+    watched : complete ``diverged`` by the monitor of wrong branches. drawn : dead-reckon poses.
     intervals : calibrates them; None leaves them as the estimators give them.
     causality : collects the estimators that declare themselves causal and look ahead; None does not check.
 
@@ -98,14 +98,14 @@ def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
     """
     from pdhef_logtool.estimators.posterior_band import posterior_band
 
-    algorithms, own, posterior = {}, {}, {}
+    algorithms, fixed_notes, posterior = {}, {}, {}
     band = posterior_band(car, use_speed=all(resolve(e).use_speed for e in estimators))
     of_log = car.self_calibrated
     calibrated = None if of_log is None else CalibratedBand(of_log, car.vehicle)
     online = None if of_log is None else OnlineBand((*of_log.earlier, of_log), car.vehicle)
     for estimator in estimators:
         if note := getattr(estimator, "intervals_note", ""):
-            own[estimator.name] = note
+            fixed_notes[estimator.name] = note
             if estimator.name == REFERENCE:
                 continue
             applies = online if isinstance(estimator, OnlineCalibrated) else calibrated
@@ -117,7 +117,7 @@ def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
         if band is not None and preset_of(estimator.name) in SELF_CALIBRATED:
             posterior[estimator.name] = band.add
     of_car = car.intervals is not None and car.intervals.physics_sha256 == car.physics_sha256
-    return TrackCalibrator(car.intervals, algorithms, own, posterior, of_car=of_car)
+    return TrackCalibrator(car.intervals, algorithms, fixed_notes, posterior, of_car=of_car)
 
 
 class DeadReckoning:
@@ -140,8 +140,8 @@ class DeadReckoning:
 def first_pose(truth: StateTrack | None) -> tuple[float, float, float]:
     """Return the first known pose x, y, yaw of the ground truth; the origin without one."""
     if truth is not None:
-        known = np.flatnonzero(np.isfinite(truth.x_m) & np.isfinite(truth.y_m) & np.isfinite(truth.yaw_rad))
-        if known.size:
-            i = int(known[0])
+        posed = np.flatnonzero(np.isfinite(truth.x_m) & np.isfinite(truth.y_m) & np.isfinite(truth.yaw_rad))
+        if posed.size:
+            i = int(posed[0])
             return float(truth.x_m[i]), float(truth.y_m[i]), float(truth.yaw_rad[i])
     return 0.0, 0.0, 0.0

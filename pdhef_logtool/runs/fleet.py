@@ -298,14 +298,14 @@ class _Fleet:
         progress = FleetProgress(self.reporter.progress, len(todo))
         tasks = (self._task(p, keep) for p in todo)
         for ended in self._supervised(tasks, progress.update):
-            one = todo[ended.number]
+            planned = todo[ended.number]
             end = self._end(ended)
             if end.outcome.failed is not None and len(self.plan.logs) > 1:
                 progress.failed += 1
-                self._warn(f"{one.log.path.name} failed, the others go on")  # the results give the reason
+                self._warn(f"{planned.log.path.name} failed, the others go on")  # the results give the reason
             for line in end.warned:
                 self._warn(line)
-            self._record(one, end, keep, quarantined=ended.failure is not None and ended.failure.tries > 1)
+            self._record(planned, end, keep, quarantined=ended.failure is not None and ended.failure.tries > 1)
             progress.end(ended.number)
 
     def _supervised(
@@ -351,15 +351,15 @@ class _Fleet:
             if mark is not None:
                 mark.unlink(missing_ok=True)
 
-    def _task(self, one: PlannedLog, keep: Keep) -> DriveTask:
-        label = one.log.stem
+    def _task(self, planned: PlannedLog, keep: Keep) -> DriveTask:
+        label = planned.log.stem
         stored: tuple[str, ...] = ()
         if self.stored is not None:
             stored = self.stored.there(label)
             if (entry := self.plan.journal.entries.get(label)) is not None:
                 self.stored.forget(entry.part)
         return DriveTask(
-            one.log,
+            planned.log,
             self.plan.output,
             replace(self.job.config, keep=keep),
             self.plan.setting,
@@ -381,14 +381,14 @@ class _Fleet:
         outcome = LogOutcome(log=log.stem, file=log.path.name, sha256=None, failed=f"{failure.reason}{tries}{last}")
         return DriveEnd(outcome, None, again=True)
 
-    def _record(self, one: PlannedLog, end: DriveEnd, keep: str, *, quarantined: bool) -> None:
+    def _record(self, log: PlannedLog, end: DriveEnd, keep: str, *, quarantined: bool) -> None:
         """Write how a drive ended into the journal, then remove its former figures."""
         car = None if end.car is None else self.plan.add_car(end.car)
         journal = self.plan.journal
-        before = journal.entries.get(one.log.stem)
+        before = journal.entries.get(log.log.stem)
         failed = end.outcome.failed is not None and end.part is None
         entry = Entry(
-            one.log.stem, one.place, end.identity or one.identity, self.plan.setting, car, keep, end.part, end.outputs,
+            log.log.stem, log.place, end.identity or log.identity, self.plan.setting, car, keep, end.part, end.outputs,
             end.failed_checks, end.error_rad, failed, end.again, quarantined,
         )  # fmt: skip
         journal.add(entry, end.outcome)

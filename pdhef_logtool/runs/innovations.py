@@ -39,29 +39,29 @@ class ChannelInnovations:
 
 def channel_innovations(estimators: Sequence[Estimator], sample: DriveSample) -> list[ChannelInnovations]:
     """Return the innovations of those estimators that have any, by channel; a channel without a sample has no row."""
-    found = []
+    innovations = []
     for estimator in estimators:
         nu = _innovations(*bare_filter(estimator, sample.signals))
         if nu is None:
             continue
         for column, channel in enumerate(CHANNELS):
             values = nu[:, column]
-            known = np.flatnonzero((sample.block >= 0) & np.isfinite(values))
-            if known.size:
-                x, block = values[known], sample.block[known]
+            scored = np.flatnonzero((sample.block >= 0) & np.isfinite(values))
+            if scored.size:
+                x, block = values[scored], sample.block[scored]
                 pair = block[1:] == block[:-1]
-                found.append(
+                innovations.append(
                     ChannelInnovations(
                         estimator=estimator.name,
                         channel=channel,
                         unit=SIGNAL_UNITS[channel],
-                        n=int(known.size),
+                        n=int(scored.size),
                         mean=float(x.mean()),
                         rms=float(np.sqrt(np.mean(x**2))),
                         autocorrelation=_correlation(x[:-1][pair], x[1:][pair]),
                     )
                 )
-    return found
+    return innovations
 
 
 def _innovations(estimator: Estimator, signals: Signals) -> FloatArray | None:

@@ -54,14 +54,14 @@ class Place:
         if isinstance(log.path, RemotePlace):
             return cls(_key(log.path.identity, log.span_s), _ELSEWHERE, 0)
         path = Path(os.path.realpath(log.path))
-        found = []
+        stats = []
         with suppress(OSError):
             files = [p for p in path.rglob("*") if p.is_file()] if path.is_dir() else [path]
-            found = [p.stat() for p in files]
+            stats = [p.stat() for p in files]
         return cls(
             _key(os.fsdecode(path), log.span_s),
-            sum(f.st_size for f in found),
-            max((f.st_mtime_ns for f in found), default=0),
+            sum(f.st_size for f in stats),
+            max((f.st_mtime_ns for f in stats), default=0),
         )
 
     @property
@@ -84,10 +84,10 @@ class Entry:
         with; car None where it has none. keep : what was written.
     part : the file of its figures below the run's folder, None without. failed_checks : those that count.
     outputs : :func:`outputs_digest` of what it left, None where that is not known.
-    error_rad : RMSE of the answer's sideslip, None where it is not scored against an independent truth.
+    error_rad : RMSE of the selected sideslip, None where it is not scored against independent ground truth.
     failed : whether nothing came out. again : whether that may be otherwise next time, as on a full disk.
     quarantined : whether it took its worker along.
-    at : bytes into the journal.
+    offset : bytes into the journal.
     """
 
     label: str
@@ -103,7 +103,7 @@ class Entry:
     failed: bool = False
     again: bool = False
     quarantined: bool = False
-    at: int = -1
+    offset: int = -1
 
 
 @dataclass(slots=True)
@@ -173,13 +173,13 @@ class Journal:
 
     def known(self, place: Place) -> tuple[str, str | None] | None:
         """Return label and identity of the log that lies there, if it lay there before and has not been changed."""
-        found = self._places.get(place.key)
-        return (found[2], found[1]) if found is not None and found[0] == place else None
+        place_entry = self._places.get(place.key)
+        return (place_entry[2], place_entry[1]) if place_entry is not None and place_entry[0] == place else None
 
     def label_at(self, place: Place) -> str | None:
         """Return the label of the log that lay there last, whether its content is the same or not."""
-        found = self._places.get(place.key)
-        return None if found is None else found[2]
+        place_entry = self._places.get(place.key)
+        return None if place_entry is None else place_entry[2]
 
     def may_know(self, place: Place) -> bool:
         """Whether a log of this size was seen, so that its content may be known."""
@@ -192,7 +192,7 @@ class Journal:
     def outcome(self, entry: Entry) -> LogOutcome:
         """Return how a drive ended; raises OutputError where its line was damaged since it was read."""
         with self.path.open("rb") as file:
-            file.seek(entry.at)
+            file.seek(entry.offset)
             document = _document(file.readline())
         if document is None:
             raise OutputError(
@@ -201,47 +201,47 @@ class Journal:
                 where=str(self.path),
                 remedy="--resume runs it again",
             )
-        told = document["outcome"]
-        car = None if told["car"] is None else CarFacts(**told["car"])
-        return LogOutcome(**{**told, "car": car, "lost": tuple(told["lost"])})
+        outcome = document["outcome"]
+        car = None if outcome["car"] is None else CarFacts(**outcome["car"])
+        return LogOutcome(**{**outcome, "car": car, "lost": tuple(outcome["lost"])})
 
     def add(self, entry: Entry, outcome: LogOutcome) -> None:
         """Write down how a drive ended; raises OutputError."""
         document = asdict(entry)
-        del document["at"]
-        at = self._append({**document, "outcome": jsonable(outcome)})
-        self._keep(replace(entry, at=at))
+        del document["offset"]
+        offset = self._append({**document, "outcome": jsonable(outcome)})
+        self._keep(replace(entry, offset=offset))
 
     def add_place(self, label: str, place: Place, identity: str) -> None:
         """Write down that a known log lies there too."""
         self._append({"label": label, "place": asdict(place), "identity": identity, "moved": True})
         self._places[place.key] = place, identity, label
 
-    def add_setting(self, digest: str, told: Mapping[str, str]) -> None:
+    def add_setting(self, digest: str, description: Mapping[str, str]) -> None:
         """Write down what a setting is, once."""
         if digest not in self.settings:
-            self._append({"setting": digest, "is": dict(told)})
-            self.settings[digest] = dict(told)
+            self._append({"setting": digest, "is": dict(description)})
+            self.settings[digest] = dict(description)
 
-    def add_car(self, digest: str, told: Mapping[str, Any]) -> None:
+    def add_car(self, digest: str, description: Mapping[str, Any]) -> None:
         """Write down what a car is, once."""
         if digest not in self.cars:
-            self._append({"car": digest, "is": dict(told)})
-            self.cars[digest] = dict(told)
+            self._append({"car": digest, "is": dict(description)})
+            self.cars[digest] = dict(description)
 
     def _append(self, document: Mapping[str, Any]) -> int:
-        at, data = self._end, _line(document)
+        offset, data = self._end, _line(document)
         with writing(self.path), open_new(self.path, "ab") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
         self._end += len(data)
-        return at
+        return offset
 
-    def _take(self, document: dict[str, Any], at: int) -> None:
+    def _take(self, document: dict[str, Any], offset: int) -> None:
         if "is" in document:
-            kind, known = ("setting", self.settings) if "setting" in document else ("car", self.cars)
-            known[document[kind]] = document["is"]
+            kind, descriptions = ("setting", self.settings) if "setting" in document else ("car", self.cars)
+            descriptions[document[kind]] = document["is"]
         elif "moved" in document:
             place = Place(**document["place"])
             self._places[place.key] = place, document["identity"], document["label"]
@@ -251,8 +251,8 @@ class Journal:
                 if entry.failed:
                     self.entries[label] = replace(entry, again=True, quarantined=False)
         elif "label" in document:
-            told = {k: v for k, v in document.items() if k != "outcome"}
-            self._keep(Entry(**{**told, "place": Place(**told["place"])}, at=at))
+            content = {k: v for k, v in document.items() if k != "outcome"}
+            self._keep(Entry(**{**content, "place": Place(**content["place"])}, offset=offset))
 
     def _keep(self, entry: Entry) -> None:
         self.entries[entry.label] = entry
@@ -291,9 +291,9 @@ def outputs_digest(*paths: Path) -> str:
     return total.hexdigest()[:_DIGITS]
 
 
-def digest_of(told: Any) -> str:
+def digest_of(content: Any) -> str:
     """Return a short digest of JSON-able values."""
-    return digest(told)[:_DIGITS]
+    return digest(content)[:_DIGITS]
 
 
 def changes(old: Mapping[str, str], new: Mapping[str, str]) -> Iterator[str]:

@@ -170,7 +170,7 @@ class RunResult:
 
     @property
     def is_fleet(self) -> bool:
-        """Whether there are too many logs to tell of each."""
+        """Whether there are too many logs to report each."""
         return len(self.results) > FEW_LOGS
 
     @property
@@ -476,7 +476,7 @@ def _choose_estimators(
 
 
 def _shown(main: MainFacts, ran: Sequence[str]) -> Shown:
-    """Return what recordings open on: the answer, and physics alone or else what is naive to hold it against."""
+    """Return what recordings open on: the selected estimate, and physics alone or else the naive estimate."""
     order = [PHYSICS, *([] if main.naive is None else [main.naive]), *main.shown]
     return Shown(main.name, next((name for name in order if name in ran and name != main.name), None))
 
@@ -552,8 +552,8 @@ def _recording(  # positional: what `_open_sinks` takes
 
 def _application_id(output: Path, config: RunConfig) -> str:
     """Return what the recordings of a run have in common, by which a viewer shows them as one dataset."""
-    told = json.dumps([config.to_dict(), tool_versions()], sort_keys=True)
-    return f"pdhef-{output.resolve().name}-{sha256(told.encode()).hexdigest()[:SHOWN_DIGITS]}"
+    identity = json.dumps([config.to_dict(), tool_versions()], sort_keys=True)
+    return f"pdhef-{output.resolve().name}-{sha256(identity.encode()).hexdigest()[:SHOWN_DIGITS]}"
 
 
 def _estimate(
@@ -605,8 +605,8 @@ def friction_events(friction: FrictionSource, signals: Signals) -> list[Event]:
     """Return when an estimated friction was observable; ``signals`` are those of all windows."""
     from pdhef_logtool.evaluation.segments import find_intervals
 
-    found = find_intervals(signals, {"friction observable": friction.observable})
-    return [Event(s.name, s.start_ns, s.end_ns, "the estimate of friction can be relied on") for s in found]
+    intervals = find_intervals(signals, {"friction observable": friction.observable})
+    return [Event(s.name, s.start_ns, s.end_ns, "the estimate of friction can be relied on") for s in intervals]
 
 
 def report_facts(
@@ -736,8 +736,8 @@ def write_run(output: Path, config: dict[str, Any], result: LogResult, car: Car 
     """Write metrics.parquet and run.json of a run of one log, with the configuration as JSON-able values."""
     from pdhef_logtool.results.parquet_sink import write_metrics
 
-    known = None if car is None else car.network
-    network = None if known is None or car is None else {"name": Path(car.network_name).name, "sha256": known.sha256}
+    used = None if car is None else car.network
+    network = None if used is None or car is None else {"name": Path(car.network_name).name, "sha256": used.sha256}
     write_metrics(output / METRICS_FILE, result.rows)
     files = {METRICS_FILE: file_sha256(output / METRICS_FILE)}
     write_json(output / RUN_FILE, build_run(run_versions(), config, network, [result.outcome], files=files))

@@ -99,12 +99,12 @@ class _Labels:
     def __post_init__(self) -> None:
         self._taken = {as_taken(label) for label in self.journal.entries}
 
-    def claim(self, number: int, one: PlannedLog) -> None:
+    def claim(self, number: int, log: PlannedLog) -> None:
         """Assign the label of a planned log."""
-        self.planned[number] = one
-        self.claimed.add(one.log.stem)
-        if one.identity is not None:
-            self.owner.setdefault(one.identity, one.log.path.name)
+        self.planned[number] = log
+        self.claimed.add(log.log.stem)
+        if log.identity is not None:
+            self.owner.setdefault(log.identity, log.log.path.name)
 
     def of(self, log: LogInput, place: Place, identity: str | None) -> PlannedLog:
         """Return a log with the first label that is free: of its content, of its path, or a new one."""
@@ -136,10 +136,10 @@ def calibrate_pools(
     if config.calibrate != "pool":
         return {}
     logs: dict[int, tuple[Car, list[LogInput]]] = {}
-    for one in planned:
+    for planned_log in planned:
         with suppress(Exception):  # the run reports the reason
-            car = cars.of_log(one.log)
-            logs.setdefault(id(car), (car, []))[1].append(one.log)
+            car = cars.of_log(planned_log.log)
+            logs.setdefault(id(car), (car, []))[1].append(planned_log.log)
     pools = {key: calibrate_pool(of, car, mapping, config) for key, (car, of) in logs.items()}
     return {log.stem: pools[key] for key, (_, of) in logs.items() for log in of}
 
@@ -193,14 +193,14 @@ class Plan:
         """Begin the journal with the settings and the new places of logs."""
         self.journal.begin()
         self.journal.add_setting(self.setting, self.settings)
-        for one in self.logs:
-            if one.moved:
-                self.journal.add_place(one.log.stem, one.place, one.identity or "")
+        for log in self.logs:
+            if log.moved:
+                self.journal.add_place(log.log.stem, log.place, log.identity or "")
 
-    def entry(self, one: PlannedLog) -> Entry | None:
+    def entry(self, log: PlannedLog) -> Entry | None:
         """Return the journal's entry of a log if it is done, whichever files were kept."""
-        entry = self.journal.entries.get(one.log.stem)
-        if entry is None or self._reason(one, "metrics", retry=False) not in (None, _REPEATED):
+        entry = self.journal.entries.get(log.log.stem)
+        if entry is None or self._reason(log, "metrics", retry=False) not in (None, _REPEATED):
             return None
         return entry
 
@@ -246,8 +246,8 @@ class Plan:
         if missing := [name for name in names if name not in labels]:
             near = ", ".join(sorted(labels)[:10]) + (" and more" if len(labels) > 10 else "")
             raise UsageError(expected=f"the name of a log ({near})", got=missing[0], where="--only")
-        for one in self.logs:
-            entry = self.journal.entries.get(one.log.stem)
+        for log in self.logs:
+            entry = self.journal.entries.get(log.log.stem)
             if entry is not None and (why := [*self._changes(entry)]):
                 raise UsageError(
                     expected="the settings of the run in the folder",
@@ -256,14 +256,14 @@ class Plan:
                     remedy="--resume runs its logs again",
                 )
 
-    def _reason(self, one: PlannedLog, keep: str, retry: bool) -> str | None:
+    def _reason(self, log: PlannedLog, keep: str, retry: bool) -> str | None:
         """Return why a log is to be run, empty for a new one; None if it is done."""
-        entry = self.journal.entries.get(one.log.stem)
+        entry = self.journal.entries.get(log.log.stem)
         if entry is None:
             return ""
         if entry.quarantined:
             return _REPEATED if retry else None
-        if entry.place != one.place and entry.identity != one.identity:
+        if entry.place != log.place and entry.identity != log.identity:
             return "their logs have changed"
         if why := [*self._changes(entry)]:
             return ", ".join(why)
@@ -280,13 +280,13 @@ class Plan:
         """Return whether report and figures of a drive are unchanged; read once per line of the journal."""
         if entry.outputs is None:
             return True
-        if entry.at not in self._sound:
+        if entry.offset not in self._sound:
             paths = self.output / log_place(entry.label) / REPORT_FILE, self.output / str(entry.part)
             try:
-                self._sound[entry.at] = outputs_digest(*paths) == entry.outputs
+                self._sound[entry.offset] = outputs_digest(*paths) == entry.outputs
             except OSError:
-                self._sound[entry.at] = False
-        return self._sound[entry.at]
+                self._sound[entry.offset] = False
+        return self._sound[entry.offset]
 
     def _changes(self, entry: Entry) -> Iterator[str]:
         """Yield as texts which settings and car of a drive have changed."""

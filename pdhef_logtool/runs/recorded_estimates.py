@@ -1,6 +1,6 @@
-"""Scores estimates that somebody else recorded in a log: which fields they are, their stamps, truth there, figures.
+"""Scores estimates that somebody else recorded in a log: their fields, their stamps, ground truth there, figures.
 
-The scored stamps are the estimate's own. The truth is interpolated to them, its latency measured gyro to truth where
+The scored stamps are the estimate's own. Ground truth is interpolated to them, its latency measured against the gyro if
 the log has an IMU; the sensors, which only cut the drive into segments, are interpolated to them too.
 """
 
@@ -228,22 +228,22 @@ class _Scoring:
         losses: list[Loss] = []
         recorded = []
         for estimate in self.estimates:
-            found, lost = read_estimate(
+            recorded_estimate, lost = read_estimate(
                 drive.log, estimate, drive.plan.start_ns, drive.plan.end_ns, drive.options.window_s
             )
-            for note in found.notes:
+            for note in recorded_estimate.notes:
                 drive.tell(f"{estimate.name}: {note}")
-            recorded.append(found)
+            recorded.append(recorded_estimate)
             losses += lost
         return recorded, losses
 
     def _with_dependence(self, plan: DrivePlan, recorded: Sequence[RecordedEstimate]) -> DrivePlan:
         """Add the truth channels that one of the estimates is, as a recorded channel."""
-        found = dict(plan.dependent)
+        dependent = dict(plan.dependent)
         for r in recorded:
             same = dependent_signals(r.channels, plan.survey_truth, role=f"estimate {r.track.name}'s")
-            found |= {name: reason for name, reason in same.items() if name not in found}
-        return replace(plan, dependent=found)
+            dependent |= {name: reason for name, reason in same.items() if name not in dependent}
+        return replace(plan, dependent=dependent)
 
     def _figures(
         self,
@@ -310,8 +310,8 @@ def _read_sensors(drive: Drive) -> Signals | None:
 
 
 def _same_column(estimate: FloatArray, truth: FloatArray) -> bool:
-    known = np.isfinite(estimate) & np.isfinite(truth)
-    return int(np.count_nonzero(known)) >= 10 and share_equal(estimate[known], truth[known]) >= SAME_SHARE
+    usable = np.isfinite(estimate) & np.isfinite(truth)
+    return int(np.count_nonzero(usable)) >= 10 and share_equal(estimate[usable], truth[usable]) >= SAME_SHARE
 
 
 def _write(
@@ -397,9 +397,9 @@ def signals_at(signals: Signals | None, stamps_ns: IntArray) -> Signals:
         if signals is None:
             return np.full(n, np.nan)
         values: FloatArray = getattr(signals, name)
-        known = np.isfinite(values)
-        at = signals.stamps_ns[known]
-        return Bracket(at, stamps_ns, gap_ns(at)).linear(values[known])
+        is_finite = np.isfinite(values)
+        stamps = signals.stamps_ns[is_finite]
+        return Bracket(stamps, stamps_ns, gap_ns(stamps)).linear(values[is_finite])
 
     return Signals(
         stamps_ns=stamps_ns,

@@ -20,23 +20,23 @@ if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
 
 #: The preferred estimator, and those it is checked against: models that explain the yaw rate by the steering. ``zero``
-#: agrees with an accelerometer near the rear axle, and ``kinematic`` integrates the residual that d2 measures.
+#: agrees with an accelerometer near the rear axle, and ``kinematic`` integrates the residual that ``d2`` measures.
 PREFERRED = "pd-hef"
 SIMPLE = ("open-loop", "open-loop:calibrated", "phy-ukf", "physics")
-#: On simulated drives with right and wrong files every estimate beyond 1.05 times the least d2 had at least 1.7 times
+#: On simulated drives with right and wrong files any estimate beyond 1.05 times the least ``d2`` had at least 1.7 times
 #: its sideslip error (docs/calibration.md).
 FACTOR = 1.2
 #: The baseline of every score. It needs the fewest signals and cannot drift; ``kinematic`` follows the accelerometer's
 #: bias and has a higher error on half of the recorded drives.
 NAIVE = "zero"
-#: The selected estimate is the first of these that ran, unless d2 contradicts it; without any, the first other one.
+#: The selected estimate is the first of these that ran, unless ``d2`` contradicts it; without any, the first other one.
 _BEST_FIRST = (PREFERRED, PHYSICS, "phy-ukf:tuned", "phy-ukf", "open-loop:calibrated", "open-loop", "kinematic")
 _LAST = (NAIVE, "zero:no-lateral", REFERENCE)
 
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """An estimate whose d2 exceeds that of the ``best`` simple estimator by more than :data:`FACTOR`; both in m/s."""
+    """An estimate whose ``d2`` exceeds that of the ``best`` simple estimator by over :data:`FACTOR`; both in m/s."""
 
     best: str
     own_d2: float
@@ -53,12 +53,12 @@ class Contradiction:
 
 
 def contradiction(rows: Iterable[MetricRow], name: str = PREFERRED) -> Contradiction | None:
-    """Return how d2 contradicts an estimate; None if it does not, or without a simple estimator to compare with."""
+    """Return how ``d2`` contradicts an estimate; None if it does not, or without a simple estimator to compare with."""
     d2 = {r.estimator: r.value for r in rows if (r.metric, r.segment) == ("d2", "all")}
-    simple = {one: d2[one] for one in SIMPLE if one in d2 and one != name}
+    simple = {other: d2[other] for other in SIMPLE if other in d2 and other != name}
     if name not in d2 or not simple:
         return None
-    best = min(simple, key=lambda one: simple[one])
+    best = min(simple, key=lambda other: simple[other])
     return Contradiction(best, d2[name], simple[best], name) if d2[name] > FACTOR * simple[best] else None
 
 
@@ -91,7 +91,7 @@ def candidates(car: Car, available: frozenset[str]) -> tuple[str, ...]:
 
 
 def choose_main(ran: Sequence[Estimator], rows: Iterable[MetricRow], *, proven: bool, named: bool) -> MainFacts:
-    """Return the main estimator of a log and why it is; of the figures only d2 counts, which needs no truth.
+    """Return the selected estimator of a log and why; of the figures only ``d2`` counts, which needs no ground truth.
 
     Parameters
     ----------

@@ -53,15 +53,15 @@ def calibrate_pool(
         return None
     from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 
-    found = []
+    drivings = []
     for log_input in inputs:
         try:
             with read_cached(log_input, car, mapping, config.read_options) as drive:
                 if not lacking(drive):
-                    found.append(read_driving(drive))
+                    drivings.append(read_driving(drive))
         except PdhefError:
             continue  # the run itself states what is wrong with it
-    return self_calibrate(found, car.vehicle, taught=car.taught_prior)
+    return self_calibrate(drivings, car.vehicle, taught=car.taught_prior)
 
 
 def lacking(drive: Drive) -> list[str]:
@@ -80,7 +80,7 @@ def read_driving(drive: Drive) -> Driving:
 
 
 def checked(drive: Drive, calibration: SelfCalibration | None) -> SelfCalibration | None:
-    """Return a calibration with the part of d2 of ``physics`` on it that correlates with the driving."""
+    """Return a calibration with the part of ``d2`` of ``physics`` on it that correlates with the driving."""
     if calibration is None or calibration.refused or calibration.earlier:
         return calibration
     alone = self_calibrated(drive, replace(calibration, varied=()))  # lateral kinematic consistency needs no interval
@@ -89,7 +89,7 @@ def checked(drive: Drive, calibration: SelfCalibration | None) -> SelfCalibratio
 
 
 def _driven_d2_of(drive: Drive, estimator: Estimator, sensors: SensorErrors) -> float:
-    """Return the part of d2 of an estimator over a drive that correlates with the driving, in m/s; NaN if unknown.
+    """Return the part of ``d2`` of an estimator over a drive that correlates with the driving, in m/s; NaN if unknown.
 
     The windows have a fixed length, so that the length of the run's windows does not change it.
     """

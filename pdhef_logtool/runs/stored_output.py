@@ -44,8 +44,8 @@ def stored_drive(objects: ObjectFolder, work: Work, task: DriveTask, tell: Tell)
         folder = Path(scratch) / task.output.name
         folder.mkdir()
         end = work(replace(task, output=folder), tell)
-        found = (p for p in folder.rglob("*") if p.is_file() and not _is_hidden(p.relative_to(folder)))
-        names = sorted((p.relative_to(folder).as_posix() for p in found), key=_order)
+        files = (p for p in folder.rglob("*") if p.is_file() and not _is_hidden(p.relative_to(folder)))
+        names = sorted((p.relative_to(folder).as_posix() for p in files), key=_order)
         here, report = f"{LOGS}/{task.log.stem}", f"{LOGS}/{task.log.stem}/{REPORT_FILE}"
         try:
             if report in names:
@@ -160,7 +160,7 @@ class StoredOutput(Mirror):
         return stored.end
 
     def begin(self) -> None:
-        """Put the journal as the run begins with it; figures that it does not know go."""
+        """Put the journal as the run begins with it; figures that it does not list are removed."""
         self._put_journal()
         self._remove_gone()
 

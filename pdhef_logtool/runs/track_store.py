@@ -21,7 +21,7 @@ from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.storage.files import open_new, writing
 
 _SIGNALS = "signals"
-#: A column up to this length stays in memory: nearly three minutes at 100 Hz, of which a track takes 5 MB.
+#: A column up to this length stays in memory: nearly three minutes at 100 Hz, where a track takes 5 MB.
 ROWS_HELD = 1 << 14
 
 
@@ -29,7 +29,7 @@ ROWS_HELD = 1 << 14
 class _Column:
     """A column that grows: rows so far, and what a row is.
 
-    While all rows are the same, as of what an estimator does not know, that one row represents them; then they are in
+    While all rows are the same, as of a signal without estimate, that one row represents them; then they are in
     memory, and from :data:`ROWS_HELD` on in a file.
     """
 
@@ -111,7 +111,7 @@ class _Stored:
         return self._end - self._start
 
     def rows(self, start: int, end: int) -> Self:
-        """Return the rows [start, end), of which nothing is read before a column is asked for."""
+        """Return the rows [start, end), each column read on first access."""
         return type(self)(self._stored, self._start + start, min(self._start + end, self._end))
 
 
@@ -173,14 +173,14 @@ class TrackStore:
 
     def windows(self) -> Iterator[tuple[Signals, list[StateTrack]]]:
         """Yield signals and drawn tracks window by window, as they were added, each in memory."""
-        at: Counter[str] = Counter()
+        row_of: Counter[str] = Counter()
         for window in self._windows:
             parts: list[Any] = []
             for key, rows in [(_SIGNALS, window.rows), *window.drawn]:
                 parts.append(
-                    _in_memory(self._stored[key], at[key], at[key] + rows, Signals if not parts else StateTrack)
+                    _in_memory(self._stored[key], row_of[key], row_of[key] + rows, Signals if not parts else StateTrack)
                 )
-                at[key] += rows
+                row_of[key] += rows
             yield parts[0], parts[1:]
 
     def _append(self, key: str, record: StateTrack | Signals) -> None:

@@ -84,7 +84,7 @@ def run_drive(task: DriveTask, tell: Tell) -> DriveEnd:
         return _run_drive(task, tell, warned)
     except MemoryError:
         raise  # the supervisor reports it
-    except Exception as error:  # noqa: BLE001 (one bad log never stops the others, whatever is wrong with it)
+    except Exception as error:  # noqa: BLE001 (one bad log never stops the others, for any error)
         expected = isinstance(error, PdhefError)
         reason = str(error) if expected else f"internal error, {type(error).__name__}: {error}"
         outcome = LogOutcome(log=task.log.stem, file=task.log.path.name, sha256=None, failed=reason)

@@ -39,7 +39,7 @@ def main(arguments: list[str] | None = None) -> int:
     drawn = json.loads((given.work / "manifest.json").read_text(encoding="utf-8"))["drives"]
     drives, learnt_on = [], []
     for entry in drawn:
-        read = read_drive(given.work / entry["file"], Car.of(car.own))
+        read = read_drive(given.work / entry["file"], Car.of(car.datasheet))
         assert read.truth is not None
         start_ns = int(read.signals.stamps_ns[0])
         drives.append(FitDrive(read.name, read.signals, read.truth, independent_yaw_rate=True, log_start_ns=start_ns))
@@ -48,13 +48,15 @@ def main(arguments: list[str] | None = None) -> int:
     def say(text: str, share: float) -> None:
         print(f"{100 * share:3.0f} % {text}", flush=True)
 
-    result, physics = find_physics(drives, car.own, progress=say)
+    result, physics = find_physics(drives, car.datasheet, progress=say)
     # Smoothed it has the filter's noise: its network predicts most of what the model lacks.
     physics = physics.model_copy(update={"smoothing": (1.0, 1.0)})
     print(f"sideslip RMSE on what it was fitted to: {result.rms_deg:.4f} deg")
     for tried in physics.tried:
         print(f"{', '.join(tried.parts) or 'static'}: {tried.held_out_deg} {'taken' if tried.taken else ''}")
-    part = Fit(physics_sha256=physics_sha256(car.own), values=FittedValues(), physics=physics, drives=tuple(learnt_on))
+    part = Fit(
+        physics_sha256=physics_sha256(car.datasheet), values=FittedValues(), physics=physics, drives=tuple(learnt_on)
+    )
     text = part_toml(part, "Written by python -m studies.defaults.fit_physics.")
     settings = {"seed": SEED, "drives": len(drives)}
     change = Change(

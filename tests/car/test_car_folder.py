@@ -91,7 +91,7 @@ def write_part(path: Path, part: Record) -> None:
 
 def add_fit(folder: Path, **values: Any) -> Fit:
     fit = Fit(
-        physics_sha256=physics_sha256(load(folder).own),
+        physics_sha256=physics_sha256(load(folder).datasheet),
         values=FittedValues(**(values or {"friction": 0.6, "steer_offset_rad": 0.01})),
         filter={TUNED: FilterNoise(q_std=(0.1, 0.2, 0.3), r_std={"ay_m_s2": 0.5})},
         drives=DRIVES,
@@ -132,7 +132,7 @@ def edit(folder: Path, old: str, new: str) -> None:
 
 def test_a_folder_with_a_persons_file_alone_is_a_car(folder: Path) -> None:
     car = load(folder)
-    assert (car.vehicle, car.source) == (car.own, folder)
+    assert (car.vehicle, car.source) == (car.datasheet, folder)
     assert car.vehicle == load(folder / VEHICLE_FILE).vehicle
     assert (dict(car.noise), car.trust, car.network, car.learnt_on, car.notes) == ({}, None, None, (), ())
 
@@ -151,7 +151,7 @@ def test_parts_come_one_by_one(folder: Path) -> None:
     own = load(folder).vehicle
     fit = add_fit(folder)
     car = load(folder)
-    assert car.own == own
+    assert car.datasheet == own
     assert car.vehicle == own.model_copy(
         update={"friction": 0.6, "steer_offset_rad": 0.01, "name": "mine (identified)"}
     )
@@ -227,8 +227,8 @@ def test_what_was_found_through_physics_is_its_own(folder: Path, tmp_path: Path)
     assert car.fitted_physics == FOUND
     assert dict(car.noise) == {TUNED: car.noise[TUNED], "physics": FOUND.noise}
     assert car.vehicle.physics == PhysicsParts()
-    assert car.physics_vehicle == FOUND.values.applied_to(car.own)
-    assert (car.physics_vehicle.friction, car.vehicle.friction) == (car.own.friction, 0.6)
+    assert car.physics_vehicle == FOUND.values.applied_to(car.datasheet)
+    assert (car.physics_vehicle.friction, car.vehicle.friction) == (car.datasheet.friction, 0.6)
     assert car.physics_vehicle.physics.names == ("lag", "roll")
     assert of_car(car).vehicle == car.physics_vehicle
     assert make_estimator(TUNED, car).vehicle == car.vehicle
@@ -248,7 +248,7 @@ def test_other_physics_leave_it_out(folder: Path) -> None:
     edit(folder, "mass_kg = 1440.0 ", "mass_kg = 1450.0 ")
     car = load(folder)
     assert car.fitted_physics is None
-    assert (dict(car.noise), car.physics_vehicle) == ({}, car.own)
+    assert (dict(car.noise), car.physics_vehicle) == ({}, car.datasheet)
 
 
 # --- staleness -----------------------------------------------------------------------------------------------------
@@ -269,7 +269,7 @@ def test_other_physics_leave_fit_noise_and_trust_out_and_say_so(folder: Path, ol
     add_trust(folder)
     edit(folder, old, new)
     car = load(folder, "default")
-    assert car.vehicle == car.own
+    assert car.vehicle == car.datasheet
     assert dict(car.noise) == {}
     assert car.learnt_on == ()
     assert car.notes == (
@@ -461,7 +461,7 @@ def test_a_bare_file_and_the_default_car_become_folders(tmp_path: Path) -> None:
     os.umask(mask)
     assert (tmp_path / "mine").stat().st_mode & 0o777 == 0o777 & ~mask
     update_car(Car.load(None, network="none"), tmp_path / "sedan", noise_change(NEW))
-    assert load(tmp_path / "sedan").own == default_vehicle()
+    assert load(tmp_path / "sedan").datasheet == default_vehicle()
 
 
 def test_what_the_output_knows_of_the_car_stays(folder: Path, tmp_path: Path) -> None:

@@ -187,7 +187,7 @@ def test_without_d2_its_own_interval_counts_as_it_is(signals: Signals) -> None:
     (plain,), (banded,) = tracks("physics", calibrated(), signals), tracks("physics", with_band(0.0, math.nan), signals)
     np.testing.assert_array_equal(banded.sideslip_std_rad, plain.sideslip_std_rad)
     told = calibrator(Car.of(OWN), [make_estimator("physics", with_band(0.0, math.nan))])
-    assert told.own["physics"] == "intervals: own and parameters"
+    assert told.fixed_notes["physics"] == "intervals: own and parameters"
 
 
 def test_intervals_of_other_driving_are_not_taken(signals: Signals) -> None:

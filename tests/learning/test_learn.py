@@ -264,7 +264,7 @@ def _tyres(factor: float) -> Callable[[Task], StageOutput]:
             front=AxleTyre(cornering_stiffness_n_per_rad=90_000.0),
             rear=AxleTyre(cornering_stiffness_n_per_rad=factor * 125_000.0),
         )
-        fit = Fit(physics_sha256=physics_sha256(task.car.own), values=FittedValues(tyres=tyres))
+        fit = Fit(physics_sha256=physics_sha256(task.car.datasheet), values=FittedValues(tyres=tyres))
         change = Change("stage", FIT_FILE, {FIT_FILE: part_toml(fit, "made").encode()})
         return StageOutput(change, (), f"factor {factor}", {"physics_parameters": [], "physics": {}})
 

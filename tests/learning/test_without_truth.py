@@ -38,7 +38,9 @@ def test_a_pool_of_logs_mends_the_file(pool: LearnResult, sample_logs_dir: Path)
     for front in (True, False):
         found = car.vehicle.cornering_stiffness_n_per_rad(front, 0.85)
         assert found == pytest.approx(right.cornering_stiffness_n_per_rad(front, 0.85), rel=0.25)
-    assert car.own.cornering_stiffness_n_per_rad(True, 0.85) < 0.6 * right.cornering_stiffness_n_per_rad(True, 0.85)
+    assert car.datasheet.cornering_stiffness_n_per_rad(True, 0.85) < 0.6 * right.cornering_stiffness_n_per_rad(
+        True, 0.85
+    )
 
 
 def test_the_car_says_what_it_rests_on_and_that_no_truth_was_looked_at(pool: LearnResult) -> None:

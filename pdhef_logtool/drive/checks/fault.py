@@ -18,6 +18,6 @@ CHECKS = (FAULT,)
 
 
 def fault_check(name: str, share: float) -> Check:
-    """Return the check of a signal of which such samples take a share of the drive's motion."""
+    """Return the check of a signal whose faulty samples take a share of the drive's motion."""
     evidence = f"{share:.0%} of what the car did fell into samples of it that are stuck or dead"
     return FAULT.failed(evidence, name) if share > FAULTY_SHARE else FAULT.passed(evidence, name)

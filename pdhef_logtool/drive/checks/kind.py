@@ -13,7 +13,7 @@ from pdhef_logtool.drive.truth import LatencyEstimate
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
 
-#: Stands in a name for each signal that the check judges.
+#: Placeholder in a name for each signal that the check judges.
 SIGNAL = "SIGNAL"
 _T = TypeVar("_T")
 

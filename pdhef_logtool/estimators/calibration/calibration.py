@@ -104,7 +104,7 @@ class SelfCalibration:
     rms : of yaw rate, rad/s, and a_y, m/s², that the model leaves; of_file : that the file's leaves.
     seconds : of driving that counted. logs : in the pool.
     varied : the vehicle one posterior 1-sigma away in each of the directions that move its sideslip most.
-    driven_d2_m_s : d2 of ``physics`` on it as far as it correlates with the driving, NaN without a run.
+    driven_d2_m_s : part of the v̇_y residual of ``physics`` that correlates with the driving, NaN without a run.
     since_ns, earlier : of a calibration on line: from when on it applies, and what applied before, in time order.
     """
 
@@ -270,19 +270,19 @@ def _understeer(problem: JointProblem, fit: Fit, vehicle_file: VehicleParameters
     return Understeer(file, centre, math.sqrt(float(slope @ fit.covariance @ slope)))
 
 
-def _refusal(found: SelfCalibration, drives: Sequence[Driving], sliding: float, *, exported: bool) -> str:
+def _refusal(calibration: SelfCalibration, drives: Sequence[Driving], sliding: float, *, exported: bool) -> str:
     """Return why a fit is not used: it explains too little, the car slides, or the stiffness remains open.
 
     ``sliding`` : share of the driving in which the rear axle slides.
     """
     for name, column, row in (("yaw rate", YAW_RATE, OF_RATE), ("lateral acceleration", AY, OF_AY)):
         measured = np.concatenate([d.columns[column][counted(d)] for d in drives])
-        share = found.rms[row] / max(float(np.sqrt(np.mean(measured**2))), 1e-9)
-        if share > LARGEST_SHARE and found.rms[row] > LARGEST_ERROR * ERROR_STD[row]:
+        share = calibration.rms[row] / max(float(np.sqrt(np.mean(measured**2))), 1e-9)
+        if share > LARGEST_SHARE and calibration.rms[row] > LARGEST_ERROR * ERROR_STD[row]:
             return f"the model leaves {share:.0%} of the {name}, at most {LARGEST_SHARE:.0%} is plausible"
-    if sliding > SLIDING_SHARE and sliding * found.seconds > SLIDING_S:
+    if sliding > SLIDING_SHARE and sliding * calibration.seconds > SLIDING_S:
         return f"the rear axle slides in {sliding:.0%} of the driving"
-    idle = [p.name for p in found.parameters if p.name in (FRONT_STIFFNESS, REAR_STIFFNESS) and not p.excited]
+    idle = [p.name for p in calibration.parameters if p.name in (FRONT_STIFFNESS, REAR_STIFFNESS) and not p.excited]
     if exported and idle:
         return f"the driving does not excite the {' and the '.join(idle)}"
     return ""

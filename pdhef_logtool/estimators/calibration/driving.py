@@ -112,9 +112,9 @@ class DrivingReader:
             FRICTION: signals.friction,
         }
         for row, values in sources.items():
-            known = np.isfinite(values)
-            count = np.bincount(place, known, cells.size)
-            total = np.bincount(place, np.where(known, values, 0.0), cells.size)
+            is_finite = np.isfinite(values)
+            count = np.bincount(place, is_finite, cells.size)
+            total = np.bincount(place, np.where(is_finite, values, 0.0), cells.size)
             means[row] = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
         self._cells.append(cells)
         self._means.append(means)
@@ -122,13 +122,13 @@ class DrivingReader:
 
 def _bridged(values: FloatArray, most: int) -> FloatArray:
     """Return values [N] with gaps of at most so many steps filled in, linear; longer ones stay NaN."""
-    at = np.flatnonzero(np.isfinite(values))
-    if at.size < 2:
+    finite_index = np.flatnonzero(np.isfinite(values))
+    if finite_index.size < 2:
         return values
     grid = np.arange(values.size)
-    filled = np.interp(grid, at, values[at], left=np.nan, right=np.nan)
-    after = np.searchsorted(at, grid)
-    gap = at[np.minimum(after, at.size - 1)] - at[np.maximum(after - 1, 0)]
+    filled = np.interp(grid, finite_index, values[finite_index], left=np.nan, right=np.nan)
+    after = np.searchsorted(finite_index, grid)
+    gap = finite_index[np.minimum(after, finite_index.size - 1)] - finite_index[np.maximum(after - 1, 0)]
     return np.where(np.isfinite(values) | (gap <= most), filled, np.nan)
 
 

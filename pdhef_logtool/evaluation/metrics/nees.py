@@ -12,7 +12,7 @@ from pdhef_logtool.evaluation.track_errors import selected
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
-#: Rows of which covariances are in memory at once.
+#: Rows whose covariances are in memory at once.
 NEES_ROWS = 1 << 16
 #: Of a covariance in units of its mean variance: far above what rounding does to it.
 LEAST_DETERMINANT = 1e-9

@@ -39,7 +39,7 @@ def whiteness_rows(track: StateTrack, masks: Mapping[str, BoolArray], *, log: st
 
 
 def _pairs(track: StateTrack, masks: SegmentMasks) -> Iterator[tuple[dict[str, BoolArray], FloatArray, FloatArray]]:
-    """Yield, by block, NIS / dof [M] of stamps and of those that follow, NaN where one lacks it, and their masks."""
+    """Yield, by block, ``NIS / dof`` [M] of stamps and of the following ones, NaN without it, and their masks."""
     for a, b in row_blocks(len(track)):
         start = max(a - 1, 0)
         part = track.rows(start, b)

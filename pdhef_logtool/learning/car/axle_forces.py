@@ -65,10 +65,10 @@ class AxleCurve:
 def usable_stamps(drive: FitDrive, vehicle: VehicleParameters) -> BoolArray:
     """Return where ground truth and signals can be used for identification, [N]."""
     truth = drive.truth
-    known = truth.valid & np.isfinite(truth.vx_m_s + truth.vy_m_s + truth.yaw_rate_rad_s + truth.ay_m_s2)
+    is_complete = truth.valid & np.isfinite(truth.vx_m_s + truth.vy_m_s + truth.yaw_rate_rad_s + truth.ay_m_s2)
     moving = truth.vx_m_s > SPEED_FACTOR * vehicle.low_speed_blend_m_s
     tame = np.abs(truth.sideslip_rad) < MAX_SIDESLIP_RAD
-    use: BoolArray = known & moving & tame & np.isfinite(drive.signals.steer_rad)
+    use: BoolArray = is_complete & moving & tame & np.isfinite(drive.signals.steer_rad)
     return use
 
 
@@ -117,8 +117,8 @@ def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters, *, simi
         total, moment = vehicle.mass_kg * ay, vehicle.yaw_inertia_kg_m2 * r_dot
         front = (lr * total + moment) / (lf + lr) / np.cos(steer)
         rear = (lf * total - moment) / (lf + lr)
-        known = similar & np.isfinite(drive.signals.friction)
-        grip = np.where(known, drive.signals.friction / vehicle.assumed_friction, 1.0)
+        usable = similar & np.isfinite(drive.signals.friction)
+        grip = np.where(usable, drive.signals.friction / vehicle.assumed_friction, 1.0)
         slips = (steer - np.arctan((vy + lf * r) / vx), -np.arctan((vy - lr * r) / vx))
         columns.append((slips[0] / grip, front / grip, slips[1] / grip, rear / grip))
     joined = [np.concatenate(c) for c in zip(*columns, strict=True)]

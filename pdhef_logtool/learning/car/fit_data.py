@@ -1,4 +1,4 @@
-"""What identification sees of a drive: signals with truth at the same stamps, cut into fit and held-out parts."""
+"""What identification sees of a drive: signals with ground truth at the same stamps, training and validation split."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from pdhef_logtool.mapping.frames import Placement
 from pdhef_logtool.records.signals import SIGNAL_UNITS, Channel, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
-#: Between the fit part and the held-out part: filter states and slow disturbances must have forgotten the former.
+#: Between the training and the validation split: filter states and slow disturbances must have forgotten the former.
 GUARD_S = 5.0
 
 
@@ -34,7 +34,7 @@ class FitDrive:
     """One drive, or a part of it: signals [N] and ground truth [N] at the same stamps.
 
     ``signals`` are as measured: no bias and no offset of a vehicle file is taken off.
-    ``independent_yaw_rate`` shows that the truth's yaw rate is not the gyro itself, ``steering_wheel`` that the log
+    ``independent_yaw_rate`` shows that the yaw rate of ground truth is not the gyro, ``steering_wheel`` that the log
     has the steering wheel's angle in place of the road wheels'. ``gyro_latency_s`` was taken off the gyro's stamps.
     ``placed`` is where recorded frames put the IMU.
     """
@@ -100,9 +100,9 @@ def _sensors_of(drive: FitDrive, vehicle: VehicleParameters) -> tuple[Proposal, 
     channels = {}
     for name in ("yaw_rate_rad_s", "ay_m_s2"):
         values = getattr(drive.signals, name)
-        known = np.isfinite(values)
-        stamps = drive.signals.stamps_ns[known]
-        channels[name] = Channel(name, SIGNAL_UNITS[name], drive.name, stamps, stamps, values[known])
+        is_finite = np.isfinite(values)
+        stamps = drive.signals.stamps_ns[is_finite]
+        channels[name] = Channel(name, SIGNAL_UNITS[name], drive.name, stamps, stamps, values[is_finite])
     truth = TruthTrack(drive.truth, max_gap_s=GAP_PERIODS * period_s(drive))
     latency = None
     rate = yaw_rate_channel(truth)

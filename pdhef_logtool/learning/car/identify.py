@@ -169,7 +169,7 @@ def fit_car(
                 break
             active, theta = excited, np.where(excited, theta, np.clip(0.0, _low_theta(priors), None))
     vehicle, noise = build_vehicle(start, priors, theta, digits=6)
-    found, physics = find_physics(
+    estimate, physics = find_physics(
         fit,
         start,
         steering_wheel=steering_wheel,
@@ -177,13 +177,13 @@ def fit_car(
         progress=lambda text, share: progress(text, 0.3 + 0.6 * share),
     )
     progress("fitting the smoother's sideslip to the ground truth", 0.9)
-    physics = physics.model_copy(update={"smoothing": fit_smoothing(fit, start, found)})
+    physics = physics.model_copy(update={"smoothing": fit_smoothing(fit, start, estimate)})
     progress("scoring", 0.95)
-    scores = [_score("fit", fit, start, vehicle, noise, found)]
+    scores = [_score("fit", fit, start, vehicle, noise, estimate)]
     if held_out:
-        scores.append(_score("held out", held_out, start, vehicle, noise, found))
+        scores.append(_score("held out", held_out, start, vehicle, noise, estimate))
     parameters = _identified(priors, theta, std, active)
-    of_physics = _identified(found.priors, found.theta, found.std, found.std < NOT_EXCITED)
+    of_physics = _identified(estimate.priors, estimate.theta, estimate.std, estimate.std < NOT_EXCITED)
     notes = (*_notes(parameters, fit, usable_s), _told(physics))
     return Identification(vehicle, noise, physics, parameters, of_physics, tuple(scores), samples, notes)
 
@@ -337,12 +337,12 @@ def _minimise(
         return np.concatenate([*scaled, part])
 
     def jacobian(part: FloatArray) -> FloatArray:
-        at = residuals(part)
-        columns = np.empty((at.size, part.size))
+        here = residuals(part)
+        columns = np.empty((here.size, part.size))
         for i in range(part.size):
             moved = part.copy()
             moved[i] += DERIVATIVE_STEP
-            columns[:, i] = (residuals(moved) - at) / DERIVATIVE_STEP
+            columns[:, i] = (residuals(moved) - here) / DERIVATIVE_STEP
         return columns
 
     part, jac = _projected_levenberg_marquardt(residuals, jacobian, theta0[index], _low_theta(priors)[index])
@@ -368,19 +368,19 @@ def _projected_levenberg_marquardt(
     Steps are projected to the bounds. (An interior-point method, such as scipy's, hardly moves at all from a start at a
     bound, and there is where the axle-force fit often ends.)
     """
-    at = np.maximum(first, low)
-    value = residuals(at)
-    jac = jacobian(at)
+    theta = np.maximum(first, low)
+    value = residuals(theta)
+    jac = jacobian(theta)
     damping = 1e-3
     for _ in range(MAX_ITERATIONS):
         gradient = jac.T @ value
-        free = (at > low) | (gradient < 0.0)
+        free = (theta > low) | (gradient < 0.0)
         normal = jac[:, free].T @ jac[:, free]
         improved = False
         for _ in range(6):
-            step = np.zeros(at.size)
+            step = np.zeros(theta.size)
             step[free] = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient[free])
-            candidate = np.maximum(at + np.clip(step, -MAX_STEP, MAX_STEP), low)
+            candidate = np.maximum(theta + np.clip(step, -MAX_STEP, MAX_STEP), low)
             there = residuals(candidate)
             if there @ there < value @ value:
                 improved = True
@@ -389,13 +389,13 @@ def _projected_levenberg_marquardt(
         if not improved:
             break
         gain = 1.0 - (there @ there) / (value @ value)
-        moved = float(np.max(np.abs(candidate - at)))
-        at, value = candidate, there
-        jac = jacobian(at)
+        moved = float(np.max(np.abs(candidate - theta)))
+        theta, value = candidate, there
+        jac = jacobian(theta)
         damping = max(damping / 4.0, 1e-6)
         if gain < MIN_GAIN and moved < 10.0 * DERIVATIVE_STEP:
             break
-    return at, jac
+    return theta, jac
 
 
 def _pseudo_huber(scaled: FloatArray) -> FloatArray:

@@ -15,11 +15,11 @@ from pdhef_logtool.records.signals import FloatArray
 _POINTS = 6000
 
 
-def plot_identification(found: Identification) -> bytes:
+def plot_identification(identification: Identification) -> bytes:
     """Return the plot as PNG."""
     figure = new_figure(11.0, 7.0)
     top = figure.subplots(2, 2, height_ratios=[3, 2])
-    samples = found.samples
+    samples = identification.samples
     for axes, name, is_front, slip, force in (
         (top[0][0], "front", True, samples.front_slip_rad, samples.front_force_n),
         (top[0][1], "rear", False, samples.rear_slip_rad, samples.rear_force_n),
@@ -29,13 +29,14 @@ def plot_identification(found: Identification) -> bytes:
             np.degrees(slip[::step]), force[::step] * 1e-3, ".", ms=1.5, color="0.65", label="from ground truth, 2 Hz"
         )
         reach = 1.1 * float(np.max(np.abs(slip), initial=math.radians(2.0)))
-        at = np.linspace(-reach, reach, 200)
-        axes.plot(np.degrees(at), _force(found.vehicle, is_front, at) * 1e-3, color="#0072B2", lw=2, label="identified")
+        grid = np.linspace(-reach, reach, 200)
+        modelled = _force(identification.vehicle, is_front, grid) * 1e-3
+        axes.plot(np.degrees(grid), modelled, color="#0072B2", lw=2, label="identified")
         axes.set(title=f"{name} axle", xlabel="slip angle (°)", ylabel="lateral force (kN)")
         axes.grid(alpha=0.3)
         axes.legend(loc="upper left", frameon=False)
-    _plot_parameters(top[1][0], found)
-    _plot_scores(top[1][1], found)
+    _plot_parameters(top[1][0], identification)
+    _plot_scores(top[1][1], identification)
     return png_bytes(figure)
 
 
@@ -45,9 +46,9 @@ def _force(vehicle: VehicleParameters, is_front: bool, slip_rad: FloatArray) -> 
     return d * np.sin(c * np.arctan(ba - e * (ba - np.arctan(ba))))
 
 
-def _plot_parameters(axes: Any, found: Identification) -> None:
+def _plot_parameters(axes: Any, identification: Identification) -> None:
     """Draw each parameter's interval in units of its prior's: 0 is the prior."""
-    car = [p for p in found.parameters if not p.tuning]
+    car = [p for p in identification.parameters if not p.tuning]
     rows = np.arange(len(car))[::-1]
     for row, p in zip(rows, car, strict=True):
         if not p.excited:
@@ -63,13 +64,13 @@ def _plot_parameters(axes: Any, found: Identification) -> None:
     axes.grid(alpha=0.3, axis="x")
 
 
-def _plot_scores(axes: Any, found: Identification) -> None:
+def _plot_scores(axes: Any, identification: Identification) -> None:
     names = ("β = 0", "starting file", "identified", "physics")
-    width = 0.8 / len(found.scores)
-    for i, score in enumerate(found.scores):
+    width = 0.8 / len(identification.scores)
+    for i, score in enumerate(identification.scores):
         values = (score.zero_deg, score.start_file_deg, score.identified_deg, score.physics_deg)
-        at = np.arange(len(names)) + (i - (len(found.scores) - 1) / 2) * width
-        bars = axes.bar(at, values, width * 0.95, label=f"{score.part}, {score.seconds:.0f} s")
+        positions = np.arange(len(names)) + (i - (len(identification.scores) - 1) / 2) * width
+        bars = axes.bar(positions, values, width * 0.95, label=f"{score.part}, {score.seconds:.0f} s")
         axes.bar_label(bars, fmt="%.3f", fontsize=8)
     axes.set_xticks(range(len(names)), names)
     axes.set(ylabel="sideslip RMSE (°)", title="error of the filter")

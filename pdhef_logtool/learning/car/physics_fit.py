@@ -2,13 +2,13 @@
 
 In normalised parameters θ (distance from the prior in its standard deviations) the cost is
 
-    Σ_i N_i log(s_i² + s_0²) + |θ|² + (log(NIS / dof) / w)²
+    Σ_i N_i log(s_i² + s_0²) + |θ|² + (log(n) / w)²
 
 where s_i is the RMS of the filter's sideslip error on drive i, N_i its length over the time in which errors stay alike,
 and s_0 what is not accepted to be beaten. With a fixed σ in place of the log, "σ is what remains" has two fixed points,
-and a poor start ends at the worse one (docs/method.md#identification). The last term fixes the scale of Q and R, of
-which the gain has the ratio alone. It is minimised by Gauss-Newton steps on errors over their present s_i,
-derivatives by differences.
+and a poor start ends at the worse one (docs/method.md#identification). The last term, of the mean normalized innovation
+squared n, fixes the scale of Q and R; the gain depends on their ratio only. It is minimised by Gauss-Newton steps on
+errors over their present s_i, derivatives by differences.
 
 Force scale and bank are states of the one filter here, and filters of their own in service
 (:mod:`~pdhef_logtool.estimators.adaptive_physics`): through the bank of them the noise follows few drives too closely.
@@ -50,7 +50,7 @@ from pdhef_logtool.records.signals import FloatArray
 CORRELATION_S, SETTLE_S = 1.0, 2.0
 #: An RMS below this is not accepted to be better still.
 FLOOR_RAD = math.radians(0.05)
-#: Spread of log(NIS / dof) about 0.
+#: Spread of the logarithm of the mean normalized innovation squared about 0.
 NIS_LOG_STD = 1.0
 #: Errors beyond this many s count linearly: a moment in which the filter is lost must not decide the tyres.
 ROBUST = 3.0
@@ -87,12 +87,12 @@ def make_priors(
             Prior(f"{axle} shape", "1", curve.shape, width * SHAPE_STD, low=1.0),
         ]
     gradient = start.roll_gradient_rad_per_m_s2
-    known = gradient > 0.001
+    observable = gradient > 0.001
     priors += [
         Prior("yaw inertia", "kg m^2", start.yaw_inertia_kg_m2, 0.20, log=True),
         Prior("steering offset", "rad", start.steer_offset_rad, math.radians(0.2)),
         Prior("roll gradient", "rad/(m/s^2)", gradient, 0.3, log=True)
-        if known
+        if observable
         else Prior("roll gradient", "rad/(m/s^2)", 0.004, 0.004, low=0.0),
         Prior("a_y bias", "m/s^2", start.sensors.ay_bias_m_s2, 0.10),
         Prior("yaw rate bias", "rad/s", start.sensors.yaw_rate_bias_rad_s, 0.002),
@@ -173,7 +173,7 @@ def build_car(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveError:
-    """Sideslip errors of one drive as :func:`~.axle_forces.sampled_errors` gives them, and the mean NIS / dof."""
+    """Sideslip errors of a drive by :func:`~.axle_forces.sampled_errors`; mean normalized innovation squared."""
 
     error: FloatArray
     counted: int
@@ -198,13 +198,13 @@ def drive_errors(
 ) -> list[DriveError]:
     """Return the errors of ``physics`` on drives."""
     estimator = physics_filter(vehicle, noise)
-    found = []
+    errors = []
     for drive in drives:
         steps, _ = estimator.run(signals_of(drive, start, vehicle), None)
-        known = steps.nis_dof > 0
-        nis = float(np.minimum(steps.nis[known], 50.0).sum() / max(steps.nis_dof[known].sum(), 1.0))
-        found.append(DriveError.of(drive, start, steps, max(nis, 1e-3)))
-    return found
+        has_innovation = steps.nis_dof > 0
+        nis = float(np.minimum(steps.nis[has_innovation], 50.0).sum() / max(steps.nis_dof[has_innovation].sum(), 1.0))
+        errors.append(DriveError.of(drive, start, steps, max(nis, 1e-3)))
+    return errors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -261,39 +261,39 @@ def fit_physics(
         )
         for first in firsts
     ]
-    (theta, normal, value), found = min(ends, key=lambda end: end[0].cost)
+    (theta, normal, value), errors_of_drives = min(ends, key=lambda end: end[0].cost)
     covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     vehicle, noise = build_car(start, parts, priors, theta, digits=6)
-    squares = sum(float(np.sum(d.error**2)) for d in found)
-    rms = math.degrees(math.sqrt(squares / max(1, sum(d.counted for d in found))))
+    squares = sum(float(np.sum(d.error**2)) for d in errors_of_drives)
+    rms = math.degrees(math.sqrt(squares / max(1, sum(d.counted for d in errors_of_drives))))
     return PhysicsFit(vehicle, noise, priors, theta, covariance, value, rms)
 
 
 def varied_vehicles(
-    drives: Sequence[FitDrive], start: VehicleParameters, found: PhysicsFit
+    drives: Sequence[FitDrive], start: VehicleParameters, fit: PhysicsFit
 ) -> tuple[VehicleParameters, ...]:
     """Return a fitted vehicle 1-sigma away along the directions of its posterior that move the sideslip most.
 
     They are uncorrelated in the posterior and in what they do to the sideslip of the drives. Its noise stays.
     """
-    held = np.array([p.tuning for p in found.priors])
+    held = np.array([p.tuning for p in fit.priors])
     free = np.flatnonzero(~held)
     root = np.zeros((held.size, free.size))
-    root[free] = np.linalg.cholesky(found.covariance[np.ix_(free, free)])
+    root[free] = np.linalg.cholesky(fit.covariance[np.ix_(free, free)])
 
     def vehicle(theta: FloatArray, digits: int = 17) -> VehicleParameters:
-        return build_car(start, found.vehicle.physics, found.priors, theta, digits=digits)[0]
+        return build_car(start, fit.vehicle.physics, fit.priors, theta, digits=digits)[0]
 
     def errors(theta: FloatArray) -> FloatArray:
-        return np.concatenate([d.error for d in drive_errors(drives, start, vehicle(theta), found.noise)])
+        return np.concatenate([d.error for d in drive_errors(drives, start, vehicle(theta), fit.noise)])
 
-    return tuple(vehicle(theta, digits=6) for theta in varied_parameters(found.theta, root, errors, VARIED))
+    return tuple(vehicle(theta, digits=6) for theta in varied_parameters(fit.theta, root, errors, VARIED))
 
 
-def fit_cost(found: Sequence[DriveError], theta: FloatArray) -> float:
+def fit_cost(errors: Sequence[DriveError], theta: FloatArray) -> float:
     """Return the cost of the head of this file."""
-    fit = sum(d.seconds / CORRELATION_S * math.log(_robust_square(d) + FLOOR_RAD**2) for d in found)
-    return fit + float(theta @ theta) + _nis_residual(found) ** 2
+    fit = sum(d.seconds / CORRELATION_S * math.log(_robust_square(d) + FLOOR_RAD**2) for d in errors)
+    return fit + float(theta @ theta) + _nis_residual(errors) ** 2
 
 
 def _scale(drive: DriveError) -> float:
@@ -306,20 +306,20 @@ def _robust_square(drive: DriveError) -> float:
     return float(np.sum(np.minimum(np.abs(drive.error), limit) ** 2) / max(drive.counted, 1))
 
 
-def _nis_residual(found: Sequence[DriveError]) -> float:
-    total = sum(d.seconds for d in found)
-    return math.log(sum(d.nis * d.seconds for d in found) / max(total, 1e-9)) / NIS_LOG_STD
+def _nis_residual(errors: Sequence[DriveError]) -> float:
+    total = sum(d.seconds for d in errors)
+    return math.log(sum(d.nis * d.seconds for d in errors) / max(total, 1e-9)) / NIS_LOG_STD
 
 
-def least_gain(found: Sequence[DriveError]) -> float:
+def least_gain(errors: Sequence[DriveError]) -> float:
     """Return what a step of a fit must gain of :func:`fit_cost`."""
-    return MIN_GAIN * max(1.0, sum(d.seconds for d in found) / CORRELATION_S)
+    return MIN_GAIN * max(1.0, sum(d.seconds for d in errors) / CORRELATION_S)
 
 
-def scaled_errors(there: Sequence[DriveError], at: Sequence[DriveError]) -> FloatArray:
-    """Return the errors and the term of the NIS as residuals, with the scales of the errors ``at`` a place."""
+def scaled_errors(there: Sequence[DriveError], here: Sequence[DriveError]) -> FloatArray:
+    """Return the errors and the term of the NIS as residuals, with the scales of the errors ``here`` a place."""
     parts = []
-    for d, now in zip(there, at, strict=True):
+    for d, now in zip(there, here, strict=True):
         s = _scale(now)
         weight = math.sqrt(now.seconds / CORRELATION_S / max(now.counted, 1))
         parts.append(weight * np.clip(d.error, -ROBUST * s, ROBUST * s) / s)
@@ -348,8 +348,8 @@ def make_folds(drives: Sequence[FitDrive], start: VehicleParameters) -> list[Fol
         halves = (usable[::2], usable[1::2])
     else:
         for drive in usable:
-            at = np.flatnonzero(usable_stamps(drive, start))
-            middle, guard = int(at[at.size // 2]), round(GUARD_S / period_s(drive))
+            usable_index = np.flatnonzero(usable_stamps(drive, start))
+            middle, guard = int(usable_index[usable_index.size // 2]), round(GUARD_S / period_s(drive))
             halves[0].append(part_of(drive, 0, max(middle - guard, 0)))
             halves[1].append(part_of(drive, min(middle + guard, len(drive.signals)), len(drive.signals)))
     if min(sum(usable_seconds(d, start) for d in half) for half in halves) < LEAST_FOLD_S:
@@ -377,11 +377,11 @@ def choose_parts(
         scores: list[float] = []
         ends: list[Sequence[Theta]] = []
         for (fit, held_out), starts in zip(folds, theta, strict=True):
-            found = fit_physics(fit, start, parts, steering_wheel=steering_wheel, starts=starts, iterations=iterations)
-            errors = drive_errors(held_out, start, found.vehicle, found.noise)
+            result = fit_physics(fit, start, parts, steering_wheel=steering_wheel, starts=starts, iterations=iterations)
+            errors = drive_errors(held_out, start, result.vehicle, result.noise)
             logs = sum(e.seconds * math.log(e.rms**2 + FLOOR_RAD**2) for e in errors)
             scores.append(0.5 * logs / sum(e.seconds for e in errors))
-            ends.append(({p.name: float(t) for p, t in zip(found.priors, found.theta, strict=True)},))
+            ends.append(({p.name: float(t) for p, t in zip(result.priors, result.theta, strict=True)},))
         return np.array(scores), ends
 
     def tell(parts: PhysicsParts, scores: FloatArray, taken: bool) -> None:
@@ -430,7 +430,7 @@ def find_physics(
                 folds, start, steering_wheel=steering_wheel, progress=lambda text, share: progress(text, 0.7 * share)
             )
     progress("fitting the physics filter's sideslip to the ground truth", 0.7)
-    found = fit_physics(drives, start, parts, steering_wheel=steering_wheel)
-    varied = tuple(FittedValues.between(found.vehicle, v) for v in varied_vehicles(drives, start, found))
-    values = FittedValues.of(found.vehicle)
-    return found, FittedPhysics(values=values, noise=found.noise, varied=varied, tried=tried)
+    result = fit_physics(drives, start, parts, steering_wheel=steering_wheel)
+    varied = tuple(FittedValues.between(result.vehicle, v) for v in varied_vehicles(drives, start, result))
+    values = FittedValues.of(result.vehicle)
+    return result, FittedPhysics(values=values, noise=result.noise, varied=varied, tried=tried)

@@ -37,20 +37,20 @@ MAX_ITERATIONS, DIGITS = 6, 4
 
 
 def smoothed_errors(
-    drives: Sequence[FitDrive], start: VehicleParameters, found: PhysicsFit, factors: Sequence[float]
+    drives: Sequence[FitDrive], start: VehicleParameters, fit: PhysicsFit, factors: Sequence[float]
 ) -> list[DriveError]:
     """Return the errors of the smoothed ``physics`` on drives, with factors on the noise of v_y and yaw rate."""
-    estimator = for_smoothing(physics_filter(found.vehicle, found.noise), factors)
+    estimator = for_smoothing(physics_filter(fit.vehicle, fit.noise), factors)
     errors = []
     for drive in drives:
-        steps, _, links = estimator.linked_steps(signals_of(drive, start, found.vehicle), None)
+        steps, _, links = estimator.linked_steps(signals_of(drive, start, fit.vehicle), None)
         stamps = steps.stamps_ns
         x, _ = smooth_steps(steps, links, len(stamps), int(stamps[0]), round(BLOCK_S * 1e9))
         errors.append(DriveError.of(drive, start, replace(steps, x=x), 1.0))  # a smoothed state has no innovation
     return errors
 
 
-def fit_smoothing(drives: Sequence[FitDrive], start: VehicleParameters, found: PhysicsFit) -> tuple[float, float]:
+def fit_smoothing(drives: Sequence[FitDrive], start: VehicleParameters, fit: PhysicsFit) -> tuple[float, float]:
     """Return the factors on the process noise of v_y and yaw rate; the usual ones where others are not worth having."""
 
     def factors(theta: FloatArray) -> tuple[float, float]:
@@ -59,7 +59,7 @@ def fit_smoothing(drives: Sequence[FitDrive], start: VehicleParameters, found: P
         return vy, rate
 
     def errors(theta: FloatArray) -> list[DriveError]:
-        return smoothed_errors(drives, start, found, factors(theta))
+        return smoothed_errors(drives, start, fit, factors(theta))
 
     usual = np.zeros(2)
     (theta, _, cost), _ = descend(

@@ -80,11 +80,11 @@ def slopes_of(driving: Driving, stamps_ns: FloatArray, sideslip_rad: FloatArray)
     if not len(driving.stamps_ns):
         return np.empty(0)
     start = int(driving.stamps_ns[0])
-    at, grid = ((s - start).astype(np.float64) for s in (stamps_ns, driving.stamps_ns))
-    return np.interp(grid, at, np.tan(sideslip_rad), left=np.nan, right=np.nan)
+    seconds, grid = ((s - start).astype(np.float64) for s in (stamps_ns, driving.stamps_ns))
+    return np.interp(grid, seconds, np.tan(sideslip_rad), left=np.nan, right=np.nan)
 
 
 def _without_constant(error: FloatArray) -> FloatArray:
     """Return errors less their median, 0 where unknown."""
-    known = np.isfinite(error)
-    return np.where(known, error - np.median(error[known]), 0.0) if known.any() else np.zeros_like(error)
+    finite = np.isfinite(error)
+    return np.where(finite, error - np.median(error[finite]), 0.0) if finite.any() else np.zeros_like(error)

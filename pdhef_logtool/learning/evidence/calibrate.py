@@ -6,7 +6,7 @@ Error e, terms t_i ≥ 0, s² = g² Σ (k_i t_i)². With r = log |e| − log(1.9
 
 is minimal where a share q of the errors lies inside; taken on the logarithm it weighs a straight road like a limit
 manoeuvre. Bins of grip use weigh alike, so do drives in a bin, and drives with the vehicle file as given and the same
-ones with it made wrong: the sensors often cannot tell which it is, so that one interval has to apply to both.
+ones with it made wrong: the sensors often do not show which it is, so that one interval has to apply to both.
 
 Errors of one drive are alike, so that the drives are the unit: what a fit is worth is found on drives that it has not
 seen (five folds of drives), and last factors make a share of *those* errors lie inside, each where a part of the grip
@@ -198,11 +198,11 @@ def fit_coefficients(
         return float(np.sum(weight * slope * r)), -share
 
     count = terms.shape[1]
-    found = [
+    minima = [
         minimize(loss, np.full(count, start), jac=True, method="L-BFGS-B", bounds=[LOG_RANGE] * count)
         for start in LOG_STARTS
     ]
-    best = np.exp(min(found, key=lambda f: float(f.fun)).x)
+    best = np.exp(min(minima, key=lambda f: float(f.fun)).x)
     return tuple(float(k) if k >= LEAST_COEFFICIENT or i == 0 else 0.0 for i, k in enumerate(best))
 
 

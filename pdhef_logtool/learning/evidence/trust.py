@@ -128,7 +128,7 @@ def decide_cap(errors: BlockErrors, *, seed: int = 0) -> TrustDecision:
     """Return the cap that the errors allow.
 
     - Too little excited driving: 0.
-    - The largest gain of which the 95 % bounds of a paired block bootstrap confirm that its squared error is below
+    - The largest gain for which the 95 % bounds of a paired block bootstrap confirm that its squared error is below
       that at gain 0, and that it is no more than :data:`TOLERANCE` of the RMSE above that of the best lower gain.
     - Else the largest gain up to :data:`UNCONFIRMED_CAP` whose squared error is below that at gain 0.
     - Else 0.

@@ -178,7 +178,7 @@ def _rmse_deg(model: LinearModel, sequences: Sequence[SideslipSequence]) -> floa
 
 
 def _sequences(data: Dataset, split: str) -> Iterable[SideslipSequence]:
-    """Yield the runs of a split; rows count where the network's do and the truth is above the low-speed blend."""
+    """Yield the runs of a split; rows count where the network's do and ground truth is above the low-speed blend."""
     for drive in data.drives:
         if drive.split != split:
             continue

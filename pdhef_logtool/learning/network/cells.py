@@ -33,7 +33,7 @@ NO_CELL = -1
 _STEP = 2.0**-24
 
 
-#: What a condition of ``--where`` may ask of a row; truth is never an input, but may say what is learnt from.
+#: What a condition of ``--where`` may ask of a row; ground truth is never an input, but may select training data.
 COLUMNS = (*FEATURES, "truth_vx_m_s", "truth_vy_m_s")
 
 
@@ -98,11 +98,11 @@ def cells() -> list[Cell]:
 def cell_of(features: FloatArray) -> NDArray[np.int16]:
     """Return the cell of each row of features [N, 28]; :data:`NO_CELL` where they are not known."""
     speed, ay, friction = (features[:, FEATURES.index(n)] for n in ("vx_m_s", "ay_m_s2", "friction"))
-    known = np.isfinite(speed) & np.isfinite(ay) & np.isfinite(friction)
+    is_finite = np.isfinite(speed) & np.isfinite(ay) & np.isfinite(friction)
     number = np.zeros(len(features), dtype=np.int16)
     for edges, values in ((FRICTION, friction), (AY_M_S2, np.abs(ay)), (SPEED_M_S, speed)):
         number = number * np.int16(len(edges)) + np.searchsorted(edges[1:], values, side="right").astype(np.int16)
-    return np.where(known, number, np.int16(NO_CELL))
+    return np.where(is_finite, number, np.int16(NO_CELL))
 
 
 def draw_of(stamps_ns: IntArray, key: str) -> NDArray[np.float32]:

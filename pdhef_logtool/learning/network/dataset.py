@@ -48,7 +48,7 @@ FILES = "split=*/car=*/part-*.parquet"
 TARGETS = (("target_dvy_m_s", "m/s"), ("target_dyaw_rate_rad_s", "rad/s"))
 TRUTH = ("truth_vx_m_s", "truth_vy_m_s")
 SPLITS = ("train", "validation", "test")
-#: The split of which --per-cell chooses: the others stay as the fleet drives.
+#: The split that --per-cell chooses from: the others stay as the fleet drives.
 CHOSEN_SPLIT = "train"
 #: Rows of a row group: what waits stays below 2 MB.
 ROWS_A_GROUP = 32768
@@ -246,8 +246,8 @@ def _sha256(path: Path) -> str:
         ) from None
 
 
-def _check_content(path: Path, named: str, found: str) -> None:
-    if found != named:
+def _check_content(path: Path, named: str, actual: str) -> None:
+    if actual != named:
         raise OutputError(
             expected="the file that the manifest names",
             got="another content",
@@ -314,25 +314,25 @@ class DatasetDrive:
         targets = np.stack([column[name] for name, _ in TARGETS], axis=1).astype(np.float32)
         weight = column["weight"].astype(np.float32)
         targets[weight == 0.0] = 0.0
-        known = np.isfinite(features).all(axis=1)
-        chosen: BoolArray = column.get("chosen", np.ones_like(known))
+        is_complete = np.isfinite(features).all(axis=1)
+        chosen: BoolArray = column.get("chosen", np.ones_like(is_complete))
         if self.limits is not None:
             chosen = chosen & is_chosen(column["cell"], column["draw"], self.limits)
         return DriveArrays(
-            stamps_ns=stamps[known],
-            features=features[known],
-            targets=targets[known],
-            step_s=step_s[known],
-            weight=weight[known],
-            segment=column["segment"].astype(np.int64)[known],
-            truth_velocity=np.stack([column[name] for name in TRUTH], axis=1).astype(np.float32)[known],
-            chosen=None if chosen[known].all() else chosen[known],
+            stamps_ns=stamps[is_complete],
+            features=features[is_complete],
+            targets=targets[is_complete],
+            step_s=step_s[is_complete],
+            weight=weight[is_complete],
+            segment=column["segment"].astype(np.int64)[is_complete],
+            truth_velocity=np.stack([column[name] for name in TRUTH], axis=1).astype(np.float32)[is_complete],
+            chosen=None if chosen[is_complete].all() else chosen[is_complete],
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dataset:
-    """A residual dataset: what its manifest states, and its drives, none of which is read before it is asked for.
+    """A residual dataset: what its manifest states, and its drives, each read on first access.
 
     ``features`` names the columns of :attr:`DriveArrays.features` in order; ``sha256`` identifies the content;
     ``model`` is the filter that features come from and residuals are of (:data:`~.bundle.MODELS`).
@@ -349,8 +349,8 @@ class Dataset:
     @property
     def physics_sha256(self) -> str:
         """Digest of the physics that residuals were taken against: that of the vehicle, or of all of them."""
-        found = [str(v["sha256"]) for v in self.manifest["vehicles"]]
-        return found[0] if len(found) == 1 else digest(found)
+        hashes = [str(v["sha256"]) for v in self.manifest["vehicles"]]
+        return hashes[0] if len(hashes) == 1 else digest(hashes)
 
     @property
     def vehicle_name(self) -> str:
@@ -361,8 +361,8 @@ class Dataset:
     @property
     def identified_share(self) -> float | None:
         """Share of the vehicles whose values identification found; None where the manifest is of before it was kept."""
-        found = [v.get("identified") for v in self.manifest["vehicles"]]
-        return None if None in found else sum(found) / len(found)
+        shares = [v.get("identified") for v in self.manifest["vehicles"]]
+        return None if None in shares else sum(shares) / len(shares)
 
     def vehicle(self, drive: DatasetDrive) -> VehicleParameters:
         """Return the vehicle whose model a drive's residuals were taken against."""

@@ -87,12 +87,12 @@ class ExtractSettings:
     Attributes
     ----------
     config : vehicle, mapping, slice, sensors, friction, which ground truth; the other entries are not used.
-    truth_smoothing : ``auto`` (decided per drive from the truth's noise), ``none``, or a half window in seconds.
+    truth_smoothing : ``auto`` (per drive from the noise of ground truth), ``none``, or a half window in seconds.
     split : for all drives; None = what a set's manifest states of a drive, else 70/15/15 by a hash of its content.
     seed : of that hash, and of the variation.
     vary : spread by which friction and vehicle are made wrong for a part of the drives (``variation.vary``).
     model : whose residuals, one of :data:`~.bundle.MODELS`.
-    where : condition on the columns of a row (``cells.COLUMNS``); rows on which it does not hold are not learnt from.
+    where : condition on the columns of a row (``cells.COLUMNS``); rows without it are not learned from.
     per_cell_s : at most so many seconds of each cell of driving are chosen of split train; None = all.
     """
 
@@ -309,7 +309,7 @@ def _write(
 
 
 def _without_copies(results: Sequence[DriveResult], warn: Tell) -> tuple[DriveResult, ...]:
-    """Leave out drives whose signals another one holds too, by name the first: it would count twice, or test itself."""
+    """Leave out all but the first by name of drives with equal signals: it would count twice, or test itself."""
     first: dict[str, str] = {}
     for entry in sorted((r.entry for r in results if r.entry is not None), key=lambda e: str(e["name"])):
         first.setdefault(str(entry["signals_sha256"]), entry["name"])
@@ -334,11 +334,11 @@ def _check_apart(entries: Sequence[Mapping[str, Any]]) -> None:
         by_source.setdefault((entry["log"], entry["source"]["sha256"]), []).append(entry)
     for same in by_source.values():
         same.sort(key=lambda e: float(e["start_s"]))
-        for one, other in pairwise(same):
-            if one["split"] != other["split"] and other["start_s"] < one["end_s"]:
+        for earlier, other in pairwise(same):
+            if earlier["split"] != other["split"] and other["start_s"] < earlier["end_s"]:
                 raise UsageError(
                     expected="slices of a log that do not overlap across splits",
-                    got=f"{one['name']} ({one['split']}) and {other['name']} ({other['split']})",
+                    got=f"{earlier['name']} ({earlier['split']}) and {other['name']} ({other['split']})",
                     where="extract",
                     remedy="choose other slices with --start and --end, or another folder with -o",
                 )
@@ -374,10 +374,10 @@ def _earlier(output: Path, settings: ExtractSettings) -> dict[str, Any]:
         expected = "a new folder, or that of a residual dataset"
         raise UsageError(expected=expected, got=got, where=str(output), remedy=remedy)
     wanted = (FORMAT_VERSION, settings.model)
-    if (found := (document.get("version"), document.get("model"))) != wanted:
+    if (format_of_file := (document.get("version"), document.get("model"))) != wanted:
         raise UsageError(
             expected=f"a dataset of version {wanted[0]} for {wanted[1]}",
-            got=f"version {found[0]} for {found[1] or NOMINAL_MODEL}",
+            got=f"version {format_of_file[0]} for {format_of_file[1] or NOMINAL_MODEL}",
             where=str(output),
             remedy=remedy,
         )
@@ -451,7 +451,7 @@ def _extract_guarded(job: _Job, progress: Progress) -> DriveResult:
         return _failure(job, str(error))
     except MemoryError:
         raise  # it may have been another's: tried again, alone
-    except Exception as error:  # noqa: BLE001 (one bad log never stops the others, whatever is wrong with it)
+    except Exception as error:  # noqa: BLE001 (one bad log never stops the others, for any error)
         return _failure(job, f"internal error, {type(error).__name__}: {error}")
 
 

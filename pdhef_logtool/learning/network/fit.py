@@ -147,8 +147,8 @@ def normalisation_of(
 
 def _summed(before: FloatArray, rows: FloatArray) -> FloatArray:
     """Return a sum [k] with rows [N, k] added one after the other: it does not matter how they come in sequences."""
-    found: FloatArray = np.add.reduce(np.ascontiguousarray(np.concatenate([before[None], rows])), axis=0)
-    return found
+    total: FloatArray = np.add.reduce(np.ascontiguousarray(np.concatenate([before[None], rows])), axis=0)
+    return total
 
 
 def train(
@@ -298,9 +298,9 @@ class PieceFile:
 
     def __getitem__(self, number: int) -> _Piece:
         """Read a piece; raises IndexError behind the last."""
-        at, steps = self._places[number]
+        offset, steps = self._places[number]
         k, m = self._shape
-        self._file.seek(at)
+        self._file.seek(offset)
         data = bytearray(self._file.read(4 * steps * (k + m + 1)))
         values = torch.frombuffer(data, dtype=torch.float32)
         features, target = values[: steps * k].view(steps, k), values[steps * k : steps * (k + m)].view(steps, m)
@@ -330,8 +330,8 @@ def _scaled(s: FeatureSequence, recipe: Recipe, n: Normalisation) -> _Piece:
 
 def _pieces(sequence: FeatureSequence, recipe: Recipe, n: Normalisation) -> Iterator[_Piece]:
     whole = _scaled(sequence, recipe, n)
-    for at in range(0, whole.features.shape[0], PIECE_STEPS):
-        part = slice(at, at + PIECE_STEPS)
+    for first in range(0, whole.features.shape[0], PIECE_STEPS):
+        part = slice(first, first + PIECE_STEPS)
         if float(whole.weight[part].sum()) > 0.0:
             yield _balanced(_Piece(whole.features[part], whole.target[part], whole.weight[part]))
 
@@ -389,8 +389,8 @@ def _train_batch(
     batch = _padded(pieces, device)
     state: State | None = None
     losses = []
-    for at in range(0, batch.features.shape[1], chunk_steps):
-        part = slice(at, at + chunk_steps)
+    for first in range(0, batch.features.shape[1], chunk_steps):
+        part = slice(first, first + chunk_steps)
         output, after = network(batch.features[:, part], state)
         state = (after[0].detach(), after[1].detach())
         weight = batch.weight[:, part]
@@ -414,8 +414,8 @@ def _validate(network: ResidualNetwork, pieces: Iterable[_Piece], device: str, s
         for p in pieces:
             state: State | None = None
             parts = []
-            for at in range(0, len(p.weight), VALIDATION_STEPS):
-                features = p.features[at : at + VALIDATION_STEPS]
+            for first in range(0, len(p.weight), VALIDATION_STEPS):
+                features = p.features[first : first + VALIDATION_STEPS]
                 sides = features[None] if signs is None else torch.stack([features, features * signs])
                 output, state = network(sides.to(device), state)
                 parts.append((output[0] if signs is None else 0.5 * (output[0] - output[1])).cpu())

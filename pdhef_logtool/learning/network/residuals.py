@@ -1,19 +1,19 @@
-"""What the model of ``physics`` misses, step by step, from a drive with truth (docs/method.md#residual, Eq 8-10, 18).
+"""What the model of ``physics`` misses, step by step, with ground truth (docs/method.md#residual, Eq 8-10, 18).
 
 From one stamp of the IMU to the next the residual is the increment
 
     Δx_net[k] = (x_true(t_k+1) − x_true(t_k)) − (step of the model from x_true(t_k) − x_true(t_k))
 
 with the model at the *true* v_x, v_y and r (at an estimated state the filter's own error would be identified), and the
-inputs of the same measurement times as the filter takes them. No truth tells the axles' forces and the roll: the model
+inputs of the same measurement times as the filter takes them. Ground truth lacks axle forces and roll: the model
 runs them along the true motion. Bank, biases and force scale are 0: at the filter's estimate of them, which
 changes while it learns, a residual would fit no other filter. The row of v_x is 0 by definition and not stored.
 
 For the paper's network and the baselines the model is the nominal one, by the trapezoidal rule between two true states.
 
-A recorded truth is noisy, and differences over one step are mostly that noise. Then the *residual* is smoothed, not the
-truth: increments are added up to a curve, a cubic is fitted by least squares to the ± half window about each step over
-the true stamps (Savitzky-Golay), and its increment over the step is the target. All of it is linear in the
+Recorded ground truth is noisy, and differences over one step are mostly noise. Then the *residual* is smoothed, not the
+ground truth: increments are added up to a curve, a cubic is fitted by least squares to ± half a window about each step
+over the true stamps (Savitzky-Golay), and its increment over the step is the target. All of it is linear in the
 increments, so that what the nominal model explains, fast as it may be, is not damped; only the residual is, 1 % at 1 Hz
 and ± 0.2 s. No target where the window contains a gap.
 """
@@ -52,11 +52,11 @@ from pdhef_logtool.records.steps import StepColumns
 GAP_PERIODS = 1.5
 #: Beyond this the car slides backwards rather than drives, and a single-track residual means nothing.
 MAX_SIDESLIP_RAD = math.radians(45.0)
-#: Half window of the smoothing when the truth is found to be noisy: on simulated RTK drives the targets were nearest to
+#: Half window of the smoothing when ground truth is noisy: on simulated RTK drives the targets were closest to
 #: those of the perfect ground truth at 0.13 to 0.16 s (lane change, sweep).
 SMOOTHING_HALF_S = 0.15
-#: Truth noise in a one-step difference, of v̇_y in m/s² and ṙ in rad/s², up to which nothing is smoothed: well below
-#: what a training target varies by (0.2 and more).
+#: Noise of ground truth in a one-step difference, of v̇_y in m/s² and ṙ in rad/s², up to which nothing is smoothed:
+#: well below what a training target varies by (0.2 and more).
 NEGLIGIBLE_NOISE = (0.05, 0.05)
 
 _CHUNK = 16384
@@ -226,9 +226,9 @@ def physics_increments(
 
 def _dynamic(state: FloatArray, parameters: ModelParameters) -> BoolArray:
     """Return where the true state [N, 3] is known, the model is the dynamic one, and the car drives forward."""
-    known = np.isfinite(state).all(axis=1)
+    is_complete = np.isfinite(state).all(axis=1)
     forward = np.abs(np.arctan2(state[:, 1], state[:, 0])) <= MAX_SIDESLIP_RAD
-    return np.asarray(known & forward & (state[:, 0] >= parameters.blend_high_m_s), dtype=np.bool_)
+    return np.asarray(is_complete & forward & (state[:, 0] >= parameters.blend_high_m_s), dtype=np.bool_)
 
 
 def smooth_increments(stamps_ns: IntArray, increments: FloatArray, half_window: int) -> FloatArray:
@@ -250,9 +250,9 @@ def smooth_increments(stamps_ns: IntArray, increments: FloatArray, half_window: 
         centre = centres[start : start + _CHUNK]
         curve = np.cumsum(increments[centre[:, None] + steps], axis=1)
         curve = np.concatenate([np.zeros_like(curve[:, :1]), curve], axis=1)
-        at = (stamps_ns[centre[:, None] + points] - stamps_ns[centre][:, None]) * 1e-9
-        span = np.abs(at).max(axis=1)
-        u = at / span[:, None]
+        time_s = (stamps_ns[centre[:, None] + points] - stamps_ns[centre][:, None]) * 1e-9
+        span = np.abs(time_s).max(axis=1)
+        u = time_s / span[:, None]
         powers = [np.ones_like(u)]
         for _ in range(6):
             powers.append(powers[-1] * u)
@@ -268,7 +268,7 @@ def smooth_increments(stamps_ns: IntArray, increments: FloatArray, half_window: 
 def difference_noise(stamps_ns: IntArray, values: FloatArray) -> float:
     """Return the 1-sigma of white noise in the derivative of ``values`` [N] by one-step differences; NaN if unknown.
 
-    From third differences, to which motion adds next to nothing at usual truth rates. Noise that an INS has filtered
+    From third differences, to which motion adds next to nothing at usual rates. Noise that an INS has filtered
     over several samples is not seen.
     """
     if stamps_ns.shape[0] < 8:
@@ -306,7 +306,7 @@ def residual_windows(
 
     Parameters
     ----------
-    windows : signals and truth at the same stamps, biases of the vehicle file taken off; without truth no targets.
+    windows : signals and ground truth at the same stamps, less biases of the vehicle file; targets need ground truth.
     physics : the parallel filter as it shall run in service; its model is what the residual is of.
     period_s : of the IMU. half_window : steps on each side that a target is smoothed over.
 
@@ -328,10 +328,10 @@ def residual_windows(
         targets[: n - 1] = smooth_increments(steps.stamps_ns, increments, half_window)
         step_s[: n - 1] = np.diff(steps.stamps_ns) * 1e-9
         part = slice(first, end)
-        known = _complete(steps.features)
-        usable = _complete(targets) & known
+        complete = _complete(steps.features)
+        usable = _complete(targets) & complete
         # Where the next row starts again, in service nothing is carried over to it either.
-        usable[: n - 1] &= known[1:] & (steps.segment[1:] == steps.segment[:-1])
+        usable[: n - 1] &= complete[1:] & (steps.segment[1:] == steps.segment[:-1])
         return ResidualRows(
             stamps_ns=steps.stamps_ns[part],
             features=steps.features[part],
@@ -346,10 +346,10 @@ def residual_windows(
         if len(window.signals) == 0:
             continue
         features, filtered, carry = run_features(physics, window.signals, carry)
-        known = _complete(features)
-        fresh: BoolArray = known & ~(np.concatenate([[running], known[:-1]]) & np.isfinite(filtered.prior[:, 0]))
+        whole = _complete(features)
+        fresh: BoolArray = whole & ~(np.concatenate([[running], whole[:-1]]) & np.isfinite(filtered.prior[:, 0]))
         numbers = segment + np.cumsum(fresh)
-        running, segment = bool(known[-1]), int(numbers[-1])
+        running, segment = bool(whole[-1]), int(numbers[-1])
         inputs = filtered.inputs.copy()
         inputs[~np.isfinite(without_impossible(window.signals).steer_rad), U_STEER] = np.nan
         new = _Steps(

@@ -202,8 +202,8 @@ def gap_free_runs(drive: DriveArrays) -> Iterable[slice]:
         piece = np.cumsum(np.diff(near, prepend=near[:1]) | (np.diff(piece, prepend=piece[:1]) != 0))
     edges = [0, *(np.flatnonzero(np.diff(piece)) + 1).tolist(), drive.stamps_ns.shape[0]]
     for a, b in pairwise(edges):
-        known = np.isfinite(drive.features[a:b]).all()
-        if b - a >= MIN_SEQUENCE_STEPS and known and weights_of(drive, slice(a, b)).sum() > 0.0:
+        is_complete = np.isfinite(drive.features[a:b]).all()
+        if b - a >= MIN_SEQUENCE_STEPS and is_complete and weights_of(drive, slice(a, b)).sum() > 0.0:
             yield slice(a, b)
 
 
@@ -215,13 +215,13 @@ def weights_of(drive: DriveArrays, part: slice) -> FloatArray:
 
 def _near(chosen: BoolArray) -> BoolArray:
     """Return which rows are chosen, or come at most :data:`LEAD_STEPS` before one that is."""
-    at = np.arange(len(chosen))
-    following = np.minimum.accumulate(np.where(chosen, at, len(chosen) + LEAD_STEPS)[::-1])[::-1]
-    return np.asarray(following - at <= LEAD_STEPS, dtype=np.bool_)
+    index = np.arange(len(chosen))
+    following = np.minimum.accumulate(np.where(chosen, index, len(chosen) + LEAD_STEPS)[::-1])[::-1]
+    return np.asarray(following - index <= LEAD_STEPS, dtype=np.bool_)
 
 
 def steering_offset(rows: DriveArrays) -> FloatArray:
-    """Return the residual rates [2] that an offset of the steering angle makes in a drive: what no network can know.
+    """Return the residual rates [2] that an offset of the steering angle makes in a drive: no network can predict it.
 
     The offset is constant over the drive, fitted to calm driving, and shrunk where there is little of it.
     """
@@ -283,9 +283,9 @@ def _history_table(history: Iterable[Epoch]) -> bytes:
 def _plot_history(history: list[Epoch]) -> bytes:
     figure = new_figure(7.0, 4.0)
     axes = figure.subplots()
-    at = [e.epoch for e in history]
-    axes.semilogy(at, [e.train_loss for e in history], label="training", color="#0072B2")
-    axes.semilogy(at, [e.validation_loss for e in history], label="validation", color="#D55E00")
+    epochs = [e.epoch for e in history]
+    axes.semilogy(epochs, [e.train_loss for e in history], label="training", color="#0072B2")
+    axes.semilogy(epochs, [e.validation_loss for e in history], label="validation", color="#D55E00")
     axes.set(xlabel="epoch", ylabel="mean square of normalised targets")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)

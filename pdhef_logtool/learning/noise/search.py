@@ -119,7 +119,7 @@ def drive_error(estimate: StateTrack, truth: StateTrack, low_speed_m_s: float) -
 
 
 def scorable_stamps(truth: StateTrack, low_speed_m_s: float) -> BoolArray:
-    """Return where [N] the truth's sideslip is known above the low-speed limit."""
+    """Return where [N] the ground truth's sideslip is known above the low-speed limit."""
     finite: BoolArray = np.isfinite(signal_error(truth, truth, "sideslip_rad", low_speed_m_s))
     return finite
 

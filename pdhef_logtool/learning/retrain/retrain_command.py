@@ -153,8 +153,8 @@ class _Retraining:
     @property
     def start(self) -> Path:
         """The network to begin with, as a bundle is named."""
-        own = self.car.residual_network is not None and self.car.network_folder
-        return self.settings.init or own or Path(MANY_CARS)
+        car_network = self.car.residual_network is not None and self.car.network_folder
+        return self.settings.init or car_network or Path(MANY_CARS)
 
     def config_for(self, car: Path | None, network: Path | None = None) -> RunConfig:
         return replace(self.settings.config, car=car, network=network, intervals=None, estimators=None)
@@ -213,17 +213,17 @@ def retrain(
     with OutputFolder(output, (WORK, ACCEPTED, REJECTED)):
         with writing(work):
             work.mkdir(exist_ok=True)
-        stages = Stages(work, lambda found: str(found["shown"]), reporter)
+        stages = Stages(work, lambda result: str(result["shown"]), reporter)
         hashes = {i.stem: identity_of(i) for i in inputs}
         car_sha256 = None if car.source is None else hash_log(car.source)
         basis = digest([record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=config), car), car_sha256])
         records, signals = _look(inputs, hashes, car, config, work / SEEN_FILE, basis, jobs, reporter)
         records, drives = _roles(inputs, records, signals, car, settings, work)
-        told = set[str]()
+        shown_texts = set[str]()
 
         def once(text: str) -> None:
-            if text not in told:
-                told.add(text)
+            if text not in shown_texts:
+                shown_texts.add(text)
                 reporter.warn(text)
 
         for record in records:
@@ -295,8 +295,8 @@ def _look(  # positional: what reading takes, where it is remembered, and how it
     mapping = open_mapping(config)
     basis = digest([basis, repr(mapping)])
     document = read_own(file, reporter.note)
-    known: dict[str, Any] = document["logs"] if document is not None and document["basis"] == basis else {}
-    new = [_Log(i, car, mapping, config) for i in inputs if hashes[i.stem] not in known]
+    log_entries: dict[str, Any] = document["logs"] if document is not None and document["basis"] == basis else {}
+    new = [_Log(i, car, mapping, config) for i in inputs if hashes[i.stem] not in log_entries]
 
     def tell(number: int, text: str, share: float) -> None:
         reporter.progress(f"reading {text}", (number + share) / len(new) / 8.0)
@@ -310,28 +310,28 @@ def _look(  # positional: what reading takes, where it is remembered, and how it
             seen = _Seen(_unread(log_input, reason), None)
         sha256 = seen.record.sha256 or hashes[log_input.stem]  # of a reduced log: its source's
         records[log_input.stem] = replace(seen.record, sha256=sha256)
-        known[hashes[log_input.stem]] = {
+        log_entries[hashes[log_input.stem]] = {
             "sha256": sha256,
             "signals_sha256": seen.signals_sha256,
             "left_out": seen.record.left_out,
             "span_s": seen.record.span_s,
         }
-    write_bytes(file, json_bytes(seal({"basis": basis, "logs": known})))
+    write_bytes(file, json_bytes(seal({"basis": basis, "logs": log_entries})))
 
     def record(log_input: LogInput) -> DriveRecord:
-        found = known[hashes[log_input.stem]]
-        span = None if found["span_s"] is None else (float(found["span_s"][0]), float(found["span_s"][1]))
+        entry = log_entries[hashes[log_input.stem]]
+        span = None if entry["span_s"] is None else (float(entry["span_s"][0]), float(entry["span_s"][1]))
         again = DriveRecord(
             log_input.stem,
             log_input.path.name,
-            found["sha256"],
+            entry["sha256"],
             seconds=0.0 if span is None else span[1] - span[0],
             span_s=span,
-            left_out=found["left_out"],
+            left_out=entry["left_out"],
         )
         return records.get(log_input.stem, again)
 
-    return [record(i) for i in inputs], [known[hashes[i.stem]]["signals_sha256"] for i in inputs]
+    return [record(i) for i in inputs], [log_entries[hashes[i.stem]]["signals_sha256"] for i in inputs]
 
 
 def _roles(
@@ -361,17 +361,17 @@ def _roles(
         before = {key: role for key, role in kept["roles"].items() if role in SHARES}
     roles = deal(candidates, before, settings.seed)
     write_bytes(work / ROLES_FILE, json_bytes(seal({"roles": roles})))
-    told = list[DriveRecord]()
+    split_records = list[DriveRecord]()
     drives: dict[str, list[LogInput]] = {role: [] for role in SHARES}
     for log_input, record, key in zip(inputs, records, signals, strict=True):
         if key is None:
-            told.append(record)
+            split_records.append(record)
         elif first[key] != log_input.stem:
-            told.append(replace(record, notes=(f"left out, its signals equal those of {first[key]}",)))
+            split_records.append(replace(record, notes=(f"left out, its signals equal those of {first[key]}",)))
         else:
-            told.append(replace(record, split=roles[key]))
+            split_records.append(replace(record, split=roles[key]))
             drives[roles[key]].append(log_input)
-    return told, {role: tuple(found) for role, found in drives.items()}
+    return split_records, {role: tuple(logs) for role, logs in drives.items()}
 
 
 def _check_counts(drives: Mapping[str, Sequence[LogInput]]) -> None:
@@ -405,9 +405,9 @@ def _stages(this: _Retraining) -> dict[str, Any]:
     basis = this.basis(digest(basis), role=INTERVALS)
     intervals = this.do(4, "intervals", basis, lambda folder: _intervals(this, folder))
     rests_on = [digest(basis), this.settings.strict, repr(this.settings.gate)]
-    own = None if this.car.residual_network is not None else Path(MANY_CARS)
+    given_network = None if this.car.residual_network is not None else Path(MANY_CARS)
     source = this.settings.config.car
-    this.do(5, "before", this.basis(role=GATE), lambda folder: _run(this, 5, folder, source, own))
+    this.do(5, "before", this.basis(role=GATE), lambda folder: _run(this, 5, folder, source, given_network))
     candidate = this.stages.place(4, "intervals") / CAR_FOLDER
     this.do(6, "after", this.basis(digest(basis), role=GATE), lambda folder: _run(this, 6, folder, candidate, None))
     judged = this.do(7, "gate", this.basis(*rests_on, role=GATE), lambda folder: _judge(this, folder, trusted))
@@ -443,12 +443,12 @@ def _extract(this: _Retraining) -> dict[str, Any]:
         splits=splits,
         reporter=Reporter(lambda text, share: this.step(1, text, share), this.warn),
     )
-    found = result.manifest
-    rows = {split: found["splits"][split]["usable_rows"] for split in (TRAIN, STOP)}
-    empty = len(found["cells"]["empty"][TRAIN])
+    manifest = result.manifest
+    rows = {split: manifest["splits"][split]["usable_rows"] for split in (TRAIN, STOP)}
+    empty = len(manifest["cells"]["empty"][TRAIN])
     return {
         "shown": f"{rows[TRAIN]} rows to train on, {rows[STOP]} to stop by; {empty} cells of driving are empty",
-        **{k: found[k] for k in ("sha256", "cells", "splits")},
+        **{k: manifest[k] for k in ("sha256", "cells", "splits")},
     }
 
 
@@ -470,15 +470,15 @@ def _train(this: _Retraining, folder: Path, basis: str) -> dict[str, Any]:
     if not (this.work / "dataset" / MANIFEST).is_file():
         _extract(this)  # somebody has tidied up
     data = dataset_for(this.work / "dataset", PHYSICS_MODEL)
-    found = train_on(data, training, recipe, init=init, progress=lambda text, share: this.step(2, text, share))
+    trained = train_on(data, training, recipe, init=init, progress=lambda text, share: this.step(2, text, share))
     with writing(training):
         (training / mark).unlink()
         shutil.move(training, folder / "model")
-    loss = found.bundle.provenance["validation_loss"]
+    loss = trained.bundle.provenance["validation_loss"]
     return {
-        "shown": f"{len(found.history)} epochs, validation {loss:.4f}",
-        "sha256": found.bundle.sha256,
-        "provenance": found.bundle.provenance,
+        "shown": f"{len(trained.history)} epochs, validation {loss:.4f}",
+        "sha256": trained.bundle.sha256,
+        "provenance": trained.bundle.provenance,
     }
 
 
@@ -536,15 +536,15 @@ def _run(this: _Retraining, number: int, folder: Path, car: Path | None, network
 def _judge(this: _Retraining, folder: Path, trusted: Mapping[str, Any]) -> dict[str, Any]:
     """Compare both runs; the candidate is rejected where the gate closes, or where it may not be followed at all."""
     a, b = (open_run(this.stages.place(n, name) / "run") for n, name in ((5, "before"), (6, "after")))
-    found = compare_runs(a, b, this.settings.gate, strict=this.settings.strict)
-    reasons = list(found.failures)
+    comparison = compare_runs(a, b, this.settings.gate, strict=this.settings.strict)
+    reasons = list(comparison.failures)
     if not trusted["cap"]:
         reasons.append(f"{trusted['shown']} (on drives that it has not seen)")
     from pdhef_logtool.reports.comparison import comparison_page
 
-    write_bytes(folder / PAGE_FILE, comparison_page(found))
-    shown = f"rejected: {'; '.join(reasons)}" if reasons else f"accepted: {found.verdict}"
-    return {"shown": shown, "accepted": not reasons, "reasons": reasons, "comparison": found.to_dict()}
+    write_bytes(folder / PAGE_FILE, comparison_page(comparison))
+    shown = f"rejected: {'; '.join(reasons)}" if reasons else f"accepted: {comparison.verdict}"
+    return {"shown": shown, "accepted": not reasons, "reasons": reasons, "comparison": comparison.to_dict()}
 
 
 def _publish(this: _Retraining, output: Path, name: str, document: Mapping[str, Any]) -> Path:

@@ -45,7 +45,7 @@ def identify(task: Task) -> StageOutput:
     """
     if task.settings.without_truth:
         return identify_without_truth(task)
-    start = task.car.own
+    start = task.car.datasheet
     records, fit, held_out = _read(task, start)
     if not fit:
         raise no_drive("ground truth velocities", IDENTIFY)

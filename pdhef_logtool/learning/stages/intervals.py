@@ -173,8 +173,8 @@ def drive_samples(
     slow = vehicle.low_speed_blend_m_s
     terms, _ = error_terms(track, given, vehicle.roll_gradient_rad_per_m_s2, None)
     error = {s: signal_error(track, truth, s, slow) for s in ("sideslip_rad", "vy_m_s", "yaw_rate_rad_s")}
-    own, rate_std = track.sideslip_std_rad, track.yaw_rate_std_rad_s
-    use = np.isfinite(own) & (own > 0.0) & np.isfinite(track.vy_std_m_s) & np.isfinite(rate_std)
+    sideslip_std, rate_std = track.sideslip_std_rad, track.yaw_rate_std_rad_s
+    use = np.isfinite(sideslip_std) & (sideslip_std > 0.0) & np.isfinite(track.vy_std_m_s) & np.isfinite(rate_std)
     for values in error.values():
         use &= np.isfinite(values)
     ay = truth.ay_m_s2 if np.isfinite(truth.ay_m_s2).any() else signals.ay_m_s2
@@ -188,11 +188,11 @@ def drive_samples(
     return Samples(
         terms=terms[kept],
         yaw_rate_terms=yaw_rate_terms(terms, rate_std)[kept],
-        vy_per_sideslip=track.vy_std_m_s[kept] / own[kept],
+        vy_per_sideslip=track.vy_std_m_s[kept] / sideslip_std[kept],
         sideslip_error=error["sideslip_rad"][kept],
         vy_error=error["vy_m_s"][kept],
         yaw_rate_error=error["yaw_rate_rad_s"][kept],
-        own_std=own[kept],
+        own_std=sideslip_std[kept],
         bin=bins[kept],
         drive=np.full(count, drive, dtype=np.int64),
         wrong=np.full(count, wrong, dtype=np.bool_),

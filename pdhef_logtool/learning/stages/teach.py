@@ -48,7 +48,7 @@ from pdhef_logtool.runs.self_calibrating import lacking, read_driving, self_cali
 LEAST_S, ENOUGH_S = 20.0, 150.0
 #: A filter settles before its error counts.
 SETTLE_NS = 3_000_000_000
-#: Drives of which the prior is tested with each left out, at most.
+#: The prior is tested with each drive left out, on at most so many drives.
 MOST_LEFT_OUT = 8
 #: Lateral acceleration below which driving teaches nothing of the tyres, and that near the limit, m/s².
 BENDS_M_S2, LIMIT_M_S2 = 2.0, 5.0
@@ -104,7 +104,7 @@ def teach(task: Task) -> StageOutput:
     if task.car.learnt_on or task.car.fitted_physics is not None:
         got = f"one with {FIT_FILE}"
         raise UsageError(expected="a car without a fit", got=got, where="--car", remedy="give its vehicle.toml")
-    car = Car.of(task.car.own)
+    car = Car.of(task.car.datasheet)
 
     def read(log: LogInput) -> tuple[DriveRecord, OpenedDrive | None]:
         with read_cached(log, car, task.mapping, task.options) as drive:

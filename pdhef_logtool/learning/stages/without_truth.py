@@ -35,7 +35,7 @@ def identify_without_truth(task: Task) -> StageOutput:
     EstimatorError
         Too few logs, too little driving, a stiffness that remains uncertain, or a car that drifts.
     """
-    start = task.car.own
+    start = task.car.datasheet
     car = Car.of(start)
 
     def read(log: LogInput) -> tuple[DriveRecord, Driving | None]:
@@ -68,10 +68,10 @@ def identify_without_truth(task: Task) -> StageOutput:
 
 def fit_part(calibration: SelfCalibration, drives: Sequence[LearntOn]) -> Fit:
     """Return the calibration as a part of a car; ``physics`` has the same values, and its own noise."""
-    own, vehicle = calibration.vehicle_file, calibration.vehicle
+    datasheet, vehicle = calibration.vehicle_file, calibration.vehicle
     return Fit(
-        physics_sha256=physics_sha256(own),
-        values=FittedValues.between(own, vehicle),
+        physics_sha256=physics_sha256(datasheet),
+        values=FittedValues.between(datasheet, vehicle),
         physics=FittedPhysics(
             values=FittedValues.of(vehicle),
             noise=calibration.noise,

@@ -72,7 +72,7 @@ CLOCK_RESIDUAL_S = 0.02
 class TopicReport:
     """One topic. Times in s; ``largest_gap_at_s`` is since the log's start; NaN where nothing can be stated.
 
-    ``rate_hz`` is by the median step; of a topic of which no time was looked at, by its messages and the log's length.
+    ``rate_hz`` is by the median step; of a topic whose times were not read, by its messages and the log's length.
     ``delay_*`` are of log time − publish time, which equals zero where a recorder has one time only.
     """
 
@@ -158,7 +158,7 @@ class Inspection:
     Attributes
     ----------
     kind : of log. start_ns, end_ns : log time, [start, end).
-    signals, truth : reports by name. missing : signals an estimator looks for and no topic provides.
+    signals, truth : reports by name. missing : signals that an estimator uses and no topic provides.
     ambiguities, notes : of the mapping. candidates : fields that were weighed for it.
     checks : what physics states of signals and ground truth. proposals : corrections of the mapping that are certain.
     lost : every loss and note of reading. sample : what was looked at; None: everything.
