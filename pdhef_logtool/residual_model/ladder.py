@@ -30,6 +30,8 @@ FULL_WITHIN, NONE_BEYOND = 1.0, 3.0
 SPEED_FULL, SPEED_NONE = 1.1, 1.5
 #: Ridge ρ of the distance, for features of variance 1.
 REGION_RIDGE = 0.5
+#: Share of a residual that its 1-sigma contains beside the posterior: a strong ridge takes about as much off it.
+SHRINKAGE = 0.5
 #: A residual is limited to this multiple of the largest one on the drives that it was fitted on.
 LARGEST = 1.5
 
@@ -176,7 +178,9 @@ class LadderModel(BaseModel):
         even_mean, even_scale = np.array(self.even_mean), np.array(self.even_scale)
         _evaluate(features.odd, features.even, self._arrays, even_mean, even_scale, residual, std, distance2)
         limit = LARGEST * self.largest_rad
-        return Correction(np.clip(residual, -limit, limit), std, self._gain(distance2, features.even[:, SPEED_COLUMN]))
+        residual = np.clip(residual, -limit, limit)
+        std = np.hypot(std, SHRINKAGE * residual)
+        return Correction(residual, std, self._gain(distance2, features.even[:, SPEED_COLUMN]))
 
     def _gain(self, distance2: FloatArray, speed: FloatArray) -> FloatArray:
         """Return the gain of the region of validity [K]."""

@@ -174,7 +174,7 @@ def _solve(drives: Sequence[_Sums], ridge: float) -> FloatArray:
     return np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
 
 
-def fit_ladder(drives: Sequence[TaughtDrive], *, seed: int = 0) -> LadderFit:
+def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR, RANDOM), seed: int = 0) -> LadderFit:
     """Choose a rung and fit it; the result does not depend on a constant that is added to a drive's error."""
     samples = [_thinned(d) for d in drives]
     samples = [s for s in samples if len(s[0]) * s[3] >= LEAST_BLOCK_S]
@@ -184,7 +184,7 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, seed: int = 0) -> LadderFit:
     odd, even = (np.concatenate([s[i] for s in samples]) for i in (0, 1))
     scale = np.maximum(np.sqrt(np.mean(odd**2, axis=0)), 1e-9)
     even_mean, even_scale = even.mean(axis=0), np.maximum(even.std(axis=0), 1e-3)
-    count = RANDOM_FEATURES if seconds >= RANDOM_LEAST_S else 0
+    count = RANDOM_FEATURES if RANDOM in rungs and seconds >= RANDOM_LEAST_S else 0
     rng = np.random.default_rng(seed)
     odd_directions = rng.normal(size=(count, ODD_COUNT)) * FREQUENCY
     even_directions = rng.normal(size=(count, EVEN_COUNT)) * FREQUENCY
