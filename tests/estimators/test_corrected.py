@@ -21,7 +21,7 @@ from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.residual_model.ladder import LadderModel
+from pdhef_logtool.residual_model.ladder import SPEED_NONE, LadderModel
 from pdhef_logtool.residual_model.slow_features import EVEN_COUNT, ODD_COUNT
 
 SEDAN = default_vehicle()
@@ -110,7 +110,7 @@ def test_beyond_the_taught_speed_it_is_physics(signals: Signals) -> None:
 
 
 def test_two_seconds_after_the_taught_region_it_is_physics_again(signals: Signals) -> None:
-    fast = with_noise(drive(slalom(0.02, 0.5), 4.0, speed=40.0).signals, seed=4)
+    fast = with_noise(drive(slalom(0.02, 0.5), 8.0, speed=40.0).signals, seed=4)
     step_ns = int(signals.stamps_ns[-1] - signals.stamps_ns[0]) + 10_000_000
     moved = {name: getattr(fast, name) + step_ns for name in ("stamps_ns", "ready_ns")}
     fast = replace(fast, friction=np.full(len(fast), 0.85), **moved)
@@ -118,7 +118,9 @@ def test_two_seconds_after_the_taught_region_it_is_physics_again(signals: Signal
     inside, outside = track_of("pd-hef", car, signals, fast)
     _, physics = track_of("physics", car, signals, fast)
     assert np.nanmean(inside.network_trust > 0.0) > 0.5
-    assert np.array_equal(outside.sideslip_rad[200:], physics.sideslip_rad[200:], equal_nan=True)
+    left = int(np.flatnonzero(physics.vx_m_s > SPEED_NONE * 21.0)[0])  # the filter takes the jump of the speed slowly
+    assert len(physics) > left + 250
+    assert np.array_equal(outside.sideslip_rad[left + 200 :], physics.sideslip_rad[left + 200 :], equal_nan=True)
 
 
 def test_a_residual_belongs_to_the_physics_that_it_was_fitted_on(signals: Signals) -> None:
@@ -151,8 +153,6 @@ def test_a_taught_prior_moves_mean_and_width_of_the_calibration() -> None:
     assert (moved[0].mean, moved[0].std) == (1.1 * first.mean, 0.5 * first.std)
     assert moved[1].std == parameters[1].std  # no teaching makes a prior wider
     assert moved[2:] == parameters[2:]
-    before = prior_vehicle(SEDAN)
-    after = prior_vehicle(SEDAN, taught)
-    assert after.cornering_stiffness_n_per_rad(True, after.assumed_friction) == pytest.approx(
-        1.1 * stiffness[0], rel=1e-4
-    )
+    vehicles = (prior_vehicle(SEDAN), prior_vehicle(SEDAN, taught))
+    before, after = (v.cornering_stiffness_n_per_rad(True, v.assumed_friction) for v in vehicles)
+    assert after == pytest.approx(1.1 * before, rel=1e-4)

@@ -48,6 +48,8 @@ from pdhef_logtool.runs.self_calibrating import lacking, read_driving, self_cali
 LEAST_S, ENOUGH_S = 20.0, 150.0
 #: A filter settles before its error counts.
 SETTLE_NS = 3_000_000_000
+#: Shortest half of a drive that teaches the other one in a test, and length of the blocks of a test.
+LEAST_HALF_S, TEST_BLOCK_S = 8.0, 5.0
 #: The prior is tested with each drive left out, on at most so many drives.
 MOST_LEFT_OUT = 8
 #: Lateral acceleration below which driving teaches nothing of the tyres, and that near the limit, m/s².
@@ -214,25 +216,54 @@ def lacking_of(drive: OpenedDrive, calibration: SelfCalibration) -> TaughtDrive:
     return TaughtDrive(drive.drive.name, signals.stamps_ns, at_stamps, -error)
 
 
-def _prior_test(drives: Sequence[OpenedDrive], progress: Any) -> Interval | None:
-    """Return RMSE with the prior of the other drives less that without, in blocks, each without its constant, in rad.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fold:
+    """Drives that teach, with their ground truth, and the part of another one, or of the same, that is scored."""
 
-    None where there is one drive.
+    driving: tuple[Driving, ...]
+    slopes: tuple[FloatArray, ...]
+    scored: OpenedDrive
+    part: slice
+
+
+def _folds(drives: Sequence[OpenedDrive]) -> list[_Fold]:
+    """Return folds with each drive left out; of one drive each half."""
+    folds = []
+    if len(drives) > 1:
+        for drive in drives[:MOST_LEFT_OUT]:
+            others = [d for d in drives if d is not drive]
+            taught = tuple(d.driving for d in others), tuple(d.slopes for d in others)
+            folds.append(_Fold(*taught, drive, slice(None)))
+        return folds
+    (drive,) = drives
+    cells, stamps = len(drive.driving.stamps_ns), drive.whole.signals.stamps_ns
+    middle = int(np.searchsorted(stamps, drive.driving.stamps_ns[cells // 2]))
+    for first, last, part in ((0, cells // 2, slice(middle, None)), (cells // 2, cells, slice(0, middle))):
+        half = drive.driving.between(first, last)
+        if half.seconds >= LEAST_HALF_S:
+            folds.append(_Fold((half,), (drive.slopes,), drive, part))
+    return folds
+
+
+def _prior_test(drives: Sequence[OpenedDrive], progress: Any) -> Interval | None:
+    """Return RMSE with the prior of other driving less that without, in blocks, each without its constant, in rad.
+
+    None where there is too little driving for a test.
     """
-    if len(drives) < 2:
-        return None
-    tested = drives[:MOST_LEFT_OUT]
-    vehicle = drives[0].drive.car.vehicle
     errors: tuple[list[FloatArray], list[FloatArray]] = ([], [])
-    for number, drive in enumerate(tested):
-        progress(f"testing the prior on {drive.drive.name}", 0.35 + 0.4 * number / len(tested))
-        others = [d for d in drives if d is not drive]
-        prior = taught_parameters([d.driving for d in others], [d.slopes for d in others], vehicle)
+    stamps, folds = [], _folds(drives)
+    vehicle = drives[0].drive.car.vehicle
+    for number, fold in enumerate(folds):
+        progress(f"testing the prior on {fold.scored.drive.name}", 0.35 + 0.4 * number / len(folds))
+        prior = taught_parameters(fold.driving, fold.slopes, vehicle)
+        stamps.append(fold.scored.whole.signals.stamps_ns[fold.part])
         for column, parameters in zip(errors, (prior, ()), strict=True):
-            lack = lacking_of(drive, _calibration(drive, parameters)).lacking_rad
+            lack = lacking_of(fold.scored, _calibration(fold.scored, parameters)).lacking_rad[fold.part]
             column.append(lack - np.nanmedian(lack) if np.isfinite(lack).any() else lack)
-    stamps = end_to_end([d.whole.signals.stamps_ns for d in tested])
-    return block_bootstrap_difference(np.concatenate(errors[0]), np.concatenate(errors[1]), stamps)
+    if not folds:
+        return None
+    with_prior, without = (np.concatenate(column) for column in errors)
+    return block_bootstrap_difference(with_prior, without, end_to_end(stamps), block_s=TEST_BLOCK_S)
 
 
 def _more(drives: Sequence[OpenedDrive], ladder: LadderFit) -> tuple[str, ...]:
