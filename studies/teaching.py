@@ -13,10 +13,9 @@ import json
 import math
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import permutations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -270,17 +269,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             results.append(result)
             print(pair_table([result]).splitlines()[-1], file=sys.stderr)
     print(summary(results), file=sys.stderr)
-    write_bytes(given.results, (json.dumps([document(r) for r in results], indent=1) + "\n").encode())
+    write_bytes(given.results, (json.dumps([asdict(r) for r in results], indent=1) + "\n").encode())
     command = "Command: `python -m studies.teaching`."
     write(given.out / "teaching.md", PAGE.format(command=command, pairs=pair_table(results), summary=summary(results)))
     return 0
-
-
-def document(result: PairResult) -> dict[str, Any]:
-    """Return a result as JSON-able values."""
-    from dataclasses import asdict
-
-    return asdict(result)
 
 
 if __name__ == "__main__":

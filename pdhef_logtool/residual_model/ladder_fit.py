@@ -7,7 +7,7 @@ of a sensor. With sums over blocks instead of samples, all fits of the cross-val
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +38,8 @@ STANDARD_ERRORS, LEAST_GAIN = 1.3, 0.02
 RANDOM_FEATURES, FREQUENCY, RANDOM_LEAST_S = 200, 0.4, 60.0
 #: Directions of the posterior that are kept.
 DIRECTIONS = 16
+#: Mean over so many seconds that neither features nor errors have in a fit: a slow error may be one of the bank of the road.
+SLOW_S = 5.0
 #: Samples a second that a fit uses.
 FIT_RATE_HZ = 25.0
 QUANTILE = 0.98
@@ -199,7 +201,8 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
         out = np.empty((len(of_odd), ODD_COUNT + count))
         expand(of_odd, of_even, odd_directions, even_directions, phases, out)
         phi.append(out)
-    problem = _problem(phi, errors, seconds)
+    fast = [without_slow(np.column_stack([p, error]), round(SLOW_S / step)) for p, (error, step) in _zip(phi, errors)]
+    problem = _problem([f[:, :-1] for f in fast], [(f[:, -1], step) for f, (_, step) in _zip(fast, errors)], seconds)
     linear = problem.only(ODD_COUNT)
     trials, chosen = _climb({LINEAR: linear} | ({RANDOM: problem} if count else {}))
     if chosen == NONE:
@@ -227,6 +230,20 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
         largest_rad=plain(np.quantile(np.abs(used @ weights), 0.999)),
     )
     return LadderFit(model, ridge, trials, seconds, len(problem.blocks))
+
+
+def _zip(
+    columns: Sequence[FloatArray], errors: Sequence[tuple[FloatArray, float]]
+) -> Iterator[tuple[FloatArray, tuple[FloatArray, float]]]:
+    return zip(columns, errors, strict=True)
+
+
+def without_slow(columns: FloatArray, count: int) -> FloatArray:
+    """Return columns [K, c] less their mean over ``count`` rows about each."""
+    rows, half = np.arange(len(columns)), count // 2
+    sums = np.concatenate([np.zeros((1, columns.shape[1])), np.cumsum(columns, axis=0)])
+    first, last = np.maximum(rows - half, 0), np.minimum(rows + half + 1, len(columns))
+    return np.asarray(columns - (sums[last] - sums[first]) / (last - first)[:, None], dtype=np.float64)
 
 
 def _thinned(drive: TaughtDrive) -> tuple[FloatArray, FloatArray, FloatArray, float]:
