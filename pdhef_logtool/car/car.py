@@ -327,8 +327,15 @@ def _file_of(source: Path | None, folder: Path | None) -> VehicleFile:
 
 
 def _with_parts(car: Car, folder: Path) -> Car:
-    """Return the car with the parts of its folder that are not stale: fit, noise and residual gain."""
+    """Return the car with the parts of its folder that are not stale: what it was taught, or fit, noise and gain."""
     notes: list[str] = []
+    taught = _part(folder / TAUGHT_FILE, Taught)
+    if taught is not None and taught.physics_sha256 == physics_sha256(car.datasheet):
+        others = [name for name in (FIT_FILE, NOISE_FILE, NETWORK_FILE) if (folder / name).is_file()]
+        idle = (f"{', '.join(others)}: not used, {TAUGHT_FILE} takes their place",) if others else ()
+        return replace(car, taught=taught, notes=idle)
+    if taught is not None:
+        notes.append(_stale(TAUGHT_FILE, f"{VEHICLE_FILE} has changed since", "teach"))
     fit = _part(folder / FIT_FILE, Fit)
     if fit is not None and fit.physics_sha256 == physics_sha256(car.datasheet):
         car = car.with_fit(fit)
@@ -339,12 +346,8 @@ def _with_parts(car: Car, folder: Path) -> Car:
     if stale := [n for n, of_filter in noise.items() if not car.owns_noise(n, of_filter)]:
         notes.append(_stale(f"noise of {', '.join(stale)}", "it belongs to other physics", "noise"))
     noise = {**car.noise, **{n: of_filter for n, of_filter in noise.items() if n not in stale}}
-    taught = _part(folder / TAUGHT_FILE, Taught)
-    if taught is not None and taught.physics_sha256 != physics_sha256(car.datasheet):
-        notes.append(_stale(TAUGHT_FILE, f"{VEHICLE_FILE} has changed since", "teach"))
-        taught = None
     trust = _part(folder / NETWORK_FILE, Trust) or car.trust
-    return replace(car, noise=noise, trust=trust, taught=taught, notes=tuple(notes))
+    return replace(car, noise=noise, trust=trust, notes=tuple(notes))
 
 
 def _stale(what: str, why: str, stage: str) -> str:

@@ -22,7 +22,7 @@ commands = typer.Typer()
     commands,
     "pdhef learn drives/ --car guess.toml -o mycar",
     "pdhef learn logs/ --car guess.toml -o mycar --without-truth",
-    "pdhef learn lap.mcap --car guess.toml -o mycar --end 150 --stages identify,noise,gain,network,intervals",
+    "pdhef learn lap.mcap --car guess.toml -o mycar --end 150 --stages identify",
     "pdhef learn logs/ --car mycar -o mycar --stages noise",
     "pdhef learn lap.mcap --car mycar -o mycar --start 155 --stages gain",
     "pdhef learn logs/ --car mycar -o mycar --stages intervals",

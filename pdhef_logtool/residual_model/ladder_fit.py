@@ -38,7 +38,7 @@ STANDARD_ERRORS, LEAST_GAIN = 1.3, 0.02
 RANDOM_FEATURES, FREQUENCY, RANDOM_LEAST_S = 200, 0.4, 60.0
 #: Directions of the posterior that are kept.
 DIRECTIONS = 16
-#: Mean over so many seconds that neither features nor errors have in a fit: a slow error may be one of the bank of the road.
+#: Mean over so many seconds that neither features nor errors have in a fit: a slow error may be due to bank.
 SLOW_S = 5.0
 #: Samples a second that a fit uses.
 FIT_RATE_HZ = 25.0

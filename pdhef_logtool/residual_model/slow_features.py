@@ -42,8 +42,7 @@ def slow_features(signals: FloatArray, dt_s: FloatArray, memory: FloatArray | No
     """
     count = signals.shape[1]
     memory = np.zeros((len(TIME_CONSTANTS_S), count)) if memory is None else memory.copy()
-    complete = np.isfinite(signals).all(axis=1)
-    given = np.where(complete[:, None], signals, np.nan)
+    given = np.where(np.isfinite(signals).all(axis=1, keepdims=True), signals, np.nan)
     out = np.empty((len(TIME_CONSTANTS_S), *signals.shape))
     for tau, of_tau, filtered in zip(TIME_CONSTANTS_S, memory, out, strict=True):
         low_pass(given, dt_s, 1.0 / (2.0 * np.pi * tau), of_tau, filtered)

@@ -12,6 +12,8 @@ import pytest
 from rich.console import Console
 
 from pdhef_logtool.car.car import TAUGHT_FILE, Car
+from pdhef_logtool.car.parts import Fit, LearntOn
+from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.cli.learning_tables import render_learning
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.calibration.joint import parameters_of
@@ -120,6 +122,19 @@ def test_a_changed_vehicle_file_makes_it_stale(result: LearnResult, tmp_path: Pa
         Car.load(car, network="none")
 
 
+def test_what_was_taught_takes_the_place_of_a_fit(result: LearnResult, tmp_path: Path) -> None:
+    car = tmp_path / "car"
+    car.mkdir()
+    for name in ("vehicle.toml", TAUGHT_FILE):
+        (car / name).write_bytes((result.car / name).read_bytes())
+    fit = Fit(physics_sha256=Car.load(result.car).physics_sha256, drives=(LearntOn(name="road"),))
+    (car / "fit.toml").write_text(part_toml(fit, "a fit"))
+    loaded = Car.load(car, network="none")
+    assert loaded.taught is not None and not loaded.has_evidence and "fit.toml" in loaded.notes[0]
+    (car / TAUGHT_FILE).unlink()
+    assert Car.load(car, network="none").has_evidence
+
+
 def test_what_cannot_be_taught_is_refused(sample_logs_dir: Path, bare: Path, tmp_path: Path) -> None:
     road = [str(sample_logs_dir / "road.mcap")]
     short = LearnSettings(config=RunConfig(car=bare, start="60", end="70"))
@@ -129,6 +144,4 @@ def test_what_cannot_be_taught_is_refused(sample_logs_dir: Path, bare: Path, tmp
         learn([str(sample_logs_dir / "no_truth.mcap")], tmp_path / "car", LearnSettings(config=RunConfig(car=bare)))
     with pytest.raises(UsageError, match="teach alone"):
         LearnSettings(config=RunConfig(car=bare), stages=("teach", "noise"))
-    with pytest.raises(UsageError, match="without a fit"):
-        learn(road, tmp_path / "car", LearnSettings(config=RunConfig(car=Path("saloon"), **SPAN)))
     assert not (tmp_path / "car").exists()

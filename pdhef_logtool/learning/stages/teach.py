@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.car import FIT_FILE, TAUGHT_FILE, Car
+from pdhef_logtool.car.car import TAUGHT_FILE, Car
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.taught import Taught, TaughtParameter
@@ -36,7 +36,7 @@ from pdhef_logtool.learning.drives import TEACH, DriveRecord, no_drive, no_true_
 from pdhef_logtool.learning.split import TRAINING
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.logs.discovery import LogInput
-from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.steps import release
 from pdhef_logtool.residual_model.ladder import NONE
@@ -94,18 +94,13 @@ class Teaching:
 
 
 def teach(task: Task) -> StageOutput:
-    """Learn the prior and the residual of a car from all drives with ground truth.
+    """Learn the prior and the residual of a car from all drives with ground truth, starting from its vehicle file.
 
     Raises
     ------
-    UsageError
-        The car has a fit, which would take the place of what is taught.
     EstimatorError
         There is too little driving.
     """
-    if task.car.learnt_on or task.car.fitted_physics is not None:
-        got = f"one with {FIT_FILE}"
-        raise UsageError(expected="a car without a fit", got=got, where="--car", remedy="give its vehicle.toml")
     car = Car.of(task.car.datasheet)
 
     def read(log: LogInput) -> tuple[DriveRecord, OpenedDrive | None]:
@@ -122,7 +117,7 @@ def teach(task: Task) -> StageOutput:
     taught = learn_from(drives, seed=task.settings.seed, progress=task.reporter.progress)
     figures = figures_of(taught)
     part = Taught(
-        physics_sha256=task.car.physics_sha256,
+        physics_sha256=car.physics_sha256,
         parameters=taught.parameters,
         residual=taught.ladder.model,
         calibrated=taught.calibrated,
