@@ -30,6 +30,8 @@ from studies.pages import DOCS, options, table, write
 
 LIMIT, PLANTED, SPREAD = 0.05, 0.10, 0.2
 COUNTS = (5, 10, 30, 100)
+#: Drives that depend on one another, and the share of the variance of their log ratios that lies between days.
+DAYS, DRIVES_A_DAY, SHARED = 6, 10, (0.0, 0.1, 0.2, 0.4, 0.8)
 #: Figures a drive that a run with three estimators writes: these make as many.
 _ESTIMATORS = ("zero", "physics", "pd-hef")
 _SIGNALS = ("sideslip_rad", "vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2")
@@ -66,6 +68,20 @@ def share_of_means(draw: Draw, drives: int, times: int, seed: int) -> float:
     level = np.exp(rng.normal(0.0, 0.5, (times, drives)))
     other = level * np.exp(rng.choice((-1.0, 1.0), level.shape) * draw(rng, (times, drives)))
     return float(np.mean(other.mean(axis=1) / level.mean(axis=1) > 1.0 + LIMIT))
+
+
+def shares_of_days(shared: float, times: int, seed: int) -> tuple[float, float]:
+    """Return how often equal runs of :data:`DAYS` days are called worse: with independent drives, and by default."""
+    rng = np.random.default_rng(seed)
+    day = np.repeat(np.arange(DAYS), DRIVES_A_DAY)
+    factors = {"day": day.tolist()}
+    alone = together = 0
+    for _ in range(times):
+        own, common = rng.normal(size=len(day)), rng.normal(size=DAYS)[day]
+        ratios = SPREAD * (math.sqrt(1.0 - shared) * own + math.sqrt(shared) * common)
+        alone += paired_change(ratios).verdict() == "worse"
+        together += paired_change(ratios, None, factors).verdict() == "worse"
+    return alone / times, together / times
 
 
 def make_run(folder: Path, drives: int) -> int:
@@ -141,6 +157,7 @@ def page(times: int, planted: int, drives: int) -> str:
         naive = share_of_means(normal, count, times, 3)
         false_alarms.append([str(count), *(f"{x:.1%}" for x in (*alarms, naive))])
         detected.append([str(count), *(f"{x:.1%}" for x in hits)])
+    days = [[f"{x:.0%}", *(f"{y:.1%}" for y in shares_of_days(x, times, 4))] for x in SHARED]
     return "\n".join(
         (
             "# Comparison of runs",
@@ -158,6 +175,13 @@ def page(times: int, planted: int, drives: int) -> str:
             f"## Every drive is worse by {PLANTED:.0%} beside that spread: how often the gate closes, of {planted:,}",
             "",
             table(["drives", "normal", "heavy tails"], detected, right_from=0),
+            "",
+            f"## Nothing changed, {DAYS * DRIVES_A_DAY} drives from {DAYS} days: how often B is called worse",
+            "",
+            "The first column is the share of the variance of log ratios between days. The limit is 0, at which the "
+            "nominal rate is 5%.",
+            "",
+            table(["between days", "--cluster none", "default: dependence is estimated"], days, right_from=0),
             "",
             "## A run compared with itself",
             "",

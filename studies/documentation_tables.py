@@ -1,17 +1,18 @@
 """Tables of the documentation that are made of the code when the site is built: a hook of MkDocs.
 
-In a page, ``<!-- table: metrics -->`` becomes the table of all metrics; ``checks``, ``settings`` and
+In a page, ``<!-- table: metrics -->`` becomes the table of all metrics; ``checks``, ``settings``, ``sensors`` and
 ``assumed_values`` are the others.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields
 from typing import Any
 
 from pdhef_logtool.car.assumed_values import RULES
+from pdhef_logtool.car.vehicle import Sensors
 from pdhef_logtool.drive.checks import registry as checks
 from pdhef_logtool.evaluation.metrics import registry as metrics
 from pdhef_logtool.runs.config import RunConfig
@@ -39,14 +40,23 @@ def _checks() -> Iterator[str]:
 
 
 def _settings() -> Iterator[str]:
+    yield from _entries(RunConfig, {key.name: key.default for key in fields(RunConfig)})
+
+
+def _sensors() -> Iterator[str]:
+    yield from _entries(Sensors, Sensors().model_dump())
+
+
+def _entries(kind: type, defaults: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the table of the attributes that the docstring of a class describes, with their defaults."""
     yield "| key | default | meaning |"
     yield "| --- | --- | --- |"
-    described = (RunConfig.__doc__ or "").partition("----------")[2]
+    described = (kind.__doc__ or "").partition("----------")[2]
     texts = dict(re.findall(r"^    (\w+) : (.*(?:\n        .*)*)", described, re.MULTILINE))
-    for key in fields(RunConfig):
-        text = re.sub(r" \(:func:`[^`]*`\)", "", " ".join(texts[key.name].split())).replace("``", "`")
-        default = "–" if key.default in (None, ()) else str(key.default).lower()
-        yield f"| `{key.name}` | {default} | {text} |"
+    for key, value in defaults.items():
+        text = re.sub(r" \(:func:`[^`]*`\)", "", " ".join(texts[key].split())).replace("``", "`")
+        default = "–" if value in (None, ()) else str(value).lower()
+        yield f"| `{key}` | {default} | {text} |"
 
 
 def _assumed_values() -> Iterator[str]:
@@ -60,5 +70,6 @@ _TABLES: dict[str, Callable[[], Iterator[str]]] = {
     "metrics": _metrics,
     "checks": _checks,
     "settings": _settings,
+    "sensors": _sensors,
     "assumed_values": _assumed_values,
 }

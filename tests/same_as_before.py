@@ -62,7 +62,7 @@ def cases() -> tuple[Case, ...]:
     return (
         Case("samples", ("run", *samples, "--car", "saloon")),
         Case("low-friction", ("run", "sample_logs/sweep.mcap", "--car", "saloon", "--friction", "0.3")),
-        Case("untuned", ("run", *samples[:1], "sample_logs/faults.mcap", *samples_car, "--sensors", "esp")),
+        Case("untuned", ("run", *samples[:1], "sample_logs/faults.mcap", *samples_car, "--set", "sensors=esp")),
         Case(
             "default-car",
             (

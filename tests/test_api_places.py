@@ -13,7 +13,7 @@ from pdhef_logtool.logs.definitions import read_definitions
 
 KINDS = [str, Path]
 MAPPING = '[signals.yaw_rate_rad_s]\ntopic = "/imu/data"\nfield = "angular_velocity.z"\n'
-FILES = ("car", "cars", "mapping", "msgs", "thresholds", "network", "intervals")
+FILES = ("car", "cars", "mapping", "msgs", "plan", "network", "intervals")
 
 
 @pytest.fixture(scope="module")
@@ -69,10 +69,10 @@ def test_run_config_and_read_options(kind: Any, entry: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_run(dlc: Path, mapping: Path, sample_logs_dir: Path, tmp_path: Path, kind: Any) -> None:
-    (tmp_path / "t.toml").write_text('[[threshold]]\nsignal = "sideslip_rad"\nmetric = "rmse"\nmax = 9.0\n')
+    (tmp_path / "t.toml").write_text('[[requirement]]\nid = "a"\nsignal = "sideslip_rad"\nlimit = 9.0\n')
     config = pdhef.RunConfig(
         estimators=("zero",), annotate="none", keep="metrics", mapping=kind(mapping),
-        car=kind(sample_logs_dir / "vehicle.toml"), thresholds=kind(tmp_path / "t.toml"),
+        car=kind(sample_logs_dir / "vehicle.toml"), plan=kind(tmp_path / "t.toml"),
     )  # fmt: skip
     result = pdhef.run(kind(dlc), kind(tmp_path / "out"), config, junit=kind(tmp_path / "j.xml"), report=False)
     assert result.exit_code == 0

@@ -368,10 +368,15 @@ BRAKING_M_S2 = 3.0
 
 def _brake_in_turn(request: Request) -> Plan:
     """ISO 7975: a steady bend, the steering held, then the throttle released and the brake pressed at once."""
+    return _slowed_in_turn(request, BRAKING_M_S2, rise_s=BRAKE_RISE_S)
+
+
+def _slowed_in_turn(request: Request, slowing_m_s2: float, *, rise_s: float) -> Plan:
+    """Return a steady bend whose steering is held, with a brake torque from ``BRAKE_AT_S`` on, scaled to μ."""
     t = _times_s(request.duration_s)
     top = steer_for(0.5 * request.friction * GRAVITY_M_S2, request.speed_m_s)
-    press = np.clip((t - BRAKE_AT_S) / BRAKE_RISE_S, 0.0, 1.0)
-    brake = BRAKING_M_S2 * min(1.0, request.friction / 0.85) * TORQUE_PER_BRAKING
+    press = np.clip((t - BRAKE_AT_S) / rise_s, 0.0, 1.0)
+    brake = slowing_m_s2 * min(1.0, request.friction / 0.85) * TORQUE_PER_BRAKING
     torque = np.stack([np.zeros_like(t), brake * press], axis=1)
     torque[t < BRAKE_AT_S] = np.nan
     return Plan(
@@ -381,6 +386,54 @@ def _brake_in_turn(request: Request) -> Plan:
         torque_n_m=torque,
         goal_window_s=(BRAKE_AT_S - 1.0, BRAKE_AT_S),
     )
+
+
+#: Engine drag after the throttle is released, on a dry road.
+ENGINE_DRAG_M_S2 = 0.8
+
+
+def _power_off_in_turn(request: Request) -> Plan:
+    """ISO 9816: a steady bend, the steering held, then the throttle released."""
+    return _slowed_in_turn(request, ENGINE_DRAG_M_S2, rise_s=0.5)
+
+
+#: Straight before a circle, and the way in which its curvature grows, in s of driving.
+_CIRCLE_STRAIGHT_S, _CIRCLE_EASE_S = 1.5, 1.5
+
+
+def _steady_circle(request: Request) -> Plan:
+    """ISO 4138: a circle of constant radius at constant speed, driven closed loop."""
+    a_y = request.scale * 0.5 * request.friction * GRAVITY_M_S2
+    x = np.arange(int((request.speed_m_s * request.duration_s + 50.0) / PATH_STEP_M)) * PATH_STEP_M
+    curvature = (
+        a_y / request.speed_m_s**2 * np.clip((x / request.speed_m_s - _CIRCLE_STRAIGHT_S) / _CIRCLE_EASE_S, 0, 1)
+    )
+    course = integrate_course(curvature, PATH_STEP_M)
+    path = np.concatenate([course, np.full((x.size, 1), request.speed_m_s)], axis=1)
+    return Plan(
+        request.speed_m_s,
+        request.duration_s,
+        path=path,
+        goal_window_s=(0.5 * request.duration_s, request.duration_s),
+    )
+
+
+#: Distance of the cones of a slalom, and their number.
+CONE_SPACING_M, CONES = 18.0, 10
+
+
+def _slalom(request: Request) -> Plan:
+    """Cones 18 m apart, passed left and right in turn on a sine, the sideways offset times ``scale``; closed loop."""
+    start = _RUN_IN_S * request.speed_m_s
+    x = np.arange(int((request.speed_m_s * request.duration_s + 50.0) / PATH_STEP_M)) * PATH_STEP_M
+    along = np.clip((x - start) / CONE_SPACING_M, 0.0, CONES)
+    eased = np.minimum(_smooth_step(along), _smooth_step(CONES - along))
+    offset = request.scale * 0.5 * eased * np.sin(np.pi * along)
+    return Plan(request.speed_m_s, request.duration_s, path=_path_from_offset(offset, request.speed_m_s))
+
+
+def _slalom_duration_s(speed_m_s: float) -> float:
+    return round(_RUN_IN_S + CONES * CONE_SPACING_M / speed_m_s + _RUN_OUT_S, 2)
 
 
 #: Friction of the slippery part of a friction jump, over the rest's.
@@ -626,6 +679,37 @@ _CATALOGUE = (
         least_share=0.45,
         default_duration_s=lambda _: 10.0,
         plan=_brake_in_turn,
+    ),
+    Manoeuvre(
+        name="power-off-in-turn",
+        description="ISO 9816: steady bend at 0.5 mu g, steering held, throttle released after 5 s",
+        speed_km_h=80.0,
+        friction=0.85,
+        peak_share=0.50,
+        least_share=0.45,
+        default_duration_s=lambda _: 10.0,
+        plan=_power_off_in_turn,
+    ),
+    Manoeuvre(
+        name="steady-circle",
+        description="ISO 4138: circle of constant radius at constant speed, |a_y| at 0.5 mu g",
+        speed_km_h=80.0,
+        friction=0.85,
+        peak_share=0.50,
+        least_share=0.45,
+        default_duration_s=lambda _: 40.0,
+        plan=_steady_circle,
+    ),
+    Manoeuvre(
+        name="slalom",
+        description="ten cones 18 m apart, offset scaled so that |a_y| peaks at 0.6 mu g",
+        speed_km_h=55.0,
+        friction=0.85,
+        peak_share=0.60,
+        least_share=0.55,
+        default_duration_s=_slalom_duration_s,
+        plan=_slalom,
+        top_speed_km_h=80.0,
     ),
     Manoeuvre(
         name="mu-jump",

@@ -7,7 +7,6 @@ used, and the car has a note of it.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -21,7 +20,6 @@ from pdhef_logtool.car.parts import (
     Fit,
     FittedPhysics,
     FittedValues,
-    HistoryLine,
     Intervals,
     LearntOn,
     Noise,
@@ -30,7 +28,7 @@ from pdhef_logtool.car.parts import (
     physics_sha256,
 )
 from pdhef_logtool.car.taught import Taught, TaughtParameter
-from pdhef_logtool.car.toml_files import VehicleFile, read_vehicle_file
+from pdhef_logtool.car.toml_files import VehicleFile, read_vehicle_file, with_sensors
 from pdhef_logtool.car.vehicle import Record, VehicleParameters, default_vehicle
 from pdhef_logtool.records.errors import UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import (
@@ -42,7 +40,7 @@ from pdhef_logtool.residual_model.bundle import (
     ModelBundle,
     load_bundle,
 )
-from pdhef_logtool.storage.documents import read_json, read_text, read_toml, validated
+from pdhef_logtool.storage.documents import read_json, read_toml, validated
 
 VEHICLE_FILE, FIT_FILE, NOISE_FILE, NETWORK_FILE = "vehicle.toml", "fit.toml", "noise.toml", "network.toml"
 INTERVALS_FILE, UNSURE_FILE, HISTORY_FILE = "intervals.json", "intervals-unsure.json", "history.jsonl"
@@ -56,6 +54,8 @@ NO_INTERVALS, UNSURE = "none", "unsure"
 SHOWN_DIGITS = 12
 
 PartT = TypeVar("PartT", bound=Record)
+#: A file or folder, or the name of one that is shipped.
+Place = Path | str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,9 +133,7 @@ class Car:
         return cls(vehicle, vehicle, **parts)
 
     @classmethod
-    def load(
-        cls, path: Path | str | None = None, *, network: Path | str | None = None, intervals: Path | str | None = None
-    ) -> Car:
+    def load(cls, path: Place = None, *, network: Place = None, intervals: Place = None, sensors: Place = None) -> Car:
         """Read a car.
 
         Parameters
@@ -143,6 +141,7 @@ class Car:
         path : a car's folder, a vehicle.toml, ``saloon`` (the shipped car); None: the default sedan.
         network : instead of the car's own: a shipped network's name, a folder, ``none``.
         intervals : instead of the car's own: a file of ``pdhef learn --stages intervals``, ``unsure``, ``none``.
+        sensors : instead of the car's own: a profile's name, or a file with ``[sensors]``.
 
         Raises
         ------
@@ -156,7 +155,8 @@ class Car:
         source = SHIPPED_CARS.get(str(path), None if path is None else Path(path))
         folder = source if source is not None and source.is_dir() else None
         file = _file_of(source, folder)
-        car = cls(file.vehicle, file.vehicle, trust=file.trust, assumed=file.assumed, source=source)
+        vehicle = file.vehicle if sensors is None else with_sensors(file.vehicle, sensors)
+        car = cls(vehicle, vehicle, trust=file.trust, assumed=file.assumed, source=source)
         if folder is not None:
             car = _with_parts(car, folder)
         name, home = _network_of(car, folder, network)
@@ -363,7 +363,7 @@ def _part(path: Path, kind: type[PartT]) -> PartT | None:
     return validated(kind, raw, str(path), VehicleError, expected=f"the entries of {what}")
 
 
-def _network_of(car: Car, folder: Path | None, chosen: Path | str | None) -> tuple[str, Path | None]:
+def _network_of(car: Car, folder: Path | None, chosen: Place) -> tuple[str, Path | None]:
     """Return name and folder of the network in force; the folder is None without one."""
     name = str(chosen) if chosen is not None else (SHIPPED if car.trust is None else car.trust.network)
     if name == NO_MODEL:
@@ -379,7 +379,7 @@ def _network_of(car: Car, folder: Path | None, chosen: Path | str | None) -> tup
     return name, home / NETWORK_FOLDER if (home / NETWORK_FOLDER / DOCUMENT_FILE).is_file() else home
 
 
-def _intervals_of(folder: Path | None, network: str, chosen: Path | str | None) -> Intervals | None:
+def _intervals_of(folder: Path | None, network: str, chosen: Place) -> Intervals | None:
     """Return the intervals in force: the chosen ones, else the car's own, else those of the shipped network."""
     if chosen is not None and str(chosen) == NO_INTERVALS:
         return None
@@ -406,18 +406,3 @@ def load_intervals(path: Path) -> Intervals:
     return validated(
         Intervals, raw, str(file), VehicleError, expected="the entries of a file of pdhef learn --stages intervals"
     )
-
-
-def read_history(folder: Path) -> list[dict[str, Any]]:
-    """Return the lines of a car's history, oldest first; none without. Raises VehicleError for a damaged one."""
-    path = folder / HISTORY_FILE
-    if not path.is_file():
-        return []
-    expected = "lines that commands wrote"
-    try:
-        lines = [json.loads(line) for line in read_text(path).splitlines() if line.strip()]
-    except (OSError, ValueError, RecursionError) as error:
-        raise VehicleError(expected=expected, got=str(error), where=str(path)) from None
-    for number, line in enumerate(lines, start=1):
-        validated(HistoryLine, line, f"{path}, line {number}", VehicleError, expected=expected)
-    return lines

@@ -110,6 +110,11 @@ class FittedValues(Record):
         return vehicle.model_copy(update=update)
 
 
+#: ``limit_gain`` of cars whose physics nobody identified. More lowers the error of single manoeuvres further; on laps
+#: with a wrong file kinematics then drift with bias and tilt (docs/method.md#limit).
+LIMIT_GAIN = 1.5
+
+
 class FilterNoise(Record):
     """Process and measurement 1-sigma of one filter, and what they were chosen with.
 
@@ -118,6 +123,7 @@ class FilterNoise(Record):
     q_std : per square root of second, of v_x, v_y and yaw rate, and of the a_x bias if it is not left out; for
         ``physics`` also of the two axle forces. Empty: the filter's own.
     r_std : by measurement; what is left out is the filter's own.
+    limit_gain : growth of the process noise of the axle forces of ``physics`` beyond the linear range; 0: none.
     physics_sha256 : of the physics that it belongs to.
     score_deg : in ``pdhef learn --stages noise``, lower is better; None where nothing was compared. trial : its number.
     """
@@ -126,6 +132,7 @@ class FilterNoise(Record):
     r_std: dict[Annotated[str, one_of(MEASUREMENTS), Field(json_schema_extra={"enum": [*MEASUREMENTS]})], Positive] = (
         Field(default_factory=dict)
     )
+    limit_gain: NonNegative = 0.0
     physics_sha256: Sha256 | None = None
     score_deg: Positive | None = None
     trial: int | None = None
@@ -347,5 +354,7 @@ class HistoryLine(Record):
 
 def noise_sha256(noise: Mapping[str, FilterNoise]) -> str:
     """Return the digest of the noise values alone, by filter."""
-    values = {name: [list(n.q_std), dict(n.r_std)] for name, n in noise.items()}
+    values = {
+        name: [list(n.q_std), dict(n.r_std), *([n.limit_gain] if n.limit_gain else [])] for name, n in noise.items()
+    }
     return digest(values)

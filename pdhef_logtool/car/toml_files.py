@@ -11,7 +11,7 @@ from pydantic import ConfigDict, Field
 
 from pdhef_logtool.car.assumed_values import AssumedValue, completed
 from pdhef_logtool.car.parts import Trust
-from pdhef_logtool.car.vehicle import REMEDY, Record, VehicleParameters
+from pdhef_logtool.car.vehicle import REMEDY, SENSOR_PROFILES, Record, Sensors, VehicleParameters
 from pdhef_logtool.records.errors import VehicleError
 from pdhef_logtool.storage.documents import read_toml, validated
 
@@ -54,6 +54,24 @@ def read_vehicle_file(path: Path) -> VehicleFile:
         The file is missing or no TOML, or has wrong, unknown or missing entries; the message names all of them.
     """
     return vehicle_of_entries(read_toml(path, "a vehicle TOML file", VehicleError), where=str(path))
+
+
+def with_sensors(vehicle: VehicleParameters, profile: Path | str) -> VehicleParameters:
+    """Return a vehicle with a sensor profile: of a name, or the table ``[sensors]`` of a file like vehicle.toml.
+
+    Raises
+    ------
+    VehicleError
+        The file is missing or no TOML, or has no such table, or the table has wrong or unknown entries.
+    """
+    sensors = SENSOR_PROFILES.get(str(profile))
+    if sensors is None:
+        entries = read_toml(Path(profile), "a TOML file with [sensors]", VehicleError).get("sensors")
+        expected, remedy = "a table [sensors] as in vehicle.toml", f"profiles by name: {', '.join(SENSOR_PROFILES)}"
+        if not isinstance(entries, dict):
+            raise VehicleError(expected=expected, got="none", where=str(profile), remedy=remedy)
+        sensors = validated(Sensors, entries, f"{profile}: sensors", VehicleError, expected=expected, remedy=REMEDY)
+    return vehicle.model_copy(update={"sensors": sensors})
 
 
 def vehicle_of_entries(raw: Mapping[str, Any], *, where: str) -> VehicleFile:

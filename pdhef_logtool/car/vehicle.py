@@ -30,6 +30,8 @@ AccelerationStd = Annotated[float, Field(gt=0, le=30)]
 #: A larger value is no bias but a mounting error, which belongs in the mapping.
 AccelerationBias = Annotated[float, Field(ge=-5, le=5)]
 AngleStd = Annotated[float, Field(gt=0, le=0.5)]
+#: Interval between samples of a sensor, and how long one is used.
+SensorTime = Annotated[float, Field(gt=0, le=30)]
 
 #: Remedy for a wrong entry.
 REMEDY = "see docs/formats.md for every entry and its unit"
@@ -84,12 +86,36 @@ class Tyres(Record):
 
 
 class Sensors(Record):
-    """White noise (1 sigma) and constant errors of the sensors; R of the filters with sensor-level noise.
+    """Sensor profile: what a user with other sensors changes, ``[sensors]`` of vehicle.toml.
 
-    A bias is reading minus true value, ``yaw_rate_gain`` reading over true value; both are corrected before any
-    estimator receives the signal. ``yaw_rate_delay_s`` is the delay of the gyro's stamps; unless it is 0 it replaces
-    the mapping's ``latency_s``. ``*_bias_std`` is the standard deviation of the remaining bias between drives, for
-    filters that estimate it. The defaults are those of a production car (docs/method.md#sensors).
+    Noise is white and 1 sigma; it is R of the filters with sensor-level noise. A bias is reading minus true value. Bias
+    and gain are corrected before any estimator receives the signal. The defaults, profile ``production``, are those of
+    a production car (docs/method.md#sensors).
+
+    Attributes
+    ----------
+    ax_std_m_s2 : noise of the longitudinal acceleration.
+    ay_std_m_s2 : noise of the lateral acceleration.
+    yaw_rate_std_rad_s : noise of the yaw rate.
+    speed_std_m_s : noise of the speed.
+    steer_std_rad : noise of the road-wheel angle.
+    ax_bias_m_s2 : bias of the longitudinal acceleration.
+    ay_bias_m_s2 : bias of the lateral acceleration.
+    yaw_rate_bias_rad_s : bias of the yaw rate.
+    yaw_rate_gain : reading of the yaw rate over the true value.
+    yaw_rate_delay_s : delay of the gyro's stamps; unless it is 0 it replaces ``latency_s`` of the mapping.
+    ay_bias_std_m_s2 : standard deviation between drives of the remaining bias of a_y.
+    yaw_rate_bias_std_rad_s : standard deviation between drives of the remaining bias of the yaw rate.
+    steer_bias_std_rad : standard deviation between drives of the remaining bias of the road-wheel angle.
+    imu_rate_hz : rate above which samples of a_y and yaw rate share road and body motion, so evidence of a noise burst.
+    imu_span_s : longest time of three intervals between samples in which noise bursts and spikes are detected.
+    imu_hold_s : longest use of a sample in the divergence monitor; without a later one the channel is missing.
+    speed_hold_s : longest use of a speed sample.
+    steer_hold_s : longest use of a steering sample in a filter.
+    stuck_samples : smallest number of equal samples of a stuck channel; repeated samples of a recorder need more.
+    speed_zero_m_s : speeds below are a standstill, or wheels without pulses.
+    speed_least_m_s : lowest speed that wheels with few pulses report; a step between it and 0 is no wheel slip.
+    still_yaw_rate_rad_s : largest yaw rate at a standstill, noise and bias included.
     """
 
     ax_std_m_s2: AccelerationStd = 0.12
@@ -105,11 +131,24 @@ class Sensors(Record):
     ay_bias_std_m_s2: AccelerationStd = 0.08
     yaw_rate_bias_std_rad_s: AngleStd = 0.0015
     steer_bias_std_rad: AngleStd = 0.0008
+    imu_rate_hz: Annotated[float, Field(gt=0, le=10_000)] = 100.0
+    imu_span_s: SensorTime = 0.16
+    imu_hold_s: SensorTime = 0.1
+    speed_hold_s: SensorTime = 0.5
+    steer_hold_s: SensorTime = 0.2
+    stuck_samples: Annotated[int, Field(ge=2, le=10_000)] = 5
+    speed_zero_m_s: Annotated[float, Field(ge=0, le=5)] = 0.05
+    speed_least_m_s: Annotated[float, Field(ge=0, le=20)] = 1.0
+    still_yaw_rate_rad_s: Annotated[float, Field(ge=0, le=0.5)] = 0.05
 
     @property
     def measurement_std(self) -> tuple[float, float, float]:
         """Standard deviations of the measurements a_y, yaw rate, speed."""
         return self.ay_std_m_s2, self.yaw_rate_std_rad_s, self.speed_std_m_s
+
+
+#: Sensor profiles by name.
+SENSOR_PROFILES = {"production": Sensors()}
 
 
 class PhysicsParts(Record):

@@ -16,15 +16,19 @@ from pdhef_logtool.cli import (
     comparing,
     compiling,
     console,
+    converting,
     inspecting,
     learning,
     panels,
     reporting,
     running,
+    serving,
     simulating,
     stopping,
+    trending,
+    validation,
 )
-from pdhef_logtool.cli.removed_commands import replacement
+from pdhef_logtool.cli.removed_commands import replaced_option, replacement
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, PdhefError, UsageError
 from pdhef_logtool.storage.files import OF_WRITING, cannot_write
 
@@ -44,12 +48,24 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
-    help="Estimate sideslip on recorded drives (MCAP, rosbag1, rosbag2), score it against ground truth, and annotate "
-    "the logs.",
+    help="Estimate sideslip on recorded drives (MCAP, rosbag, MDF, VBO, CSV, MAT, ...), score it against ground "
+    "truth, and annotate the logs.",
     epilog="Exit codes: 0 ok, 1 failure, 2 usage, 3 finished but some input was lost, a check or some logs failed, "
-    "4 a threshold or regression gate failed, 130 interrupted (Ctrl-C), 141 stdout was closed early, 143 terminated.",
+    "4 a requirement or regression gate failed, 130 interrupted (Ctrl-C), 141 stdout was closed early, 143 terminated.",
 )
-for _group in (inspecting, running, reporting, comparing, simulating, learning, compiling):
+for _group in (
+    inspecting,
+    running,
+    validation,
+    reporting,
+    comparing,
+    trending,
+    serving,
+    simulating,
+    learning,
+    converting,
+    compiling,
+):
     app.registered_commands += _group.commands.registered_commands
 
 
@@ -111,7 +127,7 @@ def _run() -> int:
     except _WrongWord as error:
         if len(sys.argv) == 1:
             error.show()  # pdhef alone is asked for its help
-        elif message := replacement(sys.argv[1:]):
+        elif message := replacement(sys.argv[1:]) or replaced_option(sys.argv[1:]):
             console.error(f"pdhef: {message}")
         else:
             command = error.ctx.command_path if error.ctx else "pdhef"

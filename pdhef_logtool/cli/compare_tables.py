@@ -11,6 +11,7 @@ from rich.padding import Padding
 from rich.text import Text
 
 from pdhef_logtool.cli.console import table
+from pdhef_logtool.cli.plan_tables import plan_line, render_plan
 from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison
 from pdhef_logtool.results.comparison_words import (
@@ -22,7 +23,7 @@ from pdhef_logtool.results.comparison_words import (
     percent,
     verdict_text,
 )
-from pdhef_logtool.results.junit import Case, cases_bytes
+from pdhef_logtool.results.junit import Case, cases_bytes, plan_cases
 from pdhef_logtool.storage.files import write_bytes
 
 if TYPE_CHECKING:
@@ -58,6 +59,9 @@ def render_comparison(comparison: Comparison, console: Console) -> None:
     console.print(Text.assemble("\n", ("Verdict: ", "bold"), verdict_text(comparison)))
     for line in comparison.failures:
         _line(f"gate closed: {line}", console)
+    if comparison.requirements is not None:
+        console.print(Text.assemble("\n", ("Plan on B: ", "bold"), plan_line(comparison.requirements)))
+        render_plan(comparison.requirements, console)
 
 
 def _line(text: str, console: Console) -> None:
@@ -133,7 +137,8 @@ def write_comparison_junit(path: Path, comparison: Comparison) -> None:
     reason = "; ".join(comparison.unpaired)
     partners = "drives without partner"
     cases.append(Case("compare", "drives", "every drive has a partner", partners, bool(lost), reason, reason or None))
-    write_bytes(path, cases_bytes({"compare": cases}))
+    plan = {} if comparison.requirements is None else plan_cases(comparison.requirements)
+    write_bytes(path, cases_bytes({**plan, "compare": cases}))
 
 
 def _figure_case(row: ComparedFigure, comparison: Comparison) -> Case:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +14,8 @@ from pdhef_logtool.cli import console, options, panels
 from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
-    from pdhef_logtool.results.gate import Gate
+    from pdhef_logtool.evaluation.validation_plan import ValidationPlan
+    from pdhef_logtool.results.gate import Figure, Gate
 
 commands = typer.Typer()
 #: Room around events: a threshold that is crossed to and fro is one event; a clip shows how it came about.
@@ -24,18 +26,21 @@ _PAD_S, _CLIP_PAD_S = 0.25, 5.0
     commands,
     "pdhef compare before after",
     "pdhef compare before after --max-regression 5%",
-    "pdhef compare before after --gate gate.toml --junit gate.xml --strict",
+    "pdhef compare before after --plan plan.toml --junit plan.xml --strict",
     "pdhef compare before after --cluster day --html change.html",
     panel=panels.READ,
     notes="Exit codes: 0 no significant regression; 1 no common drive; 3 some drives are damaged, or without a "
-    "counterpart and no gate is given; 4 the gate failed, or is inconclusive with --strict. Without a gate a "
-    "regression does not change the exit code.",
+    "counterpart and no limit is given; 4 a requirement of the plan or --max-regression failed, or is inconclusive "
+    "with --strict. Without either a regression does not change the exit code.",
 )
 def compare(
     a: Annotated[str, Argument(metavar="A", help="Output of the reference run: folder or URL.")],
     b: Annotated[str, Argument(metavar="B", help="Output of the run to compare with it.")],
     *,
-    gate: Annotated[Path | None, Option(metavar="FILE", help="gate.toml with metrics and their limits.")] = None,
+    plan: Annotated[
+        Path | None,
+        Option(metavar="FILE", help='Validation plan for B. baseline = "run" means run A. Exit code 4 if one fails.'),
+    ] = None,
     max_regression: Annotated[
         str | None, Option(metavar="SHARE", help="Largest accepted increase of the metric: 5% or 0.05.")
     ] = None,
@@ -45,28 +50,38 @@ def compare(
     metric: Annotated[str | None, Option(help="Metric of sideslip over the whole drive. Default: rmse.")] = None,
     cluster: Annotated[
         str | None,
-        Option(metavar="KEY", help="Group of dependent drives for the bootstrap: car, day, or a metadata key."),
+        Option(
+            metavar="KEY",
+            help="Groups of dependent drives: car, day, route, a metadata key, or none. Default: the dependence by "
+            "day, car and route is estimated.",
+        ),
     ] = None,
     allow_unpaired: Annotated[
         bool, Option("--allow-unpaired", help="Accept drives that only one run contains.")
     ] = False,
-    strict: Annotated[bool, Option("--strict", help="An inconclusive gate fails.")] = False,
+    strict: Annotated[bool, Option("--strict", help="Inconclusive results fail.")] = False,
     html: Annotated[Path | None, Option(help="HTML file for the comparison.")] = None,
-    junit: Annotated[Path | None, Option(help="JUnit XML file for the verdicts of the gate.")] = None,
+    junit: Annotated[Path | None, Option(help="JUnit XML file for the verdicts.")] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Compare two runs drive by drive: better, worse, or no significant difference."""
     from pdhef_logtool.cli.compare_tables import render_comparison, write_comparison_junit
+    from pdhef_logtool.evaluation.validation_plan import load_plan
     from pdhef_logtool.results.comparing import compare_runs
     from pdhef_logtool.results.opened_run import open_run
+    from pdhef_logtool.results.plan_against import plan_verdicts_against
     from pdhef_logtool.storage.object_store import is_url
     from pdhef_logtool.storage.outputs import check_no_input
 
     check_no_input(
-        [*(Path(x) for x in (a, b) if not is_url(x)), gate], [file for file in (html, junit) if file is not None]
+        [*(Path(x) for x in (a, b) if not is_url(x)), plan], [file for file in (html, junit) if file is not None]
     )
-    asked = _gate(gate, max_regression, estimator, metric, allow_unpaired=allow_unpaired)
-    comparison = compare_runs(open_run(a), open_run(b), asked, cluster=cluster, strict=strict)
+    validation = None if plan is None else load_plan(plan)
+    asked = _gate(validation, max_regression, estimator, metric, allow_unpaired=allow_unpaired)
+    run_a, run_b = open_run(a), open_run(b)
+    comparison = compare_runs(run_a, run_b, asked, cluster=cluster, strict=strict)
+    if validation is not None:
+        comparison = replace(comparison, requirements=plan_verdicts_against(validation, run_a, run_b, strict=strict))
     for line in comparison.damaged:
         console.warn(line)
     if junit is not None:
@@ -80,27 +95,36 @@ def compare(
 
 
 def _gate(
-    file: Path | None, max_regression: str | None, estimator: str | None, metric: str | None, *, allow_unpaired: bool
+    plan: ValidationPlan | None,
+    max_regression: str | None,
+    estimator: str | None,
+    metric: str | None,
+    *,
+    allow_unpaired: bool,
 ) -> Gate:
     """Return the figures that the options ask for; raises UsageError."""
-    from pdhef_logtool.results.gate import MAIN, Figure, Gate, figure_problems, load_gate, share_of
+    from pdhef_logtool.results.gate import Gate, figures_of
 
     single = {"--max-regression": max_regression, "--estimator": estimator, "--metric": metric}
     given = [name for name, value in single.items() if value is not None]
-    if file is not None:
+    if plan is not None:
         if given:
-            raise UsageError(
-                expected="a gate file or figures of the command line", got=f"--gate and {given[0]}", where="--gate"
-            )
-        gate = load_gate(file)
-        return Gate(gate.figures, gate.allow_unpaired or allow_unpaired)
+            raise UsageError(expected=f"--plan or {given[0]}", got="both", where="--plan")
+        return Gate(figures_of(plan), allow_unpaired)
+    return Gate((figure_asked(max_regression, estimator, metric),), allow_unpaired)
+
+
+def figure_asked(max_regression: str | None, estimator: str | None, metric: str | None) -> Figure:
+    """Return the figure that options ask for; raises UsageError."""
+    from pdhef_logtool.results.gate import MAIN, Figure, figure_problems, share_of
+
     limit = None if max_regression is None else share_of(max_regression)
     if max_regression is not None and limit is None:
         raise UsageError(expected="a share such as 5% or 0.05", got=max_regression, where="--max-regression")
     figure = Figure(metric=metric or "rmse", estimator=estimator or MAIN, limit=limit)
     if problems := figure_problems(figure.signal, figure.metric, figure.segment):
         raise UsageError(expected="a figure; lower is better", got="; ".join(problems), where="--metric")
-    return Gate((figure,), allow_unpaired)
+    return figure
 
 
 @options.command(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal, NoReturn, Protocol, TypeVar
@@ -28,6 +29,8 @@ class _Result(Protocol):
 
 _Shown = TypeVar("_Shown", bound=_Result)
 _quiet = _verbose = False
+#: Without a terminal, progress is one line in so many seconds.
+PROGRESS_S = 30.0
 #: A line on stderr is an error or a warning of several parts.
 _MOST_SIGNS = 5000
 
@@ -120,21 +123,23 @@ def finish(
 
 
 def _progress_lines() -> Callable[[str, float], None]:
-    last = ""
+    """Return progress as lines: each change with ``--verbose``, else one in :data:`PROGRESS_S`."""
+    last, due = "", time.monotonic() + PROGRESS_S
 
     def update(text: str, share: float) -> None:
-        nonlocal last
+        nonlocal last, due
         stopping.check()
-        if _verbose and text != last:
+        now = time.monotonic()
+        if text != last if _verbose else now >= due:
             say(f"{share:4.0%}  {text}")
-            last = text
+            last, due = text, now + PROGRESS_S
 
     return update
 
 
 @contextmanager
 def reporter() -> Iterator[Reporter]:
-    """Yield a reporter on stderr; its progress is a bar on a terminal, lines with ``--verbose``, nothing elsewhere.
+    """Yield a reporter on stderr; its progress is a bar on a terminal, lines elsewhere.
 
     Its progress raises :class:`~.stopping.Stopped` after a request to end.
     """

@@ -196,7 +196,7 @@ def train(
 @options.command(
     commands,
     "pdhef retrain logs/ -o retrained --car mycar --jobs 2",
-    "pdhef retrain logs/ -o retrained --car mycar --gate gate.toml --strict",
+    "pdhef retrain logs/ -o retrained --car mycar --plan plan.toml --strict",
     "pdhef run new/ -o out --car retrained/accepted/0123456789ab/car",
     panel=panels.LEARN,
     notes="Each drive is assigned to one split: training, validation, residual gain, intervals, or the final "
@@ -211,11 +211,14 @@ def retrain(
     logs: options.TruthLogs,
     output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Folder for stages and candidates.")],
     config: RunConfig,
-    gate: Annotated[
+    plan: Annotated[
         Path | None,
-        Option(metavar="FILE", help="gate.toml as for pdhef compare. Default: RMSE of pd-hef at most 2 % higher."),
+        Option(
+            metavar="FILE",
+            help='Validation plan with baseline = "run" as the gate. Default: RMSE of pd-hef at most 2 % higher.',
+        ),
     ] = None,
-    strict: Annotated[bool, Option("--strict", help="An inconclusive gate rejects the candidate.")] = False,
+    strict: Annotated[bool, Option("--strict", help="An inconclusive requirement rejects the candidate.")] = False,
     init: Annotated[
         Path | None, Option(help="Model bundle to start from, many-cars, or none. Default: the car's, else many-cars.")
     ] = None,
@@ -225,11 +228,12 @@ def retrain(
     as_json: options.JsonFlag = False,
 ) -> None:
     """Train a car's network further; accept it only if it is not worse on held-out drives."""
+    from pdhef_logtool.evaluation.validation_plan import load_plan
     from pdhef_logtool.learning.retrain.retrain_command import DEFAULT_GATE, RetrainSettings
     from pdhef_logtool.learning.retrain.retrain_command import retrain as train_again
-    from pdhef_logtool.results.gate import load_gate
+    from pdhef_logtool.results.gate import gate_of
 
-    asked = DEFAULT_GATE if gate is None else load_gate(gate)
+    asked = DEFAULT_GATE if plan is None else gate_of(load_plan(plan))
     settings = RetrainSettings(config=config, seed=seed, init=init, epochs=epochs, gate=asked, strict=strict)
     with console.reporter() as reporter:
         result = train_again(logs, output, settings, jobs=jobs, reporter=reporter)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +12,7 @@ import typer
 from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options, panels
+from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -26,6 +28,7 @@ commands = typer.Typer()
     "pdhef report out --open",
     "pdhef report out --by car --by vehicle_id",
     "pdhef report out --png --json",
+    "pdhef report out --pdf",
     panel=panels.READ,
 )
 def report(
@@ -36,6 +39,10 @@ def report(
         Option(metavar="KEY", help="Breakdown of the drives: car, folder, or a metadata key. Repeatable."),
     ] = None,
     png: Annotated[bool, Option("--png", help="Write each figure as a PNG file too, to logs/LOG/figures.")] = False,
+    pdf: Annotated[
+        bool, Option("--pdf", help="Write report.pdf to sign: cover, verdicts, drives, input hashes. Needs Chromium.")
+    ] = False,
+    positions: Annotated[bool, Option("--positions", help="Include the paths of the drives in report.pdf.")] = False,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Write the HTML reports of a finished run again."""
@@ -43,9 +50,15 @@ def report(
     from pdhef_logtool.results.opened_run import LOGS, open_run
     from pdhef_logtool.storage.outputs import OutputFolder
 
+    if positions and not pdf:
+        raise UsageError(expected="--pdf", got="--positions alone", where="--positions")
     open_run(output)  # before the folder is held, which would make it where it is missing
     with OutputFolder(output, (LOGS,)), console.reporter() as reporter:
         result = write_pages(open_run(output), reporter.progress, png=png, by=by or ())
+        if pdf:
+            from pdhef_logtool.reports.pdf import write_pdf
+
+            result = replace(result, pdf=write_pdf(open_run(output), positions=positions))
     console.show(result, _render, as_json)
     for line in result.wrong:
         console.warn(line)
@@ -68,6 +81,8 @@ def open_page(result: WrittenPages) -> None:
 
 
 def _render(result: WrittenPages, out: Console) -> None:
+    if result.pdf is not None:
+        out.print(str(result.pdf), soft_wrap=True)
     for page in (*result.pages, result.fleet):
         if page.file is not None:
             number = f"{len(page.pictures)} picture{'s' if len(page.pictures) > 1 else ''}"

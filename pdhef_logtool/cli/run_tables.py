@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pdhef_logtool.cli.console import cell, table
+from pdhef_logtool.cli.plan_tables import plan_line, render_plan
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.geometry import DEGREES
@@ -25,7 +27,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from pdhef_logtool.evaluation.metrics.metric import Metric
-    from pdhef_logtool.evaluation.thresholds import Verdict
     from pdhef_logtool.results.run_report import LogOutcome
     from pdhef_logtool.results.summary import RunSummary
     from pdhef_logtool.runs.pipeline import RunResult
@@ -76,7 +77,7 @@ _TEXTS = {
     "band": "95 % CI",
     "hindsight": "In hindsight",
     "assumed": "Assumed",
-    "next": "Next",
+    "next": "Then",
 }
 
 
@@ -85,17 +86,19 @@ def render_run(result: RunResult, console: Console) -> None:
     reports_by_log = [(r, all_printable(r.report)) for r in result.results]
     reports = [report for _, report in reports_by_log if report is not None]
     alike = None
+    console.print(_head(result, reports))
+    console.print()
     if len(reports) > 1 and all(report["answer"] for report in reports):
         alike = _Alike.of(reports)
         console.print(_joint_table(reports))
-        console.print(_lines(alike.texts))
+        console.print(_lines({key: text for key, text in alike.texts.items() if key != "assumed"}))
         for remark, logs in alike.remarks.items():
             _print_indented(f"note: {remark} ({', '.join(logs)})", console)
         console.print()
     for log_result, report in reports_by_log:
         _render_log(log_result.outcome, report, console, alike)
-    if result.verdicts:
-        _render_verdicts(result.verdicts, console)
+    if result.requirements is not None:
+        render_plan(result.requirements, console)
     failed = [r for r, report in reports_by_log if report is None]
     lost = [r for r in result.results if r.outcome.lost]
     if len(result.results) > 1 or failed:
@@ -105,8 +108,57 @@ def render_run(result: RunResult, console: Console) -> None:
         _print_outputs(result.place, console)
 
 
+def _head(result: RunResult, reports: Sequence[_Report]) -> Table:
+    """Return the three lines that come first: result, assumptions, next step."""
+    verdicts = None if result.requirements is None else plan_line(result.requirements)
+    texts = [_texts(report) for report in reports]
+    if len(result.results) == 1:
+        said = texts[0].get("result", "nothing was estimated") if texts else "the log failed"
+    else:
+        said = f"{len(reports)} of {len(result.results)} logs are done"
+    clauses = [_clauses("assumed", t.get("assumed", "")) for t in texts]
+    assumed = [c for c in clauses[0] if c and all(c in others for others in clauses)] if clauses else []
+    steps = list(dict.fromkeys(c for t in texts for c in _clauses("next", t.get("next", "")) if c))
+    given = result.requirements
+    if given is not None and given.plan.file:
+        steps = [*dict.fromkeys(f"{v.requirement.id}: {v.next}" for v in given.verdicts if v.next), *steps]
+    return _three_lines(
+        said if verdicts is None else Text.assemble(verdicts, f"; {said}"),
+        "; ".join(assumed) or "differs by log, see below",
+        steps[0] if steps else "nothing is needed; pdhef view OUTPUT shows the drive",
+    )
+
+
+def _three_lines(result: str | Text, assumed: str, following: str) -> Table:
+    lines = Table.grid(padding=(0, 2, 0, 0))
+    lines.add_column(no_wrap=True, style="bold")
+    lines.add_column(overflow="fold")
+    for head, text in (("Result", result), ("Assumed", assumed), ("Next", following)):
+        lines.add_row(head, text)
+    return lines
+
+
+def _fleet_head(summary: RunSummary) -> Table:
+    """Return the three lines of a run of many logs."""
+    requirements = (summary.plan or {}).get("requirements") or ()
+    counts = Counter(str(r["outcome"]) for r in requirements)
+    verdicts = ", ".join(f"{n} {outcome}" for outcome, n in sorted(counts.items()))
+    name = (summary.plan or {}).get("file") or "default plan, no gate"
+    rmse = f"median sideslip RMSE {degrees(summary.errors[0].median_rad)}" if summary.errors else "no drive is scored"
+    steps = [f"{r['id']}: {r['next']}" for outcome in ("FAIL", "INCONCLUSIVE") for r in requirements
+             if r["outcome"] == outcome and r["next"]]  # fmt: skip
+    failed = "read the failures below" if summary.failed else f"open {Path(summary.output) / PAGE_FILE}"
+    return _three_lines(
+        f"{verdicts} ({name}); {rmse} of {summary.scored} drives" if verdicts else f"{rmse} of {summary.scored} drives",
+        "differs by drive, see report.json",
+        steps[0] if steps else failed,
+    )
+
+
 def render_fleet(summary: RunSummary, console: Console) -> None:
     """Print a run of many logs: the errors over drives, the worst of them, what failed, and where the outputs are."""
+    console.print(_fleet_head(summary))
+    console.print()
     if summary.errors:
         spread = table("sideslip by", ">drives", ">median °", ">p90 °", ">largest °")
         for of in summary.errors:
@@ -145,16 +197,6 @@ def _print_outputs(output: Path | str, console: Console) -> None:
     page = Path(output) / PAGE_FILE
     shown = f"; open {page} in a browser" if page.is_file() else ""
     console.print(f"outputs in {output}{shown}", soft_wrap=True)
-
-
-def _render_verdicts(verdicts: Sequence[Verdict], console: Console) -> None:
-    judged = table("threshold", "estimator", "log", ">value", ">margin", "verdict", fold=3)
-    for v in verdicts:
-        mark = "" if v.independent else " †"
-        value, margin = ("-" if x is None else f"{x:.4g}" for x in (v.value, v.margin))
-        judged.add_row(v.threshold.label + mark, v.estimator, v.log, value, margin, v.outcome)
-    console.print(judged)
-    console.print(f"{len(verdicts)} verdicts, {sum(v.failed for v in verdicts)} failed\n")
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,8 +242,8 @@ def _render_log(outcome: LogOutcome, report: _Report | None, console: Console, a
             if not (scored and key in ("result", "band"))
             and (clauses_here := [c for c in _clauses(key, text) if c not in _clauses(key, alike.texts.get(key, ""))])
         }
-    elif answer is not None:
-        texts = {**texts, "next": texts.get("next", "nothing is needed; pdhef view OUTPUT shows the drive")}
+    else:
+        texts = _below_head(texts)
     tabled = alike is None or answer["named"]
     above = list(_failed_checks(report))
     below = list(_below(report, () if alike is None else alike.remarks, tabled=tabled))
@@ -231,6 +273,13 @@ def _texts(report: _Report) -> dict[str, str]:
         name = best["name"] if best["causal"] else f"{best['name']} (not causal)"
         texts["hindsight"] = f"by this log's ground truth {name} was best, {error} RMSE; nothing was chosen by it"
     return {key: texts[key] for key in _TEXTS if texts.get(key)}
+
+
+def _below_head(texts: Mapping[str, str]) -> dict[str, str]:
+    """Return the texts that the three lines above do not have: of the next steps those behind the first."""
+    rest = {key: text for key, text in texts.items() if key not in ("result", "assumed", "next")}
+    later = _clauses("next", texts.get("next", ""))[1:]
+    return {**rest, **({"next": "; ".join(later)} if later else {})}
 
 
 def _clauses(key: str, text: str) -> list[str]:

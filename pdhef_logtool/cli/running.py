@@ -34,10 +34,6 @@ def _list_estimators(show: bool) -> None:
         raise typer.Exit
 
 
-#: Failed thresholds that are printed one by one.
-_MOST_VERDICTS = 50
-
-
 @options.command(
     commands,
     "pdhef run drive.mcap -o out",
@@ -46,7 +42,7 @@ _MOST_VERDICTS = 50
     "pdhef run fleet/ -o out --cars cars.toml",
     "pdhef run s3://bucket/day/ -o out --annotate sidecar",
     "pdhef run drive.mcap -o out --start +60s --end end-5s --json",
-    "pdhef run logs/ -o out --thresholds limits.toml --junit out/gate.xml",
+    "pdhef run logs/ -o out --plan plan.toml --junit out/plan.xml",
     "pdhef run fleet/ -o out --jobs 8 --keep metrics",
     "pdhef run fleet/ new/ -o out --jobs 8 --resume",
     "pdhef run fleet/ -o out --only drive_0312",
@@ -59,7 +55,7 @@ _MOST_VERDICTS = 50
     "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).\n\n"
     'cars.toml, with paths relative to it: [folders] "fleet/golf" = "cars/golf"; [logs] "run_*.mcap" = '
     '"mini.toml"; [metadata.vehicle_id] "WVW-1" = "cars/golf"; default = "saloon" above them.',
-    shared="cars estimators annotate keep cache clock setup setup_from_s friction thresholds network calibrate "
+    shared="cars estimators annotate keep cache clock setup setup_from_s friction plan network calibrate "
     "reference gnss waived",
     car="Car of the logs (default: a sedan)",
 )
@@ -73,6 +69,7 @@ def run(  # positional: one an option of the command line
     ],
     config: RunConfig,
     junit: options.JunitFile = None,
+    strict: options.Strict = False,
     report: Annotated[
         bool, Option(help="Write HTML reports: report.html per log and for the run.", rich_help_panel=options.OUTPUT)
     ] = True,
@@ -114,7 +111,9 @@ def run(  # positional: one an option of the command line
 
     schedule = Schedule(jobs, ray, resume, retry, only or ())
     with console.reporter() as reporter:
-        result = run_logs(logs, output, config, schedule=schedule, junit=junit, report=report, reporter=reporter)
+        result = run_logs(
+            logs, output, config, schedule=schedule, junit=junit, report=report, strict=strict, reporter=reporter
+        )
     _finish(result, as_json)
 
 
@@ -125,13 +124,13 @@ def run(  # positional: one an option of the command line
     "  --estimate vx_m_s=/esc/state.speed --name esc",
     "pdhef metrics drive.mcap --estimate /pdhef/phy_ukf/state \\",
     "  --truth /ins/odometry --car mycar -o out",
-    "pdhef metrics drive.mcap -m mapping.toml --thresholds limits.toml --json",
+    "pdhef metrics drive.mcap -m mapping.toml --plan plan.toml --json",
     panel=panels.RUN,
     notes="Signals of nav_msgs/Odometry, geometry_msgs/Twist*Stamped and pdhef_msgs/VehicleStateEstimate are "
     "recognised by type. Other topics need SIGNAL=, one of vx_m_s, vy_m_s, yaw_rate_rad_s, sideslip_rad, ay_m_s2, "
     "their *_std_*, valid. A mapping file can contain scales, offsets, signs and several estimators, one table "
     "[estimates.NAME.SIGNAL] per signal.",
-    shared="thresholds",
+    shared="plan",
     car="Car of the log (position of the ground truth, friction, lowest speed)",
 )
 def metrics(
@@ -156,6 +155,7 @@ def metrics(
         Path | None, Option("--output", "-o", help="Output folder for tables and report. Default: print only.")
     ] = None,
     junit: options.JunitFile = None,
+    strict: options.Strict = False,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Score an estimate that the log contains, with the metrics of pdhef run."""
@@ -170,6 +170,7 @@ def metrics(
             name=name,
             output=output,
             junit=junit,
+            strict=strict,
             reporter=reporter,
         )
     _finish(result, as_json)
@@ -229,16 +230,13 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
         for entry in result.results:
             if entry.outcome.failed is not None and entry.report is not None:  # of the others the tables state it
                 console.error(f"pdhef: {entry.outcome.log}: {entry.outcome.failed}")
-    failed = [v for v in result.verdicts if v.failed]
-    for verdict in failed[:_MOST_VERDICTS]:
-        where = f"{verdict.log}: {verdict.estimator}: {verdict.threshold.label}"
-        console.error(f"pdhef: threshold failed: {where}: {verdict.reason}")
-    if len(failed) > _MOST_VERDICTS:
-        console.error(
-            f"pdhef: {len(failed) - _MOST_VERDICTS} more of {len(result.verdicts)} thresholds failed (--junit)"
-        )
-    if failed and not result.is_fleet:
-        for entry in result.results:
+    plan = result.requirements
+    if plan is not None and plan.closes_gate:
+        for verdict in plan.verdicts:
+            if verdict.outcome == "FAIL" or (plan.strict and verdict.outcome == "INCONCLUSIVE"):
+                where = f"{verdict.requirement.id} ({verdict.requirement.label})"
+                console.error(f"pdhef: {verdict.outcome}: {where}: {verdict.reason}")
+        for entry in result.results if not result.is_fleet else ():
             if entry.outcome.outcome != "ok":
                 console.error(f"pdhef: {entry.outcome.log} besides {entry.outcome.outcome}")
     raise typer.Exit(result.exit_code)

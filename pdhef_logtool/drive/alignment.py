@@ -129,6 +129,13 @@ class AlignmentPlan:
         """Whether the mapping provides GNSS velocity."""
         return has_gnss({c.target for c in self.channels})
 
+    def without(self, refused: Mapping[str, str]) -> AlignmentPlan:
+        """Return the plan without channels; ``refused`` gives the reason by name. The stamps of the grid stay."""
+        channels = tuple(c for c in self.channels if c.name not in refused)
+        unused = {**dict(self.unused), **{c.name: refused[c.name] for c in self.channels if c.name in refused}}
+        speed_from = _speed_source({c.target for c in channels})
+        return replace(self, channels=channels, unused=tuple(sorted(unused.items())), speed_from=speed_from)
+
     @property
     def by_stamp(self) -> tuple[ChannelPlan, ...]:
         """Channels that are read by their stamps: what is estimated from them is not causal."""
@@ -185,19 +192,13 @@ def plan_alignment(
         _plan_channel(survey[name], target, scale, survey[grid], grid_period, clock)
         for name, (target, scale) in sorted(chosen.items())
     )
-    if "speed_m_s" in chosen:
-        speed_from = "speed_m_s"
-    else:
-        wheels = {target for target, _ in chosen.values() if target.startswith("wheel_speed_")}
-        gnss = "GNSS" if has_gnss(chosen) else "none"
-        speed_from = "wheel speeds" if _has_whole_axle(wheels) else gnss
     return AlignmentPlan(
         grid_channel=grid,
         grid_channels=tuple(p.name for p in plans if p.name in _IMU and p.method == "exact"),
         grid_period_s=grid_period,
         channels=plans,
         unused=tuple(sorted(unused.items())),
-        speed_from=speed_from,
+        speed_from=_speed_source({target for target, _ in chosen.values()}),
     )
 
 
@@ -376,8 +377,14 @@ def _choose_sources(
     return chosen, unused
 
 
-def _has_whole_axle(columns: set[str]) -> bool:
-    return any({f"wheel_speed_{side}_m_s" for side in axle} <= columns for axle in (("fl", "fr"), ("rl", "rr")))
+def _speed_source(columns: set[str]) -> str:
+    """Return what the aligned columns take the speed from."""
+    if "speed_m_s" in columns:
+        return "speed_m_s"
+    whole_axle = any({f"wheel_speed_{side}_m_s" for side in axle} <= columns for axle in (("fl", "fr"), ("rl", "rr")))
+    if whole_axle:
+        return "wheel speeds"
+    return "GNSS" if has_gnss(columns) else "none"
 
 
 def _plan_channel(  # positional: one call

@@ -18,6 +18,8 @@ MAX_GAP_PERIODS = 2.5
 LONGEST_GAP_S = 2.5
 #: 21 hours about the middle of the drive; it keeps one wrong stamp from making a grid of decades.
 MAX_CELLS = 1_500_000
+#: Blocks of the parts of a drive that must agree: longer than a manoeuvre, and at most so many.
+PART_S, MOST_PARTS = 4.0, 12
 #: Moving: faster than this share of the drive's fast speeds, and than a speed that is too low for the relations.
 MOVING_SHARE = 0.25
 MIN_MOVING_M_S = 0.5
@@ -50,14 +52,21 @@ def earlier(column: FloatArray, by_s: float) -> FloatArray:
     return column if by_s == 0.0 else np.interp(cell, np.arange(column.shape[0]), column, left=np.nan, right=np.nan)
 
 
-def moving_at(speed: FloatArray) -> BoolArray:
+def moving_at(speed: FloatArray, least_m_s: float = MIN_MOVING_M_S) -> BoolArray:
     """Return where the car drives: by the drive's own fast speeds, so that a 1:10 car counts as a car does."""
     finite = np.abs(speed[np.isfinite(speed)])
     if finite.shape[0] == 0:
         return np.zeros(speed.shape[0], np.bool_)
-    limit = max(MIN_MOVING_M_S, MOVING_SHARE * float(np.quantile(finite, 0.9)))
+    limit = max(least_m_s, MOVING_SHARE * float(np.quantile(finite, 0.9)))
     with np.errstate(invalid="ignore"):
         return np.asarray(np.abs(speed) > limit, dtype=np.bool_)
+
+
+def halves(cells: int) -> tuple[BoolArray, BoolArray]:
+    """Return two independent parts of a drive of so many cells, [cells] each: alternate blocks, so that both drive."""
+    block = max(round(PART_S / GRID_S), cells // MOST_PARTS)
+    first = (np.arange(cells) // max(block, 1)) % 2 == 0
+    return first, ~first
 
 
 def independent_samples(count: int) -> float:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pdhef_logtool.drive.columns import columns_on_grid, derivative, moving_at
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
+from pdhef_logtool.drive.columns import columns_on_grid, derivative, halves, moving_at
 from pdhef_logtool.drive.relations import Relation, measured_relations
 from pdhef_logtool.drive.truth import TruthTrack, channel_of
+from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
 
 #: Name of the column that is the mean of the wheel speeds.
@@ -25,18 +27,28 @@ class Measured:
     Attributes
     ----------
     speed_name : the column used as the speed. topics : of the signals, by name.
+    scales : by name, those of ground truth with ``truth.``, what the mapping multiplies the raw values with.
     """
 
     columns: Mapping[str, FloatArray]
     speed_name: str | None
     relations: tuple[Relation, ...]
     topics: Mapping[str, str]
+    scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
 
     def without_truth(self) -> Measured:
         """Return what the signals alone state."""
         columns = {n: c for n, c in self.columns.items() if not n.startswith("truth.")}
         kept = tuple(r for r in self.relations if not any(n.startswith("truth.") for n in r.powers))
         return replace(self, columns=columns, speed_name=_own(self.speed_name), relations=kept)
+
+    def parts(self, vehicle: VehicleParameters | None) -> Iterator[Measured]:
+        """Yield what two independent parts of the drive state, each by itself."""
+        cells = len(next(iter(self.columns.values()), np.empty(0)))
+        for part in halves(cells):
+            columns = {n: np.where(part, c, np.nan) for n, c in self.columns.items()}
+            related = measured_relations(columns, self.speed_name, _known(vehicle))
+            yield replace(self, columns=columns, relations=tuple(related))
 
     def without(self, names: Iterable[str]) -> Measured:
         """Return it without columns that no relation is about."""
@@ -60,17 +72,36 @@ class Measured:
         return [*groups, *([tuple(wheels)] if len(wheels) > 1 else [])]
 
 
+def _known(vehicle: VehicleParameters | None) -> VehicleParameters | None:
+    return None if vehicle in (None, default_vehicle()) else vehicle
+
+
 def _own(speed_name: str | None) -> str | None:
     return None if speed_name is None or speed_name.startswith("truth.") else speed_name
 
 
 def measure(
-    signals: Mapping[str, Channel], truth: Mapping[str, Channel] | None = None, derived: TruthTrack | None = None
+    signals: Mapping[str, Channel],
+    truth: Mapping[str, Channel] | None = None,
+    derived: TruthTrack | None = None,
+    vehicle: VehicleParameters | None = None,
+    mapping: SignalMapping | None = None,
 ) -> Measured:
-    """Bring signals and ground truth, as mapped, to one grid and relate them. ``derived`` : ground truth at the CG."""
+    """Bring signals and ground truth, as mapped, to one grid and relate them.
+
+    Parameters
+    ----------
+    derived : ground truth at the CG. vehicle : the default car states nothing. mapping : of the channels, if known.
+    """
     columns, speed_name = drive_columns(signals, truth or {}, derived)
     topics = {n: c.source.split(".")[0] for n, c in signals.items()}
-    return Measured(columns, speed_name, tuple(measured_relations(columns, speed_name)), topics)
+    scales: dict[str, float | tuple[float, ...]] = {}
+    if mapping is not None:
+        scales |= {n: s.scale for n, s in mapping.signals.items()}
+        scales |= {f"truth.{n}": s.scale for n, s in mapping.truth.items()}
+    return Measured(
+        columns, speed_name, tuple(measured_relations(columns, speed_name, _known(vehicle))), topics, scales
+    )
 
 
 def drive_columns(

@@ -8,17 +8,19 @@ so, by complex regression, and its fit gives whether all of it is accepted.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.checks import check_drive
-from pdhef_logtool.drive.checks.by_relations import explained_factors
+from pdhef_logtool.drive.checks.by_relations import explained_factors, is_wrong_by
 from pdhef_logtool.drive.checks.mounting import MOUNTING
-from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
+from pdhef_logtool.drive.columns import derivative, halves, independent_samples, moving_at
 from pdhef_logtool.drive.delays import LateSensor, late_sensors
 from pdhef_logtool.drive.faulty_samples import without_faulty_samples
 from pdhef_logtool.drive.frames import (
@@ -31,6 +33,7 @@ from pdhef_logtool.drive.frames import (
     rotation_text,
 )
 from pdhef_logtool.drive.measured import Measured, measure
+from pdhef_logtool.drive.other_fields import with_other_fields
 from pdhef_logtool.drive.relations import gentle_at, steering_references, units_told, yaw_references
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
@@ -44,11 +47,13 @@ from pdhef_logtool.drive.truth import (
     yaw_rate_channel,
 )
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, read_signals
+from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, fit_clocks, read_signals
 from pdhef_logtool.mapping.frames import Placement, placement_of
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
 from pdhef_logtool.records.checks import Check
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray
+
+ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 
 #: Mean accelerations below are no gravity: the sensor's software took it off.
 COMPENSATED_M_S2 = 3.0
@@ -66,6 +71,10 @@ MAX_ERROR_DEG = 7.5
 TILT_DEG = 4.0
 YAW_DEG = 4.0
 ASKEW_SAMPLES = 40.0
+#: A part of a drive shows less than all of it; where the parts are too short, all of it must show more.
+PART_CORRELATION = 0.6
+#: Two parts of a drive that differ by more do not agree; beyond the number the regressors cannot be told apart.
+PARTS_AGREE_DEG, PARTS_AGREE_SHARE, WELL_CONDITIONED = 2.5, 0.2, 60.0
 ASKEW_CORRELATION = 0.85
 ASKEW_ERROR_DEG = 1.5
 #: Correlation of the yaw rate with another measurement of it that settles its sign.
@@ -129,7 +138,17 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
     if not fitting:
         return None
     best, hand = max(fitting, key=lambda x: x[0].correlation + np.sign(x[0].sign))
-    return Mounting(_snapped(best), named, best.evidence, best.sign > 0.0 or best.along, hand)
+    found = Mounting(_snapped(best), named, best.evidence, best.sign > 0.0 or best.along, hand)
+    if not found.confident or found.is_as_named:
+        return found
+    step = nearest_step(best.rotation)
+    parts = [
+        _turned(f, hand * w, np.where(part, speed, np.nan), best.rotation[2], references) for part in halves(len(speed))
+    ]
+    fitted = [p for p in parts if p is not None]
+    agree = all(p.correlation >= PART_CORRELATION and np.allclose(nearest_step(p.rotation), step) for p in fitted)
+    is_long = len(fitted) == len(parts) or best.correlation >= ASKEW_CORRELATION
+    return found if agree and is_long else replace(found, confident=False)
 
 
 def _named_rows(mapping: Mapping, accelerations: Triad, rates: Triad) -> FloatArray:
@@ -146,7 +165,8 @@ class _Turn:
     """A rotation for one choice of the vertical, and how well it explains the drive.
 
     ``sign``: correlation of the yaw rate with another measurement of it, 0: none. ``along``: the speed alone shows
-    which way is forward.
+    which way is forward. ``askew_deg``, ``tilts``: of two parts of the drive, what is left of the angle about the
+    vertical beside grade, steady sideslip and unequal gains, and the vertical [3] in the rotation's axes.
     """
 
     rotation: FloatArray
@@ -157,6 +177,8 @@ class _Turn:
     along: bool
     fits: bool
     evidence: str
+    askew_deg: tuple[float, float] | None = None
+    tilts: tuple[FloatArray, FloatArray] | None = None
 
 
 def _ups(f: FloatArray, w: FloatArray, named: FloatArray) -> list[FloatArray]:
@@ -225,7 +247,49 @@ def _turned(
     )
     fits = correlation >= MIN_CORRELATION and GAIN_RANGE[0] <= gain <= GAIN_RANGE[1] and error <= MAX_ERROR_DEG
     along = _along(rotation[0] @ f[use].T, driven[use].real)
-    return _Turn(rotation, correlation, error, samples, sign, along, fits, evidence)
+    askew = _askew_of_parts(f, rotation, driven, rate, use)
+    tilts = _tilts_of_parts(f, rotation, driven, use)
+    return _Turn(rotation, correlation, error, samples, sign, along, fits, evidence, askew, tilts)
+
+
+def _askew_of_parts(
+    f: FloatArray, rotation: FloatArray, driven: ComplexArray, rate: FloatArray, use: BoolArray
+) -> tuple[float, float] | None:
+    """Return for two parts of a drive the angle that a rotation still lacks, degrees; None if one does not show it.
+
+    Steady sideslip turns the acceleration by an angle that grows with lateral acceleration and curvature, roll and
+    pitch change the gains of both axes, and grade and crossfall are slow: each has its regressor, or is a constant.
+    """
+    z = f @ rotation[0] + 1j * (f @ rotation[1])
+    lateral = driven.imag
+    regressors = [driven, driven.conj(), 1j * derivative(rate), lateral**2, rate**2, np.ones_like(driven)]
+    matrix = np.stack([np.asarray(r, np.complex128) for r in regressors], axis=1)
+    angles = []
+    for part in halves(len(use)):
+        usable = use & part & np.isfinite(matrix).all(axis=1) & np.isfinite(z)
+        size = np.linalg.norm(matrix[usable], axis=0)
+        if independent_samples(int(np.count_nonzero(usable))) < ASKEW_SAMPLES / 2.0 or (size <= 1e-9).any():
+            return None
+        scaled = matrix[usable] / size
+        if np.linalg.cond(scaled) > WELL_CONDITIONED:
+            return None
+        angles.append(math.degrees(float(np.angle(np.linalg.lstsq(scaled, z[usable], rcond=None)[0][0]))))
+    return angles[0], angles[1]
+
+
+def _tilts_of_parts(
+    f: FloatArray, rotation: FloatArray, driven: ComplexArray, use: BoolArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return the vertical [3] of two parts of a drive in the axes of a rotation."""
+    ups = []
+    for part in halves(len(use)):
+        usable = use & part
+        if not usable.any():
+            return None
+        mean = rotation @ f[usable].mean(axis=0)
+        mean -= np.array([driven[usable].real.mean(), driven[usable].imag.mean(), 0.0])
+        ups.append(np.asarray(mean / max(float(np.linalg.norm(mean)), 1e-9)))
+    return ups[0], ups[1]
 
 
 def _along(measured: FloatArray, driven: FloatArray) -> bool:
@@ -259,13 +323,34 @@ def _snapped(turn: _Turn) -> FloatArray:
     is_precise = turn.correlation >= ASKEW_CORRELATION and turn.error_deg <= ASKEW_ERROR_DEG
     if not is_precise or turn.samples < ASKEW_SAMPLES:
         return step
-    is_turned = abs(yaw) > max(YAW_DEG, 3.0 * turn.error_deg)
-    if tilt > TILT_DEG:
+    is_turned = abs(yaw) > max(YAW_DEG, 3.0 * turn.error_deg) and _parts_turned(turn, yaw)
+    if tilt > TILT_DEG and _parts_tilted(turn):
         return rotation if is_turned else _level_only(rest) @ step
     if not is_turned:
         return step
     c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
     return np.asarray(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ step)
+
+
+def _parts_turned(turn: _Turn, yaw_deg: float) -> bool:
+    """Return whether two parts of the drive agree that the sensor is turned about the vertical."""
+    if turn.askew_deg is None:
+        return False
+    first, second = (yaw_deg - angle for angle in turn.askew_deg)
+    return min(first * np.sign(yaw_deg), second * np.sign(yaw_deg)) > YAW_DEG and abs(first - second) < max(
+        PARTS_AGREE_DEG, PARTS_AGREE_SHARE * abs(yaw_deg)
+    )
+
+
+def _parts_tilted(turn: _Turn) -> bool:
+    """Return whether two parts of the drive agree that the sensor is tilted: one of them may be a hill."""
+    if turn.tilts is None:
+        return False
+    step = nearest_step(turn.rotation)
+    first, second = (step @ turn.rotation.T @ up for up in turn.tilts)
+    tilts = [math.degrees(math.acos(float(np.clip(up[2], -1.0, 1.0)))) for up in (first, second)]
+    apart = math.degrees(math.acos(float(np.clip(first @ second, -1.0, 1.0))))
+    return min(tilts) > TILT_DEG and apart < PARTS_AGREE_DEG
 
 
 def _level_only(rest: FloatArray) -> FloatArray:
@@ -285,7 +370,7 @@ def _level_only(rest: FloatArray) -> FloatArray:
 class Survey:
     """The first minutes of a log as its mapping reads them, the IMU turned into the car where that is certain.
 
-    ``vehicle``: from the vehicle file, or the default car.
+    ``vehicle``: from the vehicle file, or the default car. ``reread``: completes the checks of a mapping file.
     """
 
     mapping: Mapping
@@ -299,6 +384,7 @@ class Survey:
     mounting: Mounting | None = None
     placed: Placement | None = None
     framed: Check | None = None
+    reread: Callable[[tuple[Check, ...]], tuple[Check, ...]] | None = None
 
     @property
     def mounted(self) -> tuple[Check, ...]:
@@ -336,7 +422,8 @@ class Survey:
                 k if c.verdict == "undecided" and c.name in settled else c
                 for c, k in zip(drive_checks, passed, strict=True)
             )
-        return (*self.mounted, *self._of_names(drive_checks), *drive_checks)
+        checks = (*self.mounted, *self._of_names(drive_checks), *drive_checks)
+        return checks if self.reread is None else self.reread(checks)
 
     @cached_property
     def late(self) -> tuple[LateSensor, ...]:
@@ -389,7 +476,7 @@ def survey_log(
     channels = read_signals(log, replace(mapping, signals={**mapping.signals, **extra}), clocks, *span_ns)
     truth_plan = plan_truth(channels.truth, truth_position_m=vehicle.truth_position_m) if channels.truth else None
     truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
-    measured = measure(channels.signals, channels.truth, truth)
+    measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     # The input of an estimator must not depend on ground truth: with it, a mounting is only checked.
     mounting = find_mounting(measured.without_truth(), triads, mapping)
     blind = mounting is not None and mounting.confident
@@ -406,10 +493,18 @@ def survey_log(
         mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
         channels = read_signals(log, mapping, clocks, *span_ns)
         mounting = replace(mounting, named=mounting.rows)
-        measured = measure(channels.signals, channels.truth, truth)
+        measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     latency = truth_latency(channels, truth)
     survey = Survey(mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, placed, framed)
-    return _rescaled(survey, log, clocks, span_ns) if rescale and mapping.origin == "auto" else survey
+    if not rescale:
+        return survey
+    if mapping.origin == "auto":
+        return _rescaled(survey, log, clocks, span_ns)
+
+    def checks_of(other: Mapping) -> tuple[Check, ...]:
+        return survey_log(log, other, fit_clocks(log, other, *span_ns), span_ns, vehicle, rescale=False).checks
+
+    return replace(survey, reread=lambda checks: with_other_fields(checks, log, mapping, checks_of))
 
 
 def _by_frames(
@@ -445,6 +540,8 @@ def _by_frames(
 def _rescaled(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:
     """Return the survey with the one unit or sign corrected that alone contradicts everything else, with a note.
 
+    No part of the drive may contradict it, by itself.
+
     Ground truth takes no part in it: it is only checked.
     """
     mapping = survey.mapping
@@ -452,10 +549,13 @@ def _rescaled(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span
     if factors:
         sound, shares = without_faulty_samples(survey.channels.signals, survey.vehicle)
         if shares:
-            factors = explained_factors(measure(sound), mounting_is_known=survey.is_mounted, most=1)
+            factors = explained_factors(
+                measure(sound, vehicle=survey.vehicle), mounting_is_known=survey.is_mounted, most=1
+            )
+    parts = [part.without_truth() for part in survey.measured.parts(survey.vehicle)] if factors else []
     signals, notes = dict(mapping.signals), list(mapping.notes)
     for name, (factor, evidence) in factors.items():
-        if name in signals:
+        if name in signals and all(is_wrong_by(part, name, factor) is not False for part in parts):
             signals[name] = scaled_source(signals[name], factor)
             notes.append(f"{name} is read with {factor:.6g} times its scale: {evidence}")
     if signals == mapping.signals:

@@ -30,7 +30,7 @@ from pdhef_logtool.mapping import (
     merge_losses,
 )
 from pdhef_logtool.records.checks import Check
-from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.errors import EstimatorError, MappingError, UsageError
 from pdhef_logtool.records.ledger import SampleCount, damage
 from pdhef_logtool.records.signals import Loss, Signals, join_signals
 from pdhef_logtool.records.steps import MAX_PREDICTION_S
@@ -338,7 +338,14 @@ def read_drive(
             slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
         setup = _setup_of(opened, used, car.vehicle, slice_ns, options)
         plan = plan_drive(
-            opened, used, car.vehicle, *slice_ns, require_imu=require_sensors, clock=options.clock, setup=setup
+            opened,
+            used,
+            car.vehicle,
+            *slice_ns,
+            require_imu=require_sensors,
+            clock=options.clock,
+            setup=setup,
+            waived=options.waived,
         )
         for note in plan.mapping.notes[len(used.notes) :]:
             told(note)
@@ -346,7 +353,8 @@ def read_drive(
         friction = friction_of(plan, car.vehicle, options)
         if friction.note:
             remarks.append(friction.note)
-    except BaseException:
+    except BaseException as error:
+        _name_damage(error, opened)
         opened.close()
         raise
     return Drive(log_input.stem, opened, car, options, plan, chosen, notes, friction, tell, remarks)
@@ -363,7 +371,7 @@ def _setup_of(
     start_ns, end_ns = slice_ns
     first = _as_far_as_decided(log, options)
     until_ns = min(end_ns, first.end_ns)
-    return setup_of(plan_drive(first, mapping, vehicle, start_ns, until_ns, clock=options.clock))
+    return setup_of(plan_drive(first, mapping, vehicle, start_ns, until_ns, clock=options.clock, waived=options.waived))
 
 
 def _as_far_as_decided(log: DriveLog, options: ReadOptions) -> DriveLog:
@@ -394,6 +402,17 @@ def one_log(argument: LogPlace | str, options: ReadOptions = _AS_IT_IS) -> LogIn
 def lost_texts(losses: Iterable[Loss]) -> tuple[str, ...]:
     """Return what of the input is gone, in words."""
     return tuple(f"{x.what} ({x.where})" for x in losses if x.severity == "lost")
+
+
+def _name_damage(error: BaseException, log: DriveLog) -> None:
+    """Add the damage of a log to an error, as its probable cause: a file that is cut contains no mapped fields."""
+    if not isinstance(error, MappingError | EstimatorError) or not (
+        lost := [x for x in log.lost if x.severity == "lost"]
+    ):
+        return
+    error.got = f"a damaged log: {'; '.join(x.what for x in lost[:2])}. {error.got[:1].upper()}{error.got[1:]}"
+    if any(x.kind == "truncated" for x in lost):
+        error.remedy = f"the file is cut: copy the recording again. If it is complete, {error.remedy or 'report it'}"
 
 
 def no_samples(path: LogPlace) -> EstimatorError:
@@ -434,7 +453,10 @@ def _tell_doubts(plan: DrivePlan, options: ReadOptions, tell: Tell) -> None:
                 f"{MAX_PREDICTION_S:g} s: it is read by its stamps, and no estimate of this log is causal"
             )
     for name, reason in plan.alignment.unused:
-        tell(f"{name} is not used: {reason}")
+        if name not in plan.refused:
+            tell(f"{name} is not used: {reason}")
+    if plan.refused:
+        tell(f"not used until the failed checks are corrected or waived: {', '.join(sorted(plan.refused))}")
 
 
 def friction_of(

@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
@@ -36,7 +36,7 @@ GAIN_RANGE = (0.55, 1.8)
 #: The same quantity measured twice.
 SAME_RANGE = (0.75, 1.33)
 #: a_y - v_x r over the derivative of v_y: small differences of large quantities, of a body that rolls.
-SIDESLIP_RANGE = (0.3, 3.0)
+SIDESLIP_RANGE = (0.4, 2.5)
 #: Slip of a rear axle at 1 m/s^2: cornering stiffness over load is 4 to 40 per rad, and much less where a model car
 #: drifts. It gives a sign, no unit.
 COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
@@ -50,9 +50,14 @@ STRAIGHT_M_S2 = 3.0
 #: Rim speed over ground speed, 5 % of slip and 5 % of radius; angular over rim speed, wheels of 4 cm to 80 cm radius.
 WHEEL_RANGE = (0.88, 1.14)
 WHEEL_PER_RADIAN_RANGE = (1.25, 25.0)
-#: Effective wheelbase L (1 + K v²) from road-wheel and from steering-wheel angles; m.
-ROAD_WHEEL_LENGTH_M = (0.15, 12.0)
-STEERING_WHEEL_LENGTH_M = (12.0, 240.0)
+#: Effective wheelbase L (1 + K v²) from road-wheel and from steering-wheel angles; m. From a model car to a truck, and
+#: at speeds that only full-size vehicles reach.
+ROAD_WHEEL_LENGTH_M, FULL_SIZE_LENGTH_M = (0.15, 12.0), (1.2, 12.0)
+STEERING_WHEEL_LENGTH_M, FULL_SIZE_STEERING_WHEEL_LENGTH_M = (12.0, 240.0), (22.0, 240.0)
+FULL_SIZE_M_S = (12.0, 70.0)
+#: The same over L + K v² of the vehicle file, with room for a wrong ratio in it, and tyres near their limit. A speed
+#: that is wrong itself must not make it longer than at the last.
+KNOWN_LENGTH, FAST_M_S = (0.4, 2.5), 40.0
 #: Track from a 1:10 car to a truck.
 TRACK_M = (0.12, 3.0)
 #: Share of the drive's lateral acceleration up to which the steering angle is compared with the curvature: beyond, the
@@ -64,6 +69,10 @@ TYPICAL_WHEEL_RADIUS_M = 0.3
 _TYPICAL = (*(f for t in (TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M) for f in (t, 1.0 / t)),)
 #: By so much in the logarithm must one unit fit better than another: km/h and mph are 0.48 apart.
 CLEARLY_NEARER = 0.25
+#: A range of gains that is narrower rules out all units but one; wider ones are lengths of any car.
+DECIDES_UNIT, SAME_QUANTITY = 13.0, 4.0
+#: Factors between units that mappings confuse for any quantity: degrees, g, km/h.
+_FOREIGN = (1.0 / DEGREE, GRAVITY_M_S2, 3.6)
 #: No more mistakes than this are looked for at once.
 MAX_MISTAKES = 2
 #: And no more signals for those that no mistake explains.
@@ -79,6 +88,7 @@ class Relation:
     expected : range of a plausible gain. samples : independent ones. moves : both sides, or one of two that must move
         together, move by more than what disturbs them. signless : a side is a size.
     least_correlation : below it the gain gives no information. spread : 1-sigma of the measured side.
+    typical : the likeliest gain.
     """
 
     text: str
@@ -91,6 +101,12 @@ class Relation:
     signless: bool = False
     least_correlation: float = MIN_CORRELATION
     spread: float = 0.0
+    typical: float = 1.0
+
+    @property
+    def decides_unit(self) -> bool:
+        """Return whether no other unit that is met in mappings would be plausible as well."""
+        return self.expected[1] < DECIDES_UNIT * self.expected[0]
 
     @property
     def tells(self) -> bool:
@@ -100,9 +116,13 @@ class Relation:
     @property
     def is_close(self) -> bool:
         """Return whether a gain that is not plausible is off by less than known mistakes make, or hardly known."""
+        return abs(self.correlation) < CLOSE_CORRELATION or self.is_near
+
+    @property
+    def is_near(self) -> bool:
+        """Return whether a gain is off by less than known mistakes make: a car that slides, a sensor that saturates."""
         low, high = self.expected
-        wide = replace(self, expected=(low / CLOSE, high * CLOSE))
-        return abs(self.correlation) < CLOSE_CORRELATION or wide.accepts()
+        return replace(self, expected=(low / CLOSE, high * CLOSE)).accepts()
 
     @property
     def is_vague(self) -> bool:
@@ -140,11 +160,15 @@ class Relation:
 
 @dataclass(frozen=True, slots=True)
 class Mistake:
-    """A mistake that mappings are known to make: ``factors`` by signal undo it. ``kind``: sign or unit."""
+    """A mistake that mappings are known to make: ``factors`` by signal undo it. ``kind``: sign or unit.
+
+    ``foreign``: the factor is that of another quantity's unit, as when a template's line is copied.
+    """
 
     factors: dict[str, float]
     words: str
     kind: str
+    foreign: bool = False
 
     @property
     def is_exact(self) -> bool:
@@ -156,13 +180,15 @@ class Mistake:
         return float(np.prod([f ** relation.powers.get(name, 0) for name, f in self.factors.items()]))
 
 
-def measured_relations(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[Relation]:
+def measured_relations(
+    columns: Mapping[str, FloatArray], speed_name: str | None, vehicle: VehicleParameters | None = None
+) -> list[Relation]:
     """Return every relation that the columns allow, whether it shows or not.
 
     Parameters
     ----------
     columns : on the grid, SI, by signal name; those of ground truth begin with ``truth.``.
-    speed_name : the column used as the speed.
+    speed_name : the column used as the speed. vehicle : of a file; None: nothing is known of it.
     """
     relations: list[Relation] = []
     speed = None if speed_name is None else columns[speed_name]
@@ -172,7 +198,7 @@ def measured_relations(columns: Mapping[str, FloatArray], speed_name: str | None
         if pace_name is not None and pace is not None:
             relations += _motion(columns, prefix, pace_name, pace)
     if speed_name is not None and speed is not None:
-        relations += _steering(columns, speed_name, speed)
+        relations += _steering(columns, speed_name, speed, vehicle)
         relations += _speeds(columns, speed_name, speed)
         relations += _wheel_differences(columns, speed_name, speed)
         relations += _courses(columns, speed)
@@ -195,13 +221,14 @@ def smallest_explanations(relations: Sequence[Relation], mistakes: Sequence[Mist
     for size in range(1, MAX_MISTAKES + 1):
         explanations = [
             chosen
-            for chosen in combinations(useful, size)
+            for chosen in combinations([m for m in useful if size == 1 or not m.foreign], size)
             if len({n for m in chosen for n in m.factors}) == sum(len(m.factors) for m in chosen)
             and all(r.accepts(float(np.prod([m.acts_on(r) for m in chosen]))) for r in telling)
         ]
         if explanations:
-            simplest = min(_cost(chosen) for chosen in explanations)
-            cheap = [chosen for chosen in explanations if _cost(chosen) == simplest]
+            near = _nearest(relations, explanations)
+            simplest = min(_cost(chosen) for chosen in near)
+            cheap = sorted((e for e in near if _cost(e) == simplest), key=lambda e: _misfit(relations, e))
             return [c for c in cheap if not any(_signals(other) < _signals(c) for other in cheap)]
     return []
 
@@ -212,7 +239,7 @@ def contradicting(relations: Sequence[Relation]) -> set[str]:
     As few as possible, and of them those that the fewest other relations show to be right; the wheels are one.
     """
     bad = [r for r in relations if r.tells and not r.accepts()]
-    good = [r for r in relations if r.tells and r.accepts()]
+    good = [r for r in relations if r.tells and r.accepts() and len({_sensor(n) for n in r.powers}) > 1]
     sets = [{_sensor(n) for n in r.powers} for r in bad]
     names = sorted({n for s in sets for n in s})
     best: tuple[int, tuple[str, ...]] | None = None
@@ -223,11 +250,11 @@ def contradicting(relations: Sequence[Relation]) -> set[str]:
                 if best is None or cost < best[0]:
                     best = cost, chosen
     culprits = set(names if best is None else best[1])
-    return {n for r in bad for n in r.powers if _sensor(n) in culprits}
+    return {n for r in relations for n in r.powers if _sensor(n) in culprits}
 
 
 def _sensor(name: str) -> str:
-    return "wheel speeds" if name.startswith("wheel_speed_") else name
+    return "wheel speeds" if name.startswith("wheel_speed") else name
 
 
 def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
@@ -255,7 +282,7 @@ def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
 
 def _is_told(name: str, relations: Sequence[Relation]) -> bool:
     mine = [r for r in relations if name in r.powers and r.tells]
-    others = [factor for factor, _ in _units(name.removeprefix("truth."))]
+    others = [factor for factor, _ in units_of(name.removeprefix("truth."))]
     holds = bool(mine) and bool(others) and all(r.accepts() for r in mine)
     return holds and all(any(not r.accepts(f ** r.powers[name]) for r in mine) for f in others)
 
@@ -267,16 +294,28 @@ def best_explanation(
     if not explanations or len({_signals(e) for e in explanations}) > 1:
         return None
 
-    def misfit(chosen: tuple[Mistake, ...]) -> float:
-        near_one = [r for r in relations if r.tells and r.expected[0] < 1.0 < r.expected[1]]
-        touched = [r for r in near_one if _signals(chosen) & set(r.powers)]
-        gains = [abs(r.gain * float(np.prod([m.acts_on(r) for m in chosen]))) for r in touched]
-        return float(np.mean(np.abs(np.log(gains)))) if gains else np.inf
-
-    ordered = sorted(explanations, key=misfit)
-    if len(ordered) > 1 and not misfit(ordered[1]) - misfit(ordered[0]) > CLEARLY_NEARER:
+    misfits = sorted((_misfit(relations, e), i) for i, e in enumerate(explanations))
+    if len(misfits) > 1 and not misfits[1][0] - misfits[0][0] > CLEARLY_NEARER:
         return None
-    return ordered[0]
+    return explanations[misfits[0][1]]
+
+
+def _misfit(relations: Sequence[Relation], chosen: tuple[Mistake, ...]) -> float:
+    """Return how far, in the logarithm, the gains of relations are from the typical ones."""
+    touched = [r for r in relations if r.tells and r.decides_unit and _signals(chosen) & set(r.powers)]
+    touched = [r for r in touched if r.expected[0] < r.typical < r.expected[1]]
+    same = [r for r in touched if r.expected[1] < SAME_QUANTITY * r.expected[0]]
+    gains = [abs(r.gain / r.typical * float(np.prod([m.acts_on(r) for m in chosen]))) for r in same or touched]
+    return float(np.mean(np.abs(np.log(gains)))) if gains else np.inf
+
+
+def _nearest(relations: Sequence[Relation], explanations: Sequence[tuple[Mistake, ...]]) -> list[tuple[Mistake, ...]]:
+    """Return for each set of signals the explanations that no other explains clearly better."""
+    misfits = [_misfit(relations, e) for e in explanations]
+    best: dict[frozenset[str], float] = {}
+    for chosen, misfit in zip(explanations, misfits, strict=True):
+        best[_signals(chosen)] = min(misfit, best.get(_signals(chosen), np.inf))
+    return [e for e, m in zip(explanations, misfits, strict=True) if not m - best[_signals(e)] > CLEARLY_NEARER]
 
 
 def _signals(chosen: tuple[Mistake, ...]) -> frozenset[str]:
@@ -284,7 +323,7 @@ def _signals(chosen: tuple[Mistake, ...]) -> frozenset[str]:
 
 
 def _cost(chosen: tuple[Mistake, ...]) -> int:
-    return sum(2 if m.kind == "sign and unit" else 1 for m in chosen)
+    return sum((2 if m.kind == "sign and unit" else 1) + m.foreign for m in chosen)
 
 
 _NEVER_TURNED = frozenset({"speed_m_s", "steer_rad", "steering_wheel_rad"})
@@ -300,8 +339,9 @@ def known_mistakes(names: Sequence[str], together: Sequence[tuple[str, ...]] = (
     out: list[Mistake] = []
     for name in names:
         bare = name.removeprefix("truth.")
-        units = _units(bare)
+        units = units_of(bare)
         out += [Mistake({name: factor}, f"{name} {words}", "unit") for factor, words in units]
+        out += _foreign((name,), units)
         out.append(Mistake({name: -1.0}, f"{name} has the wrong sign", "sign"))
         out += [
             Mistake({name: -factor}, f"{name} {words} and has the wrong sign", "sign and unit")
@@ -311,21 +351,37 @@ def known_mistakes(names: Sequence[str], together: Sequence[tuple[str, ...]] = (
         present = [n for n in group if n in names]
         for size in range(2, len(present) + 1):
             for part in combinations(present, size):
-                words = f"{' and '.join(part)} have the wrong sign"
+                words = f"{_together(part)} have the wrong sign"
                 # A sensor is mounted upside down or backwards, or ground truth has another convention; speeds count
                 # ahead.
                 if not _NEVER_TURNED & set(part):
                     out.append(Mistake(dict.fromkeys(part, -1.0), words, "sign"))
-                shared = dict(_units(part[0].removeprefix("truth.")))
+                shared = dict(units_of(part[0].removeprefix("truth.")))
                 for name in part[1:]:
-                    units_of_name = dict(_units(name.removeprefix("truth.")))
+                    units_of_name = dict(units_of(name.removeprefix("truth.")))
                     shared = {f: text for f, text in shared.items() if f in units_of_name}
-                words = " and ".join(part)
+                words = _together(part)
                 out += [Mistake(dict.fromkeys(part, f), f"{words}: each {text}", "unit") for f, text in shared.items()]
+                out += _foreign(part, list(shared.items()))
     return out
 
 
-def _units(name: str) -> list[tuple[float, str]]:
+def _together(names: Sequence[str]) -> str:
+    """Return signals in words; the wheel speeds and their mean as one."""
+    wheels = [n for n in names if n.startswith("wheel_speed")]
+    return "wheel speeds" if len(wheels) == len(names) > 2 else " and ".join(names)
+
+
+def _foreign(names: Sequence[str], units: Sequence[tuple[float, str]]) -> list[Mistake]:
+    """Return the mistakes by factors of units that other quantities have."""
+    factors = [f for size in _FOREIGN for f in (size, 1.0 / size)]
+    strange = [f for f in factors if all(abs(np.log(f / other)) > CLEARLY_NEARER for other, _ in units)]
+    words = _together(names)
+    text = f"{{}} {'are' if words.endswith('speeds') else 'is'} off by a factor of {{:.4g}}"
+    return [Mistake(dict.fromkeys(names, f), text.format(words, 1.0 / f), "unit", foreign=True) for f in strange]
+
+
+def units_of(name: str) -> list[tuple[float, str]]:
     """Return by what a signal is off where its unit is taken for another, and how that is stated."""
     to_radians = [(DEGREE, "is in degrees"), (1.0 / DEGREE, "was converted from degrees twice")]
     of_speeds = [(1.0 / 3.6, "is in km/h"), (3.6, "was converted from km/h twice"), (0.44704, "is in mph")]
@@ -406,7 +462,7 @@ def compare_at_ease(
 def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace: FloatArray) -> list[Relation]:
     """Relate the accelerations to speed and yaw rate, of the sensors or of ground truth."""
     relations: list[Relation] = []
-    moving = moving_at(pace)
+    moving = _moving(columns, pace)
     yaw, left, forward = (columns.get(f"{prefix}{n}") for n in ("yaw_rate_rad_s", "ay_m_s2", "ax_m_s2"))
     if yaw is not None and left is not None:
         powers = {f"{prefix}ay_m_s2": 1, f"{prefix}yaw_rate_rad_s": -1, pace_name: -1}
@@ -418,6 +474,8 @@ def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace
         text = f"{prefix}ax_m_s2 against the derivative of the speed"
         with np.errstate(invalid="ignore"):
             straight = moving if yaw is None else moving & (np.abs(yaw * pace) < STRAIGHT_M_S2)
+        if yaw is not None and not moving_at(pace).any():  # in no known unit
+            straight = gentle_at(yaw * pace, moving)
         # A pitching body moves a_x without any change of the speed, and noise the derivative of a satellite's.
         moves = None if pace_name == "truth.vx_m_s" else MOVES_M_S2
         reference = derivative(pace)
@@ -435,22 +493,58 @@ def gentle_at(lateral_m_s2: FloatArray, moving: BoolArray) -> BoolArray:
         return np.asarray(moving & (size <= STEERING_SHARE * np.quantile(size[finite], 0.95)))
 
 
-def _steering(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArray) -> list[Relation]:
+def _moving(columns: Mapping[str, FloatArray], speed: FloatArray) -> BoolArray:
+    """Return where the car drives; by the shape of the speed alone if it is too low and the IMU moves."""
+    moving = moving_at(speed)
+    if moving.any():
+        return moving
+    moves = {"yaw_rate_rad_s": MOVES_RAD_S, "ay_m_s2": MOVES_M_S2, "ax_m_s2": MOVES_M_S2}
+    finite = [(columns[n][np.isfinite(columns[n])], least) for n, least in moves.items() if n in columns]
+    return moving_at(speed, 0.0) if any(c.size and c.std() > least for c, least in finite) else moving
+
+
+def _lengths(
+    speed: FloatArray, vehicle: VehicleParameters | None
+) -> tuple[tuple[str, tuple[float, float], float], ...]:
+    """Return by steering signal the plausible effective wheelbases, m, and the typical one."""
+    finite = np.abs(speed[np.isfinite(speed)])
+    if vehicle is not None:
+        gradient = max(0.0, vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction))
+        typical_speed = min(float(np.median(finite)) if finite.size else 0.0, FAST_M_S)
+        road = vehicle.wheelbase_m + gradient * typical_speed**2
+        wheel = road * vehicle.steering_ratio
+        low, high = KNOWN_LENGTH
+        return (
+            ("steer_rad", (low * road, high * road), road),
+            ("steering_wheel_rad", (low * wheel, high * wheel), wheel),
+        )
+    is_full_size = finite.size and FULL_SIZE_M_S[0] < np.quantile(finite, 0.9) < FULL_SIZE_M_S[1]
+    road_wheel = FULL_SIZE_LENGTH_M if is_full_size else ROAD_WHEEL_LENGTH_M
+    steering_wheel = FULL_SIZE_STEERING_WHEEL_LENGTH_M if is_full_size else STEERING_WHEEL_LENGTH_M
+    return tuple(
+        (name, lengths, float(np.sqrt(lengths[0] * lengths[1])))
+        for name, lengths in (("steer_rad", road_wheel), ("steering_wheel_rad", steering_wheel))
+    )
+
+
+def _steering(
+    columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArray, vehicle: VehicleParameters | None
+) -> list[Relation]:
     relations: list[Relation] = []
     yaw = columns.get("yaw_rate_rad_s")
     if yaw is None:
         return relations
-    moving = moving_at(speed)
+    moving = _moving(columns, speed)
     with np.errstate(divide="ignore", invalid="ignore"):
         curvature = yaw / speed
     gentle = gentle_at(yaw * speed, moving)
-    for name, lengths in (("steer_rad", ROAD_WHEEL_LENGTH_M), ("steering_wheel_rad", STEERING_WHEEL_LENGTH_M)):
+    for name, lengths, typical in _lengths(speed, vehicle):
         steer = columns.get(name)
         if steer is None:
             continue
         powers = {name: 1, "yaw_rate_rad_s": -1, speed_name: 1}
         either = [
-            r
+            replace(r, typical=typical)
             for use in (moving, gentle)
             for r in compare(f"{name} against yaw_rate_rad_s / speed", powers, curvature, steer, use, lengths)
         ]
@@ -460,7 +554,8 @@ def _steering(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatAr
             powers = {"ay_m_s2": 1, name: -1, speed_name: -2}
             text = f"ay_m_s2 against {name} x speed^2"
             inverse = (1.0 / lengths[1], 1.0 / lengths[0])
-            relations += compare(text, powers, steer * speed**2, columns["ay_m_s2"], gentle, inverse)
+            lateral = compare(text, powers, steer * speed**2, columns["ay_m_s2"], gentle, inverse)
+            relations += [replace(r, typical=1.0 / typical) for r in lateral]
     return relations
 
 
@@ -470,7 +565,7 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
     wanted |= {f"wheel_speed_{w}_rad_s": WHEEL_PER_RADIAN_RANGE for w in WHEELS}
     wanted |= {"truth.vx_m_s": SAME_RANGE, "truth.position_speed_m_s": SAME_RANGE}
     relations = []
-    moving = moving_at(speed)
+    moving = _moving(columns, speed)
     # A wheel spins or locks at the limit, and each of them goes its own way where the car does.
     gentle = moving if "yaw_rate_rad_s" not in columns else gentle_at(columns["yaw_rate_rad_s"] * speed, moving)
     for name, expected in wanted.items():
@@ -506,7 +601,7 @@ def steering_references(columns: Mapping[str, FloatArray], speed_name: str | Non
 
 def _axle_differences(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[tuple[str, FloatArray]]:
     """Return what the wheels of each axle turn faster on the right, scaled to the speed: radii and units aside."""
-    moving = moving_at(speed)
+    moving = _moving(columns, speed)
     differences = []
     for unit in ("m_s", "rad_s"):
         for axle in ("r", "f"):
@@ -519,7 +614,7 @@ def _axle_differences(columns: Mapping[str, FloatArray], speed: FloatArray) -> l
 
 def _wheel_differences(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArray) -> list[Relation]:
     """Relate yaw rate and a_y to what the wheels of an axle turn faster on the right: no wheel is mounted wrong."""
-    moving = moving_at(speed)
+    moving = _moving(columns, speed)
     pairs = _axle_differences(columns, speed)
     gentle = moving if "yaw_rate_rad_s" not in columns else gentle_at(columns["yaw_rate_rad_s"] * speed, moving)
     relations = []
@@ -551,7 +646,7 @@ def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relat
     if course is None:
         return []
     relations = []
-    moving = moving_at(speed)
+    moving = _moving(columns, speed)
     for name in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s"):
         if name in columns:
             text = f"{name} against the turning of the ground-truth path"
@@ -585,7 +680,7 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     ay, vx, vy, rate = (columns[n] for n in names)
     subject = "truth.sideslip_rad" if "truth.sideslip_rad" in columns else "truth.vy_m_s"
     sideslip = columns.get("truth.sideslip_rad", np.arctan2(vy, vx))
-    moving, ones = moving_at(vx), np.ones_like(ay)
+    moving, ones = _moving(columns, vx), np.ones_like(ay)
     text = f"ay_m_s2 - v_x r against the derivative of {subject}"
     kinematic = _partial(
         text, {subject: -1, "ay_m_s2": 1}, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving
@@ -594,9 +689,11 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
         curvature = rate / vx
     text = f"{subject} against -ay_m_s2, apart from curvature"
     gentle = gentle_at(vx * rate, moving)
-    handling = _partial(text, {subject: 1, "ay_m_s2": -1}, -ay, sideslip, [curvature, ones], gentle)
+    of_vx = subject != "truth.sideslip_rad"  # the sideslip is then v_y over v_x
+    powers = {subject: 1, "ay_m_s2": -1} | ({"truth.vx_m_s": -1} if of_vx else {})
+    handling = _partial(text, powers, -ay, sideslip, [curvature, ones], gentle)
     text = f"{subject} against curvature, apart from a_y"
-    powers = {subject: 1, turning: -1}
+    powers = {subject: 1, turning: -1} | ({} if of_vx else {"truth.vx_m_s": 1})
     rolling = _partial(text, powers, curvature, sideslip, [ay, ones], gentle)
     return [
         *(replace(r, expected=SIDESLIP_RANGE) for r in kinematic),

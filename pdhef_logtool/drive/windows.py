@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, field, replace
 
@@ -21,6 +21,7 @@ from pdhef_logtool.drive.alignment import (
     plan_alignment,
 )
 from pdhef_logtool.drive.channel_hash import ChannelHash
+from pdhef_logtool.drive.checks.running import misread_channels
 from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.setup import Setup, clocks_of
 from pdhef_logtool.drive.truth import (
@@ -72,6 +73,7 @@ class DrivePlan:
     derivation : by ground truth quantity, how it is derived.
     decided_s : seconds of the log, or of that of the set-up, that the sensors' part was decided on.
     checks : of signals, ground truth and vehicle file. placed : where recorded frames put the IMU.
+    refused : mapped channels, those of ground truth with ``truth.``, that nothing is computed from, with the reason.
     """
 
     mapping: Mapping
@@ -88,6 +90,7 @@ class DrivePlan:
     decided_s: float
     checks: tuple[Check, ...] = ()
     placed: Placement | None = None
+    refused: dict[str, str] = field(default_factory=dict)
 
     @property
     def truth_latency_s(self) -> float:
@@ -126,6 +129,7 @@ def plan_drive(
     require_imu: bool = True,
     clock: Clock = "arrival",
     setup: Setup | None = None,
+    waived: Sequence[str] = (),
 ) -> DrivePlan:
     """Read at most ten minutes of the slice [start_ns, end_ns) and decide clocks, alignment and ground truth.
 
@@ -133,6 +137,7 @@ def plan_drive(
     ----------
     require_imu : False gives a plan with no alignment (``alignment.channels`` empty) where there is no IMU.
     clock : as for :func:`~.alignment.plan_alignment`. setup : the sensors' part of the plan; None decides it here.
+    waived : names of checks whose failure does not stop the use of a channel.
 
     Raises
     ------
@@ -158,26 +163,40 @@ def plan_drive(
         )
     else:
         alignment = no_alignment(survey.signals)
-    truth, derived = looked_at.truth_plan, looked_at.truth
-    derivation: dict[str, str] = {}
-    if derived is not None:
-        derivation = dict(derived.derivation)
+    refused = misread_channels(looked_at.checks, waived)
+    if setup is not None:  # what it reads must not depend on later samples
+        refused = {name: reason for name, reason in refused.items() if name.startswith("truth.")}
+    mapping, sound = without_refused_truth(mapping, refused), looked_at
+    if mapping is not looked_at.mapping:
+        sound = survey_log(log, mapping, clocks, span_ns, vehicle, rescale=False)
+    truth, derived = sound.truth_plan, sound.truth
+    derivation = {} if derived is None else dict(derived.derivation)
     return DrivePlan(
         mapping=mapping,
         vehicle=vehicle,
         clocks=clocks,
-        alignment=alignment,
+        alignment=alignment.without(refused),
         truth=truth,
-        latency=looked_at.latency,
-        dependent=dependent_signals(survey.signals, survey.truth) if survey.truth else {},
+        latency=sound.latency,
+        dependent=dependent_signals(survey.signals, sound.channels.truth) if truth else {},
         derivation=derivation,
-        survey_truth=survey.truth,
+        survey_truth=sound.channels.truth,
         start_ns=start_ns,
         end_ns=end_ns,
         decided_s=(end_ns - start_ns) * 1e-9 if setup is None else setup.decided_s,
         checks=looked_at.checks,
         placed=looked_at.placed,
+        refused=refused,
     )
+
+
+def without_refused_truth(mapping: Mapping, refused: Mapped[str, str]) -> Mapping:
+    """Return the mapping without refused ground truth; without any if a quantity that is derived is refused."""
+    names = {n.removeprefix("truth.") for n in refused if n.startswith("truth.")}
+    if not names:
+        return mapping
+    kept = {n: s for n, s in mapping.truth.items() if n not in names}
+    return replace(mapping, truth=kept if names <= mapping.truth.keys() else {})
 
 
 def setup_of(plan: DrivePlan) -> Setup:

@@ -20,27 +20,6 @@ from pdhef_logtool.records.tracks import StateTrack, make_track
 VX, VY, YAW_RATE, AY = 0, 1, 2, 3
 
 
-class StepRecord(Protocol):
-    """What an estimator returns: one row per sample of the window."""
-
-    @property
-    def valid(self) -> BoolArray:
-        """Whether the row is an estimate, [K]."""
-        ...
-
-    def joined(self, other: Any) -> Any:
-        """Append the steps of the next window."""
-        ...
-
-    def since(self, index: int) -> Any:
-        """Keep the steps from ``index`` on."""
-        ...
-
-    def until(self, index: int) -> Any:
-        """Keep the steps before ``index``."""
-        ...
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Steps(StepColumns):
     """Estimates on measurement time, [K]: the state after all samples of the stamp were used.

@@ -39,10 +39,6 @@ GRIP_SMOOTHING_S, GRIP_HOLD_S = 0.1, 1.0
 NOISE_SIGMAS = 3.0
 #: Smallest speed in the limit of D, as a multiple of the low-speed blend.
 LEAST_SPEED_BLENDS = 3.0
-#: Zero-order hold of a sample; without a newer sample the monitor is suspended.
-SAMPLE_HOLD_S = 0.1
-#: Consecutive identical samples that indicate a stuck sensor, or one whose resolution is too coarse to judge.
-STUCK_SAMPLES = 5
 
 # Entries of the memory.
 D, FLAG, HAS_LAST, VY, VX, AY, GYRO, AY_AGE, GYRO_AGE, AY_RUN, GYRO_RUN, AY_SLOW, GRIP, FRICTION, VAR = range(15)
@@ -110,6 +106,7 @@ def wrong_branch(
     car = (
         vehicle.assumed_friction, 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2, sensors.ay_std_m_s2,
         sensors.yaw_rate_std_rad_s, *vehicle.imu_position_m[:2], LEAST_SPEED_BLENDS * vehicle.low_speed_blend_m_s,
+        sensors.imu_hold_s, float(sensors.stuck_samples),
     )  # fmt: skip
     _watch(motion, car, memory, steps.flags)
     if state is not None:
@@ -135,7 +132,7 @@ def _hold(sample, dt, value, age, run, memory):  # type: ignore[no-untyped-def]
 def _watch(motion, car, memory, flags):  # type: ignore[no-untyped-def]
     """Advance the memory over the steps [N] and write the flags [N] in place; ``dt[k]`` ends at step k."""
     dt, ay, gyro, friction, vx, vy, rate, valid = motion
-    default_friction, tilt, ay_std, gyro_std, imu_x, imu_y, least_speed = car
+    default_friction, tilt, ay_std, gyro_std, imu_x, imu_y, least_speed, hold_s, stuck_samples = car
     for k in range(dt.shape[0]):
         step = dt[k]
         if not step <= RESTART_GAP_S:
@@ -143,15 +140,16 @@ def _watch(motion, car, memory, flags):  # type: ignore[no-untyped-def]
             memory[AY_AGE] = memory[GYRO_AGE] = math.inf
             step = 0.0
         before_ay, before_gyro = memory[AY], memory[GYRO]
-        could = memory[AY_AGE] <= SAMPLE_HOLD_S and memory[GYRO_AGE] <= SAMPLE_HOLD_S
+        could = memory[AY_AGE] <= hold_s and memory[GYRO_AGE] <= hold_s
         _hold(ay[k], step, AY, AY_AGE, AY_RUN, memory)
         _hold(gyro[k], step, GYRO, GYRO_AGE, GYRO_RUN, memory)
-        can = memory[AY_AGE] <= SAMPLE_HOLD_S and memory[GYRO_AGE] <= SAMPLE_HOLD_S
-        stuck = memory[AY_RUN] >= STUCK_SAMPLES or memory[GYRO_RUN] >= STUCK_SAMPLES
+        can = memory[AY_AGE] <= hold_s and memory[GYRO_AGE] <= hold_s
+        # Stuck, or with a resolution too coarse to judge.
+        stuck = memory[AY_RUN] >= stuck_samples or memory[GYRO_RUN] >= stuck_samples
         if math.isfinite(friction[k]):
             memory[FRICTION] = friction[k]
         mu = memory[FRICTION] if memory[FRICTION] > 0.0 else default_friction
-        if memory[AY_AGE] <= SAMPLE_HOLD_S:
+        if memory[AY_AGE] <= hold_s:
             memory[AY_SLOW] += (1.0 - math.exp(-step / GRIP_SMOOTHING_S)) * (memory[AY] - memory[AY_SLOW])
         share = abs(memory[AY_SLOW]) / (mu * GRAVITY_M_S2)
         memory[GRIP] = max(share, memory[GRIP] * math.exp(-step / GRIP_HOLD_S))

@@ -52,15 +52,11 @@ INPUTS = 5
 #: (docs/method.md#frame).
 NO_AX_Q_STD = 3.0
 INITIAL_STD = (0.5, 0.5, 0.1, 0.3)
-#: The last steering angle is kept for this long where the signal is missing.
-STEER_HOLD_S = 0.2
 #: A sample further from its prediction than this many standard deviations is not used ...
 GATE_SIGMA = 6.0
 #: ... unless it has been so for this long: then the filter is wrong, not the sensor (docs/method.md#gate).
 GATE_OPENS_AFTER_S = 0.2
 GATE_INFLATION = 10.0
-STANDSTILL_SPEED_M_S = 0.05
-STANDSTILL_YAW_RATE_RAD_S = 0.05
 STANDSTILL_AFTER_S = 0.3
 #: A standstill is not accepted for longer than this without a speed sample that states so.
 STANDSTILL_SILENCE_S = 1.5
@@ -80,7 +76,8 @@ M_INITIALISED, M_STEER, M_AX, M_AX_KNOWN, M_FRICTION, M_STEER_AGE, M_STILL, M_SP
 M_RATE_VY, M_RATE_R = 9, 10  # residual of the step before
 M_REJECTED = 11  # and the two after it, one a measurement: time since the first sample of an unbroken rejection
 M_SPEED = 14  # last speed sample
-MEMORY = 15
+M_GRIP = 15  # largest recent share of the grip that is used, decaying (``physics`` only)
+MEMORY = 16
 #: What M_REJECTED contains at the first rejected sample itself; 0 is "the last sample was accepted".
 JUST_REJECTED_S = 1e-9
 
@@ -110,6 +107,9 @@ class Rules(NamedTuple):
     still_after_s: float
     default_friction: float
     dynamic_speed_m_s: float  # above it a sideslip beyond DIVERGED_SIDESLIP_RAD is divergence
+    steer_hold_s: float
+    still_speed_m_s: float
+    still_yaw_rate_rad_s: float
 
 
 class Tuning(NamedTuple):
@@ -272,7 +272,7 @@ def all_finite(x, P):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def begin_step(sample, rules, memory):  # type: ignore[no-untyped-def]
-    """Reset after a time gap and zero-order-contain missing inputs. Return the inputs of this step."""
+    """Reset after a time gap and zero-order-hold missing inputs. Return the inputs of this step."""
     restart = not sample.dt <= RESTART_GAP_S
     if restart:
         memory[:] = 0.0
@@ -282,7 +282,7 @@ def begin_step(sample, rules, memory):  # type: ignore[no-untyped-def]
         memory[M_STEER_AGE] = 0.0
     else:
         memory[M_STEER_AGE] += 0.0 if restart else sample.dt
-    steer_ok = steers or (memory[M_INITIALISED] > 0.0 and memory[M_STEER_AGE] <= STEER_HOLD_S)
+    steer_ok = steers or (memory[M_INITIALISED] > 0.0 and memory[M_STEER_AGE] <= rules.steer_hold_s)
     has_ax = math.isfinite(sample.ax)
     friction = sample.friction
     if not math.isfinite(friction):
@@ -400,10 +400,10 @@ def settle(now, gated, rules, standstill_std, x, P, memory):  # type: ignore[no-
         share = min(1.0, now.dt / DIVERGED_AVERAGE_S)
         memory[M_NIS] += share * (gated.squares / gated.seen - memory[M_NIS])
     # Standstill: the speed sensor reads zero and nothing turns, for a while.
-    turns = abs(now.yaw_rate) > STANDSTILL_YAW_RATE_RAD_S
+    turns = abs(now.yaw_rate) > rules.still_yaw_rate_rad_s
     if math.isfinite(now.speed):
         memory[M_SPEED_AGE] = 0.0
-        still = abs(now.speed) < STANDSTILL_SPEED_M_S and not turns
+        still = abs(now.speed) < rules.still_speed_m_s and not turns
         memory[M_STILL] = memory[M_STILL] + now.dt if still else 0.0
     elif memory[M_STILL] > 0.0:
         memory[M_SPEED_AGE] += now.dt
@@ -555,6 +555,9 @@ def make_tuning(
             STANDSTILL_AFTER_S if standstill else math.inf,
             vehicle.assumed_friction,
             vehicle.low_speed_blend_m_s,
+            vehicle.sensors.steer_hold_s,
+            vehicle.sensors.speed_zero_m_s,
+            vehicle.sensors.still_yaw_rate_rad_s,
         ),
     )
 
@@ -728,7 +731,7 @@ class LinkedFilter:
     ) -> tuple[PosteriorSteps, FilterState, StepLinks]:
         signals, slip = believable(
             self.corrected(signals),
-            self.vehicle.sensors.speed_std_m_s,
+            self.vehicle.sensors,
             state.slip if state else None,
             gate=self.slip_gate,
         )

@@ -336,8 +336,7 @@ class PaperHybridUkf:
         state: base.FilterState | None,
     ) -> tuple[PaperSteps, base.FilterState]:
         """Filter one window; return its steps, and the state for the next one."""
-        speed_std_m_s = self.vehicle.sensors.speed_std_m_s
-        signals, slip = believable(signals, speed_std_m_s, state.slip if state else None, gate=self.slip_gate)
+        signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None, gate=self.slip_gate)
         estimate, count = base.resume(state, base.STATES, MEMORY), len(signals)
         parallel = Parallel(physics.x, physics.prior, physics.inputs, physics.valid)
         out, adapted = (

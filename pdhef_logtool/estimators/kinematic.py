@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from pdhef_logtool.car.vehicle import Sensors
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.base import AY, VX, VY, YAW_RATE, Steps
 from pdhef_logtool.estimators.stepwise import StepState, advance_speed, run_stepwise
@@ -19,17 +20,18 @@ if TYPE_CHECKING:
 #: Time constant of the leak, s. A pure integrator drifts by bias · time (0.08 m/s² gives 24 m/s in five minutes).
 #: Tuned to ground truth of simulated drives by ``studies.defaults.tune_kinematic_leak``, which is to its advantage.
 LEAK_S = 0.7
-STANDSTILL_SPEED_M_S = 0.05
+#: What it takes of a sensor profile; the wheel-slip gate has the default noise.
+_PROFILE = ("speed_hold_s", "speed_zero_m_s", "speed_least_m_s")
 
 
 @njit(cache=True)
-def _kinematic(sensors, leak_s, state, values, rates, valid):  # type: ignore[no-untyped-def]
-    dt, ax, ay, yaw_rate, speed = sensors
+def _kinematic(window, leak_s, hold_s, zero, state, values, rates, valid):  # type: ignore[no-untyped-def]
+    dt, ax, ay, yaw_rate, speed = window
     # state: v_x, age of the speed sample, v_y, v̇_y of the step before
     for k in range(dt.shape[0]):
-        advance_speed(state, dt[k], ax[k], speed[k])
+        advance_speed(state, dt[k], ax[k], speed[k], hold_s)
         is_complete = math.isfinite(state[0]) and math.isfinite(yaw_rate[k]) and math.isfinite(ay[k])
-        if not dt[k] <= RESTART_GAP_S or not math.isfinite(state[2]) or abs(state[0]) < STANDSTILL_SPEED_M_S:
+        if not dt[k] <= RESTART_GAP_S or not math.isfinite(state[2]) or abs(state[0]) < zero:
             state[2] = 0.0
             state[3] = 0.0
         else:
@@ -50,10 +52,13 @@ class Kinematic:
 
     algorithm = "kinematic"
     version = 1
-    options = ("leak_s", "slip_gate")
+    options = ("leak_s", "slip_gate", *_PROFILE)
 
     leak_s: float = LEAK_S
     slip_gate: bool = True
+    speed_hold_s: float = Sensors().speed_hold_s
+    speed_zero_m_s: float = Sensors().speed_zero_m_s
+    speed_least_m_s: float = Sensors().speed_least_m_s
     name: str = "kinematic"
     causal: bool = True
 
@@ -63,13 +68,14 @@ class Kinematic:
         def step(
             dt: FloatArray, s: Signals, state: FloatArray, values: FloatArray, rates: FloatArray, valid: BoolArray
         ) -> None:
-            sensors = (dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s)
-            _kinematic(sensors, self.leak_s, state, values, rates, valid)
+            window = (dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s)
+            _kinematic(window, self.leak_s, self.speed_hold_s, self.speed_zero_m_s, state, values, rates, valid)
 
-        return run_stepwise(signals, state, 4, step, slip_gate=self.slip_gate)
+        profile = Sensors(**{name: getattr(self, name) for name in _PROFILE})
+        return run_stepwise(signals, state, 4, step, slip_gate=self.slip_gate, sensors=profile)
 
 
 def build(name: str, car: Car, options: Options) -> Kinematic:
-    """Return ``kinematic``."""
-    del name, car, options
-    return Kinematic()
+    """Return ``kinematic`` with the sensors of a car."""
+    del name, options
+    return Kinematic(**{name: getattr(car.datasheet.sensors, name) for name in _PROFILE})

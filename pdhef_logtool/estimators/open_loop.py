@@ -29,12 +29,12 @@ AY_RATE_STEP_S = 0.001
 
 
 @njit(cache=True)
-def _open_loop(inputs, default_friction, p, state, values, rates, valid):  # type: ignore[no-untyped-def]
+def _open_loop(inputs, hold_s, default_friction, p, state, values, rates, valid):  # type: ignore[no-untyped-def]
     dt, steer, ax, speed, friction = inputs
     # state: v_x, age of the speed sample, v_y, r, steering and friction of the step before
     for k in range(dt.shape[0]):
         before = state[0]
-        advance_speed(state, dt[k], ax[k], speed[k])
+        advance_speed(state, dt[k], ax[k], speed[k], hold_s)
         mu = friction[k] if math.isfinite(friction[k]) else default_friction
         ok = math.isfinite(state[0]) and math.isfinite(steer[k])
         if (
@@ -91,10 +91,9 @@ class OpenLoop:
             dt: FloatArray, s: Signals, state: FloatArray, values: FloatArray, rates: FloatArray, valid: BoolArray
         ) -> None:
             inputs = (dt, s.steer_rad, s.ax_m_s2, s.speed_m_s, s.friction)
-            _open_loop(inputs, mu, p, state, values, rates, valid)
+            _open_loop(inputs, self.vehicle.sensors.speed_hold_s, mu, p, state, values, rates, valid)
 
-        std = self.vehicle.sensors.speed_std_m_s
-        return run_stepwise(signals, state, 6, step, slip_gate=self.slip_gate, speed_std_m_s=std)
+        return run_stepwise(signals, state, 6, step, slip_gate=self.slip_gate, sensors=self.vehicle.sensors)
 
 
 def build(name: str, car: Car, options: Options) -> OpenLoop:

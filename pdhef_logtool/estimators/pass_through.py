@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import Sensors
 from pdhef_logtool.estimators.base import Steps, make_steps
 from pdhef_logtool.estimators.presets import options_of
 from pdhef_logtool.estimators.stepwise import StepState, measured_speed
@@ -26,20 +27,21 @@ class PassThrough:
 
     algorithm = "pass-through"
     version = 1
-    options = ("claims_zero_sideslip",)
+    options = ("claims_zero_sideslip", "speed_hold_s")
 
     name: str
     claims_zero_sideslip: bool
+    speed_hold_s: float = Sensors().speed_hold_s
     causal: bool = True
 
     def run(self, signals: Signals, state: StepState | None) -> tuple[Steps, StepState]:
         """Process one window (see :class:`~.base.Estimator`)."""
-        vx, state = measured_speed(signals, state)
+        vx, state = measured_speed(signals, self.speed_hold_s, state)
         vy = np.full(len(signals), 0.0 if self.claims_zero_sideslip else np.nan)
         return make_steps(vx, vy, signals.yaw_rate_rad_s, signals.ay_m_s2), state
 
 
 def build(name: str, car: Car, options: Options) -> PassThrough:
     """Return ``zero`` or its variant ``no-lateral``."""
-    del car, options
-    return PassThrough(name, claims_zero_sideslip="no-lateral" not in options_of(name))
+    del options
+    return PassThrough(name, "no-lateral" not in options_of(name), car.datasheet.sensors.speed_hold_s)

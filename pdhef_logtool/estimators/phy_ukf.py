@@ -44,7 +44,6 @@ from pdhef_logtool.estimators.unscented import (
     kalman_update,
     mean_and_covariance,
 )
-from pdhef_logtool.records.signals import Signals
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
@@ -292,16 +291,6 @@ class PhysicsUkf(base.LinkedFilter):
         self, pending: base.PendingPredictions, start: base.PredictionStart, predicted: base.Predicted
     ) -> None:
         _predict_outputs(pending, start, self._tuning, self._parameters, predicted)
-
-
-def innovation_log_likelihood(estimator: PhysicsUkf, signals: Signals) -> tuple[float, int]:
-    """Return the Gaussian log-likelihood of all innovations of a drive and how many scalar innovations it sums.
-
-    A sample beyond the gate counts with the likelihood at the gate: a filter gains nothing by rejecting samples, and
-    no single outlier decides.
-    """
-    steps, _ = estimator.run(signals, None)
-    return float(steps.log_likelihood.sum()), int(np.isfinite(steps.innovation).sum())
 
 
 def physics_ukf_tuned(vehicle: VehicleParameters, noise: FilterNoise, *, use_speed: bool = True) -> PhysicsUkf:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pdhef_logtool.car.nominal_model import ModelParameters, dynamic_share, model_parameters
-from pdhef_logtool.car.parts import PHYSICS, FilterNoise
+from pdhef_logtool.car.parts import LIMIT_GAIN, PHYSICS, FilterNoise
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, corrected_anew
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.compiled.vectors import (
@@ -86,6 +86,10 @@ _BANK_STD = 0.02
 BIAS_WALK_STD = (0.004, 0.00008, 0.00002)
 #: Spread of the force scale (docs/method.md#adaptation).
 FORCE_SCALE_STD = 0.05
+
+#: Beyond this share of the grip, the largest of about the last ``LIMIT_TIME_S``, tyre models are least certain
+#: (docs/method.md#limit).
+LINEAR_SHARE, LIMIT_TIME_S = 0.36, 0.5
 
 #: The column of a block of points that contains the centre.
 _CENTRE = AY_BIAS
@@ -229,6 +233,16 @@ def _process_noise(q_std, ax_known, dt, layout, q):  # type: ignore[no-untyped-d
         q[FORCE_SCALE] += FORCE_SCALE_STD**2 * (1.0 - math.exp(-2.0 * dt / FORCE_SCALE_TIME_S))
     if layout.bank >= 0:
         q[BANK] += _BANK_STD**2 * (1.0 - math.exp(-2.0 * dt / BANK_TIME_S))
+
+
+@_compiled
+def _limit_factor(x, friction, dt, limit_gain, p, memory):  # type: ignore[no-untyped-def]
+    """Return the factor on the process noise of the axle forces: 1 in the linear range, more beyond it."""
+    most = friction * (p.front_D_n + p.rear_D_n) / p.mass_kg
+    used = abs(x[FRONT] + x[REAR]) / most
+    memory[base.M_GRIP] = max(used, memory[base.M_GRIP] * math.exp(-dt / LIMIT_TIME_S))
+    beyond = max(0.0, memory[base.M_GRIP] - LINEAR_SHARE)
+    return 1.0 + limit_gain * beyond * beyond
 
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
@@ -377,7 +391,7 @@ def _write_prediction(m, x, P, steer, rate_vy, places, p, predicted):  # type: i
 
 # positional: as _predict.
 @njit(cache=True)
-def _filter(window, tuning, layout, p, f, estimate, out, links):  # type: ignore[no-untyped-def]
+def _filter(window, tuning, limit_gain, layout, p, f, estimate, out, links):  # type: ignore[no-untyped-def]
     """Run over one window; ``estimate`` is moved in place. ``links`` are of length 0 where nobody asks for them."""
     dt, steer, ax, ay, yaw_rate, speed, friction, residual_rate, extra_r = window
     q_std, r_std, initial_std, standstill_std, _, _, scale, rules = tuning
@@ -397,6 +411,7 @@ def _filter(window, tuning, layout, p, f, estimate, out, links):  # type: ignore
     _, _, _, z_hat, S, _, nu, at_gate, given, use = base.make_work(base.MEASUREMENTS)
     index, root, w = np.empty(base.MEASUREMENTS, np.int64), np.empty_like(S), np.empty_like(nu)
     noise, constants = (q_std, aligned(ROOM), scale), _make_constants()
+    front_std, rear_std = q_std[FRONT], q_std[REAR]
     factored = False  # whether L is the factor of P
     for k in range(dt.shape[0]):
         sample = base.Sample(dt[k], steer[k], ax[k], ay[k], yaw_rate[k], speed[k], friction[k])
@@ -412,6 +427,9 @@ def _filter(window, tuning, layout, p, f, estimate, out, links):  # type: ignore
             if not factored:
                 wide_root(P, places, there, L)
             factored = False
+            if limit_gain > 0.0:
+                factor = _limit_factor(x, over.friction, now.dt, limit_gain, p, memory)
+                q_std[FRONT], q_std[REAR] = factor * front_std, factor * rear_std
             _draw(x, L, scale, constants, points)
             if linked:
                 _keep_before(points, x, P, places, before, out_cross[k])
@@ -498,6 +516,7 @@ class PhysicsFilter(base.LinkedFilter):
     vehicle : parameters; ``physics`` states which parts it has, ``sensors`` gives R unless ``r_std`` does, and the
         priors of the biases.
     q_std : process 1-sigma per √s of [v_x, v_y, r, b_ax, f_f, f_r], forces over mass in m/s².
+    limit_gain : growth of the process noise of the axle forces beyond the linear range; 0: none.
     r_std : 1-sigma of [a_y, r, v_x].
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
     slip_gate : leave out the speed of wheels that spin or lock (:mod:`~.speed_slip`).
@@ -507,10 +526,11 @@ class PhysicsFilter(base.LinkedFilter):
 
     algorithm = "physics-filter"
     version = 1
-    options = ("slip_gate", "standstill")
+    options = ("slip_gate", "standstill", "limit_gain")
 
     vehicle: VehicleParameters
     q_std: tuple[float, ...] = PHYSICS_Q_STD
+    limit_gain: float = 0.0
     r_std: tuple[float, float, float] | None = None
     use_speed: bool = True
     slip_gate: bool = True
@@ -571,7 +591,7 @@ class PhysicsFilter(base.LinkedFilter):
         out: base.Posterior,
         links: base.LinkColumns,
     ) -> None:
-        _filter(window, tuning, *self.parameters, estimate, out, links)
+        _filter(window, tuning, self.limit_gain, *self.parameters, estimate, out, links)
 
     def _predict_kernel(
         self, pending: base.PendingPredictions, start: base.PredictionStart, predicted: base.Predicted
@@ -586,12 +606,16 @@ class PhysicsFilter(base.LinkedFilter):
 def physics_filter(
     vehicle: VehicleParameters, noise: FilterNoise | None = None, *, use_speed: bool = True
 ) -> PhysicsFilter:
-    """Return the filter with a noise; what that leaves out is :data:`PHYSICS_Q_STD` and the sensors' noise."""
+    """Return the filter with a noise; what that leaves out is :data:`PHYSICS_Q_STD` and the sensors' noise.
+
+    A car without any has :data:`LIMIT_GAIN`.
+    """
     if noise is None:
-        return PhysicsFilter(vehicle, use_speed=use_speed)
+        return PhysicsFilter(vehicle, limit_gain=LIMIT_GAIN, use_speed=use_speed)
     return PhysicsFilter(
         vehicle,
         q_std=(*noise.q_std, *PHYSICS_Q_STD[len(noise.q_std) :]),
+        limit_gain=noise.limit_gain,
         r_std=noise.measurement_std(vehicle.sensors),
         use_speed=use_speed,
     )

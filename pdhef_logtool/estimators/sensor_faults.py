@@ -25,7 +25,7 @@ reaches once in ``HOURS_TO_FALSE_ALARM`` of clean driving:
   burst has five times. The usual noise is here a high quantile of e that decreases more slowly than it increases, so
   that rough roads are remembered and repeated samples (e = 0) do not reduce it.
 * spikes: more of them than a long tail contains, or one far beyond it.
-* stuck, missing: for ``STUCK_REPORTED_AFTER_S``, ``MISSING_REPORTED_AFTER_S``. Dead: within a narrow range for
+* stuck, missing: for ``STUCK_REPORTED_AFTER_S``, ``imu_hold_s``. Dead: within a narrow range for
   ``DEAD_REPORTED_AFTER_S`` of turning.
 """
 
@@ -33,12 +33,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model_parameters, rk4_step, substeps
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, Sensors, VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
@@ -53,8 +53,6 @@ CHANNELS = 2
 BURST_RATIO = 16.0
 #: Time constant of the decay: e^(−1/8) a step of 10 ms.
 DECAY_S = 0.08
-#: Differences over a longer span are not used: they contain the motion.
-DIFFERENCE_SPAN_S = 0.16
 #: Differences with a larger gain, which an uneven clock can cause, are not used.
 MAX_DIFFERENCE_GAIN = 200.0
 #: Shortest time in which the learned usual noise, from the median of e, doubles or halves.
@@ -69,8 +67,7 @@ TRACK_INNOVATION_RATIO = 1.5
 CURVATURE = (2000.0, 100.0)
 #: Largest number of consecutive spikes; more are a jump or a burst.
 MAX_SPIKES = 2
-#: Smallest number of identical samples of a stuck channel, and the probability below which chance is excluded.
-STUCK_SAMPLES = 5
+#: Probability below which chance is excluded as the reason of repeated samples.
 STUCK_CHANCE = 1e-6
 #: Time constants with which the share of repetitions increases and decreases, and its initial value.
 REPEATS_S = 20.0
@@ -82,8 +79,6 @@ COARSE_REPEATS = 0.1
 MOVED_RAD_S = 0.05
 #: Below this speed repeated samples are a standstill.
 STUCK_SPEED_M_S = 1.0
-#: Zero-order hold of a speed sample.
-SPEED_HOLD_S = 0.5
 #: Dead: smoothing time of the three measures; smallest value of the two others, in rad/s and in sigmas of the noise;
 #: largest share of them, range and duration of the dead channel.
 WITNESS_S = 0.04
@@ -102,9 +97,8 @@ QUIET_AFTER_S = 1.0
 WITNESS_SPEED_M_S = 6.0
 WITNESS_SETTLED_S = 1.0
 
-#: Reports: hours of clean driving per false alarm, sampling rate, and number of tests.
+#: Reports: hours of clean driving per false alarm, and number of tests.
 HOURS_TO_FALSE_ALARM = 1.0
-SAMPLES_PER_S = 100.0
 QUESTIONS = 4.0
 #: Noise of a healthy channel and of a burst as multiples of the usual sigma, and the threshold of a sample in sigmas.
 HEALTHY_FACTOR, BURST_FACTOR, BEYOND_SIGMA = 2.0, 5.0, 3.0
@@ -113,9 +107,7 @@ NATS_BEYOND = math.log(SHARE_BURST / SHARE_HEALTHY)
 NATS_WITHIN = math.log((1.0 - SHARE_BURST) / (1.0 - SHARE_HEALTHY))
 #: Number of differences, which share samples, with the information of one independent sample.
 DIFFERENCES_PER_SAMPLE = 2.3
-#: Evidence for reporting a burst, the share of it below which the report ends, and the share above which spikes belong
-#: to a burst.
-BURST_NATS = DIFFERENCES_PER_SAMPLE * math.log(3600.0 * SAMPLES_PER_S * HOURS_TO_FALSE_ALARM * QUESTIONS)
+#: Share of the evidence for reporting a burst below which the report ends, and above which spikes belong to a burst.
 BURST_OVER, BURST_LIKELY = 0.5, 0.25
 #: The level of e that ``SHARE_HEALTHY`` of the samples exceed is initialized in this time, with this gain and without
 #: reports. Afterwards it doubles in ``LEARNING_S`` at most. After the second time twice the evidence is required.
@@ -125,8 +117,8 @@ HALF_KNOWN_S = 3.0
 #: a tail of the fourth power and a spike in 45 s (Student's t with 4 degrees) the evidence does not accumulate.
 SPIKE_AT_LIMIT_NATS, SPIKE_POWER, SPIKE_FORGOTTEN_NATS_PER_S = 2.4, 3.0, 1.0
 SPIKE_NATS = math.log(3600.0 * HOURS_TO_FALSE_ALARM * QUESTIONS)
-#: Shortest reported duration of a stuck or missing channel.
-STUCK_REPORTED_AFTER_S, MISSING_REPORTED_AFTER_S = 0.05, 0.1
+#: Shortest reported duration of a stuck channel.
+STUCK_REPORTED_AFTER_S = 0.05
 #: Shortest reported duration in which both others turned and a dead channel did not change; for a_y half of it to each
 #: side, because bank can compensate a_y on one side.
 DEAD_REPORTED_AFTER_S = 0.5
@@ -144,6 +136,23 @@ CHANNEL_MEMORY = 41
 # Memory of the open-loop model: speed and its age, v_y and r, smoothed r and a_y, time, last inputs.
 W_SPEED, W_SPEED_AGE, W_VY, W_R, W_SMOOTH_R, W_SMOOTH_AY, W_SETTLED_S, W_STEER, W_FRICTION = range(9)
 WITNESS_MEMORY = 9
+
+
+class Limits(NamedTuple):
+    """Limits that follow from the sensor profile; ``burst_nats`` is the evidence for reporting a burst."""
+
+    rate_hz: float
+    span_s: float
+    hold_s: float
+    speed_hold_s: float
+    stuck_samples: float
+    burst_nats: float
+
+    @classmethod
+    def of(cls, s: Sensors) -> Limits:
+        """Return the limits of a profile."""
+        nats = DIFFERENCES_PER_SAMPLE * math.log(3600.0 * s.imu_rate_hz * HOURS_TO_FALSE_ALARM * QUESTIONS)
+        return cls(s.imu_rate_hz, s.imu_span_s, s.imu_hold_s, s.speed_hold_s, float(s.stuck_samples), nats)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,13 +185,13 @@ class SensorFaults:
 
 
 @njit(cache=True)
-def _difference(c, z):  # type: ignore[no-untyped-def]
+def _difference(c, z, span_s):  # type: ignore[no-untyped-def]
     """Return the difference of ``z`` from the parabola through the last three samples, and its gain for white noise.
 
     Ages a₁ < a₂ < a₃ of the samples are in ``c``. The gain is NaN where the ages do not allow it.
     """
     a1, a2, a3 = c[C_AGE], c[C_AGE + 1], c[C_AGE + 2]
-    if c[C_COUNT] < 3.0 or a3 > DIFFERENCE_SPAN_S or not (0.0 < a1 < a2 < a3):
+    if c[C_COUNT] < 3.0 or a3 > span_s or not (0.0 < a1 < a2 < a3):
         return 0.0, math.nan
     w1 = a2 * a3 / ((a2 - a1) * (a3 - a1))
     w2 = -a1 * a3 / ((a2 - a1) * (a3 - a2))
@@ -214,19 +223,19 @@ def _asked(c, nats):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _weigh_burst(c, e, s0, moving):  # type: ignore[no-untyped-def]
+def _weigh_burst(c, e, s0, moving, limits):  # type: ignore[no-untyped-def]
     """Add the evidence of a squared difference for a burst, and update the usual level."""
     age = c[C_AGE]
     level_is_known = c[C_LEVEL_S] > FIRST_GUESS_S
     beyond = e > max(BEYOND_SIGMA * BEYOND_SIGMA * s0 * s0, HEALTHY_FACTOR * HEALTHY_FACTOR * c[C_LEVEL])
     nats = NATS_BEYOND if beyond and moving and level_is_known else NATS_WITHIN
     # Faster samples are not independent: road and body motion are slower.
-    nats *= min(1.0, age * SAMPLES_PER_S)
-    asked = _asked(c, BURST_NATS)
+    nats *= min(1.0, age * limits.rate_hz)
+    asked = _asked(c, limits.burst_nats)
     c[C_BURST] = min(max(c[C_BURST] + nats, 0.0), asked)
     if c[C_BURST] >= asked:
         c[C_BURST_TOLD] = 1.0
-    elif c[C_BURST] < BURST_OVER * BURST_NATS:
+    elif c[C_BURST] < BURST_OVER * limits.burst_nats:
         c[C_BURST_TOLD] = 0.0
     if not moving:
         return
@@ -239,10 +248,10 @@ def _weigh_burst(c, e, s0, moving):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _weigh_spike(c, beyond, dt):  # type: ignore[no-untyped-def]
+def _weigh_spike(c, beyond, dt, burst_nats):  # type: ignore[no-untyped-def]
     """Add the evidence of a sample ``beyond`` times its limit for spikes; return whether to report it."""
     c[C_SPIKE] = max(c[C_SPIKE] - SPIKE_FORGOTTEN_NATS_PER_S * dt, 0.0)
-    if beyond <= 1.0 or c[C_LEVEL_S] <= FIRST_GUESS_S or c[C_BURST] > BURST_LIKELY * BURST_NATS:
+    if beyond <= 1.0 or c[C_LEVEL_S] <= FIRST_GUESS_S or c[C_BURST] > BURST_LIKELY * burst_nats:
         return False
     asked = _asked(c, SPIKE_NATS)
     c[C_SPIKE] = min(c[C_SPIKE] + SPIKE_AT_LIMIT_NATS + SPIKE_POWER * math.log(beyond), 2.0 * asked)
@@ -250,13 +259,13 @@ def _weigh_spike(c, beyond, dt):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _noise_and_spike(c, z, dt, s0, curvature, learn):  # type: ignore[no-untyped-def]
+def _noise_and_spike(c, z, dt, s0, curvature, learn, limits):  # type: ignore[no-untyped-def]
     """Process a sample of a channel; return whether it is a spike, and its ratio to the limit of reports.
 
     Updates ŝ² and the usual noise. The limit of reports depends on the learned level.
     """
     usual = max(s0 * s0, c[C_USUAL])
-    if c[C_AGE] > DIFFERENCE_SPAN_S:
+    if c[C_AGE] > limits.span_s:
         _forget(c)
     if c[C_COUNT] == 0.0:
         c[C_TRACK], c[C_TRACK_RATE] = z, 0.0
@@ -270,7 +279,7 @@ def _noise_and_spike(c, z, dt, s0, curvature, learn):  # type: ignore[no-untyped
         sigma = TRACK_INNOVATION_RATIO * math.sqrt(max(usual, c[C_NOISE]))
         bend = curvature * age * age / TRACK_RATE_GAIN
         # The rate needs three samples.
-        spike = c[C_COUNT] >= 3.0 and age <= DIFFERENCE_SPAN_S and abs(miss) > SPIKE_SIGMA * sigma + bend
+        spike = c[C_COUNT] >= 3.0 and age <= limits.span_s and abs(miss) > SPIKE_SIGMA * sigma + bend
         learnt = TRACK_INNOVATION_RATIO * HEALTHY_FACTOR / BEYOND_SIGMA * math.sqrt(c[C_LEVEL])
         beyond = abs(miss) / (SPIKE_SIGMA * max(sigma, learnt) + bend)
         if spike and c[C_SPIKES] >= MAX_SPIKES:
@@ -293,10 +302,10 @@ def _noise_and_spike(c, z, dt, s0, curvature, learn):  # type: ignore[no-untyped
             c[C_TRACK] = ahead + TRACK_GAIN * miss
             c[C_TRACK_RATE] = 0.0 if c[C_COUNT] < 2.0 and age <= 0.0 else c[C_TRACK_RATE] + TRACK_RATE_GAIN * miss / age
             c[C_TRACK_AGE] = 0.0
-    difference, gain = _difference(c, z)
+    difference, gain = _difference(c, z, limits.span_s)
     if math.isfinite(gain):
         e = difference * difference / gain
-        _weigh_burst(c, e, s0, learn)
+        _weigh_burst(c, e, s0, learn, limits)
         c[C_E + 3], c[C_E + 2], c[C_E + 1] = c[C_E + 2], c[C_E + 1], c[C_E]
         c[C_E] = e
         if learn and not spike:
@@ -316,7 +325,7 @@ def _noise_and_spike(c, z, dt, s0, curvature, learn):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def _stuck(c, z, dt, moving, turning):  # type: ignore[no-untyped-def]
+def _stuck(c, z, dt, moving, turning, stuck_samples):  # type: ignore[no-untyped-def]
     """Return whether the channel repeats a value for longer than its share of repetitions explains.
 
     ``turning`` is the open-loop model's yaw rate, rad/s.
@@ -342,7 +351,7 @@ def _stuck(c, z, dt, moving, turning):  # type: ignore[no-untyped-def]
     needed = 1.0 + math.log(STUCK_CHANCE) / math.log(min(repeats, 0.9999))
     if c[C_REPEATS] > COARSE_REPEATS and c[C_TURN_MOST] < MOVED_RAD_S:
         return False
-    c[C_STUCK] = 1.0 if c[C_RUN] >= max(STUCK_SAMPLES, needed) else 0.0
+    c[C_STUCK] = 1.0 if c[C_RUN] >= max(stuck_samples, needed) else 0.0
     return c[C_STUCK] > 0.0
 
 
@@ -387,14 +396,14 @@ def _open_loop(w, steer, friction, dt, p):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _detect(window, default_friction, s0, p, channels, w, output):  # type: ignore[no-untyped-def]
+def _detect(window, default_friction, s0, p, channels, w, limits, output):  # type: ignore[no-untyped-def]
     """Process one window; ``dt[k]`` ends at step k, NaN = start of a log. Memories are updated in place."""
     dt, steer, ay, yaw_rate, speed, friction = window
     extra, noise, reason, usable = output
     for k in range(dt.shape[0]):
         step = dt[k] if math.isfinite(dt[k]) else 0.0
         mask, raised = 0, False
-        if step > SPEED_HOLD_S:
+        if step > limits.speed_hold_s:
             for i in range(CHANNELS):
                 _forget(channels[i])
                 channels[i, C_BURST], channels[i, C_BURST_TOLD], channels[i, C_UNSEEN_S] = 0.0, 0.0, -step
@@ -403,7 +412,7 @@ def _detect(window, default_friction, s0, p, channels, w, output):  # type: igno
             w[W_SPEED], w[W_SPEED_AGE] = abs(speed[k]), 0.0
         else:
             w[W_SPEED_AGE] += step
-        speed_is_fresh = w[W_SPEED_AGE] <= SPEED_HOLD_S
+        speed_is_fresh = w[W_SPEED_AGE] <= limits.speed_hold_s
         moving = not speed_is_fresh or w[W_SPEED] > STUCK_SPEED_M_S
         for i in range(CHANNELS):
             z = ay[k] if i == AY else yaw_rate[k]
@@ -415,24 +424,24 @@ def _detect(window, default_friction, s0, p, channels, w, output):  # type: igno
             spike, beyond = False, 0.0
             c[C_UNSEEN_S] += step
             if not math.isfinite(z):
-                if c[C_UNSEEN_S] >= MISSING_REPORTED_AFTER_S:
+                if c[C_UNSEEN_S] >= limits.hold_s:
                     mask |= MISSING_AY << i
                 c[C_NOISE] = _decayed(c, usual, step)
-            elif _stuck(c, z, step, moving, w[W_SMOOTH_R]):
+            elif _stuck(c, z, step, moving, w[W_SMOOTH_R], limits.stuck_samples):
                 if c[C_RUN_S] >= STUCK_REPORTED_AFTER_S:
                     mask |= STUCK_AY << i
                 usable[k, i] = math.nan
                 c[C_NOISE] = _decayed(c, usual, step)
                 _forget(c)
             else:
-                spike, beyond = _noise_and_spike(c, z, step, s0[i], CURVATURE[i], moving)
+                spike, beyond = _noise_and_spike(c, z, step, s0[i], CURVATURE[i], moving, limits)
                 if spike:
                     usable[k, i] = math.nan
                 if c[C_BURST_TOLD] > 0.0:
                     mask |= BURST_AY << i
             if math.isfinite(z):
                 c[C_UNSEEN_S] = 0.0
-            if _weigh_spike(c, beyond if spike else 0.0, step):
+            if _weigh_spike(c, beyond if spike else 0.0, step, limits.burst_nats):
                 mask |= SPIKE_AY << i
             usual = max(s0[i] * s0[i], c[C_USUAL])
             extra[k, i] = 0.0
@@ -522,6 +531,7 @@ def find_faults(
         model_parameters(vehicle),
         channels,
         witness,
+        Limits.of(vehicle.sensors),
         (extra, noise, reason, usable),
     )
     last = last_stamp_ns(signals.stamps_ns, before_ns)

@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import Sensors
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -35,8 +36,6 @@ CONTRADICTION_M_S2 = 3.0
 TURN_SHARE = 1.5
 #: Bound of the cumulative sums, in standard deviations of the speed sensor, and its smallest value.
 BOUND_SIGMAS, LEAST_BOUND_M_S = 6.0, 0.4
-#: Standard deviation of the speed sensor for an estimator without a vehicle file.
-ASSUMED_STD_M_S = 0.08
 #: Consecutive samples beyond the bound; a single one is an outlier.
 ALARM_SAMPLES = 2
 #: Time constant and limit of b.
@@ -50,8 +49,6 @@ FOLLOW_S = 0.3
 RELEASE_S = 0.2
 #: Timeout without an accepted reading, and the time for which the check is then suspended.
 TIMEOUT_S, HEED_AGAIN_S = 5.0, 30.0
-#: Reading of a sensor without pulses, and the largest reading that may follow or precede it.
-ZERO_M_S, PULSE_FLOOR_M_S = 0.05, 1.0
 #: Wheels lock if the smoothed deceleration exceeds this, and spin otherwise; in the other cases they recover from slip
 #: that grew too slowly to be detected.
 BRAKING_M_S2, BRAKING_SMOOTHING_S = 0.5, 0.1
@@ -144,7 +141,7 @@ def _start(v, wheels, bound, spins):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _while_slipping(m, z, wheels, bound):  # type: ignore[no-untyped-def]
+def _while_slipping(m, z, wheels, bound, zero):  # type: ignore[no-untyped-def]
     """Process a sample during slip; return the accepted speed, NaN for none."""
     v, span = m[_V], m[_SPAN]
     tolerance = bound + m[_GROWTH]
@@ -163,7 +160,7 @@ def _while_slipping(m, z, wheels, bound):  # type: ignore[no-untyped-def]
         m[_ALONE] = 0.0
     else:
         m[_ALONE] += span
-    locked = abs(z) < ZERO_M_S and v > LOCKED_SPEED_M_S and _brakes(m)
+    locked = abs(z) < zero and v > LOCKED_SPEED_M_S and _brakes(m)
     if m[_ALONE] > TIMEOUT_S and not locked:
         m[_SLIPS] = 0.0
         m[_NOT_HEEDED] = HEED_AGAIN_S
@@ -174,12 +171,13 @@ def _while_slipping(m, z, wheels, bound):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _gate(window, bound, m, believed, reckoned):  # type: ignore[no-untyped-def]
+def _gate(window, sensor, m, believed, reckoned):  # type: ignore[no-untyped-def]
     """Process one window; ``dt[k]`` ends at step k, NaN = start. Returns whether any sample changed.
 
     ``believed`` [N] is the speed for filters, ``reckoned`` [N] that with v̂ in place of missing samples.
     """
     dt, ax, yaw_rate, speed, wheels = window
+    bound, zero, least = sensor
     changed = False
     for k in range(dt.shape[0]):
         if not dt[k] <= RESTART_GAP_S:
@@ -226,7 +224,7 @@ def _gate(window, bound, m, believed, reckoned):  # type: ignore[no-untyped-def]
                 m[_NOT_HEEDED] = RELEASE_S  # the first sample may be an outlier
                 _forget(m)
         elif m[_SLIPS] > 0.0:
-            believed[k] = _while_slipping(m, z, wheels[k], bound)
+            believed[k] = _while_slipping(m, z, wheels[k], bound, zero)
             reckoned[k] = believed[k]
             if not math.isfinite(believed[k]):
                 reckoned[k] = m[_V]
@@ -243,7 +241,7 @@ def _gate(window, bound, m, believed, reckoned):  # type: ignore[no-untyped-def]
                 m[_BIAS] = min(MAX_BIAS_M_S2, max(-MAX_BIAS_M_S2, m[_BIAS] + excess / BIAS_S))
             low, high = min(abs(z), abs(m[_SPEED])), max(abs(z), abs(m[_SPEED]))
             m[_SPEED] = z
-            if (low < ZERO_M_S and high <= PULSE_FLOOR_M_S) or m[_NOT_HEEDED] > 0.0:
+            if (low < zero and high <= least) or m[_NOT_HEEDED] > 0.0:
                 _forget(m)
             else:
                 alone = m[_UP + _BEYOND] + m[_DOWN + _BEYOND] == 1.0
@@ -267,23 +265,21 @@ def _gate(window, bound, m, believed, reckoned):  # type: ignore[no-untyped-def]
     return changed
 
 
-def _run(
-    signals: Signals, speed_std_m_s: float, state: SlipState | None
-) -> tuple[bool, FloatArray, FloatArray, SlipState]:
+def _run(signals: Signals, sensors: Sensors, state: SlipState | None) -> tuple[bool, FloatArray, FloatArray, SlipState]:
     count = len(signals)
     before_ns = state.last_stamp_ns if state else None
     memory = np.zeros(_MEMORY) if state is None else state.memory.copy()
     believed, reckoned = np.empty(count), np.empty(count)
     dt_s = step_durations_s(signals.stamps_ns, before_ns)
     window = (dt_s, signals.ax_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s, signals.wheel_speed_m_s)
-    bound = max(LEAST_BOUND_M_S, BOUND_SIGMAS * speed_std_m_s)
-    changed = _gate(window, bound, memory, believed, reckoned)
+    bound = max(LEAST_BOUND_M_S, BOUND_SIGMAS * sensors.speed_std_m_s)
+    changed = _gate(window, (bound, sensors.speed_zero_m_s, sensors.speed_least_m_s), memory, believed, reckoned)
     last = last_stamp_ns(signals.stamps_ns, before_ns)
     return changed, believed, reckoned, SlipState(memory, last)
 
 
 def without_slip(
-    signals: Signals, speed_std_m_s: float, state: SlipState | None, *, reckoned: bool = False
+    signals: Signals, sensors: Sensors, state: SlipState | None, *, reckoned: bool = False
 ) -> tuple[Signals, SlipState]:
     """Return the signals without the speed samples of slipping wheels; the same object if there are none.
 
@@ -291,18 +287,18 @@ def without_slip(
 
     Parameters
     ----------
-    speed_std_m_s : standard deviation of the speed sensor. state : state after the previous window.
+    sensors : profile of the speed sensor. state : state after the previous window.
     reckoned : replace missing samples by the dead-reckoned speed, for estimators that need one.
     """
-    changed, believed, with_reckoned, after = _run(signals, speed_std_m_s, state)
+    changed, believed, with_reckoned, after = _run(signals, sensors, state)
     if not changed:
         return signals, after
     return replace(signals, speed_m_s=with_reckoned if reckoned else believed), after
 
 
 def believable(
-    signals: Signals, speed_std_m_s: float, state: SlipState | None, *, gate: bool, reckoned: bool = False
+    signals: Signals, sensors: Sensors, state: SlipState | None, *, gate: bool, reckoned: bool = False
 ) -> tuple[Signals, SlipState | None]:
     """Return signals without impossible readings and, with ``gate``, without the speed of slipping wheels."""
     signals = without_impossible(signals)
-    return without_slip(signals, speed_std_m_s, state, reckoned=reckoned) if gate else (signals, None)
+    return without_slip(signals, sensors, state, reckoned=reckoned) if gate else (signals, None)

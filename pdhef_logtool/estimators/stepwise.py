@@ -8,14 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import SENSOR_PROFILES, Sensors
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.base import VX, Steps
-from pdhef_logtool.estimators.speed_slip import ASSUMED_STD_M_S, SlipState, believable
+from pdhef_logtool.estimators.speed_slip import SlipState, believable
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.steps import last_stamp_ns, step_durations_s
-
-#: A speed sample is carried on by a_x for this long.
-SPEED_HOLD_S = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,14 +36,14 @@ def run_stepwise(
     step: StepFunction,
     *,
     slip_gate: bool = False,
-    speed_std_m_s: float = ASSUMED_STD_M_S,
+    sensors: Sensors = SENSOR_PROFILES["production"],
 ) -> tuple[Steps, StepState]:
     """Run ``step`` over a window.
 
     ``state`` starts as NaN; ``dt[0]`` is NaN at the start of a log. With ``slip_gate`` the speed of slipping wheels is
     replaced by the dead-reckoned speed.
     """
-    signals, slip = believable(signals, speed_std_m_s, before.slip if before else None, gate=slip_gate, reckoned=True)
+    signals, slip = believable(signals, sensors, before.slip if before else None, gate=slip_gate, reckoned=True)
     count = len(signals)
     state = np.full(state_size, np.nan) if before is None else before.state.copy()
     before_ns = before.last_stamp_ns if before else None
@@ -57,35 +55,35 @@ def run_stepwise(
     return Steps(values, rates, valid), StepState(state, last_stamp_ns(signals.stamps_ns, before_ns), slip)
 
 
-def measured_speed(signals: Signals, before: StepState | None) -> tuple[FloatArray, StepState]:
+def measured_speed(signals: Signals, hold_s: float, before: StepState | None) -> tuple[FloatArray, StepState]:
     """Return the measured speed at each stamp, [K]: carried on by a_x between samples (:func:`advance_speed`)."""
 
     def step(
         dt: FloatArray, s: Signals, state: FloatArray, values: FloatArray, _rates: FloatArray, _valid: BoolArray
     ) -> None:
-        _advance_speeds(dt, s.ax_m_s2, s.speed_m_s, state, values)
+        _advance_speeds(dt, s.ax_m_s2, s.speed_m_s, hold_s, state, values)
 
     steps, after = run_stepwise(signals, before, 2, step)
     return steps.values[:, VX], after
 
 
 @njit(cache=True)
-def _advance_speeds(dt, ax, speed, state, values):  # type: ignore[no-untyped-def]
+def _advance_speeds(dt, ax, speed, hold_s, state, values):  # type: ignore[no-untyped-def]
     for k in range(dt.shape[0]):
-        advance_speed(state, dt[k], ax[k], speed[k])
+        advance_speed(state, dt[k], ax[k], speed[k], hold_s)
         values[k, VX] = state[0]
 
 
 @njit(cache=True)
-def advance_speed(state, dt, ax, speed):  # type: ignore[no-untyped-def]
+def advance_speed(state, dt, ax, speed, hold_s):  # type: ignore[no-untyped-def]
     """Advance [v_x, age of the last speed sample] by one step in place; v_x is NaN where no sample is near.
 
-    Between samples v_x follows a_x (0 where it is missing), at most ``SPEED_HOLD_S``.
+    Between samples v_x follows a_x (0 where it is missing), at most ``hold_s``.
     """
     if math.isfinite(speed):
         state[0] = speed
         state[1] = 0.0
-    elif dt <= SPEED_HOLD_S and state[1] + dt <= SPEED_HOLD_S:
+    elif dt <= hold_s and state[1] + dt <= hold_s:
         state[0] += (ax if math.isfinite(ax) else 0.0) * dt
         state[1] += dt
     else:

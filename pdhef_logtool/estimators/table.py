@@ -6,7 +6,7 @@ A name is a preset: ``build`` makes of it, for a car and options, the algorithm 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
@@ -259,21 +259,34 @@ def make_estimator(name: str, car: Car, options: Options | None = None) -> Estim
 
 
 def runnable(
-    names: Sequence[str], car: Car, available: frozenset[str], options: Options | None = None
+    names: Sequence[str],
+    car: Car,
+    available: frozenset[str],
+    options: Options | None = None,
+    refused: Collection[str] = (),
 ) -> tuple[list[Estimator], list[Skipped]]:
     """Split estimators into those whose needs car and log meet, built, and those that are skipped with the reason.
 
     Parameters
     ----------
     names : of estimators, or :data:`ALL_ESTIMATORS` alone. available : signals of the log.
+    refused : signals that the log has and that nothing is computed from, because a check of them failed.
     """
     estimators: list[Estimator] = []
     skipped: list[Skipped] = []
     for spec in map(spec_of, all_names(car) if tuple(names) == (ALL_ESTIMATORS,) else names):
         lacking = sorted(spec.needs - available)
-        reason = spec.missing(car) or (f"the log has no {', '.join(lacking)}" if lacking else "")
+        bad = sorted(_sources_of(lacking, refused))
+        lacks = f"a check of {', '.join(bad)} failed" if bad else f"the log has no {', '.join(lacking)}"
+        reason = spec.missing(car) or (lacks if lacking else "")
         if reason:
             skipped.append(Skipped(spec, reason))
         else:
             estimators.append(spec.make(car, options or Options()))
     return estimators, skipped
+
+
+def _sources_of(aligned: Sequence[str], refused: Collection[str]) -> set[str]:
+    """Return the refused signals that aligned ones could come from: a steering or wheel angle has two names."""
+    stems = {name.partition("_")[0] for name in aligned} | ({"wheel", "gnss"} if "speed_m_s" in aligned else set())
+    return {name for name in refused if name in aligned or name.partition("_")[0] in stems}

@@ -51,14 +51,6 @@ class Path:
         return error
 
 
-def lateral_errors_after_one_second(estimate: StateTrack, truth: StateTrack) -> FloatArray:
-    """Return the lateral error [K] in m at the end of each second that can be scored; positive = estimate left."""
-    seconds = Seconds()
-    for a, b in row_blocks(len(truth)):
-        seconds.add(estimate.rows(a, b), truth.rows(a, b))
-    return seconds.lateral_errors()
-
-
 class Seconds:
     """An estimate and ground truth at the first stamp of each second from the first common stamp on, block by block."""
 

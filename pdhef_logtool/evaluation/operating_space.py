@@ -13,14 +13,8 @@ import numpy as np
 
 from pdhef_logtool.evaluation.blocks import blocks_with_halo, median_step_ns
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.evaluation.segments import (
-    MANOEUVRE_SMOOTHING_HZ,
-    RUN_GAP_S,
-    known_of,
-    reach_rows,
-    smooth,
-    speed_and_ay,
-)
+from pdhef_logtool.evaluation.segments import MANOEUVRE_SMOOTHING_HZ, known_of, speed_and_ay
+from pdhef_logtool.evaluation.smoothing import RUN_GAP_S, reach_rows, smooth
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 

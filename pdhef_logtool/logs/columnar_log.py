@@ -33,6 +33,7 @@ from pdhef_logtool.logs.message_schema import (
     Selection,
     leaves,
     resolve,
+    stated_units,
 )
 from pdhef_logtool.logs.recording_span import RecordingSpan, survey
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -244,7 +245,9 @@ class ColumnarLog(DriveLog):
             schema = self.schema_of(c, channel)
             if isinstance(schema, MessageSchema):
                 if (c, channel.id) not in self._fields:
-                    self._fields[c, channel.id] = tuple(leaves(schema.root))
+                    units = stated_units(channel.schema_data) if channel.schema_encoding == "ros2msg" else {}
+                    of_units = (replace(f, unit=units.get(f.path.partition("[")[0], "")) for f in leaves(schema.root))
+                    self._fields[c, channel.id] = tuple(of_units) if units else tuple(leaves(schema.root))
                 return self._fields[c, channel.id]
         return ()
 

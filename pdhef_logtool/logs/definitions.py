@@ -86,6 +86,14 @@ def _of_machine(prefixes: str, sources: str) -> Definitions:
     )
 
 
+def dbc_files(place: Path | str | None) -> tuple[Path, ...]:
+    """Return a DBC file, or the DBC files of a folder."""
+    if place is None:
+        return ()
+    place = Path(place)
+    return tuple(sorted(place.rglob("*.dbc"))) if place.is_dir() else (place,) * (place.suffix.lower() == ".dbc")
+
+
 def read_definitions(place: Path | str | None) -> Definitions:
     """Find the definitions in a folder of ``.msg`` files, of packages, in a workspace, a zip file or a wheel.
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from pdhef_logtool.logs.byte_source import require_regular
-from pdhef_logtool.logs.formats import COMPRESSED_SUFFIXES, ROSBAG2_METADATA, log_suffixes
+from pdhef_logtool.logs.formats import COMPRESSED_SUFFIXES, ROSBAG2_METADATA, log_suffixes, without_general
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.records.errors import LogError, UsageError
 
@@ -146,7 +146,10 @@ def identity_of(log: LogInput) -> str:
         except OSError as error:
             got = error.strerror or str(error)
             remedy = "check the path and its permissions"
-            raise LogError(expected="a readable log", got=got, where=str(log.path), remedy=remedy) from error
+            missing = isinstance(error, FileNotFoundError)
+            raise LogError(
+                expected="a readable log", got=got, where=str(log.path), remedy=remedy, missing=missing
+            ) from error
     from pdhef_logtool.logs.remote_source import RemoteSource
 
     source = RemoteSource(log.path, head_bytes=1)
@@ -200,13 +203,13 @@ def _search_store(prefix: RemotePlace) -> list[RemotePlace]:
 
     keys = keys_below(prefix)
     outputs = tuple(key.removesuffix(RUN_FILE) for key in keys if key.rpartition("/")[2] == RUN_FILE)
-    return [
-        RemotePlace(f"{prefix.scheme}://{prefix.host}/{key}")
-        for key in sorted(keys)
-        if _bare_name(key) != key
-        and not key.startswith(outputs)
-        and not any(part.startswith(".") for part in key.removeprefix(prefix.key).split("/"))
-    ]
+    folders: dict[str, set[str]] = {}
+    for key in keys:
+        hidden = any(part.startswith(".") for part in key.removeprefix(prefix.key).split("/"))
+        if _bare_name(key) != key and not key.startswith(outputs) and not hidden:
+            folders.setdefault(key.rpartition("/")[0], set()).add(key)
+    logs = sorted(key for names in folders.values() for key in without_general(names))
+    return [RemotePlace(f"{prefix.scheme}://{prefix.host}/{key}") for key in logs]
 
 
 def _matches(pattern: str) -> list[Path]:
@@ -232,12 +235,12 @@ def _search(folder: Path, visited: set[str]) -> Iterator[Path]:
         return
     if (folder / RUN_FILE).is_file():
         return
-    for entry in sorted(folder.iterdir()):
-        if entry.name.startswith("."):
-            continue
+    entries = [e for e in sorted(folder.iterdir()) if not e.name.startswith(".")]
+    logs = without_general({e.name for e in entries if not e.is_dir() and _bare_name(e.name) != e.name})
+    for entry in entries:
         if entry.is_dir():
             yield from _search(entry, visited)
-        elif _bare_name(entry.name) != entry.name:
+        elif entry.name in logs:
             yield entry
 
 

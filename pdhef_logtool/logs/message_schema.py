@@ -422,6 +422,15 @@ def leaves(node: Node, path: str = "") -> Iterator[FieldInfo]:
         yield FieldInfo(path, node.kind, "" if node.kind == "string" else node.code)
 
 
+_STATED_UNIT = re.compile(r"^\s*[\w/\[\]<=]+\s+(\w+)\s*#\s*\[([^\[\]\s]{1,12})\]\s*$", re.MULTILINE)
+
+
+def stated_units(definition: bytes) -> dict[str, str]:
+    """Return the units by field that comments of a ROS 2 message's own fields give: ``float64 speed  # [km/h]``."""
+    main_type = definition.decode(errors="replace").partition("\n===")[0]
+    return {match[1]: match[2] for match in _STATED_UNIT.finditer(main_type)}
+
+
 _PART = re.compile(r"([^.\[\]]+)|\[(\d*)\]|\.")
 
 

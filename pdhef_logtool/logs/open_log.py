@@ -18,7 +18,7 @@ from pdhef_logtool.logs.container import (
     Wanted,
     describe_damage,
 )
-from pdhef_logtool.logs.definitions import read_definitions
+from pdhef_logtool.logs.definitions import dbc_files, read_definitions
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.formats import (
     COMPRESSED_SUFFIXES,
@@ -28,17 +28,21 @@ from pdhef_logtool.logs.formats import (
     log_suffixes,
     recognised_format,
     what_is_a_log,
+    without_general,
 )
 from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.reduced_log import ReducedLog, reduced_record
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, Meter, ResourceLimits
+from pdhef_logtool.logs.table_log import TableLog
 from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.storage.documents import read_text
 from pdhef_logtool.storage.files import scratch_folder
 
 _REMEDY = "give the recording itself"
+#: What a repository contains in place of a large file that was not fetched.
+LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 #: Kinds of logs by container format, as a file and as a folder.
 _KINDS = {"mcap": "mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}
 _FOLDER_KINDS = {**_KINDS, "mcap": "rosbag2-mcap"}
@@ -59,7 +63,8 @@ def open_log(
     Parameters
     ----------
     limits : resource limits of reading; what exceeds them is a loss.
-    msgs : folder, zip file or wheel with definitions of types that the log does not define (:func:`read_definitions`).
+    msgs : folder, zip file or wheel with definitions of types that the log does not define (:func:`read_definitions`);
+        or a DBC file, or a folder of them, that defines the CAN frames of a log of tables.
     wanted : what of a remote log will be read.
 
     Raises
@@ -67,10 +72,15 @@ def open_log(
     LogError : the path is missing, no regular file, or no log.
     UsageError : ``msgs`` contains no definitions.
     """
-    definitions = read_definitions(msgs)
+    databases = dbc_files(msgs)
+    definitions = read_definitions(None if databases else msgs)
     log = _opened(place_of(path) if isinstance(path, str) else path, Meter(limits), wanted)
     if log.messages is not None:
         log.messages.definitions = definitions
+    if databases and isinstance(log, TableLog):
+        from pdhef_logtool.logs.can_decoding import load_dbc
+
+        log.decode_frames([load_dbc(path) for path in databases])
     return log
 
 
@@ -81,7 +91,9 @@ def _opened(path: LogPlace, meter: Meter, wanted: Wanted) -> DriveLog:
         elif path.is_dir():
             return _open_folder(path, meter)
         elif not path.exists():
-            raise LogError(expected=what_is_a_log(), got="no such file", where=str(path), remedy="check the path")
+            raise LogError(
+                expected=what_is_a_log(), got="no such file", where=str(path), remedy="check the path", missing=True
+            )
         else:
             opened = _open_file(path, meter)
     except OSError as error:
@@ -175,8 +187,10 @@ def _open_plain(file: LogFile) -> Container | DriveLog:
     head = _head_of(file.path)
     log_format = recognised_format(head, file.path.name)
     if log_format is None:
-        got = "a file that is none of these" if head else "an empty file"
-        raise LogError(expected=what_is_a_log(), got=got, where=str(file.place), remedy=_REMEDY)
+        got, remedy = "a file that is none of these" if head else "an empty file", _REMEDY
+        if head.startswith(LFS_POINTER[:HEAD_BYTES]):
+            got, remedy = "a pointer of Git LFS in place of the recording", "git lfs pull in its repository"
+        raise LogError(expected=what_is_a_log(), got=got, where=str(file.place), remedy=remedy)
     opened = log_format.open(file)
     if isinstance(opened, Container) and file.path != file.place:
         opened.on_close(file.release)
@@ -206,6 +220,7 @@ def _open_folder(path: Path, meter: Meter) -> DriveLog:
     if is_log_folder(path):
         return _open_rosbag2_folder(path, meter)
     logs = [p for p in sorted(path.iterdir()) if p.is_file() and looks_like_log(p)]
+    logs = [p for p in logs if p.name in without_general({log.name for log in logs})]
     if len(logs) != 1:
         got = "a folder without a log" if not logs else f"a folder of {len(logs)} logs without metadata.yaml"
         raise LogError(

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,11 @@ from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.recording_span import RecordingSpan, survey_stamps
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import IntArray, Loss
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database
+
+    from pdhef_logtool.logs.can_decoding import Frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,12 +45,17 @@ class Table:
 
     @classmethod
     def of_arrays(
-        cls, name: str, stamps_ns: IntArray, columns: Mapping[str, NDArray[Any]], units: Mapping[str, str] | None = None
+        cls,
+        name: str,
+        stamps_ns: IntArray,
+        columns: Mapping[str, NDArray[Any]],
+        units: Mapping[str, str] | None = None,
+        type_name: str = "",
     ) -> Table:
         """Return a table of numbers [N] that are in memory, with the unit of each column where one is known."""
         units = units or {}
         fields = tuple(FieldInfo(path, "number", unit=units.get(path, "")) for path in columns)
-        return cls(name, stamps_ns, fields, lambda path, rows: columns[path][rows])
+        return cls(name, stamps_ns, fields, lambda path, rows: columns[path][rows], type_name)
 
 
 class TableLog(DriveLog):
@@ -56,14 +66,23 @@ class TableLog(DriveLog):
     file : that the tables come from; it is released when the log is closed.
     kind : name of the format, for reports.
     tables : one a topic. lost : what of the file could not be read.
+    frames : raw CAN frames among them, for :meth:`decode_frames`.
 
     Raises
     ------
     LogError : stamps of a table step back, or two tables have one name.
     """
 
-    def __init__(self, file: LogFile, kind: str, tables: Sequence[Table], lost: Sequence[Loss] = ()) -> None:
+    def __init__(
+        self,
+        file: LogFile,
+        kind: str,
+        tables: Sequence[Table],
+        lost: Sequence[Loss] = (),
+        frames: Sequence[Frames] = (),
+    ) -> None:
         self.path, self.kind = file.place, kind
+        self._frames = frames
         self._file = file
         self._tables = {table.name: table for table in sorted(tables, key=lambda table: table.name)}
         wrong = [t.name for t in tables if self._tables[t.name] is not t or (t.stamps_ns[1:] < t.stamps_ns[:-1]).any()]
@@ -75,6 +94,14 @@ class TableLog(DriveLog):
         self._lost = [*lost, *cut, *self._recording_span.losses]
         self._unreadable: set[tuple[str, str]] = set()
         self._size = file.path.stat().st_size
+
+    def decode_frames(self, databases: Sequence[Database]) -> None:
+        """Add a table for each message of DBC files that raw CAN frames of the log contain."""
+        tables = [table for frames in self._frames for table in frames.decoded(databases)]
+        for table in tables:
+            number = 1 + sum(name.partition("#")[0] == table.name for name in self._tables)
+            name = table.name if number == 1 else f"{table.name}#{number}"
+            self._tables[name] = replace(table, name=name)
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:

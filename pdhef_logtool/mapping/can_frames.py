@@ -2,38 +2,31 @@
 
 A source whose field is ``can:<message>.<signal>`` gets a view of its own: the frames of that message (and, for a
 multiplexed signal, of that selector) with the signal as a column. Everything behind it reads the view like a topic.
-
-A signal's bits are gathered from the few bytes that contain it, for all frames at once. Bit numbers follow the DBC: bit
-b is bit b mod 8 of byte b div 8; a little-endian signal starts at its least significant bit, a big-endian one at its
-most significant bit.
 """
 
 from __future__ import annotations
 
-import stat
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_account import ByteLedger
+from pdhef_logtool.logs.can_decoding import load_dbc, raw_bits, selectors_of, signal_values
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.recording_span import RecordingSpan
 from pdhef_logtool.mapping.records import CAN_PREFIX, CanSettings, SignalSource
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
-from pdhef_logtool.records.errors import MappingError, MappingFileError
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
+from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal
-
-_MAX_DBC_BYTES = 32 << 20
 
 # Where frames keep their parts, best first; names are compared in lower case without underscores.
 ID_NAMES = ("id", "canid", "arbitrationid", "address", "identifier", "frameid", "msgid", "messageid")
@@ -71,47 +64,6 @@ def with_can_signals(log: DriveLog, mapping: SignalMapping) -> DriveLog:
             remedy="see docs/formats.md",
         )
     return CanSignalLog(log, sources, mapping.can)
-
-
-def raw_bits(data: NDArray[np.uint8], start: int, length: int, byte_order: str) -> NDArray[np.uint64]:
-    """Gather an unsigned integer of at most 64 bits from frames.
-
-    Parameters
-    ----------
-    data : uint8 [N, k]; all bytes of the signal must be there.
-    start : of the signal's least (little-endian) or most (big-endian) significant bit, in the DBC's numbering.
-    byte_order : ``little_endian`` or ``big_endian``.
-    """
-    if byte_order == "little_endian":
-        first, skipped = divmod(start, 8)
-        last = (start + length - 1) // 8
-        columns = range(first, last + 1)
-    else:
-        top = 8 * (start // 8) + 7 - start % 8
-        first, last = top // 8, (top + length - 1) // 8
-        skipped = 8 * (last + 1) - (top + length)
-        columns = range(last, first - 1, -1)
-    value = np.zeros(data.shape[0], np.uint64)
-    for i, column in enumerate(columns):
-        byte = data[:, column].astype(np.uint64)
-        shift = 8 * i - skipped
-        value |= byte << np.uint64(shift) if shift >= 0 else byte >> np.uint64(-shift)
-    return value & np.uint64((1 << length) - 1)
-
-
-def signal_values(data: NDArray[np.uint8], signal: Signal) -> FloatArray:
-    """Decode one signal of frames uint8 [N, k] to ``scale * raw + offset``, float64 [N]."""
-    raw = raw_bits(data, signal.start, signal.length, signal.byte_order)
-    number: NDArray[Any]
-    if signal.is_float:
-        width = signal.length // 8
-        number = raw.astype(f"<u{width}").view(f"<f{width}").astype(np.float64)
-    elif signal.is_signed:
-        sign = np.uint64(1 << (signal.length - 1))
-        number = ((raw ^ sign) - sign).view(np.int64)
-    else:
-        number = raw
-    return np.asarray(number.astype(np.float64) * float(signal.scale) + float(signal.offset), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +107,7 @@ class CanSignalLog(DriveLog):
         self._settings = settings
         self._views: dict[str, _CanView] = {}
         self.short_frames: tuple[Loss, ...] = ()
-        databases = [(path, _load_dbc(path)) for path in settings.dbc]
+        databases = [(path, load_dbc(path)) for path in settings.dbc]
         valid_ids = {t.name for t in log.topics}
         paths: dict[str, _FramePaths | str] = {}
         problems: list[str] = []
@@ -341,19 +293,7 @@ def _make_view(
     same_id = [
         m for _, d in databases for m in d.messages if m.frame_id == message.frame_id and not m.is_extended_frame
     ]
-    return _CanView(source, paths, message, signal, tuple(_selectors(signal, by_name)), not same_id)
-
-
-def _selectors(signal: Signal, by_name: Mapping[str, Signal]) -> Iterator[tuple[Signal, tuple[int, ...]]]:
-    """Yield the multiplexers above a signal and the values under which it is sent."""
-    seen: set[str] = set()
-    while signal.multiplexer_ids and signal.name not in seen:
-        seen.add(signal.name)
-        selector = by_name.get(signal.multiplexer_signal or "")
-        if selector is None:
-            return
-        yield selector, tuple(int(v) for v in signal.multiplexer_ids)
-        signal = selector
+    return _CanView(source, paths, message, signal, tuple(selectors_of(signal, by_name)), not same_id)
 
 
 def holds_frames(topic: str, fields: tuple[FieldInfo, ...]) -> bool:
@@ -418,39 +358,3 @@ def _best(paths: Sequence[str], names: Sequence[str]) -> list[str]:
 def _near(name: str, valid_ids: Sequence[str]) -> str:
     close = get_close_matches(name, valid_ids, n=1, cutoff=0.3)
     return f" (did you mean {close[0]}?)" if close else ""
-
-
-def _load_dbc(path: Path) -> Database:
-    try:
-        state = path.stat()
-    except OSError as error:
-        raise MappingFileError(
-            expected="a DBC file", got=error.strerror or str(error), where=str(path), remedy="correct [can] dbc"
-        ) from None
-    if not stat.S_ISREG(state.st_mode) or state.st_size > _MAX_DBC_BYTES:
-        raise MappingFileError(
-            expected=f"a DBC file of at most {_MAX_DBC_BYTES >> 20} MiB",
-            got=f"{state.st_size} bytes" if stat.S_ISREG(state.st_mode) else "no file",
-            where=str(path),
-            remedy="correct [can] dbc",
-        )
-    return _load_cached(path, state.st_mtime_ns, state.st_size)
-
-
-@lru_cache(maxsize=16)
-def _load_cached(path: Path, _modified_ns: int, _size: int) -> Database:
-    import cantools
-    from cantools.database.can import Database
-
-    expected = "a DBC file"
-    try:
-        # Overlapping signals are an error of the file, not of the signals that are asked for.
-        matches = cantools.database.load_file(path, strict=False)
-    except Exception as error:  # noqa: BLE001  cantools' parsers raise any exception for a malformed file.
-        reason = (str(error).splitlines() or [""])[0] or type(error).__name__
-        raise MappingFileError(expected=expected, got=reason, where=str(path), remedy="correct [can] dbc") from None
-    if not isinstance(matches, Database):
-        raise MappingFileError(
-            expected=expected, got="a file of another kind", where=str(path), remedy="correct [can] dbc"
-        )
-    return matches

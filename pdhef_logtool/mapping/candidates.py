@@ -209,7 +209,7 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
             continue
         documented_fields = vendors.fields_of(topic.type_name)
         for info in fields:
-            if is_command(info.path) or info.kind != "number" or info.path.count("[]") > info.path.endswith("[]"):
+            if info.kind != "number" or info.path.count("[]") > info.path.endswith("[]") or _is_setpoint(topic, info):
                 continue
             if info.path in documented_fields:
                 results.append((topic, role, info, documented_fields[info.path].meaning, True))
@@ -218,6 +218,11 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
                 if meaning is not None:
                     results.append((topic, role, info, meaning, False))
     return results
+
+
+def _is_setpoint(topic: TopicInfo, info: FieldInfo) -> bool:
+    """Return whether a field is a command; ``REF_Speed`` of a topic ``reference`` is measured."""
+    return is_command(info.path.removeprefix("REF_") if "reference" in topic.name.lower() else info.path)
 
 
 def look(

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, windows
 from pdhef_logtool.logs.recording_span import STEP_BACK_NS, steps_back
 from pdhef_logtool.mapping.can_frames import with_can_signals
-from pdhef_logtool.mapping.checking import resolve_mapping, split_stamp
-from pdhef_logtool.mapping.records import RECORDER_STAMPS, Mapping, SignalSource
+from pdhef_logtool.mapping.checking import resolve_mapping, split_stamp, stamp_paths
+from pdhef_logtool.mapping.records import AUTO_STAMP, RECORDER_STAMPS, Mapping, SignalSource
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import FloatArray, IntArray
 
@@ -158,21 +158,27 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
     for source in wanted.values():
         paths = requests.setdefault(source.read_topic, [])
         paths += [p for p in stamp_request(log, source) if p not in paths]
-    parts = _survey(log, wanted, requests, survey_windows(start_ns, end_ns))
+    parts, recorded = _survey(log, wanted, requests, survey_windows(start_ns, end_ns))
     # Between the parts of a survey a clock may have stepped: then all of its stamps are looked at.
     doubtful = {key: source for key, source in wanted.items() if _offset_changes(parts[key])}
     whole: dict[str, list[_Stamps]] = {}
     if doubtful and end_ns - start_ns > SURVEY_WHOLE_NS:
         topics = {source.read_topic for source in doubtful.values()}
         some = {topic: paths for topic, paths in requests.items() if topic in topics}
-        whole = _survey(log, doubtful, some, windows(start_ns, end_ns, SURVEY_WHOLE_NS, log.recording_span))
+        whole, _ = _survey(log, doubtful, some, windows(start_ns, end_ns, SURVEY_WHOLE_NS, log.recording_span))
     clocks = {}
     for key, source in wanted.items():
         raw, log_time, steps = (np.concatenate(column) for column in zip(*parts[key], strict=True))
         seen, recorded_ns, _ = (np.concatenate(column) for column in zip(*whole.get(key, parts[key]), strict=True))
-        unusable = "" if source.stamp == "log_time" else why_unusable(seen, recorded_ns)
+        times = np.concatenate(recorded[key])
+        is_asked_for = source.stamp == "log_time" or source.clock == "device"
+        unusable = "" if is_asked_for else why_missing(raw.shape[0], times.shape[0])
+        if unusable:
+            raw = log_time = times
+        elif source.stamp != "log_time":
+            unusable = why_unusable(seen, recorded_ns)
         if unusable:  # they do not show the period either
-            steps = np.concatenate([np.diff(part[1]) for part in parts[key]]) * 1e-9
+            steps = np.diff(times) * 1e-9
         clocks[key] = _clock_of(source, raw, log_time, steps, unusable)
     for key, why in _of_other_clocks(clocks).items():
         raw, log_time, steps = (np.concatenate(column) for column in zip(*parts[key], strict=True))
@@ -197,10 +203,11 @@ def _survey(
     wanted: Mapped[str, SignalSource],
     requests: Mapped[str, Sequence[str]],
     spans: Iterable[tuple[int, int]],
-) -> dict[str, list[_Stamps]]:
-    """Read the stamps of each clock, window by window."""
+) -> tuple[dict[str, list[_Stamps]], dict[str, list[IntArray]]]:
+    """Read the usable stamps of each clock, and the log times of all messages, window by window."""
     none = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))
     parts: dict[str, list[_Stamps]] = {key: [none] for key in wanted}
+    recorded: dict[str, list[IntArray]] = {key: [none[0]] for key in wanted}
     for start_ns, end_ns in spans:
         columns = log.read(requests, start_ns, end_ns)
         for key, source in wanted.items():
@@ -209,13 +216,66 @@ def _survey(
             raw, usable = raw_stamps(log, columns[source.read_topic], source)
             steps = np.diff(np.unique(raw[usable])).astype(np.float64) * 1e-9
             parts[key].append((raw[usable], columns[source.read_topic].log_time_ns[usable], steps))
-    return parts
+            recorded[key].append(columns[source.read_topic].log_time_ns)
+    return parts, recorded
 
 
 def _offset_changes(parts: Sequence[_Stamps]) -> bool:
     """Return whether the least delay of one part differs from the next one's by more than clocks drift."""
     least = np.array([float((log_time - raw).min()) for raw, log_time, _ in parts if raw.shape[0]])
     return bool((np.abs(np.diff(least)) > STEP_BACK_NS).any())
+
+
+def why_missing(usable: int, messages: int) -> str:
+    """Return in words why too few messages have a stamp; empty where enough have one."""
+    share = 1.0 - usable / messages if messages else 0.0
+    return f"{share:.0%} of its stamps are zero or no time" if share > UNUSABLE_SHARE else ""
+
+
+def with_usable_stamps(log: DriveLog, mapping: Mapping) -> Mapping:
+    """Return the mapping with another stamp of a message, of its outer or inner header, where its own is no time.
+
+    The first ten seconds decide. If no stamp of a message is usable, the source keeps its own: :func:`fit_clocks`
+    then takes the recorder's time, and gives the reason.
+    """
+    notes: dict[tuple[str, str], str] = {}
+    chosen: dict[tuple[str, str], str] = {}
+    for source in mapping.sources():
+        key = (source.topic, source.stamp)
+        if key in chosen or source.stamp in (*RECORDER_STAMPS, AUTO_STAMP) or source.can_signal is not None:
+            continue
+        chosen[key] = source.stamp
+        others = [path for path in stamp_paths(log.fields(source.topic)) if path != source.stamp]
+        if not others or source.stamp_unit != "ros":
+            continue
+        why = {path: _why_no_time(log, replace(source, stamp=path)) for path in (source.stamp, *others)}
+        good = [path for path in others if not why[path]]
+        if why[source.stamp] and good:
+            chosen[key] = good[0]
+            notes[key] = f"{source.topic} is read by {good[0]}, not {source.stamp}: {why[source.stamp]}"
+    if not notes:
+        return mapping
+
+    def moved(sources: Mapped[str, SignalSource]) -> dict[str, SignalSource]:
+        return {n: replace(s, stamp=chosen.get((s.topic, s.stamp), s.stamp)) for n, s in sources.items()}
+
+    signals, truth = moved(mapping.signals), moved(mapping.truth)
+    return replace(mapping, signals=signals, truth=truth, notes=(*mapping.notes, *notes.values()))
+
+
+def _why_no_time(log: DriveLog, source: SignalSource) -> str:
+    """Return in words why the stamps of a source in the first seconds are no measure of time; empty where they are."""
+    request = {source.read_topic: list(stamp_request(log, source))}
+    columns = log.read(request, log.start_ns, min(log.end_ns, log.start_ns + SURVEY_WINDOW_NS)).get(source.read_topic)
+    if columns is None or not len(columns):
+        return ""
+    raw, usable = raw_stamps(log, columns, source)
+    missing = why_missing(int(np.count_nonzero(usable)), len(columns))
+    if missing:
+        return missing
+    if len(columns) >= MIN_BIN_SAMPLES and np.ptp(raw[usable]) == 0:
+        return "its stamps are constant"
+    return why_unusable(raw[usable], columns.log_time_ns[usable])
 
 
 def why_unusable(stamps_ns: IntArray, log_time_ns: IntArray) -> str:

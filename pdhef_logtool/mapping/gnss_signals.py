@@ -12,12 +12,12 @@ from pdhef_logtool.mapping.records import SignalSource
 
 _EAST, _NORTH = "gnss_velocity_east_m_s", "gnss_velocity_north_m_s"
 #: Ground truth with one of these states a heading, or motion that needs one.
-_HEADING = frozenset({"quat_wxyz", "yaw_rad", "vy_m_s", "sideslip_rad"})
+HEADING = frozenset({"quat_wxyz", "yaw_rad", "vy_m_s", "sideslip_rad"})
 
 
 def gnss_signals(signals: Mapping[str, SignalSource], truth: Mapping[str, SignalSource]) -> dict[str, SignalSource]:
     """Return the GNSS signals that mapped ground truth contains: a velocity, or speed and course of one topic."""
-    if _HEADING & set(truth):
+    if HEADING & set(truth):
         return {}
     if (velocity := truth.get("enu_velocity_m_s")) is not None:
         return {name: component(velocity, name, i) for i, name in enumerate((_EAST, _NORTH))}

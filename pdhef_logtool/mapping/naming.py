@@ -29,7 +29,7 @@ UNITS: dict[str, dict[str, float]] = {
     },
     "speed": {
         "mps": 1.0, "ms": 1.0, "kmh": 1 / 3.6, "kph": 1 / 3.6, "kmph": 1 / 3.6, "mph": 0.44704, "kn": 1852 / 3600,
-        "kt": 1852 / 3600, "knots": 1852 / 3600, "cmps": 1e-2, "mmps": 1e-3,
+        "kt": 1852 / 3600, "kts": 1852 / 3600, "knots": 1852 / 3600, "cmps": 1e-2, "mmps": 1e-3,
     },
     "wheel rate": {"radps": 1.0, "rads": 1.0, "rpm": 2.0 * math.pi / 60.0, "degps": math.radians(1.0)},
     "position": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3},
@@ -245,7 +245,7 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
     ``unit_text`` is the unit that the log gives (``km/h``, ``°/s``), empty where it gives none.
     """
     *parents, leaf = path.split(".")
-    leaf_words = words_of(re.sub(r"\[\d*\]", "", leaf))
+    leaf_words = words_of(f"r_{unit_text.replace('°', 'deg')}" if leaf == "r" else re.sub(r"\[\d*\]", "", leaf))
     inner = tuple(w for p in parents for w in words_of(p))
     outer = (*words_of(topic), *words_of(type_name.rpartition("/")[2].rpartition(".")[2]))
     if not leaf_words or _OTHER_DEVICES & set(outer):
@@ -323,6 +323,7 @@ _QUANTITIES: tuple[tuple[_Rule, _Quantity | None], ...] = tuple(
     for text, quantity in (
         (".roll|.pitch !@accelerates", None),
         ("@steers @rate|@accelerates|.velocity|.speed|.vel|.column|.motor", None),
+        ("@around @steers velocity|vel !.angle|.ang|.rad|.deg|.position|.pos|.delta", None),
         ("@steers @road", ("steering", "road", "angle")),
         ("@steers @hand", ("steering", "wheel", "angle")),
         ("@steers", ("steering", "", "angle")),
@@ -333,6 +334,7 @@ _QUANTITIES: tuple[tuple[_Rule, _Quantity | None], ...] = tuple(
         ("@turns @corner @wheel|.omega", ("wheel rate", "@corner", "wheel rate")),
         ("@turns yaw|yawrate|turn|wz|psi|@z", ("rate", "z", "rate")),
         ("@turns @x|@y", ("rate", "@axis", "rate")),
+        ("=r_radps|=r_rad_s|=r_rads|=r_degps|=r_deg_s|=r_dps", ("rate", "z", "rate")),
         ("@turns", None),
         ("@corner @wheel|@speeds @speeds|@around", ("wheel speed", "@corner", "speed")),
         ("@corner @wheel|@speeds", None),
@@ -340,7 +342,7 @@ _QUANTITIES: tuple[tuple[_Rule, _Quantity | None], ...] = tuple(
         ("@place_lon|@place_lng|@place_long !@speeds", ("longitude", "", "position")),
         ("wheel|wheels|whl @index|left|right", None),  # which wheel it is, is not given
         ("ecef|enu|ned|east|north|up|down @speeds", None),
-        (".lat|.lateral|.vy @speeds|.vy", ("velocity", "y", "speed")),
+        (".lat|.lateral|.vy|.uy @speeds|.vy|.uy", ("velocity", "y", "speed")),
         ("=vl", ("velocity", "y", "speed")),
         ("=vf|.vx|.ux", ("speed", "x", "speed")),
         ("@speeds .long|.lng|.longitudinal|.forward", ("speed", "x", "speed")),

@@ -26,6 +26,8 @@ from pdhef_logtool.records.signals import FloatArray
 MOVING_M_S = 3.0
 #: A heading of the right convention is this near to the course (median), and every other one this far away.
 NEAR_RAD, FAR_RAD = math.radians(12.0), math.radians(25.0)
+#: Positions by quantity.
+_PLACES = {"lat_deg": "latitude", "lon_deg": "longitude"}
 #: Nobody drives further in a log.
 WIDEST_DEG = 10.0
 _SIDES = {
@@ -54,6 +56,34 @@ def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo]) -> NavigationTr
     """
     truths = [truth for t in topics if (truth := _of_topic(log, t)) is not None]
     return max(truths, key=lambda t: len(t[0]), default=None)
+
+
+def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
+    """Return speed and course over ground of a receiver by the names of its fields if its path agrees."""
+    fields = log.fields(topic.name, quiet=True)
+    meanings = {f.path: meaning_of(topic.name, topic.type_name, f.path, f.unit) for f in fields if f.kind == "number"}
+    first = {m.quantity: (path, m.scale) for path, m in reversed([*meanings.items()]) if m is not None}
+    if not {"speed", "course", "latitude", "longitude"} <= set(first):
+        return {}
+    pieces, stamp = Pieces(log), stamp_path_of(fields)
+    samples = pieces.read({topic.name: [path for path, _ in first.values()]})
+    places = {n: SignalSource(n, topic.name, first[q][0], stamp) for n, q in _PLACES.items()}
+    if not all((topic.name, source.paths[0]) in samples for source in places.values()):
+        return {}
+    (course, unit), (speed, scale) = first["course"], first["speed"]
+    direction, seen = _course(places, samples, topic.name, pieces), samples.get((topic.name, course))
+    # A course over ground counts clockwise from north by definition; the path shows that it is one, and its unit.
+    clockwise = (c[1:] for c in _CONVENTIONS[:2] if unit is None or math.isclose(-c[1], unit))
+    convention = next(
+        (c for c in clockwise if seen is not None and direction is not None and _off(seen, direction, *c) < NEAR_RAD),
+        None,
+    )
+    if convention is None or scale is None:
+        return {}
+    return {
+        "gnss_speed_m_s": SignalSource("gnss_speed_m_s", topic.name, speed, stamp, scale),
+        "gnss_course_rad": SignalSource("gnss_course_rad", topic.name, course, stamp, *convention),
+    }
 
 
 def _of_topic(log: DriveLog, topic: TopicInfo) -> NavigationTruth | None:
@@ -161,14 +191,15 @@ def _convention(seen: Seen | None, course: FloatArray | None, unit: float | None
     if seen is None or course is None:
         return None
     unit = unit or (math.radians(1.0) if seen.largest > 2.1 * math.pi else 1.0)
-    off: list[float] = []
     conventions = [c for c in _CONVENTIONS if math.isclose(abs(c[1]), unit)]
-    for _, scale, angle in conventions:
-        away = np.abs(np.angle(np.exp(1j * (scale * seen.cells + angle - course))))
-        away = away[np.isfinite(away)]
-        if away.shape[0] < FEWEST_CELLS:
-            return None
-        off.append(float(np.median(away)))
-    if len(off) < 2 or not (min(off) < NEAR_RAD and max(off) > FAR_RAD):
+    off = [_off(seen, course, scale, angle) for _, scale, angle in conventions]
+    if len(off) < 2 or not (min(off) < NEAR_RAD and FAR_RAD < max(off) < math.inf):
         return None
     return conventions[int(np.argmin(off))]
+
+
+def _off(seen: Seen, course: FloatArray, scale: float, angle: float) -> float:
+    """Return the median difference of an angle ``scale * raw + angle`` from the course, rad; infinite if unknown."""
+    away = np.abs(np.angle(np.exp(1j * (scale * seen.cells + angle - course))))
+    away = away[np.isfinite(away)]
+    return float(np.median(away)) if away.shape[0] >= FEWEST_CELLS else math.inf

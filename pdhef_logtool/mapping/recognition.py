@@ -13,12 +13,13 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.candidates import Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
-from pdhef_logtool.mapping.gnss_signals import gnss_signals
+from pdhef_logtool.mapping.clocks import with_usable_stamps
+from pdhef_logtool.mapping.gnss_signals import HEADING, gnss_signals
 from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, length_of, speed_over_ground
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.naming import is_command
-from pdhef_logtool.mapping.navigation import navigation_truth
+from pdhef_logtool.mapping.navigation import named_gnss, navigation_truth
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.mapping.weighing import Weighed, weigh
@@ -227,8 +228,9 @@ def auto_map(
         f"{t.name} ({_type(t)}) has no messages" for t in log.topics if not t.messages and _is_well_known(t)
     ]
     draft.notes += [
-        f'{t.name} contains raw CAN frames: describe them in a mapping file with [can] dbc = ["car.dbc"]'
+        f"{t.name} contains raw CAN frames: describe them by --set msgs=car.dbc, or in a mapping file with [can]"
         for t in topics
+        if not any(o.type_name.startswith("can/msg/") and o.name != t.name for o in topics)
         if "can" in _words(f"{t.name} {t.type_name}") and holds_frames(t.name, log.fields(t.name, quiet=True))
     ]
     _map_imu(draft, topics)
@@ -249,6 +251,7 @@ def auto_map(
         notes=tuple(draft.notes),
         checks=weighed.checks,
     )
+    mapping = with_usable_stamps(log, mapping)
     return AutoMapping(mapping, tuple(draft.ambiguities), missing_signals(mapping), weighed.candidates)
 
 
@@ -365,6 +368,13 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
             for name, path in zip(("gnss_velocity_east_m_s", "gnss_velocity_north_m_s"), paths, strict=True):
                 draft.take(draft.signals, name, topic.name, path)
             return
+    for topic in topics:
+        if _role(topic) == "navigation" and not _is_well_known(topic):
+            if topic.name in used and HEADING & set(draft.truth):
+                continue
+            if named := named_gnss(draft.log, topic):
+                draft.signals |= named
+                return
 
 
 def _is_well_known(topic: TopicInfo) -> bool:

@@ -29,6 +29,7 @@ from pdhef_logtool.mapping.candidates import (
 from pdhef_logtool.mapping.checking import has_path
 from pdhef_logtool.mapping.evidence import Fit, fit, is_of_both_signs, is_of_one_sign, ratio, spread
 from pdhef_logtool.mapping.fields import CLEAR, Fields, mean_of
+from pdhef_logtool.mapping.naming import words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.signs import SLOW_M_S, WITNESSES, WORDS, judge_signs
 from pdhef_logtool.mapping.units import RADII_M, decide_units
@@ -39,6 +40,9 @@ from pdhef_logtool.records.signals import WHEELS, FloatArray
 
 #: Ground truth quantities that show the path.
 _POSITIONS = ("lat_deg", "lon_deg", "x_m", "y_m")
+_SLIP = frozenset({"vy_m_s", "sideslip_rad"})
+#: Words of a forward velocity that a lateral one is beside.
+_ALONG = frozenset({"lng", "long", "longitudinal", "forward"})
 #: Signals that one field gives: name, quantity and parts, in the order in which they are chosen.
 _SENSORS = (
     ("speed_m_s", "speed", ("", "x")), ("ax_m_s2", "acceleration", ("x",)), ("ay_m_s2", "acceleration", ("y",)),
@@ -424,11 +428,14 @@ class _Weighing:
         if not self.truth_from:
             return
         its = [f for f in self.fields.candidates if f.topic.name == self.truth_from and f.section != "signals"]
-        its = [f for f in its if f.fixed] or its  # documented fields before names
-        self.truth = _truth_of(its)
+        documented, named = _truth_of([f for f in its if f.fixed]), _truth_of(its)
+        # Documented fields before names, unless names alone give a sideslip: channels of modules beside a receiver.
+        self.truth = named if not documented or _SLIP & set(named) - set(documented) else documented
         if not self.truth:
             return
         first = its[0]
+        if first.role == "sensor" and self.truth.get("yaw_rate_rad_s") is self.taken.get("yaw_rate_rad_s"):
+            self.truth.pop("yaw_rate_rad_s", None)  # the only gyro of a table of everything is a sensor
         agrees = self._truth_turns()
         # Fields of ground truth are no inputs, except the speed of a navigation system without another speed.
         mine = set(map(id, self.truth.values()))
@@ -509,13 +516,13 @@ class _Weighing:
 def _truth_of(candidates: Sequence[Field]) -> dict[str, Field]:
     """Return ground truth quantities of one topic's fields; empty without sideslip, lateral velocity or a position."""
     truth: dict[str, Field] = {}
-    for item in sorted(candidates, key=lambda f: -f.score):
+    for item in sorted(candidates, key=lambda f: (-f.score, not _ALONG & set(words_of(f.path)))):
         name = _truth_name(item)
         if name and item.seen.changes:
             truth.setdefault(name, item)
-    if not {"vy_m_s", "sideslip_rad", "lat_deg"} & set(truth):
+    if not {*_SLIP, "lat_deg"} & set(truth):
         return {}
-    if not {"vy_m_s", "sideslip_rad"} & set(truth):
+    if not _SLIP & set(truth):
         truth.pop("vx_m_s", None)
     if {"vx_m_s", "vy_m_s"} <= set(truth):
         truth.pop("sideslip_rad", None)
@@ -563,7 +570,7 @@ def truth_topic(weighable: Sequence[Field]) -> str:
         worth += 0.5 * (fields[0].role == "truth") + 0.2 * ("latitude" in kinds) if worth else 0.0
         if worth == 0.0 and fields[0].fixed and {"latitude", "longitude"} <= kinds:
             worth = 0.1
-        if worth > best[0] and (fields[0].role != "sensor" or "sideslip" in kinds or fields[0].fixed):
+        if worth > best[0] and (fields[0].role != "sensor" or worth >= 1.5 or fields[0].fixed):
             best = (worth, name)
     return best[1]
 

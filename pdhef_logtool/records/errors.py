@@ -22,21 +22,25 @@ class PdhefError(Exception):
     got : what was found instead.
     where : file, topic, field or option.
     remedy : what the user can do; empty if nothing helps.
+    missing : a file or folder that the user named does not exist, which is a usage error.
     """
 
     exit_code: int = EXIT_FAILURE
 
-    def __init__(self, *, expected: str, got: str, where: str, remedy: str = "") -> None:
+    def __init__(self, *, expected: str, got: str, where: str, remedy: str = "", missing: bool = False) -> None:
         self.expected = expected
         self.got = got
         self.where = where
         self.remedy = remedy
+        self.missing = missing
+        if missing:
+            self.exit_code = EXIT_USAGE
         super().__init__(str(self))
 
     def __reduce__(self) -> tuple[partial[PdhefError], tuple[()]]:
-        """Travel between processes with all four parts."""
+        """Travel between processes with all parts."""
         parts = {"expected": self.expected, "got": self.got, "where": self.where, "remedy": self.remedy}
-        return partial(type(self), **parts), ()
+        return partial(type(self), missing=self.missing, **parts), ()
 
     def __str__(self) -> str:
         """One line, without a traceback's noise and safe for a terminal, as its parts are escaped."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.records.signals import BoolArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 
 #: Magnitudes beyond which a reading is no motion of a ground vehicle (10 g; eight turns a second; 540 km/h; wheels
 #: across): an input has no innovation that a gate could judge, and one such value would end a filter.
@@ -19,6 +20,8 @@ POSSIBLE_MAGNITUDE = {
     "yaw_rate_rad_s": 50.0,
     "speed_m_s": 150.0,
 }
+#: The same of an estimate: such a state is divergence, whatever the estimator reports of itself.
+POSSIBLE_STATE = {"vx_m_s": 150.0, "vy_m_s": 60.0, "yaw_rate_rad_s": 50.0}
 #: Friction below ice or above any tyre is no friction.
 POSSIBLE_FRICTION = (0.01, 5.0)
 
@@ -38,3 +41,12 @@ def without_impossible(signals: Signals) -> Signals:
         c: np.where(mask, np.nan, getattr(signals, c)) for c, mask in impossible_readings(signals).items()
     }
     return replace(signals, **changed) if changed else signals
+
+
+def without_impossible_states(track: StateTrack) -> StateTrack:
+    """Return the track with impossible states as invalid and diverged; the same object where there are none."""
+    bad = np.zeros(len(track), np.bool_)
+    for name, limit in POSSIBLE_STATE.items():
+        column = getattr(track, name)
+        bad |= ~(np.abs(column) <= limit) & ~np.isnan(column)
+    return replace(track, valid=track.valid & ~bad, diverged=track.diverged | bad) if bad.any() else track

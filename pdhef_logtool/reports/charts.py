@@ -210,6 +210,25 @@ class Charts:
         """Add a :class:`BarsFigure`."""
         self.figures[key] = BarsFigure(title, unit, edges, counts)
 
+    def text(self, key: str) -> str:
+        """Return a figure in words: what it shows, and the range of each of its tracks."""
+        figure = self.figures[key]
+        if isinstance(figure, TimeFigure):
+            parts = [f"{s.label} {_range(s.values)}" for s in figure.series if not s.group]
+            return f"{figure.heading} over time: {'; '.join(parts)}."
+        if isinstance(figure, StripFigure):
+            parts = [f"{r.label} {len(r.spans)} times" for r in figure.rows if r.spans]
+            return f"{figure.heading} over time: {'; '.join(parts) or 'none'}."
+        if isinstance(figure, PointsFigure):
+            parts = [f"{c.label} {_range(c.x)} and {_range(c.y)}" for c in figure.clouds]
+            return f"{figure.heading}; {figure.x_label} and {figure.y_label}: {'; '.join(parts)}."
+        if isinstance(figure, IntervalsFigure):
+            parts = [f"{i.label} {i.middle:.3g} ({i.low:.3g} to {i.high:.3g})" for i in figure.intervals]
+            return f"{figure.heading} in {figure.unit}: {'; '.join(parts)}."
+        return (
+            f"{figure.heading} in {figure.unit}: histogram of {figure.counts.sum():.0f} values, {_range(figure.edges)}."
+        )
+
     def start_s(self) -> float:
         """Return the start of the grid in seconds from the origin."""
         return 0.0 if self.grid is None else (self.grid.start_ns - self.origin_ns) * 1e-9
@@ -328,6 +347,11 @@ def _of_time(figure: TimeFigure, blocks: _Blocks) -> dict[str, Any]:
         ],
         "marks": [{"label": _label(m.label), "at": m.at_s, "value": m.value} for m in figure.marks],
     }
+
+
+def _range(values: FloatArray) -> str:
+    finite = values[np.isfinite(values)]
+    return f"{finite.min():.3g} to {finite.max():.3g}" if finite.size else "no value"
 
 
 def _label(text: str) -> str:

@@ -6,12 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from pdhef_logtool.evaluation.units import AY_NOTE, LABELS
 from pdhef_logtool.logs.byte_account import checksum_text
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.reports.charts import Charts
 from pdhef_logtool.reports.drive_figures import DriveFigures, Roles, drive_figures
 from pdhef_logtool.reports.drive_tables import by_segment, consistency, definitions, disagreements, residuals, scores
+from pdhef_logtool.reports.first_screen import next_steps, plan_head, tested_drive
 from pdhef_logtool.reports.page import render
+from pdhef_logtool.results.fleet import cause_and_remedy
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
 from pdhef_logtool.results.run_report import reasons_line
 
@@ -24,7 +27,7 @@ _SHORT_S = 10.0
 #: The figures of a page, in the order in which they are.
 OVER_TIME = ("sideslip", "error", "trust", "r_scale", "nis", "speed", "ay", "strip")
 IN_PLANE = ("path", "ay_sideslip", "phase")
-FIGURES = (*OVER_TIME, *IN_PLANE)
+FIGURES = ("worst", *OVER_TIME, *IN_PLANE)
 #: Rows of tables that a log can make as long as it likes.
 _MOST_ROWS = 200
 #: Outcomes of verdicts: a word, and the class of the style.
@@ -42,6 +45,7 @@ _OUTCOMES = {
 class Verdict:
     """A sentence on one signal, and the word that sums it up; ``kind``: class of the style."""
 
+    signal: str
     word: str
     text: str
     kind: str = ""
@@ -63,7 +67,8 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
     """
     report = log.report()
     if report is None or not isinstance(report.get("log"), dict):
-        return DrivePage(render("failed.html", label=log.label, outcome=log.outcome, back=back), Charts())
+        cause, remedy = cause_and_remedy(log.outcome.removeprefix("failed: "))
+        return DrivePage(render("failed.html", label=log.label, cause=cause, remedy=remedy, back=back), Charts())
     figures, why_none, wrong = None, "", ""
     roles = roles_of(report)
     low_speed = report["vehicle"].get("low_speed_blend_m_s")
@@ -87,10 +92,13 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         "drive.html",
         charts,
         label=log.label,
-        outcome=log.outcome,
         back=back,
         report=report,
         roles=roles,
+        plan=plan_head(report.get("plan")),
+        tested=tested_drive(report, log.outcome),
+        steps=next_steps(report.get("plan"), _next_of_estimate(report)),
+        identical=[] if roles is None else identical_to(report, roles.main),
         verdicts=verdicts_of(report),
         drawn=figures,
         why_none=why_none,
@@ -110,6 +118,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         faults=report.get("faults"),
         innovations=report.get("innovations") or (),
         metadata=report.get("metadata") or {},
+        ay_note=AY_NOTE,
         over_time=OVER_TIME,
         in_plane=IN_PLANE,
     )
@@ -125,8 +134,29 @@ def roles_of(report: Mapping[str, Any]) -> Roles | None:
     answer = report.get("answer") or {}
     main: str = answer["main"] if answer.get("main") in names else names[0]
     rival_of_verdict = next((str(v.get("rival")) for v in _told(report) if v.get("signal") == "sideslip_rad"), "")
-    rival = rival_of_verdict if rival_of_verdict in names else _best_physics(report, ran, main)
+    identical = identical_to(report, main)
+    others = [e for e in ran if e["name"] not in identical]
+    is_other = rival_of_verdict in names and rival_of_verdict not in identical
+    rival = rival_of_verdict if is_other else _best_physics(report, others, main)
     return Roles(main, rival, tuple(n for n in names if n not in (main, rival)))
+
+
+def _next_of_estimate(report: Mapping[str, Any]) -> str:
+    answer = report.get("answer") or {}
+    return str((answer.get("texts") or {}).get("next") or "")
+
+
+def identical_to(report: Mapping[str, Any], main: str) -> list[str]:
+    """Return the estimators whose errors equal those of ``main`` bit for bit: the same filter under another name."""
+    figures: dict[str, dict[tuple[str, str], Any]] = {}
+    for m in report["metrics"]:
+        if m["segment"] == "all" and m["metric"] in ("rmse", "max_abs", "nis") and m["value"] is not None:
+            figures.setdefault(m["estimator"], {})[m["signal"], m["metric"]] = m["value"]
+    errors = figures.get(main, {})
+    same = [n for n, f in figures.items() if n != main and "~" not in n and len(f) > 1 and f == errors]
+    apart = [m["estimator"] for m in report["metrics"] if m["metric"] == "disagreement_rms" and m["value"] == 0.0]
+    pairs = [n for pair in apart if main in (names := pair.split("~")) for n in names if n != main]
+    return [*dict.fromkeys([*same, *pairs])]
 
 
 def _best_physics(report: Mapping[str, Any], ran: Sequence[Mapping[str, Any]], main: str) -> str:
@@ -163,11 +193,11 @@ def verdicts_of(report: Mapping[str, Any]) -> list[Verdict]:
     verdicts = []
     for v in _told(report):
         word, kind = _OUTCOMES.get(str(v.get("outcome")), (str(v.get("outcome")), ""))
-        verdicts.append(Verdict(word, str(v.get("text", "")), kind))
+        verdicts.append(Verdict(LABELS.get(str(v.get("signal")), ""), word, str(v.get("text", "")), kind))
     answer = report.get("answer")
     if verdicts or answer is None:
         return verdicts
-    return [Verdict("sideslip", str(answer["texts"]["result"]))]
+    return [Verdict("sideslip", "result", str(answer["texts"]["result"]))]
 
 
 def _notices(report: Mapping[str, Any], figures: DriveFigures | None, low_speed: float | None) -> list[str]:

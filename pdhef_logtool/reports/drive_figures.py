@@ -25,12 +25,15 @@ PEAKS, _APART_S, _APART_SHARE = 10, 1.0, 0.02
 #: Stamps further apart are a gap, where they are also further apart than so many median steps.
 _GAP_S, _GAP_STEPS = 0.25, 5.0
 _MOST_POINTS = 12_000
+#: The first screen shows the sideslip so far around the largest error, with so many points.
+_AROUND_NS, _MOST_AROUND = 4_000_000_000, 1000
+#: Small, medium and large errors along the path: Okabe and Ito (2008), dark enough for white.
+_ERROR_COLOURS = ("#0072b2", "#b07800", "#c8400a")
 #: A shorter path is a point.
 _LEAST_PATH_M = 1.0
 _DASHES: tuple[tuple[int, ...], ...] = ((6, 3), (2, 2), (8, 3, 2, 3), (4, 4), (10, 4))
 #: Figures in the plane: key, title, labels of the axes.
 _PLANES = (
-    ("path", "Path, north up", "m east", "m north"),
     ("ay_sideslip", "|a_y| and sideslip", "|a_y| in m/s²", "sideslip in °"),
     ("phase", "Phase plane: sideslip rate is a_y/v_x − yaw rate", "sideslip in °", "sideslip rate in °/s"),
 )
@@ -52,9 +55,9 @@ class Roles:
     def series(self, name: str, values: FloatArray, width: float = 1.2) -> Series:
         """Return a line as its estimator is drawn: selected, ground truth, best physics always, others by box."""
         if name == self.main:
-            return Series(name, colour(name), values, width + 0.6)
+            return Series(name, colour(name), values, width + 1.0)
         if name not in self.others:
-            return Series(name, colour(name), values, width)
+            return Series(name, colour(name), values, width, _DASHES[0] if name == self.rival else ())
         dash = _DASHES[self.others.index(name) % len(_DASHES)]
         return Series(name, colour(name), values, width, dash, group=name)
 
@@ -86,11 +89,12 @@ class DriveFigures:
     scored: bool
     moves: bool
     absent: Sequence[str]
+    path_text: str = ""
 
     @property
     def in_plane(self) -> bool:
         """Whether there is a figure without a time axis."""
-        return any(key in self.charts.figures for key, *_ in _PLANES)
+        return any(key in self.charts.figures for key in ("path", *(key for key, *_ in _PLANES)))
 
 
 def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles, low_speed_m_s: float) -> DriveFigures | None:
@@ -127,9 +131,13 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles, low_speed
     _add_filter(charts, series, roles)
     _add_motion(charts, series, roles)
     charts.strip("strip", "Faults, gaps and segments", _rows(report, series, roles, stamps, origin_ns))
+    path_text = _add_path(charts, series, roles) if TRUTH in series else ""
     _add_planes(charts, [series[n] for n in (TRUTH, roles.main) if n in series])
+    _add_worst(charts, answer, reference, peaks, origin_ns)
     absent = [n for n in roles.names if n not in tracks.names]
-    return DriveFigures(charts, peaks, "" if reference is None else reference.track.name, scored, moves, absent)
+    return DriveFigures(
+        charts, peaks, "" if reference is None else reference.track.name, scored, moves, absent, path_text
+    )
 
 
 def _reference(tracks: Tracks, roles: Roles, answer: SideslipTrack) -> Reference | None:
@@ -178,9 +186,9 @@ def _peaks(
 
 
 def _lines(series: Mapping[str, DriveSeries], roles: Roles, values: str, names: Sequence[str]) -> list[Series]:
-    """Return a line of each track that has any such value; the selected estimate comes last and so lies on top."""
+    """Return a line of each track that has any such value; the selected estimate, the widest, lies below the others."""
     lines = []
-    for name in [*(n for n in names if n != roles.main), *(n for n in names if n == roles.main)]:
+    for name in sorted(names, key=lambda n: n != roles.main):
         if name in series:
             data = getattr(series[name], values)
             drawn = data.largest if values in ("error", "r_scale") else data.values
@@ -228,7 +236,10 @@ def _add_filter(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles)
 
 
 def _add_motion(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> None:
-    for key, title, unit in (("speed", "Speed, longitudinal", "m/s"), ("ay", "Lateral acceleration", "m/s²")):
+    for key, title, unit in (
+        ("speed", "Speed, longitudinal", "m/s"),
+        ("ay", "Lateral acceleration: specific force of the estimate, ground truth as in the table", "m/s²"),
+    ):
         if lines := _lines(series, roles, key, (TRUTH, roles.main)):
             charts.time(key, title, unit, lines, resolution=_SEEN, height=120)
 
@@ -267,14 +278,93 @@ def _rows(
 
 def _add_planes(charts: Charts, series: Sequence[DriveSeries]) -> None:
     for key, title, x_label, y_label in _PLANES:
-        clouds = [c for s in series if (c := _cloud(key, s.name, getattr(s, key), charts.origin_ns)) is not None]
+        clouds = [c for s in series if (c := _cloud(s.name, getattr(s, key), charts.origin_ns)) is not None]
         if clouds:
-            charts.points(key, title, x_label, y_label, clouds, equal=key == "path")
+            charts.points(key, title, x_label, y_label, clouds)
 
 
-def _cloud(key: str, name: str, points: Points, origin_ns: int) -> Cloud | None:
+def _cloud(name: str, points: Points, origin_ns: int) -> Cloud | None:
     at_ns, x, y = points.thinned(_MOST_POINTS)
-    if len(x) < 2 or (key == "path" and max(np.ptp(x), np.ptp(y)) < _LEAST_PATH_M):
+    if len(x) < 2:
         return None
     at_s = np.asarray((at_ns - float(origin_ns)) * 1e-9, dtype=np.float64)
-    return Cloud(name, colour(name), x, y, at_s, line=key == "path")
+    return Cloud(name, colour(name), x, y, at_s)
+
+
+def _add_worst(
+    charts: Charts, answer: SideslipTrack, reference: Reference | None, peaks: Sequence[Peak], origin_ns: int
+) -> None:
+    """Add the sideslip around the largest error: the one figure of the first screen."""
+    if reference is None or not peaks:
+        return
+    worst = peaks[0]
+    clouds = []
+    for track in (answer, reference.track):
+        around = slice(
+            *np.searchsorted(track.stamps_ns, [worst.stamp_ns - _AROUND_NS, worst.stamp_ns + _AROUND_NS + 1])
+        )
+        stamps, beta = track.stamps_ns[around], track.sideslip_rad[around] * DEGREES
+        step = max(1, len(stamps) // _MOST_AROUND)
+        at_s = np.asarray((stamps[::step] - origin_ns) * 1e-9, dtype=np.float64)
+        clouds.append(Cloud(track.name, colour(track.name), at_s, beta[::step], line=True))
+    kind = "error" if reference.scored else "difference"
+    title = f"Largest {kind}: {abs(worst.error_rad) * DEGREES:.2f}° at {worst.at_s:.1f} s"
+    title += f" during {worst.during}" if worst.during else ""
+    charts.points("worst", title, "s from the log's start", "sideslip in °", clouds)
+
+
+def _add_path(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> str:
+    """Add the dead-reckoned path, aligned with that of the ground truth; return its drift in words."""
+    truth, estimate = (series[n].path.thinned(_MOST_POINTS) for n in (TRUTH, roles.main))
+    if truth.shape[1] < 2 or max(np.ptp(truth[1]), np.ptp(truth[2])) < _LEAST_PATH_M:
+        return ""
+    common, at_truth, at_own = np.intersect1d(truth[0], estimate[0], return_indices=True)
+    clouds = [Cloud(TRUTH, colour(TRUTH), truth[1], truth[2], _seconds(truth[0], charts), line=True)]
+    if len(common) < 2:
+        charts.points("path", "Path of the ground truth", "m east", "m north", clouds, equal=True)
+        return ""
+    target, source = truth[1:, at_truth], estimate[1:, at_own]
+    aligned = _aligned(source, target)
+    apart = np.hypot(*(aligned - target))
+    length = float(np.hypot(*np.diff(target, axis=1)).sum())
+    end = float(np.hypot(*(source - target)[:, -1]))
+    clouds += _by_error(aligned, common, series[roles.main], charts)
+    charts.points("path", "Path, aligned with the ground truth", "m east", "m north", clouds, equal=True)
+    share = f" ({end / length:.1%})" if length > 0.0 else ""
+    return (
+        f"Path: {roles.main} integrates its velocity without position measurements. Drift: {end:.1f} m{share} at the "
+        f"end of {length / 1000.0:.2f} km from a common start. The figure shows it after one rotation and translation "
+        f"(SE(2)); the largest remaining distance is {apart.max():.1f} m. Colours: absolute sideslip error."
+    )
+
+
+def _aligned(source: FloatArray, target: FloatArray) -> FloatArray:
+    """Return points [2, K] after the rotation and translation that bring them closest to ``target`` [2, K]."""
+    a, b = (p - p.mean(axis=1, keepdims=True) for p in (source, target))
+    angle = np.arctan2(np.sum(a[0] * b[1] - a[1] * b[0]), np.sum(a * b))
+    cosine, sine = np.cos(angle), np.sin(angle)
+    rotated = np.stack([cosine * a[0] - sine * a[1], sine * a[0] + cosine * a[1]])
+    return np.asarray(rotated + target.mean(axis=1, keepdims=True), dtype=np.float64)
+
+
+def _by_error(aligned: FloatArray, at_ns: FloatArray, estimate: DriveSeries, charts: Charts) -> list[Cloud]:
+    """Return the path [2, K] in three classes of the absolute sideslip error."""
+    assert charts.grid is not None
+    largest = estimate.error.largest
+    cell = np.clip((at_ns - charts.grid.start_ns) // charts.grid.cell_ns, 0, len(largest) - 1).astype(np.int64)
+    error = np.nan_to_num(largest[cell], nan=0.0)
+    if not (error > 0.0).any():
+        return [Cloud(estimate.name, colour(estimate.name), aligned[0], aligned[1], _seconds(at_ns, charts))]
+    first, second = (float(f"{q:.1g}") for q in np.quantile(error[error > 0.0], (0.5, 0.9)))
+    edges = (0.0, first, second, np.inf)
+    names = (f"error below {first:g}°", f"{first:g} to {second:g}°", f"above {second:g}°")
+    clouds = []
+    for low, high, name, paint in zip(edges[:-1], edges[1:], names, _ERROR_COLOURS, strict=True):
+        use = (error >= low) & (error < high)
+        if use.sum() > 1:
+            clouds.append(Cloud(name, paint, aligned[0, use], aligned[1, use], _seconds(at_ns[use], charts)))
+    return clouds
+
+
+def _seconds(at_ns: FloatArray, charts: Charts) -> FloatArray:
+    return np.asarray((at_ns - float(charts.origin_ns)) * 1e-9, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""The page of a whole run: how its drives are spread, who ranks where, where nobody drove, what failed."""
+"""The page of a whole run: errors over drives, ranking, effects of conditions, operating range, failures."""
 
 from __future__ import annotations
 
@@ -14,17 +14,22 @@ from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.reports.charts import Charts, Cloud, Interval
 from pdhef_logtool.reports.colours import INK, PLAIN, colour
+from pdhef_logtool.reports.first_screen import next_steps, plan_head, tested_run
 from pdhef_logtool.reports.page import render
-from pdhef_logtool.results.fleet import ANSWER, JUDGED, LEAST_DRIVES, Distribution, Fleet, Space, read_fleet
+from pdhef_logtool.results.breakdown import LEAST_DRIVES
+from pdhef_logtool.results.comparison_words import design_effect_text
+from pdhef_logtool.results.fleet import ANSWER, JUDGED, Distribution, Fleet, Space, read_fleet
 from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
 
 #: Keys of the figures of the page.
-FIGURES = ("medians", "spread", "against")
+FIGURES = ("worst", "medians", "spread", "against")
 #: Rows of tables that a run can make as long as it likes, keys that are given, and bars of a histogram at most.
 MOST_ROWS, _MOST_KEYS, _MOST_BARS = 1000, 12, 40
 #: Errors beyond this quantile of the drives are counted in the last bar.
 _MOST_SHARE = 0.98
 _LEVELS = 8
+#: Drives of the figure of the first screen, and characters of their names in it.
+_WORST, _LABEL = 10, 22
 #: Estimators with a median error beyond this many times the selected estimate's are left to the table.
 _DRAWN = 5.0
 #: The table of the operating space shows at least this far, so that what a car can do and nobody did is seen.
@@ -63,7 +68,7 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
     fleet = read_fleet(run, by)
     pages = {log.label for log in run.logs if log.file(PAGE_FILE) is not None}
     mains = {d.main for d in fleet.scored}
-    shown = [b for b in fleet.breakdowns if by or b.explains > 0.0][: None if by else _MOST_KEYS]
+    shown = [b for b in fleet.breakdowns if by or any(g.effect for g in b.groups)][: None if by else _MOST_KEYS]
     charts = Charts()
     _add_figures(charts, fleet)
     html = render(
@@ -71,14 +76,20 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
         charts,
         fleet=fleet,
         pages=pages,
-        hours=sum(d.seconds for d in fleet.drives) / 3600.0,
-        answers=Counter(d.main for d in fleet.drives if d.main).most_common(),
+        plan=plan_head(run.document.get("plan")),
+        tested=tested_run(run.document, sum(d.seconds for d in fleet.drives) / 3600.0),
+        steps=next_steps(run.document.get("plan")),
+        worst=_worst(fleet, charts),
         verdicts=Counter(d.verdict for d in fleet.scored if d.verdict),
         paired=_paired(fleet),
         answer=next((d for d in fleet.distributions if (d.estimator, d.signal) == (ANSWER, JUDGED)), None),
         rows=_rows(_told(fleet)),
         mains={ANSWER} if len(mains) > 1 else mains,
+        names=list(dict.fromkeys(d.estimator for d in fleet.distributions if d.estimator != ANSWER)),
+        ranked=any(r.place is not None for r in fleet.ranking),
+        dependence=design_effect_text(fleet.dependence, len(fleet.scored)),
         breakdowns=shown,
+        comparisons=sum(b.comparisons for b in fleet.breakdowns),
         idle_keys=[b.key for b in fleet.breakdowns if b not in shown],
         space=None if fleet.space is None else _space_rows(fleet.space),
         held=sorted(fleet.drives, key=lambda d: d.label)[:MOST_ROWS],
@@ -87,6 +98,22 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
         run=run.document,
     )
     return FleetPage(html, charts)
+
+
+def _worst(fleet: Fleet, charts: Charts) -> tuple[str, float | None] | None:
+    """Return the drive with the largest sideslip error; add the figure that shows it among the largest."""
+    ranked = sorted(((d.error(), d) for d in fleet.scored), key=lambda pair: -(pair[0] or 0.0))
+    if not ranked:
+        return (fleet.drives[0].label, None) if fleet.logs == 1 and fleet.drives else None
+    if len(ranked) > 1:
+        degree = math.degrees(1.0)
+        bars = [
+            Interval(d.label[-_LABEL:], math.nan, (error or 0.0) * degree, math.nan, colour(d.main or ""))
+            for error, d in ranked[:_WORST]
+        ]
+        title = f"The {len(bars)} drives with the largest sideslip RMSE"
+        charts.intervals("worst", title, "°", bars, zero=0.0)
+    return ranked[0][1].label, ranked[0][0]
 
 
 def _add_figures(charts: Charts, fleet: Fleet) -> None:
@@ -133,7 +160,8 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
 def _rival(fleet: Fleet) -> str | None:
     """Return the estimator that the selected one is drawn against: physics if it ran, else the best of the others."""
     mains = {d.main for d in fleet.scored}
-    names = [r.estimator for r in fleet.ranking if {r.estimator} != mains]
+    judged = sorted((d for d in fleet.distributions if d.signal == JUDGED), key=lambda d: d.median.value)
+    names = [d.estimator for d in judged if d.estimator != ANSWER and {d.estimator} != mains]
     return "physics" if "physics" in names else next(iter(names), None)
 
 

@@ -20,7 +20,7 @@ from markupsafe import Markup
 
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.version import __version__
-from pdhef_logtool.reports.charts import Charts
+from pdhef_logtool.reports.charts import Charts, StripFigure, TimeFigure
 
 _HERE = Path(__file__).parent
 #: Scripts in order: ours before uPlot shows it how fine to draw.
@@ -31,12 +31,13 @@ _MOST_SIGNS = 600
 DASH = "–"
 
 
-def render(template: str, charts: Charts | None = None, **texts: Any) -> bytes:
+def render(template: str, charts: Charts | None = None, *, forms: bool = False, **texts: Any) -> bytes:
     """Return a page.
 
     Parameters
     ----------
     template : file of ``templates/`` that extends ``base.html``. charts : what its ``figure(key)`` places show.
+    forms : whether the page may send forms to its own server.
     texts : what the template prints.
     """
     charts = Charts() if charts is None else charts
@@ -49,7 +50,7 @@ def render(template: str, charts: Charts | None = None, **texts: Any) -> bytes:
         .render(
             **texts,
             figure=partial(_place, charts),
-            policy=_policy(scripts, style),
+            policy=_policy(scripts, style, "'self'" if forms else "'none'"),
             scripts=[Markup(s) for s in scripts],  # noqa: S704 (files of this package)
             style=Markup(style),  # noqa: S704
             licence=Markup(_asset("UPLOT-LICENSE")),  # noqa: S704
@@ -75,6 +76,7 @@ def _environment() -> Environment:
         "number": number,
         "degrees": degrees,
         "percent": percent,
+        "change": change,
         "stamp": stamp,
         "seconds": seconds,
         "unit": unit,
@@ -91,17 +93,26 @@ def _place(charts: Charts, key: str) -> Markup:
     """Return where the script draws a figure; nothing where the page has none of the name."""
     if key not in charts.figures:
         return Markup()
+    chart = charts.figures[key]
+    keys = ' tabindex="0"' if isinstance(chart, TimeFigure | StripFigure) else ""
+    hint = " Keys: plus and minus zoom, arrows move, Home shows the whole drive." if keys else ""
     return Markup(
-        '<figure class="figure" data-figure="{0}"><figcaption>{1}</figcaption><div class="legend"></div>'
-        '<div class="canvas"></div></figure>'
-    ).format(key, printable(charts.figures[key].heading, _MOST_SIGNS))
+        '<figure class="figure" data-figure="{0}"><figcaption>{1}</figcaption>'
+        '<div class="legend" aria-hidden="true"></div>'
+        '<div class="canvas" aria-label="{2}"{3}></div></figure>'
+    ).format(
+        key,
+        printable(chart.heading, _MOST_SIGNS),
+        printable(charts.text(key) + hint, _MOST_SIGNS),
+        Markup(keys),  # noqa: S704 (a constant)
+    )
 
 
-def _policy(scripts: list[str], style: str) -> Markup:
+def _policy(scripts: list[str], style: str, forms: str) -> Markup:
     of_scripts = " ".join(f"'sha256-{_digest(s)}'" for s in scripts)
     return Markup(  # noqa: S704 (digests)
         f"default-src 'none'; script-src {of_scripts}; style-src 'sha256-{_digest(style)}'; img-src data:; "
-        "base-uri 'none'; form-action 'none'"
+        f"base-uri 'none'; form-action {forms}"
     )
 
 
@@ -145,6 +156,11 @@ def degrees(value_rad: float | None) -> str:
 def percent(share: float | None) -> str:
     """Return a share in percent."""
     return DASH if share is None or not math.isfinite(share) else f"{share:.1%}"
+
+
+def change(share: float | None) -> str:
+    """Return a relative change in percent with its sign."""
+    return DASH if share is None or not math.isfinite(share) else f"{share:+.1%}"
 
 
 def seconds(value_s: float | None) -> str:

@@ -33,11 +33,12 @@ class WrittenPage:
 
 @dataclass(frozen=True, slots=True)
 class WrittenPages:
-    """The pages of a run: of its logs, and ``fleet`` of all of them."""
+    """The pages of a run: of its logs, ``fleet`` of all of them, and ``pdf``, the document to sign."""
 
     output: Path
     pages: tuple[WrittenPage, ...]
     fleet: WrittenPage
+    pdf: Path | None = None
 
     @property
     def wrong(self) -> tuple[str, ...]:
@@ -58,6 +59,7 @@ class WrittenPages:
             "output": str(self.output),
             "exit_code": self.exit_code,
             **_to_dict(self.fleet),
+            "pdf": None if self.pdf is None else str(self.pdf),
             "logs": [{"log": p.log, **_to_dict(p)} for p in self.pages],
         }
 

@@ -7,8 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
@@ -19,10 +18,12 @@ from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.units import SIGNALS
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.results.changed_signals import ChangedSignal, changed_signals
+from pdhef_logtool.results.dependence import FACTORS, factors_of
 from pdhef_logtool.results.gate import MAIN, Figure, Gate
 from pdhef_logtool.results.opened_run import METRICS_FILE, OpenedLog, OpenedRun
 from pdhef_logtool.results.paired_change import PairedChange, Verdict, holm, log_ratios, paired_change
 from pdhef_logtool.results.pairing import Pair, Pairing, pair_logs
+from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.results.run_differences import run_differences
 
 if TYPE_CHECKING:
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 #: ``no figure``: no drive has it on both sides.
 FigureVerdict: TypeAlias = Verdict | Literal["no figure"]
 
+#: Value of ``cluster`` for drives that do not depend on one another.
+INDEPENDENT = "none"
 #: Of the drives whose figure changed most, so many are followed into their tracks.
 MOST_FOLLOWED = 10
 #: The graver verdict is that of the whole.
@@ -94,6 +97,8 @@ class ComparedFigure:
             "verdict": self.verdict,
             "drives": change.drives,
             "clusters": change.clusters,
+            "design_effect": change.dependence.design_effect,
+            "dependence": change.dependence.by,
             **bounds,
             "detectable": self.detectable,
             "sign_p": change.sign_p,
@@ -118,7 +123,7 @@ class Comparison:
     figures : those that were asked for or that the gate has. others : shown beside them; none where nothing changed.
     signals : where the tracks of the most changed drives part. followed : how many drives were looked at for it.
     damaged : files of drives that could not be read, a line each.
-    gated, allow_unpaired, strict : what closes the gate.
+    gated, allow_unpaired, strict : what closes the gate. requirements : verdicts of a validation plan on B.
     """
 
     a: str
@@ -137,6 +142,7 @@ class Comparison:
     gated: bool = False
     allow_unpaired: bool = False
     strict: bool = False
+    requirements: PlanVerdicts | None = None
 
     @property
     def equal(self) -> bool:
@@ -169,7 +175,7 @@ class Comparison:
         if self.gated:
             reasons += [f"{f.figure.label}: {f.verdict}" for f in self.figures if f.verdict in ("worse", "no figure")]
             reasons += () if self.allow_unpaired else self.unpaired
-        if self.strict:
+        if self.strict and self.requirements is None:
             refused = ("inconclusive",) if self.gated else ("inconclusive", "no figure")
             reasons += [
                 f"{f.figure.label}: {f.verdict}, which --strict refuses" for f in self.figures if f.verdict in refused
@@ -179,7 +185,7 @@ class Comparison:
     @property
     def exit_code(self) -> int:
         """4 where the gate is closed, 3 for damaged files and for drives without partner and no gate, else 0."""
-        if self.failures:
+        if self.failures or (self.requirements is not None and self.requirements.closes_gate):
             return EXIT_GATE
         if self.damaged:
             return EXIT_PARTIAL
@@ -195,6 +201,7 @@ class Comparison:
             "verdict": self.verdict,
             "exit_code": self.exit_code,
             "failures": self.failures,
+            "plan": None if self.requirements is None else self.requirements.to_dict(),
             "differences": self.differences,
             "pairs": dict(self.pairs),
             "only_a": self.only_a,
@@ -217,7 +224,8 @@ def compare_runs(
     Parameters
     ----------
     gate : the figures; those without a limit are no gate.
-    cluster : ``car``, ``day`` or a key of the logs' metadata: drives that share it are no independent witnesses.
+    cluster : ``car``, ``day``, ``route`` or a key of the logs' metadata by which drives depend on one another;
+        ``none``: independent drives; None: the dependence by day, car and route is estimated.
     strict : an inconclusive figure closes the gate.
 
     Raises
@@ -253,12 +261,12 @@ def compare_runs(
     )
     if not changed and not gated:
         return replace(result, damaged=damaged.lines)
-    clusters = None if cluster is None else _clusters(pairing, cluster, damaged)
-    figures = tuple(tables.compared(gate.figures, clusters))
+    grouping = _grouping(pairing, cluster, damaged) if changed else _Grouping()
+    figures = tuple(tables.compared(gate.figures, grouping))
     tables.check_estimators(figures)
     if not changed:
         return replace(result, figures=figures, damaged=damaged.lines)
-    others = _corrected(tables.compared(_beside(gate.figures), clusters))
+    others = _corrected(tables.compared(_beside(gate.figures), grouping))
     followed = _most_changed(pairing.pairs, changed, figures[0])
     main = figures[0].figure.estimator
     signals: list[ChangedSignal] = []
@@ -268,6 +276,28 @@ def compare_runs(
     return replace(
         result, figures=figures, others=others, signals=tuple(signals), followed=len(followed), damaged=damaged.lines
     )
+
+
+def compared_figure(
+    a: OpenedRun, b: OpenedRun, figure: Figure, cluster: str | None = None
+) -> tuple[ComparedFigure | None, tuple[str, ...]]:
+    """Return one figure of two runs as in :func:`compare_runs` (None without a common drive), and what else differs.
+
+    Raises
+    ------
+    OutputError : The figures of a run are damaged. UsageError : No drive has the estimator, or the key.
+    """
+    pairing = pair_logs(a.logs, b.logs)
+    if not pairing.pairs:
+        return None, ()
+    damaged = _Damaged()
+    tables = _Tables(a, b, pairing.pairs, damaged)
+    (result,) = tables.compared((figure,), _Grouping())
+    if figure.estimator != MAIN:
+        tables.check_estimators((result,))
+    if result.drives and result.verdict != "equal":
+        (result,) = tables.compared((figure,), _grouping(pairing, cluster, damaged))
+    return result, (*damaged.lines, *run_differences(a, b, pairing.pairs))
 
 
 class _Damaged:
@@ -327,14 +357,12 @@ class _Tables:
         differs = pl.col("row").ne_missing(pl.col("row_b")) | pl.col("len").ne_missing(pl.col("len_b"))
         return frozenset(both.filter(differs)["log"])
 
-    def compared(self, figures: Sequence[Figure], clusters: Sequence[object] | None) -> list[ComparedFigure]:
+    def compared(self, figures: Sequence[Figure], grouping: _Grouping) -> list[ComparedFigure]:
         """Return figures over all pairs; nothing else is read."""
         rows = self._rows(figures)
-        return [self._compared(figure, rows, clusters) for figure in figures]
+        return [self._compared(figure, rows, grouping) for figure in figures]
 
-    def _compared(
-        self, figure: Figure, tables: Sequence[pl.DataFrame], clusters: Sequence[object] | None
-    ) -> ComparedFigure:
+    def _compared(self, figure: Figure, tables: Sequence[pl.DataFrame], grouping: _Grouping) -> ComparedFigure:
         import polars as pl
 
         names = self._main if figure.estimator == MAIN else [figure.estimator] * len(self._pairs)
@@ -365,7 +393,7 @@ class _Tables:
         both = wanted.join(sides[0], on=["a", "estimator"], how="left").join(
             sides[1], on=["b", "estimator"], how="left"
         )
-        return _of_rows(figure, both.sort("place"), clusters)
+        return _of_rows(figure, both.sort("place"), grouping)
 
     def check_estimators(self, figures: Sequence[ComparedFigure]) -> None:
         """Raise UsageError for an estimator that no drive of either run has, and for runs without a selected one."""
@@ -410,7 +438,7 @@ def _by_parts(run: OpenedRun, query: Callable[[pl.LazyFrame], pl.LazyFrame]) -> 
     return pl.concat(pieces) if pieces else query(run.metrics()).collect()
 
 
-def _of_rows(figure: Figure, both: pl.DataFrame, clusters: Sequence[object] | None) -> ComparedFigure:
+def _of_rows(figure: Figure, both: pl.DataFrame, grouping: _Grouping) -> ComparedFigure:
     import polars as pl
 
     known_a, known_b = (both[f"value_{side}"].is_not_null() & both[f"value_{side}"].is_finite() for side in "ab")
@@ -418,7 +446,7 @@ def _of_rows(figure: Figure, both: pl.DataFrame, clusters: Sequence[object] | No
     used = both.filter(known_a & known_b)
     a, b = used["value_a"].to_numpy(), used["value_b"].to_numpy()
     ratios = log_ratios(a, b, figure.floor)
-    change = paired_change(ratios, None if clusters is None else [clusters[i] for i in used["place"]])
+    change = paired_change(ratios, *grouping.of(used["place"].to_list()))
     same = bool(np.array_equal(a, b)) and bool(np.array_equal(used["n_a"].to_numpy(), used["n_b"].to_numpy()))
     verdict: FigureVerdict = change.verdict(figure.limit or 0.0)
     if same:
@@ -493,31 +521,35 @@ def _most_changed(pairs: Sequence[Pair], changed: frozenset[str], figure: Compar
     return sorted(changed_pairs, key=lambda pair: -by_drive.get(pair.a.label, -1.0))[:MOST_FOLLOWED]
 
 
-def _clusters(pairing: Pairing, key: str, damaged: _Damaged) -> list[object]:
-    """Return what each pair is of; a drive that does not state is its own."""
-    clusters: list[str | None] = [None] * len(pairing.pairs)
-    keys: set[str] = set()
+@dataclass(frozen=True, slots=True)
+class _Grouping:
+    """What the pairs [N] share: ``clusters`` that the user named, or ``factors`` whose influence is estimated."""
+
+    clusters: Sequence[object] | None = None
+    factors: Mapping[str, Sequence[object]] = field(default_factory=dict)
+
+    def of(self, places: Sequence[int]) -> tuple[list[object] | None, dict[str, list[object]]]:
+        """Return clusters and factors of some pairs."""
+        clusters = None if self.clusters is None else [self.clusters[i] for i in places]
+        return clusters, {name: [values[i] for i in places] for name, values in self.factors.items()}
+
+
+def _grouping(pairing: Pairing, key: str | None, damaged: _Damaged) -> _Grouping:
+    """Return the groups of the pairs by a key, or by day, car and route without one."""
+    if key == INDEPENDENT:
+        return _Grouping()
+    stated: list[dict[str, str | None]] = [{} for _ in pairing.pairs]
     for number, pair in enumerate(pairing.pairs):
         with damaged.noted(pair.a):
-            clusters[number] = _cluster(pair.a, key)
-            keys.update((pair.a.report() or {}).get("metadata") or {})
-    if all(value is None for value in clusters):
-        raise UsageError(
-            expected=f"a key of the drives: {', '.join(['car', 'day', *sorted(keys)])}", got=key, where="--cluster"
-        )
-    return [value if value is not None else ("alone", i) for i, value in enumerate(clusters)]
-
-
-def _cluster(log: OpenedLog, key: str) -> str | None:
-    if key == "car":
-        car = log.entry.get("car") or {}
-        return str(car["name"]) if "name" in car else None
-    report = log.report() or {}
-    if key == "day":
-        start_ns = (report.get("log") or {}).get("start_ns")
-        return None if start_ns is None else datetime.fromtimestamp(start_ns * 1e-9, UTC).date().isoformat()
-    value = (report.get("metadata") or {}).get(key)
-    return None if value is None else str(value)
+            report = pair.a.report()
+            stated[number] = {**((report or {}).get("metadata") or {}), **factors_of(pair.a.entry, report)}
+    if key is None:
+        return _Grouping(None, {name: [of.get(name) for of in stated] for name in FACTORS})
+    values = [of.get(key) for of in stated]
+    if all(value is None for value in values):
+        names = dict.fromkeys((*FACTORS, INDEPENDENT, *sorted({str(k) for of in stated for k in of})))
+        raise UsageError(expected=f"a key of the drives: {', '.join(names)}", got=key, where="--cluster")
+    return _Grouping(values)
 
 
 def _named(names: Sequence[str], most: int = 5) -> str:

@@ -6,7 +6,8 @@ import math
 
 from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.results.changed_signals import ChangedSignal
-from pdhef_logtool.results.comparing import ComparedFigure, Comparison
+from pdhef_logtool.results.comparing import INDEPENDENT, ComparedFigure, Comparison
+from pdhef_logtool.results.dependence import Dependence
 from pdhef_logtool.results.paired_change import LEAST_CLUSTERS
 from pdhef_logtool.results.sink import TRUTH
 
@@ -39,16 +40,19 @@ def verdict_text(comparison: Comparison) -> str:
     if any(math.isfinite(d) for d in detectable):
         text += f"; a worsening of {percent(max(d for d in detectable if math.isfinite(d)))} would have shown"
     elif detectable:
-        text += f", as they are too few: at least {LEAST_CLUSTERS} drives (clusters) are needed"
+        text += (
+            f": too few independent drives (at least {LEAST_CLUSTERS} drives or clusters; a design effect reduces "
+            "their number)"
+        )
     return text
 
 
 def notes_of(comparison: Comparison) -> list[str]:
     """Return what must be known of the figures that were asked for, a line each."""
     notes = []
-    if comparison.cluster:
-        notes.append(f"in brackets: clusters by {comparison.cluster}, which are drawn whole")
     for figure in comparison.figures:
+        if figure.drives and not comparison.equal:
+            notes.append(f"{figure.figure.label}: {dependence_text(figure, comparison.cluster)}")
         notes += [f"{figure.figure.label}: {note}" for note in figure.notes]
         if figure.neither and figure.drives:
             notes.append(f"{figure.figure.label}: {figure.neither} drives have it on neither side")
@@ -58,6 +62,41 @@ def notes_of(comparison: Comparison) -> list[str]:
                 f"{figure.figure.label}: the smallest worsening that so many drives show in 4 of 5 cases: {least}"
             )
     return notes
+
+
+def change_text(figure: ComparedFigure | None) -> str:
+    """Return the median change with its interval: ``+3.1 % (+1.0 % to +5.2 %)``."""
+    if figure is None or not figure.drives:
+        return "no common drive with the figure"
+    if figure.verdict == "equal":
+        return "equal"
+    median, interval = percent(math.expm1(figure.change.median)), interval_text(figure)
+    return median if interval == "-" else f"{median} ({interval})"
+
+
+def dependence_text(figure: ComparedFigure, cluster: str | None) -> str:
+    """Return the design effect of the drives and what is known of its causes."""
+    of = figure.change.dependence
+    if cluster == INDEPENDENT:
+        return "Drives are taken as independent (--cluster none)."
+    if cluster is not None:
+        return f"Design effect {of.design_effect:.2g} of {figure.change.clusters} clusters by {cluster}."
+    return design_effect_text(of, figure.change.drives)
+
+
+def design_effect_text(of: Dependence, drives: int) -> str:
+    """Return a sentence on the dependence of drives of one day, car or route."""
+    groups = [f"{count} {name}s" for name, count in of.levels if count > 1]
+    if not groups:
+        return "Drives are taken as independent: days, cars and routes are the same in all drives, or not recorded."
+    among = f"{drives} drives of {', '.join(groups)}"
+    if of.design_effect == 1.0:
+        return f"Design effect 1: no dependence between {among}."
+    effective = drives / of.design_effect
+    return (
+        f"Design effect {of.design_effect:.2g} by {' and '.join(of.by)}: {among} have the evidence of "
+        f"{effective:.0f} independent drives."
+    )
 
 
 def interval_text(figure: ComparedFigure) -> str:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdhef_logtool.evaluation.segments import RUN_GAP_S
+from pdhef_logtool.evaluation.smoothing import RUN_GAP_S
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
-from pdhef_logtool.results.expression import ERRORS, FLAGS, OPERATIONS, SPEED, Column, Condition, Node, Number
+from pdhef_logtool.results.expression import ERRORS, FLAGS, OPERATIONS, SPEED, Column, Condition, Node, Number, Within
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
 from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
@@ -189,7 +189,8 @@ def _events_of(log: OpenedLog, condition: Condition, main: str, pad_s: float) ->
     assert frame is not None
     report = log.report() or {}
     low_speed = (report.get("vehicle") or {}).get("low_speed_blend_m_s")
-    builder = _Builder(main, 0.0 if low_speed is None else float(low_speed))
+    segments = report.get("segments", [])
+    builder = _Builder(main, 0.0 if low_speed is None else float(low_speed), segments)
     holds = builder.expression(condition.node).fill_null(value=False)
     peak = pl.lit(None, pl.Float64) if condition.peak is None else builder.expression(condition.peak)
     rows = _joined(frame, builder.columns, main).select("stamp_ns", holds=holds, peak=peak.cast(pl.Float64)).collect()
@@ -255,8 +256,8 @@ def _joined(frame: pl.LazyFrame, columns: Mapping[str, set[str]], main: str) -> 
 class _Builder:
     """Turns a condition into an expression of polars; ``columns`` collects what it reads, by track."""
 
-    def __init__(self, main: str, low_speed_m_s: float) -> None:
-        self._main = main
+    def __init__(self, main: str, low_speed_m_s: float, segments: Sequence[Mapping[str, Any]]) -> None:
+        self._main, self._segments = main, segments
         self._low_speed_m_s = low_speed_m_s
         self.columns: dict[str, set[str]] = {main: set()}
 
@@ -265,6 +266,8 @@ class _Builder:
 
         if isinstance(node, Number):
             return pl.lit(node.value)
+        if isinstance(node, Within):
+            return self._within(node.segment)
         if isinstance(node, Column):
             column = self._column(node)
             return column if node.factor == 1.0 else column * node.factor
@@ -276,6 +279,19 @@ class _Builder:
         if column.name in ERRORS:
             return self._error(track, ERRORS[column.name])
         return self._speed(track) if column.name == SPEED else self._read(track, column.name)
+
+    def _within(self, segment: str) -> pl.Expr:
+        """Return where a stamp lies in a segment's intervals, which do not overlap."""
+        import polars as pl
+
+        spans = sorted((s["start_ns"], s["end_ns"]) for s in self._segments if s["name"] == segment)
+        starts, ends = np.array(spans, dtype=np.int64).reshape(-1, 2).T
+
+        def inside(stamps: pl.Series) -> pl.Series:
+            ns = stamps.to_numpy()
+            return pl.Series(np.searchsorted(starts, ns, side="right") > np.searchsorted(ends, ns, side="right"))
+
+        return pl.col("stamp_ns").map_batches(inside, return_dtype=pl.Boolean)
 
     def _read(self, track: str, name: str) -> pl.Expr:
         import polars as pl

@@ -7,7 +7,8 @@ hyphens is quoted: ``"pd-hef:gain=1".sideslip_rad``.
 
 A column is one of estimates.parquet, ``speed_m_s``, or the error of a scored signal against the ground truth, with
 ``error`` before its unit: ``sideslip_error_rad``, ``vx_error_m_s``. Columns in rad are also available in deg, columns
-in m/s in km_h. A missing value, such as an error without ground truth, is neither true nor false.
+in m/s in km_h. ``segment == "NAME"`` is true within the segments and manoeuvres of that name. A missing value, such as
+an error without ground truth, is neither true nor false.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
@@ -78,7 +80,14 @@ class Applied:
     operands: tuple[Node, ...]
 
 
-Node: TypeAlias = Number | Column | Applied
+@dataclass(frozen=True, slots=True)
+class Within:
+    """True within the segments of a name."""
+
+    segment: str
+
+
+Node: TypeAlias = Number | Column | Applied | Within
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +144,8 @@ def _value(node: Node, columns: Mapping[str, FloatArray]) -> Any:
         return np.float64(node.value)
     if isinstance(node, Column):
         return columns[node.name] * node.factor
+    if isinstance(node, Within):
+        raise TypeError(f"segment {node.segment} of columns without a drive")
     return OPERATIONS[node.of](*(_value(operand, columns) for operand in node.operands))
 
 
@@ -152,7 +163,7 @@ def is_flag(node: Node) -> bool:
     """Return whether a node is true or false rather than a number."""
     if isinstance(node, Applied):
         return node.of in ("and", "or", "not", *_COMPARISONS)
-    return isinstance(node, Column) and node.name in FLAGS
+    return isinstance(node, Within) or (isinstance(node, Column) and node.name in FLAGS)
 
 
 class _Parser:
@@ -220,6 +231,8 @@ class _Parser:
                 return Applied("minus", (self._number(operand, depth),))
             case ast.BinOp(left=left, op=op, right=right) if type(op) in _SIGNS:
                 return Applied(_SIGNS[type(op)], (self._number(left, depth), self._number(right, depth)))
+            case ast.Compare(left=ast.Name(id="segment"), comparators=[ast.Constant(value=str() as name), *_]):
+                return self._segment(of, name)
             case ast.Compare(left=left, ops=[op], comparators=[right]) if type(op) in _SIGNS:
                 return Applied(_SIGNS[type(op)], (self._number(left, depth), self._number(right, depth)))
             case ast.Compare(comparators=[_, second, *_]):
@@ -249,6 +262,15 @@ class _Parser:
         if is_flag(node):
             raise self._error("a number", of)
         return node
+
+    def _segment(self, of: ast.Compare, name: str) -> Within:
+        if self._columns is not COLUMNS:
+            raise self._error("a column", of.left)
+        if len(of.ops) > 1 or not isinstance(of.ops[0], ast.Eq):
+            raise self._error('segment == "NAME"', of)
+        if name not in SEGMENTS:
+            raise self._error(f"one of {', '.join(SEGMENTS)}", of.comparators[0])
+        return Within(name)
 
     def _column(self, track: str | None, name: str, place: ast.expr) -> Column:
         ours, factor = name, 1.0

@@ -1,8 +1,8 @@
-"""The figures of a whole run: how drives are spread, which estimator ranks where, and where nobody drove.
+"""The figures of a whole run: errors over drives, the order of estimators, effects of conditions, and coverage.
 
-Reports are read one after the other and metrics lazily: of a drive a few figures stay, never a series. The figures of
-an estimator are of the drives whose ground truth is independent of it; those without one are separate. Drives
-count as independent of one another.
+Reports are read one after the other and metrics lazily: a few figures of each drive remain in memory, never a series.
+Scores use drives whose ground truth is independent of the estimator; drives without such a ground truth are listed
+separately. Intervals take the dependence of drives of one day, car or route into account.
 """
 
 from __future__ import annotations
@@ -12,44 +12,43 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations, pairwise
-from typing import TYPE_CHECKING, Any
+from itertools import combinations
+from typing import Any
 
 import numpy as np
 
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.errors import PdhefError
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray
+from pdhef_logtool.results.breakdown import LEAST_DRIVES, SIGNIFICANT, Breakdown, BreakdownDrive, breakdowns
+from pdhef_logtool.results.dependence import FACTORS, Dependence, dependence, factors_of
 from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun
-from pdhef_logtool.results.paired_change import holm, log_ratios, sign_p
-
-if TYPE_CHECKING:
-    pass
+from pdhef_logtool.results.paired_change import PairedChange, holm, log_ratios, paired_change
 
 #: Name of the estimate that each drive's report calls its answer.
 ANSWER = "answer"
 #: Errors that are given, in order: signal and unit.
 SIGNALS = {s: SCORED_SIGNALS[s] for s in ("sideslip_rad", "vy_m_s", "yaw_rate_rad_s", "vx_m_s")}
 JUDGED = "sideslip_rad"
-#: Of fewer drives no interval is given.
-LEAST_DRIVES = 5
-#: A difference counts as one below this corrected p-value.
-SIGNIFICANT = 0.05
 WORST = 20
-#: Values of a key that are given one by one; numbers beyond them are given by quarters.
-MOST_VALUES = 12
-_QUARTERS = 4
 #: Folders from the top that drives are given by.
 _MOST_FOLDERS = 3
 #: Labels that a group of failures names, and groups that are given.
 NAMED, _MOST_GROUPS = 10, 50
+#: Remedies by the start of what a supervisor states of a worker.
+_REMEDIES = {
+    "nothing heard": "Allow more time: --set log_timeout_s=SECONDS.",
+    "the worker was killed": "If memory was short, use fewer --jobs; pdhef inspect LOG shows the size of the log.",
+    "there was no more memory": "Use fewer --jobs, or a machine with more memory.",
+    "took more than": "Allow more memory: --set max_memory_mb=MB.",
+}
 _PLACE = re.compile(r"\s*\([^()]*\)\s*$")
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 @dataclass(frozen=True, slots=True)
 class Median:
-    """A median over drives with its 95 % interval by the bootstrap over them; NaN below :data:`LEAST_DRIVES`."""
+    """A median over drives with its 95 % interval; NaN where the drives are too few."""
 
     value: float
     low: float
@@ -68,6 +67,7 @@ class FleetDrive:
     nis, d2, naive_d2 : without ground truth: NIS and v̇_y residual of the selected estimate, v̇_y residual of sideslip 0.
     verdict : of sideslip: ``better``, ``worse`` and so on. coverage : of the 95 % confidence interval.
     failed_checks : those that count. lost : what could not be used, empty for nothing. keys : what it can be given by.
+    factors : day, car and route, None where not stated.
     """
 
     label: str
@@ -84,6 +84,7 @@ class FleetDrive:
     failed_checks: int
     lost: str
     keys: Mapping[str, str]
+    factors: Mapping[str, str | None]
 
     def error(self, estimator: str = ANSWER, signal: str = JUDGED) -> float:
         """Return the RMSE of an estimator; NaN where there is none."""
@@ -114,35 +115,16 @@ class Distribution:
 class Rank:
     """The place of an estimator: those that it is shown to be better than and worse than, pair by pair.
 
-    ``against_answer``: the median of its error over the selected estimate's, less 1; None if it is always selected.
+    ``place``: None where no difference between two estimators is significant. ``against_answer``: the median of its
+    error over the selected estimate's, less 1; None for one that always is the selected estimate.
     """
 
-    place: int
+    place: int | None
     estimator: str
     drives: int
     better_than: tuple[str, ...]
     worse_than: tuple[str, ...]
     against_answer: Median | None
-
-
-@dataclass(frozen=True, slots=True)
-class Group:
-    """Drives with the same value of a key: how many, how many of them are scored, and the selected estimate's error."""
-
-    value: str
-    drives: int
-    scored: int
-    median: Median
-    worst: float
-
-
-@dataclass(frozen=True, slots=True)
-class Breakdown:
-    """The drives by what a key states; ``explains``: share of the spread of log errors that lies between groups."""
-
-    key: str
-    groups: tuple[Group, ...]
-    explains: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +134,11 @@ class Failures:
     reason: str
     count: int
     labels: tuple[str, ...]
+
+    @property
+    def explanation(self) -> tuple[str, str]:
+        """The cause, and the remedy, empty where none is known."""
+        return cause_and_remedy(self.reason)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,12 +154,18 @@ class Space:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fleet:
-    """All of a run: ``logs`` in it, ``drives`` with a report, ``failed`` ones by reason, ``losses`` of the others."""
+    """All of a run: ``logs`` in it, ``drives`` with a report, ``failed`` ones by reason, ``losses`` of the others.
+
+    ``least_to_rank``: scored drives that a ranking of these estimators needs; with fewer, ``ranking`` is empty.
+    ``dependence``: of the errors of the selected estimate.
+    """
 
     logs: int
     drives: tuple[FleetDrive, ...]
     distributions: tuple[Distribution, ...]
     ranking: tuple[Rank, ...]
+    least_to_rank: int
+    dependence: Dependence
     breakdowns: tuple[Breakdown, ...]
     space: Space | None
     failed: tuple[Failures, ...]
@@ -223,34 +216,23 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
         logs=len(run.logs),
         drives=drives,
         distributions=tuple(_distributions(scored, names)),
-        ranking=tuple(_ranking(scored, names)),
-        breakdowns=tuple(_breakdowns(drives, by)),
+        ranking=tuple(_ranking(scored, names)) if len(scored) >= least_to_rank(len(names)) else (),
+        least_to_rank=least_to_rank(len(names)),
+        dependence=_dependence(scored),
+        breakdowns=breakdowns([BreakdownDrive(d.error(), d.keys, d.factors) for d in drives], by),
         space=gathered.space(),
         failed=grouped(gathered.failed),
         losses=grouped(gathered.lost),
     )
 
 
-def exact_median(values: FloatArray) -> Median:
-    """Return the median of values [N] with its interval by the bootstrap, of infinitely many resamples.
+def least_to_rank(estimators: int) -> int:
+    """Return how many drives can show a difference of two among several estimators: sign test with Holm's correction.
 
-    The k-th of N is the median of a resample or above it as often as half of N draws lie among the first k (Maritz and
-    Jarrett 1978), so that nothing need be drawn. With an even N the outer one of the two middles counts.
+    With N drives the smallest two-sided p-value is 2 * 0.5**N.
     """
-    n = len(values)
-    if n == 0:
-        return Median(math.nan, math.nan, math.nan)
-    middle = float(np.median(values))
-    if n < LEAST_DRIVES:
-        return Median(middle, math.nan, math.nan)
-    from scipy.special import bdtrc  # what scipy.stats would call; half a second less to load
-
-    ordered = np.sort(values)
-    share = np.arange(1, n + 1) / n
-    below_lower = bdtrc((n + 1) // 2 - 1, n, share)
-    below_upper = bdtrc(n // 2, n, share)
-    low, high = np.searchsorted(below_lower, 0.025), np.searchsorted(below_upper, 0.975)
-    return Median(middle, float(ordered[low]), float(ordered[min(int(high), n - 1)]))
+    pairs = max(estimators * (estimators - 1) // 2, 1)
+    return max(LEAST_DRIVES, math.floor(math.log2(2.0 * pairs / SIGNIFICANT)) + 1)
 
 
 @dataclass(slots=True)
@@ -357,6 +339,7 @@ def _drive(log: OpenedLog, report: Mapping[str, Any], figures: Mapping[tuple[str
         failed_checks=sum(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks", ())),
         lost=reason if kind == "lost" else "",
         keys=_keys(log, report, main),
+        factors=factors_of(log.entry, report),
     )
 
 
@@ -380,6 +363,7 @@ def _keys(log: OpenedLog, report: Mapping[str, Any], main: str) -> dict[str, str
         "friction source": "estimated" if friction.get("estimated") else source.partition(",")[0],
         "length": _length(float(report["log"]["duration_s"])),
         "sensor faults": _fault_text(report),
+        "month": (factors_of(log.entry, report)["day"] or "")[:7],
     }
     parts = str(log.entry.get("folder") or "").split("/")[:_MOST_FOLDERS]
     from_log |= {"folder" if i == 0 else f"folder {i + 1}": "/".join(parts[: i + 1]) for i in range(len(parts))}
@@ -407,29 +391,46 @@ def _estimators(drives: Iterable[FleetDrive]) -> list[str]:
     return sorted(counts, key=lambda e: (-counts[e], e))
 
 
+def _of_all(drives: Sequence[FleetDrive], use: BoolArray) -> dict[str, list[str | None]]:
+    """Return day, car and route of the drives to use."""
+    return {f: [d.factors.get(f) for d, used in zip(drives, use, strict=True) if used] for f in FACTORS}
+
+
+def _dependence(drives: Sequence[FleetDrive]) -> Dependence:
+    """Return the dependence of the selected estimate's errors."""
+    errors = np.array([d.error() for d in drives])
+    use = errors > 0.0
+    return dependence(np.log(errors[use]), _of_all(drives, use))
+
+
+def _median(change: PairedChange) -> Median:
+    return Median(change.median, change.low, change.high)
+
+
 def _distributions(drives: Sequence[FleetDrive], names: Sequence[str]) -> Iterable[Distribution]:
     for signal, unit in SIGNALS.items():
         for name in (ANSWER, *names):
             values = np.array([d.error(name, signal) for d in drives])
-            values = np.sort(values[np.isfinite(values)])
-            if values.size:
-                yield Distribution(name, signal, unit, exact_median(values), values)
+            use = np.isfinite(values)
+            if use.any():
+                median = _median(paired_change(values[use], None, _of_all(drives, use)))
+                yield Distribution(name, signal, unit, median, np.sort(values[use]))
 
 
 def _ranking(drives: Sequence[FleetDrive], names: Sequence[str]) -> list[Rank]:
     """Return the estimators in order of how many others they beat, pair by pair on the drives of both."""
     errors = {name: np.array([d.error(name) for d in drives]) for name in (ANSWER, *names)}
 
-    def ratios(a: str, b: str) -> FloatArray:
+    def change(a: str, b: str) -> PairedChange:
         both = np.isfinite(errors[a]) & np.isfinite(errors[b])
-        return log_ratios(errors[a][both], errors[b][both])
+        return paired_change(log_ratios(errors[a][both], errors[b][both]), None, _of_all(drives, both))
 
     pairs = [*combinations(names, 2)]
-    changes = [ratios(a, b) for a, b in pairs]
+    changes = [change(a, b) for a, b in pairs]
     beats: dict[str, set[str]] = {name: set() for name in names}
-    for (a, b), change, p in zip(pairs, changes, holm([*map(sign_p, changes)]), strict=True):
-        if p < SIGNIFICANT:
-            better, worse = (a, b) if np.sum(np.sign(change)) > 0.0 else (b, a)
+    for (a, b), of_pair, p in zip(pairs, changes, holm([c.sign_p for c in changes]), strict=True):
+        if p < SIGNIFICANT and of_pair.median != 0.0:
+            better, worse = (a, b) if of_pair.median > 0.0 else (b, a)
             beats[better].add(worse)
     lost = {name: {other for other in names if name in beats[other]} for name in names}
     medians = {name: float(np.nanmedian(errors[name])) for name in names}
@@ -437,13 +438,15 @@ def _ranking(drives: Sequence[FleetDrive], names: Sequence[str]) -> list[Rank]:
     mains = {d.main for d in drives}
     return [
         Rank(
-            # Equal places where nothing shows them apart.
-            place=1 + sum(len(lost[o]) - len(beats[o]) < len(lost[name]) - len(beats[name]) for o in names),
+            # Equal places where no difference is significant, and none where this is true of all.
+            place=1 + sum(len(lost[o]) - len(beats[o]) < len(lost[name]) - len(beats[name]) for o in names)
+            if any(beats.values())
+            else None,
             estimator=name,
             drives=int(np.isfinite(errors[name]).sum()),
             better_than=tuple(n for n in order if n in beats[name]),
             worse_than=tuple(n for n in order if n in lost[name]),
-            against_answer=None if mains == {name} else _share(exact_median(ratios(ANSWER, name))),
+            against_answer=None if mains == {name} else _share(_median(change(ANSWER, name))),
         )
         for name in order
     ]
@@ -453,77 +456,20 @@ def _share(of_logs: Median) -> Median:
     return Median(*(math.expm1(x) for x in (of_logs.value, of_logs.low, of_logs.high)))
 
 
-def _breakdowns(drives: Sequence[FleetDrive], by: Sequence[str]) -> list[Breakdown]:
-    """Return the drives by each key that shows them apart, the one that explains most first; ``by`` keeps its order."""
-    all_keys = {key: None for d in drives for key in d.keys}
-    breakdowns = []
-    for key in by or all_keys:
-        values = _told(key, drives)
-        count = len({v for v in values if v is not None})
-        if by or 2 <= count <= min(MOST_VALUES, len(drives) - 1):
-            breakdowns.append(_breakdown(key, drives, values))
-    if by:
-        return breakdowns
-    same: dict[tuple[tuple[int, float], ...], Breakdown] = {}
-    for breakdown in sorted(breakdowns, key=lambda b: (-b.explains if math.isfinite(b.explains) else 1.0, b.key)):
-        # Two keys that part the drives alike state it once.
-        same.setdefault(tuple((g.drives, g.median.value) for g in breakdown.groups if g.scored), breakdown)
-    return [*same.values()]
+def cause_and_remedy(reason: str) -> tuple[str, str]:
+    """Return the cause of a failure and its remedy, empty where the reason contains none.
+
+    An error of this tool reads ``WHERE: expected EXPECTED, got GOT; REMEDY``.
+    """
+    expected, got, rest = reason.partition(", got ")
+    if not got or "expected " not in expected:
+        return _sentence(reason), next((remedy for start, remedy in _REMEDIES.items() if reason.startswith(start)), "")
+    cause, _, remedy = rest.rpartition("; ") if "; " in rest else (rest, "", "")
+    return f"{_sentence(cause)} (expected: {expected.rpartition('expected ')[2]}).", _sentence(remedy)
 
 
-def _told(key: str, drives: Sequence[FleetDrive]) -> list[str | None]:
-    """Return what is given of each drive by a key: its text, a quarter of its numbers, or that it is rare."""
-    texts = [d.keys.get(key) for d in drives]
-    counts = Counter(t for t in texts if t is not None)
-    if len(counts) <= MOST_VALUES:
-        return list(texts)
-    numbers = [_as_number(t) for t in texts]
-    finite = np.array([x for x in numbers if math.isfinite(x)])
-    if len(finite) == sum(counts.values()):
-        edges = np.unique(np.quantile(finite, np.linspace(0.0, 1.0, _QUARTERS + 1)))
-        bin_of = np.clip(np.searchsorted(edges, numbers, side="right") - 1, 0, max(len(edges) - 2, 0))
-        names = [f"{a:.4g} to {b:.4g}" for a, b in pairwise(edges)] or [f"{edges[0]:.4g}"]
-        return [names[i] if math.isfinite(x) else None for i, x in zip(bin_of, numbers, strict=True)]
-    common = {value for value, _ in counts.most_common(MOST_VALUES)}
-    rest = f"{len(counts) - MOST_VALUES} others"
-    return [t if t is None or t in common else rest for t in texts]
-
-
-def _as_number(text: str | None) -> float:
-    try:
-        return math.nan if text is None else float(text)
-    except ValueError:
-        return math.nan
-
-
-def _breakdown(key: str, drives: Sequence[FleetDrive], values: Sequence[str | None]) -> Breakdown:
-    members: dict[str, list[FleetDrive]] = {}
-    for drive, value in zip(drives, values, strict=True):
-        members.setdefault("not given" if value is None else value, []).append(drive)
-    groups = []
-    logs: list[FloatArray] = []
-    for value, of_group in sorted(members.items(), key=lambda item: _in_order(item[0])):
-        errors = np.array([d.error() for d in of_group if d.truth])
-        worst = float(errors.max()) if errors.size else math.nan
-        groups.append(Group(value, len(of_group), len(errors), exact_median(errors), worst))
-        logs.append(np.log(errors[errors > 0.0]))
-    return Breakdown(key, tuple(groups), _explained([x for x in logs if x.size]))
-
-
-def _in_order(value: str) -> tuple[bool, float, str]:
-    number = _as_number(value.partition(" to ")[0])
-    return math.isnan(number), 0.0 if math.isnan(number) else number, value
-
-
-def _explained(groups: Sequence[FloatArray]) -> float:
-    """Return the share of variance between groups, less what chance puts there; NaN where it cannot be determined."""
-    n, k = sum(g.size for g in groups), len(groups)
-    if k < 2 or n <= k + 1:
-        return math.nan
-    together = np.concatenate(groups)
-    total = float(((together - together.mean()) ** 2).sum())
-    within = sum(float(((g - g.mean()) ** 2).sum()) for g in groups)
-    return 1.0 - (within / (n - k)) / (total / (n - 1)) if total > 0.0 else 0.0
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def grouped(failures: Sequence[tuple[str, str]]) -> tuple[Failures, ...]:

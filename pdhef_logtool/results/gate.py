@@ -1,21 +1,17 @@
-"""Which figures two runs are compared by, and how much worse each may become: strict reading of gate.toml."""
+"""Which figures two runs are compared by, and how much worse each may become."""
 
 from __future__ import annotations
 
 import math
 import re
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
-
-from pydantic import BaseModel, ConfigDict, Field
 
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.segments import SEGMENTS
-from pdhef_logtool.evaluation.thresholds import unit_of
 from pdhef_logtool.evaluation.units import LABELS, SIGNALS
+from pdhef_logtool.evaluation.validation_plan import RUN, ValidationPlan
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.storage.documents import checked, read_toml, unknown
+from pdhef_logtool.storage.documents import unknown
 
 #: Name for the selected estimate of each drive in A.
 MAIN = "main"
@@ -59,66 +55,27 @@ class Gate:
     allow_unpaired: bool = False
 
 
-_Name = Annotated[str, Field(min_length=1)]
-
-
-class _FigureTable(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
-    signal: _Name = "sideslip_rad"
-    metric: _Name = "rmse"
-    segment: _Name = "all"
-    estimator: _Name = MAIN
-    max_regression: str | float | int
-    floor: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
-    unit: _Name | None = None
-
-
-def load_gate(path: Path) -> Gate:
-    """Read gate.toml.
+def gate_of(plan: ValidationPlan) -> Gate:
+    """Return the requirements of a plan on the ratio to another run as the figures of a comparison.
 
     Raises
     ------
-    UsageError
-        The file is missing, is no TOML, or contains wrong, unknown or missing entries; all are named.
+    UsageError : The plan has no such requirement.
     """
-    return gate_from_dict(read_toml(path, "a gate TOML file", UsageError), where=str(path))
+    figures = tuple(
+        Figure(r.signal, r.metric, r.segment, r.estimator or MAIN, max(r.bound - 1.0, 0.0))
+        for r in plan.requirements
+        if r.baseline == RUN
+    )
+    if not figures:
+        raise UsageError(expected='a requirement with baseline = "run"', got="none", where=plan.file)
+    return Gate(figures)
 
 
-def gate_from_dict(raw: dict[str, Any], *, where: str) -> Gate:
-    """Build a gate from parsed TOML; raises UsageError with every problem in one line."""
-    expected = ("allow_unpaired", "figure")
-    problems = [unknown(key, expected) for key in raw if key not in expected]
-    allowed = raw.get("allow_unpaired", False)
-    if not isinstance(allowed, bool):
-        problems.append("allow_unpaired: should be true or false")
-    tables = raw.get("figure", [])
-    if not isinstance(tables, list) or not tables:
-        problems.append("figure: give at least one [[figure]] table")
-        tables = []
-    figures = [_read_figure(table, f"figure[{i}]", problems) for i, table in enumerate(tables)]
-    labels = [f.label for f in figures if f is not None]
-    problems += [f"figure: {label} is there twice" for label in sorted(set(labels)) if labels.count(label) > 1]
-    if problems:
-        raise UsageError(
-            expected="the entries of gate.toml", got="; ".join(problems), where=where, remedy="see docs/compare.md"
-        )
-    return Gate(tuple(f for f in figures if f is not None), bool(allowed))
-
-
-def _read_figure(raw: object, where: str, problems: list[str]) -> Figure | None:
-    table = checked(_FigureTable, raw, where, problems)
-    if table is None:
-        return None
-    before = len(problems)
-    problems += figure_problems(table.signal, table.metric, table.segment, f"{where}.")
-    limit = share_of(table.max_regression)
-    if limit is None:
-        problems.append(f"{where}.max_regression: should be a share such as '5%' or 0.05, got {table.max_regression!r}")
-    if len(problems) > before or limit is None:
-        return None
-    _, factor = unit_of(table.signal, table.metric, table.unit, where, problems)
-    return Figure(table.signal, table.metric, table.segment, table.estimator, limit, table.floor * factor)
+def figures_of(plan: ValidationPlan) -> tuple[Figure, ...]:
+    """Return what the requirements of a plan measure, where lower is better, without limits."""
+    figures = [Figure(r.signal, r.metric, r.segment, r.estimator or MAIN) for r in plan.requirements]
+    return tuple(dict.fromkeys(f for f in figures if not figure_problems(f.signal, f.metric, f.segment))) or (Figure(),)
 
 
 def figure_problems(signal: str, metric: str, segment: str, where: str = "") -> list[str]:

@@ -1,6 +1,6 @@
-"""JUnit XML of verdicts: one testsuite a log, one testcase a threshold and estimator, as CI systems read it.
+"""JUnit XML of a validation plan: one testsuite, one testcase per requirement, as CI systems read it.
 
-Checks that did not pass are properties of the log's testsuite: they close no gate.
+An INCONCLUSIVE requirement is a skipped test. Checks that did not pass are properties: they fail no test.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from pdhef_logtool.evaluation.thresholds import Verdict
+from pdhef_logtool.evaluation.requirement_verdicts import RequirementVerdict
+from pdhef_logtool.evaluation.validation_plan import shown
+from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.storage.files import write_bytes
 
 
@@ -36,15 +38,27 @@ class Case:
 _Checks: TypeAlias = Mapping[str, Sequence[Mapping[str, Any]]]
 
 
-def write_junit(path: Path, verdicts: Mapping[str, Sequence[Verdict]], checks: _Checks | None = None) -> None:
-    """Write verdicts and checks by log through a temporary name; raises OutputError."""
+def write_junit(path: Path, verdicts: PlanVerdicts, checks: _Checks | None = None) -> None:
+    """Write the verdicts of a plan, and checks by log, through a temporary name; raises OutputError."""
     write_bytes(path, junit_bytes(verdicts, checks))
 
 
-def junit_bytes(verdicts: Mapping[str, Sequence[Verdict]], checks: _Checks | None = None) -> bytes:
+def junit_bytes(verdicts: PlanVerdicts, checks: _Checks | None = None) -> bytes:
     """Return JUnit XML in UTF-8; the same verdicts give the same bytes, so that there is no time of day in it."""
-    cases = {log: [_case(verdict) for verdict in of_log] for log, of_log in verdicts.items()}
-    return cases_bytes(cases, {log: _check_properties(of_log) for log, of_log in (checks or {}).items()})
+    cases = plan_cases(verdicts)
+    logs = checks or {}
+    properties = {
+        key if len(logs) == 1 else f"{log}: {key}": text
+        for log, of_log in logs.items()
+        for key, text in _check_properties(of_log).items()
+    }
+    return cases_bytes(cases, dict.fromkeys(cases, properties))
+
+
+def plan_cases(verdicts: PlanVerdicts) -> dict[str, list[Case]]:
+    """Return the testcases of a plan by the name of its suite."""
+    name = verdicts.plan.title or verdicts.plan.file or "validation plan"
+    return {name: [_case(v, name, strict=verdicts.strict) for v in verdicts.verdicts]}
 
 
 def _check_properties(checks: Sequence[Mapping[str, Any]]) -> dict[str, str]:
@@ -75,18 +89,21 @@ def cases_bytes(
     return document + b"\n"
 
 
-def _case(verdict: Verdict) -> Case:
-    note = f", {verdict.reason}" if verdict.reason and not verdict.failed else ""
+def _case(verdict: RequirementVerdict, suite: str, *, strict: bool) -> Case:
+    requirement = verdict.requirement
+    unit, exposure = requirement.unit, verdict.exposure
+    failed = verdict.outcome == "FAIL" or (strict and verdict.outcome == "INCONCLUSIVE")
+    margin = "none" if verdict.margin is None else shown(verdict.margin, unit)
+    minutes = "unknown" if exposure.minutes is None else f"{exposure.minutes:.1f}"
     return Case(
-        verdict.log,
-        verdict.estimator,
-        verdict.threshold.label,
-        verdict.outcome,
-        verdict.failed,
-        verdict.reason,
-        None
-        if verdict.value is None
-        else f"value {verdict.value:.9g} {verdict.threshold.unit}, margin {verdict.margin:.9g}, n={verdict.n}{note}",
+        suite,
+        requirement.id,
+        requirement.title or requirement.label,
+        "skipped" if verdict.outcome == "INCONCLUSIVE" and not failed else verdict.outcome,
+        failed,
+        f"{verdict.outcome}: {verdict.reason}" + (f"; {verdict.next}" if verdict.next else ""),
+        f"{requirement.label}: {verdict.outcome}, {verdict.reason}; margin {margin}; "
+        f"{exposure.drives} drives, {minutes} minutes scored",
     )
 
 

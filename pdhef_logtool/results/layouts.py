@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.mcap_sink import MAP_FRAME, topic_of
+from pdhef_logtool.results.mcap_sink import LOG_TOPIC, MAP_FRAME, topic_of
 from pdhef_logtool.results.palette import colour_rgb
 from pdhef_logtool.results.run_report import json_bytes
 from pdhef_logtool.results.sink import TRUTH, Event, Sink
@@ -18,21 +18,42 @@ from pdhef_logtool.storage.files import write_bytes
 
 @dataclass(frozen=True, slots=True)
 class _Plot:
-    """One plot: its title and the field of ``state`` that it shows; not all fields exist for ground truth."""
+    """One plot: title, topic and field of a track, fields of the limits of its interval.
+
+    ``of_truth``: not all fields mean something for the ground truth; an error needs one.
+    """
 
     title: str
     field: str
+    topic: str = "plot"
+    limits: tuple[str, ...] = ()
     of_truth: bool = True
 
 
-_PLOTS = (
-    _Plot("Sideslip [rad]", "sideslip_rad"),
-    _Plot("Yaw rate [rad/s]", "yaw_rate_rad_s"),
-    _Plot("Lateral acceleration [m/s²]", "ay_m_s2"),
-    _Plot("Longitudinal velocity [m/s]", "vx_m_s"),
-    _Plot("Standard deviation of sideslip [rad]", "sideslip_std_rad", of_truth=False),
-    _Plot("Normalised innovation squared", "nis", of_truth=False),
-)
+#: By tab of PlotJuggler.
+_TABS = {
+    "Estimates": (
+        _Plot("Sideslip [deg]", "sideslip_deg", limits=("sideslip_low_deg", "sideslip_high_deg")),
+        _Plot("Yaw rate [deg/s]", "yaw_rate_deg_s", limits=("yaw_rate_low_deg_s", "yaw_rate_high_deg_s")),
+        _Plot("Lateral acceleration [m/s²]", "ay_m_s2"),
+        _Plot("Longitudinal velocity [m/s]", "vx_m_s"),
+        _Plot("Lateral velocity [m/s]", "vy_m_s"),
+    ),
+    "Errors": (
+        _Plot("Error of sideslip [deg]", "sideslip_error_deg", of_truth=False),
+        _Plot("Error of yaw rate [deg/s]", "yaw_rate_error_deg_s", of_truth=False),
+        _Plot("Error of lateral velocity [m/s]", "vy_error_m_s", of_truth=False),
+    ),
+    "Filter": (
+        _Plot("Normalised innovation squared", "nis", "state", of_truth=False),
+        _Plot("Valid", "valid", "state", of_truth=False),
+        _Plot("Diverged", "diverged", "state", of_truth=False),
+        _Plot("Reason (sum of bits)", "reason", "state", of_truth=False),
+    ),
+}
+_STATES = ("valid", "diverged", "reason")
+#: Of Foxglove's log panel: from INFO on.
+_PANEL_LEVEL = 2
 
 
 class LayoutsSink(Sink):
@@ -43,13 +64,23 @@ class LayoutsSink(Sink):
     foxglove, plotjuggler : where the finished files are.
     names : of the tracks that are written; None: all.
     colours : 0xRRGGBB by estimator.
+    shown : of the tracks whose lines and intervals are on at first; None: all.
+    fixes : topics of satellite fixes in the log, for a map.
     """
 
     def __init__(
-        self, foxglove: Path, plotjuggler: Path, names: Container[str] | None, colours: Mapping[str, int]
+        self,
+        foxglove: Path,
+        plotjuggler: Path,
+        names: Container[str] | None,
+        colours: Mapping[str, int],
+        *,
+        shown: Collection[str] | None = None,
+        fixes: Sequence[str] = (),
     ) -> None:
         self._foxglove, self._plotjuggler = foxglove, plotjuggler
         self._names, self._colours = names, colours
+        self._shown, self._fixes = shown, fixes
         self._tracks: dict[str, str] = {}
 
     def append(self, track: StateTrack) -> None:
@@ -60,50 +91,94 @@ class LayoutsSink(Sink):
 
     def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:  # noqa: ARG002
         """Write both files."""
-        write_bytes(self._foxglove, json_bytes(foxglove_layout(self._tracks)))
-        write_bytes(self._plotjuggler, plotjuggler_layout(self._tracks))
+        shown = self._tracks if self._shown is None else self._shown
+        write_bytes(self._foxglove, json_bytes(foxglove_layout(self._tracks, shown, self._fixes)))
+        write_bytes(self._plotjuggler, plotjuggler_layout(self._tracks, shown))
 
     def abort(self) -> None:
         """Remove nothing: nothing is written before :meth:`finish`."""
 
 
-def foxglove_layout(tracks: Mapping[str, str]) -> dict[str, Any]:
-    """Return a layout of Foxglove: a column of plots, and the way driven beside it. ``tracks``: colour by name."""
-    panels: dict[str, Any] = {
-        f"Plot!{plot.field}": {
-            "foxglovePanelTitle": plot.title,
-            "paths": [
-                {
-                    "value": f"{topic_of(name, 'state')}.{plot.field}",
-                    "label": name,
-                    "color": colour,
-                    "enabled": True,
-                    "timestampMethod": "receiveTime",
-                }
-                for name, colour in _of(plot, tracks)
-            ],
-            "xAxisVal": "timestamp",
-            "isSynced": True,
-            "showXAxisLabels": True,
-            "showYAxisLabels": True,
-            "showLegend": True,
-            "legendDisplay": "floating",
-            "showPlotValuesInLegend": False,
-        }
-        for plot in _PLOTS
+def foxglove_layout(tracks: Mapping[str, str], shown: Collection[str], fixes: Sequence[str] = ()) -> dict[str, Any]:
+    """Return a layout of Foxglove: plots in degrees, errors, maps, states and the log.
+
+    ``tracks``: colour by name; ``shown``: those that are on at first, with their intervals; ``fixes``: topics.
+    """
+    plots = [plot for tab in _TABS.values() for plot in tab if plot.field not in _STATES and _of(plot, tracks)]
+    panels: dict[str, Any] = {f"Plot!{plot.field}": _plot_panel(plot, tracks, shown) for plot in plots}
+    panels["StateTransitions!states"] = {
+        "foxglovePanelTitle": "States of the estimators",
+        "paths": [
+            {
+                "value": f"{topic_of(name, 'state')}.{field}",
+                "label": f"{name} {field}",
+                "enabled": name in shown,
+                "timestampMethod": "receiveTime",
+            }
+            for name in tracks
+            if name != TRUTH
+            for field in _STATES
+        ],
+        "isSynced": True,
+    }
+    panels["RosOut!log"] = {
+        "foxglovePanelTitle": "Faults, failed checks, events and manoeuvres",
+        "topicToRender": LOG_TOPIC,
+        "minLogLevel": _PANEL_LEVEL,
+        "searchTerms": [],
     }
     panels["3D!way"] = {
         "foxglovePanelTitle": "Way driven",
         "followTf": MAP_FRAME,
-        "topics": {topic_of(name, "odometry"): {"visible": True, "color": colour} for name, colour in tracks.items()},
+        "topics": {
+            topic_of(name, what): {"visible": name in shown, "color": colour}
+            for name, colour in tracks.items()
+            for what in ("path", "odometry")
+        },
     }
-    plots = [f"Plot!{plot.field}" for plot in _PLOTS]
+    beside = ["3D!way", "StateTransitions!states", "RosOut!log"]
+    if fixes:
+        panels["map!fixes"] = {"foxglovePanelTitle": "Map", "followTopic": fixes[0], "layer": "map"}
+        beside.insert(1, "map!fixes")
     return {
         "configById": panels,
         "globalVariables": {},
         "userNodes": {},
         "playbackConfig": {"speed": 1},
-        "layout": {"direction": "row", "first": _column(plots), "second": "3D!way", "splitPercentage": 65},
+        "layout": {
+            "direction": "row",
+            "first": _column([f"Plot!{plot.field}" for plot in plots]),
+            "second": _column(beside),
+            "splitPercentage": 65,
+        },
+    }
+
+
+def _plot_panel(plot: _Plot, tracks: Mapping[str, str], shown: Collection[str]) -> dict[str, Any]:
+    paths = []
+    for name, colour in _of(plot, tracks):
+        fields = (plot.field, *(plot.limits if name != TRUTH else ()))
+        paths += [
+            {
+                "value": f"{topic_of(name, plot.topic)}.{field}",
+                "label": name if field == plot.field else f"{name} 95 %",
+                "color": colour if field == plot.field else f"{colour}80",
+                "enabled": name in shown,
+                "timestampMethod": "receiveTime",
+                "lineSize": 1.5 if field == plot.field else 0.75,
+            }
+            for field in fields
+        ]
+    return {
+        "foxglovePanelTitle": plot.title,
+        "paths": paths,
+        "xAxisVal": "timestamp",
+        "isSynced": True,
+        "showXAxisLabels": True,
+        "showYAxisLabels": True,
+        "showLegend": True,
+        "legendDisplay": "floating",
+        "showPlotValuesInLegend": False,
     }
 
 
@@ -115,18 +190,24 @@ def _column(panels: Sequence[str]) -> Any:
     return {"direction": "column", "first": panels[0], "second": _column(panels[1:]), "splitPercentage": share}
 
 
-def plotjuggler_layout(tracks: Mapping[str, str]) -> bytes:
-    """Return a layout of PlotJuggler: a column of plots. ``tracks``: colour by name."""
+def plotjuggler_layout(tracks: Mapping[str, str], shown: Collection[str]) -> bytes:
+    """Return a layout of PlotJuggler: tabs of plots in a column; arguments as for :func:`foxglove_layout`."""
     root = ET.Element("root")
     tabs = ET.SubElement(root, "tabbed_widget", {"parent": "main_window", "name": "Main Window"})
-    container = ET.SubElement(ET.SubElement(tabs, "Tab", containers="1", tab_name="pdhef"), "Container")
-    sizes = ";".join([f"{1 / len(_PLOTS):.6f}"] * len(_PLOTS))
-    column = ET.SubElement(container, "DockSplitter", orientation="-", sizes=sizes, count=str(len(_PLOTS)))
-    for plot in _PLOTS:
-        area = ET.SubElement(column, "DockArea", name=plot.title)
-        drawn = ET.SubElement(area, "plot", mode="TimeSeries", style="Lines", flip_x="false", flip_y="false")
-        for name, colour in _of(plot, tracks):
-            ET.SubElement(drawn, "curve", name=f"{topic_of(name, 'state')}/{plot.field}", color=colour)
+    for title, of_tab in _TABS.items():
+        plots = [plot for plot in of_tab if _of(plot, tracks)]
+        if not plots:
+            continue
+        container = ET.SubElement(ET.SubElement(tabs, "Tab", containers="1", tab_name=title), "Container")
+        sizes = ";".join([f"{1 / len(plots):.6f}"] * len(plots))
+        column = ET.SubElement(container, "DockSplitter", orientation="-", sizes=sizes, count=str(len(plots)))
+        for plot in plots:
+            area = ET.SubElement(column, "DockArea", name=plot.title)
+            drawn = ET.SubElement(area, "plot", mode="TimeSeries", style="Lines", flip_x="false", flip_y="false")
+            for name, colour in _of(plot, tracks):
+                fields = (plot.field, *(plot.limits if name != TRUTH and name in shown else ()))
+                for field in fields:
+                    ET.SubElement(drawn, "curve", name=f"{topic_of(name, plot.topic)}/{field}", color=colour)
     ET.SubElement(tabs, "currentTabIndex", index="0")
     ET.SubElement(root, "use_relative_time_offset", enabled="1")
     ET.indent(root)
@@ -134,4 +215,7 @@ def plotjuggler_layout(tracks: Mapping[str, str]) -> bytes:
 
 
 def _of(plot: _Plot, tracks: Mapping[str, str]) -> list[tuple[str, str]]:
+    """Return the tracks of a plot; errors only where there is a ground truth."""
+    if "_error_" in plot.field and TRUTH not in tracks:
+        return []
     return [(name, colour) for name, colour in tracks.items() if plot.of_truth or name != TRUTH]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import struct
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import astuple
 from pathlib import Path
@@ -12,8 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pdhef_logtool.evaluation.reasons import ReasonIntervals
 from pdhef_logtool.logs.container import Attachment, RawChunk
 from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.source_copy import (
     iterate_attachments,
     iterate_copy,
@@ -26,13 +29,18 @@ from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.geometry import quat_from_yaw
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.sink import Event, Sink, first_of_slots, rounded
+from pdhef_logtool.results.log_lines import LogLine, log_lines, log_message
+from pdhef_logtool.results.plotted import plotted_fields
+from pdhef_logtool.results.sink import TRUTH, Event, Sink, first_of_slots, rounded
 from pdhef_logtool.storage.documents import jsonable
 
 #: Everything below this name in a source log is ours and is replaced.
 NAMESPACE = "/pdhef/"
 STATE_TYPE = "pdhef_msgs/msg/VehicleStateEstimate"
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
+PLOT_TYPE = "pdhef_msgs/msg/PlottedEstimate"
+PATH_TYPE = "nav_msgs/msg/Path"
+LOG_TYPE, LOG_TOPIC = "rcl_interfaces/msg/Log", f"{NAMESPACE}log"
 MAP_FRAME = "map"
 BODY_FRAME = "base_link"
 METRICS_RECORD = "pdhef.metrics"
@@ -55,10 +63,16 @@ _ODOMETRY_FIELDS = ("x_m", "y_m", "vx_m_s", "vy_m_s", "yaw_rate_rad_s")
 _PLANAR = np.array([0, 1, 5])
 #: Of zstd: of rounded numbers level 3 makes 1 % more bytes, level 6 3 % fewer in three times the time.
 _LEVEL = 1
-#: Between two poses of a track that is not shown first.
+#: Between two poses of a track that is not shown first, and between two plotted values of any.
 _POSE_STEP_NS = 50_000_000
-#: Between two states, and poses, of such a track in a long drive that nobody asked for by its name.
-LONG_STEP_NS = 200_000_000
+#: Between two points of the map.
+_PATH_STEP_NS = 1_000_000_000
+#: Steps of the tracks without a name in --estimators: the shortest that leaves the file small enough is taken.
+_STEPS_NS = tuple(round(s * 1e9) for s in (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0))
+#: Of the map of a track.
+_MOST_POSES = 1000
+#: Bytes of a message with its index, and of report, figures and schemas: upper bounds of what simulated drives take.
+_MESSAGE_BYTES, _DOCUMENT_BYTES = 70, 180_000
 
 
 def topic_of(estimator: str, what: str) -> str:
@@ -67,14 +81,27 @@ def topic_of(estimator: str, what: str) -> str:
     return f"{NAMESPACE}{'_' if token[:1].isdigit() else ''}{token}/{what}"
 
 
+def thinned_step_ns(source_bytes: int, *, rows: int, others: int, span_ns: int) -> int:
+    """Return the step of the tracks that are not shown first with which an annotated log is at most twice its source.
+
+    ``rows`` : stamps of a track. ``others`` : number of such tracks. Room for selected estimate and ground truth is
+    kept: a state a stamp of the one, and four messages of both every 50 ms.
+    """
+    room = source_bytes - _DOCUMENT_BYTES - (rows + 4 * (span_ns // _POSE_STEP_NS)) * _MESSAGE_BYTES
+    fit = (step for step in _STEPS_NS if 3 * others * (span_ns // step) * _MESSAGE_BYTES <= room)
+    return next(fit, _STEPS_NS[-1])
+
+
 class AnnotatedMcapSink(Sink):
     """Writes the annotated log window by window; what the source contains passes through a chunk at a time.
 
     Sound chunks that contain nothing but what stays are written as they are, others message by message.
 
-    Each track becomes ``state`` (:data:`STATE_TYPE`, every stamp) and ``odometry`` (``nav_msgs/msg/Odometry``, the
+    Each track becomes ``state`` (:data:`STATE_TYPE`, every stamp), ``odometry`` (``nav_msgs/msg/Odometry``, the
     stamps that are valid and have a pose, as the message can state neither; of a track that is not shown first, 20 a
-    second). Log and publish time are the scored stamp. Numbers are :func:`~pdhef_logtool.results.sink.rounded`.
+    second), ``plot`` (:data:`PLOT_TYPE`, 20 a second) and ``path`` (the map, one message at the start).
+    :data:`LOG_TOPIC` has a line for each fault, failed check, loss, event and manoeuvre. Log and publish time are the
+    scored stamp. Numbers are :func:`~pdhef_logtool.results.sink.rounded`.
     Everything that an earlier annotation left in the source is replaced.
 
     Parameters
@@ -83,7 +110,9 @@ class AnnotatedMcapSink(Sink):
     source : the log to copy in full; None, or a log without messages, for a sidecar that contains our topics alone.
     names : of the tracks that are written; None: all.
     shown : of the tracks whose pose is written at every stamp; of others every 50 ms. None: all.
-    thin : both state and pose of the others are written every :data:`LONG_STEP_NS` alone.
+    others_step_ns : step of all topics of the others; those that are shown then have 10 poses a second, and the ground
+        truth 20 states. None: as above.
+    min_speed_m_s : sideslip is not plotted below.
     span_ns : only what of it was recorded in [start, end); None: all of it.
 
     Raises
@@ -98,14 +127,19 @@ class AnnotatedMcapSink(Sink):
         names: Container[str] | None = None,
         *,
         shown: Container[str] | None = None,
-        thin: bool = False,
+        others_step_ns: int | None = None,
+        min_speed_m_s: float = 1.0,
         span_ns: tuple[int, int] | None = None,
     ) -> None:
         self._source = None if source is None else source.messages
-        self._names, self._shown, self._thin = names, shown, thin
-        self._last_ns: dict[str, int] = {}  # of the tracks that are not shown
+        self._names, self._shown, self._others_step_ns = names, shown, others_step_ns
+        self._min_speed_m_s = min_speed_m_s
+        self._last_ns: dict[str, int] = {}
         self._topics: dict[str, str] = {}
-        self._window: dict[str, list[TopicBatch]] = {}
+        self._window: dict[str, StateTrack] = {}
+        self._paths: dict[str, list[FloatArray]] = {}
+        self._reasons: dict[str, ReasonIntervals] = {}
+        self._first_ns: int | None = None
         self._raws: Iterator[RawMessage | RawChunk] = iter(())
         self._next: RawMessage | RawChunk | None = None
         profile = "ros2" if self._source is None else source_profile(self._source)
@@ -130,20 +164,47 @@ class AnnotatedMcapSink(Sink):
             self._write_window()
         if track.name not in self._topics:
             self._add_topics(track.name)
-        stated = posed = np.arange(len(track))
-        if len(track) and self._shown is not None and track.name not in self._shown:
-            step_ns = LONG_STEP_NS if self._thin else _POSE_STEP_NS
-            posed = first_of_slots(track.stamps_ns, step_ns, self._last_ns.get(track.name))
-            self._last_ns[track.name] = int(track.stamps_ns[-1])
-            stated = posed if self._thin else stated
-        is_finite = track.valid & np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
-        self._window[track.name] = [_state_batch(track, stated), _odometry_batch(track, posed[is_finite[posed]])]
+        self._window[track.name] = track
 
-    def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:  # noqa: ARG002
+    def _batches(self, track: StateTrack, truth: StateTrack | None) -> list[TopicBatch]:
+        """Return the messages of one track of a window."""
+        if not len(track):
+            return []
+        stated = posed = np.arange(len(track))
+        last_ns = self._last_ns.get(track.name)
+        plotted = first_of_slots(track.stamps_ns, _POSE_STEP_NS, last_ns)
+        on_path = first_of_slots(track.stamps_ns, _PATH_STEP_NS, last_ns)
+        is_shown = self._shown is None or track.name in self._shown
+        if self._others_step_ns is None:
+            posed = posed if is_shown else plotted
+        elif is_shown:
+            posed = first_of_slots(track.stamps_ns, 2 * _POSE_STEP_NS, last_ns)
+            stated = plotted if track.name == TRUTH else stated
+        else:
+            stated = posed = plotted = first_of_slots(track.stamps_ns, self._others_step_ns, last_ns)
+        self._last_ns[track.name] = int(track.stamps_ns[-1])
+        self._first_ns = min(self._first_ns or int(track.stamps_ns[0]), int(track.stamps_ns[0]))
+        if len(track.reason) == len(track):
+            self._reasons.setdefault(track.name, ReasonIntervals()).append(track.stamps_ns, track.reason)
+        has_pose = track.valid & np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
+        on_path = on_path[has_pose[on_path]]
+        self._paths.setdefault(track.name, []).append(
+            np.stack([track.x_m[on_path], track.y_m[on_path], track.yaw_rad[on_path]], axis=1)
+        )
+        fields = plotted_fields(track, truth, self._min_speed_m_s)
+        return [
+            _state_batch(track, stated),
+            _odometry_batch(track, posed[has_pose[posed]]),
+            _plot_batch(track, plotted, fields),
+        ]
+
+    def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:
         """Write what is left of the source, the metrics record and report.json, and give the file its name."""
         try:
             self._write_window()
             self._writer.write([], raws=self._raws_before(None))
+            self._write_paths()
+            self._write_log(log_lines(report, events, self._reasons))
             if self._source is not None:
                 for attachment in iterate_attachments(self._source):
                     if not _is_our_report(attachment):
@@ -153,7 +214,7 @@ class AnnotatedMcapSink(Sink):
                         self._writer.metadata(record.name, record.metadata)
             self._writer.metadata(METRICS_RECORD, metrics_record(report))
             end_ns = int(report["log"]["end_ns"])
-            text = json.dumps(jsonable(report), sort_keys=True, separators=(",", ":"), allow_nan=False)
+            text = json.dumps(jsonable(_attached(report)), sort_keys=True, separators=(",", ":"), allow_nan=False)
             self._writer.attachment(REPORT_ATTACHMENT, "application/json", text.encode(), end_ns, end_ns)
             self._writer.close()
         except BaseException:
@@ -171,14 +232,44 @@ class AnnotatedMcapSink(Sink):
         self._writer.add_topic(state, STATE_TYPE, constants={"header.frame_id": BODY_FRAME})
         frames = {"header.frame_id": MAP_FRAME, "child_frame_id": BODY_FRAME}
         self._writer.add_topic(odometry, ODOMETRY_TYPE, constants=frames)
+        self._writer.add_topic(topic_of(estimator, "plot"), PLOT_TYPE, constants={"header.frame_id": BODY_FRAME})
         self._topics[estimator] = state
 
     def _write_window(self) -> None:
-        batches = [batch for pair in self._window.values() for batch in pair]
+        truth = self._window.get(TRUTH)
+        batches = [batch for track in self._window.values() for batch in self._batches(track, truth)]
         self._window.clear()
         ends = [int(b.log_time_ns[-1]) + 1 for b in batches if len(b.log_time_ns)]
         if ends:
             self._writer.write(batches, raws=self._raws_before(max(ends)))
+
+    def _write_paths(self) -> None:
+        """Write the way of each track, as one message at the start of the log."""
+        raws = []
+        for name, parts in self._paths.items():
+            poses = np.concatenate(parts)
+            if len(poses) and self._first_ns is not None:
+                channel = self._raw_channel(topic_of(name, "path"), PATH_TYPE)
+                data = _path_message(self._first_ns, poses[:: 1 + len(poses) // _MOST_POSES])
+                raws.append(RawMessage(channel, self._first_ns, self._first_ns, 0, data))
+        self._writer.write([], raws=raws)
+
+    def _write_log(self, lines: Sequence[LogLine]) -> None:
+        """Write the lines of the log."""
+        if lines:
+            channel = self._raw_channel(LOG_TOPIC, LOG_TYPE)
+            raws = [RawMessage(channel, x.stamp_ns, x.stamp_ns, i, log_message(x)) for i, x in enumerate(lines)]
+            self._writer.write([], raws=raws)
+
+    def _raw_channel(self, topic: str, type_name: str) -> int:
+        return self._writer.add_raw_channel(
+            topic,
+            schema_name=type_name,
+            schema_encoding="ros2msg",
+            schema_data=message_definition(type_name).encode(),
+            message_encoding="cdr",
+            metadata={},
+        )
 
     def _raws_before(self, end_ns: int | None) -> Iterator[RawMessage | RawChunk]:
         while True:
@@ -206,9 +297,17 @@ def metrics_record(report: Mapping[str, Any]) -> dict[str, str]:
         if e["algorithm"] is not None:
             record[f"{e['name']}/algorithm"] = json.dumps(e["algorithm"], sort_keys=True)
     for m in report["metrics"]:
-        value = "null" if m["value"] is None else repr(float(m["value"]))
+        value = "null" if m["value"] is None else f"{float(m['value']):.9g}"
         record[f"{m['estimator']}/{m['signal']}/{m['segment']}/{m['metric']}"] = f"{value} {m['unit']} n={m['n']}"
     return record
+
+
+def _attached(report: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the report without the figures of estimators that are not selected: the metrics record has them all."""
+    selected = report.get("selected_estimate")
+    if selected is None:
+        return report
+    return {**report, "metrics": [m for m in report["metrics"] if m["estimator"] == selected]}
 
 
 def _is_our_report(attachment: Attachment) -> bool:
@@ -240,6 +339,22 @@ def _state_batch(track: StateTrack, use: IntArray) -> TopicBatch:
         "reason": track.reason[use] if has_reason else np.zeros(n, dtype=np.int64),
     }
     return TopicBatch(topic_of(track.name, "state"), stamps_ns, stamps_ns, fields)
+
+
+def _plot_batch(track: StateTrack, use: IntArray, fields: Mapping[str, FloatArray]) -> TopicBatch:
+    stamps_ns = track.stamps_ns[use]
+    columns: dict[str, NDArray[Any]] = {name: rounded(name, column[use]) for name, column in fields.items()}
+    return TopicBatch(topic_of(track.name, "plot"), stamps_ns, stamps_ns, {"header.stamp": stamps_ns, **columns})
+
+
+def _path_message(stamp_ns: int, poses: FloatArray) -> bytes:
+    """Return ``nav_msgs/msg/Path`` in little-endian CDR; ``poses`` [N, 3]: x, y (m), yaw (rad)."""
+    header = struct.pack("<iII4s", *divmod(stamp_ns, 1_000_000_000), len(MAP_FRAME) + 1, MAP_FRAME.encode())
+    data = bytearray(header + struct.pack("<I", len(poses)))
+    for (x_m, y_m, _), (w, x, y, z) in zip(poses, quat_from_yaw(poses[:, 2]), strict=True):
+        data += header
+        data += b"\0" * (-len(data) % 8) + struct.pack("<7d", x_m, y_m, 0.0, x, y, z, w)
+    return b"\0\1\0\0" + bytes(data)
 
 
 def _odometry_batch(track: StateTrack, use: IntArray) -> TopicBatch:

@@ -206,6 +206,8 @@ def open_run(output: Path | str) -> OpenedRun:
     ------
     OutputError
         There is no finished run in the folder: run.json or metrics.parquet is missing or unreadable.
+    UsageError
+        There is no such folder.
     """
     mirror = Mirror(str(output)) if is_url(output) else None
     folder = Path(output) if mirror is None else mirror.folder
@@ -215,7 +217,8 @@ def open_run(output: Path | str) -> OpenedRun:
         if not (folder / name).is_file():
             got = f"a folder without {name}" if folder.is_dir() else "no such folder"
             where = str(folder) if mirror is None else mirror.objects.shown
-            raise OutputError(expected="the outputs of a run", got=got, where=where, remedy=_REMEDY)
+            missing = mirror is None and not folder.exists()
+            raise OutputError(expected="the outputs of a run", got=got, where=where, remedy=_REMEDY, missing=missing)
     what, path = "the run.json of a run", folder / RUN_FILE
     document = read_sealed(path, what, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)
     if document.get("format") != "pdhef.run":

@@ -1,31 +1,28 @@
-"""How much a figure of the same drives changed: the paired log ratio, its bootstrap over drives, and a verdict.
+"""How much a figure of the same drives changed: the median paired log ratio with its interval, and a verdict.
 
-Drives differ far more from one another than two runs over one drive do, so that each drive is its own yardstick. The
-median keeps one drive that went wild from speaking for all. Drives of one car or day are no independent witnesses:
-they may be drawn together, as a cluster.
+Each drive is compared with itself, because drives differ more from one another than runs do. The median limits the
+influence of single drives. Its bounds are order statistics, as in the sign test, whose variance is multiplied by the
+design effect of drives of one day, car or route (:mod:`pdhef_logtool.results.dependence`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.results.dependence import Dependence, Factors, dependence, numbered
 
 Verdict: TypeAlias = Literal["equal", "worse", "not worse", "better", "inconclusive"]
 
-RESAMPLES = 2000
-_SEED = 0
-#: Drives times resamples that are in memory at once.
-_AT_ONCE = 1 << 20
-#: With fewer drives (clusters) the bootstrap has too little to give bounds: all of four are worse by chance in 6 %.
+#: Fewer drives (clusters) have no bounds: all of four are worse by chance in 6 %.
 LEAST_CLUSTERS = 5
+#: Drives over design effect below which the extremes of the drives are no 95 % bounds.
+_LEAST_EFFECTIVE = 4.0
 #: Normal deviates of a one-sided 95 % bound, and of being found in 80 % of all cases.
 _BOUND_95, _FOUND_80 = 1.6448536269514722, 0.8416212335729143
 
@@ -36,10 +33,12 @@ class PairedChange:
 
     Attributes
     ----------
-    drives, clusters : how many, of those that have the figure on both sides.
-    median : NaN without drives. low, high : its 95 % interval; NaN below :data:`LEAST_CLUSTERS`.
-    least, most : its one-sided 95 % bounds: 5th and 95th percentile. error : its standard error.
-    sign_p : two-sided p-value of "as many drives rise as fall", a vote a cluster; 1 where nothing changed.
+    drives, clusters : number of drives with the figure on both sides, and of clusters, where the user gave some.
+    median : NaN without drives. low, high : its 95 % interval; NaN below :data:`LEAST_CLUSTERS`, or where the
+        dependence leaves too little evidence.
+    least, most : its one-sided 95 % bounds. error : its standard error, from their distance.
+    sign_p : two-sided p-value of "as many drives rise as fall"; 1 where nothing changed.
+    dependence : design effect and its causes.
     """
 
     drives: int
@@ -51,6 +50,7 @@ class PairedChange:
     most: float
     error: float
     sign_p: float
+    dependence: Dependence = field(default_factory=Dependence)
 
     def verdict(self, limit: float = 0.0) -> Verdict:
         """Return whether b is worse by more than ``limit`` (a share: 0.05) in a figure whose lower value is better.
@@ -78,34 +78,55 @@ def log_ratios(a: FloatArray, b: FloatArray, floor: float = 0.0) -> FloatArray:
         return np.where(low == high, 0.0, np.log(high) - np.log(low))
 
 
-def paired_change(ratios: FloatArray, clusters: Sequence[object] | None = None) -> PairedChange:
+def paired_change(
+    ratios: FloatArray, clusters: Sequence[object] | None = None, factors: Factors | None = None
+) -> PairedChange:
     """Return the median log ratio of drives with its bounds.
 
     Parameters
     ----------
     ratios : of :func:`log_ratios` [N]; infinite ones take part, by their sign.
-    clusters : what each drive is of [N]; None: each is its own.
+    clusters : what each drive is of [N]; fewer than :data:`LEAST_CLUSTERS` give no bounds.
+    factors : what may make drives depend on one another (day, car, route) where ``clusters`` is None.
     """
     n = len(ratios)
-    of_drive = np.arange(n) if clusters is None else _numbered(clusters)
-    groups = int(of_drive.max()) + 1 if n else 0
+    groups = n if clusters is None else len(set(numbered(clusters).tolist()))
     nan = math.nan
     if n == 0:
         return PairedChange(0, 0, nan, nan, nan, nan, nan, nan, 1.0)
-    order = np.argsort(ratios, kind="stable")
-    ascending = ratios[order]
-    median = float(_middle(ascending, np.ones((1, n), dtype=np.int32))[0])
-    votes = sign_p(np.array([np.sum(np.sign(ratios[of_drive == g])) for g in range(groups)]) if clusters else ratios)
+    ascending = np.sort(ratios)
+    lower, upper = float(ascending[(n - 1) // 2]), float(ascending[n // 2])
+    median = lower if lower == upper else 0.5 * (lower + upper)
+    above = (ratios > median).astype(np.float64) - (ratios < median)
+    effect = dependence(above, {"cluster": clusters} if clusters is not None else factors or {})
+    votes = sign_p(ratios, effect)
     if groups < LEAST_CLUSTERS:
-        return PairedChange(n, groups, median, nan, nan, nan, nan, nan, votes)
-    if ascending[0] == ascending[-1]:  # for any drawing
-        return PairedChange(n, groups, median, median, median, median, median, 0.0, votes)
-    step = max(1, _AT_ONCE // n)
-    parts = (_draws(groups)[i : i + step, of_drive[order]] for i in range(0, RESAMPLES, step))
-    medians = np.sort(np.concatenate([_middle(ascending, counts) for counts in parts]))
-    low, least, most, high = (float(medians[_rank(share)]) for share in (0.025, 0.05, 0.95, 0.975))
-    error = float(np.std(medians)) if np.isfinite(medians).all() else nan
-    return PairedChange(n, groups, median, low, high, least, most, error, votes)
+        return PairedChange(n, groups, median, nan, nan, nan, nan, nan, votes, effect)
+    (low, high), (least, most) = (_bounds(ascending, share, effect) for share in (0.975, 0.95))
+    return PairedChange(n, groups, median, low, high, least, most, (most - least) / (2 * _BOUND_95), votes, effect)
+
+
+def _bounds(ascending: FloatArray, share: float, effect: Dependence) -> tuple[float, float]:
+    """Return the one-sided bounds of the median at a probability: the sign test inverted, NaN where none exists."""
+    n = len(ascending)
+    if n < _LEAST_EFFECTIVE * effect.design_effect:
+        return math.nan, math.nan
+    place = 0.5 * (n - 1) - 0.5 * quantile(share, effect.freedom) * math.sqrt(n * effect.design_effect)
+    return _at(ascending, max(place, 0.0)), -_at(-ascending[::-1], max(place, 0.0))
+
+
+def _at(ascending: FloatArray, place: float) -> float:
+    """Return the value at a place between order statistics; between infinite ones the outer one."""
+    i = math.floor(place)
+    low, high = float(ascending[i]), float(ascending[min(i + 1, len(ascending) - 1)])
+    return low if low == high or not (math.isfinite(low) and math.isfinite(high)) else low + (place - i) * (high - low)
+
+
+def quantile(share: float, freedom: float) -> float:
+    """Return a quantile of Student's t, or of the normal distribution with infinite degrees of freedom."""
+    from scipy.special import ndtri, stdtrit  # scipy.stats takes half a second longer to load
+
+    return float(ndtri(share) if math.isinf(freedom) else stdtrit(freedom, share))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -118,45 +139,17 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return corrected
 
 
-def _rank(share: float) -> int:
-    """Return the place of a percentile among sorted resamples, to the outside: bounds are never too narrow by it."""
-    place = share * (RESAMPLES - 1)
-    return math.floor(place) if share < 0.5 else math.ceil(place)
-
-
-@lru_cache(maxsize=2)
-def _draws(groups: int) -> NDArray[np.int32]:
-    """Return how often each cluster is drawn [RESAMPLES, groups]; always the same for as many."""
-    rng = np.random.default_rng(_SEED)
-    drawn = np.empty((RESAMPLES, groups), dtype=np.int32)
-    for row in drawn:
-        row[:] = np.bincount(rng.integers(0, groups, groups), minlength=groups)
-    return drawn
-
-
-def _middle(ascending: FloatArray, counts: NDArray[np.int32]) -> FloatArray:
-    """Return the medians [M] of ascending values [N] that count [M, N] times each."""
-    reached = np.cumsum(counts, axis=1)
-    total = reached[:, -1:]
-    lower = np.argmax(reached * 2 >= total, axis=1)
-    upper = np.argmax(reached * 2 > total, axis=1)
-    low, high = ascending[lower], ascending[upper]
-    with np.errstate(invalid="ignore"):
-        middle: FloatArray = np.where(low == high, low, 0.5 * (low + high))
-    return middle
-
-
-def _numbered(clusters: Sequence[object]) -> IntArray:
-    numbers: dict[object, int] = {}
-    return np.array([numbers.setdefault(c, len(numbers)) for c in clusters], dtype=np.int64)
-
-
-def sign_p(votes: FloatArray) -> float:
-    """Return the two-sided p-value of the sign test; those without a sign do not vote."""
-    up, down = int(np.count_nonzero(votes > 0)), int(np.count_nonzero(votes < 0))
+def sign_p(ratios: FloatArray, effect: Dependence | None = None) -> float:
+    """Return the two-sided p-value of the sign test, which ignores ratios of 0; with a design effect by Student's t."""
+    up, down = int(np.count_nonzero(ratios > 0)), int(np.count_nonzero(ratios < 0))
     n = up + down
     if n == 0:
         return 1.0
+    if effect is not None and effect.design_effect > 1.0:
+        from scipy.special import stdtr
+
+        excess = max(abs(up - down) - 1.0, 0.0) / math.sqrt(n * effect.design_effect)
+        return min(1.0, 2.0 * float(stdtr(effect.freedom, -excess)))
     log_half = n * math.log(2.0)
     tail = sum(
         math.exp(math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1) - log_half)

@@ -18,12 +18,15 @@ import rerun.blueprint as rrb
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
 from pdhef_logtool.evaluation.reasons import ReasonIntervals
+from pdhef_logtool.evaluation.track_errors import NORMAL_95
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.geometry import DEGREES, wrap_angle
+from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.results.log_lines import LEVEL_NAMES, log_lines
 from pdhef_logtool.results.palette import colour_rgb
+from pdhef_logtool.results.plotted import ERRORS, errors
 from pdhef_logtool.results.run_report import report_markdown
 from pdhef_logtool.results.sink import (
     LONGEST_WHOLE_NS,
@@ -37,10 +40,7 @@ from pdhef_logtool.results.sink import (
 from pdhef_logtool.storage.files import PendingFile, cannot_write, open_new, writing
 
 #: Estimators beside the selected estimate and the baseline that the blueprint has places for, hidden until asked for.
-MOST_OTHERS = 6
-
-#: Half width of the 95 % interval of a normal distribution, in standard deviations.
-STD_OF_95_PERCENT = 1.959963985
+MOST_OTHERS = 12
 
 #: A line is broken where nothing is known for longer than this.
 LONGEST_BRIDGE_NS = 1_000_000_000
@@ -79,8 +79,7 @@ _STATES = (
     _Plot("vy_m_s", "lateral velocity [m/s]", "vy_m_s", std="vy_std_m_s"),
     _Plot("ay_m_s2", "lateral acceleration [m/s²]", "ay_m_s2"),
 )
-#: Whose error is drawn; the other two errors state the same once more.
-_ERRORS = (_STATES[0], _STATES[1], _STATES[3])
+_ERRORS = tuple(plot for plot in _STATES if plot.name in ERRORS)
 _HEALTH = (
     _Plot("nis", "normalised innovation squared", "nis", sparse=True),
     _Plot("network_trust", "residual gain", "network_trust"),
@@ -230,8 +229,9 @@ class RerunSink(Sink):
             self._log_static(f"/{place}", style)
         is_shown = place in ("main", "baseline")
         columns = self._columns(track, _STATES + _HEALTH if is_shown else _STATES)
-        if is_shown:
-            columns |= _errors(track, truth, self._min_speed_m_s)
+        if track.name != TRUTH:
+            by_name = errors(track, truth, self._min_speed_m_s)
+            columns |= {f"error_{name}": values[:, None] for name, values in by_name.items()}
         sparse = frozenset(p.name for p in _HEALTH if p.sparse)
         self._send_rows(f"/{place}", self._rows[place], _TRACK, track.stamps_ns, columns, sparse)
         if len(track.reason) == len(track):
@@ -252,7 +252,7 @@ class RerunSink(Sink):
             shown = track.valid if plot.from_low_speed else track.valid & fast
             drawn = [np.where(shown, values, np.nan)]
             if plot.std is not None and track.name != TRUTH:
-                half = STD_OF_95_PERCENT * plot.factor * np.asarray(getattr(track, plot.std))
+                half = NORMAL_95 * plot.factor * np.asarray(getattr(track, plot.std))
                 drawn += [drawn[0] - half, drawn[0] + half]
             columns[plot.name] = np.stack(drawn, axis=1)
         return columns
@@ -285,11 +285,10 @@ class RerunSink(Sink):
                     path.strips(), colors=[colour_rgb(name, self._colours)], radii=[rr.Radius.ui_points(1.5)]
                 ),
             )
-        reasons = self._draw_reasons()
-        if events or reasons:
-            ordered = sorted([*events, *reasons], key=lambda e: (e.start_ns, e.end_ns, e.name))
-            text = rr.TextLog.columns(text=[_event_text(e) for e in ordered], level=["INFO"] * len(ordered))
-            self._send("/events", np.array([e.start_ns for e in ordered], dtype=np.int64), text)
+        self._draw_reasons()
+        if lines := log_lines(report, events, self._reasons):
+            text = rr.TextLog.columns(text=[x.text for x in lines], level=[LEVEL_NAMES[x.level] for x in lines])
+            self._send("/events", np.array([x.stamp_ns for x in lines], dtype=np.int64), text)
         self._log_static("/report", rr.TextDocument(report_markdown(report), media_type=rr.MediaType.MARKDOWN))
 
     def abort(self) -> None:
@@ -361,33 +360,14 @@ class RerunSink(Sink):
             points = rr.Points2D.columns(positions=plan[shown])
             self._send(f"/plan/{place}/now", track.stamps_ns[shown], points)
 
-    def _draw_reasons(self) -> list[Event]:
-        """Draw each reason as a state that is active in its intervals; return the intervals as events."""
-        events = []
+    def _draw_reasons(self) -> None:
+        """Draw each reason as a state that is active in its intervals."""
         for name, intervals in self._reasons.items():
             for reason, spans in intervals.intervals().items():
                 text = _REASON_TEXTS[reason]
                 stamps = np.array([t for s in spans for t in (s.start_ns, s.end_ns)], dtype=np.int64)
                 states = rr.StateChange.columns(state=[text, ""] * len(spans))  # the empty one ends the state
                 self._send(f"/reasons/{name}/{reason}", stamps, states)
-                events += [Event(f"{name}: {text}", s.start_ns, s.end_ns, "") for s in spans]
-        return events
-
-
-def _errors(track: StateTrack, truth: StateTrack | None, min_speed_m_s: float) -> dict[str, FloatArray]:
-    """Return the errors by component, [N, 1] each, NaN where ground truth or estimate is not known."""
-    columns = {f"error_{plot.name}": np.full((len(track), 1), np.nan) for plot in _ERRORS}
-    if truth is None:
-        return columns
-    _, of_track, of_truth = np.intersect1d(track.stamps_ns, truth.stamps_ns, assume_unique=True, return_indices=True)
-    valid = track.valid[of_track] & truth.valid[of_truth]
-    fast = np.hypot(truth.vx_m_s, truth.vy_m_s)[of_truth] >= min_speed_m_s
-    for plot in _ERRORS:
-        error = np.asarray(getattr(track, plot.column))[of_track] - getattr(truth, plot.column)[of_truth]
-        error = plot.factor * (wrap_angle(error) if plot.is_angle else error)
-        scored = valid if plot.from_low_speed else valid & fast
-        columns[f"error_{plot.name}"][of_track, 0] = np.where(scored, error, np.nan)
-    return columns
 
 
 class _Outlet:
@@ -538,11 +518,6 @@ class _Trajectory:
         return [p for p in pieces if len(p) > 1 and np.isfinite(p[0]).all()]
 
 
-def _event_text(event: Event) -> str:
-    head = f"{event.name}, {(event.end_ns - event.start_ns) * 1e-9:.2f} s"
-    return f"{head}: {event.text}" if event.text else head
-
-
 def _blueprint() -> rrb.Blueprint:
     """Open on the drive: sideslip with intervals, yaw rate, a_y, inputs, the plan; errors, filter and report as tabs.
 
@@ -564,7 +539,7 @@ def _blueprint() -> rrb.Blueprint:
         name="Drive",
     )
     errors = rrb.Vertical(
-        *(_track_view(f"error_{plot.name}", f"error of {plot.title}", ("baseline", "main")) for plot in _ERRORS),
+        *(_track_view(f"error_{plot.name}", f"error of {plot.title}", states[1:]) for plot in _ERRORS),
         name="Errors",
     )
     filters = rrb.Vertical(

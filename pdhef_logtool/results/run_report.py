@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pdhef_logtool.car.assumed_values import AssumedValue
-    from pdhef_logtool.evaluation.thresholds import Verdict
+    from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
+    from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
 #: Columns of a figure in the report.
 _METRIC_COLUMNS = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
@@ -137,7 +138,7 @@ class DriveDetails:
     """What a report's page shows and no table contains, of a drive that a run estimated.
 
     ``faults`` of the sensors, None where no estimator detects them. ``innovations`` by channel.
-    ``standings`` of the selected estimate, empty without ground truth; ``limits``: how it is against the thresholds.
+    ``standings`` of the selected estimate, empty without ground truth.
     ``error_budget`` has a reason where there is none. ``operating_space``: the cells that the drive was in.
     ``metadata`` : what the log states of itself.
     """
@@ -145,10 +146,17 @@ class DriveDetails:
     faults: Sequence[SensorFault] | None
     innovations: Sequence[Any]
     standings: Sequence[Standing]
-    limits: Sequence[Verdict]
     error_budget: Any
     operating_space: Sequence[Cell]
     metadata: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class RequirementFacts:
+    """The verdicts of the validation plan on one drive alone, and the blocks of time that they are drawn from."""
+
+    verdicts: PlanVerdicts
+    blocks: Sequence[RequirementBlocks] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +171,7 @@ class ReportFacts:
     ``reference``: what came of the sideslip reference, None where it was not asked for.
     ``file_bytes``: what became of the bytes of each file; ``samples``: of the samples of each mapped source.
     ``checks``: plausibility of signals, ground truth and vehicle file. ``details``: None where nothing was estimated.
+    ``requirements``: None where there is nothing to judge.
     """
 
     log: LogFacts
@@ -174,6 +183,7 @@ class ReportFacts:
     truth: TruthFacts
     vehicle_file: str | None = None
     vehicle_proven: bool = False
+    sensors: Mapping[str, float] = field(default_factory=dict)
     assumed: Sequence[AssumedValue] = ()
     setup: Mapping[str, Any] | None = None
     low_speed_m_s: float | None = None
@@ -189,18 +199,23 @@ class ReportFacts:
     remarks: Sequence[str] = ()
     main: MainFacts | None = None
     checks: Sequence[Check] = ()
+    requirements: RequirementFacts | None = None
     details: DriveDetails | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class CarFacts:
-    """The car that a log of a run had: folder or file (None: none was given), vehicle, digests of physics, network."""
+    """The car that a log of a run had: folder or file (None: none was given), vehicle, digests of physics, network.
+
+    ``sensors``: the entries of its sensor profile that differ from the default.
+    """
 
     file: str | None
     name: str
     sha256: str
     network_sha256: str | None
+    sensors: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,6 +287,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
             "sha256": facts.vehicle_sha256,
             "file": facts.vehicle_file,
             "proven": facts.vehicle_proven,
+            "sensors": dict(facts.sensors),
             "assumed": list(facts.assumed),
             "low_speed_blend_m_s": facts.low_speed_m_s,
         },
@@ -310,6 +326,9 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
         "checks": list(facts.checks),
         "versions": dict(facts.versions),
     }
+    if facts.requirements is not None:
+        document["plan"] = facts.requirements.verdicts.to_dict()
+        document["requirement_blocks"] = list(facts.requirements.blocks)
     document = {key: jsonable(value) for key, value in document.items()}
     return document | _selected(document, facts.main, facts.details)
 
@@ -322,7 +341,7 @@ def _selected(document: Mapping[str, Any], main: MainFacts | None, details: Driv
     if details is None:
         return chosen
     chosen |= _detailed(details)
-    return chosen | {"verdicts": verdicts_of({**document, **chosen}, main.name, details.standings, details.limits)}
+    return chosen | {"verdicts": verdicts_of({**document, **chosen}, main.name, details.standings)}
 
 
 def _detailed(details: DriveDetails) -> dict[str, Any]:
@@ -342,7 +361,7 @@ def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
     """Return a report of a few kB, of many drives: figures that tables show, and no list that grows with the log.
 
     All figures are in metrics.parquet. Of topics those that were mapped stay, of algorithms all but the noise, of
-    segments the sideslip answer's own, and of the rest the first :data:`_MOST_LISTED`.
+    segments the sideslip answer's own, and of the rest the first :data:`_MOST_LISTED`; the verdicts are in run.json.
     """
     answer = report["answer"]
     names = {answer["main"], answer["naive"], PHYSICS} if answer else set()
@@ -350,7 +369,7 @@ def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
     if space := report.get("operating_space"):
         first["operating_space"] = {**space, "cells": [*map(_rounded, space["cells"])]}
     return {
-        **{key: value for key, value in report.items() if key not in ("innovations", "error_budget")},
+        **{key: value for key, value in report.items() if key not in ("innovations", "error_budget", "plan")},
         **first,
         "log": {**report["log"], "topics": [t for t in report["log"]["topics"] if t["mapped"]]},
         "estimators": [_brief_estimator(e, names) for e in report["estimators"]],
@@ -396,6 +415,7 @@ def build_run(
     outcomes: Iterable[LogOutcome],
     remaining: int = 0,
     files: Mapping[str, str] | None = None,
+    plan: PlanVerdicts | None = None,
 ) -> dict[str, Any]:
     """Return the document of run.json (schemas/run.schema.json), sealed.
 
@@ -405,7 +425,7 @@ def build_run(
     config : the configuration in effect, as JSON-able values.
     model : ``name`` and ``sha256`` of the network; None when none ran, or not the same for all.
     outcomes : one a log. remaining : logs that are not done, for the run was ended.
-    files : sha256 by name of the files beside run.json that commands read back.
+    files : sha256 by name of the files beside run.json that commands read back. plan : verdicts on all logs.
     """
     document = {
         "format": "pdhef.run",
@@ -415,6 +435,7 @@ def build_run(
         "model": None if model is None else dict(model),
         **({"remaining": remaining} if remaining else {}),
         "files": dict(files or {}),
+        "plan": None if plan is None else plan.to_dict(),
         "logs": [
             {
                 "log": o.log,

@@ -99,6 +99,7 @@ def _result(report: Report, main: MainFacts, figures: _Figures) -> str:
     said = [f"Sideslip RMSE of {main.name}: {degrees(rmse)} ({_truth_of(report, 'sideslip_rad')})"]
     rivals = [(name, text) for name, text in (("physics", "physics"), ("zero", "zero sideslip")) if name != main.name]
     others = [(text, other) for name, text in rivals if (other := _error(figures, name)) is not None]
+    others = [(text, other) for text, other in others if (text, other) != ("physics", rmse)]  # residual gain 0
     said += [_against(rmse, other, text) for text, other in others]
     if "sideslip_rad" in truth["not_independent"]:
         said.append("the ground truth is an input of the estimator or the estimate itself: not an independent check")
@@ -269,7 +270,7 @@ def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]
     """Return what would help, the most important first."""
     vehicle, steps = report["vehicle"], []
     if any(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks", ())):
-        steps.append("correct the failed checks above, or waive them by name")
+        steps.append("correct the failed checks below, or waive them by name")
     lacks = {e["reason"] for e in report["estimators"] if e["name"] == "physics" and e["outcome"] == "skipped"}
     steps += [f"map the missing signals ({reason}): pdhef map LOG" for reason in lacks]
     if vehicle["file"] is None:

@@ -52,6 +52,18 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True)
+class ManoeuvreEvent(Event):
+    """A recognised manoeuvre: its first side (``left``, ``right``), the speed at its start, and its peaks."""
+
+    side: str
+    speed_m_s: float
+    peak_ay_m_s2: float
+    peak_yaw_rate_rad_s: float
+    peak_steer_rad: float
+    lowest_ax_m_s2: float
+
+
+@dataclass(frozen=True, slots=True)
 class Shown:
     """The estimators that a person is shown first; ``baseline`` is what the selected one is compared with, or None."""
 

@@ -64,6 +64,7 @@ class RunSummary:
     worst: tuple[WorstDrive, ...]
     failed: tuple[Failures, ...]
     checks_failed: tuple[str, ...]
+    plan: Mapping[str, Any] | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the summary as one JSON-able document; its drives are one by one in run.json."""
@@ -94,6 +95,7 @@ def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> R
         worst=tuple(_worst(errors, answers)),
         failed=grouped(failed),
         checks_failed=tuple(checks_failed),
+        plan=run.document.get("plan"),
     )
 
 

@@ -1,4 +1,4 @@
-"""The verdict of a drive, a sentence a signal: the selected estimate against the best physics and the thresholds.
+"""The verdict of a drive, a sentence a signal: the selected estimate against the best physics.
 
 Written from the figures of a report, like :mod:`~pdhef_logtool.results.selected_estimate`, which has the other
 sentences: how the estimate was selected, its interval, what was assumed, what to do next.
@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from pdhef_logtool.evaluation.bootstrap import Interval
 from pdhef_logtool.evaluation.standing import JUDGED_SIGNALS, LEAST_BLOCKS, Standing
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS, read_unit
 from pdhef_logtool.results.selected_estimate import NO_SIDESLIP_RAD, SAME
-
-if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.thresholds import Verdict
 
 #: ``same``: the interval of the difference lies within
 #: :data:`~pdhef_logtool.results.selected_estimate.SAME` of the rival's error.
@@ -24,21 +21,13 @@ if TYPE_CHECKING:
 Outcome: TypeAlias = Literal["better", "worse", "same", "undecided", "alone", "none"]
 
 
-def verdicts_of(
-    report: Mapping[str, Any], main: str, standings: Sequence[Standing], limits: Sequence[Verdict]
-) -> list[dict[str, Any]]:
+def verdicts_of(report: Mapping[str, Any], main: str, standings: Sequence[Standing]) -> list[dict[str, Any]]:
     """Return the verdicts of a report's document, one a signal, with the figures behind the words."""
     by_signal = {s.signal: s for s in standings}
-    return [
-        _verdict(report, main, signal, by_signal.get(signal), [v for v in limits if v.threshold.signal == signal])
-        for signal in JUDGED_SIGNALS
-    ]
+    return [_verdict(report, main, signal, by_signal.get(signal)) for signal in JUDGED_SIGNALS]
 
 
-def _verdict(
-    report: Mapping[str, Any], main: str, signal: str, standing: Standing | None, limits: Sequence[Verdict]
-) -> dict[str, Any]:
-    decided_limits = [v for v in limits if v.estimator == main and v.outcome in ("pass", "fail")]
+def _verdict(report: Mapping[str, Any], main: str, signal: str, standing: Standing | None) -> dict[str, Any]:
     outcome: Outcome = "none"
     if why := _why_none(report, main, signal, standing):
         text = f"no verdict: {why}"
@@ -46,7 +35,7 @@ def _verdict(
     else:
         assert standing is not None and standing.rmse is not None
         outcome = _outcome(standing)
-        text = "; ".join([_error(standing), _against(standing, outcome), *_limits(standing, decided_limits)])
+        text = "; ".join([_error(standing), _against(standing, outcome)])
     return {
         "signal": signal,
         "estimator": main,
@@ -56,7 +45,6 @@ def _verdict(
         "rival": None if standing is None else standing.rival,
         "rival_rmse": None if standing is None else standing.rival_rmse,
         "difference": None if standing is None else _figures(standing.difference),
-        "limits": [{"text": v.threshold.label, "outcome": v.outcome, "value": v.value} for v in decided_limits],
     }
 
 
@@ -125,7 +113,7 @@ def _error(standing: Standing) -> str:
 
 def _against(standing: Standing, outcome: Outcome) -> str:
     if outcome == "alone":
-        return "no filter without a network ran for comparison"
+        return "no other filter without a network ran for comparison"
     unit, factor = _unit(standing.signal)
     assert standing.rival_rmse is not None and standing.difference is not None and standing.rmse is not None
     beside = f"{standing.rival} ({_number(standing.rival_rmse * factor)}{unit})"
@@ -140,21 +128,6 @@ def _against(standing: Standing, outcome: Outcome) -> str:
     low, high = (_number(x * factor, sign="+") for x in (difference.low, difference.high))
     between = f"95 % CI of the difference {low} to {high}{unit}"
     return f"{how}, difference not significant: {between}" if outcome == "undecided" else f"{how}: {between}"
-
-
-def _limits(standing: Standing, limits: Sequence[Verdict]) -> list[str]:
-    """Return what is stated of the thresholds; of a limit of the RMSE also whether the interval reaches beyond it."""
-    said = []
-    for verdict in limits:
-        limit = verdict.threshold
-        text = f"{'within' if verdict.outcome == 'pass' else 'exceeds'} the limit {limit.label}"
-        rmse = standing.rmse
-        if (limit.metric, limit.segment) == ("rmse", "all") and limit.maximum is not None and rmse is not None:
-            bound = limit.maximum * limit.factor
-            if math.isfinite(rmse.low) and rmse.low < bound < rmse.high:
-                text += ", which lies within the interval"
-        said.append(text)
-    return said
 
 
 def _number(value: float, sign: str = "-") -> str:

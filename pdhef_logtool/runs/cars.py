@@ -101,7 +101,9 @@ class RunCars:
     def read(self, path: Path | None) -> Car:
         """Return a car, read when it is first asked for; raises VehicleError or ModelError."""
         if path not in self._read:
-            car = Car.load(path, network=self.config.network, intervals=self.config.intervals)
+            car = Car.load(
+                path, network=self.config.network, intervals=self.config.intervals, sensors=self.config.sensor_profile
+            )
             for note in car.notes:
                 self.warn(note if self.table is None else f"{car.file_name}: {note}")
             self._read[path] = car

@@ -88,7 +88,7 @@ def _compile_checks() -> None:
 
     car, signals = Car.load("saloon"), _windows()[0]
     _compile_algebra()
-    without_slip(signals, car.vehicle.sensors.speed_std_m_s, None)
+    without_slip(signals, car.vehicle.sensors, None)
     find_faults(signals, car.vehicle, None)
     if car.network is not None:
         features = np.zeros((len(signals), len(FEATURES)))

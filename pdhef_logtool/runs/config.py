@@ -14,6 +14,7 @@ from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from pdhef_logtool.car.car import NO_INTERVALS, SHIPPED_CARS, UNSURE
+from pdhef_logtool.car.vehicle import SENSOR_PROFILES
 from pdhef_logtool.drive.friction import parse_friction
 from pdhef_logtool.drive.options import WINDOW_S, ReadOptions, parse_time
 from pdhef_logtool.estimators.presets import split_names
@@ -23,7 +24,7 @@ from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED_FOLDERS
 from pdhef_logtool.storage.documents import read_toml, validated
 from pdhef_logtool.storage.object_store import is_url
 
-_FILES = ("car", "cars", "mapping", "msgs", "thresholds", "network", "intervals", "setup")
+_FILES = ("car", "cars", "mapping", "msgs", "plan", "network", "intervals", "setup", "sensor_profile")
 #: Settings that change no result.
 _NO_RESULT = ("cache", "cache_max_gb", "allow_private_redirects", "log_timeout_s", "max_memory_mb", "full_worst")
 #: What may be in place of a file.
@@ -31,6 +32,7 @@ _KEYWORDS = {
     "car": tuple(SHIPPED_CARS),
     "network": (*SHIPPED_FOLDERS, NO_MODEL),
     "intervals": (NO_INTERVALS, UNSURE),
+    "sensor_profile": tuple(SENSOR_PROFILES),
 }
 
 
@@ -70,13 +72,16 @@ class RunConfig:
     keep : files per log: ``metrics`` (report and metrics), ``estimates`` (and the tracks) or ``full``; None = ``full``,
         for more than 50 logs ``metrics``.
     sensors : ``full``, or ``esp`` (sensor set of the paper: the speed sensor only initialises the filters).
+    sensor_profile : TOML file with ``[sensors]`` (noise, rates and limits of the sensors), or ``production``, in place
+        of the car's entries, for ``run`` and ``metrics``; None = those of the car.
     friction : ``auto`` (from the log, else the car, else estimated), ``file``, ``estimate``, or a number.
     prefer_truth : ground truth of a simulated log that has both: ``perfect`` or ``rtk``.
     window_s : length of the windows in which a log is processed, in s. Results do not depend on it.
     clock : ``arrival`` (a sample is available from its arrival on) or ``stamp`` (from its stamp on; not causal).
     budget : factor on the limits of memory and time for reading a log.
-    msgs : folder, zip file or wheel with .msg files of types that a log does not define.
-    thresholds : thresholds.toml with limits on metrics; None = no limits.
+    msgs : folder, zip file or wheel with .msg files of types that a log does not define; or a DBC file, or a folder of
+        them, for raw CAN frames in BLF, ASC and MDF files.
+    plan : validation plan (plan.toml); None = the default plan, which decides no exit code.
     network : network folder, ``default``, ``many-cars`` or ``none``; None = the car's.
     intervals : intervals file, ``none``, or ``unsure`` (wide intervals, for a car that may have changed); None = the
         car's.
@@ -107,13 +112,14 @@ class RunConfig:
     annotate: Literal["full", "sidecar", "none"] | None = None
     keep: Keep | None = None
     sensors: Literal["full", "esp"] = "full"
+    sensor_profile: File | None = None
     friction: Literal["auto", "file", "estimate"] | Friction = "auto"
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
     window_s: Annotated[float, Field(ge=1, le=1e9)] = WINDOW_S
     clock: Literal["arrival", "stamp"] = "arrival"
     budget: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     msgs: File | None = None
-    thresholds: File | None = None
+    plan: File | None = None
     network: File | None = None
     intervals: File | None = None
     calibrate: Calibrate = "log"

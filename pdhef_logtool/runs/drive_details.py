@@ -16,7 +16,6 @@ from pdhef_logtool.evaluation.operating_space import operating_space
 from pdhef_logtool.evaluation.reasons import SensorFault, sensor_faults
 from pdhef_logtool.evaluation.segments import moving_mask
 from pdhef_logtool.evaluation.standing import standings
-from pdhef_logtool.evaluation.thresholds import Verdict
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -40,7 +39,6 @@ def drive_details(
     main: str,
     read: _Read,
     signals: Signals,
-    limits: Sequence[Verdict],
     *,
     brief: bool = False,
 ) -> DriveDetails:
@@ -49,7 +47,7 @@ def drive_details(
     Parameters
     ----------
     ready : the estimators that ran. main : name of the selected estimate. read : returns the track of a name.
-    signals : what the estimators saw. limits : how the figures are against the thresholds.
+    signals : what the estimators saw.
     brief : without innovations and error decomposition, for which estimators run once more.
     """
     truth, slow = read(TRUTH), drive.car.vehicle.low_speed_blend_m_s
@@ -65,8 +63,7 @@ def drive_details(
     return DriveDetails(
         faults=next((f for e in asked if (f := _faults(read, e.name)) is not None), None),
         innovations=[] if sample is None else channel_innovations(asked, sample),
-        standings=[] if truth is None else standings(main, _rivals(ready, by_name[main]), read, truth, slow),
-        limits=limits,
+        standings=[] if truth is None else standings(main, _rivals(ready, by_name[main], read), read, truth, slow),
         error_budget=no_budget(_LEFT_OUT) if brief else _budget(drive, by_name.get(PHYSICS), read, signals),
         operating_space=operating_space(signals, truth, answer, slow),
         metadata=_metadata(drive),
@@ -78,15 +75,24 @@ def _faults(read: _Read, name: str) -> tuple[SensorFault, ...] | None:
     return None if track is None else sensor_faults(track)
 
 
-def _rivals(ready: Sequence[Estimator], main: Estimator) -> list[str]:
+def _rivals(ready: Sequence[Estimator], main: Estimator, read: _Read) -> list[str]:
     """Return the estimators on the car's model alone to compare the selected one with; none sees more of the log."""
     rivals = []
     for estimator in ready:
         algorithm = resolve(estimator)
         physics = algorithm.physics_sha256 is not None and algorithm.network_sha256 is None
-        if physics and estimator.name != main.name and (estimator.causal or not main.causal):
+        other = physics and estimator.name != main.name and (estimator.causal or not main.causal)
+        if other and not _is_same(read(estimator.name), read(main.name)):
             rivals.append(estimator.name)
     return rivals
+
+
+def _is_same(track: StateTrack | None, main: StateTrack | None) -> bool:
+    """Whether two tracks [N] have the same sideslip bit for bit: one filter under two names (residual gain 0)."""
+    if track is None or main is None or len(track) != len(main):
+        return False
+    blocks = ((track.rows(a, b), main.rows(a, b)) for a, b in row_blocks(len(main)))
+    return all(np.array_equal(t.sideslip_rad, m.sideslip_rad, equal_nan=True) for t, m in blocks)
 
 
 def _budget(drive: Drive, physics: Estimator | None, read: _Read, signals: Signals) -> ErrorBudget:

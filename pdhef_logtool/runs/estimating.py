@@ -20,6 +20,7 @@ from pdhef_logtool.estimators.online_calibrated import OnlineBand, OnlineCalibra
 from pdhef_logtool.estimators.presets import preset_of
 from pdhef_logtool.estimators.self_calibrated import SELF_CALIBRATED, CalibratedBand
 from pdhef_logtool.records.geometry import DeadReckoner
+from pdhef_logtool.records.readings import without_impossible_states
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 
@@ -82,6 +83,7 @@ def estimate_windows(
         for estimator in estimators:
             before = states.get(estimator.name)
             track, states[estimator.name] = run_window(estimator, signals, before, ahead, causality)
+            track = without_impossible_states(track)
             track = track if watch is None else watch.add(track, signals)
             track = track if intervals is None else intervals.add(track, signals)
             track = track.without_sideslip_below(drive.plan.vehicle.standstill_m_s)

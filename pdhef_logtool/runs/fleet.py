@@ -32,7 +32,7 @@ from pdhef_logtool.runs.pipeline import (
     RunResult,
     check_places,
     judge,
-    read_thresholds,
+    read_validation_plan,
     run_log,
     write_run,
     write_verdicts,
@@ -50,7 +50,8 @@ from pdhef_logtool.workers.supervisor import Ended, Limits, Tell, supervise
 
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
-    from pdhef_logtool.evaluation.thresholds import Threshold
+    from pdhef_logtool.evaluation.validation_plan import ValidationPlan
+    from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
 #: Drives with the largest errors that keep all files if the run keeps metrics only because of their number.
 FULL_WORST = 5
@@ -104,9 +105,10 @@ class _Job:
     config: RunConfig
     cars: RunCars
     mapping: Mapping | None
-    thresholds: tuple[Threshold, ...] | None
+    validation: ValidationPlan
     junit: Path | None
     report: bool
+    strict: bool
 
     def check_places(self, logs: Sequence[LogInput], output: Path) -> None:
         """Refuse to write over an input; raises UsageError."""
@@ -121,6 +123,7 @@ def run_logs(
     schedule: Schedule = Schedule(),
     junit: Path | str | None = None,
     report: bool = True,
+    strict: bool = False,
     work: Work = run_drive,
     reporter: Reporter = SILENT,
 ) -> RunResult:
@@ -132,7 +135,7 @@ def run_logs(
     ----------
     arguments : logs, folders, glob patterns.
     output : a folder, or the URL of one in an object store.
-    junit : file for the verdicts of the thresholds as JUnit XML.
+    junit : file for the verdicts of the validation plan as JUnit XML. strict : INCONCLUSIVE fails as FAIL does.
     report : whether pages are written (:mod:`pdhef_logtool.reports`); without, those of an earlier run are removed.
     work : processes one drive.
 
@@ -145,14 +148,15 @@ def run_logs(
     """
     inputs = find_logs(arguments, private_redirects=config.allow_private_redirects)
     junit = None if junit is None else Path(junit)
-    thresholds = read_thresholds(config, junit)
-    job = _Job(config, RunCars.of(config, reporter.warn), mapping_of(config.mapping), thresholds, junit, report)
+    validation = read_validation_plan(config, junit)
+    job = _Job(config, RunCars.of(config, reporter.warn), mapping_of(config.mapping), validation, junit, report, strict)
     alone = len(inputs) == 1 and schedule == Schedule() and work is run_drive and not is_url(output)
     if alone and _given_limits(config) is None:
         return _run_alone(inputs[0], Path(output), job, reporter)
     with StoredOutput(str(output)) if is_url(output) else nullcontext() as stored:
         fleet = _prepare(inputs, Path(output), job, schedule, work, reporter, stored)
-        return RunResult(fleet.plan.output, tuple(fleet.run()), stored)
+        results, verdicts = fleet.run()
+        return RunResult(fleet.plan.output, tuple(results), stored, verdicts)
 
 
 def _given_limits(config: RunConfig) -> Limits | None:
@@ -174,21 +178,21 @@ def _run_alone(log: LogInput, output: Path, job: _Job, reporter: Reporter) -> Ru
         try:
             result = run_log(
                 log, outputs, config, car, job.mapping,
-                pool=pool, thresholds=job.thresholds, prepare=compile_for, reporter=reporter,
+                pool=pool, validation=job.validation, prepare=compile_for, reporter=reporter,
             )  # fmt: skip
         except Exception:
             raise
         except BaseException as stop:
             stop.add_note("0 of 1 logs are done")
             raise
-        result = judge(result, job.thresholds)
-        write_run(output, config.to_dict(), result, car)
+        verdicts = judge(job.validation, [result], job.strict)
+        write_run(output, config.to_dict(), result, verdicts, car)
         journal = Journal.of(output)  # of a run that this one replaces
         journal.path.unlink(missing_ok=True)
         sweep_parts(journal, output)
-        write_verdicts(job.junit, [result])
+        write_verdicts(job.junit, verdicts, [result])
         write_run_pages(output, job.report, None, reporter)
-    return RunResult(output, (result,))
+    return RunResult(output, (result,), requirements=verdicts)
 
 
 def _prepare(
@@ -248,7 +252,7 @@ class _Fleet:
     _name: str = field(default_factory=lambda: f"{process_name()}-{next(_RUNS)}")
     _quiet: bool = False
 
-    def run(self) -> list[LogResult]:
+    def run(self) -> tuple[list[LogResult], PlanVerdicts | None]:
         """Process all pending logs and write the files of the run, also if the run is interrupted."""
         output, journal = self.plan.output, self.plan.journal
         with OutputFolder(output, (LOGS,)) as outputs:
@@ -269,14 +273,15 @@ class _Fleet:
             if self._lost_workers or self.schedule.ray:  # a lost node was replaced without being reported
                 outputs.sweep()
                 sweep_parts(journal, output)
-            results = collect(self.plan, self.job.config, self.job.thresholds)
-            write_verdicts(self.job.junit, results)
+            results, verdicts = collect(self.plan, self.job.config, self.job.validation, strict=self.job.strict)
+            if verdicts is not None:
+                write_verdicts(self.job.junit, verdicts, results)
             failed = {e.label for p in self.plan.logs if (e := self.plan.entry(p)) is not None and e.failed}
             pages = failed if self.job.config.kept == "full" else ()
             write_run_pages(output, self.job.report, pages, self.reporter)
             if self.stored is not None:
                 self.stored.publish()
-        return results
+        return results, verdicts
 
     def _save(self, stop: BaseException) -> None:
         """Write the files of the drives that are done when a run is interrupted."""
@@ -285,7 +290,7 @@ class _Fleet:
         stop.add_note(f"{done} of {len(self.plan.logs)} logs are done")
         sweep_parts(self.plan.journal, self.plan.output)
         with suppress(PdhefError):
-            collect(self.plan, self.job.config, self.job.thresholds)
+            collect(self.plan, self.job.config, self.job.validation)
             if self.stored is not None:
                 self.stored.publish()
 
@@ -363,7 +368,7 @@ class _Fleet:
             self.plan.output,
             replace(self.job.config, keep=keep),
             self.plan.setting,
-            self.job.thresholds,
+            self.job.validation,
             self.pools.get(label),
             self.job.report and keep == "full",
             self._name,

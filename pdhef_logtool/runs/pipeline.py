@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,8 @@ from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.intervals import TrackCalibrator
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, Skipped, all_specs, runnable
+from pdhef_logtool.evaluation.requirement_bounds import LEAST_DRIVES
+from pdhef_logtool.evaluation.validation_plan import default_plan
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
 from pdhef_logtool.mapping import Mapping, merge_losses
 from pdhef_logtool.records.errors import (
@@ -54,6 +57,7 @@ from pdhef_logtool.results.run_report import (
     LogFacts,
     LogOutcome,
     ReportFacts,
+    RequirementFacts,
     SourceFacts,
     TopicFacts,
     TruthFacts,
@@ -64,7 +68,7 @@ from pdhef_logtool.results.run_report import (
     tool_versions,
     write_json,
 )
-from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, Shown, Sink
+from pdhef_logtool.results.sink import TRUTH, Event, Shown, Sink
 from pdhef_logtool.runs.config import Keep, RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 from pdhef_logtool.runs.referencing import DriveReference, reference_of
@@ -72,14 +76,16 @@ from pdhef_logtool.runs.scoring import Evaluation, evaluate, in_time
 from pdhef_logtool.runs.selection import candidates, choose_main, contradiction, default_names
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore
-from pdhef_logtool.storage.documents import file_sha256
+from pdhef_logtool.storage.documents import file_sha256, jsonable
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder, check_no_input
 
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
     from pdhef_logtool.evaluation.metrics import MetricRow
-    from pdhef_logtool.evaluation.thresholds import Threshold, Verdict
+    from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
+    from pdhef_logtool.evaluation.validation_plan import ValidationPlan
+    from pdhef_logtool.results.plan_verdicts import PlanVerdicts
     from pdhef_logtool.results.selected_estimate import MainFacts
     from pdhef_logtool.storage.object_store import Mirror
 
@@ -101,9 +107,12 @@ LOG_FILES = (
 #: What of an earlier run's goes where a drive's new files have it not.
 STALE_FILES = (SETUP_FILE, PAGE_FILE, METRICS_FILE, ESTIMATES_FILE, RECORDING_FILE)
 
+#: Blocks of a requirement in a brief report.
+_BRIEF_BLOCKS = 12
 _SILENT = "{} has no valid row although the car moves"
 _NO_COPY = "annotated.mcap contains the tool's topics only: a log of kind {} has no messages to copy"
 _ALL_SILENT = "no estimator has a valid row although the car moves"
+_MAP_THEM = "map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)"
 _NEVER_MOVES = "the car is never faster than {:g} m/s: there is nothing to score"
 #: Units of ground truth quantities that have no channel of their own name.
 _DERIVED_UNITS = {"position_m": "m"}
@@ -117,7 +126,6 @@ class LogResult:
     ----------
     output : folder of the log, None where nothing was written.
     document, figures : report and rows that are at hand, None where they are in files; ``figures_file`` is theirs.
-    verdicts : how its figures are against the thresholds; None without thresholds.
     failed_checks : of the drive, those that count.
     """
 
@@ -125,7 +133,6 @@ class LogResult:
     output: Path | None
     document: dict[str, Any] | None = None
     figures: tuple[MetricRow, ...] | None = ()
-    verdicts: tuple[Verdict, ...] | None = None
     failed_checks: int = 0
     figures_file: Path | None = None
 
@@ -155,6 +162,8 @@ class LogResult:
 class RunResult:
     """What came out of a run; ``output`` is None when nothing was to be written.
 
+    ``requirements``: the verdicts of the validation plan on all logs.
+
     Where outputs are at a URL, ``stored`` states so, and ``output`` is a folder with what is given of them, which goes
     with this result.
     """
@@ -162,6 +171,7 @@ class RunResult:
     output: Path | None
     results: tuple[LogResult, ...]
     stored: Mirror | None = None
+    requirements: PlanVerdicts | None = None
 
     @property
     def place(self) -> Path | str | None:
@@ -175,69 +185,86 @@ class RunResult:
 
     @property
     def exit_code(self) -> int:
-        """0 if all is well, 4 if a threshold failed, 3 if input was lost, a check or some logs failed, 1 if all did."""
+        """0 if all is well, 4: a requirement failed, 3: input was lost, a check or some logs failed, 1: all failed."""
         if all(r.outcome.failed is not None for r in self.results):
             return EXIT_FAILURE
-        if any(v.failed for v in self.verdicts):
+        if self.requirements is not None and self.requirements.closes_gate:
             return EXIT_GATE
         return EXIT_OK if all(r.is_whole for r in self.results) else EXIT_PARTIAL
 
     def _shown(self, folder: Path) -> str:
         return str(folder) if self.output is None else str(folder).replace(str(self.output), str(self.place), 1)
 
-    @property
-    def verdicts(self) -> tuple[Verdict, ...]:
-        """The verdicts of all logs in order."""
-        return tuple(v for r in self.results for v in r.verdicts or ())
-
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document; of many logs without their reports."""
         return {
             "output": None if self.place is None else str(self.place),
             "exit_code": self.exit_code,
+            "plan": None if self.requirements is None else jsonable(self.requirements.to_dict()),
             "logs": [
                 {
                     "log": r.outcome.log,
                     "outcome": r.outcome.outcome,
                     "output": None if r.output is None else self._shown(r.output),
                     "report": None if self.is_fleet else r.report,
-                    **({} if r.verdicts is None else {"verdicts": [v.to_dict() for v in r.verdicts]}),
                 }
                 for r in self.results
             ],
         }
 
 
-def read_thresholds(config: RunConfig, junit: Path | None) -> tuple[Threshold, ...] | None:
-    """Return the configured thresholds, None without; raises UsageError when they are wrong or miss for ``junit``."""
-    from pdhef_logtool.evaluation.thresholds import load_thresholds
+def read_validation_plan(config: RunConfig, junit: Path | None) -> ValidationPlan:
+    """Return the configured plan or the default one; raises UsageError when it is wrong or misses for ``junit``."""
+    from pdhef_logtool.evaluation.validation_plan import load_plan
 
-    if config.thresholds is not None:
-        return load_thresholds(config.thresholds)
+    if config.plan is not None:
+        return load_plan(config.plan)
     if junit is not None:
         raise UsageError(
-            expected="thresholds to give verdicts on", got="none", where="--junit", remedy="--thresholds FILE"
+            expected="a validation plan to give verdicts on", got="none", where="--junit", remedy="--plan FILE"
         )
-    return None
+    return default_plan()
 
 
-def judge(result: LogResult, thresholds: Sequence[Threshold] | None) -> LogResult:
-    """Return the result with verdicts; a log that failed has no figures, so that its thresholds fail too."""
-    from pdhef_logtool.evaluation.thresholds import check_thresholds
+def judge(
+    plan: ValidationPlan, results: Sequence[LogResult], strict: bool, metrics: Path | None = None
+) -> PlanVerdicts:
+    """Return the verdicts of a plan on logs; a log that failed has no figures.
 
-    if thresholds is None:
-        return result
-    verdicts = check_thresholds(thresholds, result.rows, log=result.outcome.log)
-    return replace(result, verdicts=tuple(verdicts))
+    ``metrics``: the figures of all logs, None where they are at hand.
+    """
+    from pdhef_logtool.results.plan_verdicts import (
+        JudgedDrive,
+        figures_of_file,
+        figures_of_rows,
+        plan_verdicts,
+    )
+
+    done = [r for r in results if r.outcome.failed is None or r.document is not None]
+    drives = [JudgedDrive(r.outcome.log, r.outcome.main, partial(_blocks, r)) for r in done]
+    if metrics is None:
+        figures = figures_of_rows(row for r in done for row in r.rows)
+    else:
+        import polars as pl
+
+        figures = figures_of_file(pl.scan_parquet(metrics), plan, [d.main for d in drives])
+    return plan_verdicts(plan, figures, drives, strict=strict)
 
 
-def write_verdicts(junit: Path | None, results: Sequence[LogResult]) -> None:
+@lru_cache(maxsize=LEAST_DRIVES)
+def _blocks(result: LogResult) -> list[RequirementBlocks]:
+    from pdhef_logtool.results.plan_verdicts import blocks_of
+
+    return blocks_of(result.report)
+
+
+def write_verdicts(junit: Path | None, verdicts: PlanVerdicts, results: Sequence[LogResult]) -> None:
     """Write JUnit XML if a file is asked for; raises OutputError."""
     from pdhef_logtool.results.junit import write_junit
 
     if junit is not None:
         checks = {r.outcome.log: (r.report or {}).get("checks", ()) for r in results}
-        write_junit(junit, {r.outcome.log: r.verdicts or () for r in results}, checks)
+        write_junit(junit, verdicts, checks)
 
 
 def run_log(
@@ -248,7 +275,7 @@ def run_log(
     mapping: Mapping | None,
     *,
     pool: SelfCalibration | None = None,
-    thresholds: Sequence[Threshold] | None = None,
+    validation: ValidationPlan | None = None,
     prepare: Callable[[Sequence[str]], None] = lambda _names: None,
     reporter: Reporter = SILENT,
 ) -> LogResult:
@@ -257,7 +284,7 @@ def run_log(
     Parameters
     ----------
     pool : what all logs of the run together state of the car; None: the log states it, if it is asked.
-    thresholds : what the report's verdicts name; None: there are none.
+    validation : plan that the report gives verdicts on; None: the default plan.
     prepare : called with the names of the estimators before they run.
 
     Raises
@@ -274,7 +301,7 @@ def run_log(
         reference = reference_of(drive, calibration, config)
         if reference is not None and reference.estimator is not None:
             ready, requested = [*ready, reference.estimator], requested | {REFERENCE}
-        job = _Job(drive, car, calibration, reference, ready, skipped, requested, tuple(thresholds or ()))
+        job = _Job(drive, car, calibration, reference, ready, skipped, requested, validation or default_plan())
         result = _run_estimators(job, outputs, config, reporter)
     reporter.progress(result.outcome.log, 1.0)
     return result
@@ -294,7 +321,7 @@ class _Job:
     ready: Sequence[Estimator]
     skipped: Sequence[Skipped]
     requested: frozenset[str]
-    thresholds: Sequence[Threshold]
+    validation: ValidationPlan
 
 
 def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporter: Reporter) -> LogResult:
@@ -311,7 +338,7 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
         left_out = frozenset(e.name for e in job.ready) - job.requested - {main.name}
         job, scored, main = _without(left_out, job, scored, main)
         shown = _shown(main, [e.name for e in job.ready])
-        sinks = opened.enter_context(_open_sinks(change, job, config, shown, outputs.path))
+        sinks = opened.enter_context(_open_sinks(change, job, config, shown, outputs.path, len(signals)))
         _write(store, sinks, left_out | frozenset(causality.failed))
         if intervals.warning:
             drive.tell(intervals.warning)
@@ -379,7 +406,6 @@ def _facts(
     losses: Sequence[Loss],
 ) -> ReportFacts:
     """Gather the content of report.json; ``ran``: intervals, and the estimators that failed with their reasons."""
-    from pdhef_logtool.evaluation.thresholds import check_thresholds
     from pdhef_logtool.runs.drive_details import drive_details
 
     drive, (store, signals), (intervals, failed) = job.drive, estimates, ran
@@ -400,15 +426,32 @@ def _facts(
     estimators += [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in job.skipped]
     digests = {name: a.sha256[:SHOWN_DIGITS] for name, a in algorithms.items()}
     rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows]
-    limits = check_thresholds(job.thresholds, scored.rows, log=drive.name)
     return replace(
         report_facts(drive, job.car, estimators, rows, scored.events, losses),
         friction=friction_facts(drive.friction),
         calibration=None if job.calibration is None else job.calibration.to_dict(),
         reference=None if job.reference is None else job.reference.document,
         main=main,
-        details=drive_details(drive, job.ready, main.name, store.read, signals, limits, brief=config.kept != "full"),
+        details=drive_details(drive, job.ready, main.name, store.read, signals, brief=config.kept != "full"),
+        requirements=_requirements(job, main.name, scored, store, brief=config.kept == "metrics"),
     )
+
+
+def _requirements(job: _Job, main: str, scored: Evaluation, store: TrackStore, *, brief: bool) -> RequirementFacts:
+    """Return the blocks of the plan's requirements in this drive, and the verdicts on the drive alone."""
+    from pdhef_logtool.evaluation.requirement_blocks import MOST_BLOCKS, ScoredDrive, requirement_blocks
+    from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_rows, plan_verdicts
+
+    drive, truth = job.drive, store.read(TRUTH)
+    reference = None if truth is not None else store.read(REFERENCE)
+    base = reference if truth is None else truth
+    blocks = []
+    if base is not None:
+        slow, dependent = drive.car.vehicle.low_speed_blend_m_s, frozenset(drive.plan.dependent)
+        tracks = ScoredDrive(store.read, base, scored.masks, slow, dependent, estimated=truth is None)
+        blocks = requirement_blocks(job.validation.requirements, main, tracks, _BRIEF_BLOCKS if brief else MOST_BLOCKS)
+    judged = JudgedDrive(drive.name, main, lambda: blocks)
+    return RequirementFacts(plan_verdicts(job.validation, figures_of_rows(scored.rows), [judged]), blocks)
 
 
 def _write_files(
@@ -436,7 +479,8 @@ def files_of(folder: Path) -> dict[str, str]:
 
 def _car_facts(car: Car) -> CarFacts:
     network = None if car.network is None else car.network.sha256
-    return CarFacts(car.file_name, car.vehicle.name, car.physics_sha256, network)
+    sensors = car.vehicle.sensors.model_dump(exclude_defaults=True)
+    return CarFacts(car.file_name, car.vehicle.name, car.physics_sha256, network, sensors)
 
 
 def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
@@ -460,17 +504,17 @@ def _choose_estimators(
     Candidates for the selected estimate run in any case. Raises EstimatorError if no requested estimator can.
     """
     names = config.estimators or default_names(car, drive.available)
-    options = Options(drive.options.use_speed)
-    estimators, skipped = runnable(names, car, drive.available, options)
+    options, refused = Options(drive.options.use_speed), drive.plan.refused
+    estimators, skipped = runnable(names, car, drive.available, options, refused)
     requested = frozenset(e.name for e in estimators)
     more = [name for name in candidates(car, drive.available) if name not in requested]
-    estimators += runnable(more, car, drive.available, options)[0] if more else []
+    estimators += runnable(more, car, drive.available, options, refused)[0] if more else []
     if not requested:
         raise EstimatorError(
             expected="at least one estimator that can run",
             got="; ".join(f"{s.name}: {s.reason}" for s in skipped),
             where=str(drive.path),
-            remedy="map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)",
+            remedy=next((f"{reason} (or --waive it)" for reason in refused.values()), _MAP_THEM),
         )
     return estimators, skipped, requested
 
@@ -491,11 +535,15 @@ def _causal_from_ns(drive: Drive, estimators: Sequence[Estimator]) -> dict[str, 
 
 @contextmanager
 def _open_sinks(
-    change: FolderTransaction, job: _Job, config: RunConfig, shown: Shown, output: Path
+    change: FolderTransaction, job: _Job, config: RunConfig, shown: Shown, output: Path, rows: int
 ) -> Iterator[list[Sink]]:
-    """Yield the outputs of a run that are fed window by window; on an exception they are aborted."""
+    """Yield the outputs of a run that are fed window by window; on an exception they are aborted.
+
+    ``rows`` : stamps of a track.
+    """
+    from pdhef_logtool.mapping.recognition import FIX_TYPES
     from pdhef_logtool.results.layouts import LayoutsSink
-    from pdhef_logtool.results.mcap_sink import AnnotatedMcapSink
+    from pdhef_logtool.results.mcap_sink import AnnotatedMcapSink, thinned_step_ns
     from pdhef_logtool.results.parquet_sink import EstimatesSink
 
     sinks: list[Sink] = []
@@ -510,12 +558,28 @@ def _open_sinks(
             if source is not None and source.messages is None:
                 drive.remarks.append(_NO_COPY.format(source.kind))
             first = frozenset({shown.main, TRUTH})
-            names = None if config.estimators else first
-            unnamed = config.estimators == (ALL_ESTIMATORS,)
-            thin = unnamed and drive.plan.end_ns - drive.plan.start_ns > LONGEST_WHOLE_NS
-            sinks.append(AnnotatedMcapSink(change.file("annotated.mcap"), source, names, shown=first, thin=thin))
+            is_named = bool(config.estimators) and config.estimators != (ALL_ESTIMATORS,)
+            step_ns = thinned_step_ns(
+                sum(ledger.size for ledger in drive.byte_ledgers),
+                rows=rows,
+                others=len(job.ready) - 1,
+                span_ns=drive.plan.end_ns - drive.plan.start_ns,
+            )
+            annotated = AnnotatedMcapSink(
+                change.file("annotated.mcap"),
+                source,
+                shown=first,
+                others_step_ns=None if is_named else step_ns,
+                min_speed_m_s=car.vehicle.low_speed_blend_m_s,
+            )
+            sinks.append(annotated)
             layouts = change.file("foxglove.json"), change.file("plotjuggler.xml")
-            sinks.append(LayoutsSink(*layouts, names, colours))
+            fixes = (
+                [t.name for t in drive.log.topics if t.type_name.replace("/msg/", "/") in FIX_TYPES]
+                if source is not None
+                else []
+            )
+            sinks.append(LayoutsSink(*layouts, None, colours, shown=first, fixes=fixes))
         if config.kept == "full":
             sinks.append(_recording(change, drive, config, car, shown, output, colours))
         yield sinks
@@ -644,12 +708,9 @@ def report_facts(
         vehicle_sha256=car.physics_sha256,
         vehicle_file=car.file_name,
         vehicle_proven=car.has_evidence,
+        sensors=car.vehicle.sensors.model_dump(),
         assumed=drive.car.assumed,
-        setup={
-            "source": drive.setup_source,
-            "decided_s": plan.decided_s,
-            "causal_from_s": drive.causal_from_s,
-        },
+        setup={"source": drive.setup_source, "decided_s": plan.decided_s, "causal_from_s": drive.causal_from_s},
         low_speed_m_s=car.vehicle.low_speed_blend_m_s,
         estimators=list(estimators),
         truth=TruthFacts(
@@ -732,7 +793,9 @@ def check_places(
     )
 
 
-def write_run(output: Path, config: dict[str, Any], result: LogResult, car: Car | None = None) -> None:
+def write_run(
+    output: Path, config: dict[str, Any], result: LogResult, verdicts: PlanVerdicts, car: Car | None = None
+) -> None:
     """Write metrics.parquet and run.json of a run of one log, with the configuration as JSON-able values."""
     from pdhef_logtool.results.parquet_sink import write_metrics
 
@@ -740,4 +803,6 @@ def write_run(output: Path, config: dict[str, Any], result: LogResult, car: Car 
     network = None if used is None or car is None else {"name": Path(car.network_name).name, "sha256": used.sha256}
     write_metrics(output / METRICS_FILE, result.rows)
     files = {METRICS_FILE: file_sha256(output / METRICS_FILE)}
-    write_json(output / RUN_FILE, build_run(run_versions(), config, network, [result.outcome], files=files))
+    write_json(
+        output / RUN_FILE, build_run(run_versions(), config, network, [result.outcome], files=files, plan=verdicts)
+    )

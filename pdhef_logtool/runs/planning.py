@@ -44,7 +44,7 @@ _NO_SETTING = frozenset(
         "intervals",
     }
 )
-_FILES = ("mapping", "msgs", "thresholds", "cars")
+_FILES = ("mapping", "msgs", "plan", "cars")
 _READERS = 16
 _REPEATED = "they are tried again"
 _DAMAGED = "their outputs are damaged"

@@ -50,7 +50,7 @@ from pdhef_logtool.records.signals import (
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
-from pdhef_logtool.results.run_report import EstimatorFacts, build_report, write_json
+from pdhef_logtool.results.run_report import EstimatorFacts, RequirementFacts, build_report, write_json
 from pdhef_logtool.results.sink import TRUTH, Event
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimate_channels import RecordedEstimate, gap_ns, read_estimate
@@ -63,7 +63,7 @@ from pdhef_logtool.runs.pipeline import (
     judge,
     log_place,
     outcome_of,
-    read_thresholds,
+    read_validation_plan,
     report_facts,
     write_run,
     write_verdicts,
@@ -72,7 +72,11 @@ from pdhef_logtool.runs.scoring import diverged_events, in_time, segment_events
 from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder
 
 if TYPE_CHECKING:
+    from pdhef_logtool.evaluation.blocks import SegmentMasks
+    from pdhef_logtool.evaluation.manoeuvres import Manoeuvre
     from pdhef_logtool.evaluation.metrics import MetricRow
+    from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
+    from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 
 
 _RECORDED = "read from the log: not recorded whether it is causal, or what it was computed from"
@@ -87,26 +91,27 @@ def score_log(
     name: str | None = None,
     output: Path | None = None,
     junit: Path | None = None,
+    strict: bool = False,
     reporter: Reporter = SILENT,
 ) -> RunResult:
     """Score recorded estimates of one log against its ground truth; same figures, tables and report as a run.
 
     Parameters
     ----------
-    argument : the log. config : of it count vehicle, mapping, slice, ground truth choice and thresholds.
+    argument : the log. config : of it count vehicle, mapping, slice, ground truth choice and plan.
     estimates : ``[SIGNAL=]TOPIC[.FIELD]``, together one estimator called ``name`` (default: its topic); without any,
         the mapping's ``[estimates.NAME.SIGNAL]`` tables, all or the one called ``name``.
     truth : likewise; without any, the mapping's or the recognised ground truth.
-    output : folder for the files, None to write none. junit : as for :func:`pdhef_logtool.runs.fleet.run_logs`.
+    output : folder for the files, None to write none. junit, strict : as for :func:`pdhef_logtool.runs.fleet.run_logs`.
 
     Raises
     ------
     PdhefError : There is no estimate, no ground truth, or nothing of the log can be used.
     """
     log_input = one_log(argument, config.read_options)
-    car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
+    car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS, sensors=config.sensor_profile)
     mapping = mapping_of(config.mapping)
-    thresholds = read_thresholds(config, junit)
+    validation = read_validation_plan(config, junit)
     if config.car is None:
         slow = car.vehicle.low_speed_blend_m_s
         reporter.warn(
@@ -114,15 +119,16 @@ def score_log(
             f"{slow:g} m/s, and segments are cut at friction {car.vehicle.assumed_friction:g}"
         )
     check_places([log_input], output, config, mapping, junit)
-    scoring = _Scoring(config, car, reporter, estimates, truth, name)
+    scoring = _Scoring(config, car, reporter, estimates, truth, name, validation)
     with nullcontext() if output is None else OutputFolder(output, (LOGS,)) as outputs:
         with scoring.read(log_input, mapping) as drive:
-            result = judge(scoring.score(drive, outputs), thresholds)
+            result = scoring.score(drive, outputs)
+        verdicts = judge(validation, [result], strict)
         if output is not None:
             document = _config_document(config, drive, scoring.estimates)
-            write_run(output, document, result)
-        write_verdicts(junit, [result])
-    return RunResult(output, (result,))
+            write_run(output, document, result, verdicts)
+        write_verdicts(junit, verdicts, [result])
+    return RunResult(output, (result,), requirements=verdicts)
 
 
 def _config_document(config: RunConfig, drive: Drive, estimates: Sequence[EstimateSource]) -> dict[str, Any]:
@@ -144,6 +150,7 @@ class _Scoring:
     asked: Sequence[str]
     truth: Sequence[str]
     name: str | None
+    validation: ValidationPlan
     estimates: tuple[EstimateSource, ...] = ()
 
     def read(self, log_input: LogInput, mapping: SignalMapping | None) -> Drive:
@@ -181,6 +188,8 @@ class _Scoring:
 
     def score(self, drive: Drive, outputs: OutputFolder | None) -> LogResult:
         """Read, compare and, with a folder, write."""
+        from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
+
         plan = drive.plan
         self.reporter.progress(drive.name, 0.1)
         recorded, losses = self._read_estimates(drive)
@@ -189,14 +198,15 @@ class _Scoring:
         ledger = sample_ledger(drive.log, plan, counts)
         self.reporter.progress(drive.name, 0.6)
         signals = _read_sensors(drive)
+        manoeuvres = [] if signals is None else find_manoeuvres(signals, self.car.vehicle)
         all_losses = merge_losses([drive.losses, losses, truth_losses, damage(ledger)])
         self.reporter.progress(drive.name, 0.8)
         scored_ns = np.unique(np.concatenate([r.track.stamps_ns for r in recorded]))
         plan = self._with_dependence(plan, recorded)
-        rows, dependent = self._figures(drive, plan, recorded, truth, signals)
+        rows, dependent, blocks = self._figures(drive, plan, recorded, truth, signals, manoeuvres)
         drive.plan = plan = replace(plan, dependent={**dependent, **plan.dependent})
         truth_track = truth_at(truth, scored_ns, plan.truth_latency_s, standstill_m_s=self.car.vehicle.standstill_m_s)
-        events = self._events(truth_track, signals_at(signals, scored_ns), recorded)
+        events = self._events(truth_track, signals_at(signals, scored_ns), recorded, manoeuvres)
         samples |= drive.samples
         for r in recorded:
             samples |= r.samples
@@ -212,6 +222,7 @@ class _Scoring:
             facts,
             log=replace(facts.log, topics=topics),
             truth=replace(facts.truth, notes=[*latency, *facts.truth.notes]),
+            requirements=self._requirements(drive.name, rows, blocks),
         )
         report = build_report(facts)
         folder = None
@@ -252,24 +263,31 @@ class _Scoring:
         recorded: Sequence[RecordedEstimate],
         truth: TruthTrack,
         signals: Signals | None,
-    ) -> tuple[list[MetricRow], dict[str, str]]:
-        """Score each estimate at its own stamps; return what of the derived ground truth equals an estimate besides."""
+        manoeuvres: Sequence[Manoeuvre],
+    ) -> tuple[list[MetricRow], dict[str, str], list[RequirementBlocks]]:
+        """Score each estimate at its own stamps; return what of the derived ground truth equals an estimate besides.
+
+        Return the blocks of the plan's requirements, too.
+        """
         from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, score_track
         from pdhef_logtool.evaluation.segments import segment_masks
 
         rows: list[MetricRow] = []
         dependent: dict[str, str] = {}
+        blocks: list[RequirementBlocks] = []
         for r in recorded:
             at_stamps = truth_at(
                 truth, r.track.stamps_ns, plan.truth_latency_s, standstill_m_s=self.car.vehicle.standstill_m_s
             )
-            masks = segment_masks(signals_at(signals, r.track.stamps_ns), at_stamps, self.car.vehicle)
+            seen = signals_at(signals, r.track.stamps_ns)
+            masks = segment_masks(seen, at_stamps, self.car.vehicle, manoeuvres)
             same = {
                 name: f"the ground truth's {name} equals that of the estimate {r.track.name}"
                 for name in SCORED_SIGNALS
                 if _same_column(getattr(r.track, name), getattr(at_stamps, name))
             }
             dependent |= same
+            blocks += self._blocks(r, at_stamps, masks, frozenset({**plan.dependent, **same}), alone=len(recorded) == 1)
             figures = score_track(
                 r.track,
                 at_stamps,
@@ -289,13 +307,37 @@ class _Scoring:
                 for row in figures
                 if row.signal not in silent and (row.metric != "diverged" or "diverged" in r.claimed)
             ]
-        return rows, dependent
+        return rows, dependent, blocks
 
-    def _events(self, truth: StateTrack, signals: Signals, recorded: Sequence[RecordedEstimate]) -> list[Event]:
+    def _blocks(
+        self, r: RecordedEstimate, truth: StateTrack, masks: SegmentMasks, tainted: frozenset[str], *, alone: bool
+    ) -> list[RequirementBlocks]:
+        """Return the blocks of the requirements on one estimate; one without a name is on the ``alone`` recorded."""
+        from pdhef_logtool.evaluation.requirement_blocks import ScoredDrive, requirement_blocks
+
+        name, slow = r.track.name, self.car.vehicle.low_speed_blend_m_s
+        drive = ScoredDrive(lambda n: r.track if n == name else None, truth, masks, slow, tainted)
+        asked = [q for q in self.validation.requirements if q.estimator in (name, None if alone else name)]
+        return requirement_blocks(asked, name if alone else None, drive)
+
+    def _requirements(self, log: str, rows: Sequence[MetricRow], blocks: list[RequirementBlocks]) -> RequirementFacts:
+        """Return the verdicts of the plan on the log."""
+        from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_rows, plan_verdicts
+
+        judged = JudgedDrive(log, None, lambda: blocks)
+        return RequirementFacts(plan_verdicts(self.validation, figures_of_rows(rows), [judged]), blocks)
+
+    def _events(
+        self,
+        truth: StateTrack,
+        signals: Signals,
+        recorded: Sequence[RecordedEstimate],
+        manoeuvres: Sequence[Manoeuvre],
+    ) -> list[Event]:
         from pdhef_logtool.evaluation.segments import segment_masks
 
-        masks = segment_masks(signals, truth, self.car.vehicle)
-        events = segment_events(truth, masks) + [e for r in recorded for e in diverged_events(r.track)]
+        masks = segment_masks(signals, truth, self.car.vehicle, manoeuvres)
+        events = segment_events(truth, masks, manoeuvres) + [e for r in recorded for e in diverged_events(r.track)]
         return sorted(events, key=in_time)
 
 

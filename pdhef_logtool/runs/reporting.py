@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,11 +21,17 @@ from pdhef_logtool.runs.planning import Plan
 from pdhef_logtool.storage.documents import file_sha256
 
 if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.thresholds import Threshold
+    from pdhef_logtool.evaluation.validation_plan import ValidationPlan
+    from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
 
-def collect(plan: Plan, config: RunConfig, thresholds: Sequence[Threshold] | None) -> list[LogResult]:
-    """Write metrics.parquet and run.json of all drives that are done; return their results in the order of the plan."""
+def collect(
+    plan: Plan, config: RunConfig, validation: ValidationPlan, *, strict: bool = False
+) -> tuple[list[LogResult], PlanVerdicts | None]:
+    """Write metrics.parquet and run.json of all drives that are done.
+
+    Returns their results in the order of the plan of the run, and the verdicts of the validation plan.
+    """
     from pdhef_logtool.results.parquet_sink import join_metrics
 
     output = plan.output
@@ -33,8 +39,8 @@ def collect(plan: Plan, config: RunConfig, thresholds: Sequence[Threshold] | Non
     entries = [(e, f) for p, f in zip(plan.logs, folders, strict=True) if (e := plan.entry(p)) is not None]
     remaining = len(plan.logs) - len(entries)
     if not entries and remaining:
-        return []
-    results = [judge(_result(plan, entry, folder), thresholds) for entry, folder in entries]
+        return [], None
+    results = [_result(plan, entry, folder) for entry, folder in entries]
     metrics = output / METRICS_FILE
     join_metrics(metrics, [r.figures_file for r in results if r.figures_file is not None])
     cars = plan.journal.cars | plan.cars_of_run()  # the journal's line of a car may be damaged
@@ -46,10 +52,12 @@ def collect(plan: Plan, config: RunConfig, thresholds: Sequence[Threshold] | Non
     only = networks.pop() if len(networks) == 1 else None
     network = None if only is None else {"name": only[0], "sha256": only[1]}
     files, outcomes = {METRICS_FILE: file_sha256(metrics)}, [r.outcome for r in results]
-    write_json(output / RUN_FILE, build_run(run_versions(), config.to_dict(), network, outcomes, remaining, files))
+    verdicts = judge(validation, results, strict, metrics)
+    document = build_run(run_versions(), config.to_dict(), network, outcomes, remaining, files, verdicts)
+    write_json(output / RUN_FILE, document)
     if remaining:
         (output / PAGE_FILE).unlink(missing_ok=True)  # it shows other drives
-    return results
+    return results, verdicts
 
 
 def _result(plan: Plan, entry: Entry, folder: str) -> LogResult:

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.drive.reading import Drive
-from pdhef_logtool.evaluation.blocks import row_blocks
+from pdhef_logtool.evaluation.blocks import SegmentMasks, row_blocks
 from pdhef_logtool.records.signals import BoolArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.sink import TRUTH, Event
+from pdhef_logtool.results.sink import TRUTH, Event, ManoeuvreEvent
 from pdhef_logtool.runs.self_calibrating import log_sensors
 
 if TYPE_CHECKING:
+    from pdhef_logtool.evaluation.manoeuvres import Manoeuvre
     from pdhef_logtool.evaluation.metrics import MetricRow
     from pdhef_logtool.evaluation.metrics.metric import SensorErrors
     from pdhef_logtool.evaluation.reasons import ReasonFacts
@@ -27,7 +28,7 @@ class Evaluation:
     ----------
     rows, events : figures, and events in order of time.
     reasons : by estimator, why it did not use its sensors as usual.
-    silent : estimators without a valid row although the car moves. moves : whether it does.
+    silent : estimators without a valid row although the car moves. moves : whether it does. masks : of the segments.
     """
 
     rows: list[MetricRow]
@@ -35,6 +36,7 @@ class Evaluation:
     reasons: dict[str, tuple[ReasonFacts, ...] | None]
     silent: tuple[str, ...]
     moves: bool
+    masks: SegmentMasks
 
 
 def evaluate(
@@ -51,6 +53,7 @@ def evaluate(
     names : of the estimators. read : returns the track of a name, ``truth`` too; None if there is none.
     signals : what the estimators saw. sensors : as the log calibrated them; None: as the car's file states.
     """
+    from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
     from pdhef_logtool.evaluation.metrics import Scorer
     from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive
     from pdhef_logtool.evaluation.metrics.scoring import drive_rows, track_rows
@@ -58,14 +61,15 @@ def evaluate(
     from pdhef_logtool.evaluation.segments import moving_mask, segment_masks
 
     stem, truth, vehicle = drive.name, read(TRUTH), drive.car.vehicle
-    masks = segment_masks(signals, truth, vehicle)
+    manoeuvres = find_manoeuvres(signals, vehicle)
+    masks = segment_masks(signals, truth, vehicle, manoeuvres)
     moving = moving_mask(signals, truth, vehicle)
     silent = []
     slow = vehicle.low_speed_blend_m_s
     sensors = log_sensors(vehicle, None) if sensors is None else sensors
     rows: list[MetricRow] = []
     reasons: dict[str, tuple[ReasonFacts, ...] | None] = {}
-    events = segment_events(signals, masks)
+    events = segment_events(signals, masks, manoeuvres)
     scorer = None
     if truth is not None:
         scorer = Scorer(truth, masks, log=stem, low_speed_m_s=slow, not_independent=drive.plan.dependent)
@@ -79,7 +83,7 @@ def evaluate(
         reasons[name] = summarise_reasons(track)
         events += diverged_events(track)
     rows += [row for of_one in of_drive.values() for row in of_one]
-    return Evaluation(rows, sorted(events, key=in_time), reasons, tuple(silent), bool(moving.any()))
+    return Evaluation(rows, sorted(events, key=in_time), reasons, tuple(silent), bool(moving.any()), masks)
 
 
 def in_time(event: Event) -> tuple[int, int, str]:
@@ -92,12 +96,30 @@ def _known_at(track: StateTrack, mask: BoolArray) -> bool:
     return any((inside & part.valid & part.something_known).any() for part, inside in parts)
 
 
-def segment_events(stamped: Signals | StateTrack, masks: Mapping[str, BoolArray]) -> list[Event]:
-    """Return the segments that are worth an event: not the whole drive, nor what is only not nonlinear."""
+def segment_events(
+    stamped: Signals | StateTrack, masks: Mapping[str, BoolArray], manoeuvres: Sequence[Manoeuvre]
+) -> list[Event]:
+    """Return the segments that are worth an event, not the whole drive, nor ``linear``; manoeuvres with their peaks."""
+    from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES
     from pdhef_logtool.evaluation.segments import find_intervals
 
-    spans = find_intervals(stamped, masks)
-    return [Event(s.name, s.start_ns, s.end_ns, "") for s in spans if s.name not in ("all", "linear")]
+    spans = [s for s in find_intervals(stamped, masks) if s.name not in ("all", "linear", *MANOEUVRES)]
+    events = [Event(s.name, s.start_ns, s.end_ns, "") for s in spans]
+    return events + [
+        ManoeuvreEvent(
+            name=m.name,
+            start_ns=m.start_ns,
+            end_ns=m.end_ns,
+            text=m.text,
+            side="left" if m.side > 0 else "right",
+            speed_m_s=m.speed_m_s,
+            peak_ay_m_s2=m.peak_ay_m_s2,
+            peak_yaw_rate_rad_s=m.peak_yaw_rate_rad_s,
+            peak_steer_rad=m.peak_steer_rad,
+            lowest_ax_m_s2=m.lowest_ax_m_s2,
+        )
+        for m in manoeuvres
+    ]
 
 
 def diverged_events(track: StateTrack) -> list[Event]:

@@ -27,7 +27,7 @@ from pdhef_logtool.workers.supervisor import Tell
 
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
-    from pdhef_logtool.evaluation.thresholds import Threshold
+    from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +46,7 @@ class DriveTask:
     output: Path
     config: RunConfig
     setting: str
-    thresholds: tuple[Threshold, ...] | None
+    validation: ValidationPlan
     pool: SelfCalibration | None
     page: bool
     run: str
@@ -132,7 +132,7 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
     outputs = OutputFolder(task.output)  # locked by the run
     result = run_log(
         task.log, outputs, task.config, car, mapping,
-        pool=task.pool, thresholds=task.thresholds, reporter=Reporter(progress=tell, warn=warned.append),
+        pool=task.pool, validation=task.validation, reporter=Reporter(progress=tell, warn=warned.append),
     )  # fmt: skip
     record = car_record(car)
     place = car_folder(car.vehicle.name, car.physics_sha256)

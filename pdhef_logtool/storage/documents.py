@@ -100,7 +100,7 @@ def _read(
         document = parse(read_text(path, max_bytes))
         got = _oddity(document)
     except FileNotFoundError:
-        got = "no such file"
+        raise error(expected=what, got="no such file", where=str(path), remedy=remedy, missing=True) from None
     except OSError as problem:
         got = problem.strerror or str(problem)
     except RecursionError:

@@ -16,16 +16,18 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, Sensors, VehicleParameters
 from pdhef_logtool.estimators.base import VX, VY, YAW_RATE, Estimator, Steps
 from pdhef_logtool.estimators.kinematic import Kinematic
 from pdhef_logtool.estimators.pass_through import PassThrough
-from pdhef_logtool.estimators.stepwise import SPEED_HOLD_S, measured_speed
+from pdhef_logtool.estimators.stepwise import measured_speed
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, step_durations_s
 
 #: Rate of the published filters in Hz, and the longest integration step in s.
 PUBLISHED_HZ, LONGEST_STEP_S = 100.0, 0.005
+#: Longest time that a sample is kept.
+SPEED_HOLD_S = Sensors().speed_hold_s
 #: Slower than this the single track, which divides by the speed, is evaluated at this speed.
 LEAST_SPEED_M_S = 0.5
 #: Lateral velocity is extrapolated over the latency of the sensors with its change over this time.
@@ -103,7 +105,7 @@ def parameters_of(vehicle: VehicleParameters) -> Parameters:
 
 def inputs_of(signals: Signals, times_s: FloatArray) -> Inputs:
     """Return the inputs of the kernels at the stamps [N] of a drive."""
-    vx, _ = measured_speed(signals, None)
+    vx, _ = measured_speed(signals, SPEED_HOLD_S, None)
     steer = _held(signals.stamps_ns, signals.steer_rad)
     sensors = signals.ax_m_s2, signals.ay_m_s2, signals.yaw_rate_rad_s
     smooth = [_low_pass(times_s, values) for values in sensors]

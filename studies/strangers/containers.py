@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
 from pdhef_logtool.records.signals import IntArray
+from studies.strangers.tables import writers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,8 +63,8 @@ def write(topics: Sequence[Topic], path: Path, container: str) -> Path:
     Parameters
     ----------
     container : ``mcap``, ``mcap-json`` (with schemas), ``mcap-json-bare`` (without), ``mcap-protobuf``, ``mcap-ros1``,
-        ``rosbag1``, ``rosbag2`` (sqlite3), ``rosbag2-bare`` (without message definitions, as up to Humble) or
-        ``rosbag2-mcap``.
+        ``rosbag1``, ``rosbag2`` (sqlite3), ``rosbag2-bare`` (without message definitions, as up to Humble),
+        ``rosbag2-mcap``, or one of the files of ``tables.py``.
     """
     return _WRITERS[container](topics, path)
 
@@ -299,4 +300,5 @@ _WRITERS: dict[str, Callable[[Sequence[Topic], Path], Path]] = {
     "rosbag2": _rosbag2,
     "rosbag2-bare": _rosbag2_bare,
     "rosbag2-mcap": _rosbag2_mcap,
+    **dict(writers()),
 }

@@ -1,4 +1,4 @@
-"""Mutated configurations: mapping, vehicle, car folder, pdhef.toml, thresholds, metadata of networks and bags."""
+"""Mutated configurations: mapping, vehicle, car folder, pdhef.toml, plans, metadata of networks and bags."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from pdhef_logtool.evaluation.plan_example import EXAMPLE
 from studies.pages import ROOT
 from studies.torture.mutating import EDGES, TEXTS, damage_bytes
 from studies.torture.seeds import SEEDS
 from studies.torture.workers import Verdict, command, judge
 
 _MODEL = ROOT / "pdhef_logtool" / "models" / "default"
-_THRESHOLDS = '[[threshold]]\nsignal = "sideslip"\nmetric = "rmse"\nmax = 2.0\nunit = "deg"\n'
 _CONFIG = """estimators = ["zero", "kinematic"]
 annotate = "none"
 start = "0"
@@ -51,7 +51,7 @@ def config_judge(work: Path, seed: int) -> Callable[[int], Verdict]:
     documents = {
         "mapping.toml": mapping.read_bytes(),
         "vehicle.toml": (ROOT / "sample_logs" / "vehicle.toml").read_bytes(),
-        "thresholds.toml": _THRESHOLDS.encode(),
+        "plan.toml": EXAMPLE.encode(),
         "pdhef.toml": _CONFIG.encode(),
         "metadata.yaml": json.dumps(_METADATA).encode(),
         "model.json": (_MODEL / "network" / "model.json").read_bytes(),
@@ -96,8 +96,8 @@ def _arguments(name: str, content: bytes, log: Path, folder: Path) -> list[str]:
         return ["inspect", str(log), "--mapping", str(path)]
     if name == "vehicle.toml":
         return [*run, *some, "--car", str(path)]
-    if name == "thresholds.toml":
-        return [*run, "--estimators", "zero", "--car", "saloon", "--thresholds", str(path)]
+    if name == "plan.toml":
+        return [*run, "--estimators", "zero", "--car", "saloon", "--plan", str(path)]
     return [*run, "--car", "saloon", "--config", str(path)]
 
 

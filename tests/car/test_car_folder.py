@@ -25,7 +25,6 @@ from pdhef_logtool.car.car import (
     SHIPPED_CARS,
     VEHICLE_FILE,
     Car,
-    read_history,
 )
 from pdhef_logtool.car.parts import (
     FilterNoise,
@@ -79,6 +78,11 @@ def folder(tmp_path: Path) -> Path:
     path.mkdir()
     (path / VEHICLE_FILE).write_text(PERSONS)
     return path
+
+
+def history(folder: Path) -> list[dict[str, Any]]:
+    """Return the lines of a car's history, oldest first."""
+    return [json.loads(line) for line in (folder / HISTORY_FILE).read_text().splitlines()]
 
 
 def load(path: Path, network: str = "none") -> Car:
@@ -481,17 +485,13 @@ def test_the_same_folder_is_updated_and_every_command_leaves_a_line(folder: Path
     assert (folder / VEHICLE_FILE).read_bytes() == vehicle
     assert (folder / "notes.txt").read_text() == "mine too"
     assert set(load(folder).noise) == {TUNED}
-    lines = read_history(folder)
+    lines = history(folder)
     assert [(line["command"], line["part"], line["settings"]) for line in lines] == [
         ("tune", NOISE_FILE, {"trials": 8})
     ] * 2
     assert lines[0]["drives"] == [DRIVES[0].model_dump(mode="json")]
     assert lines[1]["sha256"] == digest((folder / NOISE_FILE).read_text()) != lines[0]["sha256"]
     assert [p.name for p in folder.parent.iterdir()] == [folder.name]
-    for damaged in (b"{", b"\xff", b"[]", b'{"command": 1}'):
-        (folder / HISTORY_FILE).write_bytes(damaged)
-        with pytest.raises(VehicleError, match=HISTORY_FILE):
-            read_history(folder)
 
 
 def test_a_network_is_copied_whole_and_replaces_the_one_before(folder: Path) -> None:
@@ -594,7 +594,7 @@ def test_changes_by_several_commands_at_once_are_all_there(folder: Path, new: bo
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda change: update_car(car, output, change), changes))
     assert {f"part-{i}.toml" for i in range(8)} <= set(files_of(output))
-    assert len([line for line in read_history(output) if line["part"].startswith("part-")]) == 8
+    assert len([line for line in history(output) if line["part"].startswith("part-")]) == 8
     assert not [p for p in folder.parent.iterdir() if p.name.startswith(".")]
 
 

@@ -18,9 +18,9 @@ from tests.command_line import called
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = (
-    *("inspect", "map", "run", "metrics", "report", "compare", "events", "view", "compile"),
+    *("inspect", "map", "convert", "plan", "run", "metrics", "report", "compare", "events", "trend", "serve", "view"),
     *("simulate", "simulate suite", "simulate conditions"),
-    *("learn", "extract", "train", "retrain"),
+    *("learn", "extract", "train", "retrain", "compile"),
 )
 
 
@@ -98,7 +98,7 @@ def test_run_prints_a_table_on_stdout_and_warnings_on_stderr(sample_logs_dir: Pa
     )  # fmt: skip
     assert result.returncode == 0
     assert "phy-ukf" in result.stdout
-    assert "default sedan (no car given)" in result.stdout
+    assert "default sedan (no car given)" in " ".join(result.stdout.split())
     assert "warning" not in result.stdout + result.stderr  # nothing here may be wrong
     assert "truth" in result.stdout
     assert all(len(line) <= 160 for line in result.stdout.splitlines() if "outputs in" not in line)
@@ -129,10 +129,37 @@ def test_what_is_no_log_is_one_line_and_exit_code_1(tmp_path: Path, content: byt
 
 
 @pytest.mark.slow
-def test_missing_log_is_one_line_and_exit_code_1(tmp_path: Path) -> None:
-    result = called("run", str(tmp_path / "none.mcap"), "-o", str(tmp_path / "out"))
-    assert result.returncode == 1
-    assert "none.mcap" in _one_line_error(result)
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "run NONE.mcap -o OUT", "inspect NONE.mcap", "metrics NONE.mcap --estimate /x --car saloon", "report NONE",
+        "compare NONE NONE", "events NONE --where valid", "view NONE", "learn NONE.mcap --car saloon -o OUT",
+        "train NONE -o OUT", "run LOG -o OUT --plan NONE", "run LOG -o OUT --setup NONE",
+        "plan init --from NONE -o OUT",
+    ],
+)  # fmt: skip
+def test_a_missing_file_is_one_line_and_exit_code_2(sample_logs_dir: Path, tmp_path: Path, arguments: str) -> None:
+    places = {"NONE": tmp_path / "none", "OUT": tmp_path / "out", "LOG": sample_logs_dir / "dlc.mcap"}
+    words = [re.sub("NONE|OUT|LOG", lambda m: str(places[m[0]]), word) for word in arguments.split()]
+    result = called(*words)
+    assert result.returncode == 2, result.stderr
+    assert "none" in _one_line_error(result)
+
+
+@pytest.mark.parametrize(
+    "words", [("run", "x", "-o", "y", "--thresholds", "t.toml"), ("compare", "a", "b", "--gate", "g")]
+)
+def test_an_option_that_plans_replaced_is_answered_with_the_plan(words: tuple[str, ...]) -> None:
+    result = called(*words)
+    assert result.returncode == 2
+    assert "was replaced by --plan; convert the file: pdhef plan init --from FILE" in _one_line_error(result)
+
+
+def test_a_plan_is_written_once(tmp_path: Path) -> None:
+    file = str(tmp_path / "plan.toml")
+    assert called("plan", "init", "-o", file).returncode == 0
+    assert "got one that exists" in called("plan", "init", "-o", file).stderr
+    assert called("plan", "start", "-o", file).returncode == 2
 
 
 @pytest.mark.slow
@@ -368,7 +395,8 @@ def test_log_without_truth_shows_what_there_is_instead(sample_logs_dir: Path, tm
     assert "the log contains no ground truth" in " ".join(result.stdout.split())
     assert "Consistency" in result.stdout
     assert "from pd-hef °" in result.stdout
-    assert "RMSE" not in result.stdout
+    assert "RMSE" not in result.stdout[: result.stdout.index("id  ")].replace("RMSE °", "")
+    assert "no ground truth of vx_m_s" in result.stdout
 
 
 @pytest.mark.slow

@@ -54,14 +54,21 @@ def test_the_same_run_is_equal(runs: tuple[str, str]) -> None:
 
 
 def test_json_and_junit_say_the_same(runs: tuple[str, str], tmp_path: Path) -> None:
-    gate = tmp_path / "gate.toml"
-    gate.write_text('[[figure]]\nmax_regression = "5%"\n[[figure]]\nmetric = "max_abs"\nmax_regression = 0.1\n')
-    code, text = _pdhef("compare", *runs, "--gate", str(gate), "--json", "--junit", str(tmp_path / "gate.xml"))
+    plan = tmp_path / "plan.toml"
+    ratio = 'id = "{}"\nsignal = "sideslip_rad"\nmetric = "{}"\nbaseline = "run"\nmax_ratio = 1.05\n'
+    plan.write_text("".join("[[requirement]]\n" + ratio.format(*named) for named in (("A", "rmse"), ("B", "mae"))))
+    code, text = _pdhef("compare", *runs, "--plan", str(plan), "--json", "--junit", str(tmp_path / "plan.xml"))
     document = json.loads(text)
     assert code == document["exit_code"] == 4
-    assert [f["verdict"] for f in document["figures"]] == ["worse", "no figure"]
-    suites = ET.parse(tmp_path / "gate.xml").getroot()
-    assert (suites.get("tests"), suites.get("failures")) == ("3", "2")
+    assert [r["outcome"] for r in document["plan"]["requirements"]] == ["FAIL", "INCONCLUSIVE"]
+    assert document["plan"]["requirements"][0]["value"] == pytest.approx(1.145, abs=0.001)
+    root = ET.parse(tmp_path / "plan.xml").getroot()
+    assert [s.get("name") for s in root] == ["plan.toml", "compare"]
+    assert (root[0].get("tests"), root[0].get("failures"), root[0].get("skipped")) == ("2", "1", "1")
+    _, text = _pdhef("compare", *runs, "--plan", str(plan))
+    assert "Plan on B: 1 FAIL, 1 INCONCLUSIVE (plan plan.toml)" in text
+    assert _pdhef("compare", runs[0], runs[0], "--plan", str(plan))[0] == 0
+    assert _pdhef("compare", runs[0], runs[0], "--plan", str(plan), "--strict")[0] == 4
 
 
 @pytest.mark.parametrize("option", ["--html", "--junit"])
@@ -70,9 +77,10 @@ def test_an_output_that_is_an_input_is_refused(runs: tuple[str, str], option: st
         _pdhef("compare", *runs, option, f"{runs[0]}/run.json")
 
 
-def test_a_gate_file_and_a_figure_of_the_command_line_do_not_go_together(runs: tuple[str, str]) -> None:
-    with pytest.raises(UsageError, match="--gate and --metric"):
-        _pdhef("compare", *runs, "--gate", "gate.toml", "--metric", "mae")
+def test_a_plan_and_a_figure_of_the_command_line_do_not_go_together(runs: tuple[str, str], tmp_path: Path) -> None:
+    _pdhef("plan", "init", "-o", str(tmp_path / "plan.toml"))
+    with pytest.raises(UsageError, match="--plan or --metric, got both"):
+        _pdhef("compare", *runs, "--plan", str(tmp_path / "plan.toml"), "--metric", "mae")
     with pytest.raises(UsageError, match=r"a figure; lower is better, got metric = bias"):
         _pdhef("compare", *runs, "--metric", "bias")
     with pytest.raises(UsageError, match=r"a share such as 5% or 0\.05, got five"):

@@ -1,4 +1,4 @@
-"""``pdhef metrics`` and the gate of thresholds as a user and a CI system meet them."""
+"""``pdhef metrics`` and the verdicts of a plan as a user and a CI system meet them."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from tests.command_line import called
 pytestmark = pytest.mark.slow
 
 ESTIMATE = ("--estimate", "/pdhef/phy_ukf/state")
-LIMITS = """
-[[threshold]]
+PLAN = """
+[[requirement]]
+id = "SR-1"
 signal = "sideslip_rad"
-metric = "rmse"
-max = {limit}
-unit = "deg"
-[[threshold]]
+metric = "p95_abs"
+statistic = "worst drive"
+limit_deg = {limit}
+[[requirement]]
+id = "SR-2"
 estimator = "pd-hef"
 signal = "sideslip_rad"
-metric = "rmse"
-max = 0.1
-optional = true
+limit_deg = 0.1
 """
 
 
@@ -48,9 +48,9 @@ def annotated(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -
     return str(out / "logs/dlc/annotated.mcap")
 
 
-def _limits(tmp_path: Path, limit: float) -> str:
-    path = tmp_path / "limits.toml"
-    path.write_text(LIMITS.format(limit=limit))
+def _plan(tmp_path: Path, limit: float) -> str:
+    path = tmp_path / "plan.toml"
+    path.write_text(PLAN.format(limit=limit))
     return str(path)
 
 
@@ -64,23 +64,24 @@ def test_table_goes_to_stdout_and_assumptions_to_stderr(annotated: str) -> None:
 
 
 def test_json_is_one_document(annotated: str, tmp_path: Path) -> None:
-    result = called("metrics", annotated, *ESTIMATE, "--thresholds", _limits(tmp_path, 10.0), "--json")
+    result = called("metrics", annotated, *ESTIMATE, "--plan", _plan(tmp_path, 10.0), "--json")
     document = json.loads(result.stdout)
     assert document["exit_code"] == result.returncode == 0
     assert document["output"] is None
-    assert [v["outcome"] for v in document["logs"][0]["verdicts"]] == ["pass", "skipped"]
+    assert [v["outcome"] for v in document["plan"]["requirements"]] == ["PASS", "INCONCLUSIVE"]
+    assert document["plan"]["requirements"][1]["reason"] == "pd-hef did not run: add it to --estimators"
     assert document["logs"][0]["report"]["estimators"][0]["name"] == "phy-ukf"
 
 
 def test_passed_gate_is_0_and_failed_gate_is_4(annotated: str, tmp_path: Path) -> None:
     junit = tmp_path / "gate.xml"
-    passed = called("metrics", annotated, *ESTIMATE, "--thresholds", _limits(tmp_path, 10.0), "--junit", str(junit))
+    passed = called("metrics", annotated, *ESTIMATE, "--plan", _plan(tmp_path, 10.0), "--junit", str(junit))
     assert passed.returncode == 0, passed.stderr
-    assert "pass" in passed.stdout
+    assert "PASS" in passed.stdout
     assert ET.parse(junit).getroot().attrib["failures"] == "0"
-    failed = called("metrics", annotated, *ESTIMATE, "--thresholds", _limits(tmp_path, 0.01), "--junit", str(junit))
+    failed = called("metrics", annotated, *ESTIMATE, "--plan", _plan(tmp_path, 0.01), "--junit", str(junit))
     assert failed.returncode == 4
-    assert "beyond the limit" in failed.stderr
+    assert "FAIL: SR-1 (sideslip p95 ≤ 0.01° (worst drive)): worst of 1 drives" in failed.stderr
     (suite,) = ET.parse(junit).getroot()
     assert (suite.attrib["tests"], suite.attrib["failures"], suite.attrib["skipped"]) == ("2", "1", "1")
 
@@ -90,10 +91,10 @@ def test_run_has_the_same_gate(sample_logs_dir: Path, tmp_path: Path) -> None:
     junit = tmp_path / "gate.xml"
     result = called(
         "run", *logs, "-o", str(tmp_path / "out"), "-e", "zero", "--annotate", "none",
-        "--thresholds", _limits(tmp_path, 0.01), "--junit", str(junit),
+        "--plan", _plan(tmp_path, 0.01), "--junit", str(junit),
     )  # fmt: skip
     assert result.returncode == 4
-    assert [s.attrib["name"] for s in ET.parse(junit).getroot()] == ["dlc", "sweep"]
+    assert [(s.attrib["name"], s.attrib["tests"]) for s in ET.parse(junit).getroot()] == [("plan.toml", "2")]
     assert (tmp_path / "out/run.json").is_file()
 
 
@@ -103,20 +104,19 @@ def test_failed_gate_wins_over_lost_input_and_both_are_said(sample_logs_dir: Pat
     (tmp_path / "logs/cut.mcap").write_bytes(whole[: len(whole) * 3 // 4])
     log = str(tmp_path / "logs/cut.mcap")
     arguments = ("run", log, "-e", "zero", "--annotate", "none", "-o", str(tmp_path / "out"))
-    assert called(*arguments, "--thresholds", _limits(tmp_path, 10.0)).returncode == 3
-    both = called(*arguments, "--thresholds", _limits(tmp_path, 0.01))
+    assert called(*arguments, "--plan", _plan(tmp_path, 10.0)).returncode == 3
+    both = called(*arguments, "--plan", _plan(tmp_path, 0.01))
     assert both.returncode == 4
-    assert "threshold failed" in both.stderr
+    assert "FAIL: SR-1" in both.stderr
     assert "lost" in both.stderr
     (tmp_path / "logs/bad.mcap").write_bytes(b"no log")
     junit = tmp_path / "gate.xml"
     several = called(
         "run", str(tmp_path / "logs"), "-e", "zero", "--annotate", "none", "-o", str(tmp_path / "out2"),
-        "--thresholds", _limits(tmp_path, 10.0), "--junit", str(junit),
+        "--plan", _plan(tmp_path, 10.0), "--junit", str(junit),
     )  # fmt: skip
-    assert several.returncode == 4  # a log that could not be read has not met its threshold
-    failures = {s.attrib["name"]: s.attrib["failures"] for s in ET.parse(junit).getroot()}
-    assert failures == {"bad": "1", "cut": "0"}
+    assert several.returncode == 3  # a log that could not be read is no drive of the plan
+    assert ET.parse(junit).getroot().attrib["failures"] == "0"
 
 
 @pytest.mark.parametrize(
@@ -126,8 +126,9 @@ def test_failed_gate_wins_over_lost_input_and_both_are_said(sample_logs_dir: Pat
         (("--estimate", "vx_m_s=/pdhef/phy_ukf/state.vx"), 1, "did you mean vx_m_s?"),
         (("--estimate", "/imu/data.angular_velocity.z"), 2, "SIGNAL="),
         ((), 2, "--estimate"),
-        ((*ESTIMATE, "--junit", "gate.xml"), 2, "--thresholds"),
-        ((*ESTIMATE, "--thresholds", "none.toml"), 2, "none.toml"),
+        ((*ESTIMATE, "--junit", "gate.xml"), 2, "--plan"),
+        ((*ESTIMATE, "--plan", "none.toml"), 2, "none.toml"),
+        ((*ESTIMATE, "--thresholds", "none.toml"), 2, "--thresholds was replaced by --plan"),
         ((*ESTIMATE, "--start", "900"), 2, "--start"),
     ],
 )

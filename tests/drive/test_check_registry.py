@@ -24,7 +24,7 @@ from studies.documentation_tables import on_page_markdown
 
 NAME = "speed_m_s.range"
 DOCS = Path(__file__).parents[2] / "docs"
-LIMITS = '[[threshold]]\nsignal = "sideslip_rad"\nmetric = "rmse"\nmax = 90\nunit = "deg"\n'
+PLAN = '[[requirement]]\nid = "a"\nsignal = "sideslip_rad"\nlimit_deg = 90.0\n'
 
 
 @pytest.fixture
@@ -45,12 +45,12 @@ def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 def test_a_check_is_in_report_terminal_page_junit_and_can_be_waived(
     toy: str, sample_logs_dir: Path, tmp_path: Path, waived: bool
 ) -> None:
-    (tmp_path / "thresholds.toml").write_text(LIMITS, encoding="utf-8")
+    (tmp_path / "plan.toml").write_text(PLAN, encoding="utf-8")
     config = RunConfig(
         car=sample_logs_dir / "vehicle.toml",
         estimators=("zero",),
         annotate="none",
-        thresholds=tmp_path / "thresholds.toml",
+        plan=tmp_path / "plan.toml",
         waived=(toy,) if waived else (),
     )
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config, junit=tmp_path / "junit.xml")

@@ -152,3 +152,14 @@ def test_bounds_and_ends(sample_logs_dir: Path, car: Car, monkeypatch: pytest.Mo
     assert closed == ["dlc.mcap"]
     with pytest.raises(UsageError, match="one log"):
         one_log(str(sample_logs_dir))
+
+
+@pytest.mark.parametrize("size", [250, 3000])
+def test_a_log_that_is_cut_before_its_messages_names_the_cut_and_the_remedy(
+    sample_logs_dir: Path, tmp_path: Path, car: Car, size: int
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes((sample_logs_dir / "dlc.mcap").read_bytes()[:size])
+    with pytest.raises(MappingError, match=f"the file ends inside a record at byte .* of {size}") as error:
+        read_drive(cut, car)
+    assert "the file is cut: copy the recording again" in error.value.remedy

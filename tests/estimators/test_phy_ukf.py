@@ -26,7 +26,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.filter_base import sideslip_std
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.phy_ukf import PhysicsUkf, innovation_log_likelihood
+from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.estimators.table import Options, make_estimator
 from pdhef_logtool.records.signals import Signals
@@ -392,6 +392,16 @@ def simulate_from_the_filters_own_model(q_std, r_std, seconds, seed):
         bias += noise[3]
     names = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
     return make_signals(np.full(n - 1, dt), **dict(zip(names, rows.T, strict=True)))
+
+
+def innovation_log_likelihood(estimator: PhysicsUkf, signals: Signals) -> tuple[float, int]:
+    """Return the Gaussian log-likelihood of all innovations of a drive and how many scalar innovations it sums.
+
+    A sample beyond the gate counts with the likelihood at the gate: a filter gains nothing by rejecting samples, and
+    no single outlier decides.
+    """
+    steps, _ = estimator.run(signals, None)
+    return float(steps.log_likelihood.sum()), int(np.isfinite(steps.innovation).sum())
 
 
 def test_innovation_likelihood_peaks_at_the_true_process_noise():

@@ -571,6 +571,21 @@ def test_the_parts_that_a_car_has_are_worth_having(names, without, share):
         assert right < sideslip_rmse(PhysicsUkf(oracle.as_vehicle()), made, noisy)
 
 
+def test_beyond_the_linear_range_kinematics_count_more():
+    """With tyres half as stiff in the file the error at the limit is lower; in the linear range nothing changes."""
+    oracle = Oracle(parts("lag"))
+    v = oracle.as_vehicle()
+    tyres = Tyres(**{name: tyre.model_copy(update={"B": 0.5 * tyre.B}) for name, tyre in v.tyres})
+    soft, limit, gentle = v.model_copy(update={"tyres": tyres}), slalom(0.09, 0.5), slalom(0.003, 0.5)
+    made = oracle.drive(limit, 8.0)
+    noisy = with_noise(made.signals, 1)
+    plain, yields = (sideslip_rmse(PhysicsFilter(soft, limit_gain=gain), made, noisy) for gain in (0.0, 6.0))
+    assert yields < 0.9 * plain
+    linear = with_noise(oracle.drive(gentle, 8.0).signals, 1)
+    plain, yields = (run_window(PhysicsFilter(v, limit_gain=gain), linear)[0].vy_m_s for gain in (0.0, 6.0))
+    np.testing.assert_array_equal(plain, yields)
+
+
 def test_forces_of_the_axles_are_found():
     """Also a third of them that no tyre model knows of."""
     oracle = Oracle(parts("lag"))

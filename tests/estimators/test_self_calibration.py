@@ -148,7 +148,7 @@ def test_the_calibrated_vehicle_reads_its_signals_with_what_was_found() -> None:
     signals = wide().signals
     calibration = found(replace(signals, steer_rad=signals.steer_rad + 0.005), RIGHT)
     assert calibration.vehicle.steer_offset_rad == pytest.approx(0.005, abs=1e-3)
-    assert calibration.vehicle.physics.names == ("lag", "roll")
+    assert calibration.vehicle.physics.names == ("lag", "roll", "bank")
     assert calibration.vehicle.mass_kg == RIGHT.mass_kg
     assert calibration.vehicle_file is RIGHT
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import cut, drive, make_signals, slalom, tanh_tyre, with_noise
 
-from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.car.vehicle import Sensors, default_vehicle
 from pdhef_logtool.estimators import sensor_faults as sf
 from pdhef_logtool.estimators.sensor_faults import SensorFaults, find_faults
 from pdhef_logtool.evaluation.reasons import ReasonIntervals
@@ -222,7 +222,7 @@ def test_five_identical_samples_are_stuck_and_reported_a_little_later(channel, v
     result = found(with_column(clean, channel, bad, held))
     stuck = unused(result, channel)
     assert not stuck[~bad].any()
-    assert stuck[first + sf.STUCK_SAMPLES - 1 : first + bad.sum()].all()
+    assert stuck[first + Sensors().stuck_samples - 1 : first + bad.sum()].all()
     told = reported(result, reasons.STUCK_AY, channel)
     np.testing.assert_array_equal(told, bad & (t - t[first] > sf.STUCK_REPORTED_AFTER_S - 0.005))
 
@@ -283,7 +283,7 @@ def test_missing_samples_are_said_and_harm_nothing(clean):
     result = found(with_column(clean, sf.YAW_RATE, gone, np.nan))
     np.testing.assert_array_equal(unused(result, sf.YAW_RATE), gone)
     told = result.reason & reasons.MISSING_YAW_RATE > 0
-    np.testing.assert_array_equal(told, gone & (t > 3.995 + sf.MISSING_REPORTED_AFTER_S))
+    np.testing.assert_array_equal(told, gone & (t > 3.995 + Sensors().imu_hold_s))
     assert not (result.reason & ~reasons.MISSING_YAW_RATE).any()
 
 

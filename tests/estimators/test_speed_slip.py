@@ -22,7 +22,7 @@ from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import Signals
 
 VEHICLE = default_vehicle()
-STD = 0.08
+SENSORS = VEHICLE.sensors
 ESTIMATORS = (Kinematic(), OpenLoop(VEHICLE), PhysicsUkf(VEHICLE), PhysicsFilter(VEHICLE))
 
 
@@ -49,20 +49,20 @@ def good():
 
 
 def believed(signals: Signals, **options) -> np.ndarray:
-    return without_slip(signals, STD, None, **options)[0].speed_m_s
+    return without_slip(signals, SENSORS, None, **options)[0].speed_m_s
 
 
 def test_a_drive_without_slip_is_left_alone(good):
-    assert without_slip(good.signals, STD, None)[0] is good.signals
+    assert without_slip(good.signals, SENSORS, None)[0] is good.signals
     made = drive(slalom(0.06, 0.7), 12.0, acceleration=lambda t: -6.0 if 4.0 < t < 6.0 else 0.0)
     noisy = with_noise(made.signals, 5)
-    assert without_slip(noisy, STD, None)[0] is noisy
+    assert without_slip(noisy, SENSORS, None)[0] is noisy
 
 
 @pytest.mark.parametrize("slope", [-2.0, 2.0])
 def test_a_steep_hill_is_no_slip(good, slope):
     hill = replace(good.signals, ax_m_s2=good.signals.ax_m_s2 + slope)
-    assert without_slip(hill, STD, None)[0] is hill
+    assert without_slip(hill, SENSORS, None)[0] is hill
 
 
 @pytest.mark.parametrize("size", [10.0, 20.0])
@@ -124,7 +124,7 @@ def test_a_standstill_and_the_floor_of_the_pulses_are_no_slip(good):
     signals = with_noise(made.signals, 8)
     read = np.where(signals.speed_m_s < 0.8, np.where(np.isfinite(signals.speed_m_s), 0.0, np.nan), signals.speed_m_s)
     floor = replace(signals, speed_m_s=read)
-    assert without_slip(floor, STD, None)[0] is floor
+    assert without_slip(floor, SENSORS, None)[0] is floor
 
 
 def test_the_axle_that_does_not_slip_is_believed(good):
@@ -145,7 +145,7 @@ def test_a_single_sample_that_is_off_is_left_to_the_filter(good):
         speed = good.signals.speed_m_s.copy()
         speed[at] += size
         spiked = replace(good.signals, speed_m_s=speed)
-        assert without_slip(spiked, STD, None)[0] is spiked
+        assert without_slip(spiked, SENSORS, None)[0] is spiked
 
 
 def test_a_speed_that_lasts_is_believed_in_the_end(good):
@@ -159,7 +159,7 @@ def test_a_speed_that_lasts_is_believed_in_the_end(good):
 def test_without_an_accelerometer_nothing_is_gated(good):
     blind = replace(good.signals, ax_m_s2=np.full(len(good.signals), np.nan))
     blind = replace(blind, speed_m_s=blind.speed_m_s + spin(good.time_s))
-    assert without_slip(blind, STD, None)[0] is blind
+    assert without_slip(blind, SENSORS, None)[0] is blind
 
 
 @settings(max_examples=25, deadline=None)
@@ -174,7 +174,7 @@ def test_windows_change_no_bit_and_nothing_is_seen_ahead(good, data):
     cuts = sorted(data.draw(st.sets(st.integers(1, len(rough) - 1), min_size=1, max_size=5)))
     parts, carry = [], None
     for first, end in zip([0, *cuts], [*cuts, len(rough)], strict=True):
-        out, carry = without_slip(cut(rough, first, end), STD, carry)
+        out, carry = without_slip(cut(rough, first, end), SENSORS, carry)
         parts.append(out.speed_m_s)
     np.testing.assert_array_equal(np.concatenate(parts), whole)
     later = replace(rough, speed_m_s=np.where(np.arange(len(rough)) >= cuts[0], 3.0, rough.speed_m_s))
@@ -207,4 +207,4 @@ def test_slip_that_is_seen_only_as_it_ends_is_no_lock(good):
     t = good.time_s
     slow = np.clip(2.0 * (t - 2.0), 0.0, 4.0) * (t < 4.2)
     recovering = replace(good.signals, speed_m_s=good.signals.speed_m_s + slow)
-    assert without_slip(recovering, STD, None)[0] is recovering
+    assert without_slip(recovering, SENSORS, None)[0] is recovering

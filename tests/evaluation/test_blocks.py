@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.evaluation import blocks
 from pdhef_logtool.evaluation.blocks import ErrorSums, SegmentMasks, median_step_ns, packed
-from pdhef_logtool.evaluation.dead_reckoned import lateral_errors_after_one_second, position_error
+from pdhef_logtool.evaluation.dead_reckoned import Seconds, position_error
 from pdhef_logtool.evaluation.metrics import lag, nees, score_track
 from pdhef_logtool.evaluation.metrics.disagreement import disagreement_rows
 from pdhef_logtool.evaluation.metrics.innovations import state_rows
@@ -163,13 +163,20 @@ def test_figures_do_not_know_the_blocks(seed, rows):
         ]
 
     expected = figures()
-    paths = position_error(a, truth), lateral_errors_after_one_second(a, truth)
+
+    def lateral_errors():
+        seconds = Seconds()
+        for first, end in blocks.row_blocks(len(truth)):
+            seconds.add(a.rows(first, end), truth.rows(first, end))
+        return seconds.lateral_errors()
+
+    paths = position_error(a, truth), lateral_errors()
     reasons, step_ns = summarise_reasons(a), median_step_ns(signals)
     assert step_ns == np.median(np.diff(signals.stamps_ns))
     with blocks_of(rows), patch.object(nees, "NEES_ROWS", 50):
         assert_same_rows(figures(), expected)
         np.testing.assert_array_equal(position_error(a, truth), paths[0])
-        np.testing.assert_array_equal(lateral_errors_after_one_second(a, truth), paths[1])
+        np.testing.assert_array_equal(lateral_errors(), paths[1])
         assert summarise_reasons(a) == reasons
         assert median_step_ns(signals) == step_ns
 

@@ -8,15 +8,30 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.evaluation.bootstrap import block_bootstrap_difference, block_bootstrap_interval
-from pdhef_logtool.evaluation.dead_reckoned import lateral_errors_after_one_second, position_error
+from pdhef_logtool.evaluation.dead_reckoned import Seconds, position_error
 from pdhef_logtool.evaluation.metrics import Scorer, score_track
-from pdhef_logtool.evaluation.metrics.errors import summarise_errors
+from pdhef_logtool.evaluation.metrics.errors import ErrorSums
 from pdhef_logtool.evaluation.metrics.innovations import state_rows
 from pdhef_logtool.evaluation.metrics.lag import lag_s
 from pdhef_logtool.evaluation.metrics.nees import nees
+from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack, make_track
 
 T0 = 1_700_000_000_000_000_000
+
+
+def summarise_errors(error: FloatArray) -> dict[str, float]:
+    """Return rmse, mae, bias, p95_abs and max_abs of finite errors [N], N ≥ 1."""
+    sums = ErrorSums(len(error))
+    sums.add(error)
+    return sums.figures()
+
+
+def lateral_errors_after_one_second(estimate: StateTrack, truth: StateTrack) -> FloatArray:
+    """Return the lateral error [K] in m at the end of each second that can be scored; positive = estimate left."""
+    seconds = Seconds()
+    seconds.add(estimate, truth)
+    return seconds.lateral_errors()
 
 
 def stamps_of(n, rate=100):

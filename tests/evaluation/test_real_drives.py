@@ -18,7 +18,8 @@ from pdhef_logtool.drive.truth import (
     truth_at,
     yaw_rate_channel,
 )
-from pdhef_logtool.evaluation.segments import smooth
+from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
+from pdhef_logtool.evaluation.smoothing import smooth
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import fit_clocks, load_mapping, read_signals
 
@@ -29,6 +30,7 @@ DRIVES = {
     "f1tenth_xray_run24.bag": ("f1tenth", "f1tenth"),
     "comma2k19_segment.mcap": ("comma2k19", "comma2k19_rav4"),
     "lunda_v40": ("lunda_v40", "lunda_v40"),
+    "v40_slalom.mcap": ("../../../studies/peers/v40_gnss", "lunda_v40"),
 }
 
 
@@ -124,3 +126,12 @@ def test_the_v40s_velocities_are_moved_by_the_stated_lever_arm(drive):
     assert gap.sum() == 1
     inside = truth_at(truth, track.stamps_ns[:-1][gap] + 1_000_000_000)
     assert not inside.valid.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("lunda_v40", ["sine-with-dwell"]), ("v40_slalom.mcap", ["slalom"]), ("comma2k19_segment.mcap", [])],
+)
+def test_recorded_manoeuvres_are_recognised(drive, name, expected):
+    channels, vehicle = drive(name)
+    assert [m.name for m in find_manoeuvres(aligned(channels, vehicle), vehicle)] == expected

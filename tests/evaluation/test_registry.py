@@ -22,7 +22,7 @@ from pdhef_logtool.evaluation.metrics import registry
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.reports.comparison import comparison_page
 from pdhef_logtool.results.comparing import compare_runs
-from pdhef_logtool.results.gate import gate_from_dict
+from pdhef_logtool.results.gate import Figure, Gate
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
@@ -48,13 +48,14 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 @pytest.fixture(scope="module")
 def result(toy: str, sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     out = tmp_path_factory.mktemp("out")
-    limits = f'[[threshold]]\nsignal = "sideslip_rad"\nmetric = "{toy}"\nmax = 0.001\nunit = "deg"\n'
-    (out / "thresholds.toml").write_text(limits, encoding="utf-8")
+    limits = f'metric = "{toy}"\nstatistic = "worst drive"\nestimator = "physics"\nlimit_deg = 0.001\n'
+    text = f'[[requirement]]\nid = "toy"\nsignal = "sideslip_rad"\n{limits}'
+    (out / "plan.toml").write_text(text, encoding="utf-8")
     config = RunConfig(
         car=sample_logs_dir / "vehicle.toml",
         estimators=("physics", "zero"),
         annotate="sidecar",
-        thresholds=out / "thresholds.toml",
+        plan=out / "plan.toml",
     )
     return run_logs([str(sample_logs_dir / "dlc.mcap")], out / "out", config)
 
@@ -75,7 +76,7 @@ def test_figures_are_in_parquet_json_and_mcap(toy: str, result: RunResult) -> No
     assert row["value"] in [m["value"] for m in report["metrics"] if m["metric"] == toy]
     with (folder / "annotated.mcap").open("rb") as file:
         (record,) = (m.metadata for m in make_reader(file).iter_metadata() if m.name == "pdhef.metrics")
-    assert record[f"physics/sideslip_rad/all/{toy}"] == f"{row['value']!r} rad n={row['n']}"
+    assert record[f"physics/sideslip_rad/all/{toy}"] == f"{row['value']:.9g} rad n={row['n']}"
 
 
 def test_it_has_a_column_in_the_terminal_and_on_the_page_with_its_definition(toy: str, result: RunResult) -> None:
@@ -88,11 +89,12 @@ def test_it_has_a_column_in_the_terminal_and_on_the_page_with_its_definition(toy
     assert registered()[toy].definition in page
 
 
-def test_thresholds_and_compare_accept_it(toy: str, result: RunResult) -> None:
-    verdicts = {v.estimator: v for v in result.verdicts}
-    assert verdicts["physics"].outcome == "fail"
-    assert verdicts["physics"].threshold.label == f"sideslip_rad {toy} (all) <= 0.001 deg"
-    gate = gate_from_dict({"figure": [{"metric": toy, "max_regression": "5%"}]}, where="gate.toml")
+def test_plans_and_compare_accept_it(toy: str, result: RunResult) -> None:
+    assert result.requirements is not None
+    (verdict,) = result.requirements.verdicts
+    assert (verdict.outcome, result.exit_code) == ("FAIL", 4)
+    assert verdict.requirement.label == f"sideslip {LABEL} ≤ 0.001° (worst drive, physics)"
+    gate = Gate((Figure(metric=toy, limit=0.05),))
     run = open_run(str(result.place))
     found = compare_runs(run, run, gate)
     (figure,) = found.figures

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.evaluation import segments
-from pdhef_logtool.evaluation.segments import find_intervals, segment_masks, smooth
+from pdhef_logtool.evaluation import smoothing
+from pdhef_logtool.evaluation.segments import find_intervals, segment_masks
+from pdhef_logtool.evaluation.smoothing import smooth
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
 
@@ -35,7 +36,7 @@ def signals(t, speed, ax, ay, noise=0.0, friction=np.nan):
     return Signals(
         stamps_ns=T0 + np.round(t * 1e9).astype(np.int64),
         ready_ns=T0 + np.round(t * 1e9).astype(np.int64),
-        steer_rad=np.zeros(n),
+        steer_rad=ay * (2.87 / np.maximum(speed, 1.0) ** 2 + 0.003),
         ax_m_s2=ax + rng.normal(0, noise, n),
         ay_m_s2=ay + rng.normal(0, noise, n),
         yaw_rate_rad_s=rate,
@@ -183,10 +184,10 @@ def test_swings_to_one_side_are_no_slalom():
 @pytest.mark.parametrize("n", [3, 40, 107, 108, 5000])
 def test_smoothing_what_is_known_everywhere_is_smoothing_with_weights(n: int) -> None:
     values = np.random.default_rng(n).standard_normal(n)
-    sigma = segments._sigma_rows(10_000_000, 1.0)
-    np.testing.assert_array_equal(segments._gaussian_of_ones(n, sigma), segments._gaussian(np.ones(n), sigma))
-    reach = segments.reach_rows(10_000_000, 1.0)
+    sigma = smoothing._sigma_rows(10_000_000, 1.0)
+    np.testing.assert_array_equal(smoothing._gaussian_of_ones(n, sigma), smoothing._gaussian(np.ones(n), sigma))
+    reach = smoothing.reach_rows(10_000_000, 1.0)
     weights = np.exp(-0.5 / (sigma * sigma) * np.arange(-reach, reach + 1) ** 2)
     padded = np.pad(values, reach)
     expected = [float(padded[i : i + 2 * reach + 1] @ weights) / weights.sum() for i in range(n)]
-    np.testing.assert_allclose(segments._gaussian(values, sigma), expected, atol=1e-12)
+    np.testing.assert_allclose(smoothing._gaussian(values, sigma), expected, atol=1e-12)

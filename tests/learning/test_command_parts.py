@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from reference_car import drive, slalom
 
-from pdhef_logtool.car.car import Car, read_history
+from pdhef_logtool.car.car import HISTORY_FILE, Car
 from pdhef_logtool.car.parts import FilterNoise, Inflation, LearntOn, SideslipCoefficients, YawRateCoefficients
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.reading import WholeDrive
@@ -364,7 +364,7 @@ def test_calibrate_tells_its_progress_and_whom_it_leaves_out(tmp_path: Path, mon
     assert document["roll_gradient_rad_per_m_s2"] == Car.load("saloon").vehicle.roll_gradient_rad_per_m_s2
     assert [r.split for r in result.records] == ["train", None, None, None, None, None]
     assert result.figures == {"coverage": {"phy-ukf": entry["coverage"]}} and result.exit_code == 3
-    (line,) = read_history(tmp_path / "car")[-1:]
+    line = json.loads((tmp_path / "car" / HISTORY_FILE).read_text().splitlines()[-1])
     assert (line["command"], line["part"]) == ("learn --stages intervals", "intervals.json")
     for few in (arguments[:4], [*arguments[:4], arguments[5]]):
         with pytest.raises(EstimatorError, match=r"at least 5 drives.*, got 4"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pdhef_logtool.car.car import Car, read_history
+from pdhef_logtool.car.car import HISTORY_FILE, Car
 from pdhef_logtool.learning.stages import identify
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
@@ -141,7 +142,7 @@ def test_every_order_gives_parts_that_are_valid_or_said_to_be_stale(commands: Co
         assert {f: b for f, b in after.items() if f not in own} == {f: b for f, b in before.items() if f not in own} | {
             "vehicle.toml": person
         }
-        history = read_history(commands.car)
+        history = [json.loads(line) for line in (commands.car / HISTORY_FILE).read_text().splitlines()]
         assert [line["command"] for line in history] == [f"learn --stages {name}" for name in ORDER[:number]]
         part = FILES[command][0]
         assert (history[-1]["part"], history[-1]["sha256"]) == (part, digest(after[part].decode()))

@@ -62,6 +62,7 @@ def _values(path: Path, topic: str, field: str) -> np.ndarray:
     [
         (b"", "empty file"),
         (b"time,ay\n0,1\n", "none of these"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 9\n", "git lfs pull"),
         (b"\x89MCAP0\r\n", "header"),
         (b"#ROSBAG V2.0\n", "bag header"),
         (b"SQLite format 3\0", "."),

@@ -18,9 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
+from pdhef_logtool.logs.can_decoding import signal_values
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, check_mapping, fit_clocks, load_mapping, mapping_to_toml, read_signals
-from pdhef_logtool.mapping.can_frames import signal_values
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.runs.inspection.report import inspect_log
 

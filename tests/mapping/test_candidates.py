@@ -575,3 +575,13 @@ def test_values_that_are_no_drive_break_nothing(values: str) -> None:
         assert taken(auto) == {}
     else:
         assert undecided(auto)
+
+
+def test_a_rate_of_the_steering_is_no_steering_angle() -> None:
+    assert meaning_of("/steering_velocity", "std_msgs/msg/Float64", "data") is None
+    angle = meaning_of("/steering", "std_msgs/msg/Float64", "data")
+    assert angle is not None
+    assert angle.quantity == "steering"
+    beside = meaning_of("/velocity_and_steering", "a/B", "angle")
+    assert beside is not None
+    assert beside.quantity == "steering"

@@ -7,8 +7,9 @@ import pytest
 from fake_drive_log import FakeLog, FakeTopic
 
 from pdhef_logtool.mapping import Mapping, SignalSource, fit_clocks, read_signals
-from pdhef_logtool.mapping.clocks import why_unusable
+from pdhef_logtool.mapping.clocks import why_unusable, with_usable_stamps
 from pdhef_logtool.records.signals import IntArray
+from pdhef_logtool.runs.inspection.step_statistics import StepStatistics
 
 MS, S = 1_000_000, 1_000_000_000
 T0 = 1_700_000_000 * S
@@ -105,3 +106,44 @@ def test_a_step_between_the_parts_of_a_survey_is_found() -> None:
     mapping = Mapping(signals={"ay_m_s2": SignalSource("ay_m_s2", "/imu", "v", stamp="header.stamp")})
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
     assert "step back by 2.9 s" in clocks["/imu.header.stamp"].unusable
+
+
+def test_zero_stamps_lose_no_topic() -> None:
+    zeros = np.zeros(N, np.int64)
+    log = FakeLog({"/imu": FakeTopic("a/b", LOG, {"header.stamp": zeros, "v": np.arange(float(N))})})
+    mapping = Mapping(signals={"ay_m_s2": SignalSource("ay_m_s2", "/imu", "v", stamp="header.stamp")})
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    assert clocks["/imu.header.stamp"].unusable == "100% of its stamps are zero or no time"
+    assert clocks["/imu.header.stamp"].median_period_s == pytest.approx(0.01, abs=0.001)
+    found = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
+    np.testing.assert_array_equal(found.signals["ay_m_s2"].stamps_ns, LOG)
+    assert [(x.kind, x.severity) for x in found.losses] == [("log-time-serves", "note")]
+
+
+@pytest.mark.parametrize(
+    ("inner", "outer", "chosen"),
+    [
+        (np.zeros(N, np.int64), TRUE, "header.stamp"),
+        (np.full(N, T0), TRUE, "header.stamp"),
+        (TRUE, np.zeros(N, np.int64), "imu.header.stamp"),
+        (TRUE, TRUE + 5, "imu.header.stamp"),
+        (np.zeros(N, np.int64), np.zeros(N, np.int64), "imu.header.stamp"),
+    ],
+)
+def test_the_stamp_of_a_nested_message_that_is_a_time_is_read(inner: IntArray, outer: IntArray, chosen: str) -> None:
+    fields = {"header.stamp": outer, "imu.header.stamp": inner, "imu.v": np.arange(float(N))}
+    log = FakeLog({"/state": FakeTopic("a/b", LOG, fields)})
+    source = SignalSource("ay_m_s2", "/state", "imu.v", stamp="imu.header.stamp")
+    mapping = with_usable_stamps(log, Mapping(signals={"ay_m_s2": source}))
+    assert mapping.signals["ay_m_s2"].stamp == chosen
+    assert bool(mapping.notes) == (chosen == "header.stamp")
+
+
+def test_rates_of_bursts_are_those_of_their_messages() -> None:
+    bursts = T0 + np.repeat(np.arange(0, 60 * S, 100 * MS), 4) + np.tile(np.arange(4) * 40_000, 600)
+    steps = StepStatistics()
+    steps.add(bursts)
+    assert steps.rate_hz == pytest.approx(40.0, rel=0.01)
+    regular = StepStatistics()
+    regular.add(np.delete(TRUE, [100, 200, 201, *range(500, 700)]))
+    assert regular.rate_hz == pytest.approx(100.0)

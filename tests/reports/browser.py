@@ -22,11 +22,14 @@ _FLAGS = (
     "--hide-scrollbars", "--force-device-scale-factor=1", "--remote-debugging-pipe",
 )  # fmt: skip
 
+#: Drawing in three dimensions without a graphics card, for Rerun.
+_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+
 
 class Browser:
     """One page of a browser; ``messages`` are those of its console, ``requests`` every address that it asked for."""
 
-    def __init__(self, width: int = 1280, height: int = 900) -> None:
+    def __init__(self, width: int = 1280, height: int = 900, *, webgl: bool = False) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="pdhef-chromium-")
         ours_in, theirs_out = os.pipe()
         theirs_in, ours_out = os.pipe()
@@ -35,7 +38,8 @@ class Browser:
         os.close(theirs_out)
         theirs_in, theirs_out = high
         self._in, self._out = ours_in, ours_out
-        command = [CHROMIUM, *_FLAGS, f"--user-data-dir={self._folder.name}", f"--window-size={width},{height}"]
+        flags = [f for f in _FLAGS if f != "--disable-gpu"] + list(_WEBGL) if webgl else _FLAGS
+        command = [CHROMIUM, *flags, f"--user-data-dir={self._folder.name}", f"--window-size={width},{height}"]
         shell = f'exec "$@" 3<&{theirs_in} 4>&{theirs_out} '
         self._process = subprocess.Popen(
             ["bash", "-c", shell, "bash", *command, "about:blank"],
@@ -120,11 +124,11 @@ class Browser:
         elif event == "Page.loadEventFired":
             self._loaded = True
 
-    def open(self, path: Path, wait_s: float = 180.0) -> None:
-        """Open a file and wait until all of its figures are drawn."""
+    def open(self, path: Path | str, wait_s: float = 180.0) -> None:
+        """Open a file or an address and wait until all of its figures are drawn."""
         self._loaded = False
         end = time.monotonic() + wait_s
-        self.call("Page.navigate", url=path.resolve().as_uri())
+        self.call("Page.navigate", url=path if isinstance(path, str) else path.resolve().as_uri())
         while not self._loaded:
             self._next(end)
         self.wait_for("document.documentElement.dataset.drawn !== undefined", end - time.monotonic())

@@ -14,7 +14,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 from browser import CHROMIUM, WHY_NOT, Browser
 from made_runs import NAMES, drive_tracks, write_run
-from test_drive import hostile_run
+from test_drive import hostile_run, plan_of
 
 from pdhef_logtool.reports.pages import write_pages
 from pdhef_logtool.results.opened_run import open_run
@@ -26,6 +26,22 @@ FIRST_PICTURE_S, ZOOM_S = 2.0, 0.1
 _DOT = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
 )
+#: Elements with text whose contrast to the nearest background is below 4.5 (WCAG 2.1 AA).
+_LOW_CONTRAST = """(() => {
+  const light = (c) => { const [r, g, b] = c.match(/[\\d.]+/g).map((v) => v / 255)
+    .map((v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4));
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
+  const low = [];
+  for (const node of document.querySelectorAll('main *')) {
+    if (![...node.childNodes].some((n) => n.nodeType === 3 && n.textContent.trim()) || !node.offsetWidth) continue;
+    let back = node;
+    while (back && getComputedStyle(back).backgroundColor === 'rgba(0, 0, 0, 0)') back = back.parentElement;
+    const [a, b] = [getComputedStyle(node).color, back ? getComputedStyle(back).backgroundColor : 'rgb(255,255,255)']
+      .map(light).sort((x, y) => y - x);
+    if ((a + 0.05) / (b + 0.05) < 4.5) low.push(node.outerHTML.slice(0, 60));
+  }
+  return low.slice(0, 5);
+})()"""
 _DRAWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
 
 
@@ -54,8 +70,8 @@ def test_a_page_draws_all_figures_zooms_all_of_them_and_says_nothing(browser, tm
     file = page_of(write_run(tmp_path, drive_tracks(60.0, NAMES)))
     opened(browser, file)
     places = browser.value("document.querySelectorAll('[data-figure]').length")
-    assert browser.value("document.querySelectorAll('.canvas canvas').length") == places == 11
-    browser.drag(".u-over", 0.1, 0.2)
+    assert browser.value("document.querySelectorAll('.canvas canvas').length") == places == 12
+    browser.drag('[data-figure="sideslip"] .u-over', 0.1, 0.2)
     browser.value(_DRAWN)
     low, high = (float(s) for s in browser.value("document.querySelector('.range').textContent").split()[0:3:2])
     assert (low, high) == pytest.approx((6.0, 12.0), abs=0.3)
@@ -93,7 +109,7 @@ def test_hostile_names_run_nothing(browser, tmp_path):
         "document.querySelectorAll('script[type]').length + 3"
     )
     browser.value("document.querySelectorAll('.toggles input').forEach(n => n.click())")
-    browser.drag(".u-over", 0.1, 0.2)
+    browser.drag('[data-figure="sideslip"] .u-over', 0.1, 0.2)
     time.sleep(0.2)
     assert browser.messages == []
     assert len(browser.requests) == 1
@@ -166,10 +182,44 @@ def test_print_is_a4_with_figures(browser, tmp_path):
     assert max(widths) > 1000  # back on the screen
 
 
-def test_a_browser_that_cannot_draw_says_so(browser, tmp_path):
+def test_figures_are_drawn_when_the_page_has_loaded_and_in_browsers_without_streams(browser, tmp_path):
     file = page_of(write_run(tmp_path, drive_tracks(3.0)))
-    script = browser.call("Page.addScriptToEvaluateOnNewDocument", source="delete window.DecompressionStream")
-    browser.call("Page.navigate", url=file.resolve().as_uri())
-    browser.wait_for("document.querySelector('.note') !== null")
-    assert "too old" in browser.value("document.querySelector('.note').textContent")
+    at_load = "addEventListener('load', () => { window.drawnAtLoad = document.documentElement.dataset.drawn; });"
+    source = f"delete window.DecompressionStream; {at_load}"
+    script = browser.call("Page.addScriptToEvaluateOnNewDocument", source=source)
+    opened(browser, file)
+    assert browser.value("document.querySelectorAll('.canvas:not([role=img]), .canvas:not([aria-label])').length") == 0
+    assert int(browser.value("window.drawnAtLoad")) == browser.value(
+        "document.querySelectorAll('[data-figure]').length"
+    )
     browser.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script["identifier"])
+
+
+def test_the_keyboard_zooms(browser, tmp_path):
+    opened(browser, page_of(write_run(tmp_path, drive_tracks(60.0))))
+    press = (
+        "(key) => document.querySelector('[data-figure=sideslip] .canvas')"
+        ".dispatchEvent(new KeyboardEvent('keydown', {key, bubbles: true, cancelable: true}))"
+    )
+    seen = "document.querySelector('.range').textContent"
+    for key, text in (("+", "15.0 to 45.0 s"), ("ArrowRight", "22.5 to 52.5 s"), ("-", "0.0 to 60.0 s (whole drive)")):
+        browser.value(f"({press})('{key}')")
+        assert browser.value(seen) == text
+
+
+def test_texts_have_contrast_in_the_dark_and_in_the_light(browser, tmp_path):
+    file = page_of(write_run(tmp_path, drive_tracks(3.0), plan=plan_of("PASS", "FAIL", "INCONCLUSIVE")))
+    for scheme, ground in (("dark", "rgb(20, 24, 29)"), ("light", "rgb(255, 255, 255)")):
+        browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        opened(browser, file)
+        assert browser.value("getComputedStyle(document.body).backgroundColor") == ground
+        assert browser.value(_LOW_CONTRAST) == []
+    browser.call("Emulation.setEmulatedMedia", features=[])
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_nothing_is_wider_than_the_screen(tmp_path, width):
+    file = page_of(write_run(tmp_path, drive_tracks(3.0), plan=plan_of("PASS", "FAIL", "INCONCLUSIVE")))
+    with Browser(width, 900) as narrow:
+        narrow.open(file)
+        assert narrow.value("document.documentElement.scrollWidth") <= width

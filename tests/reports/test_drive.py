@@ -7,6 +7,7 @@ import json
 import math
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -112,8 +113,9 @@ def test_one_estimator_without_truth_has_a_page(tmp_path):
 
 
 def test_a_log_that_failed_has_a_page_with_its_reason(tmp_path):
-    page = page_of(write_run(tmp_path, [], outcome="failed: no IMU <b>"))
-    assert "failed: no IMU &lt;b&gt;" in page
+    outcome = "failed: a.mcap: expected an IMU, got a damaged log <b>; copy it again"
+    page = page_of(write_run(tmp_path, [], outcome=outcome))
+    assert "A damaged log &lt;b&gt; (expected: an IMU)." in page and "<p>Copy it again</p>" in page
 
 
 @pytest.mark.parametrize("damage", ["absent", "cut", "empty"])
@@ -150,12 +152,79 @@ def test_tracks_of_one_row_and_of_unknown_values_have_a_page(tmp_path):
 
 
 @pytest.mark.parametrize("outcome", ["better", "worse", "same", "undecided", "none"])
-def test_verdicts_stand_on_top(tmp_path, outcome):
+def test_the_comparison_with_physics_follows_the_first_screen(tmp_path, outcome):
     verdict = {"signal": "sideslip_rad", "outcome": outcome, "text": "a sentence", "rival": "zero"}
     folder = write_run(tmp_path, drive_tracks(), verdicts=[verdict])
     page = page_of(folder)
-    assert "a sentence" in words(page)[:300]
+    assert "Comparison with physics sideslip: " in words(page) and "a sentence" in words(page)
     assert roles_of(open_run(folder).logs[0].report()).rival == "zero"
+
+
+def plan_of(*outcomes: str) -> dict:
+    """Return the plan of a report with one requirement per outcome."""
+    return {
+        "title": "", "file": "plan.toml", "sha256": "a" * 64,
+        "requirements": [
+            {"id": f"SR-{i}", "title": f"Title {i}", "label": "sideslip RMSE ≤ 0.5°", "unit": "rad", "bound": 0.01,
+             "baseline": None, "outcome": outcome, "value": 0.008, "low": None, "high": None, "margin": 0.002,
+             "exposure": {"drives": 1, "minutes": 2.0, "km": 3.0}, "reason": f"reason {i}", "next": f"do {i}",
+             "notes": ["interval from blocks of 10 s"]}
+            for i, outcome in enumerate(outcomes)
+        ],
+    }  # fmt: skip
+
+
+def test_the_first_screen_has_verdicts_what_was_tested_the_worst_place_and_next_steps_in_this_order(tmp_path):
+    page = page_of(write_run(tmp_path, drive_tracks(), plan=plan_of("PASS", "FAIL", "INCONCLUSIVE")))
+    text = words(page)
+    order = [
+        "Plan plan.toml: 1 FAIL, 1 INCONCLUSIVE, 1 PASS", "FAIL Title 1 SR-1", "INCONCLUSIVE Title 2 SR-2",
+        "PASS Title 0 SR-0 value 0.458° limit ≤ 0.573° margin +0.115° scored 1 drive, 2.0 min, 3.0 km",
+        "Interval from blocks of 10 s.", "Tested Car sedan", "Largest error", "Next SR-1: do 1 SR-2: do 2",
+        "Comparison with physics", "Over time",
+    ]  # fmt: skip
+    places = [text.find(part) for part in order]
+    assert -1 not in places and places == sorted(places), dict(zip(order, places, strict=True))
+    assert re.search(r'<li class="requirement fail">\s*<span class="chip">FAIL', page)
+
+
+def test_every_figure_has_a_role_and_a_text_and_those_over_time_take_the_keyboard(tmp_path):
+    page = page_of(write_run(tmp_path, drive_tracks()))
+    canvases = re.findall(r'<div class="canvas" aria-label="([^"]+)"( tabindex="0")?>', page)
+    assert len(canvases) == page.count("data-figure=") - page.count("dataset.figure") or len(canvases) > 8
+    assert any(label.startswith("Sideslip [°] over time: pd-hef ") and keys for label, keys in canvases)
+
+
+def test_a_filter_is_not_compared_with_itself(tmp_path):
+    tracks = drive_tracks()
+    physics = next(t for t in tracks if t.name == "physics")
+    same = [replace(physics, name="pd-hef") if t.name == "pd-hef" else t for t in tracks]
+    errors = (("pd-hef", 1.0), ("physics", 1.0), ("zero", 3.0))
+    common = {"log": "drive", "signal": "sideslip_rad", "segment": "all", "unit": "rad", "n": 9}
+    metrics = [
+        {**common, "estimator": name, "metric": metric, "value": factor * error}
+        for name, error in errors
+        for metric, factor in (("rmse", 1.0), ("max_abs", 2.0))
+    ]
+    folder = write_run(tmp_path, same, metrics=metrics)
+    assert roles_of(open_run(folder).logs[0].report()).rival == "zero"
+    assert "physics: the same filter as pd-hef in this drive (residual gain 0), not compared." in words(page_of(folder))
+
+
+def test_the_path_is_aligned_and_its_drift_is_stated(tmp_path):
+    tracks = drive_tracks()
+    angle, x, y = 0.3, tracks[1].x_m, tracks[1].y_m
+    turned = np.cos(angle) * x - np.sin(angle) * y + 5.0, np.sin(angle) * x + np.cos(angle) * y
+    tracks[1] = replace(tracks[1], x_m=turned[0], y_m=turned[1])
+    page = drive_page(open_run(write_run(tmp_path, tracks)).logs[0])
+    text = words(page.html.decode())
+    assert "the largest remaining distance is 0.0 m" in text
+    length = float(np.hypot(np.diff(x), np.diff(y)).sum())
+    drift = float(re.search(r"Drift: ([\d.]+) m", text)[1])
+    assert drift == pytest.approx(2.0 * np.sin(angle / 2.0) * np.hypot(x[-1], y[-1]), abs=6.0)
+    assert f"{length / 1000.0:.2f} km" in text
+    labels = [c.label for c in page.charts.figures["path"].clouds]
+    assert labels[0] == "truth" and all("°" in label for label in labels[1:])
 
 
 def test_budget_faults_and_innovations_are_shown_where_a_report_has_them(tmp_path):
@@ -282,6 +351,6 @@ def test_the_command_says_what_it_wrote_and_where_no_browser_is(tmp_path, monkey
 @pytest.mark.slow
 def test_a_folder_that_is_no_run_is_one_line_and_is_not_made(tmp_path):
     result = called("report", str(tmp_path / "nothing"))
-    assert result.returncode == 1
+    assert result.returncode == 2
     assert "pdhef run LOG -o OUT writes one" in result.stderr
     assert not (tmp_path / "nothing").exists()

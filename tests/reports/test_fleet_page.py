@@ -59,17 +59,17 @@ def words(folder: Path, **options: Any) -> str:
 
 def test_a_run_with_everything_says_everything(tmp_path: Path) -> None:
     drives: dict[str, dict[str, Any]] = {
-        f"d{i}": {"errors": (0.001 * (1 + i), 0.0015 * (1 + i)), "metadata": {"road": "ab"[i // 4]}} for i in range(8)
+        f"d{i}": {"errors": (0.001 * (1 + i), 0.0015 * (1 + i)), "metadata": {"road": "ab"[i // 5]}} for i in range(10)
     }
     drives["blind"] = {"truth": {"available": False, "not_independent": []}}
     page = words(run_of(tmp_path, drives, {"bad": "/x/bad.mcap: expected a log, got 3 bytes"}))
-    assert "9 with a report" in page and "8 scored" in page and "1 of 10 logs failed" in page
+    assert "12 logs, " in page and "1 failed" in page and "1 of 12 logs failed" in page
     assert "50.0% above the selected estimate" in page and "the selected estimate is better" in page
     assert '<a href="logs/d7/report.html">d7</a>' in page
-    assert "the log has no ground truth" in page and "expected a log, got 3 bytes" in page
+    assert "the log has no ground truth" in page and "3 bytes (expected: a log)." in page
     assert "<h3>road" in page
-    assert 'class="empty"' in page and "14 min" in page
-    for key in ("medians", "spread", "against"):
+    assert 'class="empty"' in page and "16 min" in page
+    for key in ("worst", "medians", "spread", "against"):
         assert f'data-figure="{key}"' in page
 
 
@@ -106,7 +106,7 @@ def test_every_page_of_a_run_is_written_and_removed(tmp_path: Path) -> None:
     folder = run_of(tmp_path, drives, {"bad": "empty"})
     written = write_pages(open_run(folder), png=True)
     assert written.fleet.file == folder / "report.html"
-    assert {p.name for p in written.fleet.pictures} == {"medians.png", "spread.png", "against.png"}
+    assert {p.name for p in written.fleet.pictures} == {"worst.png", "medians.png", "spread.png", "against.png"}
     assert 'href="logs/bad/report.html"' in (folder / "report.html").read_text()
     assert 'href="../../report.html"' in (folder / "logs" / "bad" / "report.html").read_text()
     assert written.to_dict()["page"] == str(folder / "report.html")

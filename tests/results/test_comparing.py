@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,8 @@ import pytest
 
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.results.comparing import Comparison, compare_runs
-from pdhef_logtool.results.gate import Figure, Gate, gate_from_dict
+from pdhef_logtool.results.comparison_words import notes_of
+from pdhef_logtool.results.gate import Figure, Gate
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.storage.documents import jsonable
 from tests.results.made_run import digest, entry, row, write_estimates, write_run
@@ -102,26 +104,47 @@ def test_cannot_tell_is_an_answer_and_strict_refuses_it(tmp_path: Path) -> None:
         assert replace(found, strict=True).exit_code == 4
 
 
-def test_clusters_are_drawn_whole(tmp_path: Path) -> None:
+def test_clusters_that_the_user_names_are_too_few_or_unknown(tmp_path: Path) -> None:
     entries = [entry(label, car={"name": f"car{i // 5}", "sha256": "a"}) for i, label in enumerate(TEN)]
     a, b = write_run(tmp_path / "a", TEN, entries=entries), write_run(tmp_path / "b", _scaled(1.2), entries=entries)
     found = _compare(a, b, GATE, cluster="car")
     assert (found.figures[0].change.clusters, found.verdict) == (2, "inconclusive")
-    with pytest.raises(UsageError, match="--cluster: expected a key of the drives: car, day, got colour"):
+    with pytest.raises(UsageError, match="--cluster: expected a key of the drives: day, car, route, none, got colour"):
         _compare(a, b, cluster="colour")
+
+
+def test_drives_of_six_days_that_change_together_are_no_evidence_unless_the_user_says_so(tmp_path: Path) -> None:
+    rmse = {f"d{i}": 0.01 for i in range(60)}
+    changed = {label: 0.01 * (1.1 if i // 10 < 4 else 0.95) * (1 + 1e-4 * i) for i, label in enumerate(rmse)}
+    a, b = write_run(tmp_path / "a", rmse), write_run(tmp_path / "b", changed)
+    for i, label in enumerate(rmse):
+        start_ns = 1_700_000_000_000_000_000 + i // 10 * 86_400_000_000_000
+        report = {"format": "pdhef.report", "log": {"start_ns": start_ns}, "metadata": {"x.road": "north"}}
+        (a / "logs" / label).mkdir(parents=True)
+        (a / "logs" / label / "report.json").write_text(json.dumps(report))
+    found = _compare(a, b, GATE)
+    (figure,) = found.figures
+    assert (found.verdict, figure.change.dependence.by) == ("inconclusive", ("day",))
+    assert figure.change.dependence.levels == (("day", 6),)
+    assert figure.change.dependence.design_effect == pytest.approx(10.0)
+    assert "60 drives of 6 days have the evidence of 6 independent drives" in "".join(notes_of(found))
+    assert found.to_dict()["figures"][0]["dependence"] == ("day",)
+    alone = _compare(a, b, GATE, cluster="none")
+    assert (alone.verdict, alone.figures[0].change.dependence.design_effect) == ("worse", 1.0)
+    assert "--cluster none" in "".join(notes_of(alone))
 
 
 def test_each_figure_of_a_gate_has_its_limit_and_floor(tmp_path: Path) -> None:
     others = [row(label, 0.5, signal="vy_m_s", unit="m/s") for label in TEN]
     worse = [row(label, 0.6, signal="vy_m_s", unit="m/s") for label in TEN]
     a, b = write_run(tmp_path / "a", TEN, rows=others), write_run(tmp_path / "b", _scaled(1.2), rows=worse)
-    figures = [
-        {"max_regression": "25%"},
-        {"signal": "vy_m_s", "max_regression": 0.1},
-        {"metric": "max_abs", "max_regression": 0},
-        {"segment": "all", "estimator": "pd-hef", "max_regression": 0.01, "floor": 30.0, "unit": "deg"},
-    ]
-    found = _compare(a, b, gate_from_dict({"figure": figures}, where="gate.toml"))
+    figures = (
+        Figure(limit=0.25),
+        Figure("vy_m_s", limit=0.1),
+        Figure(metric="max_abs", limit=0.0),
+        Figure(estimator="pd-hef", limit=0.01, floor=math.radians(30.0)),
+    )
+    found = _compare(a, b, Gate(figures))
     assert [f.verdict for f in found.figures] == ["not worse", "worse", "no figure", "not worse"]
     assert found.failures == ("vy_m_s rmse (all): worse", "sideslip_rad max_abs (all): no figure")
     assert "lateral_1s_m" not in {f.figure.signal for f in found.others}  # there is no such figure
@@ -223,23 +246,3 @@ def test_no_pair_and_unknown_names_are_errors(tmp_path: Path) -> None:
     (tmp_path / "c" / "metrics.parquet").write_bytes(b"PAR1 no")
     with pytest.raises(OutputError, match=r"metrics\.parquet: expected a readable Parquet file"):
         _compare(a, c)
-
-
-@pytest.mark.parametrize(
-    ("raw", "problem"),
-    [
-        ({}, "give at least one"),
-        ({"figure": [{}]}, "max_regression: is missing"),
-        ({"figure": [{"max_regression": "much"}]}, "a share such as '5%' or 0.05"),
-        ({"figure": [{"max_regression": -0.1}]}, "a share such as"),
-        ({"figure": [{"max_regression": 0.1, "metric": "coverage95"}]}, "metric = coverage95"),
-        ({"figure": [{"max_regression": 0.1, "signal": "beta"}]}, "signal = beta"),
-        ({"figure": [{"max_regression": 0.1, "floor": 1.0, "unit": "m"}]}, "is in rad or deg, not 'm'"),
-        ({"figure": [{"max_regression": 0.1}] * 2}, "is there twice"),
-        ({"figure": [{"max_regression": 0.1}], "allow_unpaird": True}, "did you mean allow_unpaired"),
-    ],
-)
-def test_a_wrong_gate_file_is_refused_with_every_problem(raw: dict[str, Any], problem: str) -> None:
-    with pytest.raises(UsageError, match=r"gate\.toml") as error:
-        gate_from_dict(raw, where="gate.toml")
-    assert problem in str(error.value)

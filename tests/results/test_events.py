@@ -178,3 +178,31 @@ def test_a_source_that_is_not_found_or_is_another_file_is_told(clipped: tuple[Pa
     (logs / "deep" / "drive.mcap").write_bytes(b"another")
     write_clips(open_run(folder), found, pad_s=1.0, source=logs, tell=told.append)
     assert "1 of that name with other content" in told[1]
+
+
+def test_a_segment_bounds_what_is_found(run: Path) -> None:
+    path = run / "logs" / "a" / "report.json"
+    document = json.loads(path.read_text())
+    ends = [(1.0, 1.05), (1.32, 1.35)]
+    document["segments"] = [
+        {"name": "slalom", "start_ns": START_NS + round(a * 1e9), "end_ns": START_NS + round(b * 1e9), "text": ""}
+        for a, b in ends
+    ]
+    path.write_text(json.dumps(document))
+    found = _find(run, 'segment == "slalom"')
+    assert [(e.start_ns, e.end_ns) for e in found.events] == [
+        (START_NS + round(a * 1e9), START_NS + round((b - 0.01) * 1e9) + 1) for a, b in ends
+    ]
+    [late] = _find(run, 'segment == "slalom" and abs(sideslip_error_deg) > 3.5').events
+    assert late.start_ns == START_NS + 1_320_000_000
+    assert all(
+        e.end_ns <= START_NS + 1_000_000_000 for e in _find(run, 'not segment == "slalom" and speed_m_s < 10').events
+    )
+
+
+@pytest.mark.parametrize(
+    "where", ['segment == "slalon"', 'segment > "slalom"', "segment == 3", 'segment == "all" == 3']
+)
+def test_a_segment_is_compared_with_its_name_only(run: Path, where: str) -> None:
+    with pytest.raises(UsageError, match="--where"):
+        _find(run, where)

@@ -1,76 +1,74 @@
-"""JUnit XML as CI systems count it."""
+"""JUnit XML of a plan as CI systems count it."""
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.evaluation.thresholds import Threshold, Verdict
+from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, judge
+from pdhef_logtool.evaluation.validation_plan import Requirement, ValidationPlan
 from pdhef_logtool.results.junit import junit_bytes, write_junit
+from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
-LIMIT = Threshold("sideslip_rad", "rmse", maximum=0.5, unit="deg")
-VERDICTS = {
-    "a.mcap": [
-        Verdict("a.mcap", "phy-ukf", LIMIT, "pass", 0.4, 0.1, 10),
-        Verdict("a.mcap", "zero", LIMIT, "fail", 2.0, -1.5, 10, True, "2 deg is beyond the limit by 1.5"),
-        Verdict("a.mcap", "none", LIMIT, "not evaluated", reason="no such figure in this log"),
-    ],
-    "b": [Verdict("b", "none", LIMIT, "skipped", reason="no such figure in this log")],
-    "empty": [],
-}
+WORST = Requirement("R1", "No bad drive", "sideslip_rad", limit=0.02, statistic="worst drive")
+
+
+def verdicts(*errors: float | None, strict: bool = False, title: str = "") -> PlanVerdicts:
+    """Return one verdict per error of the only drive, in rad; None: the drive has no figure."""
+    requirements = tuple(replace(WORST, id=f"R{i}") for i in range(len(errors)))
+    judged = [
+        judge(r, [] if e is None else [DriveValue("a.mcap", "pd-hef", e, 100, seconds=60.0, metres=1e3)])
+        for r, e in zip(requirements, errors, strict=True)
+    ]
+    return PlanVerdicts(ValidationPlan(requirements, title, "plan.toml"), tuple(judged), strict)
 
 
 def test_counts_agree_with_the_cases() -> None:
-    assert junit_bytes(VERDICTS).startswith(b"<?xml version=")
-    root = ET.fromstring(junit_bytes(VERDICTS))
-    assert root.tag == "testsuites"
-    suites = root.findall("testsuite")
-    assert [s.get("name") for s in suites] == ["a.mcap", "b", "empty"]
-    for suite in [root, *suites]:
-        assert int(suite.attrib["tests"]) == len(suite.findall(".//testcase"))
-        assert int(suite.attrib["failures"]) == len(suite.findall(".//failure"))
-        assert int(suite.attrib["skipped"]) == len(suite.findall(".//skipped"))
-    assert [suite.attrib["failures"] for suite in suites] == ["2", "0", "0"]
+    data = junit_bytes(verdicts(0.01, 0.03, None))
+    assert data.startswith(b"<?xml version=")
+    root = ET.fromstring(data)
+    (suite,) = root.findall("testsuite")
+    assert (root.tag, suite.get("name")) == ("testsuites", "plan.toml")
+    for element in (root, suite):
+        counts = {k: element.attrib[k] for k in ("tests", "failures", "skipped")}
+        assert counts == {"tests": "3", "failures": "1", "skipped": "1"}
+    strict = ET.fromstring(junit_bytes(verdicts(0.01, 0.03, None, strict=True)))
+    assert (strict.attrib["failures"], strict.attrib["skipped"]) == ("2", "0")
 
 
-def test_cases_name_threshold_and_estimator_and_say_why() -> None:
-    cases = ET.fromstring(junit_bytes(VERDICTS)).findall(".//testcase")
-    assert cases[0].attrib["name"] == "sideslip_rad rmse (all) <= 0.5 deg"
-    assert cases[0].attrib["classname"] == "pdhef.a_mcap.phy-ukf"
-    assert cases[0].find("failure") is None
-    failure = cases[1].find("failure")
-    assert failure is not None
-    assert failure.attrib["message"] == "2 deg is beyond the limit by 1.5"
-    not_evaluated = cases[2].find("failure")
-    assert not_evaluated is not None
-    assert not_evaluated.attrib["type"] == "not evaluated"
+def test_a_case_names_requirement_limit_value_margin_and_exposure() -> None:
+    passed, failed, skipped = ET.fromstring(junit_bytes(verdicts(0.01, 0.03, None))).iter("testcase")
+    assert (passed.attrib["name"], passed.attrib["classname"]) == ("No bad drive", "pdhef.plan_toml.R0")
+    assert passed.findtext("system-out") == (
+        "sideslip RMSE ≤ 1.15° (worst drive): PASS, worst of 1 drives: 0.573°; margin 0.573°; "
+        "1 drives, 1.0 minutes scored"
+    )
+    failure = failed.find("failure")
+    assert failure is not None and failure.attrib["message"].startswith("FAIL: worst of 1 drives: 1.72°")
+    skip = skipped.find("skipped")
+    assert skip is not None and "record drives with ground truth" in skip.attrib["message"]
+
+
+def test_checks_that_did_not_pass_are_properties() -> None:
+    checks = {"a": [{"name": "speed", "verdict": "failed", "waived": False, "evidence": "too fast"}]}
+    root = ET.fromstring(junit_bytes(verdicts(0.01), checks))
+    assert [p.attrib for p in root.iter("property")] == [{"name": "check speed", "value": "failed: too fast"}]
+    root = ET.fromstring(junit_bytes(verdicts(0.01), checks | {"b": []}))
+    assert [p.attrib["name"] for p in root.iter("property")] == ["a: check speed"]
 
 
 @settings(derandomize=True, max_examples=50)
 @given(name=st.text(min_size=1))
 def test_any_name_gives_xml_that_parsers_read(name: str) -> None:
-    verdict = Verdict(name, name, LIMIT, "fail", 1.0, -1.0, reason=name)
-    root = ET.fromstring(junit_bytes({name: [verdict]}))
+    root = ET.fromstring(junit_bytes(verdicts(0.03, title=name)))
     assert len(root.findall(".//failure")) == 1
 
 
 def test_file_appears_under_its_name_alone(tmp_path: Path) -> None:
-    write_junit(tmp_path / "deep" / "gate.xml", VERDICTS)
+    write_junit(tmp_path / "deep" / "gate.xml", verdicts(0.01))
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["gate.xml"]
-    assert (tmp_path / "deep" / "gate.xml").read_bytes() == junit_bytes(VERDICTS)
-
-
-def test_the_figure_is_there_with_its_remark_and_a_failure_s_reason_is_not_said_twice() -> None:
-    remarked = Verdict("c", "ekf", LIMIT, "pass", 0.25, 0.25, 7, reason="few samples")
-    cases = ET.fromstring(junit_bytes({**VERDICTS, "c": [remarked]})).findall(".//testcase")
-    said = [case.findtext("system-out") for case in cases]
-    assert said == [
-        "value 0.4 deg, margin 0.1, n=10",
-        "value 2 deg, margin -1.5, n=10",
-        None,
-        None,
-        "value 0.25 deg, margin 0.25, n=7, few samples",
-    ]
+    assert (tmp_path / "deep" / "gate.xml").read_bytes() == junit_bytes(verdicts(0.01))

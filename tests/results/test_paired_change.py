@@ -6,8 +6,11 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy import stats
 
+from pdhef_logtool.results.dependence import dependence
 from pdhef_logtool.results.paired_change import holm, log_ratios, paired_change
 
 
@@ -78,3 +81,61 @@ def test_what_is_below_the_floor_and_zero_against_zero_is_no_change() -> None:
     np.testing.assert_allclose(log_ratios(a, b, 0.05), [0.0, 0.0, math.log(2), math.log(2)])
     wild = paired_change(np.array([math.inf, -math.inf, 0.1, 0.1, 0.1, 0.1]))
     assert wild.median == pytest.approx(0.1)
+
+
+def _of_days(rng: np.random.Generator, days: int, each: int, shared: float) -> tuple[np.ndarray, dict[str, list[int]]]:
+    """Return log ratios without a change, with this share of their variance between days."""
+    day = np.repeat(np.arange(days), each)
+    ratios = math.sqrt(1.0 - shared) * rng.normal(size=days * each) + math.sqrt(shared) * rng.normal(size=days)[day]
+    return 0.2 * ratios, {"day": day.tolist(), "car": [0] * len(day)}
+
+
+@pytest.mark.parametrize(("shared", "each"), [(0.1, 20), (0.25, 10), (0.9, 10)])
+def test_equal_runs_with_drives_of_six_days_are_seldom_called_worse(shared: float, each: int) -> None:
+    rng = np.random.default_rng(11)
+    alone = together = 0
+    for _ in range(2000):
+        ratios, factors = _of_days(rng, 6, each, shared)
+        alone += paired_change(ratios).verdict() == "worse"
+        together += paired_change(ratios, None, factors).verdict() == "worse"
+    assert together <= 140  # of 2000, nominal 100
+    assert alone >= 200  # what treating the drives as independent does
+
+
+def test_the_design_effect_is_that_of_the_simulated_correlation() -> None:
+    rng = np.random.default_rng(12)
+    effects = []
+    for _ in range(200):
+        ratios, factors = _of_days(rng, 20, 10, 0.3)
+        effects.append(dependence(ratios, factors).design_effect)
+    assert np.mean(effects) == pytest.approx(1.0 + 0.3 * 9, abs=0.25)
+
+
+def test_factors_that_are_nested_or_equal_count_once_and_crossed_ones_add() -> None:
+    rng = np.random.default_rng(13)
+    day = np.repeat(np.arange(12), 10)
+    scores = rng.normal(size=12)[day] + 0.5 * rng.normal(size=120)
+    one = dependence(scores, {"day": day.tolist()})
+    assert dependence(scores, {"day": day.tolist(), "car": [f"c{d}" for d in day]}) == one
+    car = np.tile(np.arange(10), 12)
+    crossed = dependence(scores + rng.normal(size=10)[car], {"day": day.tolist(), "car": car.tolist()})
+    assert set(crossed.by) == {"day", "car"}
+    nested = dependence(scores, {"day": day.tolist(), "road": (day // 2).tolist()})
+    assert nested.design_effect < 1.6 * one.design_effect
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    ratios=st.lists(st.floats(-3.0, 3.0) | st.sampled_from([math.inf, -math.inf, 0.0]), min_size=1, max_size=40),
+    groups=st.integers(1, 8),
+)
+def test_bounds_enclose_the_median_and_follow_the_sign(ratios: list[float], groups: int) -> None:
+    values = np.array(ratios)
+    factors = {"day": [i % groups for i in range(len(values))], "car": [None] * len(values)}
+    one, other = paired_change(values, None, factors), paired_change(-values, None, factors)
+    assert one.dependence.design_effect >= 1.0 and 0.0 <= one.sign_p <= 1.0
+    if not math.isnan(one.low):
+        assert one.low <= one.least <= one.median <= one.most <= one.high
+        assert (one.low, one.most) == (-other.high, -other.least)
+    else:
+        assert one.verdict() == "inconclusive"

@@ -50,7 +50,7 @@ ERRORS = ("error_sideslip_deg", "error_yaw_rate_deg_s", "error_vy_m_s")
 HELD = {
     "/truth": (600, STATES),
     "/main": (600, STATES + HEALTH + ERRORS),
-    "/other/1": (600, STATES),
+    "/other/1": (600, STATES + ERRORS),
     "/inputs": (600, ("speed_m_s", "steer_deg", "ax_m_s2", "ay_m_s2", "yaw_rate_deg_s")),
     "/plan/truth/now": (120, ()),
     "/plan/main/now": (120, ()),

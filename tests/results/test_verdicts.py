@@ -15,7 +15,6 @@ from pdhef_logtool.evaluation.operating_space import Cell
 from pdhef_logtool.evaluation.reasons import Interval as Span
 from pdhef_logtool.evaluation.reasons import SensorFault
 from pdhef_logtool.evaluation.standing import Standing
-from pdhef_logtool.evaluation.thresholds import check_thresholds, thresholds_from_dict
 from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.results.run_report import DriveDetails, TruthFacts, tool_versions
 from pdhef_logtool.runs.error_budget import no_budget
@@ -36,7 +35,7 @@ def standing(difference: Interval | None, rival: str | None = "physics", own: In
 
 
 def details(*standings: Standing, **changes: Any) -> DriveDetails:
-    empty = DriveDetails([], [], standings, [], no_budget("the log contains no ground truth"), [], {})
+    empty = DriveDetails([], [], standings, no_budget("the log contains no ground truth"), [], {})
     return replace(empty, **changes)
 
 
@@ -95,19 +94,6 @@ def test_no_verdict_without_independent_truth_and_why(changes: dict[str, Any], w
 def test_a_truth_that_never_slips_gives_no_verdict() -> None:
     first = verdicts(details(standing(None)), metrics=errors_deg(pd_hef=0.1, zero=1e-6))[0]
     assert first["outcome"] == "none" and "0 throughout" in first["text"]
-
-
-def test_thresholds_of_the_answer_are_named_and_those_of_others_are_not() -> None:
-    table = {"signal": "sideslip_rad", "metric": "rmse", "unit": "deg"}
-    limits = thresholds_from_dict(
-        {"threshold": [{**table, "max": 0.105}, {**table, "metric": "max_abs", "max": 0.05}]}, where="x"
-    )
-    rows = [*METRICS, *(replace(r, metric="max_abs") for r in METRICS)]
-    judged = check_thresholds(limits, rows, log="drive")
-    first = verdicts(details(standing(interval(-0.02, -0.03, -0.01)), limits=judged))[0]
-    assert "within the limit sideslip_rad rmse (all) <= 0.105 deg, which lies within the interval" in first["text"]
-    assert "exceeds the limit sideslip_rad max_abs (all) <= 0.05 deg" in first["text"]
-    assert [x["outcome"] for x in first["limits"]] == ["pass", "fail"]
 
 
 def test_the_other_details_follow_the_schema_and_an_older_report_does_without() -> None:

@@ -11,11 +11,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from pdhef_logtool.evaluation.thresholds import Threshold, Verdict
 from pdhef_logtool.logs.container import Attachment
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.results import run_report as report_module
-from pdhef_logtool.results.junit import junit_bytes
 from pdhef_logtool.results.mcap_sink import _is_our_report
 from pdhef_logtool.results.palette import colour_rgb
 from pdhef_logtool.results.parquet_sink import EstimatesSink, RowGroups
@@ -82,15 +80,6 @@ def test_colours_are_red_green_blue_and_a_names_own() -> None:
     found = [colour_rgb(f"recorded {i}", {"phy-ukf": 0}) for i in range(40)]
     assert set(found) == palette
     assert colour_rgb("recorded 7", {}) == found[7]
-
-
-def test_junit_is_laid_out_for_people_and_a_failure_says_all() -> None:
-    limit = Threshold("sideslip_rad", "rmse", maximum=0.5, unit="deg")
-    verdict = Verdict("a", "zero", limit, "fail", 2.0, -1.5, 10, True, "beyond by 1.5")
-    lines = junit_bytes({"a": [verdict]}).decode().splitlines()
-    assert lines[1].startswith("<testsuites") and lines[3].startswith("    <testcase")
-    said = "a: zero: sideslip_rad rmse (all) &lt;= 0.5 deg: beyond by 1.5"
-    assert lines[4] == f'      <failure message="beyond by 1.5" type="fail">{said}</failure>'
 
 
 def _report(**changes: Any) -> dict[str, Any]:

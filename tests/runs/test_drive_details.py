@@ -1,4 +1,4 @@
-"""What a run writes for the pages: planted faults, verdicts against the limits, and reasons without truth."""
+"""What a run writes for the pages: planted faults, the verdict of a plan, and reasons without truth."""
 
 from __future__ import annotations
 
@@ -25,14 +25,17 @@ def run(log: str, sample_logs_dir: Path, out: Path, **changes: Any) -> dict[str,
 
 
 def test_a_drive_with_truth_has_all_of_it(sample_logs_dir: Path, tmp_path: Path) -> None:
-    limits = tmp_path / "limits.toml"
-    limits.write_text('[[threshold]]\nsignal = "sideslip_rad"\nmetric = "rmse"\nmax = 90.0\nunit = "deg"\n')
-    report = run("road", sample_logs_dir, tmp_path / "out", thresholds=limits, start="+60", end="+130")
+    plan = tmp_path / "plan.toml"
+    plan.write_text('[[requirement]]\nid = "a"\nsignal = "sideslip_rad"\nlimit_deg = 90.0\n')
+    report = run("road", sample_logs_dir, tmp_path / "out", plan=plan, start="+60", end="+130")
     assert [v["signal"] for v in report["verdicts"]] == ["sideslip_rad", "vy_m_s", "yaw_rate_rad_s", "vx_m_s"]
     first = report["verdicts"][0]
     figure = {(m["estimator"], m["signal"], m["metric"], m["segment"]): m["value"] for m in report["metrics"]}
     assert first["rmse"]["value"] == pytest.approx(figure["pd-hef", "sideslip_rad", "rmse", "all"])
-    assert first["rival"] == "physics" and "within the limit" in first["text"]
+    assert first["rival"] == "physics"
+    (judged,) = report["plan"]["requirements"]
+    assert (judged["outcome"], judged["basis"], judged["units"]) == ("PASS", "blocks", 7)
+    assert judged["exposure"]["minutes"] == pytest.approx(62.5 / 60.0, rel=0.02)  # of 70 s
     assert {i["estimator"] for i in report["innovations"]} == {"pd-hef", "physics"}
     assert {i["channel"] for i in report["innovations"]} == {"ay_m_s2", "yaw_rate_rad_s", "speed_m_s"}
     assert report["error_budget"]["reason"] == "" and len(report["error_budget"]["causes"]) == 5

@@ -48,8 +48,8 @@ def test_a_run_never_replaces_what_it_reads(sample_logs_dir: Path, tmp_path: Pat
     folder.mkdir(parents=True)
     recording = folder / "annotated.mcap"
     shutil.copy(log, recording)
-    thresholds = tmp_path / "limits.toml"
-    thresholds.write_text('[[threshold]]\nmetric = "rmse"\nsignal = "sideslip_rad"\nmax = 1.0\n')
+    plan = tmp_path / "plan.toml"
+    plan.write_text('[[requirement]]\nid = "a"\nsignal = "sideslip_rad"\nlimit = 1.0\n')
     (tmp_path / "link").symlink_to(tmp_path / "d")
     (tmp_path / "annotated.mcap").symlink_to(recording)
     before = contents(tmp_path)
@@ -60,8 +60,8 @@ def test_a_run_never_replaces_what_it_reads(sample_logs_dir: Path, tmp_path: Pat
                 act([str(argument)], output, plain)
     with pytest.raises(UsageError, match="would replace the input"):
         run_logs([str(tmp_path / "annotated.mcap")], tmp_path / "d", plain)
-    with pytest.raises(UsageError, match=r"limits\.toml"):
-        run_logs([log], tmp_path / "o", config(sample_logs_dir, thresholds=thresholds), junit=thresholds)
+    with pytest.raises(UsageError, match=r"plan\.toml"):
+        run_logs([log], tmp_path / "o", config(sample_logs_dir, plan=plan), junit=plan)
     assert contents(tmp_path) == before
     assert not (tmp_path / "o").exists()
 
@@ -92,9 +92,8 @@ def test_a_persons_files_and_what_the_run_does_not_write_stay(sample_logs_dir: P
         "notes.txt",
         "recording.rrd",
         "setup.toml",
-    )  # the report of the run depends on the selected estimate alone
-    same = {"report.html", *(f"logs/dlc/{name}" for name in kept)}
-    assert {p for p in after if after[p] == before[p]} == same
+    )
+    assert {p for p in after if after[p] == before[p]} == {f"logs/dlc/{name}" for name in kept}
 
 
 # ------------------------------------------------------------------------------------------- disks that fail

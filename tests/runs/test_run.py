@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -379,12 +380,15 @@ def test_an_annotated_log_holds_the_answer_and_the_recordings_of_a_run_are_one_d
     entries = []
     for name in ("dlc", "step"):
         folder = tmp_path / "logs" / name
-        main = json.loads((folder / "report.json").read_text())["answer"]["main"].replace("-", "_")
+        report = json.loads((folder / "report.json").read_text())
+        tracks = {re.sub(r"\W", "_", e["name"]) for e in report["estimators"] if e["outcome"] == "ran"} | {"truth"}
         with (folder / "annotated.mcap").open("rb") as stream:
             topics = {c.topic for c in make_reader(stream).get_summary().channels.values()}
-        assert topics == {f"/pdhef/{who}/{what}" for who in (main, "truth") for what in ("state", "odometry")}
+        kinds = ("state", "odometry", "plot", "path")
+        assert topics == {f"/pdhef/{track}/{kind}" for track in tracks for kind in kinds} | {"/pdhef/log"}
+        assert (folder / "annotated.mcap").stat().st_size <= (sample_logs_dir / f"{name}.mcap").stat().st_size
         plotted = json.loads((folder / "foxglove.json").read_text())["configById"]["3D!way"]["topics"]
-        assert set(plotted) == {topic for topic in topics if topic.endswith("odometry")}
+        assert set(plotted) == {topic for topic in topics if topic.endswith(("odometry", "path"))}
         entries += RrdReader(folder / "recording.rrd").recordings()
     assert len({entry.application_id for entry in entries}) == 1
     assert len({entry.recording_id for entry in entries}) == 2

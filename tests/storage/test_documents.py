@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from pdhef_logtool.car.car import SHIPPED_CARS, Car, load_intervals
 from pdhef_logtool.car.toml_files import load_vehicle
-from pdhef_logtool.evaluation.thresholds import load_thresholds
+from pdhef_logtool.evaluation.validation_plan import load_plan
 from pdhef_logtool.mapping import Mapping, SignalSource, load_mapping
 from pdhef_logtool.records.errors import PdhefError, UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import DOCUMENT_FILE, SHIPPED_FOLDERS, WEIGHTS_FILE, load_network
@@ -52,7 +52,7 @@ VALID_FIT = {
     "drives": [{"name": "lap", "sha256": "cd", "start_s": 0.0, "end_s": 9.5}],
     "scores": {"lap": {"rmse": 0.2}},
 }
-VALID_THRESHOLDS = {"threshold": [{"signal": "sideslip_rad", "metric": "rmse", "max": 0.5, "unit": "deg"}]}
+VALID_PLAN = {"requirement": [{"id": "SR-1", "signal": "sideslip_rad", "metric": "rmse", "limit_deg": 0.5}]}
 
 
 class Loader(NamedTuple):
@@ -76,7 +76,7 @@ def _part(path: Path) -> object:
 LOADERS = [
     Loader("pdhef.toml", lambda path: load_config(path, {}), VALID_CONFIG),
     Loader("mapping.toml", load_mapping, VALID_MAPPING),
-    Loader("thresholds.toml", load_thresholds, VALID_THRESHOLDS),
+    Loader("plan.toml", load_plan, VALID_PLAN),
     Loader("vehicle.toml", load_vehicle, tomllib.loads((CAR / "vehicle.toml").read_text())),
     Loader("fit.toml", _part, VALID_FIT),
     Loader("noise.toml", _part, tomllib.loads((CAR / "noise.toml").read_text())),
@@ -278,8 +278,12 @@ def test_the_nearest_name_is_told() -> None:
             "[estimates.mine.vy_ms]\ntopic = '/a'",
             "estimates.mine.vy_ms: unknown, did you mean estimates.mine.vy_m_s?",
         ),
-        (LOADERS[2], "[[threshold]]\nmaks = 3", "threshold[0].maks: unknown, did you mean threshold[0].max?"),
-        (LOADERS[2], "[[thresholds]]\nmax = 3", "thresholds: unknown, did you mean threshold?"),
+        (
+            LOADERS[2],
+            "[[requirement]]\nlimits = 3",
+            "requirement[0].limits: unknown, did you mean requirement[0].limit?",
+        ),
+        (LOADERS[2], "[[requirements]]\nlimit = 3", "requirements: unknown, did you mean requirement?"),
         (LOADERS[3], "mass = 1440.0", "mass: unknown, did you mean mass_kg?"),
         (LOADERS[3], "[sensors]\nay_std = 1.0", "sensors.ay_std: unknown, did you mean sensors.ay_std_m_s2?"),
         (LOADERS[3], "[tyres.front]\nD = 1.0", "tyres.front.D: unknown, did you mean tyres.front.D_n?"),

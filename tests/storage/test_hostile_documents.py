@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.car.car import SHIPPED_CARS, Car, load_intervals
-from pdhef_logtool.evaluation.thresholds import load_thresholds
+from pdhef_logtool.evaluation.validation_plan import load_plan
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping.mapping_file import load_mapping
 from pdhef_logtool.records.errors import EXIT_USAGE, LogError, PdhefError, UsageError
@@ -26,7 +26,7 @@ _LOADERS: dict[str, Callable[[Path], Any]] = {
     "mapping.toml": load_mapping,
     "vehicle.toml": Car.load,
     "pdhef.toml": lambda path: load_config(path, {}),
-    "thresholds.toml": load_thresholds,
+    "plan.toml": load_plan,
     "intervals.json": load_intervals,
     "model.json": lambda path: load_network(path.parent, "residual"),
     "linear_regression.json": load_linear_model,
@@ -112,13 +112,13 @@ def test_anchors_of_anchors_are_not_written_out(tmp_path: Path, key: str) -> Non
 
 
 def test_a_dbc_that_is_none_is_a_wrong_mapping(tmp_path: Path) -> None:
-    from pdhef_logtool.mapping.can_frames import _load_dbc
+    from pdhef_logtool.logs.can_decoding import load_dbc
 
     (tmp_path / "folder.dbc").mkdir()
     (tmp_path / "text.dbc").write_text("no DBC")
     for name in ("folder.dbc", "text.dbc", "none.dbc"):
         with pytest.raises(PdhefError) as caught:
-            _load_dbc(tmp_path / name)
+            load_dbc(tmp_path / name)
         assert caught.value.exit_code == EXIT_USAGE
 
 

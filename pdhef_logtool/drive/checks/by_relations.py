@@ -5,7 +5,7 @@ Where they contradict one another, the smallest mistake that explains all of the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -22,6 +22,13 @@ from pdhef_logtool.drive.relations import (
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import GNSS
 
+_LACKS_WHEELBASE = "needs the wheelbase of a vehicle file, or speeds that only full-size vehicles reach"
+_LACKS_SIDESLIP = "needs sideslip that changes fast"
+#: What a drive lacks that shows the sign of a signal and not its unit.
+_LACKS_FOR_UNIT = {
+    **dict.fromkeys(("steer_rad", "steering_wheel_rad"), _LACKS_WHEELBASE),
+    **dict.fromkeys(("truth.vy_m_s", "truth.sideslip_rad"), _LACKS_SIDESLIP),
+}
 _LACKS = {
     "ax_m_s2": "speeding up and braking, on straights",
     "speed_m_s": "a wheel speed, an accelerometer or ground truth to compare with, and speeding up or bends",
@@ -41,12 +48,22 @@ def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int 
     if chosen is None or len(chosen) > most or not all(m.is_exact for m in chosen):
         return {}
     bad = [r for r in relations if r.tells and not r.accepts()]
+    if all(r.is_near for r in bad):
+        return {}
     factor_by_name = {}
     for mistake in chosen:
         for name, factor in mistake.factors.items():
             evidence = next((r.evidence for r in bad if name in r.powers), "")
             factor_by_name[name] = (factor, f"{mistake.words}: {evidence}")
     return factor_by_name
+
+
+def is_wrong_by(measured: Measured, name: str, factor: float) -> bool | None:
+    """Return whether the relations of a signal that count are plausible after a factor and not before; None: none."""
+    mine = [r for r in measured.relations if name in r.powers and r.tells]
+    if not mine:
+        return None
+    return all(r.accepts(factor ** r.powers[name]) for r in mine) and not all(r.accepts() for r in mine)
 
 
 def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Check, ...]:
@@ -59,15 +76,25 @@ def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Che
         names.remove("truth.vy_m_s")
     explanations = smallest_explanations(relations, known_mistakes(list(columns), groups))
     likeliest, others = _mistakes_by_signal(explanations)
-    explained = _Explained(likeliest, others, bool(explanations), set() if explanations else contradicting(relations))
+    culprits = set() if explanations else contradicting(relations)
+    explained = _Explained(likeliest, others, bool(explanations), culprits, measured.scales)
     checks: list[Check] = []
     for name in names:
-        mine = [r for r in relations if name in r.powers]
+        # A wheel that contradicts others does so through the mean of the wheels, which is the speed.
+        blamed = culprits | likeliest.keys() | others.keys()
+        through = WHEEL_SPEEDS if name in blamed and name.startswith("wheel_speed_") else name
+        mine = [r for r in relations if name in r.powers or through in r.powers]
         unrelated = [r for r in mine if r.unrelated and not _is_cleared(name, r, relations)]
-        judged = _judged(name, [r for r in mine if r.tells], explained)
+        judged = _judged(name, _of(name, [r for r in mine if r.tells]), explained)
         checks += [_unrelated(name, r) for r in unrelated[:1]]
         checks += judged or ([] if unrelated else [_not_excited(name, mine)])
     return tuple(checks)
+
+
+def _of(name: str, relations: list[Relation]) -> list[Relation]:
+    """Return the relations without those of a wheel to the mean of the wheels, if others are left."""
+    others = [r for r in relations if not {name, WHEEL_SPEEDS} >= set(r.powers)]
+    return others if others and any(not r.accepts() for r in others) else relations
 
 
 class _Explained(NamedTuple):
@@ -77,20 +104,29 @@ class _Explained(NamedTuple):
     others: Mapping[str, list[Mistake]]
     is_explained: bool
     culprits: set[str]
+    scales: Mapping[str, float | tuple[float, ...]]
+
+    def scale(self, name: str, factor: float) -> str:
+        """Return the line of the mapping that multiplies the scale of a signal by a factor; empty if not known."""
+        scale = self.scales.get(name)
+        return "" if scale is None or isinstance(scale, tuple) else f"scale = {scale * factor:.6g}"
 
 
 def _judged(name: str, relations: Sequence[Relation], explained: _Explained) -> list[Check]:
     """Return sign and unit checks of a signal by the relations that count; empty without any."""
     bad, good = ([r for r in relations if r.accepts() is accepted] for accepted in (False, True))
     if name in explained.likeliest or name in explained.others:
-        failed = _failed(name, explained.likeliest.get(name) or explained.others[name], bad or good)
+        failed = _failed(name, explained.likeliest.get(name) or explained.others[name], bad or good, explained.scale)
         is_sure = name in explained.likeliest and not (bad and all(r.is_vague for r in bad))
         return failed if is_sure else [replace(c, verdict="undecided") for c in failed]
-    if name in explained.culprits:
+    if name in explained.culprits and bad:
         return [_unexplained(name, bad)]
     if good or (bad and explained.is_explained):
         usable = relations if explained.is_explained else good
         best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
+        lacks = _LACKS_FOR_UNIT.get(name)
+        if explained.is_explained and lacks and not any(r.decides_unit for r in usable):
+            return [SIGN.passed(best.evidence, name), UNIT.undecided(best.evidence, name, lacks)]
         return [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
     return [_contradicted(name, bad[0], explained.culprits)] if bad else []
 
@@ -157,15 +193,21 @@ def _unrelated(name: str, relation: Relation) -> Check:
     return AXIS.failed(evidence, name, signal_name=name)
 
 
-def _failed(name: str, mistakes: Sequence[Mistake], relations: Sequence[Relation]) -> list[Check]:
+def _failed(
+    name: str, mistakes: Sequence[Mistake], relations: Sequence[Relation], scale: Callable[[str, float], str]
+) -> list[Check]:
     kinds = {m.kind for m in mistakes}
     wrong = [c for a, c in (("sign", SIGN), ("unit", UNIT)) if any(a in k for k in kinds)]
-    words = " or ".join(dict.fromkeys(m.words for m in mistakes))
     evidence = "; ".join(r.evidence for r in relations[:2])
-    factors = {f for m in mistakes if (f := m.factors.get(name)) is not None}
-    remedy = f"perhaps {words}"
+    factors = list(dict.fromkeys(f for m in mistakes if (f := m.factors.get(name)) is not None))
     if len(factors) == 1:
-        remedy += f": multiply its scale in the mapping by {factors.pop():.6g}"
+        line = scale(name, factors[0])
+        words = " or ".join(dict.fromkeys(m.words for m in mistakes))
+        times = f"multiply its scale in the mapping by {factors[0]:.6g}"
+        remedy = f"perhaps {words}: {times}" + (f", {line}" if line else "")
+    else:
+        lines = [f" ({line})" if (line := scale(name, m.factors[name])) else "" for m in mistakes]
+        remedy = "perhaps " + " or ".join(f"{m.words}{line}" for m, line in zip(mistakes, lines, strict=True))
     return [kind.failed(evidence, name, remedy=remedy) for kind in wrong]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray
 
 #: A figure of a fit counts from this many standard errors on.
 SURE = 4.0
+#: Blocks of a drive that errors are estimated from; fewer say nothing of them.
+LEAST_BLOCKS, MOST_BLOCKS = 4, 10
 
 
 def fit(
@@ -35,4 +38,21 @@ def fit(
     coefficients = np.linalg.lstsq(a / scale, b, rcond=None)[0] / scale
     spread = float(np.sqrt(np.mean((b - a @ coefficients) ** 2) * samples / (samples - len(regressors))))
     covariance = np.linalg.inv(a.T @ a / a.shape[0]) * spread**2 / samples
-    return coefficients, np.sqrt(np.diag(covariance)), spread
+    errors = np.maximum(np.sqrt(np.diag(covariance)), _block_errors(a / scale, b, samples) / scale)
+    return coefficients, errors, spread
+
+
+def _block_errors(a: FloatArray, b: FloatArray, samples: float) -> FloatArray:
+    """Return the jackknife's standard errors of a regression over blocks of the drive; 0 with too few samples.
+
+    What is left is not noise: grade, crossfall, roll and sliding last as long as a bend does.
+    """
+    count = min(MOST_BLOCKS, int(samples // (2.0 * a.shape[1])))
+    if count < LEAST_BLOCKS:
+        return np.zeros(a.shape[1])
+    edges = np.linspace(0, a.shape[0], count + 1).astype(int)
+    squares = [a[i:j].T @ a[i:j] for i, j in pairwise(edges)]
+    products = [a[i:j].T @ b[i:j] for i, j in pairwise(edges)]
+    square, product = sum(squares), sum(products)
+    without = [np.linalg.lstsq(square - s, product - p, rcond=None)[0] for s, p in zip(squares, products, strict=True)]
+    return np.asarray(np.std(without, axis=0) * np.sqrt(count - 1.0))

@@ -19,6 +19,7 @@ LEVEL_M_S2 = 0.8
 OTHER_AXIS_M_S2 = 5.0
 #: Independent samples of gentle driving from which on a mean is a tilt or a bias, and no manoeuvre: 10 s.
 LEVEL_SAMPLES = 20.0
+GRAVITY_ALONE_M_S2 = 0.75 * GRAVITY_M_S2
 
 
 def _levels(drive: CheckedDrive) -> Iterator[Check]:
@@ -38,15 +39,19 @@ def _levels(drive: CheckedDrive) -> Iterator[Check]:
             driven = yaw * speed
         rest = columns[name] - driven
         finite = np.isfinite(rest)
+        is_known = speed is not None and yaw is not None and bool(np.nanstd(yaw) > 0.0)
         if independent_samples(int(np.count_nonzero(finite))) < 6.0:
-            rest, finite = columns[name], np.isfinite(columns[name])
+            rest, finite, is_known = columns[name], np.isfinite(columns[name]), False
         if independent_samples(int(np.count_nonzero(finite))) < 2.0:
             continue
         is_gentle_enough = independent_samples(int(np.count_nonzero(finite & at_ease))) >= LEVEL_SAMPLES
         use = finite & at_ease if is_gentle_enough else finite
         bias = sensors.ax_bias_m_s2 if name == "ax_m_s2" else sensors.ay_bias_m_s2
         check = _level(name, float(np.mean(rest[use])) - bias, float(np.mean(columns[name][use])) - bias)
-        if (driving_is_known and is_gentle_enough) or check.name == f"{name}.axis":
+        # A drive in circles has a mean too: without the yaw rate and the speed only all of gravity is gravity.
+        is_known |= name == "ax_m_s2" and speed is not None
+        is_gravity = is_known or abs(float(np.mean(rest[use]))) > GRAVITY_ALONE_M_S2
+        if (driving_is_known and is_known and is_gentle_enough) or (check.name == f"{name}.axis" and is_gravity):
             yield check
 
 

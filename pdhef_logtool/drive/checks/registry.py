@@ -14,6 +14,7 @@ MODULES = (
     "fault",
     "mounting",
     "by_relations",
+    "magnitude",
     "level",
     "truth_sideslip",
     "sensor_errors",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.checks.by_relations import relation_checks
@@ -16,6 +17,8 @@ from pdhef_logtool.drive.truth import LatencyEstimate, TruthTrack
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import Channel
 
+#: Aspects whose failure means that a channel is not the signal that it is mapped to.
+_MISREAD = frozenset({"sign", "unit", "axis", "mounting", "magnitude"})
 _BADNESS = {"passed": 0, "undecided": 1, "failed": 2}
 
 
@@ -55,14 +58,26 @@ def check_drive(
         )
         return _all_checks(drive)
 
-    checks = checks_of(measure(signals, truth, derived) if measured is None else measured)
+    checks = checks_of(measure(signals, truth, derived, vehicle) if measured is None else measured)
     if all(check.verdict != "failed" for check in checks):
         return checks
     sound, shares = without_faulty_samples(signals, vehicle or default_vehicle())
     if not shares:
         return checks
     faults = (fault_check(name, share) for name, share in shares.items())
-    return (*(c for c in faults if c.verdict == "failed"), *checks_of(measure(sound, truth, derived)))
+    again = measure(sound, truth, derived, vehicle)
+    again = again if measured is None else replace(again, scales=measured.scales)
+    return (*(c for c in faults if c.verdict == "failed"), *checks_of(again))
+
+
+def misread_channels(checks: Sequence[Check], waived: Sequence[str] = ()) -> dict[str, str]:
+    """Return by subject why nothing may be computed from it: a failed check that no one has waived, and its remedy."""
+    found: dict[str, str] = {}
+    for check in checks:
+        subject, _, aspect = check.name.rpartition(".")
+        if check.verdict == "failed" and aspect in _MISREAD and check.name not in waived:
+            found.setdefault(subject, f"check {check.name} failed: {check.remedy}")
+    return found
 
 
 def _all_checks(drive: CheckedDrive) -> tuple[Check, ...]:

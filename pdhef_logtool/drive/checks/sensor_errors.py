@@ -17,6 +17,8 @@ from pdhef_logtool.records.signals import FloatArray
 
 #: Plausible gain of an accelerometer in lateral acceleration: roll adds 10 %, banked bends take 25 %.
 AY_GAIN_RANGE = (0.65, 1.3)
+#: Crossfall alone moves an accelerometer by half a metre per second squared.
+LEAST_LATERAL_M_S2 = 0.7
 #: Production gyros have a gain error of 1 %, cheap ones of 3 %.
 GAIN_ERROR = 0.05
 #: A sensor's filter and a bus take 10 to 20 ms; at 0.5 Hz, 30 ms are 5 degrees of phase.
@@ -146,6 +148,9 @@ def _ay_gain(drive: CheckedDrive) -> Iterator[Check]:
         return
     gain, error = errors.ay_gain, errors.ay_gain_error
     low, high = AY_GAIN_RANGE
+    lateral = drive.measured.columns["truth.vx_m_s"] * drive.measured.columns["truth.yaw_rate_rad_s"]
+    if not np.nanstd(lateral) > LEAST_LATERAL_M_S2:
+        return
     evidence = f"a_y reads {gain:.2f} +- {error:.2f} of the ground-truth lateral acceleration, with roll and bank"
     if gain + SURE * error < low or gain - SURE * error > high:
         yield AY_GAIN.failed(evidence, gain=gain)

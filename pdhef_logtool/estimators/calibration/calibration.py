@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.parts import LIMIT_GAIN, FilterNoise
 from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
@@ -125,7 +125,8 @@ class SelfCalibration:
     @property
     def noise(self) -> FilterNoise:
         """The noise of ``physics`` that belongs to it."""
-        return FilterNoise(q_std=Q_STD, r_std={"ay_m_s2": max(AY_STD, self.vehicle_file.sensors.ay_std_m_s2)})
+        ay_std = max(AY_STD, self.vehicle_file.sensors.ay_std_m_s2)
+        return FilterNoise(q_std=Q_STD, r_std={"ay_m_s2": ay_std}, limit_gain=LIMIT_GAIN)
 
     @property
     def text(self) -> str:

@@ -70,7 +70,7 @@ class DrivingReader:
         """Take the next window."""
         if not len(signals):
             return
-        signals, self._slip = believable(signals, self._vehicle.sensors.speed_std_m_s, self._slip, gate=True)
+        signals, self._slip = believable(signals, self._vehicle.sensors, self._slip, gate=True)
         if self._open is not None:
             signals = join_signals([self._open, signals])
         if self._start_ns is None:

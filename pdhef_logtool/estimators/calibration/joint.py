@@ -54,10 +54,10 @@ SHARED_SHARE = 0.2
 BLOCK_S = 3.0
 ITERATIONS, DERIVATIVE_STEP, MAX_STEP, LEAST_GAIN = 40, 0.02, 1.0, 1e-3
 #: Parts of ``physics`` on a calibrated car; on simulated cars with wrong files the lowest sideslip error.
-PARTS = ("lag", "roll")
+PARTS = ("lag", "roll", "bank")
 #: Cornering stiffness over axle load of any car, 1/rad, front and rear, and the standard deviations of the logarithm
-#: about it and about the file's value.
-USUAL_STIFFNESS, USUAL_STIFFNESS_STD, FILE_STIFFNESS_STD = (14.0, 15.0), 0.4, 0.5
+#: about it and about the file's value. The compliance of the steering makes front axles softer.
+USUAL_STIFFNESS, USUAL_STIFFNESS_STD, FILE_STIFFNESS_STD = (13.5, 18.0), 0.35, 0.5
 #: Usual share of gravity in a_y by body roll, rad/(m/s²), where the file has none (3 degrees per g).
 USUAL_ROLL_GRADIENT = 0.005
 

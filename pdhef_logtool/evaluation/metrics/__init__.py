@@ -1,4 +1,4 @@
-"""Metrics: each is registered by one file, from which files, terminal, pages, thresholds and documentation derive it.
+"""Metrics: each is registered by one file, from which files, terminal, pages, plans and documentation derive it.
 
 A new metric is a file that exports ``METRICS`` (:class:`~.metric.Metric`) and its name in ``MODULES`` of
 :mod:`~.registry`. ``interval_width.py`` would be::

@@ -7,7 +7,7 @@ import numpy as np
 from pdhef_logtool.evaluation.blocks import ErrorSums
 from pdhef_logtool.evaluation.metrics.metric import Figure, Metric, OfSignal, Reference, SignalBlock
 from pdhef_logtool.evaluation.track_errors import selected
-from pdhef_logtool.records.signals import BoolArray, FloatArray
+from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.records.tracks import StateTrack
 
 
@@ -53,13 +53,6 @@ class _TruthSquares:
             sums = {s: float(np.sum(selected(values, mask & block.scored) ** 2)) for s, mask in block.inside.items()}
             self._found[key] = cached = block.scored, sums
         return cached[1]
-
-
-def summarise_errors(error: FloatArray) -> dict[str, float]:
-    """Return rmse, mae, bias, p95_abs and max_abs of finite errors [N], N ≥ 1."""
-    sums = ErrorSums(len(error))
-    sums.add(error)
-    return sums.figures()
 
 
 _FUNCTION = OfSignal(_Errors)

@@ -48,7 +48,7 @@ class Metric:
 
     Attributes
     ----------
-    name : in metrics.parquet, thresholds and gates.
+    name : in metrics.parquet and plans.
     label : head of a column, without the unit.
     definition : one or two sentences for the documentation and for pages.
     function : computes the figures; metrics that share a computation share the function. None: the scoring sets it.

@@ -23,6 +23,7 @@ MODULES = (
     "residual_active",
     "reference",
     "sensor_residuals",
+    "exposure",
     "independence",
 )
 

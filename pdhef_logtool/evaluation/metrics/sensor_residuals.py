@@ -9,7 +9,7 @@ import numpy as np
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.evaluation.blocks import SegmentSums, blocks_with_halo, median_step_ns, packed
 from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, OfDrive
-from pdhef_logtool.evaluation.segments import reach_rows, smooth
+from pdhef_logtool.evaluation.smoothing import reach_rows, smooth
 from pdhef_logtool.evaluation.units import SIGNALS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.filter_base import PosteriorSteps
-from pdhef_logtool.evaluation.segments import smooth
+from pdhef_logtool.evaluation.smoothing import smooth
 from pdhef_logtool.learning.car.fit_data import FitDrive, period_s
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray

@@ -80,7 +80,7 @@ RECORD_FILE, PAGE_FILE, CAR_FOLDER, ROLES_FILE, SEEN_FILE = (
 #: The estimator that follows the network; what runs beside it, and whose intervals are fitted.
 HYBRID, BESIDE = "pd-hef", ("physics", "zero")
 CALIBRATED = (HYBRID, "pd-hef-smoothed", "physics")
-#: Without a gate.toml: the error of the hybrid filter over the whole drive may grow by so much.
+#: Without a plan: the error of the hybrid filter over the whole drive may grow by so much.
 DEFAULT_LIMIT = 0.02
 DEFAULT_GATE = Gate((Figure(estimator=HYBRID, limit=DEFAULT_LIMIT),))
 #: Digits of a network's hash that name its folder.

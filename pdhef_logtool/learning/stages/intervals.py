@@ -18,7 +18,8 @@ from pdhef_logtool.estimators.error_features import error_terms
 from pdhef_logtool.estimators.intervals import yaw_rate_terms
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, runnable
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, smooth
+from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ
+from pdhef_logtool.evaluation.smoothing import smooth
 from pdhef_logtool.learning.drives import INTERVALS, DriveRecord, load_drive
 from pdhef_logtool.learning.evidence.calibrate import (
     COVERED,

@@ -3,7 +3,7 @@
 (function () {
   const page = JSON.parse(document.getElementById("document").textContent);
   const GAP = 65535;
-  const INK = "#1a1a1a", GRID = "#e3e6ea", FAINT = "#8a93a0";
+  let INK, GRID, FAINT, PAGE, STRIPE, dark;
   const FONT = '11px system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", Arial, sans-serif';
   const AXIS_WIDTH = 118;
   const PRINT_WIDTH = 690;
@@ -12,6 +12,22 @@
   const shownGroups = new Set();
   let range = null; // seconds of what is zoomed to; null: the whole drive
   let printing = false;
+
+  // ---- colours ----------------------------------------------------------------------------------------------------
+
+  /** Read the colours of the page's style: light, dark, or those of paper. */
+  function readColours() {
+    const style = getComputedStyle(document.documentElement);
+    [INK, GRID, FAINT, PAGE, STRIPE] = ["ink", "grid", "faint", "page", "stripe"].map((n) => style.getPropertyValue("--" + n).trim());
+    dark = !printing && matchMedia("(prefers-color-scheme: dark)").matches;
+  }
+
+  /** A colour of the data, lighter on a dark page; alpha: translucent. */
+  function tint(colour, alpha) {
+    const n = parseInt(colour.slice(1), 16), share = dark ? (n < 0x303030 ? 0.85 : 0.4) : 0;
+    const [r, g, b] = [n >> 16, (n >> 8) & 255, n & 255].map((c) => Math.round(c + share * (255 - c)));
+    return `rgba(${r},${g},${b},${alpha === undefined ? 1 : alpha})`;
+  }
 
   // ---- series -----------------------------------------------------------------------------------------------------
 
@@ -30,10 +46,9 @@
     return decoded.get(series.block);
   }
 
-  async function decodeNow(series) {
-    const stream = new Blob([bytesOf(series.block)]).stream().pipeThrough(new DecompressionStream("deflate"));
-    const planes = new Uint8Array(await new Response(stream).arrayBuffer());
+  function decodeNow(series) {
     const n = series.count;
+    const planes = inflate(bytesOf(series.block), 2 * n);
     const values = new Array(n);
     let q = 0;
     for (let i = 0; i < n; i++) {
@@ -42,6 +57,79 @@
       values[i] = q === GAP ? null : series.low + series.step * q;
     }
     return values;
+  }
+
+  // RFC 1950 and 1951: browsers inflate only asynchronously, after the page has been shown without figures.
+  const LENGTHS = Array.from({ length: 29 }, (_, i) => (i < 8 ? [3 + i, 0] : i === 28 ? [258, 0] : [3 + ((4 + (i & 3)) << ((i >> 2) - 1)), (i >> 2) - 1]));
+  const DISTANCES = Array.from({ length: 30 }, (_, i) => (i < 4 ? [1 + i, 0] : [1 + ((2 + (i & 1)) << ((i >> 1) - 1)), (i >> 1) - 1]));
+  const ORDER = [16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15];
+
+  /** Canonical Huffman code: how many codes of each length, and the symbols in the order of their codes. */
+  function huffman(lengths) {
+    const counts = new Uint16Array(16), next = new Uint16Array(16), symbols = new Uint16Array(lengths.length);
+    for (const l of lengths) counts[l]++;
+    counts[0] = 0;
+    for (let l = 1; l < 16; l++) next[l] = next[l - 1] + counts[l - 1];
+    lengths.forEach((l, symbol) => { if (l) symbols[next[l]++] = symbol; });
+    return { counts, symbols };
+  }
+
+  function inflate(bytes, size) {
+    const out = new Uint8Array(size);
+    let from = 2, held = 0, count = 0, to = 0, last = false;
+    const bits = (n) => {
+      while (count < n) { held |= bytes[from++] << count; count += 8; }
+      const value = held & ((1 << n) - 1);
+      held >>>= n;
+      count -= n;
+      return value;
+    };
+    const symbol = ({ counts, symbols }) => {
+      let code = 0, first = 0, place = 0;
+      for (let l = 1; l < 16; l++) {
+        code |= bits(1);
+        if (code - first < counts[l]) return symbols[place + code - first];
+        place += counts[l];
+        first = (first + counts[l]) << 1;
+        code <<= 1;
+      }
+      throw new Error("a damaged series");
+    };
+    while (!last) {
+      last = bits(1) === 1;
+      const kind = bits(2);
+      if (kind === 0) {
+        held = count = 0;
+        const length = bytes[from] | (bytes[from + 1] << 8);
+        out.set(bytes.subarray(from + 4, from + 4 + length), to);
+        from += 4 + length;
+        to += length;
+        continue;
+      }
+      let literals, distances;
+      if (kind === 1) {
+        literals = huffman(Array.from({ length: 288 }, (_, i) => (i < 144 ? 8 : i < 256 ? 9 : i < 280 ? 7 : 8)));
+        distances = huffman(new Array(30).fill(5));
+      } else {
+        const known = bits(5) + 257, ways = bits(5) + 1, used = bits(4) + 4, sizes = new Array(19).fill(0), all = [];
+        for (let i = 0; i < used; i++) sizes[ORDER[i]] = bits(3);
+        const code = huffman(sizes);
+        while (all.length < known + ways) {
+          const s = symbol(code);
+          if (s < 16) all.push(s);
+          else for (let k = s === 16 ? 3 + bits(2) : s === 17 ? 3 + bits(3) : 11 + bits(7), v = s === 16 ? all[all.length - 1] : 0; k > 0; k--) all.push(v);
+        }
+        literals = huffman(all.slice(0, known));
+        distances = huffman(all.slice(known));
+      }
+      for (let s = symbol(literals); s !== 256; s = symbol(literals)) {
+        if (s < 256) { out[to++] = s; continue; }
+        const [length, more] = LENGTHS[s - 257], total = length + bits(more);
+        const [way, further] = DISTANCES[symbol(distances)], back = way + bits(further);
+        for (let k = 0; k < total; k++, to++) out[to] = out[to - back];
+      }
+    }
+    return out;
   }
 
   /** Values on the figure's own instants: two a cell. */
@@ -93,14 +181,22 @@
     const canvas = element("canvas", parent);
     canvas.width = 52;
     canvas.height = 18;
+    canvas.setAttribute("aria-hidden", "true");
+    swatches.push(() => paintSwatch(canvas, item, isBand));
+    paintSwatch(canvas, item, isBand);
+  }
+
+  const swatches = [];
+
+  function paintSwatch(canvas, item, isBand) {
     const pen = canvas.getContext("2d");
+    pen.clearRect(0, 0, 52, 18);
     if (isBand) {
-      pen.fillStyle = item.colour;
-      pen.globalAlpha = 0.2;
+      pen.fillStyle = tint(item.colour, 0.3);
       pen.fillRect(0, 0, 52, 18);
       return;
     }
-    pen.strokeStyle = pen.fillStyle = item.colour;
+    pen.strokeStyle = pen.fillStyle = tint(item.colour);
     if (item.width === undefined && !item.line) {
       pen.beginPath();
       pen.arc(26, 9, 6, 0, 7);
@@ -126,7 +222,7 @@
 
   function axis(label, more) {
     return Object.assign(
-      { font: FONT, labelFont: FONT, stroke: INK, grid: { stroke: GRID, width: 1 }, ticks: { stroke: FAINT, width: 1, size: 4 },
+      { font: FONT, labelFont: FONT, stroke: () => INK, grid: { stroke: () => GRID, width: 1 }, ticks: { stroke: () => FAINT, width: 1, size: 4 },
         label, labelSize: label ? 18 : 0, labelGap: 0, gap: 3 },
       more || {},
     );
@@ -134,7 +230,8 @@
 
   function timeAxis(label) {
     return axis(label, { size: 24, values: (u, splits, i, space, step) => splits.map((s) => {
-      const digits = step >= 1 ? 0 : step >= 0.1 ? 1 : step >= 0.01 ? 2 : 3;
+      let digits = 0;
+      while (digits < 4 && Math.abs(step * 10 ** digits - Math.round(step * 10 ** digits)) > 1e-6) digits++;
       return s.toFixed(digits);
     }) });
   }
@@ -143,7 +240,7 @@
   function valueAxis(log) {
     const whole = (u, splits) => splits.map((v) => (log && Math.abs(Math.log10(v) % 1) > 1e-9 ? null : v));
     const line = { filter: whole };
-    return axis("", { size: AXIS_WIDTH, space: 24, filter: whole, grid: { stroke: GRID, width: 1, ...line }, ticks: { stroke: FAINT, width: 1, size: 4, ...line } });
+    return axis("", { size: AXIS_WIDTH, space: 24, filter: whole, grid: { stroke: () => GRID, width: 1, ...line }, ticks: { stroke: () => FAINT, width: 1, size: 4, ...line } });
   }
 
   function widthOf(figure) {
@@ -162,7 +259,7 @@
     return !item.group || shownGroups.has(item.group);
   }
 
-  async function drawTime(figure) {
+  function drawTime(figure) {
     const { data: spec } = figure;
     const nothing = new Array(2 * page.time.cells).fill(null);
     const columns = [instantsOf()];
@@ -176,15 +273,15 @@
         columns.push(nothing);
         series.push({ scale: "y", show: false, auto: false, stroke: "transparent", width: 0, points: { show: false } });
       }
-      bands.push({ series: [at + 1, at], fill: translucent(band.colour, 0.2) });
+      bands.push({ series: [at + 1, at], fill: () => tint(band.colour, 0.2) });
     }
     for (const line of spec.series) {
       figure.items.push({ item: line, at: columns.length, parts: [line.data] });
       columns.push(nothing);
-      series.push({ scale: "y", show: false, stroke: line.colour, width: line.width, dash: line.dash, points: { show: false } });
+      series.push({ scale: "y", show: false, stroke: () => tint(line.colour), width: line.width, dash: line.dash, points: { show: false } });
     }
     figure.columns = columns;
-    await fill(figure);
+    fill(figure);
     for (const one of figure.items) for (let k = 0; k < one.parts.length; k++) series[one.at + k].show = isShown(one.item);
     const yScale = spec.log ? { distr: 3, log: 10 } : { range: (u, low, high) => yRange(low, high, spec.level) };
     figure.chart = new uPlot({
@@ -200,10 +297,10 @@
     relabel(figure);
   }
 
-  async function fill(figure) {
+  function fill(figure) {
     for (const one of figure.items) {
       if (!isShown(one.item) || one.filled) continue;
-      for (let k = 0; k < one.parts.length; k++) figure.columns[one.at + k] = onGrid(await decode(one.parts[k]));
+      for (let k = 0; k < one.parts.length; k++) figure.columns[one.at + k] = onGrid(decode(one.parts[k]));
       one.filled = true;
     }
   }
@@ -213,11 +310,6 @@
     if (level !== null && level !== undefined) { low = Math.min(low, level); high = Math.max(high, level); }
     const room = 0.06 * (high - low) || 0.1 * Math.abs(high) || 1;
     return [low >= 0 && low - room < 0 ? 0 : low - room, high + room];
-  }
-
-  function translucent(colour, alpha) {
-    const n = parseInt(colour.slice(1), 16);
-    return `rgba(${n >> 16},${(n >> 8) & 255},${n & 255},${alpha})`;
   }
 
   function drawLevel(u, level) {
@@ -250,7 +342,7 @@
       const y = Math.max(top + 8 * r, Math.min(top + height - 8 * r, u.valToPos(marks[i].value, "y", true)));
       pen.beginPath();
       pen.arc(x, y, 7 * r, 0, 7);
-      pen.fillStyle = "#fff";
+      pen.fillStyle = PAGE;
       pen.fill();
       pen.lineWidth = 1.2 * r;
       pen.strokeStyle = pen.fillStyle = INK;
@@ -308,8 +400,8 @@
     pen.clip();
     const tall = height / rows.length;
     rows.forEach((row, i) => {
-      if (i % 2) { pen.fillStyle = "#f6f7f9"; pen.fillRect(left, top + i * tall, width, tall); }
-      pen.fillStyle = row.colour;
+      if (i % 2) { pen.fillStyle = STRIPE; pen.fillRect(left, top + i * tall, width, tall); }
+      pen.fillStyle = tint(row.colour);
       for (const [start, end] of row.spans) {
         const a = u.valToPos(start, "x", true), b = u.valToPos(end, "x", true);
         if (b < left || a > left + width) continue;
@@ -357,13 +449,28 @@
     }
   }
 
+  /** Zoom by the keyboard: + and -, arrows move, Home and 0 show the whole drive. */
+  function keyed(event) {
+    const [first, last] = whole(), [low, high] = range || [first, last], span = high - low, middle = (low + high) / 2;
+    const to = {
+      "+": [middle - span / 4, middle + span / 4], "=": [middle - span / 4, middle + span / 4],
+      "-": [middle - span, middle + span],
+      ArrowLeft: [Math.max(first, low - span / 4), Math.max(first + span, high - span / 4)],
+      ArrowRight: [Math.min(last - span, low + span / 4), Math.min(last, high + span / 4)],
+      Home: null, 0: null,
+    }[event.key];
+    if (to === undefined || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    zoomTo(to && to[1] - to[0] < last - first ? to : null);
+  }
+
   // ---- points, intervals, bars ------------------------------------------------------------------------------------
 
-  async function drawPoints(figure) {
+  function drawPoints(figure) {
     const spec = figure.data;
     const clouds = [];
     for (const cloud of spec.clouds) {
-      clouds.push({ cloud, x: await decode(cloud.x), y: await decode(cloud.y), at: cloud.at ? await decode(cloud.at) : null });
+      clouds.push({ cloud, x: decode(cloud.x), y: decode(cloud.y), at: cloud.at ? decode(cloud.at) : null });
     }
     figure.follows = clouds.some((c) => c.at);
     const [left, right] = extent(clouds.map((c) => c.x), spec.log), [low, high] = extent(clouds.map((c) => c.y), spec.log);
@@ -409,7 +516,7 @@
     const kx = width / (sx.max - sx.min), ky = height / (sy.max - sy.min);
     const px = (v) => (linear ? left + (v - sx.min) * kx : u.valToPos(v, "x", true));
     const py = (v) => (linear ? top + height - (v - sy.min) * ky : u.valToPos(v, "y", true));
-    pen.strokeStyle = pen.fillStyle = cloud.colour;
+    pen.strokeStyle = pen.fillStyle = tint(cloud.colour);
     if (cloud.line) {
       pen.lineWidth = 1.5 * r;
       pen.lineJoin = "round";
@@ -467,7 +574,7 @@
     intervals.forEach((one, i) => {
       const y = top + ((i + 0.5) * height) / intervals.length;
       const [a, m, b] = one.of.map((v) => (v === null ? null : u.valToPos(v, "x", true)));
-      pen.strokeStyle = pen.fillStyle = one.colour;
+      pen.strokeStyle = pen.fillStyle = tint(one.colour);
       pen.lineWidth = 2 * r;
       if (a !== null && b !== null) {
         pen.beginPath();
@@ -496,7 +603,7 @@
       cursor: { show: false },
       hooks: { draw: [(u) => {
         u.ctx.save();
-        u.ctx.fillStyle = colour;
+        u.ctx.fillStyle = tint(colour);
         counts.forEach((count, i) => {
           const a = u.valToPos(edges[i], "x", true), b = u.valToPos(edges[i + 1], "x", true);
           const y = u.valToPos(count, "y", true);
@@ -522,15 +629,15 @@
       const box = element("input", label);
       box.type = "checkbox";
       label.append(" " + group + " ");
-      box.addEventListener("change", async () => {
+      box.addEventListener("change", () => {
         if (box.checked) shownGroups.add(group); else shownGroups.delete(group);
-        for (const figure of timed) if (figure.items) await refill(figure);
+        for (const figure of timed) if (figure.items) refill(figure);
       });
     }
   }
 
-  async function refill(figure) {
-    await fill(figure);
+  function refill(figure) {
+    fill(figure);
     const u = figure.chart, [low, high] = range || whole();
     u.batch(() => {
       u.setData(figure.columns, false);
@@ -548,15 +655,18 @@
     }
   }
 
-  async function start() {
+  function start() {
+    readColours();
     for (const node of document.querySelectorAll("[data-figure]")) {
       const data = page.figures[node.dataset.figure];
       const figure = { data, place: node.querySelector(".canvas"), legend: node.querySelector(".legend") };
+      figure.place.setAttribute("role", "img");
+      if (data.kind === "time" || data.kind === "strip") figure.place.addEventListener("keydown", keyed);
       figures.push(figure);
       if (data.kind === "time" || data.kind === "strip") timed.push(figure);
     }
     if (timed.length) timed[timed.length - 1].last = true;
-    for (const figure of figures) await draw[figure.data.kind](figure);
+    for (const figure of figures) draw[figure.data.kind](figure);
     makeToggles();
     if (page.time) zoomTo(null);
     for (const button of document.querySelectorAll("button.jump")) {
@@ -571,16 +681,22 @@
       clearTimeout(waiting);
       waiting = setTimeout(resizeAll, 100);
     });
-    addEventListener("beforeprint", () => { printing = true; resizeAll(); });
-    addEventListener("afterprint", () => { printing = false; resizeAll(); });
+    const repaint = () => {
+      readColours();
+      resizeAll();
+      for (const figure of figures) figure.chart.redraw(true);
+      for (const paint of swatches) paint();
+    };
+    addEventListener("beforeprint", () => { printing = true; repaint(); });
+    addEventListener("afterprint", () => { printing = false; repaint(); });
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", repaint);
     document.documentElement.dataset.drawn = String(figures.length);
   }
 
-  start().catch((error) => {
-    const said = typeof DecompressionStream === "undefined"
-      ? "This browser is too old to draw the figures: it has no DecompressionStream."
-      : "The figures cannot be drawn: " + error;
-    document.querySelector("h1").after(element("p", null, said, "note"));
+  try {
+    start();
+  } catch (error) {
+    document.querySelector("h1").after(element("p", null, "The figures cannot be drawn: " + error, "note"));
     throw error;
-  });
+  }
 })();

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 #: Candidates of a signal that are shown beside the one that was taken.
 CANDIDATES_SHOWN = 2
+#: Log time less stamp beyond which the stamps count another time than the recorder's: since boot or another clock, and
+#: since the start of a simulation.
+OTHER_CLOCK_S, SIMULATION_CLOCK_S = 60.0, 1e8
 
 
 def render_inspection(inspection: Inspection, console: Console) -> None:
@@ -91,9 +94,16 @@ def _topics_table(topics: tuple[TopicReport, ...]) -> Table:
             number_text(topic.rate_hz),
             number_text(topic.jitter_p95_s * 1e3),
             gap,
-            delay if delay == late else f"{delay} to {late}",
+            _delay_text(topic.delay_median_s) or (delay if delay == late else f"{delay} to {late}"),
         )
     return table
+
+
+def _delay_text(delay_s: float) -> str:
+    """Return what a delay is that no transport has; empty if one may have it."""
+    if abs(delay_s) > SIMULATION_CLOCK_S:
+        return "simulation clock"
+    return "other clock" if abs(delay_s) > OTHER_CLOCK_S else ""
 
 
 def _sources_table(inspection: Inspection) -> Table:

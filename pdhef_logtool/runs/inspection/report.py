@@ -7,13 +7,14 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from collections.abc import Mapping as MappingABC
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.drive.checks.running import misread_channels
 from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_proposals
 from pdhef_logtool.logs.byte_account import checksummed_share
@@ -72,7 +73,8 @@ CLOCK_RESIDUAL_S = 0.02
 class TopicReport:
     """One topic. Times in s; ``largest_gap_at_s`` is since the log's start; NaN where nothing can be stated.
 
-    ``rate_hz`` is by the median step; of a topic whose times were not read, by its messages and the log's length.
+    ``rate_hz`` is by the median step, of bursts by the mean; of a topic whose times were not read, by its messages
+    and the log's length.
     ``delay_*`` are of log time − publish time, which equals zero where a recorder has one time only.
     """
 
@@ -93,7 +95,7 @@ class TopicReport:
 
 @dataclass(frozen=True, slots=True)
 class ClockReport:
-    """The stamps that mapped signals use, against log time."""
+    """The stamps that mapped signals use, against log time; ``reason``: why log time serves instead of theirs."""
 
     topic: str
     stamp: str
@@ -104,11 +106,12 @@ class ClockReport:
     drift_ppm: float
     residual_s: float
     delay_known: bool
+    reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class SignalReport:
-    """One mapped signal in SI units, cleaned. Vectors have NaN statistics.
+    """One mapped signal in SI units, cleaned. Statistics of vectors are those of their length.
 
     ``gaps`` counts steps of more than 5 median steps and 0.1 s; ``dropped`` samples by kind.
     """
@@ -187,7 +190,10 @@ class Inspection:
     @property
     def uses(self) -> MappingABC[str, str]:
         """What the log is good for (``can``), and what it lacks for sideslip (``sideslip_needs``, may be empty)."""
-        return uses_of(self.mapping)
+        refused = misread_channels(self.checks)
+        signals = {n: s for n, s in self.mapping.signals.items() if n not in refused}
+        truth = {n: s for n, s in self.mapping.truth.items() if f"truth.{n}" not in refused}
+        return uses_of(replace(self.mapping, signals=signals, truth=truth))
 
     @property
     def duration_s(self) -> float:
@@ -391,8 +397,7 @@ def _gather(channels: MappedChannels, gathered: dict[tuple[str, str], _Gathered]
                 # Stamps at the seam of two windows may be out of order by the jitter of their delays.
                 stamps = stamps[stamps > entry.steps.last_ns]
             entry.steps.add(stamps)
-            if channel.values.ndim == 1:
-                entry.values.add(channel.values)
+            entry.values.add(channel.values if channel.values.ndim == 1 else np.linalg.norm(channel.values, axis=1))
 
 
 # ------------------------------------------------------------------------------------------------ reports
@@ -419,7 +424,7 @@ def _topic_report(topic: TopicInfo, steps: StepStatistics, delays: DelayStatisti
         type=topic.type_name,
         encoding=topic.encoding,
         messages=topic.messages,
-        rate_hz=_inverse(steps.median_s) if steps.count else topic.messages / log_s if log_s > 0.0 else float("nan"),
+        rate_hz=steps.rate_hz if steps.count else topic.messages / log_s if log_s > 0.0 else float("nan"),
         jitter_p95_s=steps.jitter_p95_s,
         largest_gap_s=largest[0] if largest else float("nan"),
         largest_gap_at_s=(largest[1] - log.start_ns) * 1e-9 if largest else float("nan"),
@@ -457,7 +462,7 @@ def _signal_report(
         topic=source.topic,
         field=source.field if isinstance(source.field, str) else ", ".join(source.field),
         samples=entry.steps.count,
-        rate_hz=_inverse(entry.steps.median_s),
+        rate_hz=entry.steps.rate_hz,
         latency_s=clock.median_delay_s + source.latency_s,
         mean=entry.values.mean if has_values else float("nan"),
         std=entry.values.std,
@@ -473,7 +478,7 @@ def _signal_report(
 def _clock_report(source: SignalSource, clock: ClockModel) -> ClockReport:
     return ClockReport(
         topic=source.topic,
-        stamp=source.stamp,
+        stamp="log_time" if clock.unusable else source.stamp,
         clock=source.clock,
         delay_median_s=clock.median_delay_s,
         delay_p95_s=clock.p95_delay_s,
@@ -481,6 +486,7 @@ def _clock_report(source: SignalSource, clock: ClockModel) -> ClockReport:
         drift_ppm=clock.drift * 1e6,
         residual_s=clock.residual_s,
         delay_known=clock.delay_known,
+        reason=f"{source.stamp}: {clock.unusable}" if clock.unusable else "",
     )
 
 

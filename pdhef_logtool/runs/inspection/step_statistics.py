@@ -15,6 +15,8 @@ MOST_KEPT = 120_000
 #: A gap is more than this many median steps, and more than ``MIN_GAP_S``.
 GAP_PERIODS = 5.0
 MIN_GAP_S = 0.1
+#: Messages whose median step differs from the mean step by more come in bursts.
+BURST = 0.75
 
 
 @dataclass(slots=True)
@@ -73,6 +75,17 @@ class StepStatistics:
         """Median step; NaN with fewer than two times."""
         steps = self.steps_s.values
         return float(np.median(steps)) if steps.shape[0] else float("nan")
+
+    @property
+    def rate_hz(self) -> float:
+        """By the median step; of bursts, whose mean step is another, by the mean of the steps that are no gaps."""
+        steps = self.steps_s.values
+        if not steps.shape[0]:
+            return float("nan")
+        limit = max(MIN_GAP_S, GAP_PERIODS * float(steps.mean()))
+        mean, median = float(steps[steps <= limit].mean()), self.median_s
+        step = median if BURST * mean <= median <= mean / BURST else mean
+        return 1.0 / step if step > 0.0 else float("nan")
 
     @property
     def jitter_p95_s(self) -> float:

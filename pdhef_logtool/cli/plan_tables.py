@@ -1,0 +1,45 @@
+"""What commands print of a validation plan: a line for all of it, and a table of its requirements."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from rich.padding import Padding
+from rich.text import Text
+
+from pdhef_logtool.cli.console import table
+from pdhef_logtool.evaluation.validation_plan import shown
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from pdhef_logtool.results.plan_verdicts import PlanVerdicts
+
+STYLES = {"PASS": "green", "FAIL": "bold red", "INCONCLUSIVE": "dim"}
+
+
+def plan_line(plan_result: PlanVerdicts) -> Text:
+    """Return how many requirements passed, failed and are inconclusive."""
+    counts = Counter[str](v.outcome for v in plan_result.verdicts)
+    parts = [Text(f"{counts[outcome]} {outcome}", style) for outcome, style in STYLES.items() if counts[outcome]]
+    name = f"plan {plan_result.plan.file}" if plan_result.plan.file else "default plan, no gate"
+    return Text.assemble(Text(", ").join(parts), f" ({name})")
+
+
+def render_plan(plan_result: PlanVerdicts, console: Console) -> None:
+    """Print the requirements in a table, and what the inconclusive ones need."""
+    made = table("", "id", "requirement", ">value", ">margin", fold=3)
+    for v in plan_result.verdicts:
+        unit = v.requirement.unit
+        value, margin = ("-" if x is None else shown(x, unit) for x in (v.value, v.margin))
+        made.add_row(Text(v.outcome, STYLES[v.outcome]), v.requirement.id, v.requirement.label, value, margin)
+    console.print(made)
+    for v in plan_result.verdicts:
+        if v.outcome != "PASS":
+            to_do = f". Next: {v.next}" if v.next else ""
+            console.print(Padding(f"{v.requirement.id}: {v.reason}{to_do}", (0, 0, 0, 2)))
+    notes = dict.fromkeys(note for v in plan_result.verdicts for note in v.notes)
+    for note in notes:
+        console.print(Padding(f"note: {note}", (0, 0, 0, 2)))
+    console.print()

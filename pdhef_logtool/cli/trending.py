@@ -1,0 +1,98 @@
+"""``pdhef trend``: one figure over several runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from typer import Argument, Option
+
+from pdhef_logtool.cli import console, options, panels
+from pdhef_logtool.records.errors import UsageError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from pdhef_logtool.results.trend import Trend
+
+commands = typer.Typer()
+
+
+@options.command(
+    commands,
+    "pdhef trend week1 week2 week3",
+    "pdhef trend runs/* --max-regression 5% --html trend.html",
+    "pdhef trend week1 week2 week3 --estimator physics --json",
+    panel=panels.READ,
+    notes="Runs are compared drive by drive with the run before and with the first run. Marks are corrected for their "
+    "number (Holm). A regression does not change the exit code: pdhef compare is the gate.",
+)
+def trend(
+    runs: Annotated[list[str], Argument(metavar="RUN", help="Outputs of runs, the oldest first: folders or URLs.")],
+    *,
+    max_regression: Annotated[
+        str | None, Option(metavar="SHARE", help="Largest increase that is not marked: 5% or 0.05. Default: 0.")
+    ] = None,
+    estimator: Annotated[
+        str | None, Option(help="Estimator to compare. Default: the selected estimate of the earlier run, per drive.")
+    ] = None,
+    metric: Annotated[str | None, Option(help="Metric of sideslip over the whole drive. Default: rmse.")] = None,
+    cluster: Annotated[
+        str | None,
+        Option(
+            metavar="KEY",
+            help="Groups of dependent drives: car, day, route, a metadata key, or none. Default: the dependence by "
+            "day, car and route is estimated.",
+        ),
+    ] = None,
+    html: Annotated[Path | None, Option(help="HTML file for the trend.")] = None,
+    as_json: options.JsonFlag = False,
+) -> None:
+    """Show a figure over several runs, one row per run, and mark regressions."""
+    from pdhef_logtool.cli.comparing import figure_asked
+    from pdhef_logtool.results.opened_run import open_run
+    from pdhef_logtool.results.trend import trend_of
+    from pdhef_logtool.storage.object_store import is_url
+    from pdhef_logtool.storage.outputs import check_no_input
+
+    if len(runs) < 2:
+        raise UsageError(expected="two runs or more", got=str(len(runs)), where="RUN")
+    check_no_input([Path(x) for x in runs if not is_url(x)], [] if html is None else [html])
+    figure = figure_asked(max_regression, estimator, metric)
+    result = trend_of([open_run(run) for run in runs], figure, cluster)
+    if html is not None:
+        from pdhef_logtool.reports.trend import trend_page
+        from pdhef_logtool.storage.files import write_bytes
+
+        write_bytes(html, trend_page(result))
+    console.finish(result, _render, as_json)
+
+
+def _render(result: Trend, out: Console) -> None:
+    from rich.padding import Padding
+
+    from pdhef_logtool.results.comparison_words import change_text
+    from pdhef_logtool.results.trend import mark, shown_median
+
+    count = len(result.regressions)
+    out.print(
+        f"{count} of {len(result.rows)} runs with a regression of {result.figure.label}"
+        if count
+        else f"No significant regression of {result.figure.label} in {len(result.rows)} runs"
+    )
+    table = console.table(
+        "run", ">logs", ">failed", ">scored", ">median", ">change to the previous run", ">to the first run", "", fold=1
+    )
+    for number, row in enumerate(result.rows):
+        changes = ["-", "-"] if number == 0 else [change_text(row.previous), change_text(row.first)]
+        table.add_row(
+            row.run, str(row.logs), str(row.failed), str(row.scored), shown_median(row), *changes, mark(row),
+            style="bold" if row.regression else None,
+        )  # fmt: skip
+    out.print(table)
+    out.print("Median over all scored drives of a run; changes are medians over common drives, with 95 % CI.")
+    for row in result.regressions:
+        out.print(f"\n{row.run}: {mark(row)}", style="bold")
+        for line in row.differences or ("nothing else differs from the run before",):
+            out.print(Padding(line, (0, 0, 0, 2), expand=False))

@@ -1,0 +1,69 @@
+"""``SIGNAL.magnitude``: values that no vehicle has; needs no second signal, and holds for model cars too."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind
+from pdhef_logtool.drive.relations import units_of
+from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.signals import WHEELS
+
+#: Above what a road car, a race car or a model car reaches for longer than a second: model cars spin at 5 rad/s and
+#: corner at 15 m/s²; a wheel of 5 cm at 30 m/s turns with 600 rad/s; trucks have five turns of the steering wheel.
+MOST = {
+    "ax_m_s2": 30.0,
+    "ay_m_s2": 30.0,
+    "yaw_rate_rad_s": 10.0,
+    "steer_rad": 1.3,
+    "steering_wheel_rad": 20.0,
+    "speed_m_s": 120.0,
+    **{f"wheel_speed_{w}_m_s": 150.0 for w in WHEELS},
+    **{f"wheel_speed_{w}_rad_s": 700.0 for w in WHEELS},
+    "truth.vx_m_s": 120.0,
+    "truth.vy_m_s": 40.0,
+    "truth.ay_m_s2": 30.0,
+    "truth.yaw_rate_rad_s": 10.0,
+    "truth.sideslip_rad": float(np.pi),
+}
+#: This share of the low-passed values must be below it: shocks and spins are short.
+SHARE = 0.95
+#: A wheel in the air spins.
+WHEEL_SHARE = 0.5
+
+
+def _checks(drive: CheckedDrive) -> Iterator[Check]:
+    columns = drive.measured.columns
+    for name, most in MOST.items():
+        column = columns.get(name)
+        finite = np.abs(column[np.isfinite(column)]) if column is not None else np.empty(0)
+        if not finite.size or name in drive.wrong:  # a relation that fails has a better remedy
+            continue
+        share = WHEEL_SHARE if name.startswith("wheel") else SHARE
+        large = float(np.quantile(finite, share))
+        evidence = f"{1.0 - share:.0%} of its low-passed values are above {large:.3g}, vehicles reach {most:.3g}"
+        if large > most:
+            yield MAGNITUDE.failed(evidence, name, remedy=_remedy(drive, name, large, most))
+
+
+def _remedy(drive: CheckedDrive, name: str, large: float, most: float) -> str:
+    units = [(f, words) for f, words in units_of(name.removeprefix("truth.")) if large * f < 0.5 * most]
+    counts = "these may be raw counts of a converter: multiply by its resolution"
+    if not units:
+        return f"the field is no {name.removeprefix('truth.')} in SI units; {counts}"
+    factor, words = max(units)
+    scale = drive.measured.scales.get(name, 1.0)
+    line = f"scale = {scale * factor:.6g}" if isinstance(scale, float | int) else f"{factor:.6g} times its scale"
+    return f"perhaps it {words}: {line} in the mapping; or {counts}"
+
+
+MAGNITUDE = CheckKind(
+    "SIGNAL.magnitude",
+    compares="the low-passed values of the signal with what vehicles reach, model cars included",
+    fails="5 % of them are above (yaw rate 10 rad/s, accelerations 30 m/s², speed 120 m/s, road-wheel angle 1.3 rad)",
+    remedy="{remedy}",
+    function=_checks,
+)
+CHECKS = (MAGNITUDE,)

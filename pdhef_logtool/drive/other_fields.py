@@ -1,0 +1,84 @@
+"""Whether a mapping file reads a wrong field: recognition names another one of the log, and the drive decides.
+
+A signal with a wrong unit still goes with the others; one that is read from another field often does too, by chance or
+because both move in bends. Each suspicion is tested: such signals are read from the fields that recognition reads, and
+only if all checks of them then pass, and fewer fail than before, the checks name those fields.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from pdhef_logtool.drive.checks.by_relations import AXIS
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.mapping import Mapping, auto_map
+from pdhef_logtool.mapping.records import SignalSource
+from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.errors import PdhefError
+
+_MISREAD = (".sign", ".unit", ".axis", ".mounting", ".magnitude", ".frame", ".level")
+
+
+def with_other_fields(
+    checks: Sequence[Check], log: DriveLog, mapping: Mapping, checks_of: Callable[[Mapping], Sequence[Check]]
+) -> tuple[Check, ...]:
+    """Return the checks of a mapping file, with those of signals replaced that another field of the log is right for.
+
+    Parameters
+    ----------
+    checks_of : returns the checks of another mapping of the log.
+    """
+    failed = {c.name for c in checks if c.verdict == "failed"}
+    if mapping.origin != "file" or not failed:
+        return tuple(checks)
+    doubted = {c.subject for c in checks if c.verdict != "passed" and c.name.endswith(_MISREAD)}
+    differing = _others(log, mapping)
+    for others in ({n: s for n, s in differing.items() if n in doubted}, differing):
+        try:
+            again = checks_of(_replaced(mapping, others)) if others else ()
+        except PdhefError:  # the other fields cannot be read
+            continue
+        still = {c.name for c in again if c.verdict == "failed"}
+        wrong = {c.subject for c in again if c.name in still}
+        if others and not wrong & others.keys() and len(still) < len(failed):
+            break
+    else:
+        return tuple(checks)
+    renamed = tuple(_check(name, source, checks) for name, source in others.items())
+    kept = (c for c in checks if c.subject not in others and not (c.verdict == "failed" and c.name not in still))
+    return (*renamed, *kept)
+
+
+def _others(log: DriveLog, mapping: Mapping) -> dict[str, SignalSource]:
+    """Return by signal the source that recognition reads it from, where that is another one."""
+    try:
+        recognised = auto_map(log).mapping
+    except PdhefError:
+        return {}
+    pairs = [(n, s, recognised.signals.get(n)) for n, s in mapping.signals.items()]
+    pairs += [(f"truth.{n}", s, recognised.truth.get(n)) for n, s in mapping.truth.items()]
+    return {
+        name: replace(other, latency_s=source.latency_s)
+        for name, source, other in pairs
+        if other is not None and (other.topic, other.paths) != (source.topic, source.paths)
+    }
+
+
+def _replaced(mapping: Mapping, others: dict[str, SignalSource]) -> Mapping:
+    of_truth = {n.removeprefix("truth."): s for n, s in others.items() if n.startswith("truth.")}
+    of_signals = {n: s for n, s in others.items() if not n.startswith("truth.")}
+    return replace(mapping, signals={**mapping.signals, **of_signals}, truth={**mapping.truth, **of_truth})
+
+
+def _check(name: str, source: SignalSource, checks: Sequence[Check]) -> Check:
+    doubts = [c for verdict in ("failed", "undecided") for c in checks if (c.subject, c.verdict) == (name, verdict)]
+    evidence = doubts[0].evidence if doubts else "it contradicts others that fail"
+    field = str(list(source.field)).replace("'", '"') if isinstance(source.field, tuple) else f'"{source.field}"'
+    lines = f'topic = "{source.topic}", field = {field}, scale = {_shown(source.scale)}'
+    check = AXIS.failed(f"{evidence}; with {source.label} all checks of it pass", name, signal_name=name)
+    return replace(check, remedy=f"another field is mapped: in the mapping {lines}")
+
+
+def _shown(scale: float | tuple[float, ...]) -> str:
+    return str([float(f"{s:.9g}") for s in scale]) if isinstance(scale, tuple) else f"{scale:.9g}"

@@ -1,0 +1,647 @@
+"""Manoeuvres of the standards in a recorded drive, by rules on steering, yaw rate, speed and acceleration.
+
+Sensors decide, never ground truth. The steering angle is converted into a *demand*: the lateral acceleration of a
+linear car in steady state, ``δ v² / (L (1 + v²/v_ch²))``. One threshold then suits all speeds and sizes of cars, and
+does not depend on friction. A *swing* is the time in which the demand stays to one side; its duration is measured at
+half its peak. Every rule is mirror symmetric. Thresholds are in :class:`ManoeuvreRules`, the rules in docs/metrics.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.evaluation.blocks import blocks_with_halo
+from pdhef_logtool.evaluation.smoothing import RUN_GAP_S, last_known, runs, smooth
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+
+MANOEUVRES = (
+    "steady-circle",
+    "step-steer",
+    "ramp-steer",
+    "sine-steer",
+    "continuous-sine",
+    "sine-sweep",
+    "dlc",
+    "dlc-3888-2",
+    "sine-with-dwell",
+    "fishhook",
+    "slalom",
+    "brake-in-turn",
+    "power-off-in-turn",
+)
+_STEP_NS = 20_000_000
+_STEP_S = 0.02
+#: A manoeuvre that lasts longer on both sides of a block's border is joined from its parts.
+_HALO_S = 90.0
+#: Of the steering's zero one row in so many is enough.
+_ZERO_EVERY = 10
+
+
+@dataclass(frozen=True, slots=True)
+class ManoeuvreRules:
+    """All thresholds; ``demand`` and ``swing``: as the head of this file defines them.
+
+    Attributes
+    ----------
+    characteristic_speed_m_s : nominal v_ch. least_speed_m_s : below it nothing is a manoeuvre.
+    swing_m_s2, least_peak_m_s2 : demand that bounds a swing, and that its peak reaches.
+    peak_m_s2, strong_m_s2 : demand that steps and repeated swings reach; sine steer, sine with dwell, fishhook and lane
+        changes.
+    slack_m_s2 : demand by which steering that is held may differ beside ``held``: noise, and correction by the driver.
+    straight_m_s2, straight_s : mean |v r| below, and for how long, before a manoeuvre that starts straight ahead.
+    wheels_straight_rad : steering within which the gyro's zero is read.
+    swing_gap_s, swing_s : longest time between two swings of one manoeuvre; longest swing of repeated ones.
+    equal_peaks : smallest ratio of the peaks of two swings that count as equal.
+    sine_hz, sine_equal : frequencies of a single sine (ISO 7401), smallest ratio of the durations of its swings.
+    dwell_s : by how much the second swing of a sine with dwell lasts longer (FMVSS 126: 0.5 s).
+    fishhook_s, fishhook_first_s : shortest second and longest first swing of a fishhook (NHTSA: second held for 3 s).
+    repeated, sweep_repeated : least number of swings of a slalom; of a continuous sine or sweep.
+    regular : largest difference of a spacing of swings to the one before, as a share.
+    slalom_hz, sweep_ratio : highest frequency of a slalom; least growth of the frequency in a sweep.
+    side_m : distance over which the path of a double lane change is beyond half its offset (24 m on the course of ISO
+        3888-2, 52 m on that of ISO 3888-1). severe_m, severe_m_s : below both it is ISO 3888-2.
+    offset_m, returned, one_sided, heading_left : of a double lane change: sideways offset; largest shares of it left at
+        the end and gone to the other side; largest share of the peak heading that is left at the end.
+    step_rise_s, held, held_s : 10 to 90 % of a step; share within which the steering is held, and for how long.
+    ramp_s, ramp_m_s2, ramp_misfit, ramp_speed : of a ramp: duration, demand at its end, largest RMS deviation from a
+        line over its height, largest change of speed.
+    circle_rad, circle_s, circle_m_s2, circle_share : of a circle: heading turned, duration, least |v r|, and the share
+        within which the curvature stays.
+    turn_m_s2, turn_s, turn_speed : steady cornering before the car slows: |v r|, duration, largest change of speed.
+    brake_m_s2, gentle_brake_m_s2, brake_share : braking is a fall of a_x by the first, or by the second and this share
+        of |v r| (low friction). power_off_m_s2 : least fall of a_x when the throttle is released.
+    slowing_s, longest_slowing_s : how long the car slows at least, and at most for one manoeuvre.
+    """
+
+    characteristic_speed_m_s: float = 25.0
+    least_speed_m_s: float = 3.0
+    swing_m_s2: float = 0.3
+    least_peak_m_s2: float = 0.6
+    slack_m_s2: float = 0.15
+    peak_m_s2: float = 1.0
+    straight_m_s2: float = 0.8
+    straight_s: float = 0.4
+    wheels_straight_rad: float = 0.006
+    swing_gap_s: float = 0.6
+    swing_s: float = 2.5
+    equal_peaks: float = 0.6
+    sine_hz: tuple[float, float] = (0.4, 1.6)
+    sine_equal: float = 0.7
+    strong_m_s2: float = 2.0
+    dwell_s: tuple[float, float] = (0.25, 0.9)
+    fishhook_s: float = 1.5
+    fishhook_first_s: float = 1.2
+    repeated: int = 4
+    sweep_repeated: int = 6
+    regular: float = 0.35
+    slalom_hz: float = 0.7
+    sweep_ratio: float = 1.25
+    side_m: tuple[float, float] = (12.0, 80.0)
+    severe_m: float = 37.0
+    severe_m_s: float = 24.0
+    offset_m: tuple[float, float] = (0.5, 10.0)
+    returned: float = 0.5
+    one_sided: float = 0.5
+    heading_left: float = 0.4
+    step_rise_s: float = 0.35
+    held: float = 0.15
+    held_s: float = 1.5
+    ramp_s: float = 3.5
+    ramp_m_s2: float = 2.0
+    ramp_misfit: float = 0.03
+    ramp_speed: float = 0.15
+    circle_rad: float = 1.8
+    circle_s: float = 8.0
+    circle_m_s2: float = 0.8
+    circle_share: float = 0.15
+    turn_m_s2: float = 1.2
+    turn_s: float = 1.5
+    turn_speed: float = 0.05
+    brake_m_s2: float = 1.7
+    gentle_brake_m_s2: float = 0.65
+    brake_share: float = 0.48
+    power_off_m_s2: float = 0.28
+    slowing_s: float = 1.0
+    longest_slowing_s: float = 10.0
+
+
+RULES = ManoeuvreRules()
+
+
+@dataclass(frozen=True, slots=True)
+class Manoeuvre:
+    """A manoeuvre in [start_ns, end_ns): first side (1 left, -1 right), speed at its start, and peaks in SI units."""
+
+    name: str
+    start_ns: int
+    end_ns: int
+    side: int
+    speed_m_s: float
+    peak_ay_m_s2: float
+    peak_yaw_rate_rad_s: float
+    peak_steer_rad: float
+    lowest_ax_m_s2: float
+
+    @property
+    def text(self) -> str:
+        """Return what is worth knowing, in words."""
+        return (
+            f"{'left' if self.side > 0 else 'right'}, from {self.speed_m_s * 3.6:.0f} km/h, |a_y| to "
+            f"{self.peak_ay_m_s2:.1f} m/s², yaw rate to {np.degrees(self.peak_yaw_rate_rad_s):.0f}°/s, "
+            f"road-wheel angle to {np.degrees(self.peak_steer_rad):.1f}°"
+        )
+
+
+def find_manoeuvres(signals: Signals, vehicle: VehicleParameters, rules: ManoeuvreRules = RULES) -> list[Manoeuvre]:
+    """Return the manoeuvres of a drive in order of time; no two overlap."""
+    wheelbase_m = vehicle.cg_to_front_axle_m + vehicle.cg_to_rear_axle_m
+    zeros = _zeros(signals, wheelbase_m, rules)
+    by_name: dict[str, list[Manoeuvre]] = {}
+    for first, a, b, end in blocks_with_halo(signals, _HALO_S, 0):
+        if a == b:
+            continue
+        part = signals.rows(first, end)
+        from_ns, to_ns = int(part.stamps_ns[a - first]), int(part.stamps_ns[b - 1 - first])
+        for run in _runs_of(part, wheelbase_m, zeros, rules):
+            for driven in _manoeuvres_of(run, rules):
+                if driven.end_ns > from_ns and driven.start_ns <= to_ns:
+                    _join(by_name.setdefault(driven.name, []), driven)
+    return sorted((m for ones in by_name.values() for m in ones), key=lambda m: m.start_ns)
+
+
+def manoeuvre_masks(stamps_ns: IntArray, manoeuvres: Sequence[Manoeuvre]) -> dict[str, BoolArray]:
+    """Return the mask [N] of every manoeuvre by name."""
+    masks = {name: np.zeros(len(stamps_ns), dtype=np.bool_) for name in MANOEUVRES}
+    for m in manoeuvres:
+        masks[m.name][np.searchsorted(stamps_ns, m.start_ns) : np.searchsorted(stamps_ns, m.end_ns)] = True
+    return masks
+
+
+def _join(before: list[Manoeuvre], new: Manoeuvre) -> None:
+    """Add a manoeuvre, or the rest of one that the block before has found."""
+    if before and new.start_ns < before[-1].end_ns:
+        old = before.pop()
+        new = replace(
+            old,
+            end_ns=max(old.end_ns, new.end_ns),
+            peak_ay_m_s2=max(old.peak_ay_m_s2, new.peak_ay_m_s2),
+            peak_yaw_rate_rad_s=max(old.peak_yaw_rate_rad_s, new.peak_yaw_rate_rad_s),
+            peak_steer_rad=max(old.peak_steer_rad, new.peak_steer_rad),
+            lowest_ax_m_s2=min(old.lowest_ax_m_s2, new.lowest_ax_m_s2),
+        )
+    before.append(new)
+
+
+# ---- a run of samples without a gap, on a grid of 20 ms ----
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Run:
+    """Columns [N] every 20 ms from ``start_ns`` on, in SI units.
+
+    ``steer``: from its zero; ``gain``: demand over steering; ``turn``: v r; ``curvature``: r / v, smoothed to 1 Hz.
+    """
+
+    start_ns: int
+    speed: FloatArray
+    steer: FloatArray
+    yaw_rate: FloatArray
+    ax: FloatArray
+    ay: FloatArray
+    gain: FloatArray
+    turn: FloatArray
+    curvature: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.speed)
+
+    def rows(self, a: int, b: int) -> slice:
+        return slice(max(a, 0), min(b, len(self)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Swing:
+    """Rows [start, end) with the demand to one side; its peak (m/s²) and duration at half the peak (s)."""
+
+    start: int
+    end: int
+    row: int
+    sign: int
+    peak: float
+    half_s: float
+
+
+def _speed(signals: Signals) -> FloatArray:
+    """Return the speed [N]: measured, else of the wheels, else of GNSS."""
+    speed = signals.speed_m_s
+    if not np.isfinite(speed).any():
+        counts = np.isfinite(signals.wheel_speed_m_s).sum(axis=1)
+        speed = np.nansum(signals.wheel_speed_m_s, axis=1) / np.where(counts == 0, np.nan, counts)
+    if not np.isfinite(speed).any():
+        speed = np.hypot(*signals.gnss_velocity_m_s.T)
+    return np.abs(last_known(signals.stamps_ns, speed))
+
+
+def _gain(speed_m_s: FloatArray, wheelbase_m: float, rules: ManoeuvreRules) -> FloatArray:
+    squared = speed_m_s**2
+    return np.asarray(squared / (wheelbase_m * (1.0 + squared / rules.characteristic_speed_m_s**2)))
+
+
+def _zeros(signals: Signals, wheelbase_m: float, rules: ManoeuvreRules) -> tuple[float, float]:
+    """Return what steering (rad) and gyro (rad/s) read straight ahead.
+
+    Of the steering the median of what turning does not explain; of the gyro the median with the wheels straight.
+    """
+    parts = []
+    for first, a, b, _ in blocks_with_halo(signals, RUN_GAP_S, 0):
+        speed = _speed(signals.rows(first, b))[a - first :]
+        part = signals.rows(a, b)
+        rate = part.yaw_rate_rad_s
+        straight = (np.abs(rate * speed) < rules.straight_m_s2) & (speed > rules.least_speed_m_s)
+        rows = np.flatnonzero(straight & (np.arange(a, b) % _ZERO_EVERY == 0))
+        gain = _gain(speed[rows], wheelbase_m, rules)
+        parts.append(
+            np.stack([part.steer_rad[rows] - rate[rows] * speed[rows] / gain, part.steer_rad[rows], rate[rows]])
+        )
+    left, steer, rates = np.concatenate(parts, axis=1)
+    finite = left[np.isfinite(left)]
+    zero = float(np.median(finite)) if finite.size else 0.0
+    ahead = rates[np.abs(steer - zero) < rules.wheels_straight_rad]
+    return zero, float(np.median(ahead)) if ahead.size else 0.0
+
+
+def _runs_of(signals: Signals, wheelbase_m: float, zeros: tuple[float, float], rules: ManoeuvreRules) -> Iterator[_Run]:
+    """Yield the runs without gaps in which speed, yaw rate and steering are known."""
+    stamps = signals.stamps_ns
+    speed, yaw_rate = _speed(signals), signals.yaw_rate_rad_s - zeros[1]
+    steer = signals.steer_rad - zeros[0]
+    if not np.isfinite(steer).any():  # curvature of the path instead
+        with np.errstate(divide="ignore", invalid="ignore"):
+            steer = yaw_rate * speed / _gain(speed, wheelbase_m, rules)
+    finite = np.isfinite(speed) & np.isfinite(yaw_rate) & np.isfinite(steer) & (speed > rules.least_speed_m_s)
+    for a, b in runs(stamps, _bridged(stamps, finite)):
+        rows = np.flatnonzero(finite[a:b]) + a
+        start = -(-int(stamps[rows[0]]) // _STEP_NS)
+        count = int(stamps[rows[-1]]) // _STEP_NS - start + 1
+        if count * _STEP_S < 1.0:
+            continue
+        yield _on_grid(signals, (speed, steer, yaw_rate), rows, (start, count), wheelbase_m, rules)
+
+
+def _on_grid(
+    signals: Signals,
+    columns: tuple[FloatArray, FloatArray, FloatArray],
+    rows: IntArray,
+    span: tuple[int, int],
+    wheelbase_m: float,
+    rules: ManoeuvreRules,
+) -> _Run:
+    """Return the run whose speed, steering and yaw rate (``columns`` [N]) are known at ``rows``; ``span`` in steps."""
+    grid = (span[0] + np.arange(span[1], dtype=np.int64)) * _STEP_NS
+    zero_ns = int(signals.stamps_ns[rows[0]])
+    times, to = (signals.stamps_ns[rows] - zero_ns) * 1e-9, (grid - zero_ns) * 1e-9
+
+    def smoothed(values: FloatArray, cutoff_hz: float) -> FloatArray:
+        finite = np.isfinite(values[rows])
+        if not finite.any():
+            return np.zeros(len(to))
+        return smooth(grid, np.interp(to, times[finite], values[rows][finite]), cutoff_hz, _STEP_NS)
+
+    speed, steer, rate = columns
+    v, r = smoothed(speed, 2.0), smoothed(rate, 3.0)
+    return _Run(
+        start_ns=int(grid[0]),
+        speed=v,
+        steer=smoothed(steer, 5.0),
+        yaw_rate=r,
+        ax=smoothed(signals.ax_m_s2, 2.0),
+        ay=smoothed(signals.ay_m_s2, 3.0),
+        gain=_gain(v, wheelbase_m, rules),
+        turn=v * r,
+        curvature=smoothed(rate, 1.0) / v,
+    )
+
+
+def _bridged(stamps_ns: IntArray, finite: BoolArray) -> BoolArray:
+    """Fill holes that are shorter than the gap which ends a run."""
+    rows = np.flatnonzero(finite)
+    filled = finite.copy()
+    for i in np.flatnonzero(np.diff(rows) > 1):
+        if stamps_ns[rows[i + 1]] - stamps_ns[rows[i]] <= RUN_GAP_S * 1e9:
+            filled[rows[i] : rows[i + 1]] = True
+    return filled
+
+
+def _manoeuvres_of(run: _Run, rules: ManoeuvreRules) -> list[Manoeuvre]:
+    """Return the manoeuvres of a run; where two overlap, the earlier rule of this list is right."""
+    swings = _swings(run, rules)
+    spans: list[tuple[str, int, int]] = []
+    taken = np.zeros(len(run), dtype=np.bool_)
+    for rule in (_long_repeated, _lane_changes, _repeated, _two_swings, _slowing, _steps, _ramps):
+        for name, start, end in rule(run, swings, rules):
+            a, b = max(start, 0), min(end, len(run))
+            if b - a > 1 and not taken[a:b].any():
+                taken[a:b] = True
+                spans.append((name, a, b))
+    for name, start, end in _circles(run, rules):
+        free = ~taken[start:end]
+        if free.all():
+            spans.append((name, start, end))
+    return [_measured(run, *span) for span in sorted(spans, key=lambda f: f[1])]
+
+
+def _measured(run: _Run, name: str, a: int, b: int) -> Manoeuvre:
+    steer, peak = run.steer[a:b], np.abs(run.steer[a:b]).max()
+    first = int(np.argmax(np.abs(steer) >= 0.5 * peak))
+    return Manoeuvre(
+        name=name,
+        start_ns=run.start_ns + a * _STEP_NS,
+        end_ns=run.start_ns + b * _STEP_NS,
+        side=1 if steer[first] >= 0.0 else -1,
+        speed_m_s=float(run.speed[a]),
+        peak_ay_m_s2=float(np.abs(run.ay[a:b]).max()),
+        peak_yaw_rate_rad_s=float(np.abs(run.yaw_rate[a:b]).max()),
+        peak_steer_rad=float(peak),
+        lowest_ax_m_s2=float(run.ax[a:b].min()),
+    )
+
+
+# ---- swings ----
+
+
+def _swings(run: _Run, rules: ManoeuvreRules) -> list[_Swing]:
+    """Return the swings whose peak is high enough, in order."""
+    demand = run.steer * run.gain
+    stamps = np.arange(len(run), dtype=np.int64) * _STEP_NS
+    swings = []
+    for sign in (1, -1):
+        side = sign * demand
+        for a, b in runs(stamps, side > rules.swing_m_s2):
+            row = a + int(np.argmax(side[a:b]))
+            if side[row] >= rules.least_peak_m_s2:
+                half = side[a:b] >= 0.5 * side[row]
+                first, last = int(np.argmax(half)), len(half) - int(np.argmax(half[::-1]))
+                swings.append(_Swing(a, b, row, sign, float(side[row]), (last - first) * _STEP_S))
+    return sorted(swings, key=lambda s: s.start)
+
+
+def _chains(swings: Sequence[_Swing], gap_s: float, *, alternate: bool) -> Iterator[list[_Swing]]:
+    """Yield longest chains of swings that follow within a time, of alternating sign where asked."""
+    chain: list[_Swing] = []
+    for swing in swings:
+        close = bool(chain) and (swing.start - chain[-1].end) * _STEP_S <= gap_s
+        if close and not (alternate and swing.sign == chain[-1].sign):
+            chain.append(swing)
+            continue
+        if chain:
+            yield chain
+        chain = [swing]
+    if chain:
+        yield chain
+
+
+def _repeated(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
+    """Slalom, continuous sine and sine sweep: swings of alternating sign with regular spacing."""
+    for part in _regular_chains(swings, rules):
+        yield _name_of_repeated(part, rules), part[0].start, part[-1].end
+
+
+def _long_repeated(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
+    """Those that are too long, and too even towards their end, for a lane change and the corrections after it."""
+    for part in _regular_chains(swings, rules):
+        if len(part) >= rules.sweep_repeated and min(s.peak for s in part[-2:]) >= 0.5 * max(s.peak for s in part):
+            yield _name_of_repeated(part, rules), part[0].start, part[-1].end
+
+
+def _regular_chains(swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[list[_Swing]]:
+    short = [s for s in swings if s.half_s <= rules.swing_s]
+    for chain in _chains(short, rules.swing_gap_s, alternate=True):
+        for part in _regular_parts(chain, rules):
+            if np.mean([s.peak for s in part]) >= 0.8 * rules.peak_m_s2:
+                yield part
+
+
+def _regular_parts(chain: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[list[_Swing]]:
+    """Yield the parts of a chain in which each spacing is like the one before, of enough swings."""
+    part = list(chain[:1])
+    for swing in chain[1:]:
+        spacing = _middle(swing) - _middle(part[-1])
+        before = _middle(part[-1]) - _middle(part[-2]) if len(part) > 1 else spacing
+        if abs(spacing - before) <= rules.regular * max(before, spacing):
+            part.append(swing)
+            continue
+        if len(part) >= rules.repeated:
+            yield part
+        part = [part[-1], swing]
+    if len(part) >= rules.repeated:
+        yield part
+
+
+def _middle(swing: _Swing) -> float:
+    return 0.5 * (swing.start + swing.end)
+
+
+def _name_of_repeated(part: Sequence[_Swing], rules: ManoeuvreRules) -> str:
+    spacing_s = np.diff([_middle(s) for s in part]) * _STEP_S
+    frequency = 0.5 / spacing_s
+    quarter = max(1, len(frequency) // 4)
+    grown = float(frequency[-quarter:].mean() / frequency[:quarter].mean())
+    if len(part) >= rules.sweep_repeated and grown >= rules.sweep_ratio:
+        return "sine-sweep"
+    is_slow = len(part) < rules.sweep_repeated or frequency.mean() < rules.slalom_hz
+    return "slalom" if is_slow else "continuous-sine"
+
+
+def _lane_changes(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
+    """Double lane changes: out, back, and as straight at the end as before, within the length of a course."""
+    for i in range(len(swings)):
+        for last in range(i + 3, min(i + 7, len(swings)) + 1):
+            side_m = _side_lane_m(run, swings[i:last], rules)
+            if rules.side_m[0] <= side_m <= rules.side_m[1]:
+                start, end = swings[i].start, swings[last - 1].end
+                is_severe = side_m < rules.severe_m and run.speed[start] < rules.severe_m_s
+                yield "dlc-3888-2" if is_severe else "dlc", start, end
+                break
+
+
+def _side_lane_m(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> float:
+    """Return over which distance the path is beyond half its offset; 0 for what is no double lane change.
+
+    The heading returns, and the sideways offset goes out to one side and comes back.
+    """
+    sides = [s.sign for s in swings if s.peak >= 0.25 * max(w.peak for w in swings)]
+    changes = sum(a != b for a, b in pairwise(sides))
+    if changes < 2 or sides[0] != sides[-1] or max(s.peak for s in swings) < rules.strong_m_s2:
+        return 0.0
+    here = run.rows(swings[0].start - 10, swings[-1].end + 15)
+    speed = run.speed[here]
+    heading = np.cumsum(run.yaw_rate[here]) * _STEP_S
+    offset = swings[0].sign * np.cumsum(speed * np.sin(heading)) * _STEP_S
+    peak, end = float(offset.max()), float(offset[-1])
+    is_one = (
+        rules.offset_m[0] <= peak <= rules.offset_m[1]
+        and abs(end) <= rules.returned * peak
+        and -offset.min() <= rules.one_sided * peak
+        and abs(heading[-1]) <= rules.heading_left * np.abs(heading).max()
+    )
+    return float(speed[offset > 0.5 * peak].sum()) * _STEP_S if is_one else 0.0
+
+
+def _straight_before(run: _Run, row: int, rules: ManoeuvreRules) -> bool:
+    """Return whether the car ran straight before a row, which at the run's start is taken for granted."""
+    before = run.turn[max(row - round(rules.straight_s / _STEP_S), 0) : max(row, 1)]
+    return bool(np.mean(np.abs(before)) < rules.straight_m_s2)
+
+
+def _two_swings(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
+    """Sine steer, sine with dwell and fishhook: from straight ahead, two swings to opposite sides, equally high."""
+    for first, second in pairwise(swings):
+        close = (second.start - first.end) * _STEP_S <= 0.5 * rules.swing_gap_s
+        low, high = sorted((first.peak, second.peak))
+        if not close or first.sign == second.sign or low < rules.equal_peaks * high or high < rules.strong_m_s2:
+            continue
+        if not _straight_before(run, first.start, rules):
+            continue
+        longer_s, period_s = second.half_s - first.half_s, 3.0 * first.half_s
+        if first.half_s <= rules.fishhook_first_s and second.half_s >= max(rules.fishhook_s, 2.0 * first.half_s):
+            yield "fishhook", first.start, second.end
+        elif not rules.sine_hz[0] <= 1.0 / period_s <= rules.sine_hz[1]:
+            continue
+        elif rules.dwell_s[0] <= longer_s <= rules.dwell_s[1] and _has_dwell(run, first, second):
+            yield "sine-with-dwell", first.start, second.end
+        elif min(first.half_s, second.half_s) >= rules.sine_equal * max(first.half_s, second.half_s):
+            yield "sine-steer", first.start, second.end
+
+
+def _has_dwell(run: _Run, first: _Swing, second: _Swing) -> bool:
+    """Return whether the second swing is held near its peak for longer than the first."""
+
+    def held(swing: _Swing) -> int:
+        side = np.abs(run.steer[swing.start : swing.end])
+        return int((side >= 0.85 * side.max()).sum())
+
+    return held(second) - held(first) >= 10
+
+
+# ---- steps, ramps, circles, slowing in a turn ----
+
+
+def _steps(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
+    """ISO 7401 steps: from straight ahead to an angle within a short time, then held."""
+    held_rows = round(rules.held_s / _STEP_S)
+    for swing in swings:
+        if swing.end - swing.start < held_rows or swing.peak < rules.peak_m_s2:
+            continue
+        if not _straight_before(run, swing.start, rules):
+            continue
+        side = swing.sign * run.steer
+        settle = swing.start + round(rules.step_rise_s / _STEP_S)
+        held = side[settle : settle + held_rows]
+        if len(held) < held_rows:
+            continue
+        level = float(np.median(held))
+        before = side[max(swing.start - 25, 0) : settle]
+        rise = np.flatnonzero(before >= 0.9 * level), np.flatnonzero(before <= 0.1 * level)
+        tolerance = _tolerance(level, float(run.gain[settle]), rules)
+        if not rise[0].size or not rise[1].size or np.abs(held - level).max() > tolerance:
+            continue
+        if (rise[0][0] - rise[1][rise[1] < rise[0][0]].max(initial=0)) * _STEP_S <= rules.step_rise_s:
+            rest = np.abs(side[settle : swing.end] - level) > tolerance
+            end = settle + int(np.argmax(rest)) if rest.any() else swing.end
+            yield "step-steer", swing.start, end
+
+
+def _ramps(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
+    """Ramp steer: the angle grows along a line for seconds, from straight ahead, at one speed."""
+    for swing in swings:
+        row = swing.start + int(np.argmax(np.abs(run.steer[swing.start : swing.end]))) + 1
+        speed = run.speed[swing.start : row]
+        n = int(np.argmin(np.append(np.abs(speed / speed[0] - 1.0) <= rules.ramp_speed, False)))
+        row = swing.start + n
+        if n * _STEP_S < rules.ramp_s or not _straight_before(run, swing.start, rules):
+            continue
+        side = swing.sign * run.steer[swing.start : row]
+        t = np.linspace(-1.0, 1.0, n)
+        slope = float((t * side).mean() / (t * t).mean())
+        misfit = np.sqrt(np.mean((side - side.mean() - slope * t) ** 2))
+        rises = slope > 0.0 and 2.0 * slope >= 0.6 * side[-1] and side[-1] * run.gain[row - 1] >= rules.ramp_m_s2
+        if rises and misfit <= rules.ramp_misfit * 2.0 * slope + 0.5 * rules.slack_m_s2 / run.gain[row - 1]:
+            yield "ramp-steer", swing.start, row
+
+
+def _circles(run: _Run, rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
+    """ISO 4138: half a circle or more at a curvature that stays within a share of its median."""
+    stamps = np.arange(len(run), dtype=np.int64) * _STEP_NS
+    for sign in (1, -1):
+        for a, b in runs(stamps, sign * run.turn > rules.circle_m_s2):
+            start = a
+            while start < b:
+                level = float(np.median(run.curvature[start : min(start + 150, b)]))
+                off = np.abs(run.curvature[start:b] / level - 1.0) > rules.circle_share
+                end = start + int(np.argmax(off)) if off.any() else b
+                turned_rad = abs(float(run.yaw_rate[start:end].sum())) * _STEP_S
+                if turned_rad >= rules.circle_rad and (end - start) * _STEP_S >= rules.circle_s:
+                    yield "steady-circle", start, end
+                start = max(end, start + 25)
+
+
+def _slowing(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
+    """ISO 7975 and ISO 9816: the car slows in a steady turn while the steering is held."""
+    pre, ahead, lag = round(rules.turn_s / _STEP_S), round(rules.slowing_s / _STEP_S), 15
+    n = len(run)
+    if n < pre + ahead + lag:
+        return
+    total = np.concatenate([[0.0], np.cumsum(run.ax)])
+    rows = np.arange(pre, n - ahead - lag)
+    before = (total[rows] - total[rows - pre]) / pre
+    change = (total[rows + lag + ahead] - total[rows + lag]) / ahead - before
+    stamps = rows.astype(np.int64) * _STEP_NS
+    for a, b in runs(stamps, change < -rules.power_off_m_s2):
+        row = a + int(np.argmin(change[a:b]))
+        onset = _onset(run, int(rows[row]), float(before[row]), float(change[row]), pre)
+        fall, turn = -float(change[row]), float(np.mean(np.abs(run.turn[onset - pre : onset])))
+        if turn < rules.turn_m_s2 or not _steady_before(run, onset, pre, ahead, rules):
+            continue
+        end = _slowing_end(run, onset, float(before[row]) - 0.5 * fall, rules)
+        if (end - onset) * _STEP_S >= rules.slowing_s:
+            braked = fall >= min(rules.brake_m_s2, max(rules.gentle_brake_m_s2, rules.brake_share * turn))
+            yield "brake-in-turn" if braked else "power-off-in-turn", onset - pre, end
+
+
+def _onset(run: _Run, row: int, before: float, change: float, pre: int) -> int:
+    """Return the row near ``row`` at which a_x falls through a quarter of its change."""
+    here = run.ax[row : row + 40] < before + 0.25 * change
+    return max(row + (int(np.argmax(here)) if here.any() else 0), pre)
+
+
+def _steady_before(run: _Run, onset: int, pre: int, ahead: int, rules: ManoeuvreRules) -> bool:
+    """Return whether speed, curvature and steering were held before, and the steering after."""
+    speed = run.speed[onset - pre : onset]
+    curvature = run.curvature[onset - pre : onset]
+    level = float(np.mean(run.steer[onset - pre : onset]))
+    steer = run.steer[onset - pre : onset + ahead]
+    tolerance = _tolerance(level, float(run.gain[onset]), rules)
+    return bool(
+        np.ptp(speed) <= rules.turn_speed * speed.mean()
+        and np.ptp(curvature) <= 2.0 * rules.held * abs(curvature.mean())
+        and np.abs(steer - level).max() <= tolerance
+    )
+
+
+def _tolerance(level_rad: float, gain: float, rules: ManoeuvreRules) -> float:
+    """Return by how much a steering angle that is held may differ from its level, in rad."""
+    return rules.held * abs(level_rad) + rules.slack_m_s2 / gain
+
+
+def _slowing_end(run: _Run, onset: int, limit_m_s2: float, rules: ManoeuvreRules) -> int:
+    """Return the row at which the car no longer slows or the steering is let go."""
+    last = min(onset + round(rules.longest_slowing_s / _STEP_S), len(run))
+    level = float(run.steer[onset])
+    over = (run.ax[onset:last] > limit_m_s2) | (np.abs(run.steer[onset:last] - level) > 2.0 * rules.held * abs(level))
+    over[:25] = False
+    return onset + int(np.argmax(over)) if over.any() else last

@@ -1,0 +1,191 @@
+"""The metric of each requirement in blocks of 10 s of one drive, from which few drives get their confidence bounds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdhef_logtool.evaluation.blocks import SegmentMasks, median_step_ns, row_blocks
+from pdhef_logtool.evaluation.track_errors import NORMAL_95, raw_error, scorable, total_std, truth_speed
+from pdhef_logtool.evaluation.units import SCORED_SIGNALS
+from pdhef_logtool.evaluation.validation_plan import MEANS, POOLED, RUN, SQUARES, Requirement
+from pdhef_logtool.records.geometry import wrap_angle
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.tracks import StateTrack
+
+#: Errors are correlated over seconds (docs/method.md#evaluation).
+BLOCK_S = 10.0
+#: A report has at most so many blocks of a requirement: those of a longer drive are longer.
+MOST_BLOCKS = 360
+_Read = Callable[[str], StateTrack | None]
+
+
+@dataclass(frozen=True, slots=True)
+class RequirementBlocks:
+    """The scored driving of one requirement in one drive, block by block.
+
+    Attributes
+    ----------
+    of : :attr:`~.validation_plan.Requirement.measured`. estimator : that was scored. block_s : length of a block.
+    number, n, seconds, metres : number since the start, scored stamps, time and way of each block [K].
+    value, baseline : metric of the estimator and of the baseline in each block [K]; baseline empty without one.
+    std : root mean square of the reference's 1-sigma in the block [K]; empty for ground truth.
+    """
+
+    of: str
+    estimator: str
+    block_s: float
+    number: Sequence[int]
+    n: Sequence[int]
+    seconds: Sequence[float]
+    metres: Sequence[float]
+    value: Sequence[float]
+    baseline: Sequence[float] = ()
+    std: Sequence[float] = ()
+
+    @property
+    def estimated(self) -> bool:
+        """Whether errors are those against the estimated reference."""
+        return bool(self.std)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScoredDrive:
+    """The tracks of a drive at the stamps of ``truth``: ground truth, or the estimated reference.
+
+    ``read`` returns the track of a name; ``masks`` of the segments; ``not_independent``: signals without a verdict.
+    """
+
+    read: _Read
+    truth: StateTrack
+    masks: SegmentMasks
+    low_speed_m_s: float
+    not_independent: frozenset[str] = frozenset()
+    estimated: bool = False
+
+
+def requirement_blocks(
+    requirements: Sequence[Requirement], main: str | None, drive: ScoredDrive, most: int = MOST_BLOCKS
+) -> list[RequirementBlocks]:
+    """Return the blocks of the requirements that this drive scores and whose metric is a mean over stamps.
+
+    ``main`` : the selected estimate, of requirements that name no estimator.
+    """
+    results: list[RequirementBlocks] = []
+    for requirement in requirements:
+        name = requirement.estimator or main
+        if any(b.of == requirement.measured for b in results) or name is None or not _has_blocks(requirement, drive):
+            continue
+        named = [name, *([requirement.baseline] if requirement.baseline not in (None, RUN) else [])]
+        tracks = [drive.read(n) for n in named if n is not None]
+        if all(track is not None and len(track) == len(drive.truth) for track in tracks):
+            blocks = _blocks(requirement, name, [t for t in tracks if t is not None], drive, most)
+            if blocks is not None:
+                results.append(blocks)
+    return results
+
+
+def _has_blocks(requirement: Requirement, drive: ScoredDrive) -> bool:
+    scored = requirement.signal in SCORED_SIGNALS and requirement.signal not in drive.not_independent
+    if drive.estimated:
+        return scored and (requirement.signal, requirement.metric) == ("sideslip_rad", "rmse")
+    return (
+        scored
+        and requirement.statistic == POOLED
+        and requirement.metric in (SQUARES | MEANS) - {"reference_rms", "reference_independent"}
+        and requirement.segment in drive.masks
+    )
+
+
+def _blocks(
+    requirement: Requirement, name: str, tracks: Sequence[StateTrack], drive: ScoredDrive, most: int
+) -> RequirementBlocks | None:
+    """Sum the summands of one requirement by block of time."""
+    truth, n = drive.truth, len(drive.truth)
+    if not n:
+        return None
+    start_ns = int(truth.rows(0, 1).stamps_ns[0])
+    duration_s = float(int(truth.rows(n - 1, n).stamps_ns[0]) - start_ns) * 1e-9
+    block_s = BLOCK_S * max(1, math.ceil(duration_s / (BLOCK_S * most)))
+    step_s = median_step_ns(truth) * 1e-9
+    count = int(duration_s // block_s) + 1
+    sums = np.zeros((3 + len(tracks), count))
+    for a, b in row_blocks(n):
+        part = truth.rows(a, b)
+        columns = _summands(requirement, [t.rows(a, b) for t in tracks], part, drive)
+        used = np.isfinite(columns).all(axis=0) & drive.masks.rows(a, b)[requirement.segment]
+        if not used.any():
+            continue
+        block = ((part.stamps_ns[used] - start_ns) // round(block_s * 1e9)).astype(np.int64)
+        way = np.nan_to_num(truth_speed(part)[used]) * step_s
+        std = part.sideslip_std_rad[used] ** 2 if drive.estimated else np.zeros(len(block))
+        for row, weights in enumerate((np.ones(len(block)), way, std, *columns[:, used])):
+            sums[row] += np.bincount(block, weights=weights, minlength=count)
+    numbers = np.flatnonzero(sums[0])
+    kept = sums[:, numbers]
+    if not kept.shape[1]:
+        return None
+    counts, metres, variance, *scored = kept
+    root = requirement.metric in SQUARES
+    values = [_rounded(np.sqrt(s / counts) if root else s / counts) for s in scored]
+    return RequirementBlocks(
+        requirement.measured,
+        name,
+        block_s,
+        numbers.tolist(),
+        [int(c) for c in counts],
+        _rounded(counts * step_s),
+        _rounded(metres),
+        values[0],
+        values[1] if len(values) > 1 else (),
+        _rounded(np.sqrt(variance / counts)) if drive.estimated else (),
+    )
+
+
+def _rounded(values: FloatArray) -> list[float]:
+    return [float(f"{v:.9g}") for v in values]
+
+
+def _summands(
+    requirement: Requirement, tracks: Sequence[StateTrack], truth: StateTrack, drive: ScoredDrive
+) -> FloatArray:
+    """Return what the metric is the mean of at each stamp [tracks, M]; NaN where it is not scored."""
+    signal, metric = requirement.signal, requirement.metric
+    at_truth = scorable(truth, signal, drive.low_speed_m_s)
+    if drive.estimated:
+        at_truth = truth.valid & (truth.vx_m_s > drive.low_speed_m_s)
+    rows = []
+    for track in tracks:
+        error = raw_error(track, truth, signal)
+        scored = track.valid & at_truth & np.isfinite(error)
+        if drive.estimated:
+            scored &= track.vx_m_s > drive.low_speed_m_s
+            error = wrap_angle(error)
+        if metric == "availability":
+            rows.append(np.where(at_truth, scored.astype(np.float64), np.nan))
+            continue
+        if metric == "coverage95":
+            std = total_std(track, truth, signal)
+            value = (
+                np.full(len(error), np.nan)
+                if std is None
+                else np.where(np.isfinite(std), (np.abs(error) <= NORMAL_95 * std).astype(np.float64), np.nan)
+            )
+        else:
+            value = {"rmse": error**2, "mae": np.abs(error), "bias": error}[metric]
+        rows.append(np.where(scored, value, np.nan))
+    return np.stack(rows)
+
+
+def from_document(documents: Sequence[Mapping[str, object]]) -> list[RequirementBlocks]:
+    """Return the blocks of a report.json; those of another version are left out."""
+    results = []
+    for document in documents:
+        try:
+            results.append(RequirementBlocks(**document))  # type: ignore[arg-type]
+        except TypeError:
+            continue
+    return results

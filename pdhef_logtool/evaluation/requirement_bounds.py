@@ -1,0 +1,132 @@
+"""Confidence bounds of a requirement's statistic over units: drives, or blocks of time within drives.
+
+The pooled statistic uses the studentised bootstrap (Efron & Tibshirani 1993, chapter 12) of the logarithm: errors of
+drives are skewed, so that percentile intervals of few drives are too low. Both sides use half of 1 − confidence.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import stdtrit
+
+from pdhef_logtool.records.signals import FloatArray
+
+#: Fewer drives: blocks within them are drawn instead. Fewer blocks: no bounds.
+LEAST_DRIVES, LEAST_BLOCKS = 5, 6
+_RESAMPLES, _SEED = 2000, 0
+#: More units than this are drawn in groups.
+_MOST_UNITS = 1000
+#: Largest studentised deviation, in quantiles of Student's t: of few units some resamples have nearly no spread.
+_MOST_DEVIATION = 2.0
+#: Resamples times units that are in memory at once.
+_AT_ONCE = 1 << 21
+
+
+@dataclass(frozen=True, slots=True)
+class Bounded:
+    """A statistic with its bounds; NaN where there are too few units. ``units``: number of them."""
+
+    value: float
+    low: float
+    high: float
+    units: int
+
+
+def pooled(
+    weights: FloatArray, values: FloatArray, others: FloatArray | None, *, squares: bool, positive: bool, level: float
+) -> Bounded:
+    """Return the mean of values [N] weighted by stamps [N], or its ratio to that of ``others`` [N].
+
+    ``squares``: root mean square. ``positive``: values ≥ 0, whose logarithm is drawn; else the value itself is.
+    ``level``: of the two-sided interval.
+    """
+    top = weights * (values**2 if squares else values)
+    below = weights if others is None else weights * (others**2 if squares else others)
+    power = 0.5 if squares else 1.0
+    total, base = float(top.sum()), float(below.sum())
+    n, nan = len(weights), math.nan
+    if not n or base <= 0.0:
+        return Bounded(nan, nan, nan, n)
+    ratio = total / base
+    value = float(ratio**power) if positive else ratio
+    if n < 2:
+        return Bounded(value, nan, nan, n)
+    if positive and total <= 0.0:
+        return Bounded(0.0, 0.0, 0.0, n)
+    if n > _MOST_UNITS:  # neighbours are drawn together
+        groups = np.arange(n) * _MOST_UNITS // n
+        top, below = (np.bincount(groups, weights=c).astype(np.float64) for c in (top, below))
+    log = positive
+    error = float(_error(top, below, np.ones((1, len(top))), power, log=log)[0])
+    if error == 0.0:
+        return Bounded(value, value, value, n)
+    deviations = _deviations(top, below, power, math.log(ratio) * power if log else ratio, log=log)
+    tail = 0.5 * (1.0 - level)
+    most_deviation = _MOST_DEVIATION * float(stdtrit(len(top) - 1, 1.0 - tail))
+    least, most = np.clip(np.quantile(deviations, [tail, 1.0 - tail]), -most_deviation, most_deviation)
+    if log:
+        return Bounded(value, value * math.exp(-most * error), value * math.exp(-least * error), n)
+    return Bounded(value, value - float(most) * error, value - float(least) * error, n)
+
+
+def _error(top: FloatArray, below: FloatArray, counts: FloatArray, power: float, *, log: bool) -> FloatArray:
+    """Return the standard errors [M] of the statistic where units [N] count ``counts`` [M, N] times: delta method."""
+    total, base = counts @ top, counts @ below
+    ratio = total / base
+    n = len(top)
+    # Σ c (t − r b)² without an array [M, N] of residuals.
+    squares = counts @ top**2 - 2.0 * ratio * (counts @ (top * below)) + ratio**2 * (counts @ below**2)
+    spread = np.sqrt(np.maximum(squares, 0.0) * n / (n - 1))
+    result: FloatArray = power * spread / total if log else spread / base
+    return result
+
+
+def _deviations(top: FloatArray, below: FloatArray, power: float, centre: float, *, log: bool) -> FloatArray:
+    """Return (statistic − centre) / its error over resamples of the units."""
+    n = len(top)
+    rng = np.random.default_rng(_SEED)
+    step = max(1, _AT_ONCE // n)
+    parts = []
+    for start in range(0, _RESAMPLES, step):
+        m = min(step, _RESAMPLES - start)
+        counts = rng.multinomial(n, np.full(n, 1.0 / n), size=m).astype(np.float64)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = (counts @ top) / (counts @ below)
+            statistic = power * np.log(ratio) if log else ratio
+            parts.append((statistic - centre) / _error(top, below, counts, power, log=log))
+    deviations = np.concatenate(parts)
+    usable = deviations[np.isfinite(deviations)]
+    return usable if usable.size else np.zeros(1)
+
+
+def quantile(values: FloatArray, share: float, level: float) -> Bounded:
+    """Return a quantile of drives [N] with its exact bounds by order statistics; infinite where N is too small."""
+    n = len(values)
+    if not n:
+        return Bounded(math.nan, math.nan, math.nan, 0)
+    ascending = np.sort(values)
+    below = _binomial_cumulative(n, share)  # P(at most k drives are below the quantile)
+    tail = 0.5 * (1.0 - level)
+    upper = next((k for k in range(1, n + 1) if below[k - 1] >= 1.0 - tail), None)
+    lower = next((k for k in range(n, 0, -1) if below[k - 1] <= tail), None)
+    return Bounded(
+        float(np.quantile(ascending, share)),
+        -math.inf if lower is None else float(ascending[lower - 1]),
+        math.inf if upper is None else float(ascending[upper - 1]),
+        n,
+    )
+
+
+def least_drives(share: float, level: float) -> int:
+    """Return the number of drives from which on a quantile has an upper bound: 1 − share^N ≥ (1 + level) / 2."""
+    return math.ceil(math.log(0.5 * (1.0 - level)) / math.log(share))
+
+
+def _binomial_cumulative(n: int, p: float) -> FloatArray:
+    k = np.arange(n + 1)
+    logs = np.array([math.lgamma(n + 1) - math.lgamma(i + 1) - math.lgamma(n - i + 1) for i in range(n + 1)])
+    mass: FloatArray = np.exp(logs + k * math.log(p) + (n - k) * math.log1p(-p))
+    return np.cumsum(mass)

@@ -1,0 +1,395 @@
+"""The verdict on one requirement: PASS, FAIL or INCONCLUSIVE by confidence bounds, with margin and exposure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
+from pdhef_logtool.evaluation.requirement_bounds import (
+    LEAST_BLOCKS,
+    LEAST_DRIVES,
+    Bounded,
+    least_drives,
+    pooled,
+    quantile,
+)
+from pdhef_logtool.evaluation.units import AY_NOTE
+from pdhef_logtool.evaluation.validation_plan import AT_LEAST, POOLED, RUN, SQUARES, WORST_DRIVE, Requirement, shown
+from pdhef_logtool.records.signals import FloatArray
+
+Outcome: TypeAlias = Literal["PASS", "FAIL", "INCONCLUSIVE"]
+#: A margin relative to an estimated reference is at least so many of its standard deviations.
+REFERENCE_SDS = 2.0
+#: A share of drives below this is not shown.
+_SHARE_SHOWN = 0.5
+#: More driving than this many times that of now is no advice.
+_MOST_TIMES = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class DriveValue:
+    """The metric of one drive.
+
+    Attributes
+    ----------
+    estimator : that was scored. n : stamps behind ``value``; ``baseline`` None without one.
+    seconds, metres : scored driving, NaN where unknown. std : root mean square of the 1-sigma of the estimated
+        reference; NaN for ground truth. blocks : None where the run kept none. same : estimator and baseline are the
+        same algorithm.
+    """
+
+    log: str
+    estimator: str
+    value: float
+    n: int
+    baseline: float | None = None
+    seconds: float = math.nan
+    metres: float = math.nan
+    std: float = math.nan
+    blocks: RequirementBlocks | None = None
+    same: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """Scored driving: number of drives, minutes and kilometres (None: unknown)."""
+
+    drives: int
+    minutes: float | None
+    km: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class RequirementVerdict:
+    """The verdict on one requirement; values in the unit of the requirement.
+
+    Attributes
+    ----------
+    value, low, high : statistic and its two-sided interval; None where there is none.
+    margin : distance of the value to the limit, negative beyond it. estimators : that were scored.
+    basis : ``drives`` or ``blocks``: what the interval is drawn from; ``units`` of them, ``block_s`` long.
+    against : ``ground truth`` or ``estimated reference``. worst : the drive with the largest error.
+    reason : the verdict in words. next : what to do, empty after a PASS. notes : what limits the verdict.
+    """
+
+    requirement: Requirement
+    outcome: Outcome
+    value: float | None
+    low: float | None
+    high: float | None
+    margin: float | None
+    exposure: Exposure
+    estimators: tuple[str, ...]
+    basis: Literal["drives", "blocks"]
+    units: int
+    block_s: float | None
+    against: Literal["ground truth", "estimated reference"]
+    worst: str | None
+    reason: str
+    next: str = ""
+    notes: tuple[str, ...] = field(default=())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdict as JSON-able values."""
+        values = asdict(self)
+        del values["requirement"]
+        requirement = {**asdict(self.requirement), "label": self.requirement.label, "unit": self.requirement.unit}
+        requirement["title"] = self.requirement.title or self.requirement.label
+        return {
+            **requirement,
+            "at_least": self.requirement.metric in AT_LEAST,
+            "bound": self.requirement.bound,
+            **values,
+        }
+
+
+def judge(requirement: Requirement, drives: Sequence[DriveValue], missing: str = "") -> RequirementVerdict:
+    """Return the verdict on a requirement.
+
+    Parameters
+    ----------
+    drives : that have the metric; all against ground truth, or all against the estimated reference.
+    missing : why no drive has the metric.
+    """
+    exposure = _exposure(drives)
+    estimated = bool(drives) and math.isfinite(drives[0].std)
+    statistic = _statistic(requirement, drives)
+    bounded, basis, units, block_s = statistic.bounded, statistic.basis, statistic.units, statistic.block_s
+    sd = _reference_sd(requirement, drives) if estimated else 0.0
+    bound, at_least = requirement.bound, requirement.metric in AT_LEAST
+    worst = _worst(requirement, drives)
+    notes = _notes(requirement, drives, basis, block_s, estimated)
+    outcome, reason, to_do = _decide(requirement, bounded, exposure, sd, basis, missing)
+    value = bounded.value if math.isfinite(bounded.value) else None
+    margin = None if value is None else (value - bound if at_least else bound - abs(value))
+    return RequirementVerdict(
+        requirement,
+        outcome,
+        value,
+        bounded.low if math.isfinite(bounded.low) else None,
+        bounded.high if math.isfinite(bounded.high) else None,
+        margin,
+        exposure,
+        tuple(dict.fromkeys(d.estimator for d in drives)),
+        basis,
+        units,
+        block_s,
+        "estimated reference" if estimated else "ground truth",
+        worst,
+        reason,
+        to_do,
+        tuple(notes),
+    )
+
+
+def _exposure(drives: Sequence[DriveValue]) -> Exposure:
+    seconds, metres = (float(np.sum([getattr(d, key) for d in drives])) for key in ("seconds", "metres"))
+    return Exposure(
+        len(drives),
+        seconds / 60.0 if math.isfinite(seconds) else None,
+        metres / 1000.0 if math.isfinite(metres) else None,
+    )
+
+
+def _ratios(drives: Sequence[DriveValue]) -> FloatArray:
+    """Return the values of drives, of a requirement with a baseline their ratios."""
+    values = np.array([d.value for d in drives], dtype=np.float64)
+    if not drives or drives[0].baseline is None:
+        return values
+    others = np.array([math.nan if d.baseline is None else d.baseline for d in drives])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(values == others, 1.0, values / others)
+
+
+@dataclass(frozen=True, slots=True)
+class _Statistic:
+    """A statistic with its bounds, what they are drawn from, how many units, and the length of a block."""
+
+    bounded: Bounded
+    basis: Literal["drives", "blocks"] = "drives"
+    units: int = 0
+    block_s: float | None = None
+
+
+def _statistic(requirement: Requirement, drives: Sequence[DriveValue]) -> _Statistic:
+    """Return the statistic of a requirement over drives, with bounds from drives or from blocks within them."""
+    count = len(drives)
+    if requirement.statistic != POOLED:
+        return _Statistic(_of_drives(requirement, _ratios(drives)), units=count)
+    if count >= LEAST_DRIVES and requirement.baseline == RUN:
+        return _Statistic(_typical_ratio(_ratios(drives), requirement.confidence), units=count)
+    weights, values = (np.array([getattr(d, key) for d in drives], dtype=np.float64) for key in ("n", "value"))
+    others = np.array([d.baseline for d in drives], dtype=np.float64) if requirement.baseline else None
+    total = _pooled(requirement, weights, values, others)
+    if count >= LEAST_DRIVES or not count:
+        return _Statistic(total, units=count)
+    return _from_blocks(requirement, total, [d.blocks for d in drives])
+
+
+def _of_drives(requirement: Requirement, values: FloatArray) -> Bounded:
+    """Return a quantile of the drives, or the worst one, which has no bounds beside itself."""
+    if requirement.quantile is not None:
+        return quantile(values, requirement.quantile, requirement.confidence)
+    if not len(values):
+        return Bounded(math.nan, math.nan, math.nan, 0)
+    worst = np.min if requirement.metric in AT_LEAST else np.max
+    largest = float(worst(np.abs(values)))
+    return Bounded(largest, largest, largest, len(values))
+
+
+def _from_blocks(requirement: Requirement, total: Bounded, blocks: Sequence[RequirementBlocks | None]) -> _Statistic:
+    """Return the statistic ``total`` of few drives with bounds from the blocks of time within them."""
+    nan, present = math.nan, [b for b in blocks if b is not None]
+    if len(present) < len(blocks):
+        return _Statistic(Bounded(total.value, nan, nan, 0), "blocks")
+    columns = [np.concatenate([np.asarray(getattr(b, key)) for b in present]) for key in ("n", "value", "baseline")]
+    units = len(columns[0])
+    bounded = _pooled(requirement, columns[0], columns[1], columns[2] if requirement.baseline else None)
+    low, high = (bounded.low, bounded.high) if units >= LEAST_BLOCKS else (nan, nan)
+    return _Statistic(Bounded(total.value, low, high, units), "blocks", units, max(b.block_s for b in present))
+
+
+def _pooled(requirement: Requirement, weights: FloatArray, values: FloatArray, others: FloatArray | None) -> Bounded:
+    metric = requirement.metric
+    bounded = pooled(
+        weights.astype(np.float64),
+        values.astype(np.float64),
+        others,
+        squares=metric in SQUARES,
+        positive=metric != "bias" and metric not in AT_LEAST,
+        level=requirement.confidence,
+    )
+    if metric == "bias":  # limited in size
+        low = 0.0 if bounded.low <= 0.0 <= bounded.high else min(abs(bounded.low), abs(bounded.high))
+        return Bounded(abs(bounded.value), low, max(abs(bounded.low), abs(bounded.high)), bounded.units)
+    if metric in AT_LEAST:
+        return Bounded(bounded.value, max(bounded.low, 0.0), min(bounded.high, 1.0), bounded.units)
+    return bounded
+
+
+def _typical_ratio(ratios: FloatArray, level: float) -> Bounded:
+    """Return the geometric mean of the drives' ratios to another run: each drive is its values yardstick."""
+    with np.errstate(divide="ignore"):
+        logs = np.log(ratios)
+    bounded = pooled(np.ones(len(logs)), logs, None, squares=False, positive=False, level=level)
+    value, low, high = (float(np.exp(x)) for x in (bounded.value, bounded.low, bounded.high))
+    return Bounded(value, low, high, len(logs))
+
+
+def _reference_sd(requirement: Requirement, drives: Sequence[DriveValue]) -> float:
+    """Return the standard deviation of the estimated reference in the unit of the requirement."""
+    weights = np.array([d.n for d in drives], dtype=np.float64)
+    std = float(np.sqrt(np.average([d.std**2 for d in drives], weights=weights)))
+    if requirement.baseline is None:
+        return std
+    others = np.array([d.baseline for d in drives], dtype=np.float64)
+    base = float(np.sqrt(np.average(others**2, weights=weights)))
+    return std / base if base > 0.0 else math.inf
+
+
+def _worst(requirement: Requirement, drives: Sequence[DriveValue]) -> str | None:
+    values = np.abs(_ratios(drives))
+    if not len(values) or not np.isfinite(values).any():
+        return None
+    return drives[int(np.nanargmin(values) if requirement.metric in AT_LEAST else np.nanargmax(values))].log
+
+
+def _decide(
+    requirement: Requirement, bounded: Bounded, exposure: Exposure, sd: float, basis: str, missing: str
+) -> tuple[Outcome, str, str]:
+    """Return outcome, reason and next step."""
+    where = "" if requirement.segment == "all" else f" of {requirement.segment}"
+    if not exposure.drives or not math.isfinite(bounded.value):
+        return "INCONCLUSIVE", missing or "no drive has this metric", _what_to_record(requirement)
+    if lacking := _lacking(requirement, exposure):
+        return "INCONCLUSIVE", f"too little driving: {'; '.join(w for w, _ in lacking)}", _more(lacking, where)
+    if _without_bounds(requirement, bounded):
+        return "INCONCLUSIVE", *_too_few(requirement, bounded, basis, where)
+    outcome = _outcome(requirement, bounded)
+    interval = _interval(requirement, bounded, exposure, outcome)
+    if outcome == "INCONCLUSIVE":
+        return outcome, f"{interval} includes the limit", _decisive(requirement, bounded, exposure, where)
+    if abs(requirement.bound - bounded.value) < REFERENCE_SDS * sd:
+        sds = f"{REFERENCE_SDS:g} standard deviations of the estimated reference ({shown(sd, requirement.unit)})"
+        to_do = f"record drives{where} with ground truth: a two-antenna INS or an optical sensor"
+        return "INCONCLUSIVE", f"{interval}; the limit is closer than {sds}", to_do
+    if outcome == "PASS":
+        return outcome, interval, ""
+    place = "the worst drive" if exposure.drives > 1 else "the largest error"
+    return outcome, interval, f"look at {place} first"
+
+
+def _without_bounds(requirement: Requirement, bounded: Bounded) -> bool:
+    """Return whether there are too few units for the bound that decides."""
+    if requirement.quantile is not None and math.isinf(bounded.high):
+        return bounded.low <= requirement.bound
+    return not (math.isfinite(bounded.low) or math.isfinite(bounded.high))
+
+
+def _outcome(requirement: Requirement, bounded: Bounded) -> Outcome:
+    low, high, bound = bounded.low, bounded.high, requirement.bound
+    if requirement.metric in AT_LEAST:
+        return "PASS" if low >= bound else "FAIL" if high < bound else "INCONCLUSIVE"
+    return "PASS" if high <= bound else "FAIL" if low > bound else "INCONCLUSIVE"
+
+
+def _interval(requirement: Requirement, bounded: Bounded, exposure: Exposure, outcome: Outcome) -> str:
+    """Return the statistic with its interval in words."""
+    value, unit = shown(bounded.value, requirement.unit), requirement.unit
+    if requirement.statistic != WORST_DRIVE:
+        bounds = f"{shown(bounded.low, unit)} to {shown(bounded.high, unit)}"
+        return f"{value} ({100.0 * requirement.confidence:.4g} % CI {bounds})"
+    share = (0.5 * (1.0 - requirement.confidence)) ** (1.0 / exposure.drives)
+    text = f"worst of {exposure.drives} drives: {value}"
+    if outcome != "PASS" or share <= _SHARE_SHOWN:
+        return text
+    return f"{text}; at least {share:.0%} of drives like these are within it, with this confidence"
+
+
+def _lacking(requirement: Requirement, exposure: Exposure) -> list[tuple[str, str]]:
+    """Return what of the required driving is missing: in words, and how much more."""
+    needs = (
+        ("drives", float(requirement.exposure_drives), float(exposure.drives), "{:.0f}"),
+        ("minutes", requirement.exposure_minutes, exposure.minutes, "{:.1f}"),
+        ("km", requirement.exposure_km, exposure.km, "{:.1f}"),
+    )
+    lacking = []
+    for word, needed, has, layout in needs:
+        if needed > 0.0 and (has is None or has < needed):
+            has_words = "an unknown number" if has is None else layout.format(has)
+            lacking.append((f"{has_words} of {needed:g} {word}", f"{layout.format(needed - (has or 0.0))} {word}"))
+    return lacking
+
+
+def _more(lacking: Sequence[tuple[str, str]], where: str) -> str:
+    return f"drive {' and '.join(more for _, more in lacking)} more{where}, with ground truth"
+
+
+def _what_to_record(requirement: Requirement) -> str:
+    where = "" if requirement.segment == "all" else f" with {requirement.segment}"
+    if requirement.baseline == RUN:
+        return "compare with another run: pdhef compare A B --plan PLAN"
+    return f"record drives{where} with ground truth"
+
+
+def _too_few(requirement: Requirement, bounded: Bounded, basis: str, where: str) -> tuple[str, str]:
+    """Return why there is no interval, and what to drive."""
+    value = shown(bounded.value, requirement.unit)
+    if requirement.quantile is not None:
+        least = least_drives(requirement.quantile, requirement.confidence)
+        more = f"drive {least - bounded.units} more drives{where}"
+        return f"{value}; no confidence interval from {bounded.units} drives", more
+    if basis == "blocks" and not bounded.units:
+        return f"{value}; this run kept no blocks for this requirement", "run the logs again with this plan"
+    blocks = "1 block" if bounded.units == 1 else f"{bounded.units} blocks"
+    reason = f"{value}; no confidence interval from {blocks} of driving{where}, it needs {LEAST_BLOCKS}"
+    seconds = (LEAST_BLOCKS - bounded.units) * 10
+    return reason, f"drive at least {seconds} s more{where}, better {LEAST_DRIVES} drives or more"
+
+
+def _decisive(requirement: Requirement, bounded: Bounded, exposure: Exposure, where: str) -> str:
+    """Return how much driving would decide, if value and spread stay: the interval narrows with its square root."""
+    bound = requirement.bound
+    distance = abs(bound - bounded.value)
+    beyond = bounded.value > bound
+    width = bounded.value - bounded.low if beyond else bounded.high - bounded.value
+    if not math.isfinite(width) or distance <= 0.0 or (times := (width / distance) ** 2) > _MOST_TIMES:
+        return "the value is at the limit: more driving will hardly decide"
+    more = f"about {math.ceil(times)} times as much driving{where} would decide, if value and spread stay the same"
+    if exposure.minutes:
+        more += f" ({exposure.minutes * (times - 1.0):.0f} minutes more)" if exposure.minutes * times > 1.5 else ""
+    return more
+
+
+def _notes(
+    requirement: Requirement, drives: Sequence[DriveValue], basis: str, block_s: float | None, estimated: bool
+) -> list[str]:
+    notes = []
+    if drives and basis == "blocks" and requirement.statistic == POOLED:
+        length = "" if block_s is None else f" of {block_s:g} s"
+        notes.append(
+            f"interval from blocks{length} within {len(drives)} {'drive' if len(drives) == 1 else 'drives'}: other "
+            f"drives may differ more; from {LEAST_DRIVES} drives on it is drawn from drives"
+        )
+    if estimated:
+        notes.append("errors are relative to the estimated reference: no ground truth")
+    if requirement.signal == "ay_m_s2":
+        notes.append(AY_NOTE)
+    if drives and all(d.same for d in drives):
+        notes.append(f"{drives[0].estimator} equals {requirement.baseline} in these drives (residual gain 0)")
+    return notes
+
+
+def gates(verdicts: Sequence[RequirementVerdict], *, strict: bool) -> bool:
+    """Return whether verdicts close the gate: a FAIL, or with ``strict`` an INCONCLUSIVE."""
+    return any(v.outcome == "FAIL" or (strict and v.outcome == "INCONCLUSIVE") for v in verdicts)
+
+
+def of_documents(verdicts: Sequence[Mapping[str, Any]], outcome: Outcome) -> list[Mapping[str, Any]]:
+    """Return the verdicts of a document with an outcome."""
+    return [v for v in verdicts if v["outcome"] == outcome]

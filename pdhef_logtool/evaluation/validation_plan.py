@@ -1,0 +1,304 @@
+"""The validation plan: requirements on the error of an estimate, read strictly from plan.toml."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.evaluation.segments import SEGMENTS
+from pdhef_logtool.evaluation.units import LABELS, SIGNALS, read_unit
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.geometry import DEGREES
+from pdhef_logtool.storage.documents import checked, digest, read_toml, unknown
+
+#: Baseline of a requirement: run A of ``pdhef compare``, in place of an estimator of the same run.
+RUN = "run"
+POOLED, WORST_DRIVE, QUANTILE = "pooled", "worst drive", "quantile"
+#: Metrics that are means over stamps: the value of several drives is their mean (root mean square) weighted by stamps.
+SQUARES = frozenset({"rmse", "reference_rms"})
+MEANS = frozenset({"mae", "bias", "coverage95", "availability", "reference_independent"})
+#: Metrics whose limit is a minimum.
+AT_LEAST = frozenset({"coverage95", "availability"})
+_QUANTILE = re.compile(r"quantile (0\.\d+)")
+
+
+@dataclass(frozen=True, slots=True)
+class Requirement:
+    """One requirement; values in the unit of metrics.parquet.
+
+    Attributes
+    ----------
+    estimator : None: the selected estimate of each drive, or the recorded estimate.
+    limit : maximum of the metric (:data:`AT_LEAST`: minimum). None for a requirement on the ratio to ``baseline``, an
+        estimator of the same run or :data:`RUN`, which is at most ``max_ratio``.
+    statistic : of several drives: :data:`POOLED` over all their stamps, :data:`WORST_DRIVE`, or the ``quantile`` of the
+        drives. confidence : of the interval that decides.
+    exposure_drives, exposure_minutes, exposure_km : the least scored driving for a verdict.
+    """
+
+    id: str
+    title: str
+    signal: str
+    metric: str = "rmse"
+    estimator: str | None = None
+    segment: str = "all"
+    limit: float | None = None
+    baseline: str | None = None
+    max_ratio: float | None = None
+    statistic: str = POOLED
+    quantile: float | None = None
+    confidence: float = 0.95
+    exposure_drives: int = 1
+    exposure_minutes: float = 0.0
+    exposure_km: float = 0.0
+
+    @property
+    def unit(self) -> str:
+        """Unit of its value: that of the metric, or 1 for a ratio."""
+        return "1" if self.baseline is not None else registered()[self.metric].unit_of(self.signal)
+
+    @property
+    def measured(self) -> str:
+        """What is measured of a drive, independent of the limit: requirements with equal values share blocks."""
+        of = self.estimator or "selected"
+        against = "" if self.baseline in (None, RUN) else f" / {self.baseline}"
+        return f"{self.signal} {self.metric} {self.segment} {of}{against}"
+
+    @property
+    def bound(self) -> float:
+        """The limit or the largest ratio."""
+        bound = self.limit if self.baseline is None else self.max_ratio
+        assert bound is not None
+        return bound
+
+    @property
+    def label(self) -> str:
+        """``sideslip RMSE ≤ 0.5° (nonlinear)``, as people read it."""
+        what = f"{LABELS[self.signal]} {registered()[self.metric].label}"
+        if self.baseline is None:
+            limit = f"{'≥' if self.metric in AT_LEAST else '≤'} {shown(self.bound, self.unit)}"
+        else:
+            limit = f"≤ {self.bound:.4g} × {'run A' if self.baseline == RUN else self.baseline}"
+        of = [
+            "" if self.segment == "all" else self.segment,
+            "" if self.statistic == POOLED else self.statistic,
+            self.estimator or "",
+        ]
+        where = ", ".join(filter(None, of))
+        return f"{what} {limit}{f' ({where})' if where else ''}"
+
+
+@dataclass(frozen=True, slots=True)
+class ValidationPlan:
+    """Requirements in order. ``file``: name of the file; empty for the default plan, which decides no exit code."""
+
+    requirements: tuple[Requirement, ...]
+    title: str = ""
+    file: str = ""
+
+    @property
+    def sha256(self) -> str:
+        """The digest of the requirements."""
+        from pdhef_logtool.storage.documents import jsonable
+
+        return digest(jsonable(self.requirements))
+
+
+def shown(value: float, unit: str) -> str:
+    """Return a value with its unit as people read it."""
+    text, factor = read_unit(unit)
+    if unit == "1":
+        return f"{value:.3g}"
+    return f"{value * factor:.3g}{'' if text.startswith('°') else ' '}{text}"
+
+
+_Name = Annotated[str, Field(min_length=1, max_length=200)]
+_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
+class RequirementTable(BaseModel):
+    """A table ``[[requirement]]`` of plan.toml."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", description="Unique identifier.")]
+    title: Annotated[_Name | None, Field(description="One line for reports. Default: the requirement in words.")] = None
+    signal: Annotated[_Name, Field(description="Signal of metrics.parquet, for example sideslip_rad.")]
+    metric: Annotated[_Name, Field(description="Metric of metrics.parquet.")] = "rmse"
+    estimator: Annotated[
+        _Name | None, Field(description="Default: the selected estimate; with pdhef metrics the recorded estimate.")
+    ] = None
+    segment: Annotated[_Name | None, Field(description="Segment of the drives. Default: all.")] = None
+    manoeuvre: Annotated[_Name | None, Field(description="Manoeuvre, in place of segment.")] = None
+    limit: Annotated[
+        float | None,
+        Field(allow_inf_nan=False, description="Limit in the SI unit of the metric; a minimum for coverage95."),
+    ] = None
+    limit_deg: Annotated[float | None, Field(allow_inf_nan=False, description="Limit in degrees.")] = None
+    limit_deg_s: Annotated[float | None, Field(allow_inf_nan=False, description="Limit in degrees per second.")] = None
+    baseline: Annotated[
+        _Name | None,
+        Field(
+            description="In place of a limit: an estimator of the same run (physics, zero), or run: run A of compare."
+        ),
+    ] = None
+    max_ratio: Annotated[_Positive | None, Field(description="Largest ratio of the metric to the baseline's.")] = None
+    statistic: Annotated[
+        str,
+        Field(
+            pattern=r"^(pooled|worst drive|quantile 0\.\d+)$",
+            description="Over drives: pooled (all stamps together), worst drive, or for example quantile 0.9.",
+        ),
+    ] = POOLED
+    confidence: Annotated[
+        float, Field(ge=0.5, lt=1.0, description="Confidence level of the two-sided interval that decides.")
+    ] = 0.95
+    exposure_drives: Annotated[int, Field(ge=1, description="Least number of scored drives.")] = 1
+    exposure_minutes: Annotated[
+        float, Field(ge=0.0, allow_inf_nan=False, description="Least scored driving in minutes.")
+    ] = 0.0
+    exposure_km: Annotated[
+        float, Field(ge=0.0, allow_inf_nan=False, description="Least scored driving in kilometres.")
+    ] = 0.0
+
+
+class PlanTable(BaseModel):
+    """The file plan.toml."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    title: Annotated[str, Field(max_length=200, description="Name of the plan, for reports.")] = ""
+    requirement: Annotated[list[RequirementTable], Field(min_length=1)]
+
+
+def load_plan(path: Path) -> ValidationPlan:
+    """Read plan.toml.
+
+    Raises
+    ------
+    UsageError
+        The file is missing, is no TOML, or contains wrong, unknown, missing or contradicting entries; all are named.
+    """
+    raw = read_toml(path, "a validation plan (TOML)", UsageError, "pdhef plan init -o plan.toml writes an example")
+    return plan_from_dict(raw, where=str(path), file=path.name)
+
+
+def plan_from_dict(raw: dict[str, Any], *, where: str, file: str = "") -> ValidationPlan:
+    """Return the plan of parsed TOML; raises UsageError with every problem in one line."""
+    problems = [unknown(key, PlanTable.model_fields) for key in raw if key not in PlanTable.model_fields]
+    title = raw.get("title", "")
+    if not isinstance(title, str) or len(title) > 200:
+        problems.append("title: should be a text of at most 200 characters")
+    tables = raw.get("requirement", [])
+    if not isinstance(tables, list) or not tables:
+        problems.append("requirement: give at least one [[requirement]] table")
+        tables = []
+    requirements = [_read(table, f"requirement[{i}]", problems) for i, table in enumerate(tables)]
+    ids = [r.id for r in requirements if r is not None]
+    problems += [f"id {name!r} is used {ids.count(name)} times" for name in dict.fromkeys(ids) if ids.count(name) > 1]
+    if problems:
+        raise UsageError(
+            expected="the entries of a validation plan",
+            got="; ".join(problems),
+            where=where,
+            remedy="docs/report.md describes every entry",
+        )
+    return ValidationPlan(tuple(r for r in requirements if r is not None), title, file)
+
+
+def _read(raw: object, where: str, problems: list[str]) -> Requirement | None:
+    table = checked(RequirementTable, raw, where, problems)
+    if table is None:
+        return None
+    before = len(problems)
+    segment = table.manoeuvre or table.segment or "all"
+    if table.manoeuvre is not None and table.segment is not None:
+        problems.append(f"{where}: give segment or manoeuvre, not both")
+    for key, value, allowed in (
+        ("signal", table.signal, tuple(SIGNALS)),
+        ("metric", table.metric, comparable()),
+        ("manoeuvre" if table.manoeuvre else "segment", segment, SEGMENTS),
+    ):
+        if value not in allowed:
+            problems.append(f"{where}.{key} = {unknown(value, allowed)}")
+    if len(problems) > before:
+        return None
+    limit = _limit(table, where, problems)
+    if table.statistic == POOLED and table.metric not in SQUARES | MEANS:
+        problems.append(
+            f"{where}.statistic: {table.metric} of several drives cannot be pooled; use 'worst drive' or 'quantile 0.9'"
+        )
+    if len(problems) > before:
+        return None
+    matches = _QUANTILE.fullmatch(table.statistic)
+    rest = {"title", "segment", "manoeuvre", "limit", "limit_deg", "limit_deg_s"}
+    return Requirement(
+        title=table.title or "",
+        segment=segment,
+        limit=limit,
+        quantile=None if matches is None else float(matches[1]),
+        **table.model_dump(exclude=rest),
+    )
+
+
+def comparable() -> tuple[str, ...]:
+    """Return the metrics that a requirement can limit: those with a better side."""
+    return tuple(
+        name for name, m in registered().items() if m.best == "lower" or name in AT_LEAST or name in ("bias", "lag_s")
+    )
+
+
+def _limit(table: RequirementTable, where: str, problems: list[str]) -> float | None:
+    """Return the limit in the unit of metrics.parquet, None for a ratio; add what is wrong with it."""
+    unit = registered()[table.metric].unit_of(table.signal)
+    given = {
+        "limit": (table.limit, unit, 1.0),
+        "limit_deg": (table.limit_deg, "rad", 1.0 / DEGREES),
+        "limit_deg_s": (table.limit_deg_s, "rad/s", 1.0 / DEGREES),
+    }
+    matches = {key: entry for key, entry in given.items() if entry[0] is not None}
+    if table.baseline is None:
+        if table.max_ratio is not None:
+            problems.append(f"{where}.max_ratio: needs a baseline, for example baseline = 'zero'")
+        elif len(matches) != 1:
+            problems.append(f"{where}: give one of limit, limit_deg, limit_deg_s, or baseline with max_ratio")
+    else:
+        if matches:
+            problems.append(f"{where}: give {next(iter(matches))} or baseline, not both")
+        if table.max_ratio is None:
+            problems.append(f"{where}.max_ratio: is missing, for example 1.0")
+        if registered()[table.metric].best != "lower":
+            problems.append(f"{where}.baseline: {table.metric} has no ratio; use a metric such as rmse")
+    for key, (value, needed, factor) in matches.items():
+        if needed != unit:
+            problems.append(f"{where}.{key}: {table.signal} {table.metric} is in {unit}, not in {needed}")
+        elif value is not None and table.baseline is None:
+            return value * factor
+    return None
+
+
+def default_plan() -> ValidationPlan:
+    """Return the plan that reports show where none is given: an orientation, not a standard."""
+    beta, degree = "sideslip_rad", 1.0 / DEGREES
+    return ValidationPlan(
+        (
+            Requirement("sideslip", "Sideslip is accurate enough for stability control", beta, limit=degree),
+            Requirement("use", "Sideslip is 10 % better than zero sideslip", beta, baseline="zero", max_ratio=0.9),
+            Requirement("interval", "The 95 % interval contains the ground truth", beta, "coverage95", limit=0.9),
+            Requirement("yaw-rate", "Yaw rate is accurate", "yaw_rate_rad_s", limit=degree),
+            Requirement("speed", "Longitudinal speed is accurate", "vx_m_s", limit=0.3),
+        ),
+        title="Default plan (orientation only)",
+    )
+
+
+def names_of(requirements: Sequence[Requirement]) -> frozenset[str]:
+    """Return the estimators of the run that requirements name, as subject or baseline."""
+    named = {r.estimator for r in requirements} | {r.baseline for r in requirements}
+    return frozenset(name for name in named if name is not None and name != RUN)

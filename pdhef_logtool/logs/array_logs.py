@@ -1,0 +1,225 @@
+"""Logs of arrays: Parquet files, and MAT files of version 5 and (extra ``formats``) 7.3.
+
+A table of a Parquet file, and each struct of a MAT file, becomes a topic. The variables of a MAT file that are in no
+struct are one topic for each length. A vector of times in the same struct, or in one around it, is their clock.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdhef_logtool.logs.container import describe_damage
+from pdhef_logtool.logs.log_file import LogFile
+from pdhef_logtool.logs.resource_limits import ResourceLimits
+from pdhef_logtool.logs.table_columns import Sheet, extra, field_name, read_head, stamps_of, tables_of, unique
+from pdhef_logtool.logs.table_log import Table, TableLog
+from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.signals import IntArray, Loss
+
+_HDF5_MAT = b"MATLAB 7.3"
+#: Head of a MAT file, and the types of its elements: a matrix, and a compressed element.
+_MAT_HEAD, _MATRIX, _COMPRESSED = 128, 14, 15
+#: Columns of a matrix that become fields.
+_MOST_COLUMNS = 16
+#: Structs inside one another.
+_DEEPEST = 8
+#: Separates the parts of a path.
+_SLASH = "/"
+
+
+def open_parquet(file: LogFile) -> TableLog:
+    """Open a Parquet file; a row group that cannot be read is a loss."""
+    import pyarrow.parquet as pq
+
+    losses: list[Loss] = []
+    with file.meter.running(file.path.stat().st_size), pq.ParquetFile(file.path) as source:
+        groups = [source.metadata.row_group(i) for i in range(source.num_row_groups)]
+        file.meter.limits.check(
+            "chunk_ratio", sum(g.total_byte_size for g in groups) / max(1, file.path.stat().st_size), str(file.place)
+        )
+        parts = []
+        for number, group in enumerate(groups):
+            try:
+                parts.append(source.read_row_group(number))
+            except Exception as error:  # noqa: BLE001  any error of a damaged page
+                what = f"row group {number} cannot be read: {describe_damage(error)[1]}"
+                losses.append(Loss("bad-rows", what, str(file.place), count=group.num_rows))
+        if not parts:
+            raise LogError(expected="a row group that can be read", got="none", where=str(file.place))
+        import pyarrow as pa
+
+        table = pa.concat_tables(parts)
+        while any(pa.types.is_struct(column.type) for column in table.columns):
+            table = table.flatten()
+        fields, units = read_head(table.column_names)
+        units |= {n: unit for n, f in zip(fields, table.schema, strict=True) if (unit := _unit_of(f.metadata))}
+        columns = {name: _arrow_column(column) for name, column in zip(fields, table.columns, strict=True)}
+        sheet = Sheet("parquet", columns, units)
+        return TableLog(file, "parquet", list(tables_of(sheet, str(file.place), losses)), losses)
+
+
+def _unit_of(metadata: Mapping[bytes, bytes] | None) -> str:
+    values = {key.lower(): value for key, value in (metadata or {}).items()}
+    return next((values[key].decode(errors="replace") for key in (b"unit", b"units") if key in values), "")
+
+
+def _arrow_column(column: Any) -> Any:
+    """Return a column as an array [N] with NaN (NaT) for null, or as texts."""
+    import polars as pl
+    import pyarrow as pa
+
+    if pa.types.is_timestamp(column.type):
+        return column.cast(pa.timestamp("ns")).to_numpy()
+    if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
+        return pl.Series(column.to_pylist(), dtype=pl.String)
+    if pa.types.is_boolean(column.type) or (column.null_count and pa.types.is_integer(column.type)):
+        return column.cast(pa.float64()).to_numpy()
+    return column.to_numpy()
+
+
+def open_mat(file: LogFile) -> TableLog:
+    """Open a MAT file; a variable that cannot be read is a loss."""
+    losses: list[Loss] = []
+    size = file.path.stat().st_size
+    with file.meter.running(size), file.path.open("rb") as head:
+        hdf5 = head.read(len(_HDF5_MAT)) == _HDF5_MAT
+        read = _hdf5_variables if hdf5 else _variables
+        arrays: dict[str, dict[str, NDArray[Any]]] = {}
+        for path, array in read(file, losses):
+            struct_, _, name = path.rpartition(_SLASH)
+            arrays.setdefault(struct_, {}).update(_vectors(name, array))
+        tables = list(_mat_tables(arrays, str(file.place), losses))
+    if not tables:
+        raise LogError(
+            expected="a vector of times (t, time, ...) as long as the signals beside it",
+            got=", ".join(name for columns in arrays.values() for name in columns) or "no numeric variables",
+            where=str(file.place),
+            remedy="name the vector of times so",
+        )
+    return TableLog(file, "mat-7.3" if hdf5 else "mat", tables, losses)
+
+
+def _mat_tables(arrays: Mapping[str, Mapping[str, NDArray[Any]]], where: str, losses: list[Loss]) -> Iterator[Table]:
+    """Yield the tables of the structs; vectors without a clock of their length are noted."""
+    sheets = []
+    for struct_, variables in arrays.items():
+        lengths = dict.fromkeys(len(v) for v in variables.values() if len(v) > 1)
+        for length in sorted(lengths, reverse=True):
+            columns = {n: v for n, v in variables.items() if len(v) == length}
+            sheets.append((struct_, length, Sheet(field_name(struct_) if struct_ else "mat", columns, {})))
+    clocks = {}
+    for struct_, length, sheet in sheets:
+        try:
+            clocks[struct_, length] = stamps_of(sheet, where)
+        except LogError:
+            continue
+    rows: list[tuple[Sheet, IntArray]] = []
+    for struct_, length, sheet in sheets:
+        clock = _clock_of(struct_, length, clocks)
+        if clock is None:
+            text = f"{', '.join([*sheet.columns][:5])} ({length} values) have no times of their length"
+            losses.append(Loss("no-clock", text, where, severity="note"))
+            continue
+        signals = {n: v for n, v in sheet.columns.items() if (struct_, length) not in clocks or n not in clock[1]}
+        rows += [(Sheet(sheet.name, signals, {}), clock[0])] if signals else []
+    for name, (sheet, stamps) in zip(unique(sheet.name for sheet, _ in rows), rows, strict=True):
+        yield from tables_of(Sheet(name, sheet.columns, {}), where, losses, stamps)
+
+
+def _clock_of(struct_: str, length: int, clocks: Mapping[tuple[str, int], Any]) -> Any:
+    """Return the clock of a struct, or of the nearest struct around it, for vectors of a length."""
+    while (struct_, length) not in clocks:
+        if not struct_:
+            return None
+        struct_ = struct_.rpartition(_SLASH)[0]
+    return clocks[struct_, length]
+
+
+def _vectors(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """Return a vector, or the columns of a matrix, by field names."""
+    array = np.asarray(array)
+    if array.dtype.kind not in "iufb" or array.size < 2 or array.ndim > 2:
+        return {}
+    if array.ndim == 2 and min(array.shape) == 1:
+        array = array.ravel()
+    if array.ndim == 1:
+        return {field_name(name): array}
+    array = array if array.shape[0] >= array.shape[1] else array.T
+    if array.shape[1] > _MOST_COLUMNS:
+        return {}
+    return {f"{field_name(name)}_{i}": array[:, i] for i in range(array.shape[1])}
+
+
+def _variables(file: LogFile, losses: list[Loss]) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield the arrays of a MAT file of version 5 by path, element by element, so that a damaged one is a loss."""
+    from scipy.io import loadmat
+
+    data = file.path.read_bytes()
+    order = ">" if data[126:128] == b"MI" else "<"
+    offset = _MAT_HEAD
+    while offset + 8 <= len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, offset)
+        element = data[offset : offset + 8 + size]
+        offset += 8 + size + (0 if kind == _COMPRESSED else -size % 8)
+        try:
+            if len(element) < 8 + size:
+                raise ValueError("the file ends inside of it")
+            if kind == _COMPRESSED:
+                element = _inflated(element[8:], file.meter.limits)
+            values = loadmat(io.BytesIO(data[:_MAT_HEAD] + element), simplify_cells=True)
+        except Exception as error:  # noqa: BLE001  any error of a damaged element
+            losses.append(
+                Loss("bad-variable", f"a variable cannot be read: {describe_damage(error)[1]}", str(file.place))
+            )
+            continue
+        for name, value in values.items():
+            if not name.startswith("__"):
+                yield from _leaves(name, value, 0)
+
+
+def _inflated(stored: bytes, limits: ResourceLimits) -> bytes:
+    inflater = zlib.decompressobj()
+    data = inflater.decompress(stored, limits.chunk_bytes)
+    limits.check_unpacked(len(data) + (1 << 30) * bool(inflater.unconsumed_tail), len(stored), "a variable")
+    return data
+
+
+def _leaves(path: str, value: Any, depth: int) -> Iterator[tuple[str, NDArray[Any]]]:
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        yield path, value
+    elif isinstance(value, dict) and depth < _DEEPEST:
+        for name, inner in value.items():
+            yield from _leaves(f"{path}{_SLASH}{name}", inner, depth + 1)
+    elif isinstance(value, list | np.ndarray) and depth < _DEEPEST:
+        structs = [v for v in value if isinstance(v, dict)][:_MOST_COLUMNS]
+        for number, inner in enumerate(structs):
+            label = inner.get("label") or inner.get("name") or str(number)
+            yield from _leaves(f"{path}{_SLASH}{label}", inner, depth + 1)
+
+
+def _hdf5_variables(file: LogFile, losses: list[Loss]) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield the arrays of a MAT file of version 7.3 by path; a dataset that cannot be read is a loss."""
+    h5py = extra("h5py", "MAT files of version 7.3", file.place)
+    datasets: list[tuple[str, Callable[[], NDArray[Any]]]] = []
+
+    def visit(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and not name.startswith("#") and item.dtype.kind in "iufb":
+            datasets.append((name, lambda: item[()]))
+
+    with h5py.File(Path(file.path), "r") as source:
+        source.visititems(visit)
+        for name, load in datasets:
+            try:
+                yield name, np.asarray(load())
+            except Exception as error:  # noqa: BLE001  any error of a damaged chunk
+                losses.append(
+                    Loss("bad-variable", f"{name} cannot be read: {describe_damage(error)[1]}", str(file.place))
+                )

@@ -1,0 +1,188 @@
+"""MDF 3 and 4 (extra ``formats``): each channel group is a topic with its own clock; columns are read when needed.
+
+A group of bus logging becomes a topic ``can`` of raw frames.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import mmap
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdhef_logtool.logs.can_decoding import Frames
+from pdhef_logtool.logs.container import describe_damage
+from pdhef_logtool.logs.log_file import LogFile
+from pdhef_logtool.logs.message_schema import FieldInfo
+from pdhef_logtool.logs.table_columns import NO_TIME, extra, field_name, placed, unique
+from pdhef_logtool.logs.table_log import Table, TableLog
+from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.signals import IntArray, Loss
+from pdhef_logtool.storage.files import scratch_folder
+
+_FRAMES = "CAN_DataFrame"
+#: Parts of a frame by the names of the standard for bus logging.
+_PARTS = {"id": "ID", "length": "DataLength", "is_extended": "IDE", "bus": "BusChannel"}
+_DATA_BLOCK = re.compile(rb"##(?:DT|SD|DV)\0{4}")
+_LONGEST_NAME = 40
+#: Times from the start of a recording beyond this are damaged.
+_LONGEST_S = 4e9
+
+
+def open_mdf(file: LogFile) -> TableLog:
+    """Open an MDF file; groups and channels that cannot be read are losses."""
+    asammdf = extra("asammdf", "MDF files", file.place)
+    logging.getLogger("asammdf").setLevel(logging.CRITICAL)
+    losses: list[Loss] = []
+    with file.meter.running(file.path.stat().st_size):
+        source, got = _opened(asammdf, file.path)
+        copies = ExitStack()
+        if source is None and (copy := _repaired(file.path, Path(copies.enter_context(scratch_folder())))):
+            source, got = _opened(asammdf, copy)
+            losses.append(Loss("truncated", "the last block of data is incomplete", str(file.place)))
+        if source is None:
+            copies.close()
+            raise LogError(expected="an MDF file with readable channels", got=got, where=str(file.place))
+        groups = [Group(source, number) for number in range(len(source.groups))]
+        names = unique(group.name for group in groups)
+        tables: list[Table] = []
+        frames: list[Frames] = []
+        for name, group in zip(names, groups, strict=True):
+            try:
+                tables += group.tables(name, frames)
+            except Exception as error:  # noqa: BLE001  any error of a damaged block
+                what = f"the channel group cannot be read: {describe_damage(error)[1]}"
+                losses.append(Loss("bad-group", what, name))
+    if not tables:
+        source.close()
+        copies.close()
+        raise LogError(expected="a channel group with times", got="none that can be read", where=str(file.place))
+    release = file.release
+
+    def close() -> None:
+        source.close()
+        copies.close()
+        release()
+
+    opened = LogFile(file.path, file.place, file.meter, close, file.cut)
+    return TableLog(opened, f"mdf-{str(source.version)[:1]}", tables, losses, frames)
+
+
+def _repaired(path: Path, folder: Path) -> Path | None:
+    """Return a copy of a version 4 file whose last block of data has the length that is left; None if none is cut."""
+    size = path.stat().st_size
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        starts = [m.start() for m in _DATA_BLOCK.finditer(data) if m.start() + 16 <= size]
+        cut = [start for start in starts if start + int.from_bytes(data[start + 8 : start + 16], "little") > size]
+    if not cut:
+        return None
+    copy = folder / path.name
+    shutil.copyfile(path, copy)
+    with copy.open("r+b") as file:
+        file.seek(cut[-1] + 8)
+        file.write((size - cut[-1]).to_bytes(8, "little"))
+    return copy
+
+
+def _opened(asammdf: Any, path: Path) -> tuple[Any, str]:
+    """Return the file, or None and why it cannot be opened."""
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None  # the end of a half-opened object is an error there
+    source, got = None, ""
+    try:
+        try:
+            source = asammdf.MDF(str(path), use_display_names=False)
+        except Exception as error:  # noqa: BLE001  any error of a damaged file
+            got = describe_damage(error)[1]
+        if source is None:
+            gc.collect()
+    finally:
+        sys.unraisablehook = hook
+    return source, got
+
+
+class Group:
+    """A channel group of a file."""
+
+    def __init__(self, source: Any, number: int) -> None:
+        self._source, self._number = source, number
+        self._group = source.groups[number]
+        self._columns: dict[str, NDArray[Any]] = {}
+
+    @property
+    def name(self) -> str:
+        """Name by its acquisition, comment or source."""
+        group = self._group.channel_group
+        source = getattr(group, "acq_source", None)
+        texts = (getattr(group, "acq_name", ""), getattr(group, "comment", ""), getattr(source, "name", ""))
+        plain = (re.sub(r"<[^>]*>|\s+", " ", text or "").strip() for text in texts)
+        if self.is_frames:
+            return "can"
+        return field_name(next((t for t in plain if t and len(t) <= _LONGEST_NAME), f"group {self._number + 1}"))
+
+    @property
+    def is_frames(self) -> bool:
+        """Return whether it contains raw CAN frames."""
+        return any(channel.name == _FRAMES for channel in self._group.channels)
+
+    def tables(self, name: str, frames: list[Frames]) -> Iterator[Table]:
+        """Yield the table of the group, none without samples or times; raw CAN frames are added to ``frames``."""
+        master = self._source.masters_db.get(self._number)
+        if master is None or not self._group.channel_group.cycles_nr:
+            return
+        stamps, order = self._stamps()
+        if self.is_frames:
+            parts = {part: self._frames(end)[order].astype(np.int64) for part, end in _PARTS.items() if self._has(end)}
+            data = np.atleast_2d(self._frames("DataBytes"))[order].astype(np.uint8)
+            parts.setdefault("length", np.full(len(stamps), data.shape[1]))
+            frames.append(Frames(stamps, parts, data))
+            yield frames[-1].table(name)
+            return
+        indices = [i for i in range(len(self._group.channels)) if i != master]
+        titles = unique(field_name(self._group.channels[i].name) for i in indices)
+        fields = tuple(FieldInfo(t, "number", unit=self._unit(i)) for t, i in zip(titles, indices, strict=True))
+        yield Table(name, stamps, fields, partial(self._load, dict(zip(titles, indices, strict=True)), order))
+
+    def _stamps(self) -> tuple[IntArray, NDArray[Any]]:
+        """Return the times in ascending order, and the rows that they are of; rows without a time are left out."""
+        seconds = np.asarray(self._source.get_master(self._number), np.float64)
+        start_ns = round(self._source.start_time.timestamp() * 1e6) * 1000
+        finite = np.isfinite(seconds) & (np.abs(np.nan_to_num(seconds)) < _LONGEST_S)
+        stamps = np.where(finite, np.round(np.where(finite, seconds, 0.0) * 1e9).astype(np.int64) + start_ns, NO_TIME)
+        rows = np.flatnonzero(finite)
+        order = rows[np.argsort(stamps[rows], kind="stable")]
+        in_order: slice | NDArray[Any] = slice(None) if np.array_equal(order, np.arange(len(stamps))) else order
+        return placed(stamps)[in_order], in_order  # type: ignore[return-value]
+
+    def _load(self, indices: dict[str, int], order: Any, path: str, rows: slice) -> NDArray[Any]:
+        if path not in self._columns:
+            signal = self._source.get(group=self._number, index=indices[path])
+            samples = np.asarray(signal.samples)
+            if samples.dtype.kind in "SUO":  # a conversion to texts: its numbers
+                samples = self._source.get(group=self._number, index=indices[path], raw=True).samples
+            samples = np.asarray(samples)
+            invalid = getattr(signal, "invalidation_bits", None)
+            if invalid is not None and np.any(invalid):
+                samples = np.where(np.asarray(invalid, np.bool_), np.nan, samples)
+            self._columns[path] = samples[order]
+        return self._columns[path][rows]
+
+    def _unit(self, index: int) -> str:
+        with suppress(Exception):  # a damaged block of a unit is no reason to lose the channel
+            return str(self._source.get_channel_unit(group=self._number, index=index) or "")
+        return ""
+
+    def _has(self, end: str) -> bool:
+        return any(channel.name == f"{_FRAMES}.{end}" for channel in self._group.channels)
+
+    def _frames(self, end: str) -> NDArray[Any]:
+        return np.asarray(self._source.get(f"{_FRAMES}.{end}", group=self._number, raw=True, samples_only=True)[0])

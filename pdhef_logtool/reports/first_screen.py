@@ -1,0 +1,212 @@
+"""The first screen of a page: verdict per requirement, what was tested, what to do next."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pdhef_logtool.evaluation.requirement_verdicts import of_documents
+from pdhef_logtool.evaluation.validation_plan import shown
+from pdhef_logtool.records.printable import printable
+
+#: Class of the style by outcome.
+_KINDS = {"PASS": "pass", "FAIL": "fail", "INCONCLUSIVE": "unknown"}
+#: Versions that a first screen names; the appendix has all.
+_VERSIONS = ("pdhef-logtool", "python", "numpy")
+_MOST_NEXT = 4
+
+
+@dataclass(frozen=True, slots=True)
+class RequirementLine:
+    """A requirement as a reader sees it; all values are texts with their unit."""
+
+    id: str
+    title: str
+    label: str
+    outcome: str
+    kind: str
+    limit: str
+    value: str
+    margin: str
+    exposure: str
+    reason: str
+    next: str
+
+
+@dataclass(frozen=True, slots=True)
+class PlanHead:
+    """The verdicts of a plan: ``kind`` of the worst, one sentence, its requirements, and what limits the verdicts."""
+
+    kind: str
+    text: str
+    lines: Sequence[RequirementLine]
+    notes: Sequence[str]
+
+
+def plan_head(plan: Mapping[str, Any] | None) -> PlanHead | None:
+    """Return the verdicts of a report.json or run.json, None where it has none (earlier versions)."""
+    if not plan or not plan.get("requirements"):
+        return None
+    requirements = plan["requirements"]
+    counts = Counter(r["outcome"] for r in requirements)
+    parts = [f"{counts[outcome]} {outcome}" for outcome in ("FAIL", "INCONCLUSIVE", "PASS") if counts[outcome]]
+    name = f"Plan {plan['file']}" if plan.get("file") else "Default plan (orientation, decides no exit code)"
+    worst = next((k for o, k in (("FAIL", "fail"), ("INCONCLUSIVE", "unknown")) if counts[o]), "pass")
+    order = [r for outcome in ("FAIL", "INCONCLUSIVE", "PASS") for r in of_documents(requirements, outcome)]
+    notes = dict.fromkeys(note for r in requirements for note in r.get("notes") or ())
+    return PlanHead(worst, f"{name}: {', '.join(parts)}", [_line(r) for r in order], [*notes])
+
+
+def _line(requirement: Mapping[str, Any]) -> RequirementLine:
+    unit = str(requirement["unit"])
+    value, margin = requirement["value"], requirement["margin"]
+    sign = "≥" if requirement.get("at_least") else "≤"
+    of = f" × {requirement['baseline']}" if requirement.get("baseline") else ""
+    return RequirementLine(
+        str(requirement["id"]),
+        str(requirement["title"]),
+        str(requirement["label"]),
+        str(requirement["outcome"]),
+        _KINDS.get(str(requirement["outcome"]), "unknown"),
+        f"{sign} {shown(requirement['bound'], unit)}{of}",
+        "–" if value is None else f"{shown(value, unit)}{of}",
+        "–" if margin is None else f"{'+' if margin >= 0 else '−'}{shown(abs(margin), unit)}",
+        _exposure(requirement["exposure"]),
+        str(requirement["reason"]),
+        str(requirement["next"]),
+    )
+
+
+def _exposure(exposure: Mapping[str, Any]) -> str:
+    parts = [f"{exposure['drives']} {'drive' if exposure['drives'] == 1 else 'drives'}"]
+    if exposure["minutes"] is not None:
+        parts.append(f"{exposure['minutes']:.1f} min")
+    if exposure["km"] is not None:
+        parts.append(f"{exposure['km']:.1f} km")
+    return ", ".join(parts)
+
+
+def next_steps(plan: Mapping[str, Any] | None, more: str = "") -> list[str]:
+    """Return what to do: that of failed requirements, then of inconclusive ones, then ``more`` (clauses)."""
+    requirements = (plan or {}).get("requirements") or ()
+    steps = [
+        f"{r['id']}: {r['next']}"
+        for outcome in ("FAIL", "INCONCLUSIVE")
+        for r in of_documents(requirements, outcome)
+        if r["next"]
+    ]
+    by_text: dict[str, list[str]] = {}
+    for step in steps:
+        name, _, text = step.partition(": ")
+        by_text.setdefault(text, []).append(name)
+    joined = [f"{', '.join(names)}: {text}" for text, names in by_text.items()]
+    return [*joined[:_MOST_NEXT], *filter(None, more.split("; "))]
+
+
+def tested_drive(report: Mapping[str, Any], outcome: str = "") -> list[tuple[str, str]]:
+    """Return what was tested in one drive: term and text."""
+    log, vehicle, answer = report["log"], report["vehicle"], report.get("answer") or {}
+    file = f" ({vehicle['file']})" if vehicle.get("file") else ""
+    state = "validated on drives with ground truth" if vehicle.get("proven") else "parameters not validated"
+    if not vehicle.get("file"):
+        state = "no car given: default sedan"
+    facts = [
+        ("Car", f"{vehicle['name']}{file}; {state}"),
+        ("Estimate", f"{answer['main']} ({answer['why']})" if answer.get("main") else "none"),
+        ("Outcome", outcome if outcome != "ok" else ""),
+        (
+            "Drive",
+            f"{log['file']}, {duration(log['duration_s'])} from {_day(log['start_ns'])}; sha256 {log['sha256'][:12]}",
+        ),
+        ("Road", _road(report)),
+        ("Sensors", _sensors(report)),
+        ("Reference", _reference(report)),
+        ("Versions", versions(report.get("versions") or {})),
+    ]
+    return [(term, text) for term, text in facts if text]
+
+
+def duration(seconds: float) -> str:
+    """Return a duration as people read it."""
+    if seconds < 120.0:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60.0:.1f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
+
+
+def versions(installed: Mapping[str, str]) -> str:
+    """Return the versions that a first screen names."""
+    return ", ".join(f"{name} {installed[name]}" for name in _VERSIONS if name in installed)
+
+
+def _day(stamp_ns: int) -> str:
+    try:
+        return f"{dt.datetime.fromtimestamp(stamp_ns * 1e-9, dt.UTC):%Y-%m-%d %H:%M} UTC"
+    except (OverflowError, ValueError, OSError):
+        return str(stamp_ns)
+
+
+def _road(report: Mapping[str, Any]) -> str:
+    space, friction = report.get("operating_space") or {}, report.get("friction") or {}
+    cells = [c for c in space.get("cells") or () if c["seconds"] >= 0.5]
+    parts = []
+    if cells:
+        speeds, ays = space["speed_edges_m_s"], space["ay_edges_m_s2"]
+        fast, lateral = max(c["speed"] for c in cells), max(c["ay"] for c in cells)
+        parts = [
+            f"speed up to {_upper(speeds, fast)} m/s",
+            f"lateral acceleration up to {_upper(ays, lateral)} m/s²",
+        ]
+    if friction.get("source"):
+        parts.append(f"friction: {friction['source']}")
+    return ", ".join(parts)
+
+
+def _upper(edges: Sequence[float], index: int) -> str:
+    return f"{edges[index + 1]:g}" if index + 1 < len(edges) else f"more than {edges[-1]:g}"
+
+
+def _sensors(report: Mapping[str, Any]) -> str:
+    names = [str(s["name"]) for s in report["mapping"]["signals"]]
+    wheels = [n for n in names if n.startswith("wheel_speed_")]
+    others = [n for n in names if n not in wheels]
+    return ", ".join([*others, *([f"{len(wheels)} wheel speeds"] if wheels else [])])
+
+
+def _reference(report: Mapping[str, Any]) -> str:
+    truth, reference = report["truth"], report.get("reference") or {}
+    if truth["available"]:
+        topics = dict.fromkeys(
+            str(q["source"]).partition(".")[0] for q in truth["quantities"] if str(q["source"]).startswith("/")
+        )
+        return f"ground truth: {', '.join(topics) or 'derived'}"
+    if reference and not reference.get("refused"):
+        return "estimated reference (no ground truth in the log)"
+    return "no ground truth"
+
+
+def tested_run(run: Mapping[str, Any], hours: float) -> list[tuple[str, str]]:
+    """Return what was tested in a run of several drives: term and text."""
+    logs = run.get("logs") or ()
+    cars = Counter(str((log.get("car") or {}).get("name")) for log in logs if log.get("car"))
+    mains = Counter(str(log["main"]) for log in logs if log.get("main"))
+
+    def counted(counts: Mapping[str, int]) -> str:
+        named = [f"{printable(k)} ({n})" if len(counts) > 1 else printable(k) for k, n in [*counts.items()][:5]]
+        return ", ".join(named) + (f" and {len(counts) - 5} more" if len(counts) > 5 else "")
+
+    failed = sum(str(log.get("outcome", "")).startswith("failed") for log in logs)
+    lost = sum(str(log.get("outcome", "")).startswith("lost") for log in logs)
+    notes = [f"{failed} failed" if failed else "", f"{lost} with input lost" if lost else ""]
+    drives = ", ".join(
+        [f"{len(logs)} {'log' if len(logs) == 1 else 'logs'}", duration(3600.0 * hours), *filter(None, notes)]
+    )
+    facts = [
+        ("Cars", counted(cars)),
+        ("Estimate", counted(mains)),
+        ("Drives", drives),
+        ("Versions", versions(run.get("versions") or {})),
+    ]
+    return [(term, text) for term, text in facts if text]

@@ -1,0 +1,157 @@
+"""The validation report of a run as one PDF to sign: cover, contents, verdicts, drives and input hashes.
+
+The document is one HTML file with pictures of the figures, printed by a headless Chromium.
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.reports.drive import drive_page
+from pdhef_logtool.reports.first_screen import PlanHead, next_steps, plan_head, tested_drive, tested_run
+from pdhef_logtool.reports.page import render
+from pdhef_logtool.reports.pictures import picture
+from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun
+from pdhef_logtool.storage.files import write_bytes
+
+PDF_FILE = "report.pdf"
+#: Drives with a section of their own; those of the worst verdicts come first.
+_MOST_DRIVES = 20
+#: Figures of a drive in the document. The path shows where the car drove.
+_FIGURES, _POSITIONS = ("worst", "sideslip", "error", "ay"), ("path",)
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+_TIMEOUT_S = 180.0
+
+
+@dataclass(frozen=True, slots=True)
+class DriveSection:
+    """One drive of the document: verdicts, facts, next steps, and pictures with their captions."""
+
+    label: str
+    outcome: str
+    head: PlanHead | None
+    facts: Sequence[tuple[str, str]]
+    steps: Sequence[str]
+    pictures: Sequence[tuple[str, Markup]]
+
+
+def write_pdf(run: OpenedRun, *, positions: bool = False) -> Path:
+    """Write the PDF of a run; ``positions``: with the paths of the drives.
+
+    Raises
+    ------
+    OutputError : There is no Chromium, it fails, or the file cannot be written.
+    """
+    browser = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
+    target = run.folder / PDF_FILE
+    if browser is None:
+        raise OutputError(
+            expected="Chromium, which prints the PDF",
+            got="none on this machine",
+            where=str(target),
+            remedy="apt-get install chromium, or print report.html from any browser",
+        )
+    with tempfile.TemporaryDirectory(prefix="pdhef-pdf-") as scratch:
+        page, made = Path(scratch) / "report.html", Path(scratch) / PDF_FILE
+        page.write_bytes(pdf_page(run, positions=positions))
+        _print(browser, page, made, target)
+        write_bytes(target, made.read_bytes())
+    return target
+
+
+def _print(browser: str, page: Path, made: Path, target: Path) -> None:
+    command = [
+        browser, "--headless", "--disable-gpu", "--no-first-run", "--disable-extensions", "--disable-dev-shm-usage",
+        "--disable-background-networking", f"--user-data-dir={page.parent / 'profile'}", "--no-pdf-header-footer",
+        *(["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []),
+        f"--print-to-pdf={made}", page.as_uri(),
+    ]  # fmt: skip
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)  # noqa: S603
+        got = done.stderr.strip().splitlines()[-1:] if done.returncode or not made.is_file() else []
+    except (OSError, subprocess.TimeoutExpired) as error:
+        got = [str(error)]
+    if not made.is_file():
+        raise OutputError(expected="a PDF", got=(got or ["none"])[0], where=str(target), remedy="print report.html")
+
+
+def pdf_page(run: OpenedRun, *, positions: bool = False) -> bytes:
+    """Return the document as HTML."""
+    document = run.document
+    reports = [(log, _report(log)) for log in run.logs]
+    ranked = sorted(reports, key=lambda pair: _gravity(pair[1]))[:_MOST_DRIVES]
+    seconds = sum(r["log"]["duration_s"] for _, r in reports if r is not None)
+    plan = document.get("plan")
+    return render(
+        "pdf.html",
+        title=(plan or {}).get("title")
+        or f"Validation of {len(run.logs)} {'drive' if len(run.logs) == 1 else 'drives'}",
+        plan=plan_head(plan),
+        plan_file=(plan or {}).get("file"),
+        plan_sha256=(plan or {}).get("sha256"),
+        tested=tested_run(document, seconds / 3600.0),
+        steps=next_steps(plan),
+        sections=[_section(log, report, positions=positions) for log, report in ranked],
+        left_out=len(reports) - len(ranked),
+        inputs=document.get("logs") or (),
+        versions=document.get("versions") or {},
+        positions=positions,
+    )
+
+
+def _title(plan: Mapping[str, Any] | None) -> str:
+    """Return the title of a user's plan."""
+    return str(plan.get("title") or "") if plan is not None and plan.get("file") else ""
+
+
+def _report(log: OpenedLog) -> dict[str, Any] | None:
+    try:
+        report = log.report()
+    except OutputError:
+        return None
+    return report if report is not None and isinstance(report.get("log"), dict) else None
+
+
+def _gravity(report: Mapping[str, Any] | None) -> tuple[int, float]:
+    """Return what drives are sorted by: failed requirements first, then the sideslip error."""
+    if report is None:
+        return (1, 0.0)
+    fails = sum(r["outcome"] == "FAIL" for r in (report.get("plan") or {}).get("requirements") or ())
+    main = (report.get("answer") or {}).get("main")
+    wanted = (main, "sideslip_rad", "all", "rmse")
+    errors = [
+        m["value"] for m in report["metrics"] if (m["estimator"], m["signal"], m["segment"], m["metric"]) == wanted
+    ]
+    return (-fails, -(errors[0] or 0.0) if errors else 0.0)
+
+
+def _section(log: OpenedLog, report: Mapping[str, Any] | None, *, positions: bool) -> DriveSection:
+    if report is None:
+        return DriveSection(log.label, log.outcome, None, (), (), ())
+    charts = drive_page(log).charts
+    keys = (*_FIGURES, *(_POSITIONS if positions else ()))
+    drawn = [
+        (charts.text(key), Markup(base64.b64encode(picture(charts.figures[key], charts)).decode()))  # noqa: S704 (base64)
+        for key in keys
+        if key in charts.figures
+    ]
+    more = ((report.get("answer") or {}).get("texts") or {}).get("next") or ""
+    return DriveSection(
+        log.label,
+        log.outcome,
+        plan_head(report.get("plan")),
+        tested_drive(report, log.outcome),
+        next_steps(report.get("plan"), more),
+        drawn,
+    )

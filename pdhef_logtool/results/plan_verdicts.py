@@ -1,0 +1,293 @@
+"""The verdicts of a validation plan on the drives of a run, from metrics.parquet and the blocks of report.json."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.evaluation.metrics.independence import NOT_INDEPENDENT
+from pdhef_logtool.evaluation.metrics.sensor_residuals import SENSORS
+from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks, from_document
+from pdhef_logtool.evaluation.requirement_bounds import LEAST_DRIVES
+from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, RequirementVerdict, gates, judge
+from pdhef_logtool.evaluation.validation_plan import POOLED, RUN, Requirement, ValidationPlan, names_of
+from pdhef_logtool.records.tracks import REFERENCE
+from pdhef_logtool.results.sink import TRUTH
+
+if TYPE_CHECKING:
+    import polars as pl
+
+#: Figures beside that of the requirement: exposure, independence, and the estimated reference.
+_BESIDE = ("exposure_s", "exposure_m", NOT_INDEPENDENT, "reference_rms", "reference_std")
+#: Log, estimator, signal, segment and metric.
+_Key = tuple[str, str, str, str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class JudgedDrive:
+    """A drive of a run: its label, and its selected estimate (None: its only recorded estimate).
+
+    ``read_blocks`` returns its blocks of time; called where too few drives are scored for a bootstrap over drives.
+    """
+
+    log: str
+    main: str | None
+    read_blocks: Callable[[], Sequence[RequirementBlocks]] = tuple
+
+
+@dataclass(frozen=True, slots=True)
+class PlanVerdicts:
+    """The verdicts of a plan in its order. ``strict``: INCONCLUSIVE closes the gate too."""
+
+    plan: ValidationPlan
+    verdicts: tuple[RequirementVerdict, ...]
+    strict: bool = False
+
+    @property
+    def closes_gate(self) -> bool:
+        """Whether the command fails; the default plan never decides that."""
+        return bool(self.plan.file) and gates(self.verdicts, strict=self.strict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plan and verdicts as JSON-able values."""
+        return {
+            "title": self.plan.title,
+            "file": self.plan.file or None,
+            "sha256": self.plan.sha256,
+            "requirements": [v.to_dict() for v in self.verdicts],
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Figures by log, estimator, signal, segment and metric: value and number of stamps."""
+
+    values: Mapping[_Key, tuple[float, int]]
+    names: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    def of(self, log: str, name: str, requirement: Requirement, metric: str) -> tuple[float, int] | None:
+        """Return a figure of a requirement's signal and segment, None without a finite one."""
+        figure = self.values.get((log, name, requirement.signal, requirement.segment, metric))
+        return figure if figure is not None and math.isfinite(figure[0]) else None
+
+    def main(self, drive: JudgedDrive) -> str | None:
+        """Return the estimator of a drive that is judged by default."""
+        names = self.names.get(drive.log, ())
+        return drive.main if drive.main is not None else names[0] if len(names) == 1 else None
+
+
+def figures_of_rows(rows: Iterable[MetricRow]) -> Figures:
+    """Return the figures of rows at hand."""
+    values: dict[_Key, tuple[float, int]] = {}
+    names: dict[str, dict[str, None]] = {}
+    for r in rows:
+        values[r.log, r.estimator, r.signal, r.segment, r.metric] = r.value, r.n
+        if _is_estimator(r.estimator):
+            names.setdefault(r.log, {})[r.estimator] = None
+    return Figures(values, {log: list(of_log) for log, of_log in names.items()})
+
+
+def figures_of_file(metrics: pl.LazyFrame, plan: ValidationPlan, mains: Iterable[str | None]) -> Figures:
+    """Return what a plan needs of metrics.parquet; only these rows are read."""
+    import polars as pl
+
+    named = {SENSORS, *names_of(plan.requirements), *(m for m in mains if m is not None)}
+    wanted = {
+        "signal": {"state", *(r.signal for r in plan.requirements)},
+        "segment": {"all", *(r.segment for r in plan.requirements)},
+        "metric": {*_BESIDE, *(r.metric for r in plan.requirements)},
+    }
+    rows = metrics.filter(*(pl.col(key).cast(pl.String).is_in(sorted(values)) for key, values in wanted.items()))
+    if all(m is not None for m in mains):
+        rows = rows.filter(pl.col("estimator").cast(pl.String).is_in(sorted(named)))
+    columns = ("log", "estimator", "signal", "segment", "metric")
+    table = rows.select(*(pl.col(c).cast(pl.String) for c in columns), "value", "n").collect()
+    values: dict[_Key, tuple[float, int]] = {}
+    names: dict[str, dict[str, None]] = {}
+    for log, name, signal, segment, metric, value, n in table.iter_rows():
+        values[log, name, signal, segment, metric] = (math.nan if value is None else value), n
+        if _is_estimator(name):
+            names.setdefault(log, {})[name] = None
+    return Figures(values, {log: list(of_log) for log, of_log in names.items()})
+
+
+def _is_estimator(name: str) -> bool:
+    return "~" not in name and name not in (SENSORS, TRUTH, REFERENCE)
+
+
+def blocks_of(report: Mapping[str, Any] | None) -> list[RequirementBlocks]:
+    """Return the blocks of a report.json."""
+    return from_document((report or {}).get("requirement_blocks") or ())
+
+
+def plan_verdicts(
+    plan: ValidationPlan,
+    figures: Figures,
+    drives: Sequence[JudgedDrive],
+    *,
+    strict: bool = False,
+    against: tuple[Figures, Mapping[str, JudgedDrive]] | None = None,
+) -> PlanVerdicts:
+    """Return the verdicts of a plan.
+
+    Parameters
+    ----------
+    figures : of the drives. against : figures of run A, and its drive by the label of this run's, for requirements
+        with another run as baseline.
+    """
+    verdicts = []
+    for requirement in plan.requirements:
+        measured = {d.log: _measured(requirement, figures, d, against) for d in drives}
+        by_truth = [v for truth, _ in measured.values() if (v := truth) is not None]
+        values = by_truth or [v for _, estimated in measured.values() if (v := estimated) is not None]
+        if requirement.statistic == POOLED and len(values) < LEAST_DRIVES:
+            by_label = {d.log: d for d in drives}
+            values = [_with_blocks(requirement, v, by_label[v.log], against) for v in values]
+        missing = "" if values else _why_missing(requirement, figures, drives, against)
+        verdicts.append(judge(requirement, values, missing))
+    return PlanVerdicts(plan, tuple(verdicts), strict)
+
+
+def _measured(
+    requirement: Requirement,
+    figures: Figures,
+    drive: JudgedDrive,
+    against: tuple[Figures, Mapping[str, JudgedDrive]] | None,
+) -> tuple[DriveValue | None, DriveValue | None]:
+    """Return the metric of a drive against ground truth, and against the estimated reference."""
+    name = requirement.estimator or figures.main(drive)
+    if name is None:
+        return None, None
+    other = _Baseline.of(requirement, figures, drive, against)
+    truth = None
+    tainted = (drive.log, name, requirement.signal, "all", NOT_INDEPENDENT) in figures.values
+    if not tainted:
+        truth = _value(requirement, figures, drive, name, requirement.metric, other)
+    if (requirement.signal, requirement.metric) != ("sideslip_rad", "rmse"):
+        return truth, None
+    return truth, _value(requirement, figures, drive, name, "reference_rms", other)
+
+
+@dataclass(frozen=True, slots=True)
+class _Baseline:
+    """Where the baseline of a requirement is: figures, drive and estimator; ``needed``: whether there must be one."""
+
+    needed: bool
+    figures: Figures | None = None
+    drive: JudgedDrive | None = None
+    name: str | None = None
+
+    @classmethod
+    def of(
+        cls,
+        requirement: Requirement,
+        figures: Figures,
+        drive: JudgedDrive,
+        against: tuple[Figures, Mapping[str, JudgedDrive]] | None,
+    ) -> _Baseline:
+        if requirement.baseline is None:
+            return cls(False)
+        if requirement.baseline != RUN:
+            return cls(True, figures, drive, requirement.baseline)
+        partner = None if against is None else against[1].get(drive.log)
+        if against is None or partner is None:
+            return cls(True)
+        return cls(True, against[0], partner, requirement.estimator or against[0].main(partner))
+
+    def value(self, requirement: Requirement, metric: str) -> float | None:
+        if self.figures is None or self.drive is None or self.name is None:
+            return None
+        figure = self.figures.of(self.drive.log, self.name, requirement, metric)
+        return None if figure is None else figure[0]
+
+
+def _value(
+    requirement: Requirement, figures: Figures, drive: JudgedDrive, name: str, metric: str, other: _Baseline
+) -> DriveValue | None:
+    figure = figures.of(drive.log, name, requirement, metric)
+    baseline = other.value(requirement, metric)
+    if figure is None or (other.needed and baseline is None):
+        return None
+    std = figures.of(drive.log, name, requirement, "reference_std") if metric == "reference_rms" else None
+    if metric == "reference_rms" and std is None:
+        return None
+    value, n = figure
+    seconds, metres = _exposure(requirement, figures, drive, n)
+    return DriveValue(
+        drive.log, name, value, n, baseline, seconds, metres,
+        math.nan if std is None else std[0], same=other.needed and value == baseline,
+    )  # fmt: skip
+
+
+def _with_blocks(
+    requirement: Requirement,
+    value: DriveValue,
+    drive: JudgedDrive,
+    against: tuple[Figures, Mapping[str, JudgedDrive]] | None,
+) -> DriveValue:
+    """Return the metric of a drive with its blocks, which also state the exposure."""
+    estimated = math.isfinite(value.std)
+    blocks = _blocks_of(requirement, drive, estimated=estimated)
+    if requirement.baseline == RUN:
+        partner = None if against is None else against[1].get(drive.log)
+        theirs = None if partner is None else _blocks_of(requirement, partner, estimated=estimated)
+        blocks = _paired(blocks, theirs)
+    if blocks is None:
+        return value
+    return replace(value, blocks=blocks, seconds=math.fsum(blocks.seconds), metres=math.fsum(blocks.metres))
+
+
+def _blocks_of(requirement: Requirement, drive: JudgedDrive, *, estimated: bool) -> RequirementBlocks | None:
+    measured = requirement.measured
+    return next((b for b in drive.read_blocks() if b.of == measured and b.estimated == estimated), None)
+
+
+def _exposure(requirement: Requirement, figures: Figures, drive: JudgedDrive, n: int) -> tuple[float, float]:
+    """Return seconds and metres behind a figure: those of the segment, in proportion to its scored stamps."""
+    amounts = []
+    for metric in ("exposure_s", "exposure_m"):
+        whole = figures.values.get((drive.log, SENSORS, "state", requirement.segment, metric))
+        amounts.append(math.nan if whole is None or not whole[1] else whole[0] * min(n / whole[1], 1.0))
+    return amounts[0], amounts[1]
+
+
+def _paired(blocks: RequirementBlocks | None, theirs: RequirementBlocks | None) -> RequirementBlocks | None:
+    """Return blocks with those of run A as baseline, where both have them."""
+    if blocks is None or theirs is None or blocks.block_s != theirs.block_s:
+        return None
+    by_number = dict(zip(theirs.number, theirs.value, strict=True))
+    kept = [i for i, number in enumerate(blocks.number) if number in by_number]
+    columns = ("number", "n", "seconds", "metres", "value")
+    picked: dict[str, Any] = {k: [getattr(blocks, k)[i] for i in kept] for k in columns}
+    std = [blocks.std[i] for i in kept] if blocks.std else ()
+    return replace(blocks, **picked, baseline=[by_number[blocks.number[i]] for i in kept], std=std)
+
+
+def _why_missing(
+    requirement: Requirement,
+    figures: Figures,
+    drives: Sequence[JudgedDrive],
+    against: tuple[Figures, Mapping[str, JudgedDrive]] | None,
+) -> str:
+    """Return why no drive has the metric of a requirement."""
+    if requirement.baseline == RUN and against is None:
+        return "the baseline is another run: pdhef compare A B --plan PLAN"
+    names = {d.log: name for d in drives if (name := requirement.estimator or figures.main(d))}
+    if not names:
+        return "there are several recorded estimates: name one with estimator" if figures.names else "no estimate"
+    scored = [log for log, name in names.items() if figures.of(log, name, requirement, requirement.metric)]
+    tainted = [log for log in scored if (log, names[log], requirement.signal, "all", NOT_INDEPENDENT) in figures.values]
+    if scored and len(tainted) == len(scored):
+        return "the ground truth is an input of the estimator: not an independent check"
+    if scored and requirement.baseline not in (None, RUN):
+        return f"{requirement.baseline} has no such value: add it to --estimators"
+    if requirement.segment != "all" and any(
+        (log, name, requirement.signal, "all", requirement.metric) in figures.values for log, name in names.items()
+    ):
+        return f"no scored driving in {requirement.segment}"
+    if requirement.estimator is not None and not any(requirement.estimator in n for n in figures.names.values()):
+        return f"{requirement.estimator} did not run: add it to --estimators"
+    return f"no ground truth of {requirement.signal}"

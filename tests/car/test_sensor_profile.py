@@ -1,0 +1,152 @@
+"""A sensor profile replaces the sensors of a car, changes what each of its entries is about, and is in the records."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from reference_car import drive, slalom, with_noise
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.vehicle import SENSOR_PROFILES, Sensors, VehicleParameters, default_vehicle
+from pdhef_logtool.estimators.kinematic import Kinematic
+from pdhef_logtool.estimators.pass_through import PassThrough
+from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
+from pdhef_logtool.estimators.sensor_faults import find_faults
+from pdhef_logtool.estimators.speed_slip import without_slip
+from pdhef_logtool.records import reasons
+from pdhef_logtool.records.errors import VehicleError
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.runs.config import RunConfig, load_config
+from pdhef_logtool.runs.fleet import run_logs
+
+SAMPLES = Path(__file__).parents[2] / "sample_logs"
+
+
+def vehicle(**sensors: float) -> VehicleParameters:
+    return default_vehicle().model_copy(update={"sensors": Sensors(**sensors)})
+
+
+@pytest.fixture(scope="module")
+def clean() -> Signals:
+    return with_noise(drive(slalom(), 8.0, speed=15.0).signals, seed=1)
+
+
+def seconds(signals: Signals) -> np.ndarray:
+    return (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
+
+
+def reasons_of(signals: Signals, **sensors: float) -> int:
+    return int(np.bitwise_or.reduce(find_faults(signals, vehicle(**sensors), None)[0].reason))
+
+
+def masked(signals: Signals, column: str, gone: np.ndarray, value: float = np.nan) -> Signals:
+    return replace(signals, **{column: np.where(gone, value, getattr(signals, column))})
+
+
+def test_a_profile_replaces_the_sensors_and_makes_what_belongs_to_others_stale(tmp_path: Path) -> None:
+    file = tmp_path / "imu.toml"
+    file.write_text("[sensors]\nay_std_m_s2 = 0.3\nimu_rate_hz = 200.0\n")
+    car = Car.load("saloon", sensors=file)
+    assert car.datasheet.sensors == Sensors(ay_std_m_s2=0.3, imu_rate_hz=200.0)
+    assert car.vehicle.mass_kg == Car.load("saloon").vehicle.mass_kg
+    assert car.notes and car.physics_sha256 != Car.load("saloon").physics_sha256
+    named = Car.load(None, sensors="production")
+    assert (named.vehicle.sensors, named.physics_sha256) == (SENSOR_PROFILES["production"], Car.load().physics_sha256)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("[sensors]\nimu_rate = 200.0\n", r"imu\.toml: sensors.*imu_rate_hz"),
+        ("[sensors]\nimu_rate_hz = 0.0\n", r"imu\.toml: sensors.*imu_rate_hz"),
+        ("imu_rate_hz = 200.0\n", r"a table \[sensors\].*got none.*production"),
+    ],
+)
+def test_a_wrong_profile_is_refused_in_one_line(text: str, match: str, tmp_path: Path) -> None:
+    (tmp_path / "imu.toml").write_text(text)
+    with pytest.raises(VehicleError, match=match) as error:
+        Car.load(None, sensors=tmp_path / "imu.toml")
+    assert "\n" not in str(error.value)
+    with pytest.raises(VehicleError, match=r"absent\.toml"):
+        Car.load(None, sensors=tmp_path / "absent.toml")
+
+
+def test_rates_and_held_samples_decide_what_is_a_fault(clean: Signals) -> None:
+    t = seconds(clean)
+    gone = (t > 4.0) & (t < 4.3)
+    assert reasons_of(masked(clean, "ay_m_s2", gone)) & reasons.MISSING_AY
+    assert not reasons_of(masked(clean, "ay_m_s2", gone), imu_hold_s=0.5) & reasons.MISSING_AY
+    stuck = masked(clean, "ay_m_s2", (t > 4.0) & (t < 4.3), 1.0)
+    assert reasons_of(stuck) & reasons.STUCK_AY
+    assert not reasons_of(stuck, stuck_samples=60) & reasons.STUCK_AY
+    noise = np.where((t > 4.0) & (t < 7.0), np.random.default_rng(0).normal(0.0, 2.0, len(t)), 0.0)
+    burst = replace(clean, ay_m_s2=clean.ay_m_s2 + noise)
+    assert reasons_of(burst) & reasons.BURST_AY
+    assert not reasons_of(burst, imu_span_s=0.02) & reasons.BURST_AY  # 100 Hz is too slow for such a profile
+    assert not reasons_of(burst, imu_rate_hz=1.0) & reasons.BURST_AY  # 100 samples count as one
+
+
+def test_speed_and_steering_are_kept_for_the_times_of_the_profile(clean: Signals) -> None:
+    t = seconds(clean)
+    dark = masked(clean, "speed_m_s", t > 4.0)
+
+    def lost_s(**sensors: float) -> float:
+        car = Car.of(vehicle(**sensors))
+        passed = PassThrough("zero", claims_zero_sideslip=True, speed_hold_s=car.datasheet.sensors.speed_hold_s)
+        values = passed.run(dark, None)[0].values[:, 0]
+        return float(t[np.isfinite(values)].max())
+
+    assert lost_s() == pytest.approx(4.5, abs=0.02)
+    assert lost_s(speed_hold_s=1.5) == pytest.approx(5.5, abs=0.02)
+    kinematic = Kinematic(speed_hold_s=1.5).run(dark, None)[0].valid
+    assert float(t[kinematic].max()) == pytest.approx(5.5, abs=0.02)
+    lost = masked(clean, "steer_rad", t > 4.0)
+
+    def steered_s(**sensors: float) -> float:
+        steps, _ = PhysicsUkf(vehicle(**sensors)).run(lost, None)
+        return float(t[steps.valid].max())
+
+    assert steered_s() == pytest.approx(4.2, abs=0.02)
+    assert steered_s(steer_hold_s=1.0) == pytest.approx(5.0, abs=0.02)
+
+
+def test_the_lowest_speed_of_wheels_with_few_pulses_is_no_slip() -> None:
+    rolling = drive(lambda _: 0.0, 6.0, speed=1.6).signals
+    t = seconds(rolling)
+    gone = (t > 3.0) & (t < 4.0)
+    silent = masked(rolling, "speed_m_s", gone, 0.0)
+    assert without_slip(silent, Sensors(), None)[0] is not silent
+    assert without_slip(silent, Sensors(speed_least_m_s=2.0), None)[0] is silent
+
+
+def test_a_standstill_has_the_speed_and_the_yaw_rate_of_the_profile() -> None:
+    parked = drive(lambda _: 0.0, 6.0, speed=0.2).signals
+    offset = replace(parked, yaw_rate_rad_s=parked.yaw_rate_rad_s + 0.08)
+
+    def still(signals: Signals, **sensors: float) -> bool:
+        steps, _ = PhysicsUkf(vehicle(**sensors)).run(signals, None)
+        return bool((steps.x[-100:, 0] == 0.0).any())
+
+    assert not still(parked)
+    assert still(parked, speed_zero_m_s=0.5)
+    assert not still(offset, speed_zero_m_s=0.5)
+    assert still(offset, speed_zero_m_s=0.5, still_yaw_rate_rad_s=0.1)
+
+
+def test_a_run_records_the_profile(tmp_path: Path) -> None:
+    file = tmp_path / "imu.toml"
+    file.write_text("[sensors]\nspeed_hold_s = 0.7\n")
+    config = load_config(None, {"sensor_profile": file, "estimators": ("zero",), "keep": "metrics"})
+    run_logs([str(SAMPLES / "step.mcap")], tmp_path / "out", config)
+    (report,) = (tmp_path / "out").rglob("report.json")
+    written: dict[str, Any] = json.loads(report.read_text())["vehicle"]["sensors"]
+    assert written == Sensors(speed_hold_s=0.7).model_dump()
+    document = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert document["config"]["sensor_profile"] == "imu.toml"
+    assert document["logs"][0]["car"]["sensors"] == {"speed_hold_s": 0.7}
+    assert RunConfig().sensor_profile is None

@@ -1,0 +1,114 @@
+"""``pdhef convert``: the MCAP of a log gives the same columns, the same mapping and the same estimates."""
+
+from __future__ import annotations
+
+import math
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pdhef_logtool import Car, estimate, inspect_log, read_drive
+from pdhef_logtool.logs.conversion import convert_log
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.open_log import open_log
+from tests.command_line import called
+
+COLUMNS = {
+    "Lateral Acc. [g]": ("ay_m_s2", 1.0 / 9.80665),
+    "Longitudinal Acc. [m/s²]": ("ax_m_s2", 1.0),
+    "Yaw Rate [°/s]": ("yaw_rate_rad_s", math.degrees(1.0)),
+    "Road Wheel Angle [deg]": ("steer_rad", math.degrees(1.0)),
+    "Speed [km/h]": ("speed_m_s", 3.6),
+}
+
+
+@pytest.fixture(scope="module")
+def table(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A CSV file with the signals of a sample log; the speed in every second row."""
+    with read_drive(sample_logs_dir / "dlc.mcap", Car.load("saloon")) as drive:
+        signals = drive.whole().signals
+    cells = [[f"{s * 1e-9:.2f}" for s in signals.stamps_ns[10:-10] - signals.stamps_ns[0]]]
+    for signal, scale in COLUMNS.values():
+        values = getattr(signals, signal)[10:-10] * scale
+        every = 2 if signal == "speed_m_s" else 1
+        cells.append([f"{v:.6f}" if i % every == 0 else "" for i, v in enumerate(values)])
+    rows = [";".join(row).replace(".", ",") for row in zip(*cells, strict=True)]
+    path = tmp_path_factory.mktemp("table") / "drive.csv"
+    path.write_bytes("\n".join([";".join(["Time [s]", *COLUMNS]), *rows, ""]).encode("latin-1"))
+    return path
+
+
+def _same_columns(one: DriveLog, two: DriveLog) -> None:
+    assert [(t.name, t.messages) for t in one.topics] == [(t.name, t.messages) for t in two.topics]
+    for topic in one.topics:
+        fields = {f.path: f.unit for f in one.fields(topic.name)}
+        assert {f.path: f.unit for f in two.fields(topic.name)} == fields
+        first, second = (log.read({topic.name: tuple(fields)})[topic.name] for log in (one, two))
+        np.testing.assert_array_equal(first.log_time_ns, second.log_time_ns)
+        for path in fields:
+            np.testing.assert_array_equal(first.fields[path], second.fields[path])
+
+
+def test_a_converted_table_has_the_same_columns_mapping_and_estimates(table: Path, tmp_path: Path) -> None:
+    output = tmp_path / "drive.mcap"
+    done = called("convert", table, "-o", output)
+    assert done.returncode == 0, done.stderr
+    with closing(open_log(table)) as one, closing(open_log(output)) as two:
+        _same_columns(one, two)
+    mapped = [{n: (s.topic, s.paths) for n, s in inspect_log(p).mapping.signals.items()} for p in (table, output)]
+    assert mapped[0] == mapped[1]
+    assert set(mapped[0]) == {signal for signal, _ in COLUMNS.values()}
+    tracks = []
+    for path in (table, output):
+        with read_drive(path, Car.load("saloon")) as drive:
+            tracks.append(estimate(drive, ["phy-ukf"]).tracks["phy-ukf"])
+    np.testing.assert_array_equal(*(t.sideslip_rad for t in tracks))
+    assert np.nanmax(np.abs(tracks[0].sideslip_rad)) > 0.01
+
+
+def test_frames_and_messages_are_converted(sample_logs_dir: Path, tmp_path: Path) -> None:
+    can = pytest.importorskip("can")
+    with can.BLFWriter(str(tmp_path / "a.blf")) as writer:
+        for i in range(50):
+            data = bytes(range(i % 9))
+            writer.on_message_received(can.Message(timestamp=1.7e9 + i * 0.01, arbitration_id=i, data=data, channel=0))
+    convert_log(tmp_path / "a.blf", tmp_path / "a.mcap")
+    with closing(open_log(tmp_path / "a.blf")) as one, closing(open_log(tmp_path / "a.mcap")) as two:
+        wanted = {"can": ["id", "length", "data", "is_extended"]}
+        frames, copies = (log.read(wanted)["can"].fields for log in (one, two))
+    for path in ("id", "length", "is_extended"):
+        np.testing.assert_array_equal(frames[path], copies[path])
+    np.testing.assert_array_equal(np.nan_to_num(frames["data"]), copies["data"])
+    convert_log(sample_logs_dir / "dlc.mcap", tmp_path / "copy.mcap")
+    with closing(open_log(sample_logs_dir / "dlc.mcap")) as one, closing(open_log(tmp_path / "copy.mcap")) as two:
+        topic = next(t.name for t in one.topics if t.type_name.endswith("Imu"))
+        columns = [log.read({topic: ["angular_velocity.z"]})[topic] for log in (one, two)]
+    np.testing.assert_array_equal(*(c.fields["angular_velocity.z"] for c in columns))
+
+
+def test_a_conversion_is_complete_or_absent(table: Path, tmp_path: Path) -> None:
+    output = tmp_path / "drive.mcap"
+    output.write_bytes(b"mine")
+    done = called("convert", table, "-o", output)
+    assert (done.returncode, output.read_bytes()) == (1, b"mine")
+    assert "one that exists" in done.stderr
+    (tmp_path / "bad.csv").write_text("a,b\n1,2\n")
+    assert called("convert", tmp_path / "bad.csv", "-o", tmp_path / "no.mcap").returncode == 1
+    (tmp_path / "cut.csv").write_bytes(table.read_bytes()[:-30])
+    done = called("convert", tmp_path / "cut.csv", "-o", tmp_path / "cut.mcap")
+    assert done.returncode == 3
+    assert "incomplete" in done.stderr
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.csv", "cut.csv", "cut.mcap", "drive.mcap"]
+
+
+@pytest.mark.slow
+def test_a_run_on_a_table_writes_all_outputs(table: Path, tmp_path: Path) -> None:
+    done = called("run", table, "-o", tmp_path / "out", "--car", "saloon", "-e", "zero,phy-ukf")
+    assert done.returncode in (0, 3), done.stderr
+    folder = tmp_path / "out" / "logs" / "drive"
+    names = {p.name for p in folder.iterdir()}
+    assert names >= {"annotated.mcap", "recording.rrd", "estimates.parquet", "report.html", "metrics.parquet"}
+    with closing(open_log(folder / "annotated.mcap")) as log:
+        assert all(t.name.startswith("/pdhef/") for t in log.topics)

@@ -1,0 +1,162 @@
+"""Verdicts on synthetic drives: they flip at the right limits, with the promised error rates, and say what to drive."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
+from pdhef_logtool.evaluation.requirement_bounds import least_drives, quantile
+from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, judge
+from pdhef_logtool.evaluation.validation_plan import Requirement
+
+LIMIT = Requirement("A", "", "sideslip_rad", limit=0.02)
+RATIO = Requirement("B", "", "sideslip_rad", baseline="run", max_ratio=1.0)
+
+
+def drives(
+    values: Sequence[float], others: Sequence[float] | None = None, n: Sequence[int] = (), **more: Any
+) -> list[DriveValue]:
+    return [
+        DriveValue(
+            f"d{i}", "pd-hef", float(v), int(n[i]) if len(n) else 1000, None if others is None else float(others[i]),
+            60.0, 1000.0, **more,
+        )
+        for i, v in enumerate(values)
+    ]  # fmt: skip
+
+
+def blocks(values: Sequence[float], baseline: Sequence[float] = (), std: Sequence[float] = ()) -> RequirementBlocks:
+    k = len(values)
+    return RequirementBlocks("x", "pd-hef", 10.0, range(k), [1000] * k, [10.0] * k, [200.0] * k, values, baseline, std)
+
+
+@pytest.mark.parametrize("spread", [0.3, 0.5])
+@pytest.mark.parametrize("count", [5, 20, 100])
+def test_the_bound_covers_the_true_value_as_often_as_it_says(spread: float, count: int) -> None:
+    rng = np.random.default_rng(count)
+    true = 0.01 * math.exp(spread**2)  # √ mean of squares of a lognormal
+    covered = 0
+    for _ in range(100):
+        values, n = 0.01 * np.exp(rng.normal(0.0, spread, count)), rng.integers(2000, 30000, count)
+        verdict = judge(LIMIT, drives(values, n=n))
+        assert verdict.high is not None
+        covered += verdict.high >= true
+    assert 86 <= covered <= 100  # 90–98 % of many: 0.90 to 0.96 of 200 when this was chosen
+
+
+@pytest.mark.parametrize(("worse", "outcome", "least", "most"), [(1.1, "FAIL", 95, 100), (1.0, "FAIL", 0, 5)])
+def test_a_planted_regression_fails_and_equal_runs_do_not(worse: float, outcome: str, least: int, most: int) -> None:
+    rng = np.random.default_rng(3)
+    found: Counter[str] = Counter()
+    for _ in range(100):
+        common = 0.01 * np.exp(rng.normal(0.0, 0.5, 100))
+        a, b = (common * np.exp(rng.normal(0.0, 0.1, 100)) for _ in "ab")
+        found[judge(RATIO, drives(worse * b, a)).outcome] += 1
+    assert least <= found[outcome] <= most
+
+
+@pytest.mark.parametrize(("limit", "outcome"), [(0.0130, "PASS"), (0.0100, "INCONCLUSIVE"), (0.0080, "FAIL")])
+def test_the_verdict_flips_with_the_limit(limit: float, outcome: str) -> None:
+    values = 0.01 * np.exp(np.random.default_rng(1).normal(0.0, 0.2, 20))
+    verdict = judge(replace(LIMIT, limit=limit), drives(values))
+    assert verdict.outcome == outcome and verdict.basis == "drives"
+    assert verdict.margin == pytest.approx(limit - verdict.value)
+    assert verdict.low is not None and verdict.high is not None and verdict.low < verdict.value < verdict.high
+    if outcome == "PASS":
+        assert (verdict.reason[:6], verdict.next) == ("0.596°", "") or verdict.next == ""
+
+
+def test_an_inconclusive_verdict_says_how_much_driving_would_decide() -> None:
+    values = 0.01 * np.exp(np.random.default_rng(1).normal(0.0, 0.3, 8))
+    verdict = judge(replace(LIMIT, limit=0.0119), drives(values))
+    assert verdict.outcome == "INCONCLUSIVE" and "includes the limit" in verdict.reason
+    assert "times as much driving would decide" in verdict.next and "minutes more" in verdict.next
+
+
+@pytest.mark.parametrize(
+    ("needs", "reason", "to_do"),
+    [
+        ({"exposure_drives": 40}, "20 of 40 drives", "drive 20 drives more, with ground truth"),
+        ({"exposure_minutes": 30.0}, "20.0 of 30 minutes", "drive 10.0 minutes more"),
+        ({"exposure_km": 100.0}, "20.0 of 100 km", "drive 80.0 km more"),
+    ],
+)
+def test_too_little_driving_is_inconclusive_whatever_the_value(needs: dict[str, Any], reason: str, to_do: str) -> None:
+    for value in (0.001, 1.0):
+        verdict = judge(replace(LIMIT, **needs), drives([value] * 20))
+        assert verdict.outcome == "INCONCLUSIVE"
+        assert reason in verdict.reason and to_do in verdict.next
+    unknown = [replace(d, seconds=math.nan) for d in drives([0.001] * 20)]
+    assert judge(replace(LIMIT, exposure_minutes=1.0), unknown).outcome == "INCONCLUSIVE"
+    assert judge(LIMIT, unknown).outcome == "PASS"
+
+
+def test_below_five_drives_blocks_decide_and_the_verdict_says_so() -> None:
+    rng = np.random.default_rng(2)
+    values = 0.01 * np.exp(rng.normal(0.0, 0.2, 30))
+    whole = float(np.sqrt(np.mean(values**2)))
+    (drive,) = drives([whole], blocks=blocks(values.tolist()))
+    verdict = judge(LIMIT, [drive])
+    assert (verdict.outcome, verdict.basis, verdict.units, verdict.block_s) == ("PASS", "blocks", 30, 10.0)
+    assert verdict.value == pytest.approx(whole)
+    assert "blocks of 10 s within 1 drive: other drives may differ more" in verdict.notes[0]
+    short = judge(LIMIT, [replace(drive, blocks=blocks(values[:3].tolist()))])
+    assert short.outcome == "INCONCLUSIVE" and "from 3 blocks" in short.reason and "30 s more" in short.next
+    none = judge(LIMIT, [replace(drive, blocks=None)])
+    assert none.outcome == "INCONCLUSIVE" and none.next == "run the logs again with this plan"
+
+
+def test_against_an_estimated_reference_no_small_margin_decides() -> None:
+    values, std = [0.0100, 0.0101] * 10, 0.006
+    near = drives(values, std=std)
+    assert judge(replace(LIMIT, limit=0.0150), drives(values)).outcome == "PASS"
+    verdict = judge(replace(LIMIT, limit=0.0150), near)
+    assert verdict.outcome == "INCONCLUSIVE" and verdict.against == "estimated reference"
+    assert "closer than 2 standard deviations of the estimated reference (0.344°)" in verdict.reason
+    assert judge(replace(LIMIT, limit=0.0230), near).outcome == "PASS"
+    ratio = replace(RATIO, baseline="zero", max_ratio=0.9)
+    assert judge(ratio, drives(values, [0.02] * 20, std=std)).outcome == "INCONCLUSIVE"
+    assert judge(ratio, drives(values, [0.06] * 20, std=std)).outcome == "PASS"
+
+
+def test_minimum_bias_worst_drive_and_quantile() -> None:
+    share = replace(LIMIT, metric="coverage95", limit=0.9)
+    assert judge(share, drives([0.94, 0.95, 0.96] * 4)).outcome == "PASS"
+    assert judge(share, drives([0.60, 0.65, 0.70] * 4)).outcome == "FAIL"
+    bias = replace(LIMIT, metric="bias")
+    assert judge(bias, drives([-0.031, -0.030, -0.029] * 4)).outcome == "FAIL"
+    assert judge(bias, drives([-0.01, 0.0, 0.01] * 4)).outcome == "PASS"
+    worst = replace(LIMIT, statistic="worst drive")
+    verdict = judge(worst, drives([0.01] * 9 + [0.021]))
+    assert (verdict.outcome, verdict.worst) == ("FAIL", "d9")
+    assert "at least 69% of drives like these" in judge(worst, drives([0.01] * 10)).reason
+    tenth = replace(LIMIT, statistic="quantile 0.9", quantile=0.9)
+    assert "drive 26 more drives" in judge(tenth, drives([0.01] * 10)).next
+    assert judge(tenth, drives([0.01] * least_drives(0.9, 0.95))).outcome == "PASS"
+
+
+def test_the_bounds_of_a_quantile_are_exact() -> None:
+    rng = np.random.default_rng(0)
+    found = [quantile(rng.uniform(size=60), 0.9, 0.95) for _ in range(400)]
+    assert np.mean([f.low <= 0.9 for f in found]) >= 0.95
+    assert np.mean([f.high >= 0.9 for f in found]) >= 0.95
+
+
+def test_a_filter_that_is_its_own_baseline_is_named() -> None:
+    same = drives([0.01] * 6, [0.01] * 6, same=True)
+    verdict = judge(replace(RATIO, baseline="physics"), same)
+    assert verdict.value == 1.0 and verdict.notes == ("pd-hef equals physics in these drives (residual gain 0)",)
+
+
+def test_without_any_figure_the_reason_is_given() -> None:
+    verdict = judge(LIMIT, [], "no ground truth of sideslip_rad")
+    assert (verdict.outcome, verdict.value, verdict.margin) == ("INCONCLUSIVE", None, None)
+    assert verdict.reason == "no ground truth of sideslip_rad"
+    assert verdict.next == "record drives with ground truth"

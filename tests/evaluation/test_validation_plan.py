@@ -1,0 +1,110 @@
+"""The validation plan: strict reading, its JSON Schema, the example, and the conversion of earlier files."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+
+from pdhef_logtool.evaluation.plan_example import EXAMPLE, converted
+from pdhef_logtool.evaluation.validation_plan import PlanTable, default_plan, load_plan, plan_from_dict
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.results.arrow_schema import load_schema
+
+SCHEMA = Path(__file__).parents[2] / "schemas" / "plan.schema.json"
+WHOLE = {"id": "A", "signal": "sideslip_rad", "limit_deg": 0.5}
+
+
+def read(*tables: dict[str, Any]) -> Any:
+    return plan_from_dict({"requirement": list(tables)}, where="plan.toml").requirements
+
+
+def test_the_schema_is_what_the_model_says() -> None:
+    head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "$id": "plan.schema.json"}
+    text = json.dumps({**head, **PlanTable.model_json_schema()}, indent=2, ensure_ascii=False) + "\n"
+    if os.environ.get("PDHEF_UPDATE_SCHEMAS") == "1":
+        SCHEMA.write_text(text, encoding="utf-8")
+    assert SCHEMA.read_text(encoding="utf-8") == text, "PDHEF_UPDATE_SCHEMAS=1 writes it again"
+
+
+def test_the_example_is_valid_and_is_read(tmp_path: Path) -> None:
+    jsonschema.validate(tomllib.loads(EXAMPLE), load_schema("plan.schema.json"))
+    (tmp_path / "plan.toml").write_text(EXAMPLE, encoding="utf-8")
+    plan = load_plan(tmp_path / "plan.toml")
+    assert (plan.file, [r.id for r in plan.requirements]) == ("plan.toml", [f"SR-{i}" for i in range(1, 6)])
+    assert plan.requirements[0].limit == pytest.approx(math.radians(0.5))
+    assert plan.requirements[2].label == "sideslip RMSE ≤ 0.5 × zero"
+    assert plan.requirements[4].label == "sideslip in 95 % CI ≥ 0.9"
+    assert not default_plan().file
+
+
+def test_degrees_manoeuvres_and_quantiles() -> None:
+    rate, quantile = read(
+        {"id": "A", "signal": "yaw_rate_rad_s", "limit_deg_s": 1.0, "manoeuvre": "slalom"},
+        {**WHOLE, "id": "B", "metric": "p95_abs", "statistic": "quantile 0.9"},
+    )
+    assert (rate.limit, rate.segment) == (pytest.approx(math.radians(1.0)), "slalom")
+    assert (quantile.quantile, quantile.statistic) == (0.9, "quantile 0.9")
+
+
+@pytest.mark.parametrize(
+    ("table", "problem"),
+    [
+        ({}, "requirement[0].id: is missing"),
+        ({**WHOLE, "id": "a b"}, "requirement[0].id"),
+        ({**WHOLE, "limit": 0.1}, "give one of limit, limit_deg, limit_deg_s, or baseline"),
+        ({"id": "A", "signal": "sideslip_rad"}, "give one of limit"),
+        ({**WHOLE, "signal": "vx_m_s"}, "vx_m_s rmse is in m/s, not in rad"),
+        ({**WHOLE, "baseline": "zero", "max_ratio": 1.0}, "give limit_deg or baseline, not both"),
+        ({"id": "A", "signal": "sideslip_rad", "baseline": "zero"}, "max_ratio: is missing"),
+        ({**WHOLE, "max_ratio": 1.0}, "max_ratio: needs a baseline"),
+        ({**WHOLE, "metric": "p95_abs"}, "p95_abs of several drives cannot be pooled; use 'worst drive'"),
+        ({**WHOLE, "metric": "nees"}, "requirement[0].metric = nees: unknown"),
+        ({**WHOLE, "segment": "curves"}, "requirement[0].segment = curves: unknown"),
+        ({**WHOLE, "segment": "all", "manoeuvre": "slalom"}, "give segment or manoeuvre, not both"),
+        ({**WHOLE, "confidence": 1.0}, "requirement[0].confidence"),
+        ({**WHOLE, "statistic": "median"}, "requirement[0].statistic"),
+    ],
+)
+def test_a_wrong_entry_is_named(table: dict[str, Any], problem: str) -> None:
+    with pytest.raises(UsageError) as error:
+        read(table)
+    assert problem in str(error.value) and error.value.exit_code == 2
+
+
+def test_ids_are_unique_and_a_missing_file_is_a_usage_error(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="id 'A' is used 2 times"):
+        read(WHOLE, WHOLE)
+    with pytest.raises(UsageError, match=r"pdhef plan init -o plan\.toml writes an example"):
+        load_plan(tmp_path / "none.toml")
+
+
+def test_earlier_files_are_converted(tmp_path: Path) -> None:
+    old = tmp_path / "old.toml"
+    old.write_text(
+        '[[threshold]]\nsignal = "sideslip_rad"\nmetric = "rmse"\nmax = 0.5\nunit = "deg"\n'
+        '[[threshold]]\nsignal = "sideslip_rad"\nmetric = "max_abs"\nmax = 0.1\nestimator = "pd-hef"\n'
+        'segment = "linear"\n'
+        '[[threshold]]\nsignal = "sideslip_rad"\nmetric = "coverage95"\nmin = 90\nunit = "%"\n'
+        '[[threshold]]\nsignal = "sideslip_rad"\nmetric = "rmse"\nmin = 0.5\n'
+        '[[figure]]\nmax_regression = "5%"\n[[figure]]\nmetric = "max_abs"\nmax_regression = 0.1\n'
+    )
+    text = converted(old)
+    assert "# threshold 4 has no counterpart (a plan has no max for rmse" in text.replace("no min", "no max")
+    plan = plan_from_dict(tomllib.loads(text), where="converted")
+    assert [r.label for r in plan.requirements] == [
+        "sideslip RMSE ≤ 0.5°",
+        "sideslip max ≤ 5.73° (linear, worst drive, pd-hef)",
+        "sideslip in 95 % CI ≥ 0.9",
+        "sideslip RMSE ≤ 1.05 × run A",
+        "sideslip max ≤ 1.1 × run A (worst drive)",
+    ]
+    old.write_text("[mapping]\n")
+    with pytest.raises(UsageError, match=r"\[\[threshold\]\] or \[\[figure\]\] tables, got mapping"):
+        converted(old)

@@ -1,0 +1,124 @@
+"""Recorded drives in other formats: the same signals give the same sideslip scores as in MCAP."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from pdhef_logtool import Car, ReadOptions, estimate, read_drive, score
+from pdhef_logtool.mapping.mapping_file import mapping_from_dict
+
+DEG, KMH, G = math.pi / 180.0, 1.0 / 3.6, 9.81
+V40 = """
+mass_kg = 1355.0
+yaw_inertia_kg_m2 = 2380.0
+cg_to_front_axle_m = 1.0455
+cg_to_rear_axle_m = 1.5045
+track_m = 1.565
+steering_ratio = 17.0
+friction = 0.95
+[tyres.front]
+cornering_stiffness_n_per_rad = 70000.0
+[tyres.rear]
+cornering_stiffness_n_per_rad = 70000.0
+"""
+GTI = """
+mass_kg = 1926.2
+yaw_inertia_kg_m2 = 2763.49
+cg_to_front_axle_m = 1.264
+cg_to_rear_axle_m = 1.367
+friction = 0.9
+[tyres.front]
+cornering_stiffness_n_per_rad = 80000.0
+[tyres.rear]
+cornering_stiffness_n_per_rad = 120000.0
+"""
+#: Fields, with scales and latencies, of speed, a_x, a_y, yaw rate, steering, and v_x and v_y of the ground truth.
+_Table = dict[str, tuple[str, str | list[str], float, float]]
+_SPEED, _AX, _AY, _YAW, _WHEEL, _STEER = (
+    "speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "steering_wheel_rad", "steer_rad",
+)  # fmt: skip
+_VX, _VY = "truth.vx_m_s", "truth.vy_m_s"
+_SLIP = "/reference/slip"
+V40_MCAP: _Table = {
+    _SPEED: (_SLIP, "lng_vel_kmh", KMH, 0.0),
+    _AX: ("/imu/data", "linear_acceleration.x", 1.0, 0.0),
+    _AY: ("/imu/data", "linear_acceleration.y", 1.0, 0.0),
+    _YAW: ("/imu/data", "angular_velocity.z", 1.0, 0.0),
+    _WHEEL: ("/can/steering", "steering_wheel_angle_deg", DEG, 0.0),
+    _VX: (_SLIP, "lng_vel_kmh", KMH, 0.0),
+    _VY: (_SLIP, "lat_vel_kmh", KMH, 0.0),
+}
+V40_VBO: _Table = {
+    _SPEED: ("vbox", "Lng_Vel", KMH, 0.0),
+    _AX: ("vbox", "X_Accel", G, 0.0),
+    _AY: ("vbox", "Y_Accel", G, 0.0),
+    _YAW: ("vbox", "YawRate", -DEG, 0.0),
+    _WHEEL: ("vbox", "SteerAng", DEG, 0.0),
+    _VX: ("vbox", "Lng_Vel", KMH, 0.0),
+    _VY: ("vbox", "Lat_Vel", KMH, 0.0),
+}
+V40_MF4: _Table = {
+    _SPEED: ("GNSS_10_Hz", "GNSS_Speed", KMH, 0.06),
+    _AX: ("IMU_100_Hz", "IMU_AccX", G, 0.0),
+    _AY: ("IMU_100_Hz", "IMU_AccY", G, 0.0),
+    _YAW: ("IMU_100_Hz", "IMU_YawRate", -DEG, 0.0),
+    _WHEEL: ("CAN", "CAN_SteeringWheelAngle", DEG, 0.006),
+    _VX: ("reference", "REF_VelLong", KMH, 0.0),
+    _VY: ("reference", "REF_VelLat", KMH, 0.0),
+}
+GTI_MCAP: _Table = {
+    _SPEED: ("/speed_state", "ux_mps", 1.0, 0.0),
+    _AX: ("/ins/imu", "linear_acceleration.x", 1.0, 0.0),
+    _AY: ("/ins/imu", "linear_acceleration.y", 1.0, 0.0),
+    _YAW: ("/ins/imu", "angular_velocity.z", 1.0, 0.0),
+    _STEER: ("/steer_state", "delta_rad", 1.0, 0.0),
+    _VX: ("/ins/velocity", "twist.linear.x", 1.0, 0.0),
+    _VY: ("/ins/velocity", "twist.linear.y", 1.0, 0.0),
+}
+_MAT = dict(
+    zip(GTI_MCAP, ("Ux_mps", "ax_mps2", "ay_mps2", "r_radps", "deltaMeasured_rad", "Ux_mps", "Uy_mps"), strict=True)
+)
+GTI_MAT: _Table = {name: ("mat", field, 1.0, 0.0) for name, field in _MAT.items()}
+_GNSS: _Table = {_SPEED: ("/gnss/velocity", ["twist.linear.x", "twist.linear.y"], 1.0, 0.0)}
+
+
+def _scores(log: Path, table: _Table, car: Path, clock: str, end: str) -> dict[str, float]:
+    raw: dict[str, dict[str, dict[str, object]]] = {"signals": {}, "truth": {}}
+    for name, (topic, field, scale, latency_s) in table.items():
+        entry: dict[str, object] = {"topic": topic, "field": field, "scale": scale, "latency_s": latency_s}
+        if isinstance(field, list):
+            entry |= {"combine": "norm", "scale": [scale] * len(field)}
+        if name == _WHEEL:
+            entry |= {"valid_min": -10.0, "valid_max": 10.0}
+        raw["truth" if name.startswith("truth.") else "signals"][name.removeprefix("truth.")] = entry
+    options = ReadOptions(clock=clock, end=end)  # type: ignore[arg-type]
+    with read_drive(log, Car.load(car), mapping_from_dict(raw, where="test"), options=options) as drive:
+        assert not [loss for loss in drive.losses if loss.severity == "lost"]
+        figures = score(estimate(drive, ["phy-ukf", "physics"]))
+    rows = figures.filter(signal="sideslip_rad", segment="all", metric="rmse")
+    return dict(zip(rows["estimator"], rows["value"], strict=True))
+
+
+@pytest.mark.parametrize(
+    ("file", "table", "drive", "reference", "vehicle", "clock", "end"),
+    [
+        ("v40_swd.vbo", V40_VBO, "v40_swd_gnss", V40_MCAP, V40, "stamp", "+23.9s"),
+        ("v40_slalom.vbo", V40_VBO, "v40_slalom", V40_MCAP, V40, "stamp", "+33.1s"),
+        ("v40_swd.mf4", V40_MF4, "v40_swd_gnss", V40_MCAP | _GNSS, V40, "arrival", "+23.9s"),
+        ("gti_pole_aa.mat", GTI_MAT, "gti_pole_aa", GTI_MCAP, GTI, "stamp", "+61.9s"),
+    ],
+)
+def test_scores_are_those_of_the_same_drive_in_mcap(
+    file: str, table: _Table, drive: str, reference: _Table, vehicle: str, clock: str, end: str,
+    shared_dir: Path, tmp_path: Path,
+) -> None:  # fmt: skip
+    car = tmp_path / "vehicle.toml"
+    car.write_text(f'name = "test"\n{vehicle}')
+    expected = _scores(shared_dir / "data" / "drives" / f"{drive}.mcap", reference, car, clock, end)
+    got = _scores(shared_dir / "data" / "formats" / file, table, car, clock, end)
+    assert set(got) >= {"phy-ukf", "physics"}
+    for estimator, value in got.items():
+        assert value == pytest.approx(expected[estimator], rel=0.02), estimator

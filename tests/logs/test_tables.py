@@ -1,0 +1,352 @@
+"""Logs of tables: CSV in its dialects, VBO, Parquet and MAT, against the arrays that were written."""
+
+from __future__ import annotations
+
+import datetime as dt
+import io
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.io import savemat
+
+from pdhef_logtool import inspect_log
+from pdhef_logtool.logs.discovery import find_logs
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.table_columns import RELATIVE_NS, field_name, gps_stamps, number_stamps, split_unit
+from pdhef_logtool.records.errors import PdhefError
+from tests.command_line import called
+
+N = 200
+TIME_S = np.arange(N) * 0.01
+AY = np.round(3.0 * np.sin(2.0 * TIME_S), 4)
+SPEED = np.round(20.0 + TIME_S, 3)
+DAY_NS = 1_714_521_600 * 10**9  # 2024-05-01
+
+
+def _csv(times: list[str], header: str, separator: str = ",", *, comma: bool = False) -> str:
+    rows = [separator.join([t, f"{a:.4f}", f"{v:.3f}"]) for t, a, v in zip(times, AY, SPEED, strict=True)]
+    return "\n".join([header, *(row.replace(".", ",") if comma else row for row in rows), ""])
+
+
+def _iso(ending: str = "") -> list[str]:
+    start = dt.datetime(2024, 5, 1, 12, 0, 0)
+    return [(start + dt.timedelta(seconds=float(t))).isoformat(timespec="milliseconds") + ending for t in TIME_S]
+
+
+NOON_NS = DAY_NS + 12 * 3600 * 10**9
+SECONDS = [f"{t:.2f}" for t in TIME_S]
+UNITS = {"ay": "m/s²", "speed": "km/h"}
+_HEAD = "time,ay [m/s²],speed (km/h)"
+DIALECTS = {
+    "seconds": (_csv(SECONDS, _HEAD).encode(), RELATIVE_NS),
+    "bom": (b"\xef\xbb\xbf" + _csv(SECONDS, _HEAD).encode(), RELATIVE_NS),
+    "carriage-returns": (_csv(SECONDS, _HEAD).replace("\n", "\r\n").encode(), RELATIVE_NS),
+    "utf-16": (_csv(SECONDS, _HEAD).encode("utf-16"), RELATIVE_NS),
+    "european": (
+        ("Messung 12\n\n" + _csv(SECONDS, "time;ay;speed\n[s];[m/s²];[km/h]", ";", comma=True)).encode("latin-1"),
+        RELATIVE_NS,
+    ),
+    "tabs": (_csv(SECONDS, "# time\tay [m/s²]\tspeed [km/h]", "\t").encode(), RELATIVE_NS),
+    "spaces": (_csv(SECONDS, "time  ay[m/s²]  speed[km/h]", "  ").encode(), RELATIVE_NS),
+    "milliseconds": (_csv([f"{1e3 * t:.0f}" for t in TIME_S], _HEAD.replace("time", "Time_ms")).encode(), RELATIVE_NS),
+    "milliseconds-by-step": (_csv([f"{1e3 * t:.0f}" for t in TIME_S], _HEAD).encode(), RELATIVE_NS),
+    "date": (_csv([f"{1714564800 + t:.2f}" for t in TIME_S], _HEAD.replace("time", "timestamp")).encode(), NOON_NS),
+    "nanoseconds": (_csv([str(NOON_NS + round(t * 1e9)) for t in TIME_S], _HEAD).encode(), NOON_NS),
+    "iso": (_csv(_iso("Z"), _HEAD).encode(), NOON_NS),
+    "iso-without-zone": (_csv([t.replace("T", " ") for t in _iso()], _HEAD).encode(), NOON_NS),
+    "iso-offset": (_csv(_iso("+02:00"), _HEAD).encode(), NOON_NS - 7200 * 10**9),
+    "german-date": (
+        _csv([f"01.05.2024 {t.partition('T')[2]}" for t in _iso()], "Time;ay [m/s²];speed [km/h]", ";", comma=True)
+        .replace("01,05,2024", "01.05.2024")
+        .encode(),
+        NOON_NS,
+    ),
+    "motec": (
+        '"Format","MoTeC CSV File"\n"Venue","a track"\n\n"Time","ay","speed"\n"s","m/s²","km/h"\n\n\n'.encode()
+        + "\n".join(f'"{t:.2f}","{a:.4f}","{v:.3f}"' for t, a, v in zip(TIME_S, AY, SPEED, strict=True)).encode(),
+        RELATIVE_NS,
+    ),
+    "date-and-time": (_csv([t.replace("T", ",") for t in _iso()], "Date," + _HEAD).encode(), NOON_NS),
+    "clock": (_csv([t.partition("T")[2] for t in _iso()], _HEAD).encode(), RELATIVE_NS + 12 * 3600 * 10**9),
+    "gps-week": (
+        _csv([f"2312,{302418 - 43200 + t:.2f}" for t in TIME_S], "GPS_Week,tow," + _HEAD.partition(",")[2]).encode(),
+        DAY_NS,
+    ),
+    "duplicates": (_csv(SECONDS, "time,ay [m/s²],speed (km/h)").encode(), RELATIVE_NS),
+    "extra-comma": (_csv(SECONDS, _HEAD).replace("\n", ",\n").encode(), RELATIVE_NS),
+}
+
+
+def _log(path: Path, data: bytes) -> DriveLog:
+    path.write_bytes(data)
+    return open_log(path)
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_every_dialect_of_csv_gives_the_same_columns(dialect: str, tmp_path: Path) -> None:
+    data, start_ns = DIALECTS[dialect]
+    with closing(_log(tmp_path / "drive.csv", data)) as log:
+        assert [t.name for t in log.topics] == ["csv"]
+        assert {f.path: f.unit for f in log.fields("csv")} == UNITS
+        read = log.read({"csv": ["ay", "speed"]})["csv"]
+        assert log.lost == ()
+    np.testing.assert_array_equal(read.fields["ay"], AY)
+    np.testing.assert_array_equal(read.fields["speed"], SPEED)
+    expected = start_ns + np.round(TIME_S * 1e9).astype(np.int64)
+    assert np.abs(read.log_time_ns - expected).max() < 500  # a date in seconds has no more digits
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    values=st.lists(st.floats(-1e6, 1e6, allow_nan=False).map(lambda x: round(x, 6)), min_size=4, max_size=30),
+    separator=st.sampled_from([";", "\t", ","]),
+    comma=st.booleans(),
+    quoted=st.booleans(),
+)
+def test_any_numbers_come_back(
+    values: list[float], separator: str, comma: bool, quoted: bool, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    comma = comma and separator != ","
+    rows = [[f"{i * 0.02:.2f}", f"{v:.6f}"] for i, v in enumerate(values)]
+    cells = [[c.replace(".", ",") if comma else c for c in row] for row in rows]
+    text = "\n".join(separator.join(f'"{c}"' if quoted else c for c in row) for row in [["t", "a"], *cells])
+    with closing(_log(tmp_path_factory.mktemp("csv") / "a.csv", text.encode())) as log:
+        read = log.read({"csv": ["a"]})["csv"]
+    np.testing.assert_array_equal(read.fields["a"], values)
+    assert len(read) == len(values)
+
+
+def test_columns_at_another_rate_have_their_own_clock_and_repeated_names_a_number(tmp_path: Path) -> None:
+    rows = [f"{t:.2f},{AY[i]},{SPEED[i] if i % 10 == 0 else ''},{2 * AY[i]}" for i, t in enumerate(TIME_S)]
+    with closing(_log(tmp_path / "a.csv", "\n".join(["t,ay,speed,ay", *rows]).encode())) as log:
+        assert [(t.name, t.messages) for t in log.topics] == [("csv", N), ("csv_2", N // 10)]
+        read = log.read({"csv": ["ay", "ay_2"], "csv_2": ["speed"]})
+    np.testing.assert_array_equal(read["csv"].fields["ay_2"], 2 * AY)
+    np.testing.assert_array_equal(read["csv_2"].fields["speed"], SPEED[::10])
+    np.testing.assert_array_equal(read["csv_2"].log_time_ns, read["csv"].log_time_ns[::10])
+
+
+def test_damaged_rows_are_losses_and_the_others_are_read(tmp_path: Path) -> None:
+    lines = _csv(SECONDS, _HEAD).splitlines()
+    lines[10], lines[20], lines[30] = "0.09,1", "0.19,2,3,4,5", ",1.0,2.0"
+    text = "\n".join([*lines[:-1], "1.99,1.2"])  # cut within the last row
+    with closing(_log(tmp_path / "a.csv", text.encode())) as log:
+        assert {(x.kind, x.count) for x in log.lost} == {("bad-row", 2), ("truncated", 1), ("bad-stamp", 1)}
+        assert len(log.read({"csv": ["ay"]})["csv"]) == N - 4
+    done = called("inspect", tmp_path / "a.csv", "--json")
+    assert done.returncode == 3
+    assert "bad-row" in done.stdout
+
+
+def test_rows_out_of_order_are_sorted_with_a_note(tmp_path: Path) -> None:
+    lines = _csv(SECONDS, _HEAD).splitlines()
+    lines[50], lines[51] = lines[51], lines[50]
+    with closing(_log(tmp_path / "a.csv", "\n".join(lines).encode())) as log:
+        assert [(x.kind, x.severity) for x in log.lost] == [("out-of-order", "note")]
+        np.testing.assert_array_equal(log.read({"csv": ["ay"]})["csv"].fields["ay"], AY)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("1,2,3\n4,5,6\n", "row of column names"),
+        ("a,b\n5,6\n1,2\n", "column of times"),
+        ("", "CSV"),
+        ("hello\nworld\n", "row of column names"),
+    ],
+)
+def test_a_csv_without_header_or_times_is_refused_in_one_line(text: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(PdhefError, match=words) as refused:
+        _log(tmp_path / "a.csv", text.encode())
+    assert "\n" not in str(refused.value)
+
+
+def test_names_and_units_of_titles() -> None:
+    assert split_unit("Speed (km/h)") == ("Speed", "km/h")
+    assert split_unit("wheel speed [FL]") == ("wheel speed [FL]", "")
+    assert split_unit("yaw rate_[°/s]") == ("yaw rate", "°/s")
+    assert field_name("Lat._Vel.") == "Lat_Vel"
+    assert field_name("Längsbeschl.\\CCP:1") == "Laengsbeschl"
+    assert field_name("2nd gear") == "n_2nd_gear"
+
+
+def test_stamps_of_numbers() -> None:
+    week, second = np.array([1773.0, 2312.0]), np.array([0.0, 302_418_000.0])
+    # 2014-01-01 was 16 s, 2024-05-01 is 18 s behind GPS time; 1773 began on 2013-12-29.
+    assert gps_stamps(week, second / 1e3).tolist() == [1_388_275_184 * 10**9, 1_714_564_800 * 10**9]
+    assert gps_stamps(week[1:], second[1:]).tolist() == [1_714_564_800 * 10**9]
+    assert number_stamps(np.array([0.0, 20.0, np.nan]), "us").tolist()[:2] == [RELATIVE_NS, RELATIVE_NS + 20_000]
+
+
+# ------------------------------------------------------------------------------------------------ VBO
+
+
+def vbo(clock: list[str], *, units: str = "g\n\n°/s\n", created: str = "11/04/2014 @ 09:42") -> bytes:
+    """A file of a recorder with one input module: three channels, of which the second has no unit."""
+    titles = ["satellites", "time", "latitude", "longitude", "velocity kmh", "heading", "Event 1 time"]
+    titles += ["latitude_raw", "Y_Accel", "Temp.", "YawRate"]
+    head = f"File created on {created}\n\n[header]\n" + "\n".join(titles) + f"\n\n[channel units]\n{units}\n"
+    head += "[comments]\nLog Rate (Hz) : 100.00\n\n[column names]\nsats time lat long\n\n[data]\n"
+    rows = [
+        f"018 {t} +3608.246{i % 10} -1086.979{i % 10} {72.0 + i * 0.01:07.3f} 231.56  0.0 +3608.2 {AY[i]:+.6E} 20 1.0 "
+        for i, t in enumerate(clock)
+    ]
+    return (head + "\n".join(rows) + "\n").replace("\n", "\r\n").encode("latin-1")
+
+
+def test_a_vbo_file_keeps_minutes_units_and_the_clock_over_midnight(tmp_path: Path) -> None:
+    clock = ["235959.980", "235959.990", "000000.000", "000000.010", "000003.000"]
+    with closing(_log(tmp_path / "a.vbo", vbo(clock))) as log:
+        (topic,) = log.topics
+        assert (topic.name, topic.type_name, topic.messages) == ("vbox", "vbox/msg/Vbo", 5)
+        units = {f.path: f.unit for f in log.fields("vbox") if f.unit}
+        assert units == {
+            "latitude": "min", "longitude": "min", "latitude_raw": "min", "Y_Accel": "g", "YawRate": "°/s",
+        }  # fmt: skip
+        read = log.read({"vbox": ["longitude", "velocity_kmh"]})["vbox"]
+        assert log.lost == ()
+    midnight_ns = 1_397_260_800 * 10**9  # 2014-04-12
+    assert ((read.log_time_ns - midnight_ns) // 10**6).tolist() == [-20, -10, 0, 10, 3000]
+    assert read.fields["longitude"][0] == -1086.9790
+    assert read.fields["velocity_kmh"][1] == 72.01
+
+
+def test_units_that_fit_no_columns_are_left_out(tmp_path: Path) -> None:
+    with closing(_log(tmp_path / "a.vbo", vbo(["100000.00", "100000.01"], units="g\n°/s\n"))) as log:
+        assert {f.unit for f in log.fields("vbox") if f.path in ("Y_Accel", "YawRate")} == {""}
+
+
+def test_a_cut_vbo_file_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    data = vbo([f"1000{i // 100:02d}.{i % 100:02d}" for i in range(N)])
+    with closing(_log(tmp_path / "a.vbo", data[:-40])) as log:
+        assert [(x.kind, x.severity) for x in log.lost] == [("truncated", "lost")]
+        assert len(log.read({"vbox": ["Y_Accel"]})["vbox"]) == N - 1
+    with pytest.raises(PdhefError, match=r"\[header\] and \[data\]"):
+        _log(tmp_path / "b.vbo", data[: data.index(b"[data]")])
+
+
+# ------------------------------------------------------------------------------------------------ Parquet
+
+
+def test_a_parquet_file_with_units_nulls_and_structs(tmp_path: Path) -> None:
+    gnss = [float(v) if i % 10 == 0 else None for i, v in enumerate(SPEED)]
+    imu = pa.StructArray.from_arrays([pa.array(AY), pa.array(-AY)], ["ay [m/s²]", "ax"])
+    fields = [
+        pa.field("time", pa.timestamp("us")),
+        pa.field("speed", pa.float32(), metadata={"unit": "km/h"}),
+        pa.field("imu", imu.type),
+        pa.field("gnss_speed", pa.float64()),
+        pa.field("driver", pa.string()),
+    ]
+    stamps = NOON_NS + np.round(TIME_S * 1e9).astype(np.int64)
+    times = pa.array(stamps.astype("datetime64[ns]")).cast(pa.timestamp("us"))
+    columns = [times, pa.array(SPEED.astype(np.float32)), imu, pa.array(gnss), pa.array(["me"] * N)]
+    pq.write_table(pa.Table.from_arrays(columns, schema=pa.schema(fields)), tmp_path / "a.parquet")
+    with closing(open_log(tmp_path / "a.parquet")) as log:
+        assert {(t.name, f.path): f.unit for t in log.topics for f in log.fields(t.name)} == {
+            ("parquet", "speed"): "km/h", ("parquet", "imu_ay"): "m/s²", ("parquet", "imu_ax"): "",
+            ("parquet_2", "gnss_speed"): "",
+        }  # fmt: skip
+        read = log.read({"parquet": ["imu_ay"], "parquet_2": ["gnss_speed"]})
+    np.testing.assert_array_equal(read["parquet"].fields["imu_ay"], AY)
+    np.testing.assert_array_equal(read["parquet"].log_time_ns, NOON_NS + np.round(TIME_S * 1e9).astype(np.int64))
+    np.testing.assert_array_equal(read["parquet_2"].fields["gnss_speed"], SPEED[::10])
+
+
+def test_a_damaged_row_group_is_a_loss(tmp_path: Path) -> None:
+    table = pa.table({"t": TIME_S, "ay": AY})
+    out = io.BytesIO()
+    pq.write_table(table, out, row_group_size=50, compression="zstd")
+    data = bytearray(out.getvalue())
+    at = pq.ParquetFile(io.BytesIO(bytes(data))).metadata.row_group(1).column(1).data_page_offset
+    data[at : at + 60] = b"\xff" * 60
+    with closing(_log(tmp_path / "a.parquet", bytes(data))) as log:
+        assert [(x.kind, x.count, x.severity) for x in log.lost] == [("bad-rows", 50, "lost")]
+        assert len(log.read({"parquet": ["ay"]})["parquet"]) == N - 50
+
+
+# ------------------------------------------------------------------------------------------------ MAT
+
+MAT = {
+    "t": TIME_S,
+    "ay_mps2": AY[:, None],
+    "wheels_kmh": np.stack([SPEED] * 4, axis=1),
+    "other": np.arange(7.0),
+    "name": "a drive",
+    "gnss": {"time": TIME_S[::10], "speed": SPEED[::10], "inner": {"lat": SPEED[::10]}},
+}
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_a_mat_file_with_vectors_matrices_and_structs(compressed: bool, tmp_path: Path) -> None:
+    savemat(tmp_path / "a.mat", MAT, do_compression=compressed)
+    with closing(open_log(tmp_path / "a.mat")) as log:
+        there = {t.name: [f.path for f in log.fields(t.name)] for t in log.topics}
+        assert there == {
+            "mat": ["ay_mps2", "wheels_kmh_0", "wheels_kmh_1", "wheels_kmh_2", "wheels_kmh_3"],
+            "gnss": ["speed"],
+            "gnss_inner": ["lat"],
+        }
+        assert [(x.kind, x.severity) for x in log.lost] == [("no-clock", "note")]
+        read = log.read({"mat": ["ay_mps2"], "gnss_inner": ["lat"]})
+    np.testing.assert_array_equal(read["mat"].fields["ay_mps2"], AY)
+    np.testing.assert_array_equal(read["gnss_inner"].fields["lat"], SPEED[::10])
+    np.testing.assert_array_equal(read["gnss_inner"].log_time_ns, read["mat"].log_time_ns[::10])
+
+
+def test_a_damaged_variable_costs_only_itself(tmp_path: Path) -> None:
+    savemat(tmp_path / "a.mat", {"t": TIME_S, "ay": AY, "speed": SPEED}, do_compression=True)
+    data = bytearray((tmp_path / "a.mat").read_bytes())
+    second = 128 + 8 + int.from_bytes(data[132:136], "little")
+    data[second + 40 : second + 80] = b"\x00" * 40
+    with closing(_log(tmp_path / "b.mat", bytes(data))) as log:
+        assert [(x.kind, x.severity) for x in log.lost] == [("bad-variable", "lost")]
+        assert [f.path for f in log.fields("mat")] == ["speed"]
+    cut = (tmp_path / "a.mat").read_bytes()[:-30]
+    with closing(_log(tmp_path / "c.mat", cut)) as log:
+        assert [f.path for f in log.fields("mat")] == ["ay"]
+    assert called("inspect", tmp_path / "c.mat").returncode == 3
+
+
+@pytest.mark.parametrize(("turned_deg", "recognised"), [(0.0, True), (3.0, True), (90.0, False), (180.0, False)])
+def test_speed_and_course_of_a_receiver_are_gnss_signals_if_the_path_agrees(
+    turned_deg: float, recognised: bool, tmp_path: Path
+) -> None:
+    time_s = np.arange(0.0, 60.0, 0.1)
+    course = 0.4 * np.sin(0.1 * time_s) + 0.8  # clockwise from north, 15 m/s
+    north, east = (np.cumsum(15.0 * 0.1 * f(course)) for f in (np.cos, np.sin))
+    gnss = {
+        "time": time_s,
+        "latitude": 60.0 + north / 111_195.0,
+        "longitude": 18.0 + east / (111_195.0 * np.cos(np.radians(60.0))),
+        "speed_kmh": np.full(len(time_s), 54.0),
+        "course_deg": np.degrees(course) + turned_deg,
+    }
+    savemat(tmp_path / "a.mat", {"gnss": gnss, "imu": {"time": time_s, "yaw_rate_degps": -np.gradient(course, 0.1)}})
+    signals = inspect_log(tmp_path / "a.mat").mapping.signals
+    if not recognised:
+        assert "gnss_course_rad" not in signals
+        return
+    source = signals["gnss_course_rad"]
+    assert (source.topic, source.field, source.offset) == ("gnss", "course_deg", pytest.approx(np.pi / 2.0))
+    assert source.scale == pytest.approx(-np.pi / 180.0)
+    assert signals["gnss_speed_m_s"].scale == pytest.approx(1.0 / 3.6)
+
+
+# ------------------------------------------------------------------------------------------------ searching
+
+
+def test_a_search_ignores_general_files_beside_logs(tmp_path: Path) -> None:
+    for name in ("one/drive.mcap", "one/notes.csv", "two/a.csv", "two/b.parquet", "two/sub/c.vbo", "two/sub/d.mat"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"x")
+    found = {log.path.relative_to(tmp_path).as_posix() for log in find_logs([str(tmp_path)])}  # type: ignore[union-attr]
+    assert found == {"one/drive.mcap", "two/a.csv", "two/b.parquet", "two/sub/c.vbo"}
+    assert [log.path.name for log in find_logs([str(tmp_path / "one" / "notes.csv")])] == ["notes.csv"]

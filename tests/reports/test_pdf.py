@@ -1,0 +1,55 @@
+"""The document to sign: what it contains, and what it leaves out."""
+
+from __future__ import annotations
+
+import html
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from browser import CHROMIUM, WHY_NOT
+from made_runs import drive_tracks, write_run
+from test_drive import plan_of
+
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.reports.pdf import pdf_page, write_pdf
+from pdhef_logtool.results.opened_run import open_run
+
+
+def text_of(page: bytes) -> str:
+    body = page.decode().partition("<main>")[2]
+    return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", body)).split())
+
+
+def test_the_document_has_a_cover_contents_verdicts_figures_and_hashes_but_no_positions(tmp_path):
+    run = open_run(write_run(tmp_path, drive_tracks(3.0), plan=plan_of("PASS", "FAIL")))
+    page = pdf_page(run)
+    text = text_of(page)
+    order = ["Validation of 1 drive", "Prepared by", "Without positions", "Contents",
+             "Plan plan.toml: 1 FAIL, 1 PASS (this drive alone)", "sha256 of the file, of its signals"]  # fmt: skip
+    assert [text.find(part) for part in order] == sorted(text.find(part) for part in order) and -1 not in map(
+        text.find, order
+    )
+    assert str(run.document["logs"][0]["sha256"]) in text
+    pictures = re.findall(r'<img class="plot" alt="([^"]*)"', page.decode())
+    assert [p.split()[0] for p in pictures] == ["Largest", "Sideslip", "Absolute", "Lateral"]
+    assert b"<script" not in page and b"http://" not in page
+    assert "Path" in " ".join(re.findall(r'alt="([^"]*)"', pdf_page(run, positions=True).decode()))
+
+
+def test_without_chromium_there_is_one_clear_line(tmp_path, monkeypatch):
+    run = open_run(write_run(tmp_path, drive_tracks(3.0)))
+    monkeypatch.setattr(shutil, "which", lambda _name: None)
+    with pytest.raises(OutputError, match="expected Chromium, which prints the PDF, got none on this machine; apt-get"):
+        write_pdf(run)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT)
+def test_chromium_prints_it(tmp_path):
+    data = write_pdf(open_run(write_run(tmp_path, drive_tracks(3.0), plan=plan_of("PASS")))).read_bytes()
+    assert data.startswith(b"%PDF") and len(re.findall(rb"/Type\s*/Page\b", data)) >= 4

@@ -1,0 +1,63 @@
+"""Effects of conditions on the error: corrected for their number, and not confused with days."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from pdhef_logtool.results.breakdown import BreakdownDrive, breakdowns
+
+
+def drive(error: float, day: int | None = None, **keys: str) -> BreakdownDrive:
+    return BreakdownDrive(error, keys, {"day": None if day is None else str(day), "car": None, "route": None})
+
+
+def test_an_effect_is_that_of_welch() -> None:
+    rng = np.random.default_rng(0)
+    a, b = rng.lognormal(0.0, 0.3, 12), rng.lognormal(0.4, 0.5, 9)
+    (found,) = breakdowns([*(drive(x, k="a") for x in a), *(drive(x, k="b") for x in b)])
+    reference = stats.ttest_ind(np.log(b), np.log(a), equal_var=False)
+    effect = found.groups[1].effect
+    assert effect is not None and effect.p == pytest.approx(reference.pvalue)
+    low, high = reference.confidence_interval()
+    assert (effect.low, effect.high) == pytest.approx((np.expm1(low), np.expm1(high)))
+
+
+def test_of_fleets_without_effects_few_show_any() -> None:
+    rng = np.random.default_rng(1)
+    wrong = naive = 0
+    for _ in range(40):
+        keys = rng.integers(0, 3, (8, 40))
+        drives = [
+            drive(e, **{f"k{k}": str(v[i]) for k, v in enumerate(keys)}) for i, e in enumerate(rng.lognormal(size=40))
+        ]
+        found = breakdowns(drives)
+        effects = [g.effect for b in found for g in b.groups if g.effect is not None]
+        assert all(e.significant == (e.low > 0.0 or e.high < 0.0) for e in effects)
+        wrong += any(e.significant for e in effects)
+        logs = np.log([d.error for d in drives])
+        naive += any(stats.ttest_ind(logs[v == x], logs[v != x]).pvalue < 0.05 for v in keys for x in range(3))
+    assert wrong <= 5 and naive >= 16
+
+
+def test_weather_of_a_single_day_cannot_be_separated_from_it() -> None:
+    rng = np.random.default_rng(2)
+    drives = [drive(x, day=i // 10, weather="wet" if i < 10 else "dry") for i, x in enumerate(rng.lognormal(size=40))]
+    (found,) = breakdowns(drives)
+    assert {g.why_not for g in found.groups} == {
+        "its drives are all of one day: the two cannot be separated",
+        "the other drives are all of one day: the two cannot be separated",
+    }
+
+
+def test_days_that_differ_are_no_effect_of_the_weather() -> None:
+    rng = np.random.default_rng(3)
+    wrong = 0
+    for _ in range(100):
+        day = np.repeat(np.arange(12), 8)
+        errors = np.exp(rng.normal(size=12)[day] + 0.3 * rng.normal(size=96))
+        drives = [drive(e, day=int(d), weather="wet" if d % 2 else "dry") for e, d in zip(errors, day, strict=True)]
+        (found,) = breakdowns(drives)
+        wrong += found.p < 0.05
+    assert wrong <= 10  # nominal 5
