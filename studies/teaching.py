@@ -152,6 +152,7 @@ def opened(part: TeachPart, car: Car) -> OpenedDrive:
     mapping = mapping_of(peer_of(part))
     if part.steering_gain != 1.0:
         wheel = mapping.signals["steering_wheel_rad"]
+        assert isinstance(wheel.scale, float)
         angle = replace(wheel, name="steer_rad", scale=wheel.scale * part.steering_gain)
         others = {k: v for k, v in mapping.signals.items() if k != "steering_wheel_rad"}
         mapping = Mapping({**others, "steer_rad": angle}, mapping.truth)

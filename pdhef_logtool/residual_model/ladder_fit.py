@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.records.signals import BoolArray, FloatArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.residual_model.ladder import (
     LINEAR,
     NONE,
@@ -50,7 +50,7 @@ class TaughtDrive:
     """A drive with ground truth: features of its steps [K], the sideslip that ``physics`` lacks, NaN where unknown."""
 
     name: str
-    stamps_ns: FloatArray
+    stamps_ns: IntArray
     features: SlowFeatures
     lacking_rad: FloatArray
 

@@ -22,7 +22,7 @@ from pdhef_logtool.estimators.calibration.joint import (
     parameters_of,
 )
 from pdhef_logtool.estimators.calibration.single_track import SPEED
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import FloatArray, IntArray
 
 #: Error of the sideslip of a single track, rad; larger errors count linearly.
 SIDESLIP_STD_RAD = math.radians(0.3)
@@ -79,7 +79,7 @@ def taught_parameters(
     )
 
 
-def slopes_of(driving: Driving, stamps_ns: FloatArray, sideslip_rad: FloatArray) -> FloatArray:
+def slopes_of(driving: Driving, stamps_ns: IntArray, sideslip_rad: FloatArray) -> FloatArray:
     """Return v_y / v_x of the ground truth [N] on the grid of a drive; NaN between stamps where it is unknown."""
     if not len(driving.stamps_ns):
         return np.empty(0)

@@ -65,11 +65,6 @@ class OpenedDrive:
     whole: WholeDrive
     slopes: FloatArray
 
-    @property
-    def error_stamps(self) -> FloatArray:
-        """Stamps of the errors [N]."""
-        return self.whole.signals.stamps_ns
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Teaching:
@@ -196,10 +191,10 @@ def lacking_of(drive: OpenedDrive, calibration: SelfCalibration) -> TaughtDrive:
     """Return the features of a drive and the sideslip that ``physics`` lacks on its calibrated car, at its stamps."""
     car = self_calibrated(drive.drive, calibration)
     estimator = make_estimator(PHYSICS, car)
-    wrapped = isinstance(estimator, SelfCalibrated)
-    physics = estimator.estimator if wrapped else estimator
+    physics, signals = estimator, drive.whole.signals
+    if isinstance(estimator, SelfCalibrated):
+        physics, signals = estimator.estimator, estimator.given(signals)
     assert isinstance(physics, AdaptivePhysics) and drive.whole.truth is not None
-    signals = estimator.given(drive.whole.signals) if wrapped else drive.whole.signals
     steps, _ = physics.run(signals, None)
     track, _ = compensate(physics, signals, steps)
     features, _ = features_of(physics, steps, signals, None, None)
