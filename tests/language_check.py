@@ -75,8 +75,8 @@ class Hit(NamedTuple):
 def in_text(area: str, place: str, text: str) -> Iterator[Hit]:
     """Yield the retired phrases of a text."""
     text = re.sub(r"\s+", " ", text)
-    code_or_parameter = r"`+[^`]*`+|https?://\S+|\b(docs|pdhef_logtool|studies)/\S+|\bpdhef [a-z]+|\b\w+(, \w+)* : "
-    text = re.sub(code_or_parameter, " ", text)
+    code = r"`+[^`]*`+|https?://\S+|\b(docs|pdhef_logtool|studies)/\S+|\bpdhef [a-z]+|<\w[^>]*>|\b\w+(, \w+)* : "
+    text = re.sub(code, " ", text)
     for pattern, better in RETIRED.items():
         for match in pattern.finditer(text):
             around = text[max(match.start() - 40, 0) : match.end() + 40].replace("\n", " ")

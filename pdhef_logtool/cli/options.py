@@ -149,6 +149,14 @@ _OPTIONS: dict[str, Any] = {
         ),
     ],
     "gnss": Annotated[_Text, Option(help="GNSS velocity in the reference: auto or off.", rich_help_panel=ESTIMATION)],
+    "no_position": Annotated[
+        bool | None,
+        Option(
+            "--no-position",
+            help="Keep positions out of all outputs; do not copy topics that may contain one.",
+            rich_help_panel=OUTPUT,
+        ),
+    ],
     "waived": Annotated[
         list[str] | None,
         Option("--waive", metavar="CHECK", help="Ignore the failure of this check. Repeatable.", rich_help_panel=INPUT),

@@ -121,7 +121,8 @@ def _head(result: RunResult, reports: Sequence[_Report]) -> Table:
     steps = list(dict.fromkeys(c for t in texts for c in _clauses("next", t.get("next", "")) if c))
     given = result.requirements
     if given is not None and given.plan.file:
-        steps = [*dict.fromkeys(f"{v.requirement.id}: {v.next}" for v in given.verdicts if v.next), *steps]
+        ordered = sorted(given.verdicts, key=lambda v: v.outcome != "FAIL")
+        steps = [*dict.fromkeys(f"{v.requirement.id}: {v.next}" for v in ordered if v.next), *steps]
     return _three_lines(
         said if verdicts is None else Text.assemble(verdicts, f"; {said}"),
         "; ".join(assumed) or "differs by log, see below",

@@ -56,7 +56,7 @@ def _list_estimators(show: bool) -> None:
     'cars.toml, with paths relative to it: [folders] "fleet/golf" = "cars/golf"; [logs] "run_*.mcap" = '
     '"mini.toml"; [metadata.vehicle_id] "WVW-1" = "cars/golf"; default = "saloon" above them.',
     shared="cars estimators annotate keep cache clock setup setup_from_s friction plan network calibrate "
-    "reference gnss waived",
+    "reference gnss no_position waived",
     car="Car of the logs (default: a sedan)",
 )
 def run(  # positional: one an option of the command line
@@ -129,8 +129,9 @@ def run(  # positional: one an option of the command line
     notes="Signals of nav_msgs/Odometry, geometry_msgs/Twist*Stamped and pdhef_msgs/VehicleStateEstimate are "
     "recognised by type. Other topics need SIGNAL=, one of vx_m_s, vy_m_s, yaw_rate_rad_s, sideslip_rad, ay_m_s2, "
     "their *_std_*, valid. A mapping file can contain scales, offsets, signs and several estimators, one table "
-    "[estimates.NAME.SIGNAL] per signal.",
-    shared="plan",
+    "[estimates.NAME.SIGNAL] per signal. Without ground truth the estimates are compared with the sideslip reference "
+    "of the log's IMU and GNSS, which --reference on does beside ground truth.",
+    shared="plan reference gnss",
     car="Car of the log (position of the ground truth, friction, lowest speed)",
 )
 def metrics(

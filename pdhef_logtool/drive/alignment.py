@@ -26,8 +26,10 @@ import numpy as np
 
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import (
+    ALIGNED_SIGNALS,
     GNSS,
     GNSS_COMPONENTS,
+    GNSS_POSITION,
     WHEELS,
     BoolArray,
     Channel,
@@ -63,6 +65,10 @@ SAME_CLOCK_SHARE = 0.9
 
 
 _IMU = ("yaw_rate_rad_s", "ay_m_s2", "ax_m_s2")
+#: What only the sideslip reference uses, which is not causal: never waited for.
+_TILT_RATES = frozenset({"roll_rate_rad_s", "pitch_rate_rad_s"})
+#: Columns that only the reference uses, with their own names.
+_ALONE = ("gnss_heading_rad", *sorted(_TILT_RATES))
 _INPUTS = frozenset({"steer_rad", "steering_wheel_rad", "ax_m_s2", "friction"})
 
 
@@ -245,7 +251,7 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
         if p.name in usable and stamps.size:
             values, arrival = _to_grid(usable[p.name], p, stamps, _ns(_max_gap_s(plan.grid_period_s)))
             columns[p.target] = p.scale * values if p.scale != 1.0 else values
-            if not p.name.startswith(GNSS) or plan.speed_from == "GNSS":  # no causal estimator uses it otherwise
+            if p.name not in _TILT_RATES and (not p.name.startswith(GNSS) or plan.speed_from == "GNSS"):
                 np.maximum(ready, arrival, out=ready)
     ready = np.maximum.accumulate(ready)
 
@@ -260,22 +266,18 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
     else:
         speed = columns.get("speed_m_s", missing)
 
-    def column(name: str) -> FloatArray:
-        return columns.get(name, missing)[inside].copy()
-
+    made = {name: columns.get(name, missing)[inside].copy() for name in (*ALIGNED_SIGNALS, *_ALONE)}
+    made["speed_m_s"] = speed[inside].copy()
     return Signals(
         stamps_ns=stamps[inside].copy(),
         ready_ns=ready[inside].copy(),
-        steer_rad=column("steer_rad"),
-        ax_m_s2=column("ax_m_s2"),
-        ay_m_s2=column("ay_m_s2"),
-        yaw_rate_rad_s=column("yaw_rate_rad_s"),
-        speed_m_s=speed[inside].copy(),
-        friction=column("friction"),
         wheel_speed_m_s=wheels[inside].copy(),
         available=plan.available,
         gnss_velocity_m_s=velocity[inside].copy(),
-        gnss_velocity_std_m_s=column("gnss_velocity_accuracy_m_s"),
+        gnss_velocity_std_m_s=columns.get("gnss_velocity_accuracy_m_s", missing)[inside].copy(),
+        gnss_position_deg=np.stack([columns.get(name, missing)[inside] for name in GNSS_POSITION], axis=1),
+        gnss_position_std_m=columns.get("gnss_position_accuracy_m", missing)[inside].copy(),
+        **made,
     )
 
 

@@ -73,7 +73,7 @@ YAW_DEG = 4.0
 ASKEW_SAMPLES = 40.0
 #: A part of a drive shows less than all of it; where the parts are too short, all of it must show more.
 PART_CORRELATION = 0.6
-#: Two parts of a drive that differ by more do not agree; beyond the number the regressors cannot be told apart.
+#: Two parts of a drive that differ by more do not agree; beyond the number the regressors are not separable.
 PARTS_AGREE_DEG, PARTS_AGREE_SHARE, WELL_CONDITIONED = 2.5, 0.2, 60.0
 ASKEW_CORRELATION = 0.85
 ASKEW_ERROR_DEG = 1.5
@@ -138,9 +138,9 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
     if not fitting:
         return None
     best, hand = max(fitting, key=lambda x: x[0].correlation + np.sign(x[0].sign))
-    found = Mounting(_snapped(best), named, best.evidence, best.sign > 0.0 or best.along, hand)
-    if not found.confident or found.is_as_named:
-        return found
+    mounting = Mounting(_snapped(best), named, best.evidence, best.sign > 0.0 or best.along, hand)
+    if not mounting.confident or mounting.is_as_named:
+        return mounting
     step = nearest_step(best.rotation)
     parts = [
         _turned(f, hand * w, np.where(part, speed, np.nan), best.rotation[2], references) for part in halves(len(speed))
@@ -148,7 +148,7 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
     fitted = [p for p in parts if p is not None]
     agree = all(p.correlation >= PART_CORRELATION and np.allclose(nearest_step(p.rotation), step) for p in fitted)
     is_long = len(fitted) == len(parts) or best.correlation >= ASKEW_CORRELATION
-    return found if agree and is_long else replace(found, confident=False)
+    return mounting if agree and is_long else replace(mounting, confident=False)
 
 
 def _named_rows(mapping: Mapping, accelerations: Triad, rates: Triad) -> FloatArray:
@@ -604,6 +604,9 @@ def turned_signals(
     for i, name in enumerate(MOUNTED):
         if name in signals:
             signals[name] = (rates if i == 2 else accelerations).turned(signals[name], mounting.rows[i])
+    for i, name in enumerate(("roll_rate_rad_s", "pitch_rate_rad_s")):
+        if name in signals:
+            signals[name] = rates.turned(signals[name], mounting.hand * mounting.rotation[i])
     return signals
 
 

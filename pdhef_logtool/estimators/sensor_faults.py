@@ -93,9 +93,8 @@ ALIVE_SHARE = 0.6
 ALIVE_AFTER_S = 0.2
 QUIET_RAD_S = 0.03
 QUIET_AFTER_S = 1.0
-#: The open-loop model is used above this speed and this long after its start.
+#: The open-loop model is used above this speed.
 WITNESS_SPEED_M_S = 6.0
-WITNESS_SETTLED_S = 1.0
 
 #: Reports: hours of clean driving per false alarm, and number of tests.
 HOURS_TO_FALSE_ALARM = 1.0
@@ -107,8 +106,8 @@ NATS_BEYOND = math.log(SHARE_BURST / SHARE_HEALTHY)
 NATS_WITHIN = math.log((1.0 - SHARE_BURST) / (1.0 - SHARE_HEALTHY))
 #: Number of differences, which share samples, with the information of one independent sample.
 DIFFERENCES_PER_SAMPLE = 2.3
-#: Share of the evidence for reporting a burst below which the report ends, and above which spikes belong to a burst.
-BURST_OVER, BURST_LIKELY = 0.5, 0.25
+#: Share of the evidence for reporting a burst below which the report ends.
+BURST_OVER = 0.5
 #: The level of e that ``SHARE_HEALTHY`` of the samples exceed is initialized in this time, with this gain and without
 #: reports. Afterwards it doubles in ``LEARNING_S`` at most. After the second time twice the evidence is required.
 FIRST_GUESS_S, FIRST_GAIN = 1.0, 5.0
@@ -248,10 +247,10 @@ def _weigh_burst(c, e, s0, moving, limits):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _weigh_spike(c, beyond, dt, burst_nats):  # type: ignore[no-untyped-def]
+def _weigh_spike(c, beyond, dt):  # type: ignore[no-untyped-def]
     """Add the evidence of a sample ``beyond`` times its limit for spikes; return whether to report it."""
     c[C_SPIKE] = max(c[C_SPIKE] - SPIKE_FORGOTTEN_NATS_PER_S * dt, 0.0)
-    if beyond <= 1.0 or c[C_LEVEL_S] <= FIRST_GUESS_S or c[C_BURST] > BURST_LIKELY * burst_nats:
+    if beyond <= 1.0 or c[C_LEVEL_S] <= FIRST_GUESS_S:
         return False
     asked = _asked(c, SPIKE_NATS)
     c[C_SPIKE] = min(c[C_SPIKE] + SPIKE_AT_LIMIT_NATS + SPIKE_POWER * math.log(beyond), 2.0 * asked)
@@ -262,7 +261,7 @@ def _weigh_spike(c, beyond, dt, burst_nats):  # type: ignore[no-untyped-def]
 def _noise_and_spike(c, z, dt, s0, curvature, learn, limits):  # type: ignore[no-untyped-def]
     """Process a sample of a channel; return whether it is a spike, and its ratio to the limit of reports.
 
-    Updates ŝ² and the usual noise. The limit of reports depends on the learned level.
+    Updates ŝ² and the usual noise.
     """
     usual = max(s0 * s0, c[C_USUAL])
     if c[C_AGE] > limits.span_s:
@@ -280,8 +279,7 @@ def _noise_and_spike(c, z, dt, s0, curvature, learn, limits):  # type: ignore[no
         bend = curvature * age * age / TRACK_RATE_GAIN
         # The rate needs three samples.
         spike = c[C_COUNT] >= 3.0 and age <= limits.span_s and abs(miss) > SPIKE_SIGMA * sigma + bend
-        learnt = TRACK_INNOVATION_RATIO * HEALTHY_FACTOR / BEYOND_SIGMA * math.sqrt(c[C_LEVEL])
-        beyond = abs(miss) / (SPIKE_SIGMA * max(sigma, learnt) + bend)
+        beyond = abs(miss) / (SPIKE_SIGMA * sigma + bend)
         if spike and c[C_SPIKES] >= MAX_SPIKES:
             # A jump or a burst: the samples are valid.
             spike = False
@@ -441,7 +439,7 @@ def _detect(window, default_friction, s0, p, channels, w, limits, output):  # ty
                     mask |= BURST_AY << i
             if math.isfinite(z):
                 c[C_UNSEEN_S] = 0.0
-            if _weigh_spike(c, beyond if spike else 0.0, step, limits.burst_nats):
+            if _weigh_spike(c, beyond if spike else 0.0, step):
                 mask |= SPIKE_AY << i
             usual = max(s0[i] * s0[i], c[C_USUAL])
             extra[k, i] = 0.0
@@ -470,7 +468,7 @@ def _detect(window, default_friction, s0, p, channels, w, limits, output):  # ty
                     rate = usable[k, i] / v if i == AY else usable[k, i]
                     channels[i, C_SMOOTH] += gain * (rate - channels[i, C_SMOOTH])
             clear = math.isfinite(usable[k, AY]) and math.isfinite(usable[k, YAW_RATE])
-            if clear and not raised and w[W_SETTLED_S] >= WITNESS_SETTLED_S:
+            if clear and not raised:
                 of_ay, of_r = channels[AY, C_SMOOTH], channels[YAW_RATE, C_SMOOTH]
                 least = WITNESS_RAD_S + WITNESS_NOISE_SIGMAS * max(s0[AY] / v, s0[YAW_RATE])
                 drift = w[W_SMOOTH_AY] - w[W_SMOOTH_R]  # the model's v̇_y over v_x

@@ -117,16 +117,6 @@ def _brakes(m):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _one_axle_agrees(z, wheels, bound):  # type: ignore[no-untyped-def]
-    """Return whether the speed agrees with one axle and not with the other: it has just recovered.
-
-    Wheels that slip together move the speed to a value of no axle or of both.
-    """
-    front, rear = abs(_axle(wheels, 0) - z) <= 0.5 * bound, abs(_axle(wheels, 2) - z) <= 0.5 * bound
-    return math.isfinite(wheels.sum()) and front != rear
-
-
-@njit(cache=True)
 def _start(v, wheels, bound, spins):  # type: ignore[no-untyped-def]
     """Return v̂ at an alarm: the dead-reckoned speed, or that of the axle with less slip if it indicates more slip.
 
@@ -247,8 +237,7 @@ def _gate(window, sensor, m, believed, reckoned):  # type: ignore[no-untyped-def
                 alone = m[_UP + _BEYOND] + m[_DOWN + _BEYOND] == 1.0
                 up = _gather(m, _UP, excess - m[_ALLOWED], z, bound)
                 down = _gather(m, _DOWN, -excess - m[_ALLOWED], z, bound)
-                recovers = up == _brakes(m) or _one_axle_agrees(z, wheels[k], bound)
-                if (up or down) and recovers:
+                if (up or down) and up == _brakes(m):  # a recovery
                     _forget(m)
                 elif alone and not (up or down):
                     _forget(m)  # a single outlier: its return is no slip

@@ -12,8 +12,9 @@ import re
 import shutil
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, redirect_stdout, suppress
 from functools import partial
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,8 @@ def open_mdf(file: LogFile) -> TableLog:
         frames: list[Frames] = []
         for name, group in zip(names, groups, strict=True):
             try:
-                tables += group.tables(name, frames)
+                with redirect_stdout(StringIO()):
+                    tables += group.tables(name, frames)
             except Exception as error:  # noqa: BLE001  any error of a damaged block
                 what = f"the channel group cannot be read: {describe_damage(error)[1]}"
                 losses.append(Loss("bad-group", what, name))
@@ -88,9 +90,9 @@ def _repaired(path: Path, folder: Path) -> Path | None:
         return None
     copy = folder / path.name
     shutil.copyfile(path, copy)
-    with copy.open("r+b") as file:
-        file.seek(cut[-1] + 8)
-        file.write((size - cut[-1]).to_bytes(8, "little"))
+    with copy.open("r+b") as repaired:
+        repaired.seek(cut[-1] + 8)
+        repaired.write((size - cut[-1]).to_bytes(8, "little"))
     return copy
 
 
@@ -139,6 +141,7 @@ class Group:
         master = self._source.masters_db.get(self._number)
         if master is None or not self._group.channel_group.cycles_nr:
             return
+        self._check_layout()
         stamps, order = self._stamps()
         if self.is_frames:
             parts = {part: self._frames(end)[order].astype(np.int64) for part, end in _PARTS.items() if self._has(end)}
@@ -151,6 +154,16 @@ class Group:
         titles = unique(field_name(self._group.channels[i].name) for i in indices)
         fields = tuple(FieldInfo(t, "number", unit=self._unit(i)) for t, i in zip(titles, indices, strict=True))
         yield Table(name, stamps, fields, partial(self._load, dict(zip(titles, indices, strict=True)), order))
+
+    def _check_layout(self) -> None:
+        """Raise ValueError for a channel outside of its record: asammdf would read and write memory of others."""
+        for channel in self._group.channels:
+            if hasattr(channel, "start_offset"):  # version 3
+                start = channel.start_offset + 8 * getattr(channel, "additional_byte_offset", 0)
+            else:
+                start = 8 * channel.byte_offset + channel.bit_offset
+            if start + channel.bit_count > 8 * self._group.channel_group.samples_byte_nr:
+                raise ValueError(f"channel {channel.name} is outside of its record")
 
     def _stamps(self) -> tuple[IntArray, NDArray[Any]]:
         """Return the times in ascending order, and the rows that they are of; rows without a time are left out."""
@@ -165,11 +178,11 @@ class Group:
 
     def _load(self, indices: dict[str, int], order: Any, path: str, rows: slice) -> NDArray[Any]:
         if path not in self._columns:
-            signal = self._source.get(group=self._number, index=indices[path])
-            samples = np.asarray(signal.samples)
-            if samples.dtype.kind in "SUO":  # a conversion to texts: its numbers
-                samples = self._source.get(group=self._number, index=indices[path], raw=True).samples
-            samples = np.asarray(samples)
+            with redirect_stdout(StringIO()):  # what asammdf prints of a channel that it cannot read
+                signal = self._source.get(group=self._number, index=indices[path])
+                samples = np.asarray(signal.samples)
+                if samples.dtype.kind in "SUO":  # a conversion to texts: its numbers
+                    samples = np.asarray(self._source.get(group=self._number, index=indices[path], raw=True).samples)
             invalid = getattr(signal, "invalidation_bits", None)
             if invalid is not None and np.any(invalid):
                 samples = np.where(np.asarray(invalid, np.bool_), np.nan, samples)

@@ -316,7 +316,10 @@ def si_values(topic: Columns, source: SignalSource) -> FloatArray:
         if source.combine == "norm":
             squares = sum((s * raw[:, i]) ** 2 for i, s in enumerate(scales))
             return np.asarray(np.sqrt(squares) + source.offset, dtype=np.float64)
-        return np.asarray(sum(s * raw[:, i] for i, s in enumerate(scales)) + source.offset, dtype=np.float64)
+        total = sum(s * raw[:, i] for i, s in enumerate(scales))
+        if source.combine == "root":
+            total = np.sqrt(np.maximum(total, 0.0))
+        return np.asarray(total + source.offset, dtype=np.float64)
     if width > 1 and raw.ndim == 2 and raw.shape[1] != width:
         raw = np.full((n, width), np.nan)  # Not the vector that the signal is: every sample is counted as lost.
     elif (width > 1 and raw.ndim == 1) or (width == 1 and raw.ndim == 2):

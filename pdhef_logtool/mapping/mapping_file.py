@@ -217,8 +217,12 @@ def _read_can(raw: object, folder: Path, problems: list[str]) -> CanSettings | N
 def _shape_problem(name: str, model: _SourceTable) -> str:
     columns = VECTOR_COLUMNS.get(name, 1)
     fields = model.field if isinstance(model.field, list) else [model.field]
-    if model.combine == "norm" and (columns > 1 or len(fields) < 2):
-        return f'combine = "norm" is the length of two or more fields, {name} has {columns} columns of {len(fields)}'
+    if model.combine != "sum" and (columns > 1 or len(fields) < 2):
+        what = {"norm": "length", "root": "root of the sum"}[model.combine]
+        return (
+            f'combine = "{model.combine}" is the {what} of two or more fields, '
+            f"{name} has {columns} columns of {len(fields)}"
+        )
     problem = _vector_problem(columns, model) if columns > 1 else _scalar_problem(name, len(fields), model)
     from_can = [f for f in fields if f.startswith(CAN_PREFIX)]
     if not problem and from_can and (columns > 1 or len(fields) > 1):

@@ -14,7 +14,7 @@ from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.candidates import Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.clocks import with_usable_stamps
-from pdhef_logtool.mapping.gnss_signals import HEADING, gnss_signals
+from pdhef_logtool.mapping.gnss_signals import gnss_signals, has_heading, receiver_signals
 from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, length_of, speed_over_ground
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
@@ -107,6 +107,7 @@ SEVERAL_POSITIONS = {
 }
 #: What a type must have to be what its name gives; of an IMU any of them, of others all.
 _IMU_PATHS = ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z")
+_TILT_RATE_PATHS = ("angular_velocity.x", "angular_velocity.y")
 
 
 @dataclass(frozen=True, slots=True)
@@ -352,16 +353,28 @@ def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
 
 
 def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
-    """Take GNSS velocity as a sensor: of ground truth without heading, else of a receiver that is not ground truth."""
+    """Take GNSS as a sensor: of ground truth without heading, else of a receiver that is not ground truth."""
     draft.signals |= gnss_signals(draft.signals, draft.truth)
-    if has_gnss(draft.signals):
-        return
-    used = {source.topic for source in draft.truth.values()}
+    instruments = {_device(source.topic) for source in draft.truth.values()} if has_heading(draft.truth) else set()
+    topics = [t for t in topics if not _words(t.name) & TRUTH_WORDS and _device(t.name) not in instruments]
+    receivers = [
+        receiver_signals(t.name, stamp_path_of(fields), {f.path for f in fields})
+        for t in topics
+        if not _type(t).startswith(NO_SENSORS) and (fields := draft.log.fields(t.name, quiet=True))
+    ]
+    for signals in sorted(receivers, key=lambda s: not has_gnss(s)):
+        if has_gnss(signals) if not has_gnss(draft.signals) else not set(signals) & set(draft.signals):
+            draft.signals |= signals
+    if not has_gnss(draft.signals):
+        _map_twist(draft, topics)
+        if has_gnss(draft.signals):
+            draft.signals |= next((signals for signals in receivers if signals and not has_gnss(signals)), {})
+
+
+def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
+    """Take GNSS velocity of a twist over ground."""
     for topic in topics:
-        words = _words(topic.name)
-        if topic.name in used or words & TRUTH_WORDS or not words & NAVIGATION_WORDS:
-            continue
-        if _type(topic) not in TWIST_FIELDS or _type(topic) in BODY_TWIST_TYPES:
+        if _type(topic) not in TWIST_FIELDS or _type(topic) in BODY_TWIST_TYPES or not _is_truth(topic):
             continue
         paths = tuple(_twist(topic, "linear", axis) for axis in "xy")
         if _looks_like_body_frame(*(draft.values(topic.name, path) for path in paths)) is False:
@@ -369,12 +382,14 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
                 draft.take(draft.signals, name, topic.name, path)
             return
     for topic in topics:
-        if _role(topic) == "navigation" and not _is_well_known(topic):
-            if topic.name in used and HEADING & set(draft.truth):
-                continue
-            if named := named_gnss(draft.log, topic):
-                draft.signals |= named
-                return
+        if _role(topic) == "navigation" and not _is_well_known(topic) and (named := named_gnss(draft.log, topic)):
+            draft.signals |= named
+            return
+
+
+def _device(topic: str) -> str:
+    """Return the name that topics of one instrument share: all but its last element."""
+    return topic.rpartition("/")[0] or topic
 
 
 def _is_well_known(topic: TopicInfo) -> bool:
@@ -522,7 +537,7 @@ def _probed_paths(topic: TopicInfo) -> list[str]:
     kind = _type(topic)
     paths: list[str] = []
     if kind in IMU_TYPES:
-        paths += [*_IMU_PATHS, "linear_acceleration_covariance[0]", "angular_velocity_covariance[0]"]
+        paths += [*_IMU_PATHS, *_TILT_RATE_PATHS, "linear_acceleration_covariance[0]", "angular_velocity_covariance[0]"]
     if kind in TWIST_FIELDS:
         paths += [*(_twist(topic, "linear", axis) for axis in "xyz"), _twist(topic, "angular", "z")]
     if kind in POSE_FIELDS:
@@ -557,6 +572,9 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
         draft.notes.append(f"{imu.name} provides no angular rate (covariance -1)")
     elif draft.is_given(imu.name, "angular_velocity.z"):
         draft.take(draft.signals, "yaw_rate_rad_s", imu.name, "angular_velocity.z")
+        for name, axis in (("roll_rate_rad_s", "x"), ("pitch_rate_rad_s", "y")):
+            if _span(draft.values(imu.name, f"angular_velocity.{axis}")) > 0.0:  # fillers are constant
+                draft.take(draft.signals, name, imu.name, f"angular_velocity.{axis}")
 
 
 def _map_steering(draft: _Draft, topics: list[TopicInfo]) -> None:

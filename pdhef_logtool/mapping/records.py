@@ -15,7 +15,7 @@ VECTOR_COLUMNS: dict[str, int] = {"ecef_position_m": 3, "ecef_velocity_m_s": 3, 
 
 StampUnit: TypeAlias = Literal["ros", "s", "ms", "us", "ns"]
 Clock: TypeAlias = Literal["utc", "device"]
-Combine: TypeAlias = Literal["sum", "norm"]
+Combine: TypeAlias = Literal["sum", "norm", "root"]
 
 #: Encoding of a frame's bytes in a message: numbers, or a text of digits.
 CanDataEncoding: TypeAlias = Literal["bytes", "hex", "base64"]
@@ -35,7 +35,8 @@ class SignalSource:
     """Where one signal comes from: ``value_SI = scale * raw + offset``, measured at ``stamp - latency_s``.
 
     A scalar signal of several fields is their sum, each times its own scale: a component of a sensor that is mounted
-    askew. With ``combine`` ``norm`` it is the length of their vector: a speed of its components.
+    askew. With ``combine`` ``norm`` it is the length of their vector, a speed of its components; with ``root`` the root
+    of their sum, a standard deviation of variances.
 
     Attributes
     ----------

@@ -20,7 +20,7 @@ POSSIBLE_MAGNITUDE = {
     "yaw_rate_rad_s": 50.0,
     "speed_m_s": 150.0,
 }
-#: The same of an estimate: such a state is divergence, whatever the estimator reports of itself.
+#: The same of an estimate: such a state is divergence for any status of the estimator.
 POSSIBLE_STATE = {"vx_m_s": 150.0, "vy_m_s": 60.0, "yaw_rate_rad_s": 50.0}
 #: Friction below ice or above any tyre is no friction.
 POSSIBLE_FRICTION = (0.01, 5.0)

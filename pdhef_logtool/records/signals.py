@@ -22,6 +22,8 @@ SIGNAL_UNITS: dict[str, str] = {
     "ax_m_s2": "m/s^2",
     "ay_m_s2": "m/s^2",
     "yaw_rate_rad_s": "rad/s",
+    "roll_rate_rad_s": "rad/s",
+    "pitch_rate_rad_s": "rad/s",
     "speed_m_s": "m/s",
     **{f"wheel_speed_{w}_m_s": "m/s" for w in WHEELS},
     **{f"wheel_speed_{w}_rad_s": "rad/s" for w in WHEELS},
@@ -31,6 +33,10 @@ SIGNAL_UNITS: dict[str, str] = {
     "gnss_course_rad": "rad",  # ENU: counter-clockwise from east
     "gnss_velocity_accuracy_m_s": "m/s",  # as the receiver states it, 1-sigma
     "gnss_fix_type": "1",  # below 1: no position
+    "gnss_latitude_deg": "deg",  # of the antenna
+    "gnss_longitude_deg": "deg",
+    "gnss_position_accuracy_m": "m",  # horizontal, as the receiver states it, 1-sigma
+    "gnss_heading_rad": "rad",  # of two antennas, ENU: only if mapped by hand
     "friction": "1",
 }
 
@@ -75,6 +81,10 @@ ESTIMATE_UNITS: dict[str, str] = {
 GNSS = "gnss_"
 #: GNSS velocity by its components, or as speed and course.
 GNSS_COMPONENTS = frozenset({"gnss_velocity_east_m_s", "gnss_velocity_north_m_s"})
+#: GNSS position.
+GNSS_POSITION = ("gnss_latitude_deg", "gnss_longitude_deg")
+#: Signals and ground truth that state a place.
+POSITIONS = frozenset({*GNSS_POSITION, "lat_deg", "lon_deg", "alt_m", "x_m", "y_m", "ecef_position_m"})
 _GNSS_POLAR = frozenset({"gnss_speed_m_s", "gnss_course_rad"})
 #: Signals the alignment's output carries as one column each.
 ALIGNED_SIGNALS = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "friction")
@@ -150,6 +160,8 @@ class Signals:
     available : names of the signals that the log's mapping provides at all.
     gnss_velocity_m_s : float64 [N, 2], east and north, of the antenna, finite only at the first stamp after a new
         sample. gnss_velocity_std_m_s : float64 [N], as the receiver states it. NaN where they are not given.
+    gnss_position_deg : float64 [N, 2], latitude and longitude; gnss_position_std_m, gnss_heading_rad : float64 [N].
+    roll_rate_rad_s, pitch_rate_rad_s : float64 [N]. All of these are NaN where they are not given.
     """
 
     stamps_ns: IntArray
@@ -164,13 +176,18 @@ class Signals:
     available: frozenset[str] = field(default_factory=frozenset)
     gnss_velocity_m_s: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     gnss_velocity_std_m_s: FloatArray = field(default_factory=lambda: np.empty(0))
+    gnss_position_deg: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    gnss_position_std_m: FloatArray = field(default_factory=lambda: np.empty(0))
+    gnss_heading_rad: FloatArray = field(default_factory=lambda: np.empty(0))
+    roll_rate_rad_s: FloatArray = field(default_factory=lambda: np.empty(0))
+    pitch_rate_rad_s: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
-        """Fill GNSS columns that are not given with NaN."""
-        if len(self.gnss_velocity_m_s) != len(self):
-            object.__setattr__(self, "gnss_velocity_m_s", np.full((len(self), 2), np.nan))
-        if len(self.gnss_velocity_std_m_s) != len(self):
-            object.__setattr__(self, "gnss_velocity_std_m_s", np.full(len(self), np.nan))
+        """Fill columns that are not given with NaN."""
+        for f in fields(Signals):
+            column = getattr(self, f.name)
+            if f.name != "available" and len(column) != len(self):
+                object.__setattr__(self, f.name, np.full((len(self), *column.shape[1:]), np.nan))
 
     def __len__(self) -> int:
         """Return the number of stamps."""

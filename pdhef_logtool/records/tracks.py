@@ -43,11 +43,15 @@ TRACK_COLUMNS = (
     "share_law",
     "share_kinematics",
     "share_gnss",
+    "independent",
 )
-#: Shares of the information on v_y of the sideslip reference.
-SHARE_COLUMNS = TRACK_COLUMNS[-3:]
+#: Shares of the information on v_y of the sideslip reference, and whether (1, 0) estimators with the same IMU may be
+#: ranked by it.
+SHARE_COLUMNS = TRACK_COLUMNS[-4:]
 #: Quantities that a filter may estimate in addition to the motion.
-ESTIMATED_COLUMNS = TRACK_COLUMNS[-9:-3]
+ESTIMATED_COLUMNS = TRACK_COLUMNS[-10:-4]
+#: Above this share of GNSS in its information the reference is independent of estimators that use the same IMU.
+INDEPENDENT_SHARE = 0.5
 #: Those that a source may not have at all.
 OPTIONAL_COLUMNS = ("mixture_weight", "reason", *ESTIMATED_COLUMNS, *SHARE_COLUMNS)
 
@@ -96,6 +100,7 @@ class StateTrack:
     share_law: FloatArray = field(default_factory=lambda: np.empty(0))
     share_kinematics: FloatArray = field(default_factory=lambda: np.empty(0))
     share_gnss: FloatArray = field(default_factory=lambda: np.empty(0))
+    independent: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __len__(self) -> int:
         """Return the number of stamps."""

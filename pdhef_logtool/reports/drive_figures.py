@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.evaluation.largest_errors import largest_places
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
@@ -20,8 +21,6 @@ from pdhef_logtool.results.sink import TRUTH
 
 #: What nobody sees on a page, in degrees, as a share, and in m/s or m/s².
 _DEGREES_SEEN, _SHARE_SEEN, _SEEN = 0.001, 0.001, 0.002
-#: Rows of the table of the largest errors; two of them are further apart than this, and than this share of the drive.
-PEAKS, _APART_S, _APART_SHARE = 10, 1.0, 0.02
 #: Stamps further apart are a gap, where they are also further apart than so many median steps.
 _GAP_S, _GAP_STEPS = 0.25, 5.0
 _MOST_POINTS = 12_000
@@ -164,11 +163,8 @@ def _peaks(
     if rows is None:
         return ()
     error, stamps = reference.whole_error(answer), answer.stamps_ns
-    size = np.nan_to_num(np.abs(error), nan=0.0)
-    apart_ns = int(max(_APART_S * 1e9, _APART_SHARE * float(stamps[-1] - stamps[0])))
-    peaks: list[Peak] = []
-    while len(peaks) < PEAKS and size.max() > 0.0:
-        row = int(np.argmax(size))
+    peaks = []
+    for row in largest_places(stamps, error):
         stamp = int(stamps[row])
         names = [s["name"] for s in segments if s["start_ns"] <= stamp < s["end_ns"]]
         peaks.append(
@@ -181,7 +177,6 @@ def _peaks(
                 ", ".join(dict.fromkeys(names)),
             )
         )
-        size[slice(*np.searchsorted(stamps, [stamp - apart_ns, stamp + apart_ns + 1]))] = 0.0
     return tuple(peaks)
 
 

@@ -31,7 +31,7 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.log_lines import LogLine, log_lines, log_message
 from pdhef_logtool.results.plotted import plotted_fields
-from pdhef_logtool.results.sink import TRUTH, Event, Sink, first_of_slots, rounded
+from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, Sink, first_of_slots, rounded
 from pdhef_logtool.storage.documents import jsonable
 
 #: Everything below this name in a source log is ours and is replaced.
@@ -69,6 +69,8 @@ _POSE_STEP_NS = 50_000_000
 _PATH_STEP_NS = 1_000_000_000
 #: Steps of the tracks without a name in --estimators: the shortest that leaves the file small enough is taken.
 _STEPS_NS = tuple(round(s * 1e9) for s in (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0))
+#: The shortest one of a long drive.
+_LONG_STEP_NS = 200_000_000
 #: Of the map of a track.
 _MOST_POSES = 1000
 #: Bytes of a message with its index, and of report, figures and schemas: upper bounds of what simulated drives take.
@@ -88,7 +90,8 @@ def thinned_step_ns(source_bytes: int, *, rows: int, others: int, span_ns: int) 
     kept: a state a stamp of the one, and four messages of both every 50 ms.
     """
     room = source_bytes - _DOCUMENT_BYTES - (rows + 4 * (span_ns // _POSE_STEP_NS)) * _MESSAGE_BYTES
-    fit = (step for step in _STEPS_NS if 3 * others * (span_ns // step) * _MESSAGE_BYTES <= room)
+    steps = [step for step in _STEPS_NS if span_ns <= LONGEST_WHOLE_NS or step >= _LONG_STEP_NS]
+    fit = (step for step in steps if 3 * others * (span_ns // step) * _MESSAGE_BYTES <= room)
     return next(fit, _STEPS_NS[-1])
 
 
@@ -114,6 +117,7 @@ class AnnotatedMcapSink(Sink):
         truth 20 states. None: as above.
     min_speed_m_s : sideslip is not plotted below.
     span_ns : only what of it was recorded in [start, end); None: all of it.
+    left_out : topics of the source that are not copied; its attachments and metadata are not either. None: all are.
 
     Raises
     ------
@@ -130,7 +134,9 @@ class AnnotatedMcapSink(Sink):
         others_step_ns: int | None = None,
         min_speed_m_s: float = 1.0,
         span_ns: tuple[int, int] | None = None,
+        left_out: Container[str] | None = None,
     ) -> None:
+        self._copies_rest = left_out is None
         self._source = None if source is None else source.messages
         self._names, self._shown, self._others_step_ns = names, shown, others_step_ns
         self._min_speed_m_s = min_speed_m_s
@@ -148,7 +154,7 @@ class AnnotatedMcapSink(Sink):
             return
         try:
             channels = register_channels(
-                self._writer, self._source, leave_out=lambda topic: topic.startswith(NAMESPACE)
+                self._writer, self._source, leave_out=lambda t: t.startswith(NAMESPACE) or t in (left_out or ())
             )
         except BaseException:
             self._writer.abort()
@@ -205,7 +211,7 @@ class AnnotatedMcapSink(Sink):
             self._writer.write([], raws=self._raws_before(None))
             self._write_paths()
             self._write_log(log_lines(report, events, self._reasons))
-            if self._source is not None:
+            if self._source is not None and self._copies_rest:
                 for attachment in iterate_attachments(self._source):
                     if not _is_our_report(attachment):
                         self._writer.attachment(*astuple(attachment))

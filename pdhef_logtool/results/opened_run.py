@@ -205,9 +205,8 @@ def open_run(output: Path | str) -> OpenedRun:
     Raises
     ------
     OutputError
-        There is no finished run in the folder: run.json or metrics.parquet is missing or unreadable.
-    UsageError
-        There is no such folder.
+        There is no finished run in the folder: run.json or metrics.parquet is missing or unreadable. Its exit code is 2
+        where there is no such folder.
     """
     mirror = Mirror(str(output)) if is_url(output) else None
     folder = Path(output) if mirror is None else mirror.folder

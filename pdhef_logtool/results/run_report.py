@@ -134,13 +134,23 @@ class FrictionFacts:
 
 
 @dataclass(frozen=True, slots=True)
+class LargestError:
+    """A place of a large sideslip error: stamp in ns, angles in rad."""
+
+    stamp_ns: int
+    estimate_rad: float
+    truth_rad: float
+    error_rad: float
+
+
+@dataclass(frozen=True, slots=True)
 class DriveDetails:
     """What a report's page shows and no table contains, of a drive that a run estimated.
 
     ``faults`` of the sensors, None where no estimator detects them. ``innovations`` by channel.
     ``standings`` of the selected estimate, empty without ground truth.
     ``error_budget`` has a reason where there is none. ``operating_space``: the cells that the drive was in.
-    ``metadata`` : what the log states of itself.
+    ``metadata`` : what the log states of itself. ``largest_errors`` : of sideslip, the largest first.
     """
 
     faults: Sequence[SensorFault] | None
@@ -149,6 +159,7 @@ class DriveDetails:
     error_budget: Any
     operating_space: Sequence[Cell]
     metadata: Mapping[str, str]
+    largest_errors: Sequence[LargestError] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -353,6 +364,7 @@ def _detailed(details: DriveDetails) -> dict[str, Any]:
         "error_budget": details.error_budget,
         "operating_space": space,
         "metadata": dict(details.metadata),
+        "largest_errors": details.largest_errors,
     }
     return {key: jsonable(value) for key, value in values.items()}
 

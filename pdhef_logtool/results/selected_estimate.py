@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 from pdhef_logtool.records.geometry import DEGREES
+from pdhef_logtool.records.tracks import REFERENCE
 
 Report: TypeAlias = Mapping[str, Any]
 #: Figures of the whole drive by estimator, signal and metric; None where there is none.
@@ -295,7 +296,7 @@ def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]
 
 def _best_in_hindsight(report: Report, main: MainFacts, figures: _Figures) -> dict[str, Any] | None:
     """Return the estimator with the least error against ground truth, None without it; nothing is chosen by it."""
-    ran = [e["name"] for e in report["estimators"] if e["outcome"] == "ran"]
+    ran = [e["name"] for e in report["estimators"] if e["outcome"] == "ran" and e["name"] != REFERENCE]
     errors = {name: error for name in ran if (error := _error(figures, name)) is not None}
     if not errors:
         return None

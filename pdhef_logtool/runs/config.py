@@ -90,6 +90,8 @@ class RunConfig:
     reference : sideslip reference (not causal, without tyre data): ``auto`` (where the log has no ground truth of
         sideslip), ``on`` (beside ground truth as well) or ``off``.
     gnss : ``auto`` (the reference uses GNSS velocity where the log has it) or ``off``.
+    no_position : keep latitude, longitude and all other positions and headings out of the outputs; topics that may
+        contain one are not copied. Reduced logs (``cache``) keep them.
     waived : names of checks whose failure is ignored.
     setup : setup.toml of another run of the same car and recorder, from which mounting, units, delays and clocks are
         taken; None = decided on the log.
@@ -125,6 +127,7 @@ class RunConfig:
     calibrate: Calibrate = "log"
     reference: Literal["auto", "on", "off"] = "auto"
     gnss: Literal["auto", "off"] = "auto"
+    no_position: bool = False
     waived: Names = ()
     setup: File | None = None
     setup_from_s: Annotated[float, Field(ge=1)] | None = None
@@ -247,6 +250,9 @@ def _toml_value(text: str) -> Any:
 
 def _read_file(path: Path) -> dict[str, Any]:
     raw = read_toml(path, "a configuration TOML file", UsageError)
+    if "thresholds" in raw:
+        remedy = "convert the file: pdhef plan init --from FILE -o plan.toml"
+        raise UsageError(expected="plan in place of thresholds", got="thresholds", where=str(path), remedy=remedy)
     if isinstance(raw.get("cache"), str) and "://" not in raw["cache"]:
         raw["cache"] = str(path.parent / raw["cache"])
     for key in _FILES:

@@ -37,8 +37,9 @@ from pdhef_logtool.records.errors import (
 )
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
+from pdhef_logtool.records.signals import POSITIONS, SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
 from pdhef_logtool.records.tracks import REFERENCE
+from pdhef_logtool.results.no_position import WithoutPosition, topics_with_position
 from pdhef_logtool.results.opened_run import (
     ESTIMATES_FILE,
     LOGS,
@@ -71,6 +72,7 @@ from pdhef_logtool.results.run_report import (
 from pdhef_logtool.results.sink import TRUTH, Event, Shown, Sink
 from pdhef_logtool.runs.config import Keep, RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
+from pdhef_logtool.runs.reference_audit import audit_truth
 from pdhef_logtool.runs.referencing import DriveReference, reference_of
 from pdhef_logtool.runs.scoring import Evaluation, evaluate, in_time
 from pdhef_logtool.runs.selection import candidates, choose_main, contradiction, default_names
@@ -370,9 +372,21 @@ def _score(job: _Job, store: TrackStore, signals: Signals) -> Evaluation:
     if drive.friction.bank is not None:
         observable = friction_events(drive.friction, signals)
         scored = replace(scored, events=sorted([*scored.events, *observable], key=in_time))
+    _audit(job, store)
     if against := contradiction(scored.rows):
         drive.notes.append(f"WARNING: {against.text}")  # the selected estimate's text gives the consequence
     return scored
+
+
+def _audit(job: _Job, store: TrackStore) -> None:
+    """Compare the ground truth of sideslip with the reference, and note where they contradict each other."""
+    truth, reference = store.read(TRUTH), store.read(REFERENCE)
+    if truth is None or reference is None or job.reference is None:
+        return
+    contradictions = audit_truth(truth, reference, job.drive.car.vehicle.low_speed_blend_m_s)
+    job.reference.document["ground_truth"] = list(contradictions)
+    for text in contradictions:
+        job.drive.tell(text)
 
 
 def _without(
@@ -571,22 +585,32 @@ def _open_sinks(
                 shown=first,
                 others_step_ns=None if is_named else step_ns,
                 min_speed_m_s=car.vehicle.low_speed_blend_m_s,
+                left_out=_left_out(drive) if config.no_position else None,
             )
             sinks.append(annotated)
             layouts = change.file("foxglove.json"), change.file("plotjuggler.xml")
             fixes = (
                 [t.name for t in drive.log.topics if t.type_name.replace("/msg/", "/") in FIX_TYPES]
-                if source is not None
+                if source is not None and not config.no_position
                 else []
             )
             sinks.append(LayoutsSink(*layouts, None, colours, shown=first, fixes=fixes))
         if config.kept == "full":
             sinks.append(_recording(change, drive, config, car, shown, output, colours))
-        yield sinks
+        yield [WithoutPosition(sink) for sink in sinks] if config.no_position else sinks
     except BaseException:
         for sink in sinks:
             sink.abort()
         raise
+
+
+def _left_out(drive: Drive) -> frozenset[str]:
+    """Return the topics that ``--no-position`` keeps out of the copy, and note them."""
+    places = [s for n, s in (drive.plan.mapping.truth | drive.plan.mapping.signals).items() if n in POSITIONS]
+    topics = topics_with_position(drive.log, {s.topic for s in places})
+    if topics:
+        drive.remarks.append(f"--no-position: {', '.join(sorted(topics))} not copied, attachments and metadata neither")
+    return topics
 
 
 def _recording(  # positional: what `_open_sinks` takes

@@ -72,6 +72,7 @@ from pdhef_logtool.runs.scoring import diverged_events, in_time, segment_events
 from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder
 
 if TYPE_CHECKING:
+    from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
     from pdhef_logtool.evaluation.blocks import SegmentMasks
     from pdhef_logtool.evaluation.manoeuvres import Manoeuvre
     from pdhef_logtool.evaluation.metrics import MetricRow
@@ -172,13 +173,8 @@ class _Scoring:
                 named = sources_of(log, self.truth, TRUTH_UNITS, "--truth")[0]
                 can = None if given is None else given.can
                 chosen = replace(chosen, truth=named, quality=None, can=can)
-            if not chosen.truth:
-                raise MappingError(
-                    expected="a ground truth to score against",
-                    got="none mapped and none recognised",
-                    where=str(log.path),
-                    remedy="name it with --truth SIGNAL=TOPIC.FIELD or in a mapping file",
-                )
+            if not chosen.truth and self.config.reference == "off":
+                raise _nothing_to_score_against("none mapped and none recognised", str(log.path))
             return chosen
 
         options = replace(self.config.read_options, friction=None)
@@ -194,18 +190,20 @@ class _Scoring:
         self.reporter.progress(drive.name, 0.1)
         recorded, losses = self._read_estimates(drive)
         self.reporter.progress(drive.name, 0.3)
-        truth, truth_losses, samples, counts = read_truth(drive.log, plan, drive.options.window_s)
+        truth, truth_losses, samples, counts = self._read_truth(drive)
         ledger = sample_ledger(drive.log, plan, counts)
         self.reporter.progress(drive.name, 0.6)
         signals = _read_sensors(drive)
+        reference = self._reference(drive, scored=truth is not None)
         manoeuvres = [] if signals is None else find_manoeuvres(signals, self.car.vehicle)
         all_losses = merge_losses([drive.losses, losses, truth_losses, damage(ledger)])
         self.reporter.progress(drive.name, 0.8)
         scored_ns = np.unique(np.concatenate([r.track.stamps_ns for r in recorded]))
         plan = self._with_dependence(plan, recorded)
-        rows, dependent, blocks = self._figures(drive, plan, recorded, truth, signals, manoeuvres)
+        against = _Against(truth, plan.truth_latency_s, self.car.vehicle.standstill_m_s, reference)
+        rows, dependent, blocks = self._figures(drive, plan, recorded, against, signals, manoeuvres)
         drive.plan = plan = replace(plan, dependent={**dependent, **plan.dependent})
-        truth_track = truth_at(truth, scored_ns, plan.truth_latency_s, standstill_m_s=self.car.vehicle.standstill_m_s)
+        truth_track = against.truth_at(scored_ns)
         events = self._events(truth_track, signals_at(signals, scored_ns), recorded, manoeuvres)
         samples |= drive.samples
         for r in recorded:
@@ -217,7 +215,8 @@ class _Scoring:
         )  # fmt: skip
         read = {s.topic for e in self.estimates for s in e.signals.values()}
         topics = [replace(t, mapped=t.mapped or t.name in read) for t in facts.log.topics]
-        latency = [] if plan.latency is not None else ["no gyro to measure the ground truth's latency with: taken as 0"]
+        unknown = truth is not None and plan.latency is None
+        latency = ["no gyro to measure the ground truth's latency with: taken as 0"] if unknown else []
         facts = replace(
             facts,
             log=replace(facts.log, topics=topics),
@@ -227,13 +226,39 @@ class _Scoring:
         report = build_report(facts)
         folder = None
         if outputs is not None:
-            written = valid_as_a_whole(truth_track, plan.derivation, self.car.vehicle.standstill_m_s)
+            tracks = [r.track for r in recorded] + [t for t in (against.reference_at(scored_ns),) if t is not None]
+            if truth_track is not None:
+                tracks.insert(0, valid_as_a_whole(truth_track, plan.derivation, self.car.vehicle.standstill_m_s))
             with outputs.begin(log_place(drive.name), stale=(PAGE_FILE,)) as change:
-                _write(change, report, rows, [written, *(r.track for r in recorded)], plan)
+                _write(change, report, rows, tracks, plan)
             folder = change.target
         self.reporter.progress(drive.name, 1.0)
         files = {} if folder is None else files_of(folder)
         return LogResult(replace(outcome_of(drive, all_losses), files=files), folder, report, tuple(rows))
+
+    def _read_truth(
+        self, drive: Drive
+    ) -> tuple[TruthTrack | None, tuple[Loss, ...], dict[str, int], dict[tuple[Role, str], Counter[str]]]:
+        """Return what :func:`read_truth` does, nothing where no ground truth is mapped."""
+        if not drive.mapping.truth:
+            return None, (), {}, {}
+        return read_truth(drive.log, drive.plan, drive.options.window_s)
+
+    def _reference(self, drive: Drive, *, scored: bool) -> ReferenceEstimator | None:
+        """Return the sideslip reference of the sensors: without ground truth, or beside it where asked for."""
+        if self.config.reference == "off" or (scored and self.config.reference == "auto"):
+            return None
+        from pdhef_logtool.runs.referencing import reference_of
+
+        made = reference_of(drive, None, self.config)
+        if made is None or made.estimator is None:
+            why = "the log has no IMU" if made is None else str(made.document["refused"])
+            if not scored:
+                raise _nothing_to_score_against(f"none, and no sideslip reference: {why}", drive.file)
+            drive.tell(f"no sideslip reference: {why}")
+            return None
+        drive.tell("estimated sideslip reference: differences from it are no errors (docs/estimators.md#reference)")
+        return made.estimator
 
     def _read_estimates(self, drive: Drive) -> tuple[list[RecordedEstimate], list[Loss]]:
         losses: list[Loss] = []
@@ -261,7 +286,7 @@ class _Scoring:
         drive: Drive,
         plan: DrivePlan,
         recorded: Sequence[RecordedEstimate],
-        truth: TruthTrack,
+        against: _Against,
         signals: Signals | None,
         manoeuvres: Sequence[Manoeuvre],
     ) -> tuple[list[MetricRow], dict[str, str], list[RequirementBlocks]]:
@@ -270,33 +295,40 @@ class _Scoring:
         Return the blocks of the plan's requirements, too.
         """
         from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, score_track
+        from pdhef_logtool.evaluation.metrics.reference import reference_rows
         from pdhef_logtool.evaluation.segments import segment_masks
 
         rows: list[MetricRow] = []
         dependent: dict[str, str] = {}
         blocks: list[RequirementBlocks] = []
         for r in recorded:
-            at_stamps = truth_at(
-                truth, r.track.stamps_ns, plan.truth_latency_s, standstill_m_s=self.car.vehicle.standstill_m_s
-            )
+            at_stamps, reference = against.truth_at(r.track.stamps_ns), against.reference_at(r.track.stamps_ns)
             seen = signals_at(signals, r.track.stamps_ns)
             masks = segment_masks(seen, at_stamps, self.car.vehicle, manoeuvres)
+            slow = self.car.vehicle.low_speed_blend_m_s
+            figures: list[MetricRow] = []
+            if reference is not None:
+                figures += reference_rows([r.track], reference, masks, log=drive.name, low_speed_m_s=slow)
+            base = reference if at_stamps is None else at_stamps
             same = {
                 name: f"the ground truth's {name} equals that of the estimate {r.track.name}"
                 for name in SCORED_SIGNALS
-                if _same_column(getattr(r.track, name), getattr(at_stamps, name))
+                if at_stamps is not None and _same_column(getattr(r.track, name), getattr(at_stamps, name))
             }
             dependent |= same
-            blocks += self._blocks(r, at_stamps, masks, frozenset({**plan.dependent, **same}), alone=len(recorded) == 1)
-            figures = score_track(
-                r.track,
-                at_stamps,
-                masks,
-                log=drive.name,
-                low_speed_m_s=self.car.vehicle.low_speed_blend_m_s,
-                not_independent={**plan.dependent, **same},
-            )
-            if not any(row.metric == "rmse" for row in figures):
+            if base is not None:
+                tainted = frozenset({**plan.dependent, **same})
+                blocks += self._blocks(r, base, masks, tainted, alone=len(recorded) == 1, estimated=at_stamps is None)
+            if at_stamps is not None:
+                figures += score_track(
+                    r.track,
+                    at_stamps,
+                    masks,
+                    log=drive.name,
+                    low_speed_m_s=slow,
+                    not_independent={**plan.dependent, **same},
+                )
+            if not any(row.metric in ("rmse", "reference_rms") for row in figures):
                 drive.tell(
                     f"{r.track.name}: nowhere are estimate and ground truth known together, so there are no errors"
                 )
@@ -310,13 +342,20 @@ class _Scoring:
         return rows, dependent, blocks
 
     def _blocks(
-        self, r: RecordedEstimate, truth: StateTrack, masks: SegmentMasks, tainted: frozenset[str], *, alone: bool
+        self,
+        r: RecordedEstimate,
+        truth: StateTrack,
+        masks: SegmentMasks,
+        tainted: frozenset[str],
+        *,
+        alone: bool,
+        estimated: bool,
     ) -> list[RequirementBlocks]:
         """Return the blocks of the requirements on one estimate; one without a name is on the ``alone`` recorded."""
         from pdhef_logtool.evaluation.requirement_blocks import ScoredDrive, requirement_blocks
 
         name, slow = r.track.name, self.car.vehicle.low_speed_blend_m_s
-        drive = ScoredDrive(lambda n: r.track if n == name else None, truth, masks, slow, tainted)
+        drive = ScoredDrive(lambda n: r.track if n == name else None, truth, masks, slow, tainted, estimated=estimated)
         asked = [q for q in self.validation.requirements if q.estimator in (name, None if alone else name)]
         return requirement_blocks(asked, name if alone else None, drive)
 
@@ -329,7 +368,7 @@ class _Scoring:
 
     def _events(
         self,
-        truth: StateTrack,
+        truth: StateTrack | None,
         signals: Signals,
         recorded: Sequence[RecordedEstimate],
         manoeuvres: Sequence[Manoeuvre],
@@ -337,8 +376,39 @@ class _Scoring:
         from pdhef_logtool.evaluation.segments import segment_masks
 
         masks = segment_masks(signals, truth, self.car.vehicle, manoeuvres)
-        events = segment_events(truth, masks, manoeuvres) + [e for r in recorded for e in diverged_events(r.track)]
+        events = segment_events(signals if truth is None else truth, masks, manoeuvres) + [
+            e for r in recorded for e in diverged_events(r.track)
+        ]
         return sorted(events, key=in_time)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Against:
+    """What estimates are compared with: ground truth, the sideslip reference, or both."""
+
+    truth: TruthTrack | None
+    latency_s: float
+    standstill_m_s: float
+    reference: ReferenceEstimator | None
+
+    def truth_at(self, stamps_ns: IntArray) -> StateTrack | None:
+        """Return the ground truth at stamps [N]."""
+        if self.truth is None:
+            return None
+        return truth_at(self.truth, stamps_ns, self.latency_s, standstill_m_s=self.standstill_m_s)
+
+    def reference_at(self, stamps_ns: IntArray) -> StateTrack | None:
+        """Return the sideslip reference at stamps [N]."""
+        return None if self.reference is None else self.reference.at(stamps_ns)
+
+
+def _nothing_to_score_against(got: str, where: str) -> MappingError:
+    return MappingError(
+        expected="a ground truth to score against, or an IMU for a sideslip reference",
+        got=got,
+        where=where,
+        remedy="name ground truth with --truth SIGNAL=TOPIC.FIELD or in a mapping file",
+    )
 
 
 def _read_sensors(drive: Drive) -> Signals | None:
@@ -365,7 +435,7 @@ def _write(
 ) -> None:
     from pdhef_logtool.results.parquet_sink import EstimatesSink, write_metrics
 
-    start = first_pose(tracks[0])
+    start = first_pose(tracks[0] if tracks[0].name == TRUTH else None)
     sink = EstimatesSink(change.file("estimates.parquet"))
     try:
         for track in tracks:

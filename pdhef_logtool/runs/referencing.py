@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,9 +47,15 @@ def reference_of(drive: Drive, calibration: SelfCalibration | None, config: RunC
     missing = [name for name in _NEEDS if name not in drive.available]
     if missing:
         return DriveReference(None, _document([], f"the log has no {', '.join(missing)}"))
-    spans = list(_spans(drive, prior_of(drive.car.vehicle, calibration), use_gnss=config.gnss != "off"))
+    speed = drive.mapping.signals.get("speed_m_s")
+    prior = replace(
+        prior_of(drive.car.vehicle, calibration), speed_over_ground=speed is not None and speed.combine == "norm"
+    )
+    spans = list(_spans(drive, prior, use_gnss=config.gnss != "off"))
     used = [span for span in spans if not span.refused]
     refused = "" if used else next((span.refused for span in spans), "the log has no samples")
+    if refused and config.reference == "on":
+        drive.tell(f"no sideslip reference: {refused}")
     note = "estimated from the IMU and GNSS, without tyre data: not causal"
     estimator = ReferenceEstimator(tuple(used), (note,)) if used else None
     return DriveReference(estimator, _document(spans, refused))

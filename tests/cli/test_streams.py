@@ -92,3 +92,17 @@ def test_the_second_request_ends_at_once_and_what_is_ignored_stays_so() -> None:
 def test_nothing_came_here() -> None:
     assert stopping.came() is None
     stopping.check()
+
+
+def test_without_a_terminal_progress_is_a_line_every_half_minute(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from pdhef_logtool.cli import console
+
+    now = [0.0]
+    monkeypatch.setattr(console.time, "monotonic", lambda: now[0])
+    with console.reporter() as reporter:
+        for second in range(0, 100, 5):
+            now[0] = float(second)
+            reporter.progress(f"drive {second}", second / 100.0)
+    assert capsys.readouterr().err.splitlines() == [" 30%  drive 30", " 60%  drive 60", " 90%  drive 90"]

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.estimators.reference import drive as reference
-from pdhef_logtool.estimators.reference import smoother
+from pdhef_logtool.estimators.reference import inputs, smoother
 from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference, refer, sideslip_std
 from pdhef_logtool.estimators.reference.estimator import steps_at
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -209,7 +208,10 @@ def test_spans_cover_a_drive_once():
 
 
 @settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 10_000), size=st.sampled_from([smoother.WITHOUT_GNSS, smoother.WITH_GNSS]))
+@given(
+    seed=st.integers(0, 10_000),
+    size=st.sampled_from([smoother.WITHOUT_GNSS, smoother.WITH_GNSS, smoother.WITH_POSITION]),
+)
 def test_sparse_products_equal_dense_ones(seed, size):
     rng = np.random.default_rng(seed)
     root = rng.standard_normal((size, size))
@@ -217,15 +219,9 @@ def test_sparse_products_equal_dense_ones(seed, size):
     point = 0.1 * rng.standard_normal(size)
     point[smoother.VX] = 20.0
     row = rng.standard_normal(smoother.INPUTS)
-    dense, x = np.zeros((3, size)), point.copy()
+    dense, x = np.zeros((len(smoother.DENSE), size)), point.copy()
     smoother._transition(x, point, 0.05, row, dense)
-    rows, decay = np.full(size, -1), np.ones(size)
-    rows[smoother.VX], rows[smoother.VY] = 0, 1
-    decay[smoother.AX_BIAS] = decay[smoother.AY_BIAS] = np.exp(-0.05 / smoother.BIAS_S)
-    decay[smoother.LAW_ERROR] = np.exp(-0.05 / smoother.LAW_S)
-    if size == smoother.WITH_GNSS:
-        rows[smoother.HEADING] = 2
-        decay[smoother.EAST_ERROR] = decay[smoother.NORTH_ERROR] = np.exp(-0.05 / smoother.RECEIVER_S)
+    rows, decay = smoother.structure(size, 0.05)
     f = np.diag(decay)
     for i in np.flatnonzero(rows >= 0):
         f[i] = dense[rows[i]]
@@ -243,20 +239,15 @@ def test_sparse_products_equal_dense_ones(seed, size):
 @given(seed=st.integers(0, 10_000), east=st.booleans())
 def test_jacobians_equal_differences(seed, east):
     rng = np.random.default_rng(seed)
-    point = 0.05 * rng.standard_normal(smoother.WITH_GNSS)
-    point[smoother.VX] = 15.0
-    point[smoother.HEADING] = rng.uniform(-3.0, 3.0)
-    row = rng.standard_normal(smoother.INPUTS)
-    row[smoother.LAW_STD] = 0.01
-    for function in (
-        lambda q, h: smoother._axle_law(q, row, 1.5, h),
-        lambda q, h: smoother._gnss(q, row, east, h),
+    point, row = _drawn(rng)
+    for function, left_out in (
+        (lambda q, h: smoother._axle_law(q, row, 1.5, h), {smoother.VX, smoother.VY}),
+        (lambda q, h: smoother._gnss(q, row, east, h), _OVER_THE_OFFSET),
+        (lambda q, h: smoother._position(q, row, east, h), set()),
     ):
-        jacobian, scratch = np.zeros(smoother.WITH_GNSS), np.zeros(smoother.WITH_GNSS)
+        jacobian, scratch = np.zeros(smoother.WITH_POSITION), np.zeros(smoother.WITH_POSITION)
         function(point, jacobian)
-        for i in range(smoother.WITH_GNSS):
-            if i in _LEFT_OUT and function(point, scratch) is not None:
-                continue
+        for i in set(range(smoother.WITH_POSITION)) - left_out:
             up, down = point.copy(), point.copy()
             up[i] += 1e-5
             down[i] -= 1e-5
@@ -264,25 +255,64 @@ def test_jacobians_equal_differences(seed, east):
             assert jacobian[i] == pytest.approx(slope, abs=2e-5, rel=1e-5), i
 
 
-#: Second-order effects between a knot and a GNSS sample: errors of the IMU over some hundredths of a second.
-_LEFT_OUT = {
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10_000), tilts=st.booleans())
+def test_the_jacobian_of_the_transition_equals_differences(seed, tilts):
+    rng = np.random.default_rng(seed)
+    point, row = _drawn(rng)
+    row[smoother.TILT] = float(tilts)
+    dense = np.zeros((len(smoother.DENSE), smoother.WITH_POSITION))
+
+    def moved(state: FloatArray) -> FloatArray:
+        out = state.copy()
+        smoother._transition(out, state, 0.05, row, np.zeros_like(dense))
+        return out
+
+    smoother._transition(point.copy(), point, 0.05, row, dense)
+    for i in set(range(smoother.WITH_POSITION)) - _SECOND_ORDER:
+        up, down = point.copy(), point.copy()
+        up[i] += 1e-5
+        down[i] -= 1e-5
+        slope = (moved(up) - moved(down))[list(smoother.DENSE)] / 2e-5
+        np.testing.assert_allclose(dense[:, i], slope, atol=1e-2 if i == smoother.HEADING else 1e-3, err_msg=str(i))
+
+
+def _drawn(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Return a state and a row of inputs."""
+    point = 0.05 * rng.standard_normal(smoother.WITH_POSITION)
+    point[smoother.VX] = 15.0
+    point[smoother.HEADING] = rng.uniform(-3.0, 3.0)
+    row = rng.standard_normal(smoother.INPUTS)
+    row[smoother.LAW_STD] = 0.01
+    return point, row
+
+
+#: Errors of the IMU over the hundredths of a second between a knot and a GNSS sample, and on the yaw rate.
+_OVER_THE_OFFSET = {
     smoother.AX_BIAS,
     smoother.AY_BIAS,
     smoother.ROLL_GAIN,
+    smoother.AX_GAIN,
     smoother.IMU_X,
+    smoother.IMU_Y,
+    smoother.IMU_YAW,
     smoother.YAW_RATE_BIAS,
     smoother.YAW_RATE_GAIN,
 }
+#: What is left out of the transition: errors of the gyro in the centripetal term and in the tilt, and of accelerations
+#: in the position.
+_SECOND_ORDER = {smoother.YAW_RATE_BIAS, smoother.YAW_RATE_GAIN} | (_OVER_THE_OFFSET - {smoother.HEADING})
 
 
 def test_the_noise_of_a_sensor_that_repeats_its_samples_is_that_of_the_new_ones():
     rng = np.random.default_rng(0)
     noise = np.repeat(0.2 * rng.standard_normal(500), 4)
     held = replace(SLALOM.signals.rows(0, 2000), ay_m_s2=noise)
-    assert reference.accelerometer_noise(held) == pytest.approx(0.2 * np.sqrt(0.04), rel=0.15)
+    found = inputs.white_noise(held.stamps_ns, held.ay_m_s2, 0.0)
+    assert found == pytest.approx(0.2 * np.sqrt(0.04), rel=0.15)
 
 
-def test_gnss_whose_course_does_not_follow_the_gyro_is_not_used():
+def test_gnss_that_does_not_change_as_the_imu_is_not_used():
     signals = with_gnss(LONG)
     swapped = replace(signals, gnss_velocity_m_s=signals.gnss_velocity_m_s[:, ::-1].copy())
     assert refer(signals, PRIOR).with_gnss

@@ -156,6 +156,27 @@ def test_a_speed_that_lasts_is_believed_in_the_end(good):
     np.testing.assert_array_equal(out[late], jumped.speed_m_s[late])
 
 
+def test_after_a_timeout_a_broken_accelerometer_takes_little_of_the_speed():
+    """Noise of 30 m/s² contradicts any speed again and again: the check is suspended for longer than it rejected."""
+    made = rolling_drive(lambda t: 12.0 + 3.0 * np.sin(0.4 * t), lambda t: 0.004 * np.sin(t), 60.0)
+    signals = with_noise(made.signals, 1)
+    noise = np.where(made.time_s > 10.0, np.random.default_rng(0).normal(0.0, 30.0, len(signals)), 0.0)
+    out = believed(replace(signals, ax_m_s2=signals.ax_m_s2 + noise))
+    assert np.isnan(out[np.isfinite(signals.speed_m_s)]).mean() < 0.4
+
+
+def test_v_y_r_of_a_drift_widens_the_tolerance_while_wheels_spin():
+    """A drift changes v_x by v_y r, which the accelerometer does not show: readings within that are accepted again."""
+    made = rolling_drive(lambda t: np.clip(1.5 * (t - 1.0), 0.0, 14.0), np.zeros_like, 16.0)
+    signals, t = with_noise(made.signals, 2), made.time_s
+    spinning = signals.speed_m_s + spin(t, at=9.0, length=1.5, size=8.0)
+    turning = np.where(t > 9.0, 0.2, 0.0)
+    slipping = replace(signals, speed_m_s=spinning, ax_m_s2=signals.ax_m_s2 - 2.5 * (t > 9.0))
+    without, within = (believed(replace(slipping, yaw_rate_rad_s=r)) for r in (np.zeros_like(t), turning))
+    late = (t > 11.5) & np.isfinite(spinning)
+    assert np.isfinite(within[late]).mean() > np.isfinite(without[late]).mean() + 0.2
+
+
 def test_without_an_accelerometer_nothing_is_gated(good):
     blind = replace(good.signals, ax_m_s2=np.full(len(good.signals), np.nan))
     blind = replace(blind, speed_m_s=blind.speed_m_s + spin(good.time_s))

@@ -109,7 +109,7 @@ def test_a_cut_mdf_gives_what_is_readable_or_one_line(tmp_path: Path) -> None:
         assert "internal error" not in done.stderr
 
 
-def _metadata_first(rows: int) -> bytes:
+def _metadata_first(rows: int, offset: int = 8) -> bytes:
     """An MDF 4.10 as recorders write it: one group with time and AccY [g], whose data are the last block."""
     samples = np.zeros(rows, [("t", "<f8"), ("a", "<f8")])
     samples["t"], samples["a"] = TIME_S[:rows], AY[:rows]
@@ -132,7 +132,7 @@ def _metadata_first(rows: int) -> bytes:
             "TX2": ([], b"AccY\0"),
             "TX3": ([], b"g\0"),
             "CN": (["CN2", "", "TX1", "", "", "", "", ""], channel(2, 1, 0)),
-            "CN2": (["", "", "TX2", "", "", "", "TX3", ""], channel(0, 0, 8)),
+            "CN2": (["", "", "TX2", "", "", "", "TX3", ""], channel(0, 0, offset)),
             "DT": ([], samples.tobytes()),
         }
         out = bytearray(b"MDF     4.10    test".ljust(28, b"\0") + struct.pack("<H", 410)).ljust(64, b"\0")
@@ -157,6 +157,29 @@ def test_an_mdf_that_ends_within_its_data_is_read_so_far(tmp_path: Path) -> None
     np.testing.assert_array_equal(read, AY[: len(read)])
     assert N - 102 <= len(read) <= N - 100
     assert called("inspect", tmp_path / "b.mf4").returncode == 3
+
+
+@pytest.mark.parametrize("offset", [1000, 2**31, 12])
+def test_a_channel_outside_of_its_record_is_not_read(offset: int, tmp_path: Path) -> None:
+    (tmp_path / "a.mf4").write_bytes(_metadata_first(N, offset))
+    with pytest.raises(PdhefError, match="with times"):
+        open_log(tmp_path / "a.mf4")
+
+
+def test_what_asammdf_prints_of_a_damaged_channel_does_not_reach_the_output(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def get(*_: object, **__: object) -> None:
+        print("CHANNEL =====")
+        raise ValueError("damaged")
+
+    with closing(open_log(mdf(tmp_path / "a.mf4"))) as log:
+        monkeypatch.setattr(asammdf.MDF, "get", get)
+        capsys.readouterr()
+        read = log.read({"IMU_100_Hz": ["IMU_AccY"]})["IMU_100_Hz"]
+        assert [(x.kind, x.severity) for x in log.lost] == [("bad-column", "lost")]
+    assert np.isnan(read.fields["IMU_AccY"]).all()
+    assert capsys.readouterr().out == ""
 
 
 def _check_can(path: Path, tmp_path: Path, kind: str) -> None:

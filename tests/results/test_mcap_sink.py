@@ -625,3 +625,4 @@ def test_the_log_has_a_line_for_faults_checks_losses_and_events(tmp_path, circle
 def test_other_tracks_are_thinned_to_the_size_of_the_source(source_bytes, expected_s):
     step_ns = thinned_step_ns(source_bytes, rows=30_000, others=6, span_ns=300 * 10**9)
     assert step_ns == pytest.approx(expected_s * 1e9)
+    assert thinned_step_ns(10**12, rows=360_000, others=6, span_ns=3600 * 10**9) == 200_000_000

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pdhef_logtool.records.errors import OutputError, UsageError
+from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.storage.documents import seal
 
@@ -37,7 +37,8 @@ def test_a_label_that_leads_out_of_the_folder_is_refused(tmp_path: Path, label: 
 def test_a_folder_that_is_no_run_is_refused_with_what_it_lacks(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"without run\.json"):
         open_run(tmp_path)
-    with pytest.raises(UsageError, match="no such folder"):
+    with pytest.raises(OutputError, match="no such folder") as missing:
         open_run(tmp_path / "none")
+    assert missing.value.exit_code == 2
     with pytest.raises(OutputError, match="format 'other'"):
         open_run(_run(tmp_path, [], format="other"))

@@ -45,7 +45,7 @@ ESTIMATE_COLUMNS = {
     "steer_bias_rad": pl.Float64,
     "ay_bias_m_s2": pl.Float64,
     "yaw_rate_bias_rad_s": pl.Float64,
-    **dict.fromkeys(("share_law", "share_kinematics", "share_gnss"), pl.Float64),
+    **dict.fromkeys(("share_law", "share_kinematics", "share_gnss", "independent"), pl.Float64),
     "causal": pl.Boolean,
 }
 #: Those that none of these tracks has.
@@ -79,7 +79,7 @@ UNITS = {
     "steer_bias_rad": "rad",
     "ay_bias_m_s2": "m/s^2",
     "yaw_rate_bias_rad_s": "rad/s",
-    **dict.fromkeys(("share_law", "share_kinematics", "share_gnss"), "1"),
+    **dict.fromkeys(("share_law", "share_kinematics", "share_gnss", "independent"), "1"),
     "causal": "",
 }
 METRIC_COLUMNS = {

@@ -71,7 +71,7 @@ def test_without_a_rival_or_an_interval_that_is_said() -> None:
     first = verdicts(details(standing(None, None, interval(0.1))))[0]
     assert first["outcome"] == "alone"
     assert "no CI: it needs 6 blocks of 10 s" in first["text"]
-    assert first["text"].endswith("no filter without a network ran for comparison")
+    assert first["text"].endswith("no other filter without a network ran for comparison")
     assert first["rmse"]["low"] is None
 
 

@@ -38,6 +38,9 @@ def test_a_drive_with_truth_has_all_of_it(sample_logs_dir: Path, tmp_path: Path)
     assert judged["exposure"]["minutes"] == pytest.approx(62.5 / 60.0, rel=0.02)  # of 70 s
     assert {i["estimator"] for i in report["innovations"]} == {"pd-hef", "physics"}
     assert {i["channel"] for i in report["innovations"]} == {"ay_m_s2", "yaw_rate_rad_s", "speed_m_s"}
+    largest = report["largest_errors"][0]
+    assert abs(largest["error_rad"]) == pytest.approx(figure["pd-hef", "sideslip_rad", "max_abs", "all"])
+    assert largest["estimate_rad"] - largest["truth_rad"] == pytest.approx(largest["error_rad"])
     assert report["error_budget"]["reason"] == "" and len(report["error_budget"]["causes"]) == 5
     seconds = sum(c["seconds"] for c in report["operating_space"]["cells"])
     assert seconds == pytest.approx(report["log"]["duration_s"], rel=0.05)

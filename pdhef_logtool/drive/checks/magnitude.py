@@ -1,4 +1,4 @@
-"""``SIGNAL.magnitude``: values that no vehicle has; needs no second signal, and holds for model cars too."""
+"""``SIGNAL.magnitude``: values that no vehicle has; needs no second signal, and applies to model cars too."""
 
 from __future__ import annotations
 

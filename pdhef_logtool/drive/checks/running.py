@@ -72,12 +72,12 @@ def check_drive(
 
 def misread_channels(checks: Sequence[Check], waived: Sequence[str] = ()) -> dict[str, str]:
     """Return by subject why nothing may be computed from it: a failed check that no one has waived, and its remedy."""
-    found: dict[str, str] = {}
+    misread: dict[str, str] = {}
     for check in checks:
         subject, _, aspect = check.name.rpartition(".")
         if check.verdict == "failed" and aspect in _MISREAD and check.name not in waived:
-            found.setdefault(subject, f"check {check.name} failed: {check.remedy}")
-    return found
+            misread.setdefault(subject, f"check {check.name} failed: {check.remedy}")
+    return misread
 
 
 def _all_checks(drive: CheckedDrive) -> tuple[Check, ...]:

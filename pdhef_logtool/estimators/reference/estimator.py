@@ -11,7 +11,7 @@ import numpy as np
 from pdhef_logtool.estimators.reference.drive import SideslipReference, sideslip_std
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import Extrapolation, StepColumns
-from pdhef_logtool.records.tracks import REFERENCE, StateTrack, make_track
+from pdhef_logtool.records.tracks import INDEPENDENT_SHARE, REFERENCE, StateTrack, make_track
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,9 +46,17 @@ class ReferenceEstimator:
     def predict(self, steps: ReferenceSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Return the track of the steps, each at its own stamp."""
         values, covariance, shares = (c[ahead.step] for c in (steps.values, steps.covariance, steps.shares))
-        vx, vy, yaw_rate = values.T
+        return self._track(ReferenceSteps(values, covariance, shares, ahead.usable), stamps_ns)
+
+    def at(self, stamps_ns: IntArray) -> StateTrack:
+        """Return the track at any stamps [N]."""
+        return self._track(steps_at(self.spans, stamps_ns), stamps_ns)
+
+    def _track(self, steps: ReferenceSteps, stamps_ns: IntArray) -> StateTrack:
+        vx, vy, yaw_rate = steps.values.T
         full = np.full((len(stamps_ns), 3, 3), np.nan)
-        full[:, 0, 0], full[:, 0, 1], full[:, 1, 0], full[:, 1, 1] = covariance[:, [0, 1, 1, 2]].T
+        full[:, 0, 0], full[:, 0, 1], full[:, 1, 0], full[:, 1, 1] = steps.covariance[:, [0, 1, 1, 2]].T
+        law, kinematics, gnss = steps.shares.T
         return make_track(
             self.name,
             stamps_ns,
@@ -56,11 +64,12 @@ class ReferenceEstimator:
             vy_m_s=vy,
             yaw_rate_rad_s=yaw_rate,
             covariance=full,
-            sideslip_std_rad=sideslip_std(vx, vy, covariance),
-            share_law=shares[:, 0],
-            share_kinematics=shares[:, 1],
-            share_gnss=shares[:, 2],
-            valid=ahead.usable,
+            sideslip_std_rad=sideslip_std(vx, vy, steps.covariance),
+            share_law=law,
+            share_kinematics=kinematics,
+            share_gnss=gnss,
+            independent=np.where(np.isnan(gnss), np.nan, gnss > INDEPENDENT_SHARE),
+            valid=steps.valid,
         )
 
 

@@ -1,16 +1,18 @@
 """Kinematic smoother between stretches of linear driving, with or without GNSS velocity (docs/method.md#reference).
 
-States at the knots, in body axes at the CG: v_x, v_y, biases of the accelerometers, error d of the axle law; constants:
-compliance of the rear axle and the parameters of the sensors; with GNSS also heading, error of the receiver, antenna.
+States at the knots, in body axes at the CG: v_x, v_y, biases b of the accelerometers, error d of the axle law;
+constants: compliance of the rear axle and the parameters of the sensors; with GNSS also heading, error of the receiver,
+antenna; with positions also those and their error.
 
     v̇_x = a_x + v_y r,   v̇_y = a_y − v_x r                               (kinematics of a plane body)
-    v_y − l_r r = −(κ a_r + k₂ ṙ) |v_x| − k₃ ȧ_y + β₀ v_x + S v_x (d + w) (axle law in the linear range)
+    ḃ_x = −g q + r b_y,  ḃ_y = g p − r b_x                                (tilt, where roll rate p, pitch rate q exist)
+    v_y − l_r r = −(κ a_r + k₂ ṙ) |v_x| − k₃ ȧ_y + β₀ v_x + S |v| (d + w)  (axle law in the linear range)
 
 with the rear axle's lateral acceleration a_r, the lag k₃ of tyre relaxation and body roll, and S, the law's
-uncertainty, which grows beyond the linear range. Each
-iteration linearises about the last smoothed states (Gauss–Newton): a Kalman filter with scalar updates, then the
-modified Bryson–Frazier smoother (Bierman, "Fixed interval smoothing with discrete measurements", 1973), which inverts
-no matrix. Measurements with large residuals count less (Cauchy, k = 3).
+uncertainty, which grows beyond the linear range. Gains multiply accelerations after a low pass: their noise would pass
+for a gain. Each iteration linearises about the last smoothed states (Gauss–Newton): a Kalman filter with scalar
+updates, then the modified Bryson–Frazier smoother (Bierman, "Fixed interval smoothing with discrete measurements",
+1973), which inverts no matrix. Measurements with large residuals count less (Cauchy, k = 3).
 """
 
 from __future__ import annotations
@@ -21,26 +23,36 @@ import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
 
-#: Entries of the state. Those up to RATE_COMPLIANCE always, the others with GNSS.
+#: Entries of the state: up to PITCH_RATE_BIAS always, to ANTENNA_HEIGHT with GNSS velocity, all with positions.
 VX, VY, AX_BIAS, AY_BIAS, LAW_ERROR = 0, 1, 2, 3, 4
 COMPLIANCE, YAW_COMPLIANCE, LAW_ANGLE, REAR_AXLE, ROLL_GAIN, SPEED_SCALE, IMU_X = 5, 6, 7, 8, 9, 10, 11
-YAW_RATE_BIAS, YAW_RATE_GAIN, RATE_COMPLIANCE = 12, 13, 14
-HEADING, EAST_ERROR, NORTH_ERROR, ANTENNA_X, ANTENNA_Y, GNSS_DELAY, ANTENNA_ROLL = 15, 16, 17, 18, 19, 20, 21
-WITHOUT_GNSS, WITH_GNSS = 15, 22
+YAW_RATE_BIAS, YAW_RATE_GAIN, RATE_COMPLIANCE, IMU_Y, IMU_YAW, AX_GAIN = 12, 13, 14, 15, 16, 17
+ROLL_RATE_BIAS, PITCH_RATE_BIAS = 18, 19
+HEADING, EAST_ERROR, NORTH_ERROR, ANTENNA_X, ANTENNA_Y, GNSS_DELAY, ANTENNA_HEIGHT = 20, 21, 22, 23, 24, 25, 26
+EAST, NORTH, EAST_OFFSET, NORTH_OFFSET = 27, 28, 29, 30
+WITHOUT_GNSS, WITH_GNSS, WITH_POSITION = 20, 27, 31
+#: Entries whose transition is more than a decay, by their row of the Jacobian.
+DENSE = (VX, VY, AX_BIAS, AY_BIAS, HEADING, EAST, NORTH)
 #: Columns of the inputs at the knots: means over the interval before the knot, values at it, and 1-sigmas.
 MEAN_AX, MEAN_AY, MEAN_YAW_RATE, YAW_RATE, AX, AY, YAW_ACCELERATION, AY_RATE = 0, 1, 2, 3, 4, 5, 6, 7
 SPEED, SPEED_STD, LAW_STD, GNSS_EAST, GNSS_NORTH, GNSS_OFFSET, GNSS_STD = 8, 9, 10, 11, 12, 13, 14
-GAP, STANDSTILL = 15, 16
-INPUTS = 17
+GAP, STANDSTILL, MEAN_YAW_ACCELERATION, SLOW_AX, SLOW_AY = 15, 16, 17, 18, 19
+ROLL_RATE, MEAN_ROLL_RATE, MEAN_PITCH_RATE, TILT, LENGTH = 20, 21, 22, 23, 24
+POSITION_EAST, POSITION_NORTH, POSITION_STD, POSITION_OFFSET_STD, UNSIGNED = 25, 26, 27, 28, 29
+INPUTS = 30
 
 #: Time constants of the accelerometer biases (tilt, bank), the law's error and the receiver's error, s.
 BIAS_S, LAW_S, RECEIVER_S = 6.0, 2.0, 5.0
 #: Their stationary 1-sigmas (the law's is LAW_STD), m/s² and m/s.
 BIAS_M_S2, RECEIVER_M_S = 0.35, 0.02
-#: Share of a change of a_x, a_y that changes their bias: pitch and roll.
-TILT_SHARE = 0.05
-#: White noise of the gyro, rad/s/√Hz, and of a stretch without IMU, m/s²/√Hz.
-GYRO_NOISE, GAP_NOISE = 0.0007, 3.0
+#: Share of a change of a_x, a_y that changes their bias: pitch and roll; the same where roll and pitch rate are known.
+TILT_SHARE, KNOWN_TILT_SHARE = 0.05, 0.01
+#: Time constant of the tilt that roll and pitch rate give, and what their errors add, m/s²/√s.
+TILT_S, TILT_NOISE, GRAVITY_M_S2 = 30.0, 0.03, 9.80665
+#: White noise of a stretch without IMU, m/s²/√Hz.
+GAP_NOISE = 3.0
+#: Time constant of the error of a position.
+POSITION_S = 60.0
 #: White part of the law's error as a share of LAW_STD, and its floor in m/s.
 LAW_WHITE, LAW_FLOOR_M_S = 0.7, 0.02
 #: Share of the rear axle in the lateral acceleration that acts on it in steady turns.
@@ -84,7 +96,7 @@ def _update(x, p, h, e, r, store, k, m):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _propagate(f, x, p, dense, dense_row, decay):  # type: ignore[no-untyped-def]
-    """Return F P Fᵀ; F has the rows ``dense`` [3, n] and is diagonal (``decay``) elsewhere."""
+    """Return F P Fᵀ; F has the rows ``dense`` [7, n] and is diagonal (``decay``) elsewhere."""
     n = x.shape[0]
     a = np.empty((n, n))
     for i in range(n):
@@ -134,65 +146,113 @@ def _pull_back(f, lam, dense, dense_row, decay):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def _corrected(point, ax, ay, slow_ax, slow_ay, rate, yaw_acceleration):  # type: ignore[no-untyped-def]
+    """Return the accelerations of the CG of accelerometers that read a_x, a_y, at a state."""
+    x, y, yaw = point[IMU_X], point[IMU_Y], point[IMU_YAW]
+    corrected_ax = ax - point[AX_GAIN] * slow_ax - yaw * slow_ay - point[AX_BIAS] + x * rate**2 + y * yaw_acceleration
+    corrected_ay = ay - point[ROLL_GAIN] * slow_ay + yaw * slow_ax - point[AY_BIAS] - x * yaw_acceleration + y * rate**2
+    return corrected_ax, corrected_ay
+
+
+@njit(cache=True)
 def _transition(x, point, step_s, row, dense):  # type: ignore[no-untyped-def]
-    """Put f(x), linearised about ``point``, into x, and the Jacobian's rows of v_x, v_y and heading into ``dense``."""
+    """Put f(x), linearised about ``point``, into x, and the Jacobian's rows of ``DENSE`` into ``dense``."""
     h = step_s
     n = x.shape[0]
     rate = row[MEAN_YAW_RATE] * (1.0 - point[YAW_RATE_GAIN]) - point[YAW_RATE_BIAS]
+    turning = row[MEAN_YAW_ACCELERATION]
     c, s = math.cos(rate * h), math.sin(rate * h)
-    ax = row[MEAN_AX] - point[AX_BIAS] + point[IMU_X] * rate * rate
-    ay = row[MEAN_AY] * (1.0 - point[ROLL_GAIN]) - point[AY_BIAS] - point[IMU_X] * row[YAW_ACCELERATION]
+    ax, ay = _corrected(point, row[MEAN_AX], row[MEAN_AY], row[SLOW_AX], row[SLOW_AY], rate, turning)
     dense[:, :] = 0.0
     dense[0, VX], dense[0, VY] = c, s
     dense[1, VX], dense[1, VY] = -s, c
     dvx, dvy = -s * point[VX] + c * point[VY], -c * point[VX] - s * point[VY]  # by the turned angle
     dense[0, AX_BIAS], dense[1, AY_BIAS] = -h, -h
-    dense[1, ROLL_GAIN] = -h * row[MEAN_AY]
-    dense[0, IMU_X], dense[1, IMU_X] = h * rate * rate, -h * row[YAW_ACCELERATION]
+    dense[1, ROLL_GAIN], dense[0, AX_GAIN] = -h * row[SLOW_AY], -h * row[SLOW_AX]
+    dense[0, IMU_X], dense[1, IMU_X] = h * rate * rate, -h * turning
+    dense[0, IMU_Y], dense[1, IMU_Y] = h * turning, h * rate * rate
+    dense[0, IMU_YAW], dense[1, IMU_YAW] = -h * row[SLOW_AY], h * row[SLOW_AX]
     dense[0, YAW_RATE_BIAS], dense[1, YAW_RATE_BIAS] = -h * dvx, -h * dvy
     dense[0, YAW_RATE_GAIN], dense[1, YAW_RATE_GAIN] = -h * row[MEAN_YAW_RATE] * dvx, -h * row[MEAN_YAW_RATE] * dvy
-    new0 = c * point[VX] + s * point[VY] + h * ax
-    new1 = -s * point[VX] + c * point[VY] + h * ay
-    new2 = 0.0
-    if n == WITH_GNSS:
-        dense[2, HEADING], dense[2, YAW_RATE_BIAS], dense[2, YAW_RATE_GAIN] = 1.0, -h, -h * row[MEAN_YAW_RATE]
-        new2 = point[HEADING] + rate * h
+    new = np.zeros(dense.shape[0])
+    new[0] = c * point[VX] + s * point[VY] + h * ax
+    new[1] = -s * point[VX] + c * point[VY] + h * ay
+    tilts = row[TILT] > 0.0
+    kept = math.exp(-h / (TILT_S if tilts else BIAS_S))
+    dense[2, AX_BIAS], dense[3, AY_BIAS] = kept, kept
+    new[2], new[3] = kept * point[AX_BIAS], kept * point[AY_BIAS]
+    if tilts:
+        dense[2, AY_BIAS], dense[3, AX_BIAS] = h * rate, -h * rate
+        dense[2, PITCH_RATE_BIAS], dense[3, ROLL_RATE_BIAS] = h * GRAVITY_M_S2, -h * GRAVITY_M_S2
+        pitch_rate = row[MEAN_PITCH_RATE] - point[PITCH_RATE_BIAS]
+        roll_rate = row[MEAN_ROLL_RATE] - point[ROLL_RATE_BIAS]
+        new[2] += h * (rate * point[AY_BIAS] - GRAVITY_M_S2 * pitch_rate)
+        new[3] += h * (GRAVITY_M_S2 * roll_rate - rate * point[AX_BIAS])
+    if n >= WITH_GNSS:
+        dense[4, HEADING], dense[4, YAW_RATE_BIAS], dense[4, YAW_RATE_GAIN] = 1.0, -h, -h * row[MEAN_YAW_RATE]
+        new[4] = point[HEADING] + rate * h
+    if n == WITH_POSITION:
+        _move(point, h, ax, ay, dense, new)
     for j in range(n):
         away = x[j] - point[j]
-        new0 += dense[0, j] * away
-        new1 += dense[1, j] * away
-        new2 += dense[2, j] * away
-    x[VX], x[VY] = new0, new1
-    bias, law = math.exp(-h / BIAS_S), math.exp(-h / LAW_S)
-    x[AX_BIAS] *= bias
-    x[AY_BIAS] *= bias
-    x[LAW_ERROR] *= law
-    if n == WITH_GNSS:
-        x[HEADING] = new2
+        for q in range(dense.shape[0]):
+            new[q] += dense[q, j] * away
+    for q in range(dense.shape[0]):
+        if DENSE[q] < n:
+            x[DENSE[q]] = new[q]
+    x[LAW_ERROR] *= math.exp(-h / LAW_S)
+    if n >= WITH_GNSS:
         receiver = math.exp(-h / RECEIVER_S)
         x[EAST_ERROR] *= receiver
         x[NORTH_ERROR] *= receiver
+    if n == WITH_POSITION:
+        offset = math.exp(-h / POSITION_S)
+        x[EAST_OFFSET] *= offset
+        x[NORTH_OFFSET] *= offset
 
 
 @njit(cache=True)
-def _add_process_noise(p, point, step_s, row, before, accelerometer_noise):  # type: ignore[no-untyped-def]
+def _move(point, h, ax, ay, dense, new):  # type: ignore[no-untyped-def]
+    """Put the new position of the CG and its Jacobian into rows 5 and 6."""
+    c, s = math.cos(point[HEADING]), math.sin(point[HEADING])
+    forward, left = point[VX], point[VY]
+    new[5] = point[EAST] + h * (c * forward - s * left) + 0.5 * h * h * (c * ax - s * ay)
+    new[6] = point[NORTH] + h * (s * forward + c * left) + 0.5 * h * h * (s * ax + c * ay)
+    dense[5, EAST], dense[6, NORTH] = 1.0, 1.0
+    dense[5, VX], dense[5, VY], dense[5, HEADING] = h * c, -h * s, -h * (s * forward + c * left)
+    dense[6, VX], dense[6, VY], dense[6, HEADING] = h * s, h * c, h * (c * forward - s * left)
+
+
+@njit(cache=True)
+def _add_process_noise(p, point, step_s, row, before, noise):  # type: ignore[no-untyped-def]
+    """Add what the interval adds; ``noise``: white, of a_x, a_y in m/s²/√Hz, of the gyro in rad/s/√Hz."""
     h = step_s
-    white = accelerometer_noise * accelerometer_noise * h
-    if row[GAP] > 0.0:
-        white += GAP_NOISE * GAP_NOISE * h
-    gyro = GYRO_NOISE * GYRO_NOISE * h
-    p[VX, VX] += white + gyro * point[VY] * point[VY]
-    p[VY, VY] += white + gyro * point[VX] * point[VX]
-    bias, law = math.exp(-2.0 * h / BIAS_S), math.exp(-2.0 * h / LAW_S)
-    stationary = BIAS_M_S2 * BIAS_M_S2 * (1.0 - bias)
-    p[AX_BIAS, AX_BIAS] += stationary + (TILT_SHARE * (row[AX] - before[AX])) ** 2
-    p[AY_BIAS, AY_BIAS] += stationary + (TILT_SHARE * (row[AY] - before[AY])) ** 2
-    p[LAW_ERROR, LAW_ERROR] += 1.0 - law
-    if p.shape[0] == WITH_GNSS:
+    gap = GAP_NOISE * GAP_NOISE * h if row[GAP] > 0.0 else 0.0
+    gyro = noise[2] * noise[2] * h
+    p[VX, VX] += noise[0] * noise[0] * h + gap + gyro * point[VY] * point[VY]
+    p[VY, VY] += noise[1] * noise[1] * h + gap + gyro * point[VX] * point[VX]
+    p[VX, VY] -= gyro * point[VX] * point[VY]
+    p[VY, VX] -= gyro * point[VX] * point[VY]
+    if row[TILT] > 0.0:
+        added, share = TILT_NOISE * TILT_NOISE * h, KNOWN_TILT_SHARE
+    else:
+        added, share = BIAS_M_S2 * BIAS_M_S2 * (1.0 - math.exp(-2.0 * h / BIAS_S)), TILT_SHARE
+    p[AX_BIAS, AX_BIAS] += added + (share * (row[AX] - before[AX])) ** 2
+    p[AY_BIAS, AY_BIAS] += added + (share * (row[AY] - before[AY])) ** 2
+    p[LAW_ERROR, LAW_ERROR] += 1.0 - math.exp(-2.0 * h / LAW_S)
+    if p.shape[0] >= WITH_GNSS:
         p[HEADING, HEADING] += gyro
+        p[HEADING, VX] += gyro * point[VY]
+        p[VX, HEADING] += gyro * point[VY]
+        p[HEADING, VY] -= gyro * point[VX]
+        p[VY, HEADING] -= gyro * point[VX]
         receiver = RECEIVER_M_S * RECEIVER_M_S * (1.0 - math.exp(-2.0 * h / RECEIVER_S))
         p[EAST_ERROR, EAST_ERROR] += receiver
         p[NORTH_ERROR, NORTH_ERROR] += receiver
+    if p.shape[0] == WITH_POSITION:
+        offset = row[POSITION_OFFSET_STD] ** 2 * (1.0 - math.exp(-2.0 * h / POSITION_S))
+        p[EAST_OFFSET, EAST_OFFSET] += offset
+        p[NORTH_OFFSET, NORTH_OFFSET] += offset
 
 
 @njit(cache=True)
@@ -204,10 +264,11 @@ def _axle_law(point, row, rear_m, h):  # type: ignore[no-untyped-def]
     vx = point[VX]
     speed, sign = abs(vx), 1.0 if vx >= 0.0 else -1.0
     slip = point[COMPLIANCE] * acceleration + point[YAW_COMPLIANCE] * row[YAW_ACCELERATION]
+    error_m_s = row[LAW_STD] * math.hypot(vx, point[VY])
     h[:] = 0.0
-    h[VX] = slip * sign - point[LAW_ANGLE] - row[LAW_STD] * point[LAW_ERROR]
+    h[VX] = slip * sign - point[LAW_ANGLE]
     h[VY] = 1.0
-    h[LAW_ERROR] = -row[LAW_STD] * vx
+    h[LAW_ERROR] = -error_m_s
     h[COMPLIANCE] = acceleration * speed
     h[YAW_COMPLIANCE] = row[YAW_ACCELERATION] * speed
     h[RATE_COMPLIANCE] = row[AY_RATE]
@@ -216,7 +277,7 @@ def _axle_law(point, row, rear_m, h):  # type: ignore[no-untyped-def]
     h[YAW_RATE_BIAS] = length
     h[YAW_RATE_GAIN] = length * row[YAW_RATE]
     lag = point[RATE_COMPLIANCE] * row[AY_RATE]
-    return point[VY] - length * rate + slip * speed + lag - (point[LAW_ANGLE] + row[LAW_STD] * point[LAW_ERROR]) * vx
+    return point[VY] - length * rate + slip * speed + lag - point[LAW_ANGLE] * vx - error_m_s * point[LAW_ERROR]
 
 
 @njit(cache=True)
@@ -224,9 +285,8 @@ def _gnss(point, row, east, h):  # type: ignore[no-untyped-def]
     """Return the velocity of the antenna to the east or north that a receiver shows at a state; Jacobian in h."""
     rate = row[YAW_RATE] * (1.0 - point[YAW_RATE_GAIN]) - point[YAW_RATE_BIAS]
     forward = point[VX] - point[ANTENNA_Y] * rate
-    left = point[VY] + point[ANTENNA_X] * rate - point[ANTENNA_ROLL] * row[AY_RATE]
-    ax = row[AX] - point[AX_BIAS] + point[IMU_X] * rate * rate
-    ay = row[AY] * (1.0 - point[ROLL_GAIN]) - point[AY_BIAS] - point[IMU_X] * row[YAW_ACCELERATION]
+    left = point[VY] + point[ANTENNA_X] * rate - point[ANTENNA_HEIGHT] * row[ROLL_RATE]
+    ax, ay = _corrected(point, row[AX], row[AY], row[SLOW_AX], row[SLOW_AY], rate, row[YAW_ACCELERATION])
     later = row[GNSS_OFFSET] + point[GNSS_DELAY]
     c, s = math.cos(point[HEADING]), math.sin(point[HEADING])
     if not east:  # the north component is the east component of a frame turned by −90°
@@ -234,7 +294,7 @@ def _gnss(point, row, east, h):  # type: ignore[no-untyped-def]
     h[:] = 0.0
     h[VX], h[VY] = c, -s
     h[HEADING] = -s * (forward + later * ax) - c * (left + later * ay)
-    h[ANTENNA_X], h[ANTENNA_Y], h[ANTENNA_ROLL] = -s * rate, -c * rate, s * row[AY_RATE]
+    h[ANTENNA_X], h[ANTENNA_Y], h[ANTENNA_HEIGHT] = -s * rate, -c * rate, s * row[ROLL_RATE]
     h[YAW_RATE_BIAS] = s * point[ANTENNA_X] + c * point[ANTENNA_Y]
     h[GNSS_DELAY] = c * ax - s * ay
     h[EAST_ERROR if east else NORTH_ERROR] = 1.0
@@ -243,28 +303,67 @@ def _gnss(point, row, east, h):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def _position(point, row, east, h):  # type: ignore[no-untyped-def]
+    """Return the place of the antenna to the east or north that a receiver shows at a state; Jacobian in h."""
+    later = row[GNSS_OFFSET] + point[GNSS_DELAY]
+    forward, left = point[ANTENNA_X] + later * point[VX], point[ANTENNA_Y] + later * point[VY]
+    c, s = math.cos(point[HEADING]), math.sin(point[HEADING])
+    if not east:
+        c, s = s, -c
+    h[:] = 0.0
+    h[EAST if east else NORTH], h[EAST_OFFSET if east else NORTH_OFFSET] = 1.0, 1.0
+    h[VX], h[VY] = c * later, -s * later
+    h[ANTENNA_X], h[ANTENNA_Y] = c, -s
+    h[HEADING] = -s * forward - c * left
+    h[GNSS_DELAY] = c * point[VX] - s * point[VY]
+    place = point[EAST] + point[EAST_OFFSET] if east else point[NORTH] + point[NORTH_OFFSET]
+    return place + c * forward - s * left
+
+
+@njit(cache=True)
 def _cauchy(variance, residual, trusted):  # type: ignore[no-untyped-def]
     """Return the variance, enlarged for a large residual unless the linearisation is not yet ``trusted``."""
     return variance * (1.0 + residual * residual / (variance * CAUCHY * CAUCHY)) if trusted else variance
 
 
+@njit(cache=True)
+def structure(n, step_s):  # type: ignore[no-untyped-def]
+    """Return the row in ``DENSE`` of each state, −1 for those that only decay, and the decay over a step, [n] each."""
+    dense_row, decay = np.full(n, -1), np.ones(n)
+    for q in range(len(DENSE)):
+        if DENSE[q] < n:
+            dense_row[DENSE[q]] = q
+    decay[LAW_ERROR] = math.exp(-step_s / LAW_S)
+    if n >= WITH_GNSS:
+        decay[EAST_ERROR] = decay[NORTH_ERROR] = math.exp(-step_s / RECEIVER_S)
+    if n == WITH_POSITION:
+        decay[EAST_OFFSET] = decay[NORTH_OFFSET] = math.exp(-step_s / POSITION_S)
+    return dense_row, decay
+
+
 # positional: compiled code takes no keywords at no cost.
 @njit(cache=True)
-def _measure(x, p, point, row, rear_m, store, k, used, iteration):  # type: ignore[no-untyped-def]
-    """Update with all measurements of a knot; ``point`` is where they are linearised."""
+def _measure(x, p, point, row, rear_m, store, k, used, trusted):  # type: ignore[no-untyped-def]
+    """Update with all measurements of a knot; ``point``, where they are linearised, is ``trusted`` to judge them."""
     n = x.shape[0]
     h = np.zeros(n)
     m = 0
-    trusted = iteration > 1
     if row[LAW_STD] > 0.0:
         value = _axle_law(point, row, rear_m, h)
-        r = (LAW_WHITE * row[LAW_STD] * point[VX]) ** 2 + LAW_FLOOR_M_S**2
+        r = (LAW_WHITE * row[LAW_STD] * math.hypot(point[VX], point[VY])) ** 2 + LAW_FLOOR_M_S**2
+        r = _cauchy(r, value, trusted)
         _update(x, p, h, -value - _dot(h, x - point), r, store, k, m)
         m += 1
     if row[SPEED] == row[SPEED]:
         h[:] = 0.0
-        h[VX], h[SPEED_SCALE] = 1.0 + point[SPEED_SCALE], point[VX]
-        value = (1.0 + point[SPEED_SCALE]) * point[VX]
+        if row[LENGTH] > 0.0:  # the length of a velocity over ground
+            value = math.hypot(point[VX], point[VY])
+            length = max(value, 0.1)
+            h[VX], h[VY] = point[VX] / length, point[VY] / length
+        else:
+            sign = -1.0 if point[VX] < 0.0 and row[UNSIGNED] > 0.0 else 1.0
+            value = sign * (1.0 + point[SPEED_SCALE]) * point[VX]
+            h[VX], h[SPEED_SCALE] = sign * (1.0 + point[SPEED_SCALE]), sign * point[VX]
         r = _cauchy(row[SPEED_STD] ** 2, row[SPEED] - value, trusted)
         _update(x, p, h, row[SPEED] - value - _dot(h, x - point), r, store, k, m)
         m += 1
@@ -277,25 +376,34 @@ def _measure(x, p, point, row, rear_m, store, k, used, iteration):  # type: igno
         h[YAW_RATE_BIAS], h[YAW_RATE_GAIN] = 1.0, row[YAW_RATE]
         _update(x, p, h, row[YAW_RATE] - _dot(h, x), STILL_RAD_S**2, store, k, m)
         m += 1
-    if n == WITH_GNSS and row[GNSS_EAST] == row[GNSS_EAST]:
+    if n >= WITH_GNSS and row[GNSS_EAST] == row[GNSS_EAST]:
         for east in (True, False):
             value = _gnss(point, row, east, h)
             measured = row[GNSS_EAST] if east else row[GNSS_NORTH]
             r = _cauchy(row[GNSS_STD] ** 2, measured - value, trusted)
             _update(x, p, h, measured - value - _dot(h, x - point), r, store, k, m)
             m += 1
+    if n == WITH_POSITION and row[POSITION_EAST] == row[POSITION_EAST]:
+        for east in (True, False):
+            value = _position(point, row, east, h)
+            measured = row[POSITION_EAST] if east else row[POSITION_NORTH]
+            r = _cauchy(row[POSITION_STD] ** 2, measured - value, trusted)
+            _update(x, p, h, measured - value - _dot(h, x - point), r, store, k, m)
+            m += 1
     used[k] = m
 
 
 @njit(cache=True)
-def smooth(step_s, rows, rear_m, start, start_variance, accelerometer_noise, iterations, tolerance_m_s):  # type: ignore[no-untyped-def]
+def smooth(step_s, rows, rear_m, start, start_variance, noise, guess, iterations, tolerance_m_s):  # type: ignore[no-untyped-def]
     """Smooth a drive over its knots.
 
     Parameters
     ----------
     step_s : between knots. rows : inputs [K, INPUTS]. rear_m : distance of the rear axle from the CG.
-    start, start_variance : first state and its variances [n]; n is ``WITHOUT_GNSS`` or ``WITH_GNSS``.
-    accelerometer_noise : white, m/s²/√Hz. iterations : at most. tolerance_m_s : of v_y between iterations, rms.
+    start, start_variance : first state and its variances [n], of ``WITHOUT_GNSS``, ``WITH_GNSS`` or ``WITH_POSITION``.
+    noise : white, of a_x, a_y in m/s²/√Hz, of the gyro in rad/s/√Hz.
+    guess : states [K, n] about which the first iteration linearises; [0, n]: about its own.
+    iterations : at most. tolerance_m_s : of v_y between iterations, rms.
 
     Returns
     -------
@@ -305,40 +413,35 @@ def smooth(step_s, rows, rear_m, start, start_variance, accelerometer_noise, ite
     knots, n = rows.shape[0], start.shape[0]
     filtered = np.empty((knots, n))
     variance = np.empty((knots, n, n))
-    dense = np.zeros((knots, 3, n))
-    store = np.zeros((knots, 6, 2 * n + 2))
+    dense = np.zeros((knots, len(DENSE), n))
+    store = np.zeros((knots, 8, 2 * n + 2))
     used = np.zeros(knots, np.int64)
-    smoothed = np.empty((knots, n))
+    guessed = guess.shape[0] > 0
+    smoothed = guess.copy() if guessed else np.empty((knots, n))
     moved = np.inf
-    dense_row = np.full(n, -1)
-    decay = np.ones(n)
-    dense_row[VX], dense_row[VY] = 0, 1
-    decay[AX_BIAS] = decay[AY_BIAS] = math.exp(-step_s / BIAS_S)
-    decay[LAW_ERROR] = math.exp(-step_s / LAW_S)
-    if n == WITH_GNSS:
-        dense_row[HEADING] = 2
-        decay[EAST_ERROR] = decay[NORTH_ERROR] = math.exp(-step_s / RECEIVER_S)
+    dense_row, decay = structure(n, step_s)
     done = 0
     for iteration in range(iterations):
         x = start.copy()
+        trusted = iteration > 1 or guess.shape[0] > 0
         p = np.diag(start_variance)
         scratch = np.empty((n, n))
         for k in range(knots):
             if k:
-                point = smoothed[k - 1] if iteration else x.copy()
+                point = smoothed[k - 1] if guessed else x.copy()
                 _transition(x, point, step_s, rows[k], dense[k])
                 _propagate(scratch, x, p, dense[k], dense_row, decay)
                 p, scratch = scratch, p
-                _add_process_noise(p, point, step_s, rows[k], rows[k - 1], accelerometer_noise)
-            point = smoothed[k] if iteration else x.copy()
-            _measure(x, p, point, rows[k], rear_m, store, k, used, iteration)
+                _add_process_noise(p, point, step_s, rows[k], rows[k - 1], noise)
+            point = smoothed[k] if guessed else x.copy()
+            _measure(x, p, point, rows[k], rear_m, store, k, used, trusted)
             filtered[k] = x
             variance[k] = p
         pull = np.zeros(n)
         information = np.zeros((n, n))
         total = 0.0
         for k in range(knots - 1, -1, -1):
-            before = smoothed[k, VY] if iteration else filtered[k, VY]
+            before = smoothed[k, VY] if guessed else filtered[k, VY]
             change = _times(variance[k], pull)
             for i in range(n):
                 smoothed[k, i] = filtered[k, i] - change[i]
@@ -350,6 +453,7 @@ def smooth(step_s, rows, rear_m, start, start_variance, accelerometer_noise, ite
                 pull -= h * (weighted + e / s)
             if k:
                 _pull_vector(pull, dense[k], dense_row, decay)
+        guessed = True
         moved = math.sqrt(total / knots)
         done = iteration
         if iteration > 2 and moved < tolerance_m_s:

@@ -1,45 +1,84 @@
-"""``reference_rms``: how far an estimate is from the sideslip reference, where no ground truth states its error."""
+"""How far estimates are from the sideslip reference, where no ground truth states their error, and which is closer."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
 import numpy as np
 
-from pdhef_logtool.evaluation.blocks import SegmentSums, packed, row_blocks
+from pdhef_logtool.evaluation.blocks import SegmentMasks, SegmentSums, packed, row_blocks
 from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, OfDrive
 from pdhef_logtool.records.geometry import wrap_angle
+from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
-
-#: Above this share of GNSS in its information the reference is independent of an estimator that uses the same IMU.
-INDEPENDENT_SHARE = 0.5
 
 
 def _rows(drive: EvaluatedDrive) -> list[MetricRow]:
-    reference = drive.tracks.get(REFERENCE)
+    others = dict(drive.tracks)
+    reference = others.pop(REFERENCE, None)
     if reference is None:
         return []
-    others = [track for name, track in drive.tracks.items() if name != REFERENCE]
-    return [row for track in others for row in _against(track, reference, drive)]
+    estimates = list(others.values())
+    return reference_rows(estimates, reference, drive.masks, log=drive.log, low_speed_m_s=drive.low_speed_m_s)
 
 
-def _against(track: StateTrack, reference: StateTrack, drive: EvaluatedDrive) -> list[MetricRow]:
-    """Return the rows of one estimate [N] by segment."""
-    masks = packed(drive.masks, len(track))
+def reference_rows(
+    estimates: Sequence[StateTrack],
+    reference: StateTrack,
+    masks: Mapping[str, BoolArray],
+    *,
+    log: str,
+    low_speed_m_s: float,
+) -> list[MetricRow]:
+    """Return the figures of estimates and of their pairs against the reference, all [N] at the same stamps."""
+    place = _Place(log, low_speed_m_s, packed(masks, len(reference)))
+    rows = [row for track in estimates for row in _against(track, reference, place)]
+    return rows + [row for a, b in combinations(estimates, 2) for row in _ranked(a, b, reference, place)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    log: str
+    low_speed_m_s: float
+    masks: SegmentMasks
+
+    def row(self, estimator: str, segment: str, metric: str, value: float, n: int, unit: str = "rad") -> MetricRow:
+        return MetricRow(self.log, estimator, "sideslip_rad", segment, metric, value, unit, n)
+
+
+def _against(track: StateTrack, reference: StateTrack, place: _Place) -> Iterator[MetricRow]:
     sums = SegmentSums()
     for start, end in row_blocks(len(track)):
         a, b = track.rows(start, end), reference.rows(start, end)
-        used = a.valid & b.valid & (a.vx_m_s > drive.low_speed_m_s) & (b.vx_m_s > drive.low_speed_m_s)
+        used = a.valid & b.valid & (b.vx_m_s > place.low_speed_m_s) & ~(a.vx_m_s <= place.low_speed_m_s)
         difference = np.where(used, wrap_angle(a.sideslip_rad - b.sideslip_rad), np.nan)
-        independent = np.where(used, (b.share_gnss >= INDEPENDENT_SHARE).astype(np.float64), np.nan)
-        sums.add(masks.rows(start, end), difference**2, b.sideslip_std_rad**2, independent)
-    rows = []
+        independent = np.where(used, b.independent, np.nan)
+        sums.add(place.masks.rows(start, end), difference**2, b.sideslip_std_rad**2, independent)
     for segment, (n, (squares, variances, independents)) in sums.totals().items():
-        for metric, value, unit in (
-            ("reference_rms", float(np.sqrt(squares / n)), "rad"),
-            ("reference_std", float(np.sqrt(variances / n)), "rad"),
-            ("reference_independent", independents / n, "1"),
-        ):
-            rows.append(MetricRow(drive.log, track.name, "sideslip_rad", segment, metric, value, unit, n))
-    return rows
+        yield place.row(track.name, segment, "reference_rms", float(np.sqrt(squares / n)), n)
+        yield place.row(track.name, segment, "reference_std", float(np.sqrt(variances / n)), n)
+        yield place.row(track.name, segment, "reference_independent", float(independents / n), n, "1")
+
+
+def _ranked(a: StateTrack, b: StateTrack, reference: StateTrack, place: _Place) -> Iterator[MetricRow]:
+    """Yield by how much the first of two estimates [N] is further off, by segment, where that may be claimed.
+
+    Only stamps count at which the reference is independent and the two differ by more than its standard deviation.
+    """
+    sums = SegmentSums()
+    for start, end in row_blocks(len(a)):
+        first, second, c = (t.rows(start, end) for t in (a, b, reference))
+        used = first.valid & second.valid & c.valid & (c.vx_m_s > place.low_speed_m_s) & (c.independent > 0.0)
+        used &= np.abs(wrap_angle(first.sideslip_rad - second.sideslip_rad)) > c.sideslip_std_rad
+        errors = [wrap_angle(t.sideslip_rad - c.sideslip_rad) ** 2 for t in (first, second)]
+        columns = (np.where(used, e, np.nan) for e in (*errors, c.sideslip_std_rad**2))
+        sums.add(place.masks.rows(start, end), *columns)
+    for segment, (n, (of_a, of_b, variance)) in sums.totals().items():
+        further = float(np.sqrt(of_a / n) - np.sqrt(of_b / n))
+        if abs(further) > np.sqrt(variance / n):
+            yield place.row(f"{a.name}~{b.name}", segment, "reference_further", further, n)
 
 
 _FUNCTION = OfDrive(_rows)
@@ -61,9 +100,17 @@ METRICS = (
     Metric(
         "reference_independent",
         "reference independent",
-        "share of these stamps at which GNSS has at least half of the reference's information; at the others axle law "
+        "share of these stamps at which GNSS has more than half of the reference's information; at the others axle law "
         "and kinematics of the same IMU prevail",
         _FUNCTION,
         unit="1",
+    ),
+    Metric(
+        "reference_further",
+        "further from reference",
+        "by how much the first of two estimates `a~b` is further from the sideslip reference, as RMS, than the second, "
+        "at the stamps where the reference is independent and the two differ by more than its 1-sigma. Only where this "
+        "exceeds the RMS of that 1-sigma: other pairs are not ranked",
+        _FUNCTION,
     ),
 )

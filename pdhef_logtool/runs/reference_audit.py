@@ -1,0 +1,80 @@
+"""Where the ground truth differs from the sideslip reference by more than the uncertainty of the reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdhef_logtool.evaluation.blocks import row_blocks
+from pdhef_logtool.records.geometry import wrap_angle
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.tracks import StateTrack
+
+#: Blocks over which differences are averaged, s; so many in a row, beyond so many 1-sigmas, are a contradiction.
+BLOCK_S, LEAST_BLOCKS, BEYOND_STD = 1.0, 3, 3.0
+#: Share of equal neighbours that makes ground truth held; correlation with time that makes it drift.
+HELD_SHARE, DRIFT_CORRELATION = 0.8, 0.8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Blocks:
+    """Per block [B]: start in s, mean difference and mean 1-sigma in rad, share of ground truth that repeats."""
+
+    start_s: FloatArray
+    difference_rad: FloatArray
+    std_rad: FloatArray
+    held: FloatArray
+
+
+def audit_truth(truth: StateTrack, reference: StateTrack, low_speed_m_s: float) -> tuple[str, ...]:
+    """Return what contradicts ground truth [N] in sentences; empty where the reference contains it."""
+    blocks = _blocks(truth, reference, low_speed_m_s)
+    if len(blocks.start_s) < LEAST_BLOCKS:
+        return ()
+    beyond = np.abs(blocks.difference_rad) > BEYOND_STD * blocks.std_rad
+    beyond &= _runs(beyond, blocks.start_s) >= LEAST_BLOCKS
+    if not beyond.any():
+        return ()
+    difference, seconds = np.degrees(blocks.difference_rad), blocks.start_s
+    where = f"from {seconds[beyond][0]:.0f} to {seconds[beyond][-1] + BLOCK_S:.0f} s of the log"
+    uncertain = f"reference ± {np.degrees(np.sqrt(np.mean(blocks.std_rad[beyond] ** 2))):.2f}°"
+    share = f"{beyond.sum() * BLOCK_S:.0f} of {len(beyond) * BLOCK_S:.0f} s"
+    contradiction = f"ground truth contradicts the estimated sideslip reference ({share}, {where}, {uncertain})"
+    if np.median(blocks.held[beyond]) > HELD_SHARE:
+        return (f"{contradiction}: it repeats its values there",)
+    mean, spread = float(np.mean(difference)), float(np.std(difference))
+    slope, _ = np.polyfit(seconds, difference, 1)
+    if spread > 0.0 and abs(np.corrcoef(seconds, difference)[0, 1]) > DRIFT_CORRELATION:
+        return (f"{contradiction}: it drifts by {60.0 * slope:+.2f}° per minute",)
+    if spread < abs(mean) and beyond.mean() > 0.5:
+        return (f"{contradiction}: it is turned by {mean:+.2f}°",)
+    return (f"{contradiction}: mean difference {float(np.mean(difference[beyond])):+.2f}° there",)
+
+
+def _blocks(truth: StateTrack, reference: StateTrack, low_speed_m_s: float) -> _Blocks:
+    numbers, parts = [], []
+    origin = int(reference.rows(0, 1).stamps_ns[0]) if len(reference) else 0
+    for start, end in row_blocks(len(reference)):
+        a, b = truth.rows(start, end), reference.rows(start, end)
+        used = a.valid & b.valid & (a.vx_m_s > low_speed_m_s) & (b.vx_m_s > low_speed_m_s)
+        used &= np.isfinite(a.sideslip_rad) & np.isfinite(b.sideslip_std_rad)
+        same = np.diff(a.vy_m_s, prepend=np.nan) == 0.0
+        columns = wrap_angle(a.sideslip_rad - b.sideslip_rad), b.sideslip_std_rad, same.astype(np.float64)
+        numbers.append((b.stamps_ns[used] - origin) // round(BLOCK_S * 1e9))
+        parts.append(np.stack([c[used] for c in columns], axis=1))
+    if not numbers:
+        return _Blocks(*(np.empty(0) for _ in range(4)))
+    number = np.concatenate(numbers)
+    ids, inverse, counts = np.unique(number, return_inverse=True, return_counts=True)
+    sums = np.zeros((len(ids), 3))
+    np.add.at(sums, inverse, np.concatenate(parts))
+    means = sums / counts[:, None]
+    return _Blocks(np.asarray(ids * BLOCK_S, dtype=np.float64), means[:, 0], means[:, 1], means[:, 2])
+
+
+def _runs(flags: BoolArray, start_s: FloatArray) -> IntArray:
+    """Return the length of the run of true blocks, without a gap in time, that each block [B] is part of."""
+    breaks = np.flatnonzero((np.diff(flags.astype(np.int64)) != 0) | (np.diff(start_s) > 1.5 * BLOCK_S)) + 1
+    lengths = np.diff([0, *breaks, len(flags)])
+    return np.asarray(np.repeat(lengths, lengths), dtype=np.int64)
