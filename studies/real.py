@@ -33,7 +33,7 @@ from pdhef_logtool.estimators.table import SPECS, runnable
 from pdhef_logtool.evaluation.bootstrap import block_sums
 from pdhef_logtool.evaluation.comparison import Errors, compare, shown_interval
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
-from pdhef_logtool.learning.drives import IDENTIFY, LearnSettings
+from pdhef_logtool.learning.drives import IDENTIFY, STAGES, LearnSettings
 from pdhef_logtool.learning.engine import learn
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.errors import PdhefError
@@ -219,7 +219,7 @@ def trained_car(case: Case, network: Path, trials: int) -> tuple[list[Row], str]
     given = None if str(network) == NO_MODEL else network
     config = replace(case.fit.config, mapping=mapping_file, car=vehicle_file, network=given)
     # The scored part is the test split: the training part has none of its own.
-    settings = LearnSettings(config=config, trials=trials, holdout=0.0)
+    settings = LearnSettings(config=config, stages=STAGES, trials=trials, holdout=0.0)
     with tempfile.TemporaryDirectory() as name:
         car = Path(name) / "car"
         say(f"{case.name}: learn")

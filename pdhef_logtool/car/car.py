@@ -27,6 +27,7 @@ from pdhef_logtool.car.parts import (
     noise_sha256,
     physics_sha256,
 )
+from pdhef_logtool.car.taught import Taught, TaughtParameter
 from pdhef_logtool.car.toml_files import VehicleFile, read_vehicle_file, with_sensors
 from pdhef_logtool.car.vehicle import Record, VehicleParameters, default_vehicle
 from pdhef_logtool.records.errors import UsageError, VehicleError
@@ -44,6 +45,7 @@ from pdhef_logtool.storage.documents import read_json, read_toml, validated
 VEHICLE_FILE, FIT_FILE, NOISE_FILE, NETWORK_FILE = "vehicle.toml", "fit.toml", "noise.toml", "network.toml"
 INTERVALS_FILE, UNSURE_FILE, HISTORY_FILE = "intervals.json", "intervals-unsure.json", "history.jsonl"
 NETWORK_FOLDER = "network"
+TAUGHT_FILE = "taught.json"
 #: The car that comes with the package, by name.
 SHIPPED_CARS = {"saloon": Path(__file__).parents[1] / "models" / "default"}
 #: Instead of a file: intervals as the estimators give them: wide, for a car that may differ from its vehicle file.
@@ -100,6 +102,7 @@ class Car:
     datasheet : physics and sensors as the person's file has them.
     noise : of filters, by the name of :data:`~.parts.NOISY_FILTERS`; only what belongs to ``vehicle``.
     fitted_physics : what identification found through ``physics``, None without.
+    taught : prior and residual from drives with ground truth, for the calibration of every later drive; None without.
     network, network_name, network_folder : the residual network, None without; trust : evidence for it.
     intervals : calibrated 95 % intervals, None without.
     learnt_on : drives that ``vehicle`` was identified on.
@@ -118,6 +121,7 @@ class Car:
     intervals: Intervals | None = None
     learnt_on: tuple[LearntOn, ...] = ()
     fitted_physics: FittedPhysics | None = None
+    taught: Taught | None = None
     self_calibrated: WithoutTruth | None = None
     assumed: tuple[AssumedValue, ...] = ()
     source: Path | None = None
@@ -256,6 +260,11 @@ class Car:
         return "other noise" if trust is not None and trust.noise_sha256 not in (None, noise) else ""
 
     @property
+    def taught_prior(self) -> tuple[TaughtParameter, ...]:
+        """Prior of the calibration from drives with ground truth; empty without."""
+        return () if self.taught is None else self.taught.parameters
+
+    @property
     def has_evidence(self) -> bool:
         """Whether driving has shown this vehicle to be right: it was fitted, or its network was tried with it."""
         fitted = bool(self.learnt_on) or self.fitted_physics is not None
@@ -318,8 +327,15 @@ def _file_of(source: Path | None, folder: Path | None) -> VehicleFile:
 
 
 def _with_parts(car: Car, folder: Path) -> Car:
-    """Return the car with the parts of its folder that are not stale: fit, noise and residual gain."""
+    """Return the car with the parts of its folder that are not stale: what it was taught, or fit, noise and gain."""
     notes: list[str] = []
+    taught = _part(folder / TAUGHT_FILE, Taught)
+    if taught is not None and taught.physics_sha256 == physics_sha256(car.datasheet):
+        others = [name for name in (FIT_FILE, NOISE_FILE, NETWORK_FILE) if (folder / name).is_file()]
+        idle = (f"{', '.join(others)}: not used, {TAUGHT_FILE} takes their place",) if others else ()
+        return replace(car, taught=taught, notes=idle)
+    if taught is not None:
+        notes.append(_stale(TAUGHT_FILE, f"{VEHICLE_FILE} has changed since", "teach"))
     fit = _part(folder / FIT_FILE, Fit)
     if fit is not None and fit.physics_sha256 == physics_sha256(car.datasheet):
         car = car.with_fit(fit)
@@ -330,7 +346,8 @@ def _with_parts(car: Car, folder: Path) -> Car:
     if stale := [n for n, of_filter in noise.items() if not car.owns_noise(n, of_filter)]:
         notes.append(_stale(f"noise of {', '.join(stale)}", "it belongs to other physics", "noise"))
     noise = {**car.noise, **{n: of_filter for n, of_filter in noise.items() if n not in stale}}
-    return replace(car, noise=noise, trust=_part(folder / NETWORK_FILE, Trust) or car.trust, notes=tuple(notes))
+    trust = _part(folder / NETWORK_FILE, Trust) or car.trust
+    return replace(car, noise=noise, trust=trust, notes=tuple(notes))
 
 
 def _stale(what: str, why: str, stage: str) -> str:

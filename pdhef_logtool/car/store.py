@@ -20,6 +20,7 @@ from pdhef_logtool.car.car import (
     NETWORK_FILE,
     NETWORK_FOLDER,
     NOISE_FILE,
+    TAUGHT_FILE,
     VEHICLE_FILE,
     Car,
 )
@@ -136,7 +137,7 @@ def update_car(source: Car, output: Path, change: Change, *, parts_from: Path | 
 
 def _remove_parts(folder: Path) -> None:
     shutil.rmtree(folder / NETWORK_FOLDER, ignore_errors=True)
-    for name in (FIT_FILE, NOISE_FILE, NETWORK_FILE, INTERVALS_FILE, HISTORY_FILE):
+    for name in (FIT_FILE, NOISE_FILE, NETWORK_FILE, INTERVALS_FILE, TAUGHT_FILE, HISTORY_FILE):
         (folder / name).unlink(missing_ok=True)
 
 

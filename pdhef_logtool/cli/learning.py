@@ -27,7 +27,10 @@ commands = typer.Typer()
     "pdhef learn lap.mcap --car mycar -o mycar --start 155 --stages gain",
     "pdhef learn logs/ --car mycar -o mycar --stages intervals",
     panel=panels.LEARN,
-    notes="""Stages, in the order in which they run: identify (tyres, steering, biases, roll gradient, model structure),
+    notes="""The default stage, teach, uses all driving with ground truth, from 20 s on: it learns the prior for the
+calibration of every later drive, and the residual that physics then lacks (taught.json in the car's folder).
+
+Other stages, in the order in which they run: identify (tyres, steering, biases, roll gradient, model structure),
 noise (filter noise by search), gain (residual gain of the network), network (fine-tuning of the network and its
 residual gain), intervals (95 % confidence intervals).
 
@@ -45,7 +48,7 @@ def learn(
         Path, Option("--output", "-o", metavar="CAR", help="Folder of the car to write; may be that of --car.")
     ],
     config: RunConfig,
-    stages: Annotated[str | None, Option(help="Comma-separated stages. Default: all.")] = None,
+    stages: Annotated[str | None, Option(help="Comma-separated stages. Default: teach.")] = None,
     without_truth: Annotated[
         bool, Option("--without-truth", help="Identify from the sensors of several logs; ground truth is not read.")
     ] = False,
@@ -69,13 +72,13 @@ def learn(
     fresh: Annotated[bool, Option("--fresh", help="Forget the results of an earlier call with this output.")] = False,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Identify, tune, train and calibrate a car. Each stage can also run alone."""
-    from pdhef_logtool.learning.drives import IDENTIFY, STAGES, LearnSettings
+    """Learn the prior and the residual of a car, or run stages that identify, tune, train and calibrate it."""
+    from pdhef_logtool.learning.drives import IDENTIFY, TEACH, LearnSettings
     from pdhef_logtool.learning.engine import learn as run_stages
 
     if estimators is not None:
         config = replace(config, estimators=options.split_names(estimators))
-    names = STAGES if stages is None else options.split_names(stages)
+    names = (TEACH,) if stages is None else options.split_names(stages)
     settings = LearnSettings(
         config=config,
         stages=(IDENTIFY,) if without_truth and stages is None else names,

@@ -121,7 +121,29 @@ def _intervals(figures: Mapping[str, Any], console: Console) -> None:
     console.print(intervals)
 
 
-_RENDER = {"identify": _identification, "noise": _noise, "gain": _gain, "intervals": _intervals}
+def _teaching(figures: Mapping[str, Any], console: Console) -> None:
+    """Print the rungs that were tried, what the drives taught is worth on them, and what to drive next."""
+    rungs = table("residual model", ">RMSE °, held-out\nblocks", ">difference °²", ">± 1 se", "outcome")
+    for t in figures["rungs"]:
+        against = [
+            cell(t[key] if t["against"] else None, digits=4) for key in ("difference_deg2", "standard_error_deg2")
+        ]
+        rungs.add_row(t["rung"], cell(t["rmse_deg"], digits=3), *against, "taken" if t["taken"] else "not taken")
+    console.print(rungs)
+    console.print()
+    drives = table("drive", ">seconds", ">physics °", ">with residual °", "calibration", fold=4)
+    for d in figures["drives"]:
+        errors = (cell(d[key], digits=3) for key in ("physics_deg", "corrected_deg"))
+        drives.add_row(d["name"], cell(d["seconds"], digits=0), *errors, d["calibration"])
+    console.print(drives)
+    console.print(f"  {figures['evidence']}")
+    if not figures["prior_used"]:
+        console.print("  no prior: with each drive left out, the prior of the others raises the error significantly")
+    for text in figures["more"]:
+        console.print(f"  {text}")
+
+
+_RENDER = {"teach": _teaching, "identify": _identification, "noise": _noise, "gain": _gain, "intervals": _intervals}
 
 
 def render_extraction(result: ExtractResult, console: Console) -> None:

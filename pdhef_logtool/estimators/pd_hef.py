@@ -10,17 +10,36 @@ from typing import TYPE_CHECKING
 
 from pdhef_logtool.car.parts import SMOOTHING
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.physics_filter import of_car
 from pdhef_logtool.estimators.presets import options_of
 from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_smoothing
+
+#: The preset that takes what the car was taught.
+PRESET = "pd-hef"
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
     from pdhef_logtool.estimators.presets import Options
 
 
-def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
-    """Return ``physics`` of a car with its network, at the residual gain that options, name or evidence state."""
+def build(name: str, car: Car, options: Options) -> AdaptivePhysics | CorrectedPhysics:
+    """Return ``physics`` of a car with the residual of its teaching drives, or with its network.
+
+    The network has the residual gain that options, name or evidence state; a name with options means the network.
+    """
+    taught = car.taught
+    if name == PRESET and options.trust is None and taught is not None and taught.residual is not None:
+        physics = AdaptivePhysics(of_car(car, use_speed=options.use_speed), name=name)
+        if (car.fitted_physics is not None) == taught.calibrated:
+            return CorrectedPhysics(physics, taught.residual, name, notes=(taught.evidence,))
+        state, other = ("calibrated", "not calibrated") if taught.calibrated else ("not calibrated", "calibrated")
+        return replace(physics, notes=(f"residual gain 0: it belongs to a {state} car, this drive has one {other}",))
+    return _with_network(name, car, options)
+
+
+def _with_network(name: str, car: Car, options: Options) -> AdaptivePhysics:
+    """Return ``physics`` of a car with its network."""
     trust, notes = _trust(name, car, options)
     return AdaptivePhysics(
         of_car(car, use_speed=options.use_speed),
@@ -34,7 +53,7 @@ def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
 
 def build_smoothed(name: str, car: Car, options: Options) -> SmoothedPhysics:
     """Return the same smoothed, with the noise for that; ``name`` is that of the result."""
-    filtered = build(name, car, options)
+    filtered = _with_network(name, car, options)
     factors = SMOOTHING if car.fitted_physics is None else car.fitted_physics.smoothing
     filtered = replace(filtered, physics=for_smoothing(filtered.physics, factors))
     return SmoothedPhysics(filtered, name=name, notes=(NOT_CAUSAL, *filtered.notes))

@@ -31,6 +31,8 @@ from pdhef_logtool.runs.config import RunConfig
 
 #: Stages of ``pdhef learn`` in the order in which they run.
 IDENTIFY, NOISE, GAIN, NETWORK, INTERVALS = STAGES = ("identify", "noise", "gain", "network", "intervals")
+#: Stage by itself, the default: prior of the calibration and residual of a car, from all drives with ground truth.
+TEACH = "teach"
 #: Splits of a simulated set that results are reported on, and those that a network is trained on and chosen by.
 HELD_OUT, SEEN = ("test", "extrapolation"), ("train", "validation")
 #: Entries of the configuration that decide what is learned.
@@ -47,7 +49,7 @@ class LearnSettings:
     Attributes
     ----------
     config : car, network, mapping, slice, sensors, truth channel; estimators of the stages noise and intervals.
-    stages : names out of :data:`STAGES`, in any order.
+    stages : :data:`TEACH` alone, or names out of :data:`STAGES`, in any order.
     holdout : share of the driving that is only scored, once.
     trials : of the noise search, per estimator.
     spread : of the random errors of friction and vehicle in further runs of each interval drive; 0 = no such runs.
@@ -58,7 +60,7 @@ class LearnSettings:
     """
 
     config: RunConfig
-    stages: tuple[str, ...] = STAGES
+    stages: tuple[str, ...] = (TEACH,)
     holdout: float = 0.15
     trials: int = 64
     spread: float = 0.1
@@ -75,8 +77,8 @@ class LearnSettings:
             (self.trials >= MIN_TRIALS, f"at least {MIN_TRIALS} trials", self.trials, "--trials"),
             (0.0 <= self.spread <= MAX_VARIATION, f"a spread of 0 to {MAX_VARIATION:g}", self.spread, "--vary"),
             (
-                self.stages and set(self.stages) <= set(STAGES),
-                f"stages out of {', '.join(STAGES)}",
+                self.stages == (TEACH,) or (self.stages and set(self.stages) <= set(STAGES)),
+                f"{TEACH} alone, or stages out of {', '.join(STAGES)}",
                 ", ".join(self.stages) or "none",
                 "--stages",
             ),
@@ -94,7 +96,7 @@ class LearnSettings:
     @property
     def order(self) -> tuple[str, ...]:
         """The stages in the order in which they run."""
-        return tuple(name for name in STAGES if name in self.stages)
+        return tuple(name for name in (TEACH, *STAGES) if name in self.stages)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON-able values; files by name only."""

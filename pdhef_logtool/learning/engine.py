@@ -35,6 +35,7 @@ from pdhef_logtool.learning.drives import (
     INTERVALS,
     NETWORK,
     NOISE,
+    TEACH,
     DriveRecord,
     LearnSettings,
     choose_drives,
@@ -57,6 +58,7 @@ from pdhef_logtool.learning.stages.intervals import fit_intervals
 from pdhef_logtool.learning.stages.network import train_network
 from pdhef_logtool.learning.stages.noise import tune
 from pdhef_logtool.learning.stages.task import StageOutput, Task
+from pdhef_logtool.learning.stages.teach import teach
 from pdhef_logtool.logs.discovery import LogInput, Logs, hash_log
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import EstimatorError, ModelError, UsageError
@@ -76,6 +78,7 @@ CAR, EVALUATIONS_FILE = "car", "evaluations.json"
 #: Outcome of a stage.
 KEPT, UNDONE, NOT_DONE = "kept", "undone", "not done"
 RUN: dict[str, Callable[[Task], StageOutput]] = {
+    TEACH: teach,
     IDENTIFY: identify,
     NOISE: tune,
     GAIN: find_gain,
@@ -225,7 +228,7 @@ def learn(
 def _open(settings: LearnSettings, warn: Tell) -> Car:
     """Return the car to start from: identification starts from the vehicle file and nothing else."""
     config = settings.config
-    if IDENTIFY in settings.order:
+    if {TEACH, IDENTIFY} & set(settings.order):
         car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
         if config.car is None:
             warn(f"no --car: mass, geometry and priors are those of the default {car.datasheet.name}")

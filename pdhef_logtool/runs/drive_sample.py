@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
 from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
 from pdhef_logtool.evaluation.blocks import row_blocks
@@ -86,8 +87,8 @@ def sample_drive(signals: Signals, truth: StateTrack | None, weight: FloatArray)
 
 def bare_filter(estimator: Estimator, signals: Signals) -> tuple[Estimator, Signals]:
     """Return what runs under a fallback and self-calibration, and what it is given of a drive's signals."""
-    while isinstance(estimator, SelfCalibrated | OnlineCalibrated):
+    while isinstance(estimator, SelfCalibrated | OnlineCalibrated | CorrectedPhysics):
         if isinstance(estimator, SelfCalibrated):
             signals = estimator.given(signals)
-        estimator = estimator.estimator
+        estimator = estimator.physics if isinstance(estimator, CorrectedPhysics) else estimator.estimator
     return estimator, signals

@@ -41,8 +41,8 @@ def calibrate_drive(drive: Drive, config: RunConfig) -> SelfCalibration | None:
     from pdhef_logtool.estimators.calibration.calibration import calibrate_online, self_calibrate
 
     if config.calibrate == "online":
-        return calibrate_online(read_driving(drive), drive.car.vehicle)
-    return self_calibrate([read_driving(drive)], drive.car.vehicle)
+        return calibrate_online(read_driving(drive), drive.car.vehicle, taught=drive.car.taught_prior)
+    return self_calibrate([read_driving(drive)], drive.car.vehicle, taught=drive.car.taught_prior)
 
 
 def calibrate_pool(
@@ -61,7 +61,7 @@ def calibrate_pool(
                     drivings.append(read_driving(drive))
         except PdhefError:
             continue  # the run itself states what is wrong with it
-    return self_calibrate(drivings, car.vehicle)
+    return self_calibrate(drivings, car.vehicle, taught=car.taught_prior)
 
 
 def lacking(drive: Drive) -> list[str]:

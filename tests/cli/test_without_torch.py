@@ -70,7 +70,7 @@ def test_what_trains_one_ends_with_one_line(tmp_path: Path) -> None:
         trained,
         (*trained, "--baselines"),
         ("retrain", "sample_logs/dlc.mcap", *car),
-        ("learn", "sample_logs/dlc.mcap", *car),
+        ("learn", "sample_logs/dlc.mcap", *car, "--stages", "network"),
         ("learn", "sample_logs/dlc.mcap", *car, "--network", "none", "--holdout", "2"),
     )
     *without, other = ended

@@ -422,7 +422,7 @@ def test_a_minute_of_driving_gives_a_car_that_says_what_it_could_not_learn(
     result = learn(
         [str(sample_logs_dir / "road.mcap")],
         tmp_path / "car",
-        LearnSettings(config=config),
+        LearnSettings(config=config, stages=STAGES),
         reporter=Reporter(note=said.append),
     )
     by_name = {s.name: s for s in result.stages}
@@ -444,7 +444,7 @@ def test_a_minute_of_driving_gives_a_car_that_says_what_it_could_not_learn(
 
 def test_too_little_driving_and_wrong_options_are_said(guess: Path, tmp_path: Path, sample_logs_dir: Path) -> None:
     logs = [str(sample_logs_dir / "dlc.mcap")]
-    settings = LearnSettings(config=RunConfig(car=guess))
+    settings = LearnSettings(config=RunConfig(car=guess), stages=STAGES)
     with pytest.raises(EstimatorError, match="at least 50 s"):
         learn(logs, tmp_path / "car", settings)
     assert not (tmp_path / "car").exists()

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.parts import LIMIT_GAIN, FilterNoise
+from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
 from pdhef_logtool.estimators.calibration.joint import (
@@ -26,6 +27,7 @@ from pdhef_logtool.estimators.calibration.joint import (
     Fit,
     JointProblem,
     counted,
+    parameters_of,
     prior_vehicle,
     varied_parameters,
 )
@@ -188,6 +190,7 @@ def self_calibrate(
     drives: Sequence[Driving],
     vehicle_file: VehicleParameters,
     *,
+    taught: Sequence[TaughtParameter] = (),
     exported: bool = False,
     progress: Callable[[float], None] = lambda _share: None,
 ) -> SelfCalibration:
@@ -195,6 +198,7 @@ def self_calibrate(
 
     Parameters
     ----------
+    taught : prior that drives with ground truth gave.
     exported : whether it is written to a car, for which the driving must excite both cornering stiffnesses.
     """
     drives = [d for d in drives if len(d.stretches)]
@@ -204,13 +208,13 @@ def self_calibrate(
         return SelfCalibration(
             vehicle_file, vehicle_file, (), None, why, (math.nan,) * 2, (math.nan,) * 2, seconds, len(drives)
         )
-    problem = JointProblem(drives, vehicle_file)
+    problem = JointProblem(drives, vehicle_file, taught)
     fit = problem.solve()
     progress(1.0)
     std = np.sqrt(np.diag(fit.covariance))
     parameters = tuple(
-        Calibrated(p.name, p.unit, p.value(float(t)), p.mean, float(s) * p.std, p.std, p.log)
-        for p, t, s in zip(problem.parameters, fit.theta, std, strict=True)
+        Calibrated(p.name, p.unit, p.value(float(t)), p.mean, float(s) * p.std, untaught.std, p.log)
+        for p, untaught, t, s in zip(problem.parameters, parameters_of(vehicle_file), fit.theta, std, strict=True)
     )
     root = np.asarray(np.linalg.cholesky(fit.covariance), dtype=np.float64)
     varied = varied_parameters(fit.theta, root, problem.sideslip, VARIED)
@@ -230,7 +234,9 @@ def self_calibrate(
     return replace(calibration, refused=_refusal(calibration, drives, sliding, exported=exported))
 
 
-def calibrate_online(driving: Driving, vehicle_file: VehicleParameters) -> SelfCalibration:
+def calibrate_online(
+    driving: Driving, vehicle_file: VehicleParameters, *, taught: Sequence[TaughtParameter] = ()
+) -> SelfCalibration:
     """Calibrate a car again and again as its log goes on; before the first calibration it has the prior means.
 
     Each calibration takes half as much driving again as the one before it, so that all take three times as long as the
@@ -241,12 +247,12 @@ def calibrate_online(driving: Driving, vehicle_file: VehicleParameters) -> SelfC
         inside[first:last] = STEP_S
     driven, needed = np.cumsum(inside), LEAST_S
     start = SelfCalibration(
-        vehicle_file, prior_vehicle(vehicle_file), (), None, "", (math.nan,) * 2, (math.nan,) * 2, 0.0, 1
+        vehicle_file, prior_vehicle(vehicle_file, taught), (), None, "", (math.nan,) * 2, (math.nan,) * 2, 0.0, 1
     )
     stages = [start]
     while driven.size and needed < driven[-1]:
         count = int(np.searchsorted(driven, needed)) + 1
-        calibration = self_calibrate([driving.until(count)], vehicle_file)
+        calibration = self_calibrate([driving.until(count)], vehicle_file, taught=taught)
         if not calibration.refused:
             stages.append(replace(calibration, since_ns=int(driving.stamps_ns[count - 1]) + ONLINE_DELAY_NS))
         needed *= ONLINE_GROWTH

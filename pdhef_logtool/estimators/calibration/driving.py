@@ -45,6 +45,10 @@ class Driving:
         """Driving in all stretches."""
         return float(np.sum(np.diff(self.stretches, axis=1))) * STEP_S
 
+    def between(self, first: int, last: int) -> Driving:
+        """Return the same grid with the stretches between two cells alone."""
+        return Driving(self.columns, self.stamps_ns, _long(np.clip(self.stretches, first, last)), self.read_with)
+
     def until(self, count: int) -> Driving:
         """Return the first cells of the grid."""
         stretches = np.minimum(self.stretches, count)

@@ -19,11 +19,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pdhef_logtool.car.descent import descend
+from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, STIFFNESS_TYRE_SHAPE, AxleTyre, Tyres, VehicleParameters
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
 from pdhef_logtool.estimators.calibration.single_track import (
@@ -128,6 +129,15 @@ def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
     )
 
 
+def with_taught(parameters: Sequence[Parameter], taught: Sequence[TaughtParameter]) -> tuple[Parameter, ...]:
+    """Return the parameters with the mean and standard deviation that drives with ground truth gave them."""
+    by_name = {t.name: t for t in taught}
+    return tuple(
+        replace(p, mean=t.value, std=min(t.std, p.std)) if (t := by_name.get(p.name)) is not None else p
+        for p in parameters
+    )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
     """Result of a fit: θ [n] and its covariance [n, n]."""
@@ -137,10 +147,12 @@ class Fit:
 
 
 class JointProblem:
-    """The fit of one car to the driving of its logs, which were read with ``vehicle_file``."""
+    """The fit of one car to the driving of its logs, which were read with ``vehicle_file``; ``taught``: its prior."""
 
-    def __init__(self, drives: Sequence[Driving], vehicle_file: VehicleParameters) -> None:
-        self.parameters = parameters_of(vehicle_file)
+    def __init__(
+        self, drives: Sequence[Driving], vehicle_file: VehicleParameters, taught: Sequence[TaughtParameter] = ()
+    ) -> None:
+        self.parameters = with_taught(parameters_of(vehicle_file), taught)
         self._drives, self._file = drives, vehicle_file
         self._filter = low_pass(CUTOFF_HZ, STEP_S)
         self._kept = [np.flatnonzero(counted(d))[::KEPT_STEPS] for d in drives]
@@ -277,9 +289,10 @@ def _vehicle_with(vehicle_file: VehicleParameters, values: Mapping[str, float], 
     )
 
 
-def prior_vehicle(vehicle_file: VehicleParameters) -> VehicleParameters:
+def prior_vehicle(vehicle_file: VehicleParameters, taught: Sequence[TaughtParameter] = ()) -> VehicleParameters:
     """Return the vehicle file with every parameter at its prior mean."""
-    return _vehicle_with(vehicle_file, {p.name: p.value(0.0) for p in parameters_of(vehicle_file)}, 6)
+    parameters = with_taught(parameters_of(vehicle_file), taught)
+    return _vehicle_with(vehicle_file, {p.name: p.value(0.0) for p in parameters}, 6)
 
 
 def track_of(

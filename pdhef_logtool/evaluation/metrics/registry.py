@@ -20,6 +20,7 @@ MODULES = (
     "whiteness",
     "lateral_consistency",
     "disagreement",
+    "residual_active",
     "reference",
     "sensor_residuals",
     "exposure",

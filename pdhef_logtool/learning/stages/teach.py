@@ -1,0 +1,296 @@
+"""Stage ``teach``: what drives with ground truth teach about a car (``taught.json``).
+
+All driving with ground truth counts, at any speed above the car's low-speed limit. First the prior of the calibration
+of every later drive is fitted; then the drives calibrate the car as later drives will, without ground truth, and the
+ladder of residual models is fitted to the sideslip that ``physics`` then lacks (docs/learn.md).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.car.car import TAUGHT_FILE, Car
+from pdhef_logtool.car.parts import PHYSICS
+from pdhef_logtool.car.store import Change
+from pdhef_logtool.car.taught import Taught, TaughtParameter
+from pdhef_logtool.drive.cached import read_cached
+from pdhef_logtool.drive.reading import Drive, WholeDrive
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
+from pdhef_logtool.estimators.calibration.driving import Driving
+from pdhef_logtool.estimators.corrected import features_of
+from pdhef_logtool.estimators.latency_compensation import compensate
+from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
+from pdhef_logtool.estimators.table import FEATURES, make_estimator
+from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference
+from pdhef_logtool.evaluation.comparison import end_to_end
+from pdhef_logtool.evaluation.metrics import signal_error
+from pdhef_logtool.learning.car.taught_prior import slopes_of, taught_parameters
+from pdhef_logtool.learning.drives import TEACH, DriveRecord, no_drive, no_true_sideslip, record_of
+from pdhef_logtool.learning.split import TRAINING
+from pdhef_logtool.learning.stages.task import StageOutput, Task
+from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.records.errors import EstimatorError
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.steps import release
+from pdhef_logtool.residual_model.ladder import NONE
+from pdhef_logtool.residual_model.ladder_fit import LadderFit, TaughtDrive, corrected_rmse_deg, fit_ladder
+from pdhef_logtool.residual_model.slow_features import SlowFeatures
+from pdhef_logtool.runs.self_calibrating import lacking, read_driving, self_calibrated
+
+#: Least driving with ground truth, and length from which on little more is gained (docs/learn.md).
+LEAST_S, ENOUGH_S = 20.0, 150.0
+#: A filter settles before its error counts.
+SETTLE_NS = 3_000_000_000
+#: Shortest half of a drive that teaches the other one in a test, and length of the blocks of a test.
+LEAST_HALF_S, TEST_BLOCK_S = 8.0, 5.0
+#: The prior is tested with each drive left out, on at most so many drives.
+MOST_LEFT_OUT = 8
+#: Lateral acceleration below which driving teaches nothing of the tyres, and that near the limit, m/s².
+BENDS_M_S2, LIMIT_M_S2 = 2.0, 5.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OpenedDrive:
+    """A drive with ground truth in memory: its reading, driving for the calibration, signals with ground truth."""
+
+    drive: Drive
+    driving: Driving
+    whole: WholeDrive
+    slopes: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Teaching:
+    """What drives taught: prior, residual, whether its drives calibrated their car, evidence, what to drive next."""
+
+    parameters: tuple[TaughtParameter, ...]
+    ladder: LadderFit
+    calibrated: bool
+    prior_test: Interval | None
+    drives: tuple[dict[str, Any], ...]
+    more: tuple[str, ...]
+
+    @property
+    def evidence(self) -> str:
+        """In one line."""
+        tried = ", ".join(f"{t.rung} {t.rmse_deg:.3f}°" for t in self.ladder.trials)
+        rung = "no residual" if self.ladder.rung == NONE else f"residual model {self.ladder.rung}"
+        return (
+            f"{rung}, by held-out blocks of {self.ladder.seconds:.0f} s with ground truth"
+            f" (RMSE without constants: {tried or 'not tried'})"
+        )
+
+
+def teach(task: Task) -> StageOutput:
+    """Learn the prior and the residual of a car from all drives with ground truth, starting from its vehicle file.
+
+    Raises
+    ------
+    EstimatorError
+        There is too little driving.
+    """
+    car = Car.of(task.car.datasheet)
+
+    def read(log: LogInput) -> tuple[DriveRecord, OpenedDrive | None]:
+        with read_cached(log, car, task.mapping, task.options) as drive:
+            return open_drive(drive)
+
+    records, drives = task.read(task.split.parts[TRAINING], read, 0.3)
+    if not drives:
+        raise no_drive("a true sideslip and the signals of a calibration", TEACH)
+    seconds = math.fsum(float(np.sum(np.isfinite(d.slopes))) * 0.02 for d in drives)
+    if seconds < LEAST_S:
+        expected = f"at least {LEAST_S:g} s of driving with ground truth above {car.vehicle.low_speed_blend_m_s:g} m/s"
+        raise EstimatorError(expected=expected, got=f"{seconds:.1f} s", where=TEACH, remedy="give more drives")
+    taught = learn_from(drives, seed=task.settings.seed, progress=task.reporter.progress)
+    figures = figures_of(taught)
+    part = Taught(
+        physics_sha256=car.physics_sha256,
+        parameters=taught.parameters,
+        residual=taught.ladder.model,
+        calibrated=taught.calibrated,
+        evidence=taught.evidence,
+        drives=tuple(r.learnt_on for r in records if not r.left_out),
+        figures=figures,
+    )
+    files = {TAUGHT_FILE: (json.dumps(part.model_dump(mode="json"), indent=1) + "\n").encode()}
+    change = Change(f"learn --stages {TEACH}", TAUGHT_FILE, files, {}, task.settings.to_dict(), part.drives)
+    return StageOutput(change, records, taught.evidence, figures)
+
+
+def open_drive(drive: Drive) -> tuple[DriveRecord, OpenedDrive | None]:
+    """Return the record of an open drive and what teaching takes of it; None with the reason in the record."""
+    missing = sorted({*lacking(drive), *(FEATURES - drive.available)})
+    left_out = f"the log has no {', '.join(missing)}" if missing else no_true_sideslip(drive.plan)
+    if left_out:
+        return record_of(drive, left_out=left_out), None
+    driving, whole = read_driving(drive), drive.whole(fill_friction=drive.friction.bank is None)
+    assert whole.truth is not None
+    true = np.where(whole.truth.valid, whole.truth.sideslip_rad, np.nan)
+    slopes = slopes_of(driving, whole.signals.stamps_ns, true)
+    inside = np.zeros(len(slopes), dtype=np.bool_)
+    for first, last in driving.stretches:
+        inside[first:last] = True
+    slopes = np.where(inside, slopes, np.nan)
+    if not np.isfinite(slopes).any():
+        return record_of(drive, left_out="no driving with a true sideslip above the low-speed limit"), None
+    return record_of(drive, whole=whole), OpenedDrive(drive, driving, whole, slopes)
+
+
+def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = lambda _text, _share: None) -> Teaching:
+    """Return what drives of one car teach, which were read with its vehicle file."""
+    vehicle = drives[0].drive.car.vehicle
+    progress("fitting the prior", 0.3)
+    parameters = taught_parameters([d.driving for d in drives], [d.slopes for d in drives], vehicle)
+    test = _prior_test(drives, progress)
+    if test is not None and test.low > 0.0:
+        parameters = ()
+    calibrations = [_calibration(d, parameters) for d in drives]
+    progress("fitting the residual", 0.8)
+    lacks = [lacking_of(d, c) for d, c in zip(drives, calibrations, strict=True)]
+    seconds = {False: 0.0, True: 0.0}
+    for drive, calibration in zip(drives, calibrations, strict=True):
+        seconds[not calibration.refused] += drive.driving.seconds
+    calibrated = seconds[True] >= seconds[False]  # a residual of one kind of physics is none of the other
+    fitted = [lack for lack, c in zip(lacks, calibrations, strict=True) if calibrated is not bool(c.refused)]
+    ladder = fit_ladder(fitted, seed=seed)
+    lines = []
+    for drive, calibration, lack in zip(drives, calibrations, lacks, strict=True):
+        correction = None if ladder.model is None else ladder.model.evaluate(lack.features)
+        (before, before_free), (after, after_free) = (
+            corrected_rmse_deg(lack, None),
+            corrected_rmse_deg(lack, correction),
+        )
+        lines.append(
+            {
+                "name": drive.drive.name,
+                "seconds": round(drive.driving.seconds, 1),
+                "calibration": calibration.refused or "as later drives",
+                "physics_deg": before,
+                "corrected_deg": after,
+                "physics_without_constant_deg": before_free,
+                "corrected_without_constant_deg": after_free,
+            }
+        )
+    return Teaching(parameters, ladder, calibrated, test, tuple(lines), _more(drives, ladder))
+
+
+def _calibration(drive: OpenedDrive, parameters: Sequence[TaughtParameter]) -> SelfCalibration:
+    calibration = self_calibrate([drive.driving], drive.drive.car.vehicle, taught=parameters)
+    return replace(calibration, varied=())
+
+
+def lacking_of(drive: OpenedDrive, calibration: SelfCalibration) -> TaughtDrive:
+    """Return the features of a drive and the sideslip that ``physics`` lacks on its calibrated car, at its stamps."""
+    car = self_calibrated(drive.drive, calibration)
+    estimator = make_estimator(PHYSICS, car)
+    physics, signals = estimator, drive.whole.signals
+    if isinstance(estimator, SelfCalibrated):
+        physics, signals = estimator.estimator, estimator.given(signals)
+    assert isinstance(physics, AdaptivePhysics) and drive.whole.truth is not None
+    steps, _ = physics.run(signals, None)
+    track, _ = compensate(physics, signals, steps)
+    features, _ = features_of(physics, steps, signals, None, None)
+    arrived = release(signals.ready_ns, signals.stamps_ns)
+    error = signal_error(track, drive.whole.truth, "sideslip_rad", car.vehicle.low_speed_blend_m_s)
+    settled = signals.stamps_ns - signals.stamps_ns[0] > SETTLE_NS
+    error = np.where(arrived.arrived & settled, error, np.nan)
+    at_stamps = SlowFeatures(features.odd[arrived.row], features.even[arrived.row])
+    return TaughtDrive(drive.drive.name, signals.stamps_ns, at_stamps, -error)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fold:
+    """Drives that teach, with their ground truth, and the part of another one, or of the same, that is scored."""
+
+    driving: tuple[Driving, ...]
+    slopes: tuple[FloatArray, ...]
+    scored: OpenedDrive
+    part: slice
+
+
+def _folds(drives: Sequence[OpenedDrive]) -> list[_Fold]:
+    """Return folds with each drive left out; of one drive each half."""
+    folds = []
+    if len(drives) > 1:
+        for drive in drives[:MOST_LEFT_OUT]:
+            others = [d for d in drives if d is not drive]
+            taught = tuple(d.driving for d in others), tuple(d.slopes for d in others)
+            folds.append(_Fold(*taught, drive, slice(None)))
+        return folds
+    (drive,) = drives
+    cells, stamps = len(drive.driving.stamps_ns), drive.whole.signals.stamps_ns
+    middle = int(np.searchsorted(stamps, drive.driving.stamps_ns[cells // 2]))
+    for first, last, part in ((0, cells // 2, slice(middle, None)), (cells // 2, cells, slice(0, middle))):
+        half = drive.driving.between(first, last)
+        if half.seconds >= LEAST_HALF_S:
+            folds.append(_Fold((half,), (drive.slopes,), drive, part))
+    return folds
+
+
+def _prior_test(drives: Sequence[OpenedDrive], progress: Any) -> Interval | None:
+    """Return RMSE with the prior of other driving less that without, in blocks, each without its constant, in rad.
+
+    None where there is too little driving for a test.
+    """
+    errors: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    stamps, folds = [], _folds(drives)
+    vehicle = drives[0].drive.car.vehicle
+    for number, fold in enumerate(folds):
+        progress(f"testing the prior on {fold.scored.drive.name}", 0.35 + 0.4 * number / len(folds))
+        prior = taught_parameters(fold.driving, fold.slopes, vehicle)
+        stamps.append(fold.scored.whole.signals.stamps_ns[fold.part])
+        for column, parameters in zip(errors, (prior, ()), strict=True):
+            lack = lacking_of(fold.scored, _calibration(fold.scored, parameters)).lacking_rad[fold.part]
+            column.append(lack - np.nanmedian(lack) if np.isfinite(lack).any() else lack)
+    if not folds:
+        return None
+    with_prior, without = (np.concatenate(column) for column in errors)
+    return block_bootstrap_difference(with_prior, without, end_to_end(stamps), block_s=TEST_BLOCK_S)
+
+
+def _more(drives: Sequence[OpenedDrive], ladder: LadderFit) -> tuple[str, ...]:
+    """Return what to drive next, in sentences."""
+    texts = []
+    truths = [d.whole.truth for d in drives]
+    ay = np.concatenate([t.vx_m_s * t.yaw_rate_rad_s for t in truths if t is not None])
+    ay = ay[np.isfinite(ay)]
+    if ladder.seconds < ENOUGH_S:
+        texts.append(
+            f"{ladder.seconds:.0f} s of driving were used; up to {ENOUGH_S:g} s of driving like that of later drives "
+            "lower the error further"
+        )
+    left, right = np.mean(ay > BENDS_M_S2), np.mean(ay < -BENDS_M_S2)
+    if min(left, right) < 0.25 * max(left, right):
+        side = "right" if right < left else "left"
+        texts.append(f"few bends to the {side}: an asymmetric error cannot be distinguished from a constant")
+    if np.mean(np.abs(ay) > LIMIT_M_S2) < 0.02:
+        texts.append(f"little driving above {LIMIT_M_S2:g} m/s²: the peak force of the tyres keeps its prior")
+    return tuple(texts)
+
+
+def figures_of(taught: Teaching) -> dict[str, Any]:
+    """Return the figures as JSON-able values."""
+    test, ladder = taught.prior_test, taught.ladder
+    bounds = () if test is None else (test.value, test.low, test.high)
+    return {
+        "evidence": taught.evidence,
+        "rung": ladder.rung,
+        "ridge": ladder.ridge if math.isfinite(ladder.ridge) else None,
+        "seconds": round(ladder.seconds, 1),
+        "blocks": ladder.blocks,
+        "rungs": [asdict(t) for t in ladder.trials],
+        "calibrated": taught.calibrated,
+        "prior_used": bool(taught.parameters),
+        "prior_against_untaught_deg": [None if math.isnan(x) else math.degrees(x) for x in bounds],
+        "parameters": [p.model_dump() for p in taught.parameters],
+        "drives": list(taught.drives),
+        "more": list(taught.more),
+    }

@@ -1,0 +1,200 @@
+"""The ladder of residual models: what ``physics`` lacks in sideslip, linear in slow features or in random products.
+
+Rungs: ``none``; ``linear``, in the odd features; ``random``, with random Fourier features besides, √2 sin(w·z)
+cos(v·e + p) of the odd features z and the even ones e (Rahimi and Recht 2007). Each is exactly odd: it has no constant,
+and the mirrored drive has the mirrored residual. A rung is fitted by ridge regression (:mod:`~.ladder_fit`), whose
+posterior is part of the interval.
+
+Region of validity: a gain per step, 1 where the drives that it was fitted on have been and 0 outside. It is a function
+of the whitened distance of z, d² = zᵀ (Σ + ρ I)⁻¹ z over that of 98 % of these drives, and of the speed.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.residual_model.slow_features import EVEN_COUNT, ODD_COUNT, SPEED_COLUMN, SlowFeatures
+from pdhef_logtool.storage.documents import digest
+
+NONE, LINEAR, RANDOM = RUNGS = ("none", "linear", "random")
+#: Squared distance, over that of 98 % of the drives, up to which the gain is 1, and from which on it is 0.
+FULL_WITHIN, NONE_BEYOND = 1.0, 3.0
+#: The same for the speed: factors on its range.
+SPEED_FULL, SPEED_NONE = 1.1, 1.5
+#: Ridge ρ of the distance, for features of variance 1.
+REGION_RIDGE = 0.5
+#: Share of a residual that its 1-sigma contains beside the posterior: a strong ridge takes about as much off it.
+SHRINKAGE = 0.5
+#: A residual is limited to this multiple of the largest one on the drives that it was fitted on.
+LARGEST = 1.5
+
+Row = Annotated[tuple[float, ...], Field(strict=False)]
+Rows = Annotated[tuple[Row, ...], Field(strict=False)]
+
+
+class Correction(NamedTuple):
+    """Per step [K]: residual of the sideslip and its 1-sigma, rad, gain not yet applied; and the gain, 0 to 1."""
+
+    residual_rad: FloatArray
+    std_rad: FloatArray
+    gain: FloatArray
+
+
+class _Arrays(NamedTuple):
+    scale: FloatArray
+    odd_directions: FloatArray
+    even_directions: FloatArray
+    phases: FloatArray
+    weights: FloatArray
+    factor: FloatArray
+    whitening: FloatArray
+
+
+@njit(cache=True)
+def _features(z, e, odd_directions, even_directions, phases, out):  # type: ignore[no-untyped-def]
+    """Write the features of a step: z, then the random products."""
+    count = z.shape[0]
+    out[:count] = z
+    for j in range(phases.shape[0]):
+        a, b = 0.0, phases[j]
+        for i in range(count):
+            a += z[i] * odd_directions[j, i]
+        for i in range(e.shape[0]):
+            b += e[i] * even_directions[j, i]
+        out[count + j] = math.sqrt(2.0) * math.sin(a) * math.cos(b)
+
+
+@njit(cache=True)
+def _evaluate(odd, even, arrays, even_mean, even_scale, residual, std, distance2):  # type: ignore[no-untyped-def]
+    z, e, phi = np.empty(odd.shape[1]), np.empty(even.shape[1]), np.empty(arrays.weights.shape[0])
+    for k in range(odd.shape[0]):
+        residual[k], std[k], distance2[k] = 0.0, 0.0, math.nan
+        if not math.isfinite(odd[k].sum() + even[k].sum()):
+            continue
+        for i in range(z.shape[0]):
+            z[i] = odd[k, i] / arrays.scale[i]
+        for i in range(e.shape[0]):
+            e[i] = (even[k, i] - even_mean[i]) / even_scale[i]
+        _features(z, e, arrays.odd_directions, arrays.even_directions, arrays.phases, phi)
+        for i in range(phi.shape[0]):
+            residual[k] += phi[i] * arrays.weights[i]
+        variance = 0.0
+        for j in range(arrays.factor.shape[1]):
+            part = 0.0
+            for i in range(phi.shape[0]):
+                part += phi[i] * arrays.factor[i, j]
+            variance += part * part
+        std[k] = math.sqrt(variance)
+        distance2[k] = 0.0
+        for j in range(z.shape[0]):
+            part = 0.0
+            for i in range(z.shape[0]):
+                part += arrays.whitening[j, i] * z[i]
+            distance2[k] += part * part
+
+
+@njit(cache=True)
+def expand(z, e, odd_directions, even_directions, phases, out):  # type: ignore[no-untyped-def]
+    """Write the features of steps [K]: standardised odd ones z, even ones e, and ``out`` [K, 16 + random]."""
+    for k in range(z.shape[0]):
+        _features(z[k], e[k], odd_directions, even_directions, phases, out[k])
+
+
+class LadderModel(BaseModel):
+    """A fitted rung, as ``taught.json`` contains it.
+
+    Attributes
+    ----------
+    scale : of the odd features [16]. even_mean, even_scale : of the even ones [8].
+    odd_directions, even_directions, phases : of the random features, none in the rung ``linear``.
+    weights : by feature, rad. factor : its product with its transpose is the posterior covariance of the weights.
+    whitening : d² is the squared norm of its product with z. speed_m_s : range of the fitted drives.
+    largest_rad : of the residual on them.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    rung: Literal["linear", "random"]
+    scale: Row
+    even_mean: Row
+    even_scale: Row
+    odd_directions: Rows = ()
+    even_directions: Rows = ()
+    phases: Row = ()
+    weights: Row
+    factor: Rows
+    whitening: Rows
+    speed_m_s: Annotated[tuple[float, float], Field(strict=False)]
+    largest_rad: Annotated[float, Field(ge=0)]
+
+    @model_validator(mode="after")
+    def _one_size(self) -> LadderModel:
+        random, count = len(self.phases), ODD_COUNT + len(self.phases)
+        shapes = (
+            (self.scale, ODD_COUNT), (self.even_mean, EVEN_COUNT), (self.even_scale, EVEN_COUNT),
+            (self.odd_directions, random), (self.even_directions, random), (self.weights, count),
+            (self.factor, count), (self.whitening, ODD_COUNT),
+            *((row, ODD_COUNT) for row in (*self.odd_directions, *self.whitening)),
+            *((row, EVEN_COUNT) for row in self.even_directions),
+            *((row, len(self.factor[0])) for row in self.factor),
+        )  # fmt: skip
+        if any(len(values) != size for values, size in shapes):
+            raise ValueError("the arrays of a residual model have other sizes than its features")
+        if min(*self.scale, *self.even_scale, self.speed_m_s[0]) <= 0.0:
+            raise ValueError("scales and speeds are positive")
+        return self
+
+    @property
+    def sha256(self) -> str:
+        """Digest of all of it."""
+        return digest(self.model_dump(mode="json"))
+
+    @cached_property
+    def _arrays(self) -> _Arrays:
+        def matrix(rows: tuple[tuple[float, ...], ...], columns: int) -> FloatArray:
+            return np.array(rows, dtype=np.float64).reshape(len(rows), columns)
+
+        return _Arrays(
+            np.array(self.scale),
+            matrix(self.odd_directions, ODD_COUNT),
+            matrix(self.even_directions, EVEN_COUNT),
+            np.array(self.phases, dtype=np.float64),
+            np.array(self.weights),
+            matrix(self.factor, len(self.factor[0])),
+            matrix(self.whitening, ODD_COUNT),
+        )
+
+    def evaluate(self, features: SlowFeatures) -> Correction:
+        """Return the residual at each step; where a feature is unknown it is 0 with gain 0."""
+        count = len(features.odd)
+        residual, std, distance2 = np.empty(count), np.empty(count), np.empty(count)
+        even_mean, even_scale = np.array(self.even_mean), np.array(self.even_scale)
+        _evaluate(features.odd, features.even, self._arrays, even_mean, even_scale, residual, std, distance2)
+        limit = LARGEST * self.largest_rad
+        residual = np.clip(residual, -limit, limit)
+        std = np.hypot(std, SHRINKAGE * residual)
+        return Correction(residual, std, self._gain(distance2, features.even[:, SPEED_COLUMN]))
+
+    def _gain(self, distance2: FloatArray, speed: FloatArray) -> FloatArray:
+        """Return the gain of the region of validity [K]."""
+        low, high = self.speed_m_s
+        with np.errstate(invalid="ignore", divide="ignore"):
+            outside = np.maximum(np.maximum(low / speed, speed / high), 0.0)
+            of_speed = (SPEED_NONE - outside) / (SPEED_NONE - SPEED_FULL)
+            of_distance = (NONE_BEYOND - distance2) / (NONE_BEYOND - FULL_WITHIN)
+        gain = np.clip(np.minimum(of_speed, of_distance), 0.0, 1.0)
+        return np.where(np.isfinite(distance2) & (speed > 0.0), gain, 0.0)
+
+
+def plain(values: Any) -> Any:
+    """Return arrays as nested tuples of floats with twelve digits, as :class:`LadderModel` takes them."""
+    if isinstance(values, np.ndarray) and values.ndim:
+        return tuple(plain(row) for row in values)
+    return float(f"{float(values):.12g}")

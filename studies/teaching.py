@@ -1,0 +1,303 @@
+"""Teaching on recorded drives: taught on one drive with ground truth, scored on another one of the same car.
+
+    python -m studies.teaching [--cars GTI,...] [--out docs] [--stored]
+
+Each drive calibrates its car on its own sensors, without ground truth. Columns: ``physics`` of the untaught car, of the
+taught car, and ``pd-hef`` of the taught car with its residual. The drives are in ``../shared`` and may not be
+redistributed. Without them, the command ends with 0 and writes nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.taught import Taught
+from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool.estimators.calibration.calibration import self_calibrate
+from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.table import make_estimator
+from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
+from pdhef_logtool.learning.stages.teach import OpenedDrive, Teaching, learn_from, open_drive
+from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.estimating import calibrator
+from pdhef_logtool.runs.self_calibrating import self_calibrated
+from pdhef_logtool.storage.files import write_bytes
+from studies.pages import DOCS, DRIVES, RESULTS, number, options, table, write
+from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_of, vehicle_of
+
+RESULTS_FILE = RESULTS / "real" / "teaching.json"
+#: No pair may be worse than untaught by more than the larger of this share and this many degrees.
+WORSE_SHARE, WORSE_DEG = 0.05, 0.03
+#: Intervals run six filters, and longer drives have none here.
+MOST_STAMPS = 20_000
+#: Driving counts as alike where the residual is active on so much of it.
+ALIKE = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class TeachPart:
+    """A slice of a log, in seconds from its start; ``steering_gain`` makes a road-wheel angle of its channel."""
+
+    log: str
+    start: str | None = None
+    end: str | None = None
+    steering_gain: float = 1.0
+
+    @property
+    def name(self) -> str:
+        """Log and slice."""
+        span = "" if self.start is None and self.end is None else f" {self.start or '0'} to {self.end or 'end'} s"
+        return f"{self.log.partition('.')[0]}{span}"
+
+
+@dataclass(frozen=True, slots=True)
+class TeachCar:
+    """A car: its parts; pairs of them, in which one or several teach; the drive whose vehicle file all have."""
+
+    name: str
+    parts: tuple[TeachPart, ...]
+    taught_on: int = 1
+
+
+_F1TENTH = sorted(p.log for p in PEER_DRIVES if p.car == "1:10 F1TENTH")
+CARS = (
+    TeachCar("250 LM", (TeachPart("revs_250lm_a.mcap", None, "150"), TeachPart("revs_250lm_a.mcap", "150"))),
+    TeachCar(
+        "GTI",
+        (
+            TeachPart("gti_pole_aa.mcap"),
+            TeachPart("gti_low_speed.mcap"),
+            TeachPart("niki_gti_1khz.mcap", None, "50"),
+            TeachPart("stanford_wet_1.mcap", steering_gain=1.0 / 13.9),
+        ),
+    ),
+    TeachCar("V40", (TeachPart("v40_slalom.mcap"), TeachPart("v40_swd_gnss.mcap"))),
+    TeachCar("TT-S", (TeachPart("tts_kk.mcap", None, "62"), TeachPart("tts_kk.mcap", "62"))),
+    TeachCar("Polaris", (TeachPart("polaris_a.mcap"), TeachPart("polaris_b.mcap"))),
+    TeachCar("1:10 DART", (TeachPart("dart_circles_fast.mcap"), TeachPart("dart_steer_rate.mcap"))),
+    TeachCar("1:10 F1TENTH", tuple(map(TeachPart, _F1TENTH)), taught_on=5),
+)
+
+PAGE = """# Teaching on recorded drives
+
+This page shows what a car that was taught on one drive with ground truth is worth on another drive of the same car.
+{command}
+
+Sideslip RMSE in degrees; in brackets without the constant of each drive, which may be an offset of the ground truth.
+Each drive calibrates its car on its own sensors, not causal. *untaught* and *taught*: `physics` without and with the
+prior from the teaching drive. *pd-hef*: with the residual as well. *active*: share of the scored stamps at which the
+residual acts. *95 %*: coverage of the confidence intervals of untaught `physics` and of `pd-hef`.
+
+These are development figures: the width of the prior, the duration of the slow changes that are not learned and the
+smallest ridge parameter were chosen on these pairs and on simulated drives.
+
+{pairs}
+
+{summary}
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """RMSE in degrees, also without the constant; shares with an active residual and inside 95 % intervals."""
+
+    rmse_deg: float
+    without_constant_deg: float
+    active: float
+    covered: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class PairResult:
+    """A pair: taught on ``taught``, scored on ``scored``."""
+
+    car: str
+    taught: str
+    scored: str
+    untaught: Score
+    prior: Score
+    hybrid: Score
+    kinematic_deg: float
+    rung: str
+
+    @property
+    def worse(self) -> bool:
+        """Whether teaching costs more than it may."""
+        limit = max((1.0 + WORSE_SHARE) * self.untaught.rmse_deg, self.untaught.rmse_deg + WORSE_DEG)
+        return self.hybrid.rmse_deg > limit
+
+    @property
+    def ratio(self) -> float:
+        """RMSE of ``pd-hef`` of the taught car over that of untaught ``physics``."""
+        return self.hybrid.rmse_deg / self.untaught.rmse_deg
+
+
+def peer_of(part: TeachPart) -> PeerDrive:
+    """Return the recorded drive of a part."""
+    return next(p for p in PEER_DRIVES if p.log == part.log)
+
+
+def opened(part: TeachPart, car: Car) -> OpenedDrive:
+    """Read a part for a car."""
+    mapping = mapping_of(peer_of(part))
+    if part.steering_gain != 1.0:
+        wheel = mapping.signals["steering_wheel_rad"]
+        assert isinstance(wheel.scale, float)
+        angle = replace(wheel, name="steer_rad", scale=wheel.scale * part.steering_gain)
+        others = {k: v for k, v in mapping.signals.items() if k != "steering_wheel_rad"}
+        mapping = Mapping({**others, "steer_rad": angle}, mapping.truth)
+    config = RunConfig(start=part.start, end=part.end)
+    with read_drive(DRIVES / part.log, car, mapping, config.read_options) as drive:
+        record, found = open_drive(drive)
+    if found is None:
+        raise SystemExit(f"{part.name}: {record.left_out}")
+    return found
+
+
+def score(drive: OpenedDrive, car: Car, name: str, taught: Taught | None, least_speed_m_s: float) -> Score:
+    """Calibrate a car on a drive and score an estimator with its intervals."""
+    prior = () if taught is None else taught.parameters
+    calibration = self_calibrate([drive.driving], car.vehicle, taught=prior)
+    wanted = len(drive.whole.signals) <= MOST_STAMPS
+    calibration = calibration if wanted else replace(calibration, varied=())
+    calibrated = replace(self_calibrated(drive.drive, calibration), taught=taught)
+    estimator = make_estimator(name, calibrated)
+    track, _ = run_window(estimator, drive.whole.signals)
+    track = calibrator(calibrated, [estimator]).add(track, drive.whole.signals)
+    assert drive.whole.truth is not None
+    error = signal_error(track, drive.whole.truth, "sideslip_rad", least_speed_m_s)
+    kept = np.isfinite(error)
+    degrees = np.degrees(error[kept])
+    return Score(
+        float(np.sqrt(np.mean(degrees**2))),
+        float(np.std(degrees)),
+        float(np.mean(track.network_trust[kept] > 0.0)),
+        float(np.mean(np.abs(error[kept]) <= NORMAL_95 * track.sideslip_std_rad[kept])) if wanted else None,
+    )
+
+
+def taught_of(teaching: Teaching, car: Car) -> Taught:
+    """Return the part of a car that drives taught."""
+    return Taught(
+        physics_sha256=car.physics_sha256,
+        parameters=teaching.parameters,
+        residual=teaching.ladder.model,
+        calibrated=teaching.calibrated,
+        evidence=teaching.evidence,
+    )
+
+
+def pairs_of(car: TeachCar) -> Iterator[PairResult]:
+    """Yield the results of a car's pairs."""
+    vehicle = vehicle_of(peer_of(car.parts[0]))
+    of_file = Car.of(vehicle)
+    drives = [opened(part, of_file) for part in car.parts]
+    least = peer_of(car.parts[0]).least_speed_m_s
+    untaught = [score(d, of_file, "physics", None, least) for d in drives]
+    kinematic = [score(d, of_file, "kinematic", None, least).rmse_deg for d in drives]
+    numbers = range(len(drives))
+    if car.taught_on > 1:
+        choices = [(tuple(numbers[: car.taught_on]), k) for k in numbers[car.taught_on :]]
+    else:
+        choices = [((a,), b) for a, b in permutations(numbers, 2)]
+    learned: dict[tuple[int, ...], Taught] = {}
+    for teachers, k in choices:
+        if teachers not in learned:
+            learned[teachers] = taught_of(learn_from([drives[i] for i in teachers]), of_file)
+        taught = learned[teachers]
+        prior, hybrid = (score(drives[k], of_file, n, taught, least) for n in ("physics", "pd-hef"))
+        names = ", ".join(car.parts[i].name for i in teachers) if len(teachers) == 1 else f"{len(teachers)} runs"
+        rung = "none" if taught.residual is None else taught.residual.rung
+        yield PairResult(car.name, names, car.parts[k].name, untaught[k], prior, hybrid, kinematic[k], rung)
+
+
+def pair_table(results: Sequence[PairResult]) -> str:
+    """Return one line per pair."""
+
+    def cell(s: Score) -> str:
+        return f"{s.rmse_deg:.3f} ({s.without_constant_deg:.3f})"
+
+    body = [
+        [
+            r.car, r.taught, r.scored, cell(r.untaught), cell(r.prior), cell(r.hybrid),
+            number(r.ratio, 2) + (" worse" if r.worse else ""), r.rung, f"{r.hybrid.active:.0%}",
+            " / ".join("–" if s.covered is None else f"{s.covered:.0%}" for s in (r.untaught, r.hybrid)),
+        ]
+        for r in results
+    ]  # fmt: skip
+    head = ["car", "taught on", "scored on", "untaught", "taught", "pd-hef", "ratio", "residual", "active", "95 %"]
+    return table(head, body, right_from=3)
+
+
+def summary(results: Sequence[PairResult]) -> str:
+    """Return the figures that the targets are about."""
+
+    def mean(ratios: Sequence[float]) -> str:
+        return f"{math.exp(float(np.mean(np.log(ratios)))):.2f} ({len(ratios)} pairs)" if ratios else "–"
+
+    alike = [r for r in results if r.hybrid.active >= ALIKE]
+    unlike = [r for r in results if r.hybrid.active < ALIKE]
+    small = [r for r in results if r.car == "1:10 F1TENTH"]
+    lines = [
+        ["pairs worse than untaught by more than max(5 %, 0.03°)", str(sum(r.worse for r in results))],
+        ["geometric mean of the ratios, residual active on at least 50 %", mean([r.ratio for r in alike])],
+        ["geometric mean of the ratios, residual active on less", mean([r.ratio for r in unlike])],
+        ["the same with the prior alone, all pairs", mean([r.prior.rmse_deg / r.untaught.rmse_deg for r in results])],
+        ["1:10 cars, pd-hef over kinematic", mean([r.hybrid.rmse_deg / r.kinematic_deg for r in small])],
+    ]
+    return table(["figure", "value"], lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the pairs and write the page."""
+    parser = options("teaching", __doc__)
+    parser.add_argument("--cars", default=",".join(c.name for c in CARS))
+    parser.add_argument("--out", type=Path, default=DOCS)
+    parser.add_argument("--results", type=Path, default=RESULTS_FILE)
+    parser.add_argument("--stored", action="store_true", help="write the page of the stored results")
+    given = parser.parse_args(arguments)
+    if given.stored:
+        write_page(given.out, stored_results(given.results))
+        return 0
+    if not DRIVES.is_dir():
+        print("needs ../shared beside the repository (recorded drives that may not be redistributed); nothing is done")
+        return 0
+    wanted = given.cars.split(",")
+    if unknown := set(wanted) - {c.name for c in CARS}:
+        parser.error(f"--cars: expected names out of {', '.join(c.name for c in CARS)}, got {', '.join(unknown)}")
+    results = []
+    for car in (c for c in CARS if c.name in wanted):
+        for result in pairs_of(car):
+            results.append(result)
+            print(pair_table([result]).splitlines()[-1], file=sys.stderr)
+    print(summary(results), file=sys.stderr)
+    write_bytes(given.results, (json.dumps([asdict(r) for r in results], indent=1) + "\n").encode())
+    write_page(given.out, results)
+    return 0
+
+
+def stored_results(file: Path) -> list[PairResult]:
+    """Return the results of a stored run."""
+    scores = ("untaught", "prior", "hybrid")
+    documents = json.loads(file.read_text(encoding="utf-8"))
+    return [PairResult(**{**d, **{name: Score(**d[name]) for name in scores}}) for d in documents]
+
+
+def write_page(folder: Path, results: Sequence[PairResult]) -> None:
+    """Write the page of results."""
+    command = "Command: `python -m studies.teaching`."
+    write(folder / "teaching.md", PAGE.format(command=command, pairs=pair_table(results), summary=summary(results)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

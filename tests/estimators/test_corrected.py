@@ -1,0 +1,158 @@
+"""``pd-hef`` of a taught car: physics plus the residual of its ladder, causal, window by window, within its region."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from reference_car import cut, drive, slalom, with_noise
+
+from pdhef_logtool.car.car import Car, WithoutTruth
+from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.taught import Taught, TaughtParameter
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.estimators.calibration.joint import parameters_of, prior_vehicle, with_taught
+from pdhef_logtool.estimators.causality_check import CausalityCheck
+from pdhef_logtool.estimators.corrected import CorrectedPhysics
+from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.presets import Options
+from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
+from pdhef_logtool.estimators.table import make_estimator
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.residual_model.ladder import SPEED_NONE, LadderModel
+from pdhef_logtool.residual_model.slow_features import EVEN_COUNT, ODD_COUNT
+
+SEDAN = default_vehicle()
+
+
+def model(weight: float = 0.01, fastest_m_s: float = 40.0) -> LadderModel:
+    """Return a residual of the low-passed yaw rate over 0.3, valid up to a speed."""
+    weights = [0.0] * ODD_COUNT
+    weights[5] = weight
+    return LadderModel(
+        rung="linear",
+        scale=(0.3,) * ODD_COUNT,
+        even_mean=(20.0,) * EVEN_COUNT,
+        even_scale=(5.0,) * EVEN_COUNT,
+        weights=tuple(weights),
+        factor=tuple((0.001,) for _ in range(ODD_COUNT)),
+        whitening=tuple(tuple(map(float, 1e-4 * row)) for row in np.eye(ODD_COUNT)),
+        speed_m_s=(5.0, fastest_m_s),
+        largest_rad=0.1,
+    )
+
+
+def taught_car(residual: LadderModel | None, *, calibrated: bool = False) -> Car:
+    taught = Taught(physics_sha256=Car.of(SEDAN).physics_sha256, residual=residual, calibrated=calibrated)
+    return replace(Car.of(SEDAN), taught=taught)
+
+
+@pytest.fixture(scope="module")
+def signals() -> Signals:
+    s = with_noise(drive(slalom(0.03, 0.5), 6.0, speed=22.0).signals, seed=3)
+    return replace(s, friction=np.full(len(s), 0.85))
+
+
+def track_of(name: str, car: Car, *parts: Signals) -> list[StateTrack]:
+    estimator, state, tracks = make_estimator(name, car), None, []
+    for part in parts:
+        track, state = run_window(estimator, part, state)
+        tracks.append(track)
+    return tracks
+
+
+def test_a_residual_of_zero_is_physics_bit_for_bit(signals: Signals) -> None:
+    (physics,), (hybrid,) = (track_of(name, taught_car(model(0.0)), signals) for name in ("physics", "pd-hef"))
+    assert np.array_equal(hybrid.vx_m_s, physics.vx_m_s, equal_nan=True)
+    assert np.array_equal(hybrid.sideslip_rad, physics.sideslip_rad, equal_nan=True)
+    assert np.allclose(hybrid.vy_m_s, physics.vy_m_s, atol=1e-12, equal_nan=True)
+    assert np.nanmax(hybrid.network_trust) == 1.0
+
+
+def test_the_residual_is_added_and_widens_the_interval(signals: Signals) -> None:
+    (physics,), (hybrid,) = (track_of(name, taught_car(model()), signals) for name in ("physics", "pd-hef"))
+    added = hybrid.sideslip_rad - physics.sideslip_rad
+    late = slice(200, None)
+    assert np.nanmax(np.abs(added[late])) > 0.003
+    assert np.corrcoef(added[late], physics.yaw_rate_rad_s[late])[0, 1] > 0.6
+    assert np.all(hybrid.sideslip_std_rad[late] > physics.sideslip_std_rad[late])
+    assert np.all(hybrid.covariance[late, 1, 1] > physics.covariance[late, 1, 1])
+    assert np.allclose(np.arctan2(hybrid.vy_m_s, hybrid.vx_m_s)[late], hybrid.sideslip_rad[late])
+    assert np.array_equal(hybrid.yaw_rate_rad_s, physics.yaw_rate_rad_s, equal_nan=True)
+
+
+@pytest.mark.parametrize("at", [1, 250, 401])
+def test_windows_do_not_change_a_bit(signals: Signals, at: int) -> None:
+    car = taught_car(model())
+    (whole,) = track_of("pd-hef", car, signals)
+    parts = track_of("pd-hef", car, cut(signals, 0, at), cut(signals, at, len(signals)))
+    for name in ("vy_m_s", "sideslip_rad", "sideslip_std_rad", "network_trust"):
+        joined = np.concatenate([getattr(part, name) for part in parts])
+        assert np.array_equal(joined, getattr(whole, name), equal_nan=True)
+
+
+def test_it_is_causal(signals: Signals) -> None:
+    estimator, check = make_estimator("pd-hef", taught_car(model())), CausalityCheck()
+    assert isinstance(estimator, CorrectedPhysics) and estimator.causal
+    run_window(estimator, signals, causality=check)
+    later = replace(signals, yaw_rate_rad_s=np.where(np.arange(len(signals)) > 300, 0.0, signals.yaw_rate_rad_s))
+    ran = [estimator.run(s, None)[0].until(300) for s in (signals, later)]
+    assert np.array_equal(ran[0].residual_rad, ran[1].residual_rad)
+
+
+def test_beyond_the_taught_speed_it_is_physics(signals: Signals) -> None:
+    car = taught_car(model(fastest_m_s=10.0))
+    (physics,), (hybrid,) = (track_of(name, car, signals) for name in ("physics", "pd-hef"))
+    assert np.array_equal(hybrid.sideslip_rad, physics.sideslip_rad, equal_nan=True)
+    assert np.nanmax(hybrid.network_trust) == 0.0
+
+
+def test_two_seconds_after_the_taught_region_it_is_physics_again(signals: Signals) -> None:
+    fast = with_noise(drive(slalom(0.02, 0.5), 8.0, speed=40.0).signals, seed=4)
+    step_ns = int(signals.stamps_ns[-1] - signals.stamps_ns[0]) + 10_000_000
+    moved = {name: getattr(fast, name) + step_ns for name in ("stamps_ns", "ready_ns")}
+    fast = replace(fast, friction=np.full(len(fast), 0.85), **moved)
+    car = taught_car(model(fastest_m_s=21.0))
+    inside, outside = track_of("pd-hef", car, signals, fast)
+    _, physics = track_of("physics", car, signals, fast)
+    assert np.nanmean(inside.network_trust > 0.0) > 0.5
+    left = int(np.flatnonzero(physics.vx_m_s > SPEED_NONE * 21.0)[0])  # the filter takes the jump of the speed slowly
+    assert len(physics) > left + 250
+    assert np.array_equal(outside.sideslip_rad[left + 200 :], physics.sideslip_rad[left + 200 :], equal_nan=True)
+
+
+def test_a_residual_belongs_to_the_physics_that_it_was_fitted_on(signals: Signals) -> None:
+    calibration = WithoutTruth(SEDAN, FilterNoise(r_std={"ay_m_s2": 1.0}), True, "calibrated")
+    for calibrated in (False, True):
+        car = taught_car(model(), calibrated=calibrated)
+        plain, of_log = (make_estimator("pd-hef", c) for c in (car, replace(car, self_calibrated=calibration)))
+        assert isinstance(of_log, SelfCalibrated)
+        assert isinstance(plain, CorrectedPhysics) is not calibrated
+        assert isinstance(of_log.estimator, CorrectedPhysics) is calibrated
+        without = of_log.estimator if not calibrated else plain
+        assert any("residual gain 0" in note for note in without.notes)  # type: ignore[attr-defined]
+    (track,) = track_of("pd-hef", replace(taught_car(model(), calibrated=True), self_calibrated=calibration), signals)
+    assert np.nanmax(track.network_trust) == 1.0
+
+
+def test_a_car_without_a_residual_or_with_a_named_gain_does_not_take_it() -> None:
+    assert not isinstance(make_estimator("pd-hef", taught_car(None)), CorrectedPhysics)
+    assert not isinstance(make_estimator("pd-hef", taught_car(model()), Options(trust=0.0)), CorrectedPhysics)
+
+
+def test_a_taught_prior_moves_mean_and_width_of_the_calibration() -> None:
+    parameters = parameters_of(SEDAN)
+    first = parameters[0]
+    taught = (
+        TaughtParameter(name=first.name, value=1.1 * first.mean, std=0.5 * first.std),
+        TaughtParameter(name=parameters[1].name, value=parameters[1].mean, std=9.0),
+    )
+    moved = with_taught(parameters, taught)
+    assert (moved[0].mean, moved[0].std) == (1.1 * first.mean, 0.5 * first.std)
+    assert moved[1].std == parameters[1].std  # no teaching makes a prior wider
+    assert moved[2:] == parameters[2:]
+    vehicles = (prior_vehicle(SEDAN), prior_vehicle(SEDAN, taught))
+    before, after = (v.cornering_stiffness_n_per_rad(True, v.assumed_friction) for v in vehicles)
+    assert after == pytest.approx(1.1 * before, rel=1e-4)

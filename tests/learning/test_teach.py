@@ -1,0 +1,147 @@
+"""Stage ``teach``: prior and residual from drives with ground truth, and the car that they make."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from pdhef_logtool.car.car import TAUGHT_FILE, Car
+from pdhef_logtool.car.parts import Fit, LearntOn
+from pdhef_logtool.car.toml_files import part_toml
+from pdhef_logtool.cli.learning_tables import render_learning
+from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool.estimators.calibration.joint import parameters_of
+from pdhef_logtool.learning.drives import TEACH, LearnSettings
+from pdhef_logtool.learning.engine import LearnResult, learn
+from pdhef_logtool.learning.stages.teach import OpenedDrive, learn_from, open_drive
+from pdhef_logtool.records.errors import EstimatorError, UsageError, VehicleError
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.self_calibrating import calibrate_drive
+
+SPAN = {"start": "60", "end": "130"}
+
+
+@pytest.fixture(scope="module")
+def bare(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the vehicle file of the sample logs with a front axle that is too soft, and without a network."""
+    text = (sample_logs_dir / "vehicle.toml").read_text()
+    head, _, rest = text.partition("[network]")
+    path = tmp_path_factory.mktemp("car") / "vehicle.toml"
+    path.write_text(head + rest[rest.index("[sensors]") :].replace("B = 11.146", "B = 7.0"))
+    return path
+
+
+def opened(log: Path, bare: Path, **span: str) -> OpenedDrive:
+    with read_drive(log, Car.load(bare, network="none"), None, RunConfig(**span).read_options) as drive:
+        found = open_drive(drive)[1]
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def drive(sample_logs_dir: Path, bare: Path) -> OpenedDrive:
+    return opened(sample_logs_dir / "road.mcap", bare, **SPAN)
+
+
+@pytest.fixture(scope="module")
+def result(sample_logs_dir: Path, bare: Path, tmp_path_factory: pytest.TempPathFactory) -> LearnResult:
+    settings = LearnSettings(config=RunConfig(car=bare, **SPAN))
+    assert settings.order == (TEACH,)
+    return learn([str(sample_logs_dir / "road.mcap")], tmp_path_factory.mktemp("out") / "car", settings)
+
+
+def test_a_drive_teaches_a_prior_that_later_drives_start_from(result: LearnResult, sample_logs_dir: Path) -> None:
+    car = Car.load(result.car, network="none")
+    assert car.taught is not None and not car.has_evidence and car.notes == ()
+    by_name = {p.name: p for p in car.taught_prior}
+    parameters = parameters_of(car.vehicle)
+    assert by_name.keys() == {p.name for p in parameters}
+    assert all(by_name[p.name].std <= 1.00001 * p.std for p in parameters)
+    right = Car.load(sample_logs_dir / "vehicle.toml").vehicle
+    true = right.cornering_stiffness_n_per_rad(True, right.assumed_friction)
+    front = parameters[0]
+    assert abs(np.log(by_name[front.name].value / true)) < 0.2
+    with read_drive(sample_logs_dir / "sweep.mcap", car, None) as drive:
+        calibration = calibrate_drive(drive, RunConfig())
+    assert calibration is not None
+    assert [p.prior for p in calibration.parameters] == [by_name[p.name].value for p in calibration.parameters]
+
+
+def test_the_figures_say_which_rung_and_what_to_drive_next(result: LearnResult) -> None:
+    (stage,) = result.stages
+    figures = stage.figures
+    assert [t["rung"] for t in figures["rungs"]][:2] == ["none", "linear"]
+    assert figures["rung"] in ("none", "linear", "random") and figures["evidence"] in stage.text
+    assert any("driving were used" in text for text in figures["more"])
+    console = Console(width=150, record=True, file=io.StringIO())
+    render_learning(result, console)
+    text = console.export_text()
+    assert "held-out" in text and "road" in text
+    document = json.loads((result.car / TAUGHT_FILE).read_text())
+    assert document["drives"][0]["name"] == "road" and "nan" not in (result.car / TAUGHT_FILE).read_text().lower()
+
+
+def test_an_offset_of_the_ground_truth_changes_neither_prior_nor_residual(drive: OpenedDrive) -> None:
+    truth = drive.whole.truth
+    assert truth is not None
+    offset = 0.01
+    moved = replace(truth, sideslip_rad=truth.sideslip_rad + offset, vy_m_s=truth.vy_m_s + offset * truth.vx_m_s)
+    shifted = replace(drive, whole=replace(drive.whole, truth=moved), slopes=drive.slopes + offset)
+    first, second = (learn_from([d]) for d in (drive, shifted))
+    assert [p.value for p in second.parameters] == pytest.approx([p.value for p in first.parameters], rel=1e-6)
+    assert second.ladder.rung == first.ladder.rung
+    if first.ladder.model is not None and second.ladder.model is not None:
+        assert np.allclose(second.ladder.model.weights, first.ladder.model.weights, rtol=1e-4, atol=1e-9)
+
+
+def test_the_prior_of_several_drives_is_tested_with_each_left_out(sample_logs_dir: Path, bare: Path) -> None:
+    drives = [opened(sample_logs_dir / "road.mcap", bare, start=a, end=b) for a, b in (("60", "90"), ("95", "125"))]
+    taught = learn_from(drives)
+    assert taught.prior_test is not None and taught.prior_test.blocks >= 4
+    assert bool(taught.parameters) is not (taught.prior_test.low > 0.0)
+
+
+def test_a_changed_vehicle_file_makes_it_stale(result: LearnResult, tmp_path: Path) -> None:
+    car = tmp_path / "car"
+    car.mkdir()
+    for name in ("vehicle.toml", TAUGHT_FILE):
+        (car / name).write_bytes((result.car / name).read_bytes())
+    text = (car / "vehicle.toml").read_text()
+    (car / "vehicle.toml").write_text(text.replace("B = 7.0", "B = 7.1"))
+    loaded = Car.load(car, network="none")
+    assert loaded.taught is None and TAUGHT_FILE in loaded.notes[0]
+    document = json.loads((car / TAUGHT_FILE).read_text())
+    (car / TAUGHT_FILE).write_text(json.dumps({**document, "parameters": [{"name": "x", "value": 1.0, "std": -1.0}]}))
+    with pytest.raises(VehicleError, match=TAUGHT_FILE):
+        Car.load(car, network="none")
+
+
+def test_what_was_taught_takes_the_place_of_a_fit(result: LearnResult, tmp_path: Path) -> None:
+    car = tmp_path / "car"
+    car.mkdir()
+    for name in ("vehicle.toml", TAUGHT_FILE):
+        (car / name).write_bytes((result.car / name).read_bytes())
+    fit = Fit(physics_sha256=Car.load(result.car).physics_sha256, drives=(LearntOn(name="road"),))
+    (car / "fit.toml").write_text(part_toml(fit, "a fit"))
+    loaded = Car.load(car, network="none")
+    assert loaded.taught is not None and not loaded.has_evidence and "fit.toml" in loaded.notes[0]
+    (car / TAUGHT_FILE).unlink()
+    assert Car.load(car, network="none").has_evidence
+
+
+def test_what_cannot_be_taught_is_refused(sample_logs_dir: Path, bare: Path, tmp_path: Path) -> None:
+    road = [str(sample_logs_dir / "road.mcap")]
+    short = LearnSettings(config=RunConfig(car=bare, start="60", end="70"))
+    with pytest.raises(EstimatorError, match="at least 20 s"):
+        learn(road, tmp_path / "car", short)
+    with pytest.raises(EstimatorError, match="at least one drive"):
+        learn([str(sample_logs_dir / "no_truth.mcap")], tmp_path / "car", LearnSettings(config=RunConfig(car=bare)))
+    with pytest.raises(UsageError, match="teach alone"):
+        LearnSettings(config=RunConfig(car=bare), stages=("teach", "noise"))
+    assert not (tmp_path / "car").exists()

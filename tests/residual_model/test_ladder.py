@@ -1,0 +1,223 @@
+"""The ladder of residual models: symmetry, constants, region of validity, choice of the rung, and its document."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from pdhef_logtool.residual_model.ladder import LARGEST, LadderModel
+from pdhef_logtool.residual_model.ladder_fit import (
+    LadderFit,
+    TaughtDrive,
+    _solve,
+    _Sums,
+    corrected_rmse_deg,
+    fit_ladder,
+)
+from pdhef_logtool.residual_model.slow_features import ODD_COUNT, SlowFeatures, slow_features
+
+RATE_HZ = 50.0
+
+
+def driving(seconds: float, seed: int, speed: float = 20.0) -> np.ndarray:
+    """Return smooth random signals [K, 6]: four odd ones, speed and a_x."""
+    rng, count = np.random.default_rng(seed), round(seconds * RATE_HZ)
+    kernel = np.hanning(50)
+    smooth = np.stack([np.convolve(rng.normal(size=count + 49), kernel, "valid") for _ in range(5)], axis=1) / 5.0
+    odd = smooth[:, :4] * np.array([0.05, 0.3, 3.0, 0.03])
+    return np.concatenate([odd, np.full((count, 1), speed), smooth[:, 4:]], axis=1)
+
+
+def features(signals: np.ndarray) -> SlowFeatures:
+    dt = np.full(len(signals), 1.0 / RATE_HZ)
+    dt[0] = np.nan
+    return slow_features(signals, dt, None)[0]
+
+
+def taught(seconds: float, seed: int, lacking: object = None, noise_rad: float = 0.002) -> TaughtDrive:
+    """Return a drive whose error is a function of its features, with slow noise and a constant."""
+    found = features(driving(seconds, seed))
+    rng = np.random.default_rng(seed + 100)
+    noise = np.convolve(rng.normal(size=len(found.odd) + 24), np.ones(25) / 5.0, "valid") * noise_rad
+    error = np.zeros(len(found.odd)) if lacking is None else lacking(found)  # type: ignore[operator]
+    stamps = np.round(np.arange(len(noise)) * 1e9 / RATE_HZ).astype(np.int64)
+    return TaughtDrive(f"drive {seed}", stamps, found, error + noise + 0.003)
+
+
+def linear(found: SlowFeatures) -> np.ndarray:
+    return 0.2 * found.odd[:, 4] - 0.01 * found.odd[:, 6]
+
+
+@cache
+def linear_fit() -> LadderFit:
+    return fit_ladder([taught(600.0, 1, linear)], rungs=("linear",))
+
+
+def linear_model() -> LadderModel:
+    model = linear_fit().model
+    assert model is not None
+    return model
+
+
+def test_a_linear_error_is_found_on_a_drive_that_was_not_taught() -> None:
+    fit, other = linear_fit(), taught(60.0, 7, linear)
+    assert fit.rung == "linear" and fit.model is not None
+    before, after = (corrected_rmse_deg(other, c)[1] for c in (None, fit.model.evaluate(other.features)))
+    assert after < 0.75 * before
+    assert np.mean(fit.model.evaluate(other.features).gain > 0.0) > 0.8
+
+
+def test_noise_alone_teaches_nothing() -> None:
+    fits = [fit_ladder([taught(60.0, seed)]) for seed in range(8)]
+    assert sum(fit.model is not None for fit in fits) <= 1
+    assert all(fit.trials[0].rung == "none" for fit in fits)
+
+
+def test_a_product_of_odd_and_even_takes_the_random_rung() -> None:
+    def product(found: SlowFeatures) -> np.ndarray:
+        return 0.3 * found.odd[:, 4] * np.tanh(found.even[:, 3])
+
+    fit = fit_ladder([taught(900.0, 2, product, noise_rad=0.0003)])
+    assert fit.rung == "random"
+
+
+def test_too_little_driving_gives_no_model() -> None:
+    fit = fit_ladder([taught(5.0, 1, linear)])
+    assert fit.model is None and fit.trials == ()
+    assert fit_ladder([]).model is None
+
+
+@pytest.mark.parametrize("offset_rad", [0.02, -0.5])
+def test_a_constant_of_the_ground_truth_is_not_learned(offset_rad: float) -> None:
+    drive = taught(600.0, 1, linear)
+    moved = fit_ladder([replace(drive, lacking_rad=drive.lacking_rad + offset_rad)], rungs=("linear",)).model
+    assert moved is not None
+    found = drive.features
+    expected, got = linear_model().evaluate(found), moved.evaluate(found)
+    assert np.allclose(got.residual_rad, expected.residual_rad, atol=1e-9)
+    assert np.array_equal(got.gain, expected.gain)
+
+
+def test_each_drive_may_have_its_own_constant() -> None:
+    drives = [taught(200.0, seed, linear) for seed in (1, 2, 3)]
+    moved = [replace(d, lacking_rad=d.lacking_rad + 0.01 * k) for k, d in enumerate(drives)]
+    fits = [fit_ladder(each).model for each in (drives, moved)]
+    assert all(f is not None for f in fits)
+    a, b = (f.evaluate(drives[0].features).residual_rad for f in fits if f is not None)
+    assert np.allclose(a, b, atol=1e-9)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 10_000), st.floats(0.1, 3.0))
+def test_the_mirrored_drive_has_the_mirrored_residual(seed: int, size: float) -> None:
+    found = features(driving(2.0, seed) * np.array([size] * 4 + [1.0, 1.0]))
+    mirrored = SlowFeatures(-found.odd, found.even)
+    for model in (linear_model(), random_model()):
+        straight, turned = model.evaluate(found), model.evaluate(mirrored)
+        assert np.array_equal(turned.residual_rad, -straight.residual_rad)
+        assert np.array_equal(turned.gain, straight.gain) and np.array_equal(turned.std_rad, straight.std_rad)
+
+
+@cache
+def random_model() -> LadderModel:
+    """Return the linear model with random features of small weight."""
+    model, rng, count = linear_model(), np.random.default_rng(5), 12
+    rows = np.concatenate([np.array(model.factor), rng.normal(size=(count, len(model.factor[0]))) * 1e-4])
+    return LadderModel(
+        **{
+            **model.model_dump(),
+            "rung": "random",
+            "odd_directions": rng.normal(size=(count, ODD_COUNT)).tolist(),
+            "even_directions": rng.normal(size=(count, len(model.even_mean))).tolist(),
+            "phases": rng.uniform(size=count).tolist(),
+            "weights": [*model.weights, *(rng.normal(size=count) * 1e-3).tolist()],
+            "factor": rows.tolist(),
+        }
+    )
+
+
+def test_straight_driving_has_no_residual() -> None:
+    signals = np.zeros((200, 6))
+    signals[:, 4] = 20.0
+    for model in (linear_model(), random_model()):
+        assert np.all(model.evaluate(features(signals)).residual_rad == 0.0)
+
+
+def test_outside_of_the_taught_driving_the_residual_is_zero_within_two_seconds() -> None:
+    inside = driving(20.0, 3)
+    for outside in (driving(10.0, 3, speed=60.0), inside[:500] * np.array([8.0] * 4 + [1.0, 1.0])):
+        found = linear_model().evaluate(features(np.concatenate([inside, outside])))
+        first = len(inside)
+        assert np.mean(found.gain[first - 500 : first]) > 0.8
+        assert np.mean(found.gain[first + 100 :] == 0.0) > 0.9
+    fast = linear_model().evaluate(features(driving(10.0, 3, speed=60.0)))
+    assert np.all(fast.gain == 0.0)
+
+
+def test_a_residual_is_limited() -> None:
+    found = linear_model().evaluate(features(driving(5.0, 1) * np.array([100.0] * 4 + [1.0, 1.0])))
+    assert np.max(np.abs(found.residual_rad)) <= LARGEST * linear_model().largest_rad
+
+
+def test_unknown_features_have_gain_zero_and_the_next_ones_go_on() -> None:
+    signals = driving(8.0, 3)
+    signals[50:60, 2] = np.nan
+    found = linear_model().evaluate(features(signals))
+    assert np.all(found.gain[50:60] == 0.0) and np.all(found.residual_rad[50:60] == 0.0)
+    assert np.all(np.isfinite(found.residual_rad)) and np.mean(found.gain[60:] > 0.0) > 0.5
+
+
+@pytest.mark.parametrize("cut", [1, 57, 199])
+def test_windows_do_not_change_a_bit(cut: int) -> None:
+    signals, dt = driving(4.0, 9), np.full(200, 0.02)
+    dt[0] = np.nan
+    whole, _ = slow_features(signals, dt, None)
+    first, memory = slow_features(signals[:cut], dt[:cut], None)
+    second, _ = slow_features(signals[cut:], dt[cut:], memory)
+    for name in ("odd", "even"):
+        assert np.array_equal(np.concatenate([getattr(first, name), getattr(second, name)]), getattr(whole, name))
+    model = random_model()
+    joined = np.concatenate([model.evaluate(part).residual_rad for part in (first, second)])
+    assert np.array_equal(joined, model.evaluate(whole).residual_rad)
+
+
+def test_the_sums_of_blocks_give_the_ridge_regression_of_the_samples() -> None:
+    rng = np.random.default_rng(4)
+    phi, error, step_s, ridge = rng.normal(size=(300, 5)) + 0.4, rng.normal(size=300) + 2.0, 0.04, 3.0
+    blocks = [_Sums.of(phi[rows], error[rows], step_s) for rows in np.array_split(np.arange(300), 7)]
+    total = blocks[0]
+    for block in blocks[1:]:
+        total = total + block
+    weights = _solve([total], ridge)
+    # Least squares with λ as five more samples, and a column of ones for the constant.
+    columns = np.concatenate([np.concatenate([phi, np.ones((300, 1))], axis=1) * np.sqrt(step_s), np.zeros((5, 6))])
+    columns[300:, :5] = np.sqrt(ridge) * np.eye(5)
+    right = np.concatenate([error * np.sqrt(step_s), np.zeros(5)])
+    expected = np.linalg.lstsq(columns, right, rcond=None)[0]
+    assert np.allclose(weights, expected[:5])
+    squares = np.sum((error - phi @ expected[:5] - expected[5]) ** 2) * step_s
+    assert total.squares(weights, float(expected[5])) == pytest.approx(squares)
+
+
+def test_the_interval_contains_most_of_what_a_strong_ridge_leaves() -> None:
+    drive = taught(60.0, 21, linear)
+    found = linear_model().evaluate(drive.features)
+    error = found.residual_rad - linear(drive.features)
+    assert np.mean(np.abs(error) <= 1.96 * found.std_rad) > 0.65
+
+
+def test_a_model_survives_its_document_and_damage_is_refused() -> None:
+    model = random_model()
+    text = model.model_dump_json()
+    assert LadderModel.model_validate_json(text).sha256 == model.sha256
+    for name, value in (("weights", model.weights[:-1]), ("phases", ()), ("scale", (0.0,) * ODD_COUNT)):
+        with pytest.raises(ValidationError):
+            LadderModel(**{**model.model_dump(), name: value})
+    with pytest.raises(ValidationError):
+        LadderModel(**{**model.model_dump(), "largest_rad": float("nan")})
