@@ -176,6 +176,16 @@ def _solve(drives: Sequence[_Sums], ridge: float) -> FloatArray:
     return np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
 
 
+def _expanded(
+    features: tuple[FloatArray, FloatArray], odd_directions: FloatArray, even_directions: FloatArray, phases: FloatArray
+) -> FloatArray:
+    """Return the odd features [N, 16] of a drive, then its random ones."""
+    odd, even = features
+    out = np.empty((len(odd), ODD_COUNT + len(phases)))
+    expand(odd, even, odd_directions, even_directions, phases, out)
+    return out
+
+
 def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR, RANDOM), seed: int = 0) -> LadderFit:
     """Choose a rung and fit it; the result does not depend on a constant that is added to a drive's error."""
     samples = [_thinned(d) for d in drives]
@@ -196,11 +206,7 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
         z.append(np.ascontiguousarray(sample_odd / scale))
         e.append(np.ascontiguousarray((sample_even - even_mean) / even_scale))
         errors.append((error, step_s))
-    phi = []
-    for of_odd, of_even in zip(z, e, strict=True):
-        out = np.empty((len(of_odd), ODD_COUNT + count))
-        expand(of_odd, of_even, odd_directions, even_directions, phases, out)
-        phi.append(out)
+    phi = [_expanded(of, odd_directions, even_directions, phases) for of in zip(z, e, strict=True)]
     fast = [without_slow(np.column_stack([p, error]), round(SLOW_S / step)) for p, (error, step) in _zip(phi, errors)]
     problem = _problem([f[:, :-1] for f in fast], [(f[:, -1], step) for f, (_, step) in _zip(fast, errors)], seconds)
     linear = problem.only(ODD_COUNT)
