@@ -188,8 +188,7 @@ def _expanded(
 
 def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR, RANDOM), seed: int = 0) -> LadderFit:
     """Choose a rung and fit it; the result does not depend on a constant that is added to a drive's error."""
-    samples = [_thinned(d) for d in drives]
-    samples = [s for s in samples if len(s[0]) * s[3] >= LEAST_BLOCK_S]
+    samples = [s for s in map(_thinned, drives) if len(s[0]) * s[3] >= LEAST_BLOCK_S]
     seconds = math.fsum(len(s[0]) * s[3] for s in samples)
     if not samples or seconds < 2.0 * LEAST_BLOCK_S:
         return LadderFit(None, math.inf, (), seconds, 0)
