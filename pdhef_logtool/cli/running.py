@@ -134,7 +134,7 @@ def run(  # positional: one an option of the command line
     shared="plan reference gnss",
     car="Car of the log (position of the ground truth, friction, lowest speed)",
 )
-def metrics(
+def metrics(  # positional: one an option of the command line
     log: options.Log,
     config: RunConfig,
     estimate: Annotated[

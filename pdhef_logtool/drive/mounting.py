@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
@@ -51,7 +52,7 @@ from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSou
 from pdhef_logtool.mapping.frames import Placement, placement_of
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
 from pdhef_logtool.records.checks import Check
-from pdhef_logtool.records.signals import BoolArray, FloatArray
+from pdhef_logtool.records.signals import BoolArray, Channel, FloatArray
 
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 
@@ -405,16 +406,34 @@ class Survey:
     @cached_property
     def checks(self) -> tuple[Check, ...]:
         """The checks of the mounting with those of :func:`~pdhef_logtool.drive.checks.running.check_drive`."""
-        channels = self.channels
+        drive_checks = self._drive_checks(self.channels.truth, self.truth, self.latency, self.measured)
+        checks = (*self.mounted, *self._of_names(drive_checks), *drive_checks)
+        return checks if self.reread is None else self.reread(checks)
+
+    @cached_property
+    def sensor_checks(self) -> tuple[Check, ...]:
+        """The checks of the sensors by one another: ground truth must not decide what the estimators read."""
+        if not self.channels.truth:
+            return self.checks
+        measured = measure(self.channels.signals, {}, None, self.vehicle, self.mapping)
+        return (*self.mounted, *self._drive_checks({}, None, None, measured))
+
+    def _drive_checks(
+        self,
+        truth: Mapped[str, Channel],
+        derived: TruthTrack | None,
+        latency: LatencyEstimate | None,
+        measured: Measured,
+    ) -> tuple[Check, ...]:
         drive_checks = check_drive(
-            channels.signals,
-            channels.truth,
-            self.truth,
+            self.channels.signals,
+            truth,
+            derived,
             self.vehicle,
-            latency=self.latency,
+            latency=latency,
             late=self.late,
             mounting_is_known=self.is_mounted,
-            measured=self.measured,
+            measured=measured,
         )
         if self.mounting is not None and self.is_mounted:
             # Right axes have right signs, and gravity gives the unit.
@@ -425,8 +444,7 @@ class Survey:
                 k if c.verdict == "undecided" and c.name in settled else c
                 for c, k in zip(drive_checks, passed, strict=True)
             )
-        checks = (*self.mounted, *self._of_names(drive_checks), *drive_checks)
-        return checks if self.reread is None else self.reread(checks)
+        return drive_checks
 
     @cached_property
     def late(self) -> tuple[LateSensor, ...]:

@@ -163,9 +163,9 @@ def plan_drive(
         )
     else:
         alignment = no_alignment(survey.signals)
-    refused = misread_channels(looked_at.checks, waived)
-    if setup is not None:  # what it reads must not depend on later samples
-        refused = {name: reason for name, reason in refused.items() if name.startswith("truth.")}
+    refused = {n: why for n, why in misread_channels(looked_at.checks, waived).items() if n.startswith("truth.")}
+    if setup is None:  # what a set-up reads must not depend on later samples
+        refused |= misread_channels(looked_at.sensor_checks, waived)
     mapping, sound = without_refused_truth(mapping, refused), looked_at
     if mapping is not looked_at.mapping:
         sound = survey_log(log, mapping, clocks, span_ns, vehicle, rescale=False)

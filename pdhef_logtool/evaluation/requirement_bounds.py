@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
 
 from pdhef_logtool.records.signals import FloatArray
 
@@ -65,6 +64,8 @@ def pooled(
         return Bounded(value, value, value, n)
     deviations = _deviations(top, below, power, math.log(ratio) * power if log else ratio, log=log)
     tail = 0.5 * (1.0 - level)
+    from scipy.special import stdtrit
+
     most_deviation = _MOST_DEVIATION * float(stdtrit(len(top) - 1, 1.0 - tail))
     least, most = np.clip(np.quantile(deviations, [tail, 1.0 - tail]), -most_deviation, most_deviation)
     if log:

@@ -11,17 +11,18 @@ of the whitened distance of z, d² = zᵀ (Σ + ρ I)⁻¹ z over that of 98 % o
 
 from __future__ import annotations
 
-import math
 from functools import cached_property
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.slow_features import EVEN_COUNT, ODD_COUNT, SPEED_COLUMN, SlowFeatures
 from pdhef_logtool.storage.documents import digest
+
+if TYPE_CHECKING:
+    from pdhef_logtool.residual_model.ladder_kernels import LadderArrays
 
 NONE, LINEAR, RANDOM = RUNGS = ("none", "linear", "random")
 #: Squared distance, over that of 98 % of the drives, up to which the gain is 1, and from which on it is 0.
@@ -45,66 +46,6 @@ class Correction(NamedTuple):
     residual_rad: FloatArray
     std_rad: FloatArray
     gain: FloatArray
-
-
-class _Arrays(NamedTuple):
-    scale: FloatArray
-    odd_directions: FloatArray
-    even_directions: FloatArray
-    phases: FloatArray
-    weights: FloatArray
-    factor: FloatArray
-    whitening: FloatArray
-
-
-@njit(cache=True)
-def _features(z, e, odd_directions, even_directions, phases, out):  # type: ignore[no-untyped-def]
-    """Write the features of a step: z, then the random products."""
-    count = z.shape[0]
-    out[:count] = z
-    for j in range(phases.shape[0]):
-        a, b = 0.0, phases[j]
-        for i in range(count):
-            a += z[i] * odd_directions[j, i]
-        for i in range(e.shape[0]):
-            b += e[i] * even_directions[j, i]
-        out[count + j] = math.sqrt(2.0) * math.sin(a) * math.cos(b)
-
-
-@njit(cache=True)
-def _evaluate(odd, even, arrays, even_mean, even_scale, residual, std, distance2):  # type: ignore[no-untyped-def]
-    z, e, phi = np.empty(odd.shape[1]), np.empty(even.shape[1]), np.empty(arrays.weights.shape[0])
-    for k in range(odd.shape[0]):
-        residual[k], std[k], distance2[k] = 0.0, 0.0, math.nan
-        if not math.isfinite(odd[k].sum() + even[k].sum()):
-            continue
-        for i in range(z.shape[0]):
-            z[i] = odd[k, i] / arrays.scale[i]
-        for i in range(e.shape[0]):
-            e[i] = (even[k, i] - even_mean[i]) / even_scale[i]
-        _features(z, e, arrays.odd_directions, arrays.even_directions, arrays.phases, phi)
-        for i in range(phi.shape[0]):
-            residual[k] += phi[i] * arrays.weights[i]
-        variance = 0.0
-        for j in range(arrays.factor.shape[1]):
-            part = 0.0
-            for i in range(phi.shape[0]):
-                part += phi[i] * arrays.factor[i, j]
-            variance += part * part
-        std[k] = math.sqrt(variance)
-        distance2[k] = 0.0
-        for j in range(z.shape[0]):
-            part = 0.0
-            for i in range(z.shape[0]):
-                part += arrays.whitening[j, i] * z[i]
-            distance2[k] += part * part
-
-
-@njit(cache=True)
-def expand(z, e, odd_directions, even_directions, phases, out):  # type: ignore[no-untyped-def]
-    """Write the features of steps [K]: standardised odd ones z, even ones e, and ``out`` [K, 16 + random]."""
-    for k in range(z.shape[0]):
-        _features(z[k], e[k], odd_directions, even_directions, phases, out[k])
 
 
 class LadderModel(BaseModel):
@@ -157,11 +98,13 @@ class LadderModel(BaseModel):
         return digest(self.model_dump(mode="json"))
 
     @cached_property
-    def _arrays(self) -> _Arrays:
+    def _arrays(self) -> LadderArrays:
+        from pdhef_logtool.residual_model.ladder_kernels import LadderArrays
+
         def matrix(rows: tuple[tuple[float, ...], ...], columns: int) -> FloatArray:
             return np.array(rows, dtype=np.float64).reshape(len(rows), columns)
 
-        return _Arrays(
+        return LadderArrays(
             np.array(self.scale),
             matrix(self.odd_directions, ODD_COUNT),
             matrix(self.even_directions, EVEN_COUNT),
@@ -173,10 +116,12 @@ class LadderModel(BaseModel):
 
     def evaluate(self, features: SlowFeatures) -> Correction:
         """Return the residual at each step; where a feature is unknown it is 0 with gain 0."""
+        from pdhef_logtool.residual_model.ladder_kernels import evaluate
+
         count = len(features.odd)
         residual, std, distance2 = np.empty(count), np.empty(count), np.empty(count)
         even_mean, even_scale = np.array(self.even_mean), np.array(self.even_scale)
-        _evaluate(features.odd, features.even, self._arrays, even_mean, even_scale, residual, std, distance2)
+        evaluate(features.odd, features.even, self._arrays, even_mean, even_scale, residual, std, distance2)
         limit = LARGEST * self.largest_rad
         residual = np.clip(residual, -limit, limit)
         std = np.hypot(std, SHRINKAGE * residual)

@@ -20,9 +20,9 @@ from pdhef_logtool.residual_model.ladder import (
     REGION_RIDGE,
     Correction,
     LadderModel,
-    expand,
     plain,
 )
+from pdhef_logtool.residual_model.ladder_kernels import expand
 from pdhef_logtool.residual_model.slow_features import EVEN_COUNT, ODD_COUNT, SPEED_COLUMN, SlowFeatures
 
 #: Ridge parameters that are tried, in seconds of driving with features of variance 1. Blocks of the same drive favour

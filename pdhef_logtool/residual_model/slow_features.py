@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.residual_model.low_pass import low_pass
 
 ODD = ("steer_rad", "yaw_rate_rad_s", "ay_m_s2", "sideslip_rad")
 EVEN = ("speed_m_s", "ax_m_s2")
@@ -40,6 +39,8 @@ def slow_features(signals: FloatArray, dt_s: FloatArray, memory: FloatArray | No
     dt_s : [K], duration before each step; NaN where a sequence starts.
     memory : [4, 6], of the window before; None at the start of a log.
     """
+    from pdhef_logtool.residual_model.low_pass import low_pass  # compiled
+
     count = signals.shape[1]
     memory = np.zeros((len(TIME_CONSTANTS_S), count)) if memory is None else memory.copy()
     given = np.where(np.isfinite(signals).all(axis=1, keepdims=True), signals, np.nan)

@@ -666,7 +666,7 @@ def test_a_fitted_car_runs_on_its_values_and_on_signals_that_were_read_with_othe
     fitted = values.applied_to(own)
     assert (estimator.vehicle, estimator.read_with) == (fitted, own)
     assert resolve(adaptive).physics_sha256 == physics_sha256(fitted) != physics_sha256(own)
-    assert resolve(estimator).identity == resolve(physics_filter(fitted)).identity
+    assert resolve(estimator).identity == resolve(physics_filter(fitted, FilterNoise())).identity
     ours, _ = run_window(estimator, correct_signals(noisy, own))
     raw = replace(noisy, steer_rad=noisy.steer_rad * own.steering_ratio / 15.0)
     want, _ = run_window(physics_filter(fitted), correct_signals(raw, fitted), None)

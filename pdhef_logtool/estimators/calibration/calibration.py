@@ -48,6 +48,8 @@ LARGEST_SHARE, LARGEST_ERROR = 0.5, 1.0
 #: A fit is refused if the rear axle slides for so long and in so large a share of the driving: beyond this slip angle
 #: longitudinal slip, which the model lacks, decides the lateral force.
 SLIDING_RAD, SLIDING_S, SLIDING_SHARE = math.radians(8.0), 10.0, 0.2
+#: A stiffness is written to a car if the standard deviation of its logarithm is at most this.
+EXPORTED_STD = 0.16
 #: Directions of the posterior that an interval follows, at most.
 VARIED = 5
 #: Smallest difference of understeer gradients that is reported as a contradiction, rad/(m/s²).
@@ -283,7 +285,8 @@ def _refusal(calibration: SelfCalibration, drives: Sequence[Driving], sliding: f
             return f"the model leaves {share:.0%} of the {name}, at most {LARGEST_SHARE:.0%} is plausible"
     if sliding > SLIDING_SHARE and sliding * calibration.seconds > SLIDING_S:
         return f"the rear axle slides in {sliding:.0%} of the driving"
-    idle = [p.name for p in calibration.parameters if p.name in (FRONT_STIFFNESS, REAR_STIFFNESS) and not p.excited]
+    stiffness = [p for p in calibration.parameters if p.name in (FRONT_STIFFNESS, REAR_STIFFNESS)]
+    idle = [p.name for p in stiffness if p.sd > EXPORTED_STD]
     if exported and idle:
         return f"the driving does not excite the {' and the '.join(idle)}"
     return ""

@@ -393,6 +393,7 @@ def _measure(x, p, point, row, rear_m, store, k, used, trusted):  # type: ignore
     used[k] = m
 
 
+# positional: numbers and arrays of a compiled function.
 @njit(cache=True)
 def smooth(step_s, rows, rear_m, start, start_variance, noise, guess, iterations, tolerance_m_s):  # type: ignore[no-untyped-def]
     """Smooth a drive over its knots.
