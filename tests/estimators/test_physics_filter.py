@@ -669,7 +669,7 @@ def test_a_fitted_car_runs_on_its_values_and_on_signals_that_were_read_with_othe
     assert resolve(estimator).identity == resolve(physics_filter(fitted, FilterNoise())).identity
     ours, _ = run_window(estimator, correct_signals(noisy, own))
     raw = replace(noisy, steer_rad=noisy.steer_rad * own.steering_ratio / 15.0)
-    want, _ = run_window(physics_filter(fitted), correct_signals(raw, fitted), None)
+    want, _ = run_window(physics_filter(fitted, FilterNoise()), correct_signals(raw, fitted), None)
     np.testing.assert_allclose(ours.sideslip_rad, want.sideslip_rad, rtol=1e-9, atol=1e-12)
 
 

@@ -134,7 +134,7 @@ def test_masks_and_intervals_do_not_know_the_blocks(seed, rows, with_truth):
     signals, truth, _, _ = drive(seed)
     truth = truth if with_truth else None
     whole, moving = segment_masks(signals, truth, VEHICLE), moving_mask(signals, truth, VEHICLE)
-    events, spans = segment_events(signals, whole), find_intervals(signals, {"moving": moving})
+    events, spans = segment_events(signals, whole, ()), find_intervals(signals, {"moving": moving})
     with blocks_of(rows):
         parted = segment_masks(signals, truth, VEHICLE)
         np.testing.assert_array_equal(moving_mask(signals, truth, VEHICLE), moving)
