@@ -261,7 +261,8 @@ def compare_runs(
     )
     if not changed and not gated:
         return replace(result, damaged=damaged.lines)
-    grouping = _grouping(pairing, cluster, damaged) if changed else _Grouping()
+    asked = cluster not in (None, INDEPENDENT)
+    grouping = _grouping(pairing, cluster, damaged) if changed or asked else _Grouping()
     figures = tuple(tables.compared(gate.figures, grouping))
     tables.check_estimators(figures)
     if not changed:

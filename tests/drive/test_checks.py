@@ -219,7 +219,9 @@ def saloon(sample_logs_dir: Path) -> VehicleParameters:
 @pytest.mark.slow
 def test_a_sound_road_passes_everything(road: MappedChannels, saloon: VehicleParameters) -> None:
     checks = checked(road, saloon)
-    assert {c.verdict for c in checks} == {"passed"}
+    alone = {"roll_rate_rad_s", "pitch_rate_rad_s"}  # nothing else in the log measures them
+    assert {c.verdict for c in checks if c.subject not in alone} == {"passed"}
+    assert {c.verdict for c in checks if c.subject in alone} == {"undecided"}
     subjects = {c.subject for c in checks}
     truth = {"truth.vx_m_s", "truth.vy_m_s", "truth.yaw_rate_rad_s", "truth.sideslip_rad"}
     assert subjects == set(road.signals) | truth | {"vehicle"}

@@ -138,7 +138,7 @@ def test_masks_and_intervals_do_not_know_the_blocks(seed, rows, with_truth):
     with blocks_of(rows):
         parted = segment_masks(signals, truth, VEHICLE)
         np.testing.assert_array_equal(moving_mask(signals, truth, VEHICLE), moving)
-        assert segment_events(signals, parted) == events
+        assert segment_events(signals, parted, ()) == events
         assert find_intervals(signals, {"moving": moving}) == spans
     assert tuple(parted) == tuple(whole)
     for name in whole:
@@ -238,8 +238,8 @@ def test_scoring_a_stored_track_holds_few_columns(tmp_path, monkeypatch):
                 tracemalloc.stop()
     assert_same_rows(found, expected)
     assert all(np.array_equal(stored[name], masks[name]) for name in masks)
-    # What the estimates of a drive share of its truth, and what a block takes.
-    assert peak < 4 * truth.vx_m_s.nbytes
+    # What the estimates of a drive share of its truth, what a block takes, and masks of segments.
+    assert peak < 4 * truth.vx_m_s.nbytes + 2 * len(truth.vx_m_s)
 
 
 def test_a_truth_whose_square_is_beyond_floats_is_still_scored():

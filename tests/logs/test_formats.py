@@ -225,10 +225,10 @@ def test_a_fleet_of_tables_runs_in_several_processes(package: Path, npz: Path, t
         assert {m["metric"] for m in report["metrics"]} >= {"d2"}
         assert (folder / "report.html").stat().st_size > 10_000
         annotated = open_log(folder / "annotated.mcap")
-        assert {t.name for t in annotated.topics} == {
+        assert {t.name for t in annotated.topics} == {"/pdhef/log"} | {
             f"/pdhef/{name}/{kind}"
             for name in ("phy_ukf", "zero", "pd_hef", "reference")
-            for kind in ("state", "odometry")
+            for kind in ("state", "odometry", "plot", "path")
         }  # fmt: skip
         annotated.close()
     code, _, said = _pdhef(package, "events", out, "--where", "vx_m_s > 1", "--clip", "--source", logs / "one")

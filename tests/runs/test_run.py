@@ -17,8 +17,8 @@ from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
 from pdhef_logtool.estimators.table import SPECS, all_names
 from pdhef_logtool.records.errors import EstimatorError, LogError, MappingError, UsageError, VehicleError
 from pdhef_logtool.records.reporter import Reporter
+from pdhef_logtool.results import mcap_sink
 from pdhef_logtool.results.arrow_schema import load_schema
-from pdhef_logtool.runs import pipeline
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 
@@ -110,10 +110,10 @@ def test_documents_follow_their_schemas(dlc_run: Path, sample_logs_dir: Path) ->
     assert names == list(all_names(Car.load(sample_logs_dir / "vehicle.toml")))
 
 
-def test_of_a_long_drive_truth_answer_and_what_was_named_stand_at_every_stamp(
+def test_of_a_long_drive_the_selected_estimate_and_what_was_named_have_every_stamp(
     dlc_run: Path, sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipeline, "LONGEST_WHOLE_NS", 10**9)
+    monkeypatch.setattr(mcap_sink, "LONGEST_WHOLE_NS", 10**9)
 
     def counts(out: Path, *estimators: str) -> dict[str, int]:
         run_logs(
@@ -132,7 +132,7 @@ def test_of_a_long_drive_truth_answer_and_what_was_named_stand_at_every_stamp(
     assert named["/pdhef/zero/state"] == named["/pdhef/phy_ukf/state"] == named["/pdhef/truth/state"] == n
     every = counts(tmp_path / "all", "all")
     main = json.loads((tmp_path / "all/logs/dlc/report.json").read_text())["answer"]["main"].replace("-", "_")
-    assert every[f"/pdhef/{main}/state"] == every["/pdhef/truth/state"] == n
+    assert every[f"/pdhef/{main}/state"] == n and n / 10 < every["/pdhef/truth/state"] <= n / 4  # 20 a second
     others = {t: m for t, m in every.items() if main not in t and "truth" not in t}
     assert len(others) >= 8 and all(0 < m <= n / 20 + 1 for m in others.values())
     written = pl.read_parquet(tmp_path / "all/logs/dlc/estimates.parquet")
@@ -316,7 +316,8 @@ def test_impossible_readings_are_told(sample_logs_dir: Path, tmp_path: Path) -> 
         'field = "linear_acceleration.y"', 'field = "linear_acceleration.y"\nscale = 96.2361'
     )
     (tmp_path / "m.toml").write_text(in_g)
-    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("phy-ukf",))
+    checks = ("ay_m_s2.magnitude", "ay_m_s2.unit", "ay_m_s2.gain", "ay_m_s2.sign")
+    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("phy-ukf",), waived=checks)
     run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
     report = json.loads((tmp_path / "out/logs/dlc/report.json").read_text())
     told = [x for x in report["losses"] if x["kind"] == "impossible"]
