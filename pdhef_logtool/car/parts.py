@@ -110,11 +110,6 @@ class FittedValues(Record):
         return vehicle.model_copy(update=update)
 
 
-#: ``limit_gain`` of cars whose physics nobody identified. More lowers the error of single manoeuvres further; on laps
-#: with a wrong file kinematics then drift with bias and tilt (docs/method.md#limit).
-LIMIT_GAIN = 1.5
-
-
 class FilterNoise(Record):
     """Process and measurement 1-sigma of one filter, and what they were chosen with.
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pdhef_logtool.car.nominal_model import ModelParameters, dynamic_share, model_parameters
-from pdhef_logtool.car.parts import LIMIT_GAIN, PHYSICS, FilterNoise
+from pdhef_logtool.car.parts import PHYSICS, FilterNoise
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, corrected_anew
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.compiled.vectors import (
@@ -606,12 +606,9 @@ class PhysicsFilter(base.LinkedFilter):
 def physics_filter(
     vehicle: VehicleParameters, noise: FilterNoise | None = None, *, use_speed: bool = True
 ) -> PhysicsFilter:
-    """Return the filter with a noise; what that leaves out is :data:`PHYSICS_Q_STD` and the sensors' noise.
-
-    A car without any has :data:`LIMIT_GAIN`.
-    """
+    """Return the filter with a noise; what that leaves out is :data:`PHYSICS_Q_STD` and the sensors' noise."""
     if noise is None:
-        return PhysicsFilter(vehicle, limit_gain=LIMIT_GAIN, use_speed=use_speed)
+        return PhysicsFilter(vehicle, use_speed=use_speed)
     return PhysicsFilter(
         vehicle,
         q_std=(*noise.q_std, *PHYSICS_Q_STD[len(noise.q_std) :]),
