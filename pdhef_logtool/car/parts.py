@@ -110,6 +110,11 @@ class FittedValues(Record):
         return vehicle.model_copy(update=update)
 
 
+#: ``limit_gain`` of cars that no drive with ground truth has validated (docs/method.md#limit). More lowers the error of
+#: single manoeuvres further, but on laps with a wrong file kinematics then drift with bias and tilt.
+LIMIT_GAIN = 1.5
+
+
 class FilterNoise(Record):
     """Process and measurement 1-sigma of one filter, and what they were chosen with.
 

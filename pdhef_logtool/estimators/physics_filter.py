@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pdhef_logtool.car.nominal_model import ModelParameters, dynamic_share, model_parameters
-from pdhef_logtool.car.parts import PHYSICS, FilterNoise
+from pdhef_logtool.car.parts import LIMIT_GAIN, PHYSICS, FilterNoise
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, corrected_anew
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.compiled.vectors import (
@@ -621,12 +621,15 @@ def physics_filter(
 def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:
     """Return ``physics`` of a car, with what was found through it and its noise where the car has them.
 
-    A car without identified parts has none: a static single track with the sensors' noise. What tuned noise leaves
-    out of the process noise is what was found through the filter.
+    A car without identified parts has none: a static single track with the sensors' noise, and :data:`LIMIT_GAIN` if
+    no drive with ground truth has validated it. What tuned noise leaves out of the process noise is what was found
+    through the filter.
     """
     vehicle, noise = car.physics_vehicle, car.noise.get(PHYSICS)
     if noise is not None and car.fitted_physics is not None:
         fitted = car.fitted_physics.noise.q_std
         noise = noise.model_copy(update={"q_std": (*noise.q_std, *fitted[len(noise.q_std) :])})
     physics = physics_filter(vehicle, noise, use_speed=use_speed)
+    if noise is None and not car.has_evidence:
+        physics = replace(physics, limit_gain=LIMIT_GAIN)
     return physics if vehicle == car.vehicle else replace(physics, read_with=car.vehicle)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.parts import LIMIT_GAIN, FilterNoise
 from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
@@ -39,9 +39,6 @@ AY_STD = 1.0
 #: Process noise of ``physics`` on a calibrated car: PHYSICS_Q_STD with more for the axle forces, so that kinematics
 #: have more influence beyond the linear range, where the fitted tyres are least certain.
 Q_STD = (0.085, 0.12, 0.012, 0.086, 1.0, 1.0)
-#: Its growth beyond the linear range (docs/method.md#limit). More lowers the error of single manoeuvres further, but on
-#: laps with a wrong file kinematics then drift with bias and tilt.
-LIMIT_GAIN = 1.5
 #: Least driving above the low-speed limit; on line, growth of the driving from one calibration to the next, and the
 #: delay after which it applies, for gaps before its last sample may be interpolated.
 LEAST_S, ONLINE_GROWTH, ONLINE_DELAY_NS = 5.0, 1.5, 1_000_000_000
