@@ -231,7 +231,8 @@ class JointProblem:
         """Return residuals [2 K] with the weights that soft L1 gives to the errors ``centre``."""
         return np.asarray(self._weight * scaled / (1.0 + centre**2) ** 0.25, dtype=np.float64).ravel()
 
-    def _covariance(self, theta: FloatArray) -> FloatArray:
+    def _curvature(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the inverse curvature of the cost [n, n], and its gradient by block [blocks, n]."""
         centre = self.errors_of(theta)
         residuals = self._residuals(centre, centre)
         jacobian = np.empty((residuals.size, theta.size))
@@ -240,9 +241,13 @@ class JointProblem:
             moved[i] += DERIVATIVE_STEP
             jacobian[:, i] = (self._residuals(self.errors_of(moved), centre) - residuals) / DERIVATIVE_STEP
         inverse = np.linalg.inv(jacobian.T @ jacobian + np.eye(theta.size))
-        block, blocks = np.tile(self._block, 2), int(self._block.max()) + 1
-        gradients = np.zeros((blocks, theta.size))
-        np.add.at(gradients, block, jacobian * residuals[:, None])
+        gradients = np.zeros((int(self._block.max()) + 1, theta.size))
+        np.add.at(gradients, np.tile(self._block, len(centre)), jacobian * residuals[:, None])
+        return inverse, gradients
+
+    def _covariance(self, theta: FloatArray) -> FloatArray:
+        inverse, gradients = self._curvature(theta)
+        blocks = len(gradients)
         spread = gradients.T @ gradients * (blocks / max(blocks - 1, 1))
         shared = SHARED_SHARE**2 * np.eye(theta.size)
         return np.asarray(inverse + inverse @ spread @ inverse + shared, dtype=np.float64)

@@ -16,7 +16,6 @@ from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
 from pdhef_logtool.estimators.calibration.joint import (
-    DERIVATIVE_STEP,
     KEPT_STEPS,
     JointProblem,
     parameters_of,
@@ -32,7 +31,6 @@ BETWEEN_DRIVES = 0.8
 #: Mean over so many seconds that does not count. On simulated roads with bank, a constant alone doubles the sideslip
 #: error of other drives.
 SLOW_S = 4.0
-_CHANNELS = 3
 
 
 class TaughtProblem(JointProblem):
@@ -52,16 +50,7 @@ class TaughtProblem(JointProblem):
         return np.concatenate([errors, np.concatenate(rows)[None] / SIDESLIP_STD_RAD])
 
     def _covariance(self, theta: FloatArray) -> FloatArray:
-        centre = self.errors_of(theta)
-        residuals = self._residuals(centre, centre)
-        jacobian = np.empty((residuals.size, theta.size))
-        for i in range(theta.size):
-            moved = theta.copy()
-            moved[i] += DERIVATIVE_STEP
-            jacobian[:, i] = (self._residuals(self.errors_of(moved), centre) - residuals) / DERIVATIVE_STEP
-        inverse = np.linalg.inv(jacobian.T @ jacobian + np.eye(theta.size))
-        gradients = np.zeros((int(self._block.max()) + 1, theta.size))
-        np.add.at(gradients, np.tile(self._block, _CHANNELS), jacobian * residuals[:, None])
+        inverse, gradients = self._curvature(theta)
         spread = inverse @ gradients.T @ gradients @ inverse
         return np.asarray(inverse + spread + BETWEEN_DRIVES**2 * np.eye(theta.size), dtype=np.float64)
 
