@@ -240,7 +240,7 @@ class JointProblem:
             moved = theta.copy()
             moved[i] += DERIVATIVE_STEP
             jacobian[:, i] = (self._residuals(self.errors_of(moved), centre) - residuals) / DERIVATIVE_STEP
-        inverse = np.linalg.inv(jacobian.T @ jacobian + np.eye(theta.size))
+        inverse = np.asarray(np.linalg.inv(jacobian.T @ jacobian + np.eye(theta.size)), dtype=np.float64)
         gradients = np.zeros((int(self._block.max()) + 1, theta.size))
         np.add.at(gradients, np.tile(self._block, len(centre)), jacobian * residuals[:, None])
         return inverse, gradients
