@@ -134,10 +134,17 @@ class Browser:
         self.wait_for("document.documentElement.dataset.drawn !== undefined", end - time.monotonic())
 
     def wait_for(self, expression: str, wait_s: float = 30.0) -> None:
+        """Wait until the expression is true; between two pages it may raise (no document, a context that has gone)."""
         end = time.monotonic() + wait_s
-        while not self.value(expression):
+        while True:
+            try:
+                if self.value(expression):
+                    return
+                last = "false"
+            except RuntimeError as error:
+                last = str(error)
             if time.monotonic() > end:
-                raise TimeoutError(f"{expression}; {self.messages}")
+                raise TimeoutError(f"{expression}; {last}; {self.messages}")
             time.sleep(0.02)
 
     def value(self, expression: str):
