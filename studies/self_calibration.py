@@ -38,10 +38,10 @@ from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.selection import FACTOR
 from pdhef_logtool.runs.self_calibrating import log_sensors
 from studies.condition_drives import SIDESLIP, as_logged
-from studies.many_cars import BASE, KINDS, draw_car
+from studies.many_cars import BASE, KINDS, DrawnCar, draw_car
 from studies.pages import DRIVES, ROOT, number, table
 from truthsim.batch import sensor_noise
-from truthsim.drive import simulate_drive
+from truthsim.drive import Drive, simulate_drive
 from truthsim.vehicle_choice import choose_vehicle
 
 #: Manoeuvre, km/h, seconds (None: its own).
@@ -92,32 +92,43 @@ def make_wrong(vehicle: VehicleParameters, front: float, rear: float) -> Vehicle
     return vehicle.model_copy(update={"tyres": tyres})
 
 
+def draw(seed: int, index: int) -> tuple[np.random.Generator, DrawnCar, float, tuple[float, float]]:
+    """Return a car with its friction and the factors that make its file wrong, and the generator that drew them."""
+    rng = np.random.default_rng([seed, index])
+    car = draw_car(rng, load_vehicle(BASE), (*KINDS, "hatchback"))
+    front, rear = np.exp(rng.uniform(np.log(WRONG[0]), np.log(WRONG[1]), 2))
+    return rng, car, float(rng.choice(FRICTIONS)), (float(front), float(rear))
+
+
+def drive_of(
+    car: DrawnCar, friction: float, rng: np.random.Generator, manoeuvre: str, speed: float, duration_s: float | None
+) -> Drive:
+    """Simulate a drive of a drawn car; raises SimulationError where it cannot be driven."""
+    return simulate_drive(
+        manoeuvre,
+        speed_km_h=speed,
+        friction=friction,
+        seed=int(rng.integers(2**31)),
+        duration_s=duration_s,
+        vehicle=choose_vehicle(car.text),
+        vehicle_name=car.text,
+        noise=sensor_noise(dict(car.sensors)),
+    )
+
+
 def simulate(cars: int, seed: int, driven: Sequence[tuple[str, float, float | None]] = DRIVEN) -> list[Simulated]:
     """Return the drives of the cars; one that cannot be driven is left out, with a message."""
     drives_of_cars = []
     for index in range(cars):
-        rng = np.random.default_rng([seed, index])
-        car = draw_car(rng, load_vehicle(BASE), (*KINDS, "hatchback"))
-        front, rear = np.exp(rng.uniform(np.log(WRONG[0]), np.log(WRONG[1]), 2))
-        friction = float(rng.choice(FRICTIONS))
+        rng, car, friction, factors = draw(seed, index)
         file = car.vehicle.model_copy(update={"friction": friction})
         for manoeuvre, speed, duration_s in driven:
             try:
-                drive = simulate_drive(
-                    manoeuvre,
-                    speed_km_h=speed,
-                    friction=friction,
-                    seed=int(rng.integers(2**31)),
-                    duration_s=duration_s,
-                    vehicle=choose_vehicle(car.text),
-                    vehicle_name=car.text,
-                    noise=sensor_noise(dict(car.sensors)),
-                )
+                drive = drive_of(car, friction, rng, manoeuvre, speed, duration_s)
             except SimulationError as error:
                 say(f"car {index}, {manoeuvre} is left out: {error}")
                 continue
-            logged = as_logged(drive, Car.of(file))
-            drives_of_cars.append(Simulated(index, manoeuvre, logged, file, (float(front), float(rear))))
+            drives_of_cars.append(Simulated(index, manoeuvre, as_logged(drive, Car.of(file)), file, factors))
     return drives_of_cars
 
 
