@@ -80,6 +80,7 @@ class WithoutTruth:
     ``varied`` : the vehicle one posterior 1-sigma away, in independent directions. ``driven_d2_m_s`` : v̇_y residual of
     ``physics`` on the log, the part that correlates with the driving, NaN if unknown. ``earlier`` : what applied
     before, in time order, where the log calibrates its car as it goes on; each applies from its ``since_ns``.
+    ``causal`` : whether it depends on nothing that follows ``since_ns``.
     """
 
     vehicle: VehicleParameters
@@ -90,6 +91,7 @@ class WithoutTruth:
     driven_d2_m_s: float = math.nan
     since_ns: int = 0
     earlier: tuple[WithoutTruth, ...] = ()
+    causal: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

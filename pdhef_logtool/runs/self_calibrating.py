@@ -31,15 +31,17 @@ if TYPE_CHECKING:
 
 #: Squares are summed window by window, over spans that no window cuts: another length would be another figure.
 _WINDOW_S = 600.0
-_NEEDS = ("steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
+_NEEDS = ("steer_rad", "yaw_rate_rad_s", "speed_m_s")
 
 
 def calibrate_drive(drive: Drive, config: RunConfig) -> SelfCalibration | None:
-    """Return what a drive states of its car; None where nobody asks or the log lacks a sensor for it."""
-    if config.calibrate == "off" or not _asked(config, drive.car) or lacking(drive):
+    """Return what a drive states of its car, its prior where the log lacks a sensor for more; None if nobody asks."""
+    if config.calibrate == "off" or not _asked(config, drive.car):
         return None
-    from pdhef_logtool.estimators.calibration.calibration import calibrate_online, self_calibrate
+    from pdhef_logtool.estimators.calibration.calibration import calibrate_online, prior_calibration, self_calibrate
 
+    if lacking(drive):
+        return prior_calibration(drive.car.vehicle, drive.car.taught_prior)
     if config.calibrate == "online":
         return calibrate_online(read_driving(drive), drive.car.vehicle, taught=drive.car.taught_prior)
     return self_calibrate([read_driving(drive)], drive.car.vehicle, taught=drive.car.taught_prior)
@@ -109,8 +111,11 @@ def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
     """Return the car of a drive with what was found, unless it was refused."""
     if calibration is None or calibration.refused:
         return drive.car
-    online = "its car is calibrated on what the log has shown so far, without ground truth"
-    note = online if calibration.earlier else "not causal: car calibrated on the whole log, without ground truth"
+    causal, note = bool(calibration.earlier), "not causal: car calibrated on the whole log, without ground truth"
+    if causal:
+        note = "its car is calibrated on what the log has shown so far, without ground truth"
+    elif not calibration.parameters:
+        causal, note = True, calibration.text
 
     def applied(stage: SelfCalibration) -> WithoutTruth:
         return WithoutTruth(
@@ -122,6 +127,7 @@ def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
             driven_d2_m_s=stage.driven_d2_m_s,
             since_ns=stage.since_ns,
             earlier=tuple(map(applied, stage.earlier)),
+            causal=causal,
         )
 
     return replace(drive.car, self_calibrated=applied(calibration))
