@@ -286,7 +286,8 @@ def begin_step(sample, rules, memory):  # type: ignore[no-untyped-def]
         memory[M_STEER_AGE] += 0.0 if restart else sample.dt
     steer_ok = steers or (memory[M_INITIALISED] > 0.0 and memory[M_STEER_AGE] <= rules.steer_hold_s)
     if not rules.needs_steer:
-        steers = steers or memory[M_STEER_AGE] > rules.steer_hold_s
+        lateral = math.isfinite(sample.yaw_rate) or math.isfinite(sample.ay)
+        steers = steers or (memory[M_STEER_AGE] > rules.steer_hold_s and lateral)
         steer_ok = True
     has_ax = math.isfinite(sample.ax)
     friction = sample.friction

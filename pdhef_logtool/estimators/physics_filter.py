@@ -444,9 +444,9 @@ def _filter(window, tuning, limit_gain, layout, p, f, estimate, out, links):  # 
         if guessed and not unknown:
             _find_steering(x, P, initial_std[STEER_BIAS])
             guessed, factored = False, False
-        q_std[STEER_BIAS] = steer_std
-        if unknown:
-            q_std[STEER_BIAS] = UNKNOWN_STEER_WALK if P[STEER_BIAS, STEER_BIAS] <= MAX_STEER_STD**2 else 0.0
+        q_std[STEER_BIAS] = UNKNOWN_STEER_WALK if unknown else steer_std
+        if unknown and x[VX] < p.blend_high_m_s and P[STEER_BIAS, STEER_BIAS] > UNKNOWN_STEER_STD**2:
+            q_std[STEER_BIAS] = 0.0  # a slow car shows no steering
         there[STEER_BIAS] = guessed or not hidden
         if memory[base.M_INITIALISED] == 0.0:
             factored = False
@@ -504,10 +504,11 @@ def _filter(window, tuning, limit_gain, layout, p, f, estimate, out, links):  # 
                 if memory[base.M_STILL] >= rules.still_after_s:
                     factored = False
                 alive = _finite(x, P)
-            # without steering, a_y and yaw rate nothing is known of the motion
-            out_valid[k] = alive and not (unknown and P[STEER_BIAS, STEER_BIAS] > MAX_STEER_STD**2)
+            # Without steering, a_y and yaw rate nothing determines the motion: the filter ends, and waits for them.
+            determined = alive and not (unknown and P[STEER_BIAS, STEER_BIAS] > MAX_STEER_STD**2)
+            out_valid[k] = determined
             out_diverged[k] = not alive or base.diverges(rules, x, memory)
-            if not alive:
+            if not determined:
                 memory[base.M_INITIALISED] = 0.0
             elif linked and memory[base.M_STILL] < rules.still_after_s:
                 out_link[k] = LINK_WHOLE

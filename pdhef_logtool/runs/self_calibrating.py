@@ -127,29 +127,36 @@ def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
             driven_d2_m_s=stage.driven_d2_m_s,
             since_ns=stage.since_ns,
             earlier=tuple(map(applied, stage.earlier)),
+            cg_std_m=drive.car.cg_std_m,
             causal=causal,
         )
 
     return replace(drive.car, self_calibrated=applied(calibration))
 
 
-def log_sensors(vehicle: VehicleParameters, calibration: SelfCalibration | None) -> SensorErrors:
+def log_sensors(
+    vehicle: VehicleParameters, calibration: SelfCalibration | None, *, told_friction: bool = True
+) -> SensorErrors:
     """Return what the sensors of a log have that was read with a vehicle: as calibrated on it, else as its file states.
 
-    What is refused for its tyres is no worse for its sensors.
+    What is refused for its tyres is no worse for its sensors. ``told_friction`` : whether that of the signals is given.
     """
-    from pdhef_logtool.estimators.calibration.joint import AY_BIAS, AY_GAIN, IMU_X, RATE_BIAS
+    from pdhef_logtool.estimators.calibration.joint import AY_BIAS, AY_GAIN, IMU_X, RATE_BIAS, STEER_DELAY
     from pdhef_logtool.evaluation.metrics.metric import SensorErrors
 
     if calibration is None or not calibration.parameters:
         gain = 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2
-        return SensorErrors(ay_gain=gain, lever_m=vehicle.imu_position_m[0])
+        return SensorErrors(ay_gain=gain, lever_m=vehicle.imu_position_m[0], vehicle=vehicle)
     fitted = {p.name: p.value for p in calibration.parameters}
     return SensorErrors(
         ay_bias_m_s2=fitted[AY_BIAS] - vehicle.sensors.ay_bias_m_s2,
         yaw_rate_bias_rad_s=fitted[RATE_BIAS] - vehicle.sensors.yaw_rate_bias_rad_s,
         ay_gain=fitted[AY_GAIN],
         lever_m=fitted[IMU_X],
+        vehicle=vehicle if calibration.refused else calibration.vehicle,
+        read_with=vehicle,
+        steer_delay_s=0.0 if calibration.refused else fitted[STEER_DELAY],
+        friction=None if told_friction else calibration.vehicle.assumed_friction,
     )
 
 
