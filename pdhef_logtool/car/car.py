@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pdhef_logtool.car.assumed_values import AssumedValue
+from pdhef_logtool.car.assumed_values import DEFAULT_CG_SPREAD, AssumedValue
 from pdhef_logtool.car.parts import (
     PHYSICS,
     FilterNoise,
@@ -29,7 +29,7 @@ from pdhef_logtool.car.parts import (
 )
 from pdhef_logtool.car.taught import Taught, TaughtParameter
 from pdhef_logtool.car.toml_files import VehicleFile, read_vehicle_file, with_sensors
-from pdhef_logtool.car.vehicle import Record, VehicleParameters, default_vehicle
+from pdhef_logtool.car.vehicle import DEFAULT_VEHICLE_NAME, Record, VehicleParameters, default_vehicle
 from pdhef_logtool.records.errors import UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
@@ -80,6 +80,7 @@ class WithoutTruth:
     ``varied`` : the vehicle one posterior 1-sigma away, in independent directions. ``driven_d2_m_s`` : v̇_y residual of
     ``physics`` on the log, the part that correlates with the driving, NaN if unknown. ``earlier`` : what applied
     before, in time order, where the log calibrates its car as it goes on; each applies from its ``since_ns``.
+    ``causal`` : whether it depends on nothing that follows ``since_ns``. ``cg_std_m`` : as :attr:`Car.cg_std_m`.
     """
 
     vehicle: VehicleParameters
@@ -90,6 +91,8 @@ class WithoutTruth:
     driven_d2_m_s: float = math.nan
     since_ns: int = 0
     earlier: tuple[WithoutTruth, ...] = ()
+    causal: bool = False
+    cg_std_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -268,6 +271,14 @@ class Car:
         fitted = bool(self.learnt_on) or self.fitted_physics is not None
         tried = self.trust is not None and self.trust.has_evidence and not self._other_than_tried
         return fitted or tried
+
+    @property
+    def cg_std_m(self) -> float:
+        """1-sigma of the distance from the rear axle to the centre of gravity where no file gives it; else 0."""
+        share = next((a.spread for a in self.assumed if a.entry == "front_weight_share"), 0.0)
+        if self.source is None and self.datasheet.name == DEFAULT_VEHICLE_NAME:
+            share = DEFAULT_CG_SPREAD
+        return share * self.datasheet.cg_to_rear_axle_m
 
     @property
     def calibrated_car(self) -> Car:

@@ -367,7 +367,7 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
 def _score(job: _Job, store: TrackStore, signals: Signals) -> Evaluation:
     """Score the stored tracks; add the events of an estimated friction and a contradiction as a note of the drive."""
     drive = job.drive
-    sensors = log_sensors(drive.car.vehicle, job.calibration)
+    sensors = log_sensors(drive.car.vehicle, job.calibration, told_friction=drive.friction.bank is None)
     scored = evaluate(drive, [e.name for e in job.ready], store.read, signals, sensors)
     if drive.friction.bank is not None:
         observable = friction_events(drive.friction, signals)
