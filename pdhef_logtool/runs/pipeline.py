@@ -518,7 +518,7 @@ def _choose_estimators(
     Candidates for the selected estimate run in any case. Raises EstimatorError if no requested estimator can.
     """
     names = config.estimators or default_names(car, drive.available)
-    options, refused = Options(drive.options.use_speed), drive.plan.refused
+    options, refused = Options(drive.options.use_speed, gnss=config.gnss == "auto"), drive.plan.refused
     estimators, skipped = runnable(names, car, drive.available, options, refused)
     requested = frozenset(e.name for e in estimators)
     more = [name for name in candidates(car, drive.available) if name not in requested]
