@@ -35,7 +35,7 @@ from pdhef_logtool.drive.frames import (
 )
 from pdhef_logtool.drive.measured import Measured, measure
 from pdhef_logtool.drive.other_fields import with_other_fields
-from pdhef_logtool.drive.relations import gentle_at, steering_references, units_told, yaw_references
+from pdhef_logtool.drive.relations import gentle_at, steering_references, yaw_references
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
     TruthPlan,
@@ -50,6 +50,7 @@ from pdhef_logtool.drive.truth import (
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, fit_clocks, read_signals
 from pdhef_logtool.mapping.frames import Placement, placement_of
+from pdhef_logtool.mapping.hypotheses import units_told
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import BoolArray, Channel, FloatArray
