@@ -32,7 +32,6 @@ from pdhef_logtool.mapping import (
     Mapping,
     QualityGate,
     SignalSource,
-    check_mapping,
     clock_key,
     fit_clocks,
     mapping_of,
@@ -43,6 +42,7 @@ from pdhef_logtool.mapping import (
     resolve_mapping,
 )
 from pdhef_logtool.mapping.candidates import Candidate
+from pdhef_logtool.mapping.choosing import choose_mapping
 from pdhef_logtool.mapping.clocks import sources_by_clock, survey_windows
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.records.checks import Check
@@ -287,8 +287,7 @@ def inspect_drive_log(
         auto = recognise(log, prefer_truth=prefer_truth)
         mapping, ambiguities, candidates = auto.mapping, auto.ambiguities, auto.candidates
     else:
-        check_mapping(given, log)
-        mapping = given
+        mapping = choose_mapping(log, given, prefer_truth=prefer_truth, require_signals=False).mapping
     mapping = resolve_mapping(log, mapping)
     head = (log.start_ns, min(log.end_ns, log.start_ns + WINDOW_NS))
     whole = _Look(windows(log.start_ns, log.end_ns, WINDOW_NS, log.recording_span), tuple(t.name for t in log.topics))
