@@ -117,7 +117,7 @@ def mapping_of(given: Mapping | Path | str | None) -> Mapping | None:
 
 
 def load_mapping(path: Path | str) -> Mapping:
-    """Read mapping.toml, or those of a folder, of which each log takes the one that is for its recorder.
+    """Read mapping.toml, or the mappings of a folder, from which each log takes that of its recorder.
 
     Raises
     ------

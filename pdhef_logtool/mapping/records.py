@@ -175,7 +175,7 @@ class Mapping:
     fill_recognised : what the file does not name is taken from recognised types.
     checks : what stays undecided of fields that were taken by their names.
     file : it was read from. recorder : type by topic of the logs that it is for.
-    recorders : of a folder, the mappings of which a log takes the one that is for its recorder.
+    recorders : the mappings of a folder; a log takes that of its recorder.
     """
 
     signals: dict[str, SignalSource] = field(default_factory=dict)
