@@ -507,10 +507,6 @@ def _clock_notes(mapping: Mapping, clocks: dict[str, ClockModel]) -> list[str]:
     return notes
 
 
-def _inverse(seconds: float) -> float:
-    return 1.0 / seconds if math.isfinite(seconds) and seconds > 0.0 else float("nan")
-
-
 # ------------------------------------------------------------------------------------------------ mapping
 
 
