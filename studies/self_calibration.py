@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -41,7 +41,8 @@ from studies.condition_drives import SIDESLIP, as_logged
 from studies.many_cars import BASE, KINDS, draw_car
 from studies.pages import DRIVES, ROOT, number, table
 from truthsim.batch import sensor_noise
-from truthsim.drive import simulate_drive
+from truthsim.drive import Drive, simulate_drive
+from truthsim.sensors import SensorNoise
 from truthsim.vehicle_choice import choose_vehicle
 
 #: Manoeuvre, km/h, seconds (None: its own).
@@ -81,7 +82,13 @@ class Simulated:
 
 def simulate(cars: int, seed: int, driven: Sequence[tuple[str, float, float | None]] = DRIVEN) -> list[Simulated]:
     """Return the drives of the cars; one that cannot be driven is left out, with a message."""
-    drives_of_cars = []
+    return [simulated for simulated, _, _ in simulated_drives(cars, seed, driven)]
+
+
+def simulated_drives(
+    cars: int, seed: int, driven: Sequence[tuple[str, float, float | None]], **sensors: float
+) -> Iterator[tuple[Simulated, Drive, SensorNoise]]:
+    """Yield what :func:`simulate` returns, with the drive as it is simulated and its sensors; ``sensors`` are given."""
     for index in range(cars):
         rng = np.random.default_rng([seed, index])
         car = draw_car(rng, load_vehicle(BASE), (*KINDS, "hatchback"))
@@ -89,6 +96,7 @@ def simulate(cars: int, seed: int, driven: Sequence[tuple[str, float, float | No
         friction = float(rng.choice(FRICTIONS))
         file = car.vehicle.model_copy(update={"friction": friction})
         for manoeuvre, speed, duration_s in driven:
+            noise = sensor_noise(dict(car.sensors) | sensors)
             try:
                 drive = simulate_drive(
                     manoeuvre,
@@ -98,14 +106,13 @@ def simulate(cars: int, seed: int, driven: Sequence[tuple[str, float, float | No
                     duration_s=duration_s,
                     vehicle=choose_vehicle(car.text),
                     vehicle_name=car.text,
-                    noise=sensor_noise(dict(car.sensors)),
+                    noise=noise,
                 )
             except SimulationError as error:
                 say(f"car {index}, {manoeuvre} is left out: {error}")
                 continue
             logged = as_logged(drive, Car.of(file))
-            drives_of_cars.append(Simulated(index, manoeuvre, logged, file, (float(front), float(rear))))
-    return drives_of_cars
+            yield Simulated(index, manoeuvre, logged, file, (float(front), float(rear))), drive, noise
 
 
 def calibrate(signals: Signals, file: VehicleParameters) -> SelfCalibration:

@@ -75,7 +75,8 @@ _OPTIONS: dict[str, Any] = {
         Option(
             "--mapping",
             "-m",
-            help="mapping.toml, which maps fields to signals. Default: recognised by message type, name and unit.",
+            help="mapping.toml, which maps fields to signals, or a folder with one per recorder. Default: recognised "
+            "by message type, name and unit.",
             rich_help_panel=INPUT,
         ),
     ],

@@ -808,7 +808,7 @@ def check_places(
     cars: Sequence[Path | None] = (),
 ) -> None:
     """Refuse to write over what is read; raises UsageError."""
-    can = () if mapping is None or mapping.can is None else mapping.can.dbc
+    can = () if mapping is None else mapping.dbc
     files = [] if output is None else [output / name for name in (METRICS_FILE, RUN_FILE, PAGE_FILE)]
     folders = [] if output is None else [output / log_place(i.stem) for i in inputs]
     files += [folder / name for folder in folders for name in LOG_FILES]
