@@ -160,6 +160,17 @@ class DriveDetails:
     operating_space: Sequence[Cell]
     metadata: Mapping[str, str]
     largest_errors: Sequence[LargestError] = ()
+    friction_median: float | None = None
+
+    @property
+    def space(self) -> dict[str, Any]:
+        """The operating space as JSON-able values."""
+        return {
+            "speed_edges_m_s": SPEED_EDGES_M_S,
+            "ay_edges_m_s2": AY_EDGES_M_S2,
+            "cells": self.operating_space,
+            "friction_median": self.friction_median,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +247,7 @@ class LogOutcome:
     ``failed`` is the one-line reason if nothing came out; ``lost`` states what of the log could not be used.
     ``main``: the estimator of the selected estimate. ``folder`` of the log, below the folder of the run.
     ``algorithms``: the identity of each estimator that ran. ``files``: sha256 by name of the files in the log's folder
-    that commands read back.
+    that commands read back. ``day`` (UTC) and ``route``: drives that share them depend on one another.
     """
 
     log: str
@@ -252,6 +263,8 @@ class LogOutcome:
     folder: str = ""
     algorithms: Mapping[str, str] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
+    day: str | None = None
+    route: str | None = None
 
     @property
     def outcome(self) -> str:
@@ -358,12 +371,11 @@ def _selected(document: Mapping[str, Any], main: MainFacts | None, details: Driv
 
 def _detailed(details: DriveDetails) -> dict[str, Any]:
     """Return the keys that only a run writes."""
-    space = {"speed_edges_m_s": SPEED_EDGES_M_S, "ay_edges_m_s2": AY_EDGES_M_S2, "cells": details.operating_space}
     values = {
         "faults": details.faults,
         "innovations": details.innovations,
         "error_budget": details.error_budget,
-        "operating_space": space,
+        "operating_space": details.space,
         "metadata": dict(details.metadata),
         "largest_errors": details.largest_errors,
     }
@@ -463,6 +475,8 @@ def build_run(
                 "algorithms": o.algorithms,
                 "car": o.car,
                 "files": o.files,
+                "day": o.day,
+                "route": o.route,
             }
             for o in outcomes
         ],

@@ -67,9 +67,16 @@ def drive_details(
         standings=[] if truth is None else standings(main, _rivals(ready, by_name[main], read), read, truth, slow),
         error_budget=no_budget(_LEFT_OUT) if brief else _budget(drive, by_name.get(PHYSICS), read, signals),
         operating_space=operating_space(signals, truth, answer, slow),
+        friction_median=_friction(signals, drive.car.vehicle.assumed_friction),
         metadata=_metadata(drive),
         largest_errors=[] if truth is None else _largest_errors(answer, truth, slow),
     )
+
+
+def _friction(signals: Signals, assumed: float) -> float:
+    """Return the median friction of a drive."""
+    known = signals.friction[np.isfinite(signals.friction)]
+    return float(np.median(known)) if known.size else assumed
 
 
 def _faults(read: _Read, name: str) -> tuple[SensorFault, ...] | None:
