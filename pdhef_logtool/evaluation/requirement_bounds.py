@@ -2,7 +2,7 @@
 
 The pooled statistic uses the studentised bootstrap (Efron & Tibshirani 1993, chapter 12) of the logarithm: errors of
 drives are skewed, so that percentile intervals of few drives are too low. Below ``_LOGNORMAL`` drives the upper bound
-is at least that of lognormal errors (Zou, Taleban & Huo 2009, CSDA 53, 3755): few drives do not show their tail. Drives
+is at least halfway to that of lognormal errors (Zou, Taleban & Huo 2009, CSDA 53, 3755): few drives lack a tail. Drives
 of one day, car or route widen both by the design effect. Both sides use half of 1 − confidence.
 """
 
@@ -91,7 +91,8 @@ def pooled(
     if not log:
         return Bounded(value, value - below_s, value + above_s, n, effect)
     if factors is not None and others is None and LEAST_DRIVES <= n < _LOGNORMAL and (values > 0.0).all():
-        above_s = max(above_s, scale * _lognormal_excess(values, 1.0 if squares else 0.5, tail))
+        # The mean of both: that of lognormal errors alone is wide where few drives differ much.
+        above_s += 0.5 * max(scale * _lognormal_excess(values, 1.0 if squares else 0.5, tail) - above_s, 0.0)
     return Bounded(value, value * math.exp(-below_s), value * math.exp(min(above_s, _MOST_LOG)), n, effect)
 
 

@@ -91,8 +91,10 @@ class Requirement:
 
     @property
     def unit(self) -> str:
-        """Unit of its value: that of the metric, or 1 for a ratio."""
-        return "1" if self.baseline is not None else registered()[self.metric].unit_of(self.signal)
+        """Unit of its value: that of the metric, 1 for a ratio, ``share`` of coverage and availability."""
+        if self.baseline is not None:
+            return "1"
+        return "share" if self.metric in AT_LEAST else registered()[self.metric].unit_of(self.signal)
 
     @property
     def measured(self) -> str:
@@ -145,6 +147,8 @@ class ValidationPlan:
 def shown(value: float, unit: str) -> str:
     """Return a value with its unit as people read it."""
     text, factor = read_unit(unit)
+    if unit == "share":
+        return f"{100.0 * value:.3g} %"
     if unit == "1":
         return f"{value:.3g}"
     return f"{value * factor:.3g}{'' if text.startswith('°') else ' '}{text}"

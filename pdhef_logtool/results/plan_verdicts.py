@@ -13,6 +13,7 @@ from pdhef_logtool.evaluation.metrics.sensor_residuals import SENSORS
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks, from_document
 from pdhef_logtool.evaluation.requirement_bounds import LEAST_DRIVES
 from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, RequirementVerdict, gates, judge
+from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import POOLED, RUN, Requirement, ValidationPlan, names_of
 from pdhef_logtool.records.tracks import REFERENCE
 from pdhef_logtool.results.sink import TRUTH
@@ -307,4 +308,5 @@ def _why_missing(
         return f"no scored driving in {requirement.segment}"
     if requirement.estimator is not None and not any(requirement.estimator in n for n in figures.names.values()):
         return f"{requirement.estimator} did not run: add it to --estimators"
-    return f"no ground truth of {requirement.signal}"
+    above = " above the low-speed limit" if requirement.signal == "sideslip_rad" else ""
+    return f"no ground truth of {LABELS[requirement.signal]}{above}"

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.compiled.sources import compiled_digest
+from pdhef_logtool.evaluation.dead_reckoned import PathDrift
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S, Cell
@@ -161,6 +162,7 @@ class DriveDetails:
     metadata: Mapping[str, str]
     largest_errors: Sequence[LargestError] = ()
     friction_median: float | None = None
+    path_drift: PathDrift | None = None
 
     @property
     def space(self) -> dict[str, Any]:
@@ -376,6 +378,7 @@ def _detailed(details: DriveDetails) -> dict[str, Any]:
         "innovations": details.innovations,
         "error_budget": details.error_budget,
         "operating_space": details.space,
+        "path_drift": details.path_drift,
         "metadata": dict(details.metadata),
         "largest_errors": details.largest_errors,
     }
