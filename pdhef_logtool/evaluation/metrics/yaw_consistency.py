@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from pdhef_logtool.car.nominal_model import model_parameters, yaw_rates_at
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, corrected_anew
-from pdhef_logtool.evaluation.blocks import SegmentMasks, SegmentSums, blocks_with_halo
+from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
+from pdhef_logtool.evaluation.blocks import SegmentSums, blocks_with_halo, packed
 from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, OfDrive, SensorErrors
 from pdhef_logtool.evaluation.metrics.sensor_residuals import MAX_STEP_S, carried_speed
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
@@ -16,8 +16,6 @@ from pdhef_logtool.records.tracks import StateTrack
 
 #: The yaw rate forgets its start within this time.
 SETTLE_S = 2.0
-#: Tyres are least certain beyond this share of the grip, and for some time after it.
-LINEAR_SHARE, LINEAR_S = 0.4, 0.5
 
 
 def _rows(drive: EvaluatedDrive) -> list[MetricRow]:
@@ -25,11 +23,12 @@ def _rows(drive: EvaluatedDrive) -> list[MetricRow]:
 
 
 def yaw_rows(
-    tracks: Sequence[StateTrack], signals: Signals, masks: SegmentMasks, *, log: str, sensors: SensorErrors
+    tracks: Sequence[StateTrack], signals: Signals, masks: Mapping[str, BoolArray], *, log: str, sensors: SensorErrors
 ) -> list[MetricRow]:
     """Return the figure of estimators at the same stamps as the signals [N], one row per segment."""
     if sensors.vehicle is None:
         return []
+    masks = packed(masks, len(signals))
     sums_by_track = [SegmentSums() for _ in tracks]
     for first, a, b, end in blocks_with_halo(signals, SETTLE_S, 1):
         core, inside = slice(a - first, b - first), dict(masks.rows(a, b))
@@ -61,18 +60,8 @@ def yaw_residual(track: StateTrack, signals: Signals, vehicle: VehicleParameters
     vy = np.where(track.valid, track.vy_m_s, np.nan)
     modelled = np.full(len(t), np.nan)
     inputs = (dt, carried_speed(signals), vy, steer, friction, read.yaw_rate_rad_s)
-    yaw_rates_at(inputs, model_parameters(vehicle), modelled)
-    residual = modelled - read.yaw_rate_rad_s
-    residual[~_linear(signals, friction)] = np.nan
-    return residual
-
-
-def _linear(signals: Signals, friction: FloatArray) -> BoolArray:
-    """Return where [N] the car has been in the linear range of its tyres for a while."""
-    t = signals.stamps_ns
-    beyond = np.abs(signals.ay_m_s2) > LINEAR_SHARE * GRAVITY_M_S2 * friction
-    last = np.maximum.accumulate(np.where(beyond, t, t[:1] - round(2e9 * LINEAR_S)))
-    return np.asarray(t - last > round(LINEAR_S * 1e9), dtype=np.bool_)
+    yaw_rates_at(inputs, max(vehicle.relaxation_length_m, 0.01), model_parameters(vehicle), modelled)
+    return modelled - read.yaw_rate_rad_s
 
 
 METRICS = (
@@ -80,7 +69,7 @@ METRICS = (
         "yaw_consistency",
         "yaw consistency",
         "signal `yaw_rate_rad_s`: RMS of the gyro minus the yaw rate that the car's tyres have at the estimated v_y "
-        "and the measured steering, above the low-speed blend and up to 40 % of the grip; tyres, steering and gyro "
+        "and the measured steering, above the low-speed blend; tyres, steering and gyro "
         "bias as the log calibrated them",
         OfDrive(_rows),
         best="lower",
