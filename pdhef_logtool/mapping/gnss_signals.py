@@ -64,10 +64,13 @@ def _receiver(fields: str, *signals: tuple[str, str, float, float], heading: str
 
 _SPEED, _COURSE_NAME, _FIX = "gnss_speed_m_s", "gnss_course_rad", "gnss_fix_type"
 _LATITUDE, _LONGITUDE = "gnss_latitude_deg", "gnss_longitude_deg"
+#: Course of a single antenna beside the heading of two: a sensor, even of an instrument that is ground truth.
+RAW_COURSE = "heading_raw"
 _VELOCITY_ACCURACY, _POSITION_ACCURACY = "gnss_velocity_accuracy_m_s", "gnss_position_accuracy_m"
-#: gps_common/GPSFix; u-blox NAV-PVT in the drivers' spellings, NAV-VELNED; NovAtel BESTVEL in those of its drivers;
-#: Septentrio PVTGeodetic; NovAtel INSPVA; sensor_msgs/NavSatFix. Scales as documented: mm/s, cm/s, deg clockwise from
-#: north, uncertainties of 95 % or twice the RMS.
+#: gps_common/GPSFix; u-blox NAV-PVT in the drivers' spellings, NAV-VELNED, NAV-POSLLH; Piksi VelNed, PosLlh; raw
+#: columns of a VBO file; NovAtel BESTVEL in the spellings of its drivers; Septentrio PVTGeodetic; NovAtel INSPVA;
+#: sensor_msgs/NavSatFix. Scales as documented: mm/s, cm/s, km/h, 1e-7 deg, deg clockwise from north, mm, uncertainties
+#: of 95 % or twice the RMS.
 RECEIVERS = (
     _receiver(
         "track speed err_track err_horz",
@@ -83,6 +86,8 @@ RECEIVERS = (
         "vel_n vel_e g_speed h_acc",
         (_EAST, "vel_e", 1e-3, 0.0),
         (_NORTH, "vel_n", 1e-3, 0.0),
+        (_LATITUDE, "lat", 1e-7, 0.0),
+        (_LONGITUDE, "lon", 1e-7, 0.0),
         (_FIX, "fix_type", 1.0, 0.0),
         (_FIX, "gps_fix.fix_type", 1.0, 0.0),
         (_VELOCITY_ACCURACY, "s_acc", 1e-3, 0.0),
@@ -92,6 +97,8 @@ RECEIVERS = (
         "velN velE gSpeed hAcc",
         (_EAST, "velE", 1e-3, 0.0),
         (_NORTH, "velN", 1e-3, 0.0),
+        (_LATITUDE, "lat", 1e-7, 0.0),
+        (_LONGITUDE, "lon", 1e-7, 0.0),
         (_FIX, "fixType", 1.0, 0.0),
         (_VELOCITY_ACCURACY, "sAcc", 1e-3, 0.0),
         (_POSITION_ACCURACY, "hAcc", 1e-3, 0.0),
@@ -102,6 +109,25 @@ RECEIVERS = (
         (_NORTH, "vel_n", 1e-2, 0.0),
         (_VELOCITY_ACCURACY, "s_acc", 1e-2, 0.0),
     ),
+    _receiver(
+        "lat lon h_msl h_acc v_acc",
+        (_LATITUDE, "lat", 1e-7, 0.0),
+        (_LONGITUDE, "lon", 1e-7, 0.0),
+        (_POSITION_ACCURACY, "h_acc", 1e-3, 0.0),
+    ),
+    _receiver(
+        "n e d h_accuracy n_sats",
+        (_EAST, "e", 1e-3, 0.0),
+        (_NORTH, "n", 1e-3, 0.0),
+        (_VELOCITY_ACCURACY, "h_accuracy", 1e-3, 0.0),
+    ),
+    _receiver(
+        "lat lon height h_accuracy n_sats",
+        (_LATITUDE, "lat", 1.0, 0.0),
+        (_LONGITUDE, "lon", 1.0, 0.0),
+        (_POSITION_ACCURACY, "h_accuracy", 1e-3, 0.0),
+    ),
+    _receiver("speed_raw heading_raw", (_SPEED, "speed_raw", 1.0 / 3.6, 0.0), (_COURSE_NAME, RAW_COURSE, *_COURSE)),
     _receiver("hor_speed trk_gnd", (_SPEED, "hor_speed", 1.0, 0.0), (_COURSE_NAME, "trk_gnd", *_COURSE)),
     _receiver("hor_spd trk_gnd", (_SPEED, "hor_spd", 1.0, 0.0), (_COURSE_NAME, "trk_gnd", *_COURSE)),
     _receiver(

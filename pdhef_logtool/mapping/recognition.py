@@ -14,7 +14,7 @@ from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.candidates import Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.clocks import with_usable_stamps
-from pdhef_logtool.mapping.gnss_signals import gnss_signals, has_heading, receiver_signals
+from pdhef_logtool.mapping.gnss_signals import RAW_COURSE, gnss_signals, has_heading, receiver_signals
 from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, length_of, speed_over_ground
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
@@ -23,7 +23,7 @@ from pdhef_logtool.mapping.navigation import named_gnss, navigation_truth
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.mapping.weighing import Weighed, weigh
-from pdhef_logtool.records.signals import WHEELS, FloatArray, has_gnss
+from pdhef_logtool.records.signals import WHEELS, FloatArray, has_gnss, has_position
 
 #: Words of a topic's name that make it a reference to score against; never an input.
 TRUTH_WORDS = frozenset(
@@ -359,12 +359,15 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
     """Take GNSS as a sensor: of ground truth without heading, else of a receiver that is not ground truth."""
     draft.signals |= gnss_signals(draft.signals, draft.truth)
     instruments = {_device(source.topic) for source in draft.truth.values()} if has_heading(draft.truth) else set()
-    topics = [t for t in topics if not _words(t.name) & TRUTH_WORDS and _device(t.name) not in instruments]
+    topics = [t for t in topics if not _words(t.name) & TRUTH_WORDS]
     receivers = [
         receiver_signals(t.name, stamp_path_of(fields), {f.path for f in fields})
         for t in topics
-        if not _type(t).startswith(NO_SENSORS) and (fields := draft.log.fields(t.name, quiet=True))
+        if not _type(t).startswith(NO_SENSORS)
+        if (fields := draft.log.fields(t.name, quiet=True))
+        if _device(t.name) not in instruments or has_path(fields, RAW_COURSE)
     ]
+    topics = [t for t in topics if _device(t.name) not in instruments]
     for signals in sorted(receivers, key=lambda s: not has_gnss(s)):
         if has_gnss(signals) if not has_gnss(draft.signals) else not set(signals) & set(draft.signals):
             draft.signals |= signals
@@ -372,6 +375,8 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
         _map_twist(draft, topics)
         if has_gnss(draft.signals):
             draft.signals |= next((signals for signals in receivers if signals and not has_gnss(signals)), {})
+        elif not has_heading(draft.truth):
+            draft.signals |= next((signals for signals in receivers if has_position(signals)), {})
 
 
 def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
