@@ -9,7 +9,7 @@ error of the filter's v_y, antenna x, delay of the receiver] from
 with d of unit variance and S the uncertainty of the hypothesis, and from the velocity of the antenna across the
 heading. That of a late sample is the present one less what the sensors have integrated since. The likelihood of the
 GNSS samples, forgotten within seconds, weighs the hypotheses, as in :mod:`~.adaptive_physics`: where GNSS does not
-contradict the filter, its estimate stays. A sample outside of the gate speaks for the filter: multipath.
+contradict the filter, its estimate stays. Samples between a jump against the sensors and one back are not used.
 """
 
 from __future__ import annotations
@@ -45,13 +45,18 @@ STATES = 7
 #: Uncertainty of the filter's v_y over v_x in degrees: constant, per m/s², per m/s³, per square of the share of the
 #: grip beyond the linear range; and the logarithm of the prior weight. Chosen on simulated drives.
 HYPOTHESES = np.array(
-    [[0.01, 0.0, 0.0, 0.0, 0.0], [0.06, 0.02, 0.02, 30.0, -5.0], [1.0, 0.3, 0.1, 30.0, -7.0]],
+    [
+        [0.01, 0.0, 0.0, 0.0, 0.0],
+        [0.06, 0.02, 0.02, 30.0, -5.5],
+        [1.0, 0.3, 0.1, 30.0, -9.0],
+        [10.0, 0.3, 0.1, 30.0, -13.0],
+    ]
 )
 #: 1-sigma of a GNSS velocity at least, m/s; gate in 1-sigmas; a heading that every sample contradicts for as long is
 #: found anew, s.
 GNSS_STD_M_S, GATE_SIGMA, LOST_S = 0.1, 4.0, 20.0
-#: Time constant with which the likelihood is forgotten, s.
-FORGET_S = 5.0
+#: Time constant with which the likelihood is forgotten, s; jump of a GNSS velocity against the sensors, m/s.
+FORGET_S, JUMP_M_S = 5.0, 0.3
 #: Slower, a velocity shows no course, m/s.
 LEAST_SPEED_M_S = 3.0
 #: Height of an antenna over the roll axis and its 1-sigma, m.
@@ -70,7 +75,9 @@ _GATE = GATE_SIGMA**2
 _LAW = HYPOTHESES * np.array([math.pi / 180.0] * 4 + [1.0])
 
 # Entries of what all hypotheses share, and columns of a sample that waits.
-_CLOCK, _RATE, _AY, _VX, _VY, _TURNED, _MOVED, _SIZE, _SLOPE, _GRIP, _RUNS, _FIRST, _END = range(13)
+_CLOCK, _RATE, _AY, _VX, _TURNED, _MOVED, _SIZE, _SLOPE, _GRIP, _RUNS, _LEFT, _LAST, _JUMP, _SINCE, _FIRST, _END = (
+    range(16)
+)
 _EAST, _NORTH, _AT, _ARRIVAL, _TURNED_THEN, _MOVED_THEN, _RATE_THEN, _AY_THEN, _ROLL_THEN, _STD = range(10)
 
 
@@ -136,8 +143,8 @@ def _advance(x, P, dt, vx, ay_slope, kinematic):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _use(x, P, facts, sample, shared, h):  # type: ignore[no-untyped-def]
-    """Update one hypothesis with a GNSS velocity that has arrived."""
+def _residual(x, P, facts, sample, shared, h):  # type: ignore[no-untyped-def]
+    """Return residual and variances, the sample's and in all, of a GNSS velocity across the heading; Jacobian in h."""
     age = shared[_CLOCK] - sample[_AT]
     turned = shared[_TURNED] - sample[_TURNED_THEN] - age * x[RATE_BIAS]
     moved = shared[_MOVED] - sample[_MOVED_THEN] - age * (x[AY_BIAS] - x[RATE_BIAS] * shared[_VX])
@@ -151,21 +158,48 @@ def _use(x, P, facts, sample, shared, h):  # type: ignore[no-untyped-def]
     h[:] = 0.0
     h[VY], h[HEADING] = 1.0, c * sample[_EAST] + s * sample[_NORTH]
     h[ANTENNA_X], h[DELAY] = rate, -sample[_AY_THEN]
-    error = c * sample[_NORTH] - s * sample[_EAST] - left
-    variance = sample[_STD] ** 2
+    white = sample[_STD] ** 2 + (BIAS_M_S2 * age) ** 2
+    variance = white
     for i in range(STATES):
         for j in range(STATES):
             variance += h[i] * P[i, j] * h[j]
+    return c * sample[_NORTH] - s * sample[_EAST] - left, white, variance
+
+
+@njit(cache=True)
+def _use(x, P, facts, sample, shared, h, doubt):  # type: ignore[no-untyped-def]
+    """Update one hypothesis with a GNSS velocity; return the residual left. ``doubt``: cost of not fitting."""
+    error, white, variance = _residual(x, P, facts, sample, shared, h)
     square = error * error / variance
     facts[0] -= 0.5 * (min(square, _GATE) + math.log(variance))
     if square <= _GATE:
         facts[2] = -1.0
-        correct(x, P, h, error, sample[_STD] ** 2)
-        return 0.0
+        correct(x, P, h, error, white)
+        return error * white / variance
+    facts[0] -= doubt
     facts[2] = shared[_CLOCK] if facts[2] < 0.0 else facts[2]
     if shared[_CLOCK] - facts[2] > LOST_S:
         facts[1], facts[2] = 0.0, -1.0
-    return 1.0
+    return error
+
+
+@njit(cache=True)
+def _has_jumped(error, sample, shared, facts):  # type: ignore[no-untyped-def]
+    """Return whether GNSS is between a jump against the sensors and one back (multipath), for ``LOST_S`` at most."""
+    change = error - shared[_LEFT]
+    limit = JUMP_M_S + 0.02 * abs(sample[_AY_THEN]) + 0.5 * (sample[_AT] - shared[_LAST]) + abs(sample[_ROLL_THEN])
+    limit += 0.3 * abs(sample[_RATE_THEN])  # an error of v_x becomes one of v_y
+    shared[_LAST] = sample[_AT]
+    if shared[_JUMP] == 0.0 and abs(change) > limit:
+        shared[_JUMP], shared[_SINCE] = change, shared[_CLOCK]
+    elif abs(change + shared[_JUMP]) < 0.5 * abs(shared[_JUMP]):
+        shared[_JUMP] = 0.0
+    elif shared[_JUMP] != 0.0 and shared[_CLOCK] - shared[_SINCE] > LOST_S:
+        shared[_JUMP], shared[_LEFT] = 0.0, 0.0
+        facts[:, 1] = 0.0
+        return True
+    shared[_LEFT] = error
+    return shared[_JUMP] != 0.0
 
 
 @njit(cache=True)
@@ -215,7 +249,8 @@ def _mixture(x, P, facts, vy, out, k):  # type: ignore[no-untyped-def]
         most = max(most, facts[i, 0] + _LAW[i, 4])
     total, mean, variance = 0.0, 0.0, 0.0
     for i in range(x.shape[0]):
-        weight = math.exp(facts[i, 0] + _LAW[i, 4] - most)
+        known = i == 0 or facts[i, 1] > 0.0  # without a heading GNSS states nothing
+        weight = math.exp(facts[i, 0] + _LAW[i, 4] - most) if known else 0.0
         total += weight
         if i > 0:
             mean += weight * (x[i, VY] - vy)
@@ -262,9 +297,10 @@ def _aid(columns, car, memory, out):  # type: ignore[no-untyped-def]
             if sample[_ARRIVAL] > shared[_CLOCK] + ready[k]:
                 break
             shared[_FIRST] += 1.0
-            for i in range(x.shape[0]):
-                rejected = _use(x[i], P[i], facts[i], sample, shared, h)
-                facts[i, 0] -= rejected if i > 0 else 0.0
+            error, _, _ = _residual(x[-1], P[-1], facts[-1], sample, shared, h)
+            if not _has_jumped(error, sample, shared, facts):
+                for i in range(x.shape[0]):
+                    shared[_LEFT] = _use(x[i], P[i], facts[i], sample, shared, h, min(i, 1))
         _mixture(x, P, facts, vy[k], out, k)
 
 
