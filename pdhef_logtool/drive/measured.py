@@ -124,7 +124,11 @@ def drive_columns(
     if "truth.x_m" in columns and "truth.y_m" in columns:
         vx, vy = derivative(columns.pop("truth.x_m")), derivative(columns.pop("truth.y_m"))
         columns["truth.position_speed_m_s"] = np.hypot(vx, vy)
-        columns["truth.course_rate_rad_s"] = _turning(vx, vy)
+        course = _turning(vx, vy)
+        if "truth.vx_m_s" in columns and "truth.vy_m_s" in columns:  # the sideslip turns as well, in a spin above all
+            slip = _turning(columns["truth.vx_m_s"], columns["truth.vy_m_s"])
+            course -= np.where(np.isfinite(slip), slip, 0.0)
+        columns["truth.course_rate_rad_s"] = course
     return columns, _speed_of(columns)
 
 

@@ -29,7 +29,7 @@ SIDESLIP_RANGE = (0.5, 2.0)
 COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
 #: Of ground truth ahead of the rear axle. Ground truth that is near that axle gives no information: its lever may
 #: be of any sign.
-REAR_LEVER_M = (1.0, 12.0)
+REAR_LEVER_M, REAR_LEVER_TYPICAL_M = (1.0, 12.0), 1.6
 #: Beyond, sideslip times lateral acceleration is no longer small beside the derivative of the speed.
 STRAIGHT_M_S2 = 3.0
 #: Rim speed over ground speed, 5 % of slip and 5 % of radius; angular over rim speed, wheels of 4 cm to 80 cm radius.
@@ -360,14 +360,13 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     sideslip = columns.get("truth.sideslip_rad", np.arctan2(vy, vx))
     moving, ones = _moving(columns, vx), np.ones_like(ay)
     text = f"ay_m_s2 - v_x r against the derivative of {subject}"
-    kinematic = _partial(
-        text, {subject: -1, "ay_m_s2": 1}, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving
-    )
+    of_vx = subject != "truth.sideslip_rad"  # the sideslip is then v_y over v_x, else v_y is v_x times its tangent
+    powers = {subject: -1, "ay_m_s2": 1} | ({} if of_vx else {"truth.vx_m_s": -1})
+    kinematic = _partial(text, powers, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving)
     with np.errstate(divide="ignore", invalid="ignore"):
         curvature = rate / vx
     text = f"{subject} against -ay_m_s2, apart from curvature"
     gentle = gentle_at(vx * rate, moving)
-    of_vx = subject != "truth.sideslip_rad"  # the sideslip is then v_y over v_x
     powers = {subject: 1, "ay_m_s2": -1} | ({"truth.vx_m_s": -1} if of_vx else {})
     handling = _partial(text, powers, -ay, sideslip, [curvature, ones], gentle)
     text = f"{subject} against curvature, apart from a_y"
@@ -376,7 +375,7 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     return [
         *(replace(r, expected=SIDESLIP_RANGE) for r in kinematic),
         *(replace(r, expected=COMPLIANCE_RAD_PER_M_S2) for r in handling),
-        *(replace(r, expected=REAR_LEVER_M) for r in rolling if abs(r.gain) > REAR_LEVER_M[0]),
+        *(replace(r, expected=REAR_LEVER_M, typical=REAR_LEVER_TYPICAL_M) for r in rolling if abs(r.gain) > REAR_LEVER_M[0]),
     ]
 
 

@@ -7,14 +7,13 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from collections.abc import Mapping as MappingABC
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.drive.checks.running import misread_channels
 from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_proposals
 from pdhef_logtool.logs.byte_account import checksummed_share
@@ -166,6 +165,7 @@ class Inspection:
     checks : what physics states of signals and ground truth. proposals : corrections of the mapping that are certain.
     lost : every loss and note of reading. sample : what was looked at; None: everything.
     checksummed_share : which share of the bytes that were read a verified checksum covers; None where none was read.
+    refused : by channel why a run computes nothing from it.
     """
 
     path: str
@@ -186,13 +186,13 @@ class Inspection:
     candidates: tuple[Candidate, ...] = ()
     sample: Sample | None = None
     checksummed_share: float | None = None
+    refused: MappingABC[str, str] = field(default_factory=dict)
 
     @property
     def uses(self) -> MappingABC[str, str]:
         """What the log is good for (``can``), and what it lacks for sideslip (``sideslip_needs``, may be empty)."""
-        refused = misread_channels(self.checks)
-        signals = {n: s for n, s in self.mapping.signals.items() if n not in refused}
-        truth = {n: s for n, s in self.mapping.truth.items() if f"truth.{n}" not in refused}
+        signals = {n: s for n, s in self.mapping.signals.items() if n not in self.refused}
+        truth = {n: s for n, s in self.mapping.truth.items() if f"truth.{n}" not in self.refused}
         return uses_of(replace(self.mapping, signals=signals, truth=truth))
 
     @property
@@ -319,6 +319,7 @@ def inspect_drive_log(
         candidates=candidates,
         sample=None if look.sample is None else look.sample(),
         checksummed_share=checksummed_share(log.byte_ledgers),
+        refused=looked_at.refused(),
     )
 
 
