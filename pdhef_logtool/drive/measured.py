@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
-from pdhef_logtool.drive.columns import columns_on_grid, derivative, halves, moving_at
-from pdhef_logtool.drive.relations import measured_relations
+from pdhef_logtool.drive.columns import columns_on_grid, derivative, halves
+from pdhef_logtool.drive.relations import direction_rate, measured_relations
 from pdhef_logtool.drive.truth import TruthTrack, channel_of
 from pdhef_logtool.mapping.hypotheses import Posterior, Relation, known_hypotheses, posterior
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
@@ -124,11 +124,7 @@ def drive_columns(
     if "truth.x_m" in columns and "truth.y_m" in columns:
         vx, vy = derivative(columns.pop("truth.x_m")), derivative(columns.pop("truth.y_m"))
         columns["truth.position_speed_m_s"] = np.hypot(vx, vy)
-        course = _turning(vx, vy)
-        if "truth.vx_m_s" in columns and "truth.vy_m_s" in columns:  # the sideslip turns as well, in a spin above all
-            slip = _turning(columns["truth.vx_m_s"], columns["truth.vy_m_s"])
-            course -= np.where(np.isfinite(slip), slip, 0.0)
-        columns["truth.course_rate_rad_s"] = course
+        columns["truth.course_rate_rad_s"] = direction_rate(vx, vy)
     return columns, _speed_of(columns)
 
 
@@ -142,13 +138,3 @@ def _speed_of(columns: dict[str, FloatArray]) -> str | None:
             columns[WHEEL_SPEEDS] = np.asarray(np.mean(wheels, axis=0))
             return WHEEL_SPEEDS
     return "truth.vx_m_s" if "truth.vx_m_s" in columns else None
-
-
-def _turning(vx: FloatArray, vy: FloatArray) -> FloatArray:
-    ax, ay = derivative(vx), derivative(vy)
-    speed = np.hypot(vx, vy)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rate = (vx * ay - vy * ax) / speed**2
-    # Slower, the noise of a position turns the path.
-    with np.errstate(invalid="ignore"):
-        return np.where(moving_at(speed) & (speed > 1.0), rate, np.nan)

@@ -150,6 +150,7 @@ class Hypothesis:
         names = {"wheels" if n.startswith("wheel_speed") else n for n in self.factors}
         ranks = [_OFTEN_WRONG.index(n) if n in _OFTEN_WRONG else len(_OFTEN_WRONG) for n in names]
         seldom = 0.0 if max(ranks) < 2 else _SELDOM + _SELDOM_STEP * max(ranks)
+        seldom *= 2.0 if self.kind == "foreign" else 1.0
         return PRIORS[self.kind] + seldom + 0.5 * (len(names) - 1) + (0.0 if self.is_exact else 0.5)
 
     def acts_on(self, relation: Relation) -> float:
@@ -236,7 +237,8 @@ def known_hypotheses(names: Sequence[str], together: Sequence[tuple[str, ...]] =
     out: list[Hypothesis] = []
     groups = [[n for n in group if n in names] for group in together]
     parts = [part for group in groups for size in range(2, len(group) + 1) for part in combinations(group, size)]
-    for part in (*((n,) for n in names), *dict.fromkeys(parts)):
+    # The mean of the wheels is no signal.
+    for part in (*((n,) for n in names if n != "wheel_speeds"), *dict.fromkeys(parts)):
         words = _together(part)
         is_one = len(part) == 1
         units = units_of(part[0].removeprefix("truth."))
@@ -249,7 +251,7 @@ def known_hypotheses(names: Sequence[str], together: Sequence[tuple[str, ...]] =
         if is_one:
             both = "and has the wrong sign"
             out += [Hypothesis({part[0]: -f}, f"{words} {text} {both}", "sign and unit") for f, text in units]
-        if is_one or words.startswith("wheel"):
+        if is_one or (words.startswith("wheel") and list(part) in groups):
             out.append(Hypothesis(dict.fromkeys(part, math.nan), words, "field"))
         # A sensor is mounted upside down or backwards, or ground truth has another convention; speeds count ahead.
         if is_one or not _NEVER_TURNED & set(part):
