@@ -17,6 +17,8 @@ from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
 
 #: Name of the column that is the mean of the wheel speeds.
 WHEEL_SPEEDS = "wheel_speeds"
+#: A wheel differs from the others by less in a bend; one that spins or locks counts with this.
+SPIN_SHARE = 0.2
 
 _TRUTH = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m")
 
@@ -129,12 +131,14 @@ def drive_columns(
 
 
 def _speed_of(columns: dict[str, FloatArray]) -> str | None:
-    """Return the name of the column used as the speed; the wheels' is added, since one alone turns in bends."""
+    """Return the name of the column used as the speed; the wheels' is added: one alone turns in bends, or spins."""
     if "speed_m_s" in columns:
         return "speed_m_s"
     for unit in ("m_s", "rad_s"):
         wheels = [columns[n] for w in WHEELS if (n := f"wheel_speed_{w}_{unit}") in columns]
         if wheels:
-            columns[WHEEL_SPEEDS] = np.asarray(np.mean(wheels, axis=0))
+            middle = np.median(wheels, axis=0)
+            most = SPIN_SHARE * np.abs(middle)
+            columns[WHEEL_SPEEDS] = np.asarray(np.mean(np.clip(wheels, middle - most, middle + most), axis=0))
             return WHEEL_SPEEDS
     return "truth.vx_m_s" if "truth.vx_m_s" in columns else None

@@ -111,13 +111,14 @@ class Relation:
         with np.errstate(divide="ignore"):
             size = np.log(np.abs(gains))
         room = -math.log(max(abs(self.correlation), 1e-3))  # between the two regressions
+        # Blocks that differ show what changes: sliding, a frequency that tyres do not follow; a unit does not change.
+        apart = float(np.std(size)) if np.isfinite(size).all() else 0.0
         beyond = np.maximum(np.maximum(low - room - size, size - high - room), 0.0)
-        beyond /= EDGE if self.decides_unit else WIDE_EDGE
-        energy = 0.5 * beyond**2
+        energy = 0.5 * (beyond / math.hypot(EDGE if self.decides_unit else WIDE_EDGE, apart)) ** 2
         if self.decides_unit:
             middle = math.log(self.typical) if low < math.log(self.typical) < high else 0.5 * (low + high)
-            off = np.maximum(np.abs(size - middle) - room, 0.0) / max((high - low) / 6.0, LEAST_WIDTH)
-            energy = energy + 0.5 * off**2
+            off = np.maximum(np.abs(size - middle) - room, 0.0)
+            energy += 0.5 * (off / math.hypot(max((high - low) / 6.0, LEAST_WIDTH), apart)) ** 2
         energy = np.minimum(energy, MOST_ENERGY)
         return float(np.mean(energy if self.signless else np.where(gains > 0.0, energy, MOST_ENERGY)))
 
