@@ -19,7 +19,7 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.toml_files import load_vehicle
-from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import DrivingReader
@@ -78,19 +78,6 @@ class Simulated:
         """Return the sideslip error [N] of an estimate in rad, NaN where it is not scored."""
         assert self.drive.truth is not None
         return signal_error(track, self.drive.truth, SIDESLIP, self.file.low_speed_blend_m_s)
-
-
-def make_wrong(vehicle: VehicleParameters, front: float, rear: float) -> VehicleParameters:
-    """Return a vehicle with the stiffness of its axles multiplied; peaks stay."""
-
-    def tyre(of: AxleTyre, factor: float) -> AxleTyre:
-        if of.B is not None:
-            return of.model_copy(update={"B": factor * of.B})
-        assert of.cornering_stiffness_n_per_rad is not None
-        return of.model_copy(update={"cornering_stiffness_n_per_rad": factor * of.cornering_stiffness_n_per_rad})
-
-    tyres = Tyres(front=tyre(vehicle.tyres.front, front), rear=tyre(vehicle.tyres.rear, rear))
-    return vehicle.model_copy(update={"tyres": tyres})
 
 
 def simulate(cars: int, seed: int, driven: Sequence[tuple[str, float, float | None]] = DRIVEN) -> list[Simulated]:
@@ -194,7 +181,7 @@ class Outcome:
 
 def outcome_of(simulated: Simulated) -> Outcome:
     """Run a drive with its files."""
-    wrong = make_wrong(simulated.file, *simulated.factors)
+    wrong = simulated.file.with_stiffness(*simulated.factors)
     calibration, from_right = (
         calibrate(simulated.drive.signals, wrong),
         calibrate(simulated.drive.signals, simulated.file),

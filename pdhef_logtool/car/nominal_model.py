@@ -126,6 +126,27 @@ def state_derivative(vx, vy, r, steer, ax, friction, p):  # type: ignore[no-unty
 
 
 @njit(cache=True)
+def yaw_rates_at(inputs, p, out):  # type: ignore[no-untyped-def]
+    """Write the yaw rate [N] that the model has with a v_y that is given, where all inputs are known and it is dynamic.
+
+    ``inputs`` [N] each: step before the sample, v_x, v_y, steering, friction and measured yaw rate, from which the
+    model starts.
+    """
+    dt, vx, vy, steer, friction, measured = inputs
+    r = math.nan
+    for k in range(dt.shape[0]):
+        whole = vx[k] > p.blend_high_m_s and math.isfinite(vy[k] + steer[k]) and dt[k] >= 0.0
+        if not whole or not math.isfinite(r):
+            r = measured[k] if whole else math.nan
+            continue
+        n = 2 * substeps(vx[k], dt[k], friction[k], p)
+        for _ in range(n):
+            _, _, r_dot = state_derivative(vx[k], vy[k], r, steer[k], 0.0, friction[k], p)
+            r += dt[k] / n * r_dot
+        out[k] = r
+
+
+@njit(cache=True)
 def planar_lateral_acceleration(vx, vy, r, steer, friction, p):  # type: ignore[no-untyped-def]
     """Return the lateral acceleration at the centre of gravity in m/s²; v_x r in the kinematic range."""
     w = dynamic_share(vx, p)

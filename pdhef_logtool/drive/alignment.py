@@ -246,11 +246,13 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
     }
     stamps = _grid_stamps(channels, plan, start_ns - margin, end_ns)
     columns = {p.target: np.full(stamps.shape[0], np.nan) for p in plan.channels}
-    ready = stamps.copy()
+    ready, gnss_ready = stamps.copy(), stamps.copy()
     for p in plan.channels:
         if p.name in usable and stamps.size:
             values, arrival = _to_grid(usable[p.name], p, stamps, _ns(_max_gap_s(plan.grid_period_s)))
             columns[p.target] = p.scale * values if p.scale != 1.0 else values
+            if p.name.startswith(GNSS):
+                np.maximum(gnss_ready, arrival, out=gnss_ready)
             if p.name not in _TILT_RATES and (not p.name.startswith(GNSS) or plan.speed_from == "GNSS"):
                 np.maximum(ready, arrival, out=ready)
     ready = np.maximum.accumulate(ready)
@@ -275,6 +277,7 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
         available=plan.available,
         gnss_velocity_m_s=velocity[inside].copy(),
         gnss_velocity_std_m_s=columns.get("gnss_velocity_accuracy_m_s", missing)[inside].copy(),
+        gnss_late_s=np.where(np.isfinite(velocity[inside, 0]), (gnss_ready - stamps)[inside] * 1e-9, np.nan),
         gnss_position_deg=np.stack([columns.get(name, missing)[inside] for name in GNSS_POSITION], axis=1),
         gnss_position_std_m=columns.get("gnss_position_accuracy_m", missing)[inside].copy(),
         **made,

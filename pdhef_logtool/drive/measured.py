@@ -9,8 +9,9 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.columns import columns_on_grid, derivative, halves, moving_at
-from pdhef_logtool.drive.relations import Relation, measured_relations
+from pdhef_logtool.drive.relations import measured_relations
 from pdhef_logtool.drive.truth import TruthTrack, channel_of
+from pdhef_logtool.mapping.hypotheses import Posterior, Relation, known_hypotheses, posterior
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
 
@@ -55,6 +56,11 @@ class Measured:
         gone = set(names)
         columns = {n: c for n, c in self.columns.items() if n not in gone}
         return replace(self, columns=columns, topics={n: t for n, t in self.topics.items() if n not in gone})
+
+    def posterior(self, *, mounting_is_known: bool) -> Posterior:
+        """Return the probabilities of the mistakes that mappings make with these signals."""
+        groups = self.groups(mounting_is_known=mounting_is_known)
+        return posterior(self.relations, known_hypotheses(list(self.columns), groups))
 
     def groups(self, *, mounting_is_known: bool) -> list[tuple[str, ...]]:
         """Return the signals whose signs or units are wrong together: those of one topic, and of ground truth."""

@@ -35,7 +35,7 @@ from pdhef_logtool.drive.frames import (
 )
 from pdhef_logtool.drive.measured import Measured, measure
 from pdhef_logtool.drive.other_fields import with_other_fields
-from pdhef_logtool.drive.relations import gentle_at, steering_references, units_told, yaw_references
+from pdhef_logtool.drive.relations import gentle_at, steering_references, yaw_references
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
     TruthPlan,
@@ -50,6 +50,7 @@ from pdhef_logtool.drive.truth import (
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, fit_clocks, read_signals
 from pdhef_logtool.mapping.frames import Placement, placement_of
+from pdhef_logtool.mapping.hypotheses import units_told
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import BoolArray, Channel, FloatArray
@@ -495,7 +496,8 @@ def survey_log(
     for triad, names in zip(triads, (ACCELERATIONS, RATES), strict=True):
         extra |= {} if triad is None else triad.components(names)
     channels = read_signals(log, replace(mapping, signals={**mapping.signals, **extra}), clocks, *span_ns)
-    truth_plan = plan_truth(channels.truth, truth_position_m=vehicle.truth_position_m) if channels.truth else None
+    place, gradient = vehicle.truth_position_m, vehicle.roll_gradient_rad_per_m_s2
+    truth_plan = plan_truth(channels.truth, truth_position_m=place, roll_gradient_rad_per_m_s2=gradient)
     truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
     measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     # The input of an estimator must not depend on ground truth: with it, a mounting is only checked.

@@ -27,7 +27,7 @@ from pdhef_logtool.records.signals import WHEELS, FloatArray, has_gnss
 
 #: Words of a topic's name that make it a reference to score against; never an input.
 TRUTH_WORDS = frozenset(
-    {"truth", "groundtruth", "gt", "perfect", "mocap", "optitrack", "vicon", "qualisys", "correvit"}
+    {"truth", "groundtruth", "gt", "perfect", "mocap", "optitrack", "vicon", "qualisys", "correvit", "reference"}
 )
 #: Words of satellite and inertial navigation: velocities and poses of such topics are ground truth, their IMU is a
 #: sensor.
@@ -306,7 +306,10 @@ def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
         for t, role in rest
         if is_joints(t) and role != "command" and not joint_names(draft.log, t)
     ]
-    draft.truth.update(weighed.truth)
+    if weighed.truth and draft.truth:
+        draft.quality = None
+        draft.notes = [n for n in draft.notes if not n.startswith("ground truth is used where")]
+    draft.truth = weighed.truth or draft.truth
     draft.notes += weighed.notes
     for name, fields in weighed.rivals:
         draft.doubt(name, fields, fields[0], "the best score, then most messages")

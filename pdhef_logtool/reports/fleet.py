@@ -17,7 +17,6 @@ from pdhef_logtool.reports.colours import INK, PLAIN, colour
 from pdhef_logtool.reports.first_screen import next_steps, plan_head, tested_run
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.breakdown import LEAST_DRIVES
-from pdhef_logtool.results.comparison_words import design_effect_text
 from pdhef_logtool.results.fleet import ANSWER, JUDGED, Distribution, Fleet, Space, read_fleet
 from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
 
@@ -87,7 +86,7 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
         mains={ANSWER} if len(mains) > 1 else mains,
         names=list(dict.fromkeys(d.estimator for d in fleet.distributions if d.estimator != ANSWER)),
         ranked=any(r.place is not None for r in fleet.ranking),
-        dependence=design_effect_text(fleet.dependence, len(fleet.scored)),
+        dependence=fleet.dependence.text(len(fleet.scored)),
         breakdowns=shown,
         comparisons=sum(b.comparisons for b in fleet.breakdowns),
         idle_keys=[b.key for b in fleet.breakdowns if b not in shown],

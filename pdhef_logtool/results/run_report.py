@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.compiled.sources import compiled_digest
+from pdhef_logtool.evaluation.dead_reckoned import PathDrift
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S, Cell
@@ -160,6 +161,18 @@ class DriveDetails:
     operating_space: Sequence[Cell]
     metadata: Mapping[str, str]
     largest_errors: Sequence[LargestError] = ()
+    friction_median: float | None = None
+    path_drift: PathDrift | None = None
+
+    @property
+    def space(self) -> dict[str, Any]:
+        """The operating space as JSON-able values."""
+        return {
+            "speed_edges_m_s": SPEED_EDGES_M_S,
+            "ay_edges_m_s2": AY_EDGES_M_S2,
+            "cells": self.operating_space,
+            "friction_median": self.friction_median,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +249,7 @@ class LogOutcome:
     ``failed`` is the one-line reason if nothing came out; ``lost`` states what of the log could not be used.
     ``main``: the estimator of the selected estimate. ``folder`` of the log, below the folder of the run.
     ``algorithms``: the identity of each estimator that ran. ``files``: sha256 by name of the files in the log's folder
-    that commands read back.
+    that commands read back. ``day`` (UTC) and ``route``: drives that share them depend on one another.
     """
 
     log: str
@@ -252,6 +265,8 @@ class LogOutcome:
     folder: str = ""
     algorithms: Mapping[str, str] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
+    day: str | None = None
+    route: str | None = None
 
     @property
     def outcome(self) -> str:
@@ -358,12 +373,12 @@ def _selected(document: Mapping[str, Any], main: MainFacts | None, details: Driv
 
 def _detailed(details: DriveDetails) -> dict[str, Any]:
     """Return the keys that only a run writes."""
-    space = {"speed_edges_m_s": SPEED_EDGES_M_S, "ay_edges_m_s2": AY_EDGES_M_S2, "cells": details.operating_space}
     values = {
         "faults": details.faults,
         "innovations": details.innovations,
         "error_budget": details.error_budget,
-        "operating_space": space,
+        "operating_space": details.space,
+        "path_drift": details.path_drift,
         "metadata": dict(details.metadata),
         "largest_errors": details.largest_errors,
     }
@@ -463,6 +478,8 @@ def build_run(
                 "algorithms": o.algorithms,
                 "car": o.car,
                 "files": o.files,
+                "day": o.day,
+                "route": o.route,
             }
             for o in outcomes
         ],

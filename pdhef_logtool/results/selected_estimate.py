@@ -228,6 +228,8 @@ def _assumed(report: Report, main: MainFacts) -> list[str]:
     if calibration is not None and modelled:
         if calibration["refused"]:
             said.append(f"not calibrated on this log: {calibration['refused']}")
+        elif not calibration["parameters"]:
+            said.append(calibration["text"])
         if calibration["understeer"] is not None and calibration["understeer"]["contradicts"]:
             said.append("the understeer gradient of the drive contradicts the file")
     if friction is not None and modelled:

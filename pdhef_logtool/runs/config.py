@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import tomllib
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -91,7 +91,7 @@ class RunConfig:
         sideslip), ``on`` (beside ground truth as well) or ``off``.
     gnss : ``auto`` (the reference uses GNSS velocity where the log has it) or ``off``.
     no_position : keep latitude, longitude and all other positions and headings out of the outputs; topics that may
-        contain one are not copied. Reduced logs (``cache``) keep them.
+        contain one are not copied, and no reduced logs (``cache``) are written.
     waived : names of checks whose failure is ignored.
     setup : setup.toml of another run of the same car and recorder, from which mounting, units, delays and clocks are
         taken; None = decided on the log.
@@ -141,7 +141,8 @@ class RunConfig:
     @property
     def read_options(self) -> ReadOptions:
         """What of it decides how a log is read."""
-        return ReadOptions(**{f.name: getattr(self, f.name) for f in fields(ReadOptions)})
+        options = ReadOptions(**{f.name: getattr(self, f.name) for f in fields(ReadOptions)})
+        return replace(options, cache=None) if self.no_position else options
 
     @property
     def kept(self) -> Keep:
@@ -203,6 +204,13 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
             got="full",
             where="--annotate",
             remedy="a full copy reads all of each log: leave out --cache",
+        )
+    if config.cache is not None and config.no_position:
+        raise UsageError(
+            expected="--cache or --no-position",
+            got="both",
+            where="--cache",
+            remedy="reduced logs contain the positions of their logs: leave out --cache",
         )
     if config.cache_max_gb is not None and (config.cache is None or is_url(config.cache)):
         raise UsageError(expected="--cache DIR", got=config.cache or "none", where="cache_max_gb")

@@ -72,6 +72,7 @@ from pdhef_logtool.runs.pipeline import (
     write_verdicts,
 )
 from pdhef_logtool.runs.scoring import diverged_events, in_time, segment_events
+from pdhef_logtool.storage.documents import jsonable
 from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder
 
 if TYPE_CHECKING:
@@ -370,7 +371,7 @@ class _Scoring:
         """Return the verdicts of the plan on the log."""
         from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_rows, plan_verdicts
 
-        judged = JudgedDrive(log, None, lambda: blocks)
+        judged = JudgedDrive(log, None, lambda: {"requirement_blocks": jsonable(blocks)})
         return RequirementFacts(plan_verdicts(self.validation, figures_of_rows(rows), [judged]), blocks)
 
     def _events(

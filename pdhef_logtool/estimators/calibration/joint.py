@@ -221,6 +221,8 @@ class JointProblem:
     def _errors(self, p: TrackParameters) -> FloatArray:
         for d, out, differences in zip(self._drives, self._out, self._differences, strict=True):
             errors(d.columns, d.stretches, STEP_S, p, self._filter, out, differences)
+            if not d.has_ay:
+                differences[OF_AY] = 0.0
         parts = [e[:, k] for e, k in zip(self._differences, self._kept, strict=True)]
         return np.asarray(np.concatenate(parts, axis=1) / np.array(ERROR_STD)[:, None], dtype=np.float64)
 
@@ -295,10 +297,14 @@ def _vehicle_with(vehicle_file: VehicleParameters, values: Mapping[str, float], 
     )
 
 
-def prior_vehicle(vehicle_file: VehicleParameters, taught: Sequence[TaughtParameter] = ()) -> VehicleParameters:
-    """Return the vehicle file with every parameter at its prior mean."""
+def prior_vehicles(
+    vehicle_file: VehicleParameters, taught: Sequence[TaughtParameter] = (), varied: Sequence[str] = ()
+) -> list[VehicleParameters]:
+    """Return the vehicle file with every parameter at its prior mean, then with each of ``varied`` 1-sigma away."""
     parameters = with_taught(parameters_of(vehicle_file), taught)
-    return _vehicle_with(vehicle_file, {p.name: p.value(0.0) for p in parameters}, 6)
+    names = ("", *varied)
+    values = ({p.name: p.value(1.0 if p.name == name else 0.0) for p in parameters} for name in names)
+    return [_vehicle_with(vehicle_file, of_one, 6) for of_one in values]
 
 
 def track_of(

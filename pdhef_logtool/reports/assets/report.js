@@ -24,8 +24,9 @@
 
   /** A colour of the data, lighter on a dark page; alpha: translucent. */
   function tint(colour, alpha) {
-    const n = parseInt(colour.slice(1), 16), share = dark ? (n < 0x303030 ? 0.85 : 0.4) : 0;
-    const [r, g, b] = [n >> 16, (n >> 8) & 255, n & 255].map((c) => Math.round(c + share * (255 - c)));
+    const n = parseInt(colour.slice(1), 16), parts = [n >> 16, (n >> 8) & 255, n & 255];
+    const share = dark ? (Math.max(...parts) < 0x30 ? 0.85 : 0.4) : 0;
+    const [r, g, b] = parts.map((c) => Math.round(c + share * (255 - c)));
     return `rgba(${r},${g},${b},${alpha === undefined ? 1 : alpha})`;
   }
 
@@ -548,7 +549,7 @@
       width: widthOf(figure), height: intervals.length * 24 + 56, legend: { show: false },
       scales: { x: { time: false, range: [low, high] }, y: { range: [0, intervals.length] } },
       axes: [axis(unit, { size: 26 }), axis("", {
-        size: 150, splits: () => intervals.map((_, i) => intervals.length - 0.5 - i), values: () => intervals.map((i) => i.label),
+        size: 150, splits: () => intervals.map((_, i) => intervals.length - 0.5 - i), values: () => intervals.map((i) => fitted(i.label)),
         grid: { show: false }, ticks: { show: false },
       })],
       series: [{}, { scale: "y", stroke: "transparent", points: { show: false } }],
