@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 #: What may be asked for beside a number.
 CHOICES = ("auto", "file", "estimate")
 #: 1-sigma of an estimate by the tyres of the vehicle file: without evidence, when the stiffness may be wrong by a
-#: factor of two at each axle, and with it (simulated cars, studies/plus_minus.py, seed 555).
-MODEL_STD = {False: 0.36, True: 0.015}
+#: factor of two at each axle, and with it (simulated cars, studies/plus_minus.py, seeds 555 and 99004).
+MODEL_STD = {False: 0.5, True: 0.015}
 
 
 def parse_friction(text: str | float) -> str | float:
