@@ -91,7 +91,7 @@ def test_the_estimated_reference_counts_only_without_ground_truth() -> None:
 @pytest.mark.parametrize(
     ("requirement", "reason"),
     [
-        (Requirement("A", "", "vx_m_s", limit=1.0), "no ground truth of vx_m_s"),
+        (Requirement("A", "", "vx_m_s", limit=1.0), "no ground truth of v_x"),
         (Requirement("A", "", "sideslip_rad", segment="slalom", limit=1.0), "no scored driving in slalom"),
         (Requirement("A", "", "sideslip_rad", estimator="ekf", limit=1.0), "ekf did not run: add it to --estimators"),
         (Requirement("A", "", "sideslip_rad", baseline="ekf", max_ratio=1.0), "ekf has no such value"),
