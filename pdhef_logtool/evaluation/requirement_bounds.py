@@ -66,10 +66,8 @@ def pooled(
         return Bounded(nan, nan, nan, n)
     ratio = total / base
     value = float(ratio**power) if positive else ratio
-    if n < 2:
-        return Bounded(value, nan, nan, n)
-    if positive and total <= 0.0:
-        return Bounded(0.0, 0.0, 0.0, n)
+    if n < 2 or (positive and total <= 0.0):
+        return Bounded(value, nan, nan, n) if n < 2 else Bounded(0.0, 0.0, 0.0, n)
     effect = dependence(top - ratio * below, factors or {})
     if n > _MOST_UNITS:  # neighbours are drawn together
         groups = np.arange(n) * _MOST_UNITS // n
@@ -90,17 +88,20 @@ def pooled(
     below_s, above_s = float(most) * error * scale, -float(least) * error * scale
     if not log:
         return Bounded(value, value - below_s, value + above_s, n, effect)
-    if factors is not None and others is None and LEAST_DRIVES <= n < _LOGNORMAL and (values > 0.0).all():
+    if factors is not None and others is None:
         # The mean of both: that of lognormal errors alone is wide where few drives differ much.
         above_s += 0.5 * max(scale * _lognormal_excess(values, 1.0 if squares else 0.5, tail) - above_s, 0.0)
     return Bounded(value, value * math.exp(-below_s), value * math.exp(min(above_s, _MOST_LOG)), n, effect)
 
 
 def _lognormal_excess(values: FloatArray, power: float, tail: float) -> float:
-    """Return ln(upper bound / estimate) of exp(μ + ``power`` σ²) of lognormal values [N]."""
+    """Return ln(upper bound / estimate) of exp(μ + ``power`` σ²) of lognormal values [N]; 0 of too few or too many."""
     from scipy.special import chdtri, stdtrit
 
-    n, variance = len(values), float(np.var(np.log(values), ddof=1))
+    n = len(values)
+    if not LEAST_DRIVES <= n < _LOGNORMAL or not (values > 0.0).all():
+        return 0.0
+    variance = float(np.var(np.log(values), ddof=1))
     of_mean = float(stdtrit(n - 1, 1.0 - tail)) * math.sqrt(variance / n)
     return math.hypot(of_mean, power * variance * ((n - 1) / float(chdtri(n - 1, 1.0 - tail)) - 1.0))
 

@@ -57,6 +57,9 @@ def test_degrees_manoeuvres_and_quantiles() -> None:
     ("table", "problem"),
     [
         ({}, "requirement[0].id: is missing"),
+        ({**WHOLE, "exposure": [{"speed_m_s": [3.0, 10.0], "drives": 1}]}, "multiples of 5"),
+        ({**WHOLE, "exposure": [{"friction": [0.5, 0.4], "minutes": 1.0}]}, "should be [from, to]"),
+        ({**WHOLE, "exposure": [{"car": "golf"}]}, "give drives or minutes"),
         ({**WHOLE, "id": "a b"}, "requirement[0].id"),
         ({**WHOLE, "limit": 0.1}, "give one of limit, limit_deg, limit_deg_s, or baseline"),
         ({"id": "A", "signal": "sideslip_rad"}, "give one of limit"),
