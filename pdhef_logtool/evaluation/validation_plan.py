@@ -49,11 +49,10 @@ class ExposureNeed(BaseModel):
 
     @model_validator(mode="after")
     def _agrees(self) -> ExposureNeed:
-        for bounds, step in ((self.speed_m_s, 5.0), (self.ay_m_s2, 1.0), (self.friction, 1e-9)):
-            if bounds is not None and (
-                not 0.0 <= bounds[0] < bounds[1] or (step >= 1.0 and any(b % step for b in bounds))
-            ):
-                raise ValueError(f"{bounds} should be [from, to]{f', multiples of {step:g}' if step >= 1.0 else ''}")
+        for bounds, step in ((self.speed_m_s, 5.0), (self.ay_m_s2, 1.0), (self.friction, None)):
+            off_grid = bounds is not None and step is not None and any(b % step for b in bounds)
+            if bounds is not None and (off_grid or not 0.0 <= bounds[0] < bounds[1]):
+                raise ValueError(f"{bounds} should be [from, to]{f', multiples of {step:g}' if off_grid else ''}")
         if not self.drives and not self.minutes:
             raise ValueError("give drives or minutes")
         return self

@@ -43,7 +43,7 @@ def drive_rows(runs: Sequence[tuple[str, OpenedRun]]) -> pl.DataFrame:
 
 
 def independent_figures(run: OpenedRun, signal: str, metric: str, segment: str = "all") -> pl.DataFrame:
-    """Return log, estimator, value, unit and main (the selected estimator) of a figure, where ground truth is independent.
+    """Return log, estimator, value, unit and main (selected estimator) of a figure with independent ground truth.
 
     Raises
     ------
