@@ -42,7 +42,7 @@ HYPOTHESES = ((0.01, 0.0, 0.0, 0.0, 0.0), (0.06, 0.02, 0.02, 30.0, -5.5), (1.0, 
 #: 1-sigma of a GNSS velocity at least, m/s; gate in 1-sigmas; speed below which there is no course, m/s.
 GNSS_STD_M_S, GATE_SIGMA, LEAST_SPEED_M_S = 0.1, 4.0, 3.0
 #: Time constant with which the likelihood is forgotten, s; jump of GNSS against the sensors, m/s; time after which a
-#: heading that samples contradict is found anew, s.
+#: heading that samples contradict is determined again, s.
 FORGET_S, JUMP_M_S, LOST_S = 5.0, 0.3, 20.0
 #: Height of an antenna over the roll axis and its 1-sigma, m; 1-sigma of antenna x, unknown and known, m.
 ANTENNA_HEIGHT_M, HEIGHT_STD_M, ANTENNA_STD_M, KNOWN_ANTENNA_STD_M = 1.2, 0.5, 0.5, 0.1
@@ -220,8 +220,8 @@ def _mixture(x, P, facts, agrees, vy, out, k):  # type: ignore[no-untyped-def]
     """Write what the hypotheses add to v_y at step k, the weight of the filter, and their part of the variance."""
     total, mean, variance, most = 0.0, 0.0, 0.0, np.max(facts[:, 0] + _LAW[:, 4])
     for i in range(x.shape[0]):
-        known = i == 0 or (agrees and facts[i, 1] > 0.0)  # without a heading GNSS states nothing
-        weight = math.exp(facts[i, 0] + _LAW[i, 4] - most) if known else 0.0
+        has_heading = i == 0 or (agrees and facts[i, 1] > 0.0)  # without a heading GNSS states nothing
+        weight = math.exp(facts[i, 0] + _LAW[i, 4] - most) if has_heading else 0.0
         total += weight
         if i > 0:
             mean += weight * (x[i, VY] - vy)
@@ -348,8 +348,8 @@ class GnssAided:
         vehicle = self._physics.vehicle
         antenna = vehicle.gnss_antenna_position_m
         body = (vehicle.roll_gradient_rad_per_m_s2, vehicle.imu_position_m[0], GRAVITY_M_S2 * vehicle.assumed_friction)
-        known = (0.0, ANTENNA_STD_M) if antenna is None else (antenna[0], KNOWN_ANTENNA_STD_M)
-        _aid(columns, body, known, aiding, out)
+        prior = (0.0, ANTENNA_STD_M) if antenna is None else (antenna[0], KNOWN_ANTENNA_STD_M)
+        _aid(columns, body, prior, aiding, out)
         return AidedSteps(steps, out), AidedState(after, aiding, last_stamp_ns(stamps_ns, before_ns))
 
     def predict(self, steps: AidedSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
