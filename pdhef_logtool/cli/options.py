@@ -149,7 +149,9 @@ _OPTIONS: dict[str, Any] = {
             rich_help_panel=ESTIMATION,
         ),
     ],
-    "gnss": Annotated[_Text, Option(help="GNSS velocity in the reference: auto or off.", rich_help_panel=ESTIMATION)],
+    "gnss": Annotated[
+        _Text, Option(help="GNSS velocity in filters and reference: auto or off.", rich_help_panel=ESTIMATION)
+    ],
     "no_position": Annotated[
         bool | None,
         Option(

@@ -113,7 +113,6 @@ def test_wrong_gnss_costs_nothing_on_a_road(bare, fault):
         signals = replace(signals, gnss_late_s=np.full(len(t), 3.0))
     plain, _ = _error_deg(drive, run_window(make_estimator("physics", bare), signals)[0])
     aided, _ = _error_deg(drive, run_window(_aided(bare), replace(signals, gnss_velocity_m_s=velocity))[0])
-    print(fault, plain, aided)
     assert aided < plain + max(0.05 * plain, 0.003)
 
 
