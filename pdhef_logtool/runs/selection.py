@@ -34,7 +34,7 @@ SIMPLE = ("open-loop", "open-loop:calibrated", "phy-ukf", "physics")
 FACTOR, YAW_FACTOR = 1.2, 3.0
 #: Its lateral figure shows nothing, for it integrates the residual that ``d2`` measures.
 _NOT_JUDGED = "kinematic"
-#: Driving that a choice on line looks back on.
+#: Longest driving before a choice on line that decides it.
 _LOOK_BACK_NS = 3600 * 10**9
 #: The baseline of every score. It needs the fewest signals and cannot drift; ``kinematic`` follows the accelerometer's
 #: bias and has a higher error on half of the recorded drives.
@@ -48,21 +48,21 @@ _LAST = (NAIVE, "zero:no-lateral", REFERENCE)
 class Contradiction:
     """An estimate that fails a test, and the ``best`` one that passes both.
 
-    ``own``, ``other`` : lateral consistency in m/s and yaw consistency in rad/s of the two, NaN where unknown.
+    ``figures``, ``other`` : lateral consistency in m/s and yaw consistency in rad/s of the two, NaN where unknown.
     """
 
     best: str
-    own: tuple[float, float]
+    figures: tuple[float, float]
     other: tuple[float, float]
     name: str = PREFERRED
 
     @property
     def text(self) -> str:
         """The warning of the report."""
+        (d2, yaw), (of_best, yaw_of_best) = self.figures, self.other
         return (
-            f"{self.name} contradicts the sensors: its lateral consistency is {self.own[0]:.3g} m/s and its yaw "
-            f"consistency {self.own[1]:.3g} rad/s, those of {self.best} {self.other[0]:.3g} and {self.other[1]:.3g}; "
-            "the vehicle file may be wrong"
+            f"{self.name} contradicts the sensors: its lateral consistency is {d2:.3g} m/s and its yaw consistency "
+            f"{yaw:.3g} rad/s, those of {self.best} {of_best:.3g} and {yaw_of_best:.3g}; the vehicle file may be wrong"
         )
 
 
@@ -77,8 +77,8 @@ def contradiction(rows: Iterable[MetricRow], name: str = PREFERRED) -> Contradic
     if name not in d2 or best is None:
         return None
     passes = d2[name] <= FACTOR * d2[best] and (name in explain or name not in yaw)
-    own = d2[name], yaw.get(name, math.nan)
-    return None if passes else Contradiction(best, own, (d2[best], yaw[best]), name)
+    figures = d2[name], yaw.get(name, math.nan)
+    return None if passes else Contradiction(best, figures, (d2[best], yaw[best]), name)
 
 
 def _figures(rows: Iterable[MetricRow]) -> tuple[dict[str, float], dict[str, float]]:

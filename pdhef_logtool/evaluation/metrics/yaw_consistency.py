@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from pdhef_logtool.car.nominal_model import model_parameters, yaw_rates_at
-from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.evaluation.blocks import SegmentSums, blocks_with_halo, packed
 from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, OfDrive, SensorErrors
 from pdhef_logtool.evaluation.metrics.sensor_residuals import MAX_STEP_S, carried_speed
@@ -51,17 +51,20 @@ def yaw_residual(track: StateTrack, signals: Signals, vehicle: VehicleParameters
     The steering, its delay, the gyro's bias and the tyres are those of the calibrated ``vehicle``.
     """
     friction = signals.friction if sensors.friction is None else np.full(len(signals), sensors.friction)
-    read = corrected_anew(signals, sensors.read_with or vehicle, vehicle)
-    t = signals.stamps_ns
-    steer = np.interp(t - round(sensors.steer_delay_s * 1e9), t, read.steer_rad)
+    was = sensors.read_with or vehicle
+    before, after, t = was.sensors, vehicle.sensors, signals.stamps_ns
+    angle = (signals.steer_rad + was.steer_offset_rad) * (was.steering_ratio / vehicle.steering_ratio)
+    rate = signals.yaw_rate_rad_s * before.yaw_rate_gain + before.yaw_rate_bias_rad_s
+    rate = (rate - after.yaw_rate_bias_rad_s) / after.yaw_rate_gain
+    steer = np.interp(t - round(sensors.steer_delay_s * 1e9), t, angle - vehicle.steer_offset_rad)
     friction = np.where(np.isfinite(friction), friction, vehicle.assumed_friction)
     dt = np.diff(t, prepend=t[:1]) * 1e-9
     dt[dt > MAX_STEP_S] = np.nan
     vy = np.where(track.valid, track.vy_m_s, np.nan)
     modelled = np.full(len(t), np.nan)
-    inputs = (dt, carried_speed(signals), vy, steer, friction, read.yaw_rate_rad_s)
+    inputs = (dt, carried_speed(signals), vy, steer, friction, rate)
     yaw_rates_at(inputs, max(vehicle.relaxation_length_m, 0.01), model_parameters(vehicle), modelled)
-    return modelled - read.yaw_rate_rad_s
+    return modelled - rate
 
 
 METRICS = (
