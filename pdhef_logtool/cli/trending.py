@@ -9,6 +9,7 @@ import typer
 from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options, panels
+from pdhef_logtool.cli.comparing import Cluster, Estimator, MaxRegression, Metric, figure_asked
 from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
@@ -26,31 +27,19 @@ commands = typer.Typer()
     "pdhef trend week1 week2 week3 --estimator physics --json",
     panel=panels.READ,
     notes="Runs are compared drive by drive with the run before and with the first run. Marks are corrected for their "
-    "number (Holm). A regression does not change the exit code: pdhef compare is the gate.",
+    "number (Holm); the default limit is 0. A regression does not change the exit code: pdhef compare is the gate.",
 )
 def trend(
     runs: Annotated[list[str], Argument(metavar="RUN", help="Outputs of runs, the oldest first: folders or URLs.")],
     *,
-    max_regression: Annotated[
-        str | None, Option(metavar="SHARE", help="Largest increase that is not marked: 5% or 0.05. Default: 0.")
-    ] = None,
-    estimator: Annotated[
-        str | None, Option(help="Estimator to compare. Default: the selected estimate of the earlier run, per drive.")
-    ] = None,
-    metric: Annotated[str | None, Option(help="Metric of sideslip over the whole drive. Default: rmse.")] = None,
-    cluster: Annotated[
-        str | None,
-        Option(
-            metavar="KEY",
-            help="Groups of dependent drives: car, day, route, a metadata key, or none. Default: the dependence by "
-            "day, car and route is estimated.",
-        ),
-    ] = None,
+    max_regression: MaxRegression = None,
+    estimator: Estimator = None,
+    metric: Metric = None,
+    cluster: Cluster = None,
     html: Annotated[Path | None, Option(help="HTML file for the trend.")] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Show a figure over several runs, one row per run, and mark regressions."""
-    from pdhef_logtool.cli.comparing import figure_asked
     from pdhef_logtool.results.opened_run import open_run
     from pdhef_logtool.results.trend import trend_of
     from pdhef_logtool.storage.object_store import is_url
