@@ -170,7 +170,7 @@ def _unused(log: DriveLog, pieces: Pieces, used: set[tuple[str, str]]) -> tuple[
         paths = [p for p in paths if (topic.name, p) not in used]
         room = min(_OF_TOPIC, _OTHERS - shown) if topic.messages else 0
         samples = pieces.read({topic.name: paths[:room]}) if paths[:room] else {}
-        cards = []
+        cards: list[_Card] = []
         for (_, path), seen in samples.items():
             finite = seen.values[np.isfinite(seen.values)]
             if finite.shape[0] and len(cards) < room and (topic.name, path) not in used:
