@@ -430,7 +430,8 @@ def _notes(
     if requirement.signal == "ay_m_s2":
         notes.append(AY_NOTE)
     if drives and all(d.same for d in drives):
-        notes.append(f"{drives[0].estimator} equals {requirement.baseline} in these drives (residual gain 0)")
+        why = "" if requirement.other_run is not None else " (residual gain 0)"
+        notes.append(f"{drives[0].estimator} equals {requirement.baseline} in these drives{why}")
     return notes
 
 
