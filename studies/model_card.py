@@ -9,7 +9,6 @@ wrote.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ from pdhef_logtool.residual_model.bundle import PAPER_FOLDER, PURE_LSTM_FOLDER, 
 from studies.condition_drives import drives_of, read_drive, root_mean_square, sideslip_error
 from studies.defaults.train_default import DRIVES, SETS
 from studies.pages import options, table, write
-from studies.teaching import RESULTS_FILE, SIMULATED, PairResult, stored_results
 
 ESTIMATORS = ("zero", "linear-regression", "phy-ukf", "phy-ukf:tuned", "physics", "pure-lstm", "pd-hef-paper",
               "pd-hef:fixed-r", "pd-hef")  # fmt: skip
@@ -73,23 +71,6 @@ def network_line(name: str, network: ModelBundle) -> list[str]:
     return [name, *shape, weights, f"{p['epochs']} (best {p['best_epoch']})", *losses]
 
 
-def taught_text() -> str:
-    """Return what the hybrid is worth on cars other than the simulated saloon, by the stored results of teaching."""
-    stored = stored_results(RESULTS_FILE)
-    recorded = [r for r in stored if not r.car.startswith(SIMULATED)]
-    acting = [r for r in recorded if r.hybrid.active > 0.0]
-
-    def ratio(pairs: Sequence[PairResult]) -> str:
-        return f"{np.exp(np.mean([np.log(r.ratio) for r in pairs])):.2f}"
-
-    return (
-        "On an untaught car the residual gain is 0, and `pd-hef` equals `physics`. On cars that `pdhef learn` taught,"
-        f" `pd-hef` has {ratio(recorded)} times the error of untaught `physics` on {len(recorded)} pairs of recorded"
-        f" drives (geometric mean; {sum(r.worse for r in recorded)} pairs worse). The residual acts on {len(acting)} of"
-        f" them, with {ratio(acting)}; elsewhere the gain is that of the prior. Details: [teaching](teaching.md)."
-    )
-
-
 def page(work: Path, car: Car) -> str:
     """Return the card."""
     model, folder = car.network, car.source
@@ -136,7 +117,7 @@ Sensors have [errors](method.md#sensors); the true friction is given.
 - The training drives are of one family of simulated cars, without trucks, worn dampers or overheated tyres.
 - No training drive is a fishhook; [conditions](conditions.md) contains fishhooks, faults, wrong friction and bank.
 - Below the vehicle's low-speed limit the residual is switched off.
-- Real cars: [recorded drives](real.md). {taught_text()}
+- Real cars: [peers](peers.md), [teaching](teaching.md). For your car: `pdhef learn`.
 """
 
 

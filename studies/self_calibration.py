@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +19,7 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.toml_files import load_vehicle
-from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import DrivingReader
@@ -38,10 +38,11 @@ from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.selection import FACTOR
 from pdhef_logtool.runs.self_calibrating import log_sensors
 from studies.condition_drives import SIDESLIP, as_logged
-from studies.many_cars import BASE, KINDS, DrawnCar, draw_car
+from studies.many_cars import BASE, KINDS, draw_car
 from studies.pages import DRIVES, ROOT, number, table
 from truthsim.batch import sensor_noise
 from truthsim.drive import Drive, simulate_drive
+from truthsim.sensors import SensorNoise
 from truthsim.vehicle_choice import choose_vehicle
 
 #: Manoeuvre, km/h, seconds (None: its own).
@@ -79,57 +80,39 @@ class Simulated:
         return signal_error(track, self.drive.truth, SIDESLIP, self.file.low_speed_blend_m_s)
 
 
-def make_wrong(vehicle: VehicleParameters, front: float, rear: float) -> VehicleParameters:
-    """Return a vehicle with the stiffness of its axles multiplied; peaks stay."""
-
-    def tyre(of: AxleTyre, factor: float) -> AxleTyre:
-        if of.B is not None:
-            return of.model_copy(update={"B": factor * of.B})
-        assert of.cornering_stiffness_n_per_rad is not None
-        return of.model_copy(update={"cornering_stiffness_n_per_rad": factor * of.cornering_stiffness_n_per_rad})
-
-    tyres = Tyres(front=tyre(vehicle.tyres.front, front), rear=tyre(vehicle.tyres.rear, rear))
-    return vehicle.model_copy(update={"tyres": tyres})
-
-
-def draw(seed: int, index: int) -> tuple[np.random.Generator, DrawnCar, float, tuple[float, float]]:
-    """Return a car with its friction and the factors that make its file wrong, and the generator that drew them."""
-    rng = np.random.default_rng([seed, index])
-    car = draw_car(rng, load_vehicle(BASE), (*KINDS, "hatchback"))
-    front, rear = np.exp(rng.uniform(np.log(WRONG[0]), np.log(WRONG[1]), 2))
-    return rng, car, float(rng.choice(FRICTIONS)), (float(front), float(rear))
-
-
-def drive_of(
-    car: DrawnCar, friction: float, rng: np.random.Generator, manoeuvre: str, speed: float, duration_s: float | None
-) -> Drive:
-    """Simulate a drive of a drawn car; raises SimulationError where it cannot be driven."""
-    return simulate_drive(
-        manoeuvre,
-        speed_km_h=speed,
-        friction=friction,
-        seed=int(rng.integers(2**31)),
-        duration_s=duration_s,
-        vehicle=choose_vehicle(car.text),
-        vehicle_name=car.text,
-        noise=sensor_noise(dict(car.sensors)),
-    )
-
-
 def simulate(cars: int, seed: int, driven: Sequence[tuple[str, float, float | None]] = DRIVEN) -> list[Simulated]:
     """Return the drives of the cars; one that cannot be driven is left out, with a message."""
-    drives_of_cars = []
+    return [simulated for simulated, _, _ in simulated_drives(cars, seed, driven)]
+
+
+def simulated_drives(
+    cars: int, seed: int, driven: Sequence[tuple[str, float, float | None]], **sensors: float
+) -> Iterator[tuple[Simulated, Drive, SensorNoise]]:
+    """Yield what :func:`simulate` returns, with the drive as it is simulated and its sensors; ``sensors`` are given."""
     for index in range(cars):
-        rng, car, friction, factors = draw(seed, index)
+        rng = np.random.default_rng([seed, index])
+        car = draw_car(rng, load_vehicle(BASE), (*KINDS, "hatchback"))
+        front, rear = np.exp(rng.uniform(np.log(WRONG[0]), np.log(WRONG[1]), 2))
+        friction = float(rng.choice(FRICTIONS))
         file = car.vehicle.model_copy(update={"friction": friction})
         for manoeuvre, speed, duration_s in driven:
+            noise = sensor_noise(dict(car.sensors) | sensors)
             try:
-                drive = drive_of(car, friction, rng, manoeuvre, speed, duration_s)
+                drive = simulate_drive(
+                    manoeuvre,
+                    speed_km_h=speed,
+                    friction=friction,
+                    seed=int(rng.integers(2**31)),
+                    duration_s=duration_s,
+                    vehicle=choose_vehicle(car.text),
+                    vehicle_name=car.text,
+                    noise=noise,
+                )
             except SimulationError as error:
                 say(f"car {index}, {manoeuvre} is left out: {error}")
                 continue
-            drives_of_cars.append(Simulated(index, manoeuvre, as_logged(drive, Car.of(file)), file, factors))
-    return drives_of_cars
+            logged = as_logged(drive, Car.of(file))
+            yield Simulated(index, manoeuvre, logged, file, (float(front), float(rear))), drive, noise
 
 
 def calibrate(signals: Signals, file: VehicleParameters) -> SelfCalibration:
@@ -198,7 +181,7 @@ class Outcome:
 
 def outcome_of(simulated: Simulated) -> Outcome:
     """Run a drive with its files."""
-    wrong = make_wrong(simulated.file, *simulated.factors)
+    wrong = simulated.file.with_stiffness(*simulated.factors)
     calibration, from_right = (
         calibrate(simulated.drive.signals, wrong),
         calibrate(simulated.drive.signals, simulated.file),
