@@ -16,14 +16,14 @@ from pdhef_logtool.car.parts import Fit, LearntOn
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.cli.learning_tables import render_learning
 from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 from pdhef_logtool.estimators.calibration.joint import FRONT_STIFFNESS, PEAK, parameters_of
 from pdhef_logtool.learning.car.taught_prior import TYRES, taught_parameters
 from pdhef_logtool.learning.drives import TEACH, LearnSettings
 from pdhef_logtool.learning.engine import LearnResult, learn
-from pdhef_logtool.learning.stages.teach import OpenedDrive, learn_from, open_drive
+from pdhef_logtool.learning.stages.teach import OpenedDrive, _folds, learn_from, open_drive
 from pdhef_logtool.records.errors import EstimatorError, UsageError, VehicleError
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.self_calibrating import calibrate_drive
 
 SPAN = {"start": "60", "end": "130"}
 
@@ -57,21 +57,21 @@ def result(sample_logs_dir: Path, bare: Path, tmp_path_factory: pytest.TempPathF
     return learn([str(sample_logs_dir / "road.mcap")], tmp_path_factory.mktemp("out") / "car", settings)
 
 
-def test_a_drive_teaches_a_prior_that_later_drives_start_from(result: LearnResult, sample_logs_dir: Path) -> None:
+def test_a_drive_teaches_a_prior_that_later_drives_start_from(
+    result: LearnResult, drive: OpenedDrive, sample_logs_dir: Path
+) -> None:
     car = Car.load(result.car, network="none")
     assert car.taught is not None and not car.has_evidence and car.notes == ()
-    by_name = {p.name: p for p in car.taught_prior}
+    assert bool(car.taught_prior) is result.figures["prior_used"]
+    taught = taught_parameters([drive.driving], [drive.slopes], car.vehicle)
+    by_name = {p.name: p for p in taught}
     parameters = {p.name: p for p in parameters_of(car.vehicle)}
     assert by_name.keys() == set(TYRES)
-    assert all(p.std <= 1.00001 * parameters[p.name].std and p.ay_m_s2 > 0.0 for p in by_name.values())
+    assert all(p.std <= 1.00001 * parameters[p.name].std and p.ay_m_s2 > 0.0 for p in taught)
     right = Car.load(sample_logs_dir / "vehicle.toml").vehicle
     true = right.cornering_stiffness_n_per_rad(True, right.assumed_friction)
-    front = parameters[FRONT_STIFFNESS]
-    assert abs(np.log(by_name[front.name].value / true)) < 0.2
-    with read_drive(sample_logs_dir / "road.mcap", car, None) as drive:
-        calibration = calibrate_drive(drive, RunConfig())
-    assert calibration is not None
-    prior = {p.name: p.prior for p in calibration.parameters}
+    assert abs(np.log(by_name[FRONT_STIFFNESS].value / true)) < 0.2
+    prior = {p.name: p.prior for p in self_calibrate([drive.driving], car.vehicle, taught=taught).parameters}
     assert [prior[name] for name in TYRES] == pytest.approx([by_name[name].value for name in TYRES])
 
 
@@ -117,6 +117,15 @@ def test_the_prior_of_several_drives_is_tested_with_each_left_out(sample_logs_di
     taught = learn_from(drives)
     assert taught.prior_test is not None and taught.prior_test.blocks >= 4
     assert not (taught.parameters and taught.prior_test.value > 0.0)
+
+
+def test_a_drive_that_begins_with_a_long_stop_is_halved_by_its_driving(drive: OpenedDrive) -> None:
+    cells = len(drive.driving.stamps_ns)
+    moving = np.array([[cells // 2, cells]])
+    slopes = np.where(np.arange(cells) < cells // 2, np.nan, drive.slopes)
+    late = replace(drive, driving=replace(drive.driving, stretches=moving), slopes=slopes)
+    first, second = (fold.driving[0].seconds for fold in _folds([late]))
+    assert first == pytest.approx(second, abs=2.0) and first > 8.0
 
 
 def test_a_changed_vehicle_file_makes_it_stale(result: LearnResult, tmp_path: Path) -> None:
