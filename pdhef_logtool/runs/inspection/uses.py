@@ -49,8 +49,9 @@ def possible_uses(mapping: Mapping) -> str:
 
 
 def missing_for_sideslip(mapping: Mapping) -> str:
-    """Return what sideslip still needs; empty where nothing is missing."""
-    lacking = sorted(spec_of(_MAIN).lacking(usable_signals(mapping)), key=list(_WORDS).index)
+    """Return what sideslip still needs, or would gain most from; empty where nothing is missing."""
+    wanted = spec_of(_MAIN).needs | {"steer_rad"}
+    lacking = sorted(wanted - usable_signals(mapping), key=list(_WORDS).index)
     return ", ".join(_WORDS.get(n, n) for n in lacking)
 
 
