@@ -20,22 +20,6 @@ if TYPE_CHECKING:
 commands = typer.Typer()
 #: Room around events: a threshold that is crossed to and fro is one event; a clip shows how it came about.
 _PAD_S, _CLIP_PAD_S = 0.25, 5.0
-#: Options of ``compare`` and ``trend``.
-MaxRegression = Annotated[
-    str | None, Option(metavar="SHARE", help="Largest accepted increase of the metric: 5% or 0.05.")
-]
-Estimator = Annotated[
-    str | None, Option(help="Estimator to compare. Default: the selected estimate of the earlier run, per drive.")
-]
-Metric = Annotated[str | None, Option(help="Metric of sideslip over the whole drive. Default: rmse.")]
-Cluster = Annotated[
-    str | None,
-    Option(
-        metavar="KEY",
-        help="Groups of dependent drives: car, day, route, a metadata key, or none. Default: the dependence by "
-        "day, car and route is estimated.",
-    ),
-]
 
 
 @options.command(
@@ -57,10 +41,10 @@ def compare(
         Path | None,
         Option(metavar="FILE", help='Validation plan for B. baseline = "run" means run A. Exit code 4 if one fails.'),
     ] = None,
-    max_regression: MaxRegression = None,
-    estimator: Estimator = None,
-    metric: Metric = None,
-    cluster: Cluster = None,
+    max_regression: options.MaxRegression = None,
+    estimator: options.ComparedEstimator = None,
+    metric: options.ComparedMetric = None,
+    cluster: options.Cluster = None,
     allow_unpaired: Annotated[
         bool, Option("--allow-unpaired", help="Accept drives that only one run contains.")
     ] = False,

@@ -9,7 +9,6 @@ import typer
 from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options, panels
-from pdhef_logtool.cli.comparing import Cluster, Estimator, MaxRegression, Metric, figure_asked
 from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
@@ -27,19 +26,20 @@ commands = typer.Typer()
     "pdhef trend week1 week2 week3 --estimator physics --json",
     panel=panels.READ,
     notes="Runs are compared drive by drive with the run before and with the first run. Marks are corrected for their "
-    "number (Holm); the default limit is 0. A regression does not change the exit code: pdhef compare is the gate.",
+    "number (Holm). A regression does not change the exit code: pdhef compare is the gate.",
 )
 def trend(
     runs: Annotated[list[str], Argument(metavar="RUN", help="Outputs of runs, the oldest first: folders or URLs.")],
     *,
-    max_regression: MaxRegression = None,
-    estimator: Estimator = None,
-    metric: Metric = None,
-    cluster: Cluster = None,
+    max_regression: options.MaxRegression = None,
+    estimator: options.ComparedEstimator = None,
+    metric: options.ComparedMetric = None,
+    cluster: options.Cluster = None,
     html: Annotated[Path | None, Option(help="HTML file for the trend.")] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Show a figure over several runs, one row per run, and mark regressions."""
+    from pdhef_logtool.cli.comparing import figure_asked
     from pdhef_logtool.results.opened_run import open_run
     from pdhef_logtool.results.trend import trend_of
     from pdhef_logtool.storage.object_store import is_url

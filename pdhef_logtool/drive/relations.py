@@ -16,6 +16,10 @@ from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 BLOCKS = 8
 #: What is left of two columns by regression is small, and a car that slides leaves it related otherwise.
 MIN_PARTIAL_CORRELATION = 0.8
+#: Share of the curvature that a_y must leave: at one speed they are one regressor.
+SEPARABLE = 0.15
+#: One of two sides that moves by more must move the other. Crossfall and grade alone move an accelerometer by less (5 %
+#: are 0.5 m/s^2), and noise of 1 Hz bandwidth moves a gyro by less.
 MOVES_M_S2 = 1.0
 MOVES_RAD_S = 0.06
 #: Gains between these are tyres, roll, bank, grade and noise; beyond them they are units.
@@ -29,7 +33,7 @@ SIDESLIP_RANGE = (0.5, 2.0)
 COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
 #: Of ground truth ahead of the rear axle. Ground truth that is near that axle gives no information: its lever may
 #: be of any sign.
-REAR_LEVER_M = (1.0, 12.0)
+REAR_LEVER_M, REAR_LEVER_TYPICAL_M = (1.0, 12.0), 1.6
 #: Beyond, sideslip times lateral acceleration is no longer small beside the derivative of the speed.
 STRAIGHT_M_S2 = 3.0
 #: Rim speed over ground speed, 5 % of slip and 5 % of radius; angular over rim speed, wheels of 4 cm to 80 cm radius.
@@ -323,14 +327,30 @@ def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relat
     course = columns.get("truth.course_rate_rad_s")
     if course is None:
         return []
+    turnings = [course]
+    if "truth.vx_m_s" in columns and "truth.vy_m_s" in columns:  # in a spin the sideslip turns as well
+        turnings.append(course - direction_rate(columns["truth.vx_m_s"], columns["truth.vy_m_s"]))
     relations = []
     moving = _moving(columns, speed)
     for name in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s"):
         if name in columns:
             text = f"{name} against the turning of the ground-truth path"
             use = (moving, gentle_at(columns[name] * speed, moving))
-            relations += compare_at_ease(text, {name: 1}, course, columns[name], use, GAIN_RANGE, moves=MOVES_RAD_S)
+            either = [
+                r
+                for turning in turnings
+                for r in compare_at_ease(text, {name: 1}, turning, columns[name], use, GAIN_RANGE, moves=MOVES_RAD_S)
+            ]
+            relations += sorted(either, key=lambda r: (r.tells and r.accepts(), abs(r.correlation)))[-1:]
     return relations
+
+
+def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:
+    """Return how fast the direction of a velocity turns, rad/s [N]; NaN where it is slow: noise turns it."""
+    ax, ay = derivative(vx), derivative(vy)
+    speed = np.hypot(vx, vy)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(moving_at(speed) & (speed > 1.0), (vx * ay - vy * ax) / speed**2, np.nan)
 
 
 def _twice(columns: Mapping[str, FloatArray], sensor: str, truth: str, moves: float) -> list[Relation]:
@@ -360,23 +380,26 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     sideslip = columns.get("truth.sideslip_rad", np.arctan2(vy, vx))
     moving, ones = _moving(columns, vx), np.ones_like(ay)
     text = f"ay_m_s2 - v_x r against the derivative of {subject}"
-    kinematic = _partial(
-        text, {subject: -1, "ay_m_s2": 1}, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving
-    )
+    of_vx = subject != "truth.sideslip_rad"  # the sideslip is then v_y over v_x, else v_y is v_x times its tangent
+    powers = {subject: -1, "ay_m_s2": 1} | ({} if of_vx else {"truth.vx_m_s": -1})
+    kinematic = _partial(text, powers, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving)
     with np.errstate(divide="ignore", invalid="ignore"):
         curvature = rate / vx
     text = f"{subject} against -ay_m_s2, apart from curvature"
     gentle = gentle_at(vx * rate, moving)
-    of_vx = subject != "truth.sideslip_rad"  # the sideslip is then v_y over v_x
     powers = {subject: 1, "ay_m_s2": -1} | ({"truth.vx_m_s": -1} if of_vx else {})
     handling = _partial(text, powers, -ay, sideslip, [curvature, ones], gentle)
     text = f"{subject} against curvature, apart from a_y"
     powers = {subject: 1, turning: -1} | ({} if of_vx else {"truth.vx_m_s": 1})
-    rolling = _partial(text, powers, curvature, sideslip, [ay, ones], gentle)
+    rolling = _partial(text, powers, curvature, sideslip, [ay, ones], gentle, SEPARABLE)
     return [
         *(replace(r, expected=SIDESLIP_RANGE) for r in kinematic),
         *(replace(r, expected=COMPLIANCE_RAD_PER_M_S2) for r in handling),
-        *(replace(r, expected=REAR_LEVER_M) for r in rolling if abs(r.gain) > REAR_LEVER_M[0]),
+        *(
+            replace(r, expected=REAR_LEVER_M, typical=REAR_LEVER_TYPICAL_M)
+            for r in rolling
+            if abs(r.gain) > REAR_LEVER_M[0]
+        ),
     ]
 
 
@@ -387,8 +410,9 @@ def _partial(
     measured: FloatArray,
     others: list[FloatArray],
     use: BoolArray,
-) -> list[Relation]:
-    """Return the relation between what regression on other columns leaves of two columns."""
+    separable: float = 0.0,
+) -> list[Relation]:  # positional: both sides of a relation and what is wanted of them
+    """Return the relation between what regression on other columns leaves of two columns; none if that is little."""
     finite = use & np.isfinite(np.stack([reference, measured, *others])).all(axis=0)
     if independent_samples(int(np.count_nonzero(finite))) < 2.0 * MIN_SAMPLES:
         return []
@@ -398,5 +422,7 @@ def _partial(
         out = np.full(column.shape[0], np.nan)
         out[finite] = column[finite] - aside @ np.linalg.lstsq(aside, column[finite], rcond=None)[0]
         left.append(out)
+    if np.nanstd(left[0]) < separable * np.std(reference[finite]):
+        return []
     relations = compare(text, powers, left[0], left[1], finite, (0.0, np.inf))
     return [replace(r, least_correlation=MIN_PARTIAL_CORRELATION) for r in relations]

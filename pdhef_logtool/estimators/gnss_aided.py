@@ -9,7 +9,7 @@ error of the filter's v_y, antenna x, delay of the receiver] from
 with d of unit variance and S the uncertainty of the hypothesis, and from the velocity of the antenna across the
 heading. That of a late sample is the present one less what the sensors have integrated since. The likelihood of the
 GNSS samples, forgotten within seconds, weighs the hypotheses, as in :mod:`~.adaptive_physics`: where GNSS does not
-contradict the filter, its estimate stays. A sample outside of the gate speaks for the filter: multipath.
+contradict the filter, its estimate stays. Samples between a jump against the sensors and one back are not used.
 """
 
 from __future__ import annotations
@@ -30,47 +30,34 @@ from pdhef_logtool.estimators.physics_filter import LIMIT_TIME_S, LINEAR_SHARE, 
 from pdhef_logtool.estimators.reference.inputs import GNSS_LAG_S
 from pdhef_logtool.estimators.reference.smoother import BIAS_M_S2, BIAS_S, LAW_S, LAW_WHITE, TILT_SHARE, correct
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import (
-    RESTART_GAP_S,
-    Extrapolation,
-    StepColumns,
-    last_stamp_ns,
-    step_durations_s,
-)
+from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns, last_stamp_ns, step_durations_s
 from pdhef_logtool.records.tracks import StateTrack
 
 #: Entries of the state of a hypothesis.
-VY, HEADING, AY_BIAS, RATE_BIAS, LAW_ERROR, ANTENNA_X, DELAY = range(7)
-STATES = 7
+VY, HEADING, AY_BIAS, RATE_BIAS, LAW_ERROR, ANTENNA_X, DELAY, STATES = range(8)
 #: Uncertainty of the filter's v_y over v_x in degrees: constant, per m/s², per m/s³, per square of the share of the
 #: grip beyond the linear range; and the logarithm of the prior weight. Chosen on simulated drives.
-HYPOTHESES = np.array(
-    [[0.01, 0.0, 0.0, 0.0, 0.0], [0.06, 0.02, 0.02, 30.0, -5.0], [1.0, 0.3, 0.1, 30.0, -7.0]],
-)
-#: 1-sigma of a GNSS velocity at least, m/s; gate in 1-sigmas; a heading that every sample contradicts for as long is
-#: found anew, s.
-GNSS_STD_M_S, GATE_SIGMA, LOST_S = 0.1, 4.0, 20.0
-#: Time constant with which the likelihood is forgotten, s.
-FORGET_S = 5.0
-#: Slower, a velocity shows no course, m/s.
-LEAST_SPEED_M_S = 3.0
-#: Height of an antenna over the roll axis and its 1-sigma, m.
-ANTENNA_HEIGHT_M, HEIGHT_STD_M = 1.2, 0.5
-#: 1-sigmas at the start: heading, rad; gyro, rad/s; antenna x if unknown and if known, m; delay, s.
-HEADING_STD, RATE_STD, ANTENNA_STD_M, KNOWN_ANTENNA_STD_M, DELAY_STD_S = 0.1, 0.002, 0.5, 0.1, 0.03
-#: White noise of accelerometer, m/s²/√Hz, and gyro, rad/s/√Hz; walk of the gyro's bias, rad/s/√s.
-AY_NOISE, RATE_NOISE, RATE_WALK = 0.05, 0.001, 1e-5
-#: Interval to which the white part of the filter's error belongs, and its floor, m/s.
-KNOT_S, FLOOR_M_S = 0.05, 0.005
-#: Low passes of a_y: for its size and its derivative, s.
-SIZE_S, SLOPE_S = 0.05, 0.1
-#: GNSS samples that can wait for their arrival.
-QUEUE = 64
-_GATE = GATE_SIGMA**2
-_LAW = HYPOTHESES * np.array([math.pi / 180.0] * 4 + [1.0])
+HYPOTHESES = ((0.01, 0.0, 0.0, 0.0, 0.0), (0.06, 0.02, 0.02, 30.0, -5.5), (1.0, 0.3, 0.1, 30.0, -9.0),
+              (10.0, 0.3, 0.1, 30.0, -13.0))  # fmt: skip
+#: 1-sigma of a GNSS velocity at least, m/s; gate in 1-sigmas; speed below which there is no course, m/s.
+GNSS_STD_M_S, GATE_SIGMA, LEAST_SPEED_M_S = 0.1, 4.0, 3.0
+#: Time constant with which the likelihood is forgotten, s; jump of GNSS against the sensors, m/s; time after which a
+#: heading that samples contradict is determined again, s.
+FORGET_S, JUMP_M_S, LOST_S = 5.0, 0.3, 20.0
+#: Height of an antenna over the roll axis and its 1-sigma, m; 1-sigma of antenna x, unknown and known, m.
+ANTENNA_HEIGHT_M, HEIGHT_STD_M, ANTENNA_STD_M, KNOWN_ANTENNA_STD_M = 1.2, 0.5, 0.5, 0.1
+#: 1-sigmas at the start: heading, rad; gyro, rad/s; delay, s.
+HEADING_STD, RATE_STD, DELAY_STD_S = 0.1, 0.002, 0.03
+#: White noise of accelerometer, m/s²/√Hz, and gyro, rad/s/√Hz; walk of the gyro's bias, rad/s/√s; interval to which the
+#: white part of the filter's error belongs, s, and its floor, m/s.
+AY_NOISE, RATE_NOISE, RATE_WALK, KNOT_S, FLOOR_M_S = 0.05, 0.001, 1e-5, 0.05, 0.005
+#: Low passes of a_y: for its size and its derivative, s. GNSS samples that can wait for their arrival.
+SIZE_S, SLOPE_S, QUEUE = 0.05, 0.1, 64
+_LAW = np.array(HYPOTHESES) * np.array([math.pi / 180.0] * 4 + [1.0])
 
 # Entries of what all hypotheses share, and columns of a sample that waits.
-_CLOCK, _RATE, _AY, _VX, _VY, _TURNED, _MOVED, _SIZE, _SLOPE, _GRIP, _RUNS, _FIRST, _END = range(13)
+_CLOCK, _RATE, _AY, _VX, _TURNED, _MOVED, _SIZE, _SLOPE = range(8)
+_GRIP, _RUNS, _LEFT, _LAST, _JUMP, _SINCE, _AGREES, _FIRST, _END = range(8, 17)
 _EAST, _NORTH, _AT, _ARRIVAL, _TURNED_THEN, _MOVED_THEN, _RATE_THEN, _AY_THEN, _ROLL_THEN, _STD = range(10)
 
 
@@ -87,24 +74,16 @@ class Aiding(NamedTuple):
     waiting: FloatArray
 
 
-class _Car(NamedTuple):
-    roll_gradient: float
-    imu_x_m: float
-    grip_m_s2: float
-    antenna_x_m: float
-    antenna_std_m: float
-
-
 @njit(cache=True)
-def _start(memory, car, vy, vx):  # type: ignore[no-untyped-def]
+def _start(memory, antenna, vy, vx):  # type: ignore[no-untyped-def]
     x, P, facts, shared, _ = memory
     x[:], P[:], facts[:], shared[:] = 0.0, 0.0, 0.0, 0.0
-    x[:, VY], x[:, ANTENNA_X], facts[:, 2] = vy, car.antenna_x_m, -1.0
+    x[:, VY], x[:, ANTENNA_X], facts[:, 2] = vy, antenna[0], -1.0
     for i in range(x.shape[0]):
         P[i, VY, VY] = 0.01 + (_LAW[i, 0] * vx) ** 2
         P[i, AY_BIAS, AY_BIAS], P[i, RATE_BIAS, RATE_BIAS] = BIAS_M_S2**2, RATE_STD**2
         P[i, LAW_ERROR, LAW_ERROR] = 1.0
-        P[i, ANTENNA_X, ANTENNA_X], P[i, DELAY, DELAY] = car.antenna_std_m**2, DELAY_STD_S**2
+        P[i, ANTENNA_X, ANTENNA_X], P[i, DELAY, DELAY] = antenna[1] ** 2, DELAY_STD_S**2
 
 
 @njit(cache=True)
@@ -136,8 +115,8 @@ def _advance(x, P, dt, vx, ay_slope, kinematic):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _use(x, P, facts, sample, shared, h):  # type: ignore[no-untyped-def]
-    """Update one hypothesis with a GNSS velocity that has arrived."""
+def _residual(x, P, facts, sample, shared, h):  # type: ignore[no-untyped-def]
+    """Return residual and variances, the sample's and in all, of a GNSS velocity across the heading; Jacobian in h."""
     age = shared[_CLOCK] - sample[_AT]
     turned = shared[_TURNED] - sample[_TURNED_THEN] - age * x[RATE_BIAS]
     moved = shared[_MOVED] - sample[_MOVED_THEN] - age * (x[AY_BIAS] - x[RATE_BIAS] * shared[_VX])
@@ -151,32 +130,61 @@ def _use(x, P, facts, sample, shared, h):  # type: ignore[no-untyped-def]
     h[:] = 0.0
     h[VY], h[HEADING] = 1.0, c * sample[_EAST] + s * sample[_NORTH]
     h[ANTENNA_X], h[DELAY] = rate, -sample[_AY_THEN]
-    error = c * sample[_NORTH] - s * sample[_EAST] - left
-    variance = sample[_STD] ** 2
+    white = sample[_STD] ** 2 + (BIAS_M_S2 * age) ** 2
+    variance = white
     for i in range(STATES):
         for j in range(STATES):
             variance += h[i] * P[i, j] * h[j]
+    return c * sample[_NORTH] - s * sample[_EAST] - left, white, variance
+
+
+@njit(cache=True)
+def _use(x, P, facts, sample, shared, h, doubt):  # type: ignore[no-untyped-def]
+    """Update one hypothesis with a GNSS velocity; return the residual left. ``doubt``: cost of not fitting."""
+    error, white, variance = _residual(x, P, facts, sample, shared, h)
     square = error * error / variance
-    facts[0] -= 0.5 * (min(square, _GATE) + math.log(variance))
-    if square <= _GATE:
+    facts[0] -= 0.5 * (min(square, GATE_SIGMA**2) + math.log(variance))
+    if square <= GATE_SIGMA**2:
         facts[2] = -1.0
-        correct(x, P, h, error, sample[_STD] ** 2)
-        return 0.0
+        correct(x, P, h, error, white)
+        return error * white / variance
+    facts[0] -= doubt
     facts[2] = shared[_CLOCK] if facts[2] < 0.0 else facts[2]
     if shared[_CLOCK] - facts[2] > LOST_S:
         facts[1], facts[2] = 0.0, -1.0
-    return 1.0
+    return error
+
+
+@njit(cache=True)
+def _has_jumped(error, sample, shared, facts):  # type: ignore[no-untyped-def]
+    """Return whether GNSS is between a jump against the sensors and one back (multipath), for ``LOST_S`` at most."""
+    change = error - shared[_LEFT]
+    limit = JUMP_M_S + 0.02 * abs(sample[_AY_THEN]) + 0.5 * (sample[_AT] - shared[_LAST]) + abs(sample[_ROLL_THEN])
+    limit += 0.3 * abs(sample[_RATE_THEN])  # an error of v_x becomes one of v_y
+    shared[_LAST] = sample[_AT]
+    if shared[_JUMP] == 0.0 and abs(change) > limit:
+        shared[_JUMP], shared[_SINCE] = change, shared[_CLOCK]
+    elif abs(change + shared[_JUMP]) < 0.5 * abs(shared[_JUMP]):
+        shared[_JUMP] = 0.0
+    elif shared[_JUMP] != 0.0 and shared[_CLOCK] - shared[_SINCE] > LOST_S:
+        shared[_JUMP], shared[_LEFT] = 0.0, 0.0
+        facts[:, 1] = 0.0
+        return True
+    shared[_LEFT] = error
+    return shared[_JUMP] != 0.0
 
 
 @njit(cache=True)
 def _queue(columns, k, p_roll, shared, waiting):  # type: ignore[no-untyped-def]
     """Put the GNSS velocity of step k where it waits for its arrival; the oldest one goes where there is no room."""
     east, north, std, late = columns[7:]
-    row = waiting[int(shared[_END]) % QUEUE]
-    row[_EAST], row[_NORTH] = east[k], north[k]
-    row[_AT], row[_ARRIVAL] = shared[_CLOCK], shared[_CLOCK] + late[k]
-    row[_TURNED_THEN], row[_MOVED_THEN] = shared[_TURNED], shared[_MOVED]
-    row[_RATE_THEN], row[_AY_THEN], row[_ROLL_THEN] = shared[_RATE], shared[_AY], p_roll
+    row, last = waiting[int(shared[_END]) % QUEUE], waiting[int(shared[_END] - 1.0) % QUEUE]
+    if shared[_END] > 0.0:  # a course that turns against the gyro is that of exchanged or mirrored axes
+        turn = last[_EAST] * north[k] - last[_NORTH] * east[k]
+        shared[_AGREES] += turn / (math.hypot(east[k], north[k]) ** 2) * (shared[_TURNED] - last[_TURNED_THEN])
+    row[_EAST], row[_NORTH], row[_AT], row[_ARRIVAL] = east[k], north[k], shared[_CLOCK], shared[_CLOCK] + late[k]
+    row[_TURNED_THEN], row[_MOVED_THEN], row[_ROLL_THEN] = shared[_TURNED], shared[_MOVED], p_roll
+    row[_RATE_THEN], row[_AY_THEN] = shared[_RATE], shared[_AY]
     stated = max(std[k], GNSS_STD_M_S) if std[k] == std[k] else GNSS_STD_M_S
     row[_STD] = math.sqrt(stated**2 + (GNSS_LAG_S * shared[_AY]) ** 2 + (HEIGHT_STD_M * p_roll) ** 2)
     shared[_END] += 1.0
@@ -184,22 +192,22 @@ def _queue(columns, k, p_roll, shared, waiting):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _share(columns, k, dt, car, memory):  # type: ignore[no-untyped-def]
+def _share(columns, k, dt, body, shared):  # type: ignore[no-untyped-def]
     """Move what the hypotheses share to step k; return what the sensors integrate to, and the slope of a_y."""
     ay, rate, vx = columns[2:5]
-    shared = memory.shared
+    roll_gradient, imu_x_m, grip_m_s2 = body
     new_rate = rate[k] if math.isfinite(rate[k]) else shared[_RATE]
-    new_ay = ay[k] / (1.0 + GRAVITY_M_S2 * car.roll_gradient) if math.isfinite(ay[k]) else shared[_AY]
+    new_ay = ay[k] / (1.0 + GRAVITY_M_S2 * roll_gradient) if math.isfinite(ay[k]) else shared[_AY]
     if dt == 0.0:
         shared[_RATE], shared[_AY], shared[_SIZE], shared[_SLOPE], shared[_VX] = new_rate, new_ay, new_ay, new_ay, vx[k]
     r = 0.5 * (shared[_RATE] + new_rate)
     turned = dt * r
     moved = dt * (0.5 * (shared[_AY] + new_ay) - r * 0.5 * (shared[_VX] + vx[k]))
-    moved -= car.imu_x_m * (new_rate - shared[_RATE])
+    moved -= imu_x_m * (new_rate - shared[_RATE])
     before = shared[_SLOPE]
     shared[_SIZE] += (new_ay - shared[_SIZE]) * (1.0 - math.exp(-dt / SIZE_S))
     shared[_SLOPE] += (new_ay - shared[_SLOPE]) * (1.0 - math.exp(-dt / SLOPE_S))
-    shared[_GRIP] = max(abs(shared[_SIZE]) / car.grip_m_s2, shared[_GRIP] * math.exp(-dt / LIMIT_TIME_S))
+    shared[_GRIP] = max(abs(shared[_SIZE]) / grip_m_s2, shared[_GRIP] * math.exp(-dt / LIMIT_TIME_S))
     shared[_CLOCK] += dt
     shared[_TURNED] += turned
     shared[_MOVED] += moved
@@ -208,26 +216,24 @@ def _share(columns, k, dt, car, memory):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _mixture(x, P, facts, vy, out, k):  # type: ignore[no-untyped-def]
+def _mixture(x, P, facts, agrees, vy, out, k):  # type: ignore[no-untyped-def]
     """Write what the hypotheses add to v_y at step k, the weight of the filter, and their part of the variance."""
-    most = -math.inf
+    total, mean, variance, most = 0.0, 0.0, 0.0, np.max(facts[:, 0] + _LAW[:, 4])
     for i in range(x.shape[0]):
-        most = max(most, facts[i, 0] + _LAW[i, 4])
-    total, mean, variance = 0.0, 0.0, 0.0
-    for i in range(x.shape[0]):
-        weight = math.exp(facts[i, 0] + _LAW[i, 4] - most)
+        has_heading = i == 0 or (agrees and facts[i, 1] > 0.0)  # without a heading GNSS states nothing
+        weight = math.exp(facts[i, 0] + _LAW[i, 4] - most) if has_heading else 0.0
         total += weight
         if i > 0:
             mean += weight * (x[i, VY] - vy)
             variance += weight * (P[i, VY, VY] + (x[i, VY] - vy) ** 2)
+        else:
+            out[k, 1] = weight
     mean /= total
-    out[k, 0] = mean
-    out[k, 1] = math.exp(facts[0, 0] + _LAW[0, 4] - most) / total
-    out[k, 2] = max(0.0, variance / total - mean * mean)
+    out[k, 0], out[k, 1], out[k, 2] = mean, out[k, 1] / total, max(0.0, variance / total - mean * mean)
 
 
 @njit(cache=True)
-def _aid(columns, car, memory, out):  # type: ignore[no-untyped-def]
+def _aid(columns, body, antenna, memory, out):  # type: ignore[no-untyped-def]
     """Run over one window; ``memory`` is moved in place. ``out`` [K, 3] as :func:`_mixture` writes it."""
     dts, ready, _, _, vx, vy, usable, east, north, _, _ = columns
     x, P, facts, shared, waiting = memory
@@ -239,10 +245,10 @@ def _aid(columns, car, memory, out):  # type: ignore[no-untyped-def]
             continue
         dt = dts[k]
         if shared[_RUNS] == 0.0 or not dt <= RESTART_GAP_S:
-            _start(memory, car, vy[k], vx[k])
+            _start(memory, antenna, vy[k], vx[k])
             dt = 0.0
         shared[_RUNS] = 1.0
-        kinematic, ay_slope = _share(columns, k, dt, car, memory)
+        kinematic, ay_slope = _share(columns, k, dt, body, shared)
         beyond = max(0.0, shared[_GRIP] - LINEAR_SHARE) ** 2
         for i in range(x.shape[0]):
             if dt == 0.0:
@@ -256,16 +262,17 @@ def _aid(columns, car, memory, out):  # type: ignore[no-untyped-def]
             white = (LAW_WHITE * error_m_s) ** 2 * KNOT_S / dt + FLOOR_M_S**2
             correct(x[i], P[i], h, vy[k] - x[i, VY] + error_m_s * x[i, LAW_ERROR], white)
         if math.hypot(east[k], north[k]) >= LEAST_SPEED_M_S:
-            _queue(columns, k, car.roll_gradient * ay_slope, shared, waiting)
+            _queue(columns, k, body[0] * ay_slope, shared, waiting)
         while shared[_FIRST] < shared[_END]:
             sample = waiting[int(shared[_FIRST]) % QUEUE]
             if sample[_ARRIVAL] > shared[_CLOCK] + ready[k]:
                 break
             shared[_FIRST] += 1.0
-            for i in range(x.shape[0]):
-                rejected = _use(x[i], P[i], facts[i], sample, shared, h)
-                facts[i, 0] -= rejected if i > 0 else 0.0
-        _mixture(x, P, facts, vy[k], out, k)
+            error, _, _ = _residual(x[-1], P[-1], facts[-1], sample, shared, h)
+            if not _has_jumped(error, sample, shared, facts):
+                for i in range(x.shape[0]):
+                    shared[_LEFT] = _use(x[i], P[i], facts[i], sample, shared, h, min(i, 1))
+        _mixture(x, P, facts, shared[_AGREES] > 0.0, vy[k], out, k)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -331,35 +338,19 @@ class GnssAided:
         track = self.estimator.predict(steps, at_steps, stamps_ns)
         corrected = self._physics.corrected(signals)
         columns = (
-            step_durations_s(stamps_ns, before_ns),
-            (signals.ready_ns - stamps_ns) * 1e-9,
-            corrected.ay_m_s2,
-            corrected.yaw_rate_rad_s,
-            track.vx_m_s,
-            track.vy_m_s,
-            track.valid & np.isfinite(track.vy_m_s),
-            signals.gnss_velocity_m_s[:, 0],
-            signals.gnss_velocity_m_s[:, 1],
-            signals.gnss_velocity_std_m_s,
-            np.nan_to_num(signals.gnss_late_s),
-        )
+            step_durations_s(stamps_ns, before_ns), (signals.ready_ns - stamps_ns) * 1e-9, corrected.ay_m_s2,
+            corrected.yaw_rate_rad_s, track.vx_m_s, track.vy_m_s, track.valid & np.isfinite(track.vy_m_s),
+            *signals.gnss_velocity_m_s.T, signals.gnss_velocity_std_m_s, np.nan_to_num(signals.gnss_late_s),
+        )  # fmt: skip
         shapes = ((h, STATES), (h, STATES, STATES), (h, 3), (_END + 1,), (QUEUE, _STD + 1))
         aiding = Aiding(*(np.zeros(s) for s in shapes) if state is None else (a.copy() for a in state.aiding))
         out = np.empty((count, 3))
-        _aid(columns, self._car, aiding, out)
-        return AidedSteps(steps, out), AidedState(after, aiding, last_stamp_ns(stamps_ns, before_ns))
-
-    @property
-    def _car(self) -> _Car:
         vehicle = self._physics.vehicle
         antenna = vehicle.gnss_antenna_position_m
-        return _Car(
-            vehicle.roll_gradient_rad_per_m_s2,
-            vehicle.imu_position_m[0],
-            GRAVITY_M_S2 * vehicle.assumed_friction,
-            0.0 if antenna is None else antenna[0],
-            ANTENNA_STD_M if antenna is None else KNOWN_ANTENNA_STD_M,
-        )
+        body = (vehicle.roll_gradient_rad_per_m_s2, vehicle.imu_position_m[0], GRAVITY_M_S2 * vehicle.assumed_friction)
+        prior = (0.0, ANTENNA_STD_M) if antenna is None else (antenna[0], KNOWN_ANTENNA_STD_M)
+        _aid(columns, body, prior, aiding, out)
+        return AidedSteps(steps, out), AidedState(after, aiding, last_stamp_ns(stamps_ns, before_ns))
 
     def predict(self, steps: AidedSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate the filter's steps and add what GNSS adds (see :class:`~.base.ModelPredictor`)."""
@@ -367,9 +358,8 @@ class GnssAided:
         change, weight, variance = steps.aid[ahead.step].T
         change = np.where(track.valid, change, 0.0)
         vy, covariance = track.vy_m_s + change, track.covariance
-        old = covariance[:, 1, 1]
         scale = np.ones((len(track), 3))  # row and column alike, so that correlations stay
-        scale[:, 1] = np.sqrt(weight + np.where(old > 0.0, variance / np.where(old > 0.0, old, 1.0), 0.0))
+        scale[:, 1] = np.sqrt(weight + variance / np.maximum(covariance[:, 1, 1], 1e-12))
         covariance = covariance * scale[:, :, None] * scale[:, None, :]
         return replace(
             track,

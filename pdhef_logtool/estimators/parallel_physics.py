@@ -131,8 +131,8 @@ def run_features(
         steps.inputs[:, U_STEER], usable.ay_m_s2, usable.yaw_rate_rad_s, steps.x, steps.prior, predicted,
         friction, usable.ax_m_s2, body, np.concatenate([car_features(physics.vehicle, friction), parameters], axis=1),
     )  # fmt: skip
-    known = steps.inputs[:, U_STEER_KNOWN] > 0.0
-    features[~(steps.valid & known & rolls_forward(steps.x[:, VX], steps.inputs[:, U_SPEED]))] = np.nan
+    steers = steps.inputs[:, U_STEER_KNOWN] > 0.0
+    features[~(steps.valid & steers & rolls_forward(steps.x[:, VX], steps.inputs[:, U_SPEED]))] = np.nan
     return features, steps, after
 
 

@@ -398,7 +398,7 @@ def _write_prediction(m, x, P, steer, rate_vy, places, p, predicted):  # type: i
 # positional: as _predict.
 @_compiled
 def _find_steering(x, P, std):  # type: ignore[no-untyped-def]
-    """End the estimate of an unknown steering angle: its bias starts anew with ``std``."""
+    """End the estimate of an unknown steering angle: its bias restarts with ``std``."""
     x[STEER_BIAS] = 0.0
     P[STEER_BIAS, :] = 0.0
     P[:, STEER_BIAS] = 0.0

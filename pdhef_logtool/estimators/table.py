@@ -40,7 +40,7 @@ class Spec:
     ----------
     build : called with the name, the :class:`Car` and :class:`Options`: a function, or ``module:function`` under
         :mod:`pdhef_logtool.estimators`, imported when it is first needed.
-    needs : aligned signals without which it cannot run. one_of : signals of which it needs any one; empty: none.
+    needs : aligned signals without which it cannot run. one_of : signals; it needs at least one of them; empty: none.
     colour : 0xRRGGBB in every plot, tellable apart with any colour vision (Okabe and Ito 2008; Tol's muted scheme).
     causal : whether an estimate at t uses only what had arrived by t.
     in_all : whether it is one of :data:`ALL_ESTIMATORS`.

@@ -66,41 +66,52 @@ def pooled(
         return Bounded(nan, nan, nan, n)
     ratio = total / base
     value = float(ratio**power) if positive else ratio
-    if n < 2:
-        return Bounded(value, nan, nan, n)
-    if positive and total <= 0.0:
-        return Bounded(0.0, 0.0, 0.0, n)
+    if n < 2 or (positive and total <= 0.0):
+        return Bounded(value, nan, nan, n) if n < 2 else Bounded(0.0, 0.0, 0.0, n)
     effect = dependence(top - ratio * below, factors or {})
-    if n > _MOST_UNITS:  # neighbours are drawn together
-        groups = np.arange(n) * _MOST_UNITS // n
-        top, below = (np.bincount(groups, weights=c).astype(np.float64) for c in (top, below))
-    log = positive
-    error = float(_error(top, below, np.ones((1, len(top))), power, log=log)[0])
-    if error == 0.0:
-        return Bounded(value, value, value, n)
-    deviations = _deviations(top, below, power, math.log(ratio) * power if log else ratio, log=log)
     tail = 0.5 * (1.0 - level)
-    from scipy.special import stdtrit
-
-    most_deviation = _MOST_DEVIATION * float(stdtrit(len(top) - 1, 1.0 - tail))
-    least, most = np.clip(np.quantile(deviations, [tail, 1.0 - tail]), -most_deviation, most_deviation)
-    scale = math.sqrt(effect.design_effect)
-    if effect.by:  # few days: their number limits what is known of the spread
-        least, most = min(least, -deviate(1.0 - tail, effect.freedom)), max(most, deviate(1.0 - tail, effect.freedom))
-    below_s, above_s = float(most) * error * scale, -float(least) * error * scale
-    if not log:
+    below_s, above_s = _studentised(top, below, power, tail, effect, log=positive)
+    if not positive:
         return Bounded(value, value - below_s, value + above_s, n, effect)
-    if factors is not None and others is None and LEAST_DRIVES <= n < _LOGNORMAL and (values > 0.0).all():
+    if factors is not None and others is None:
         # The mean of both: that of lognormal errors alone is wide where few drives differ much.
+        scale = math.sqrt(effect.design_effect)
         above_s += 0.5 * max(scale * _lognormal_excess(values, 1.0 if squares else 0.5, tail) - above_s, 0.0)
     return Bounded(value, value * math.exp(-below_s), value * math.exp(min(above_s, _MOST_LOG)), n, effect)
 
 
+def _studentised(
+    top: FloatArray, below: FloatArray, power: float, tail: float, effect: Dependence, *, log: bool
+) -> tuple[float, float]:
+    """Return the distances from the statistic, or its logarithm, to its lower and upper bound."""
+    from scipy.special import stdtrit
+
+    n = len(top)
+    if n > _MOST_UNITS:  # neighbours are drawn together
+        groups = np.arange(n) * _MOST_UNITS // n
+        top, below = (np.bincount(groups, weights=c).astype(np.float64) for c in (top, below))
+    error = float(_error(top, below, np.ones((1, len(top))), power, log=log)[0])
+    if error == 0.0:
+        return 0.0, 0.0
+    ratio = float(top.sum() / below.sum())
+    deviations = _deviations(top, below, power, math.log(ratio) * power if log else ratio, log=log)
+    most_deviation = _MOST_DEVIATION * float(stdtrit(len(top) - 1, 1.0 - tail))
+    least, most = np.clip(np.quantile(deviations, [tail, 1.0 - tail]), -most_deviation, most_deviation)
+    if effect.by:  # few days: their number limits what is known of the spread
+        known = deviate(1.0 - tail, effect.freedom)
+        least, most = min(least, -known), max(most, known)
+    error *= math.sqrt(effect.design_effect)
+    return float(most) * error, -float(least) * error
+
+
 def _lognormal_excess(values: FloatArray, power: float, tail: float) -> float:
-    """Return ln(upper bound / estimate) of exp(μ + ``power`` σ²) of lognormal values [N]."""
+    """Return ln(upper bound / estimate) of exp(μ + ``power`` σ²) of lognormal values [N]; 0 of too few or too many."""
     from scipy.special import chdtri, stdtrit
 
-    n, variance = len(values), float(np.var(np.log(values), ddof=1))
+    n = len(values)
+    if not LEAST_DRIVES <= n < _LOGNORMAL or not (values > 0.0).all():
+        return 0.0
+    variance = float(np.var(np.log(values), ddof=1))
     of_mean = float(stdtrit(n - 1, 1.0 - tail)) * math.sqrt(variance / n)
     return math.hypot(of_mean, power * variance * ((n - 1) / float(chdtri(n - 1, 1.0 - tail)) - 1.0))
 

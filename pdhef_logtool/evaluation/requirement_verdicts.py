@@ -69,15 +69,14 @@ class DriveValue:
 
     def seconds_in(self, need: ExposureNeed) -> float:
         """Return the driving in conditions."""
-        of_drive = ((need.friction, self.friction),)
-        if not all(_inside(r, value) for r, value in of_drive) or need.car not in (None, self.factors.get("car")):
+        if not _inside(need.friction, self.friction) or need.car not in (None, self.factors.get("car")):
             return 0.0
         return math.fsum(
             s for (speed, ay), s in self.space.items() if _inside(need.speed_m_s, speed) and _inside(need.ay_m_s2, ay)
         )
 
 
-def _inside(bounds: tuple[float, float] | None, value: float) -> bool:
+def _inside(bounds: Sequence[float] | None, value: float) -> bool:
     return bounds is None or bounds[0] <= value < bounds[1]
 
 
@@ -128,7 +127,7 @@ class RequirementVerdict:
         del values["requirement"]
         requirement = {**asdict(self.requirement), "label": self.requirement.label, "unit": self.requirement.unit}
         requirement["title"] = self.requirement.title or self.requirement.label
-        requirement["exposure_in"] = requirement.pop("exposure")
+        requirement["exposure_in"] = [need.model_dump() for need in requirement.pop("exposure")]
         return {
             **requirement,
             "at_least": self.requirement.metric in AT_LEAST,
@@ -431,7 +430,8 @@ def _notes(
     if requirement.signal == "ay_m_s2":
         notes.append(AY_NOTE)
     if drives and all(d.same for d in drives):
-        notes.append(f"{drives[0].estimator} equals {requirement.baseline} in these drives (residual gain 0)")
+        why = "" if requirement.other_run is not None else " (residual gain 0)"
+        notes.append(f"{drives[0].estimator} equals {requirement.baseline} in these drives{why}")
     return notes
 
 

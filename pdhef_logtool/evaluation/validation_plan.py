@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.segments import SEGMENTS
@@ -30,19 +30,32 @@ AT_LEAST = frozenset({"coverage95", "availability"})
 _QUANTILE = re.compile(r"quantile (0\.\d+)")
 
 
-@dataclass(frozen=True, slots=True)
-class ExposureNeed:
-    """The least driving in conditions, of the drives that are scored.
+_Name = Annotated[str, Field(min_length=1, max_length=200)]
+_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+_Range = Annotated[list[float] | None, Field(min_length=2, max_length=2)]
 
-    ``speed_m_s``, ``ay_m_s2`` (its size), ``friction`` (median of the drive): [least, less than]; None: any.
-    """
 
-    speed_m_s: tuple[float, float] | None = None
-    ay_m_s2: tuple[float, float] | None = None
-    friction: tuple[float, float] | None = None
-    car: str | None = None
-    drives: int = 0
-    minutes: float = 0.0
+class ExposureNeed(BaseModel):
+    """A table ``[[requirement.exposure]]``: the least driving in conditions, of the drives that are scored."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    speed_m_s: Annotated[_Range, Field(description="Speed from, to: multiples of 5; [60, 65] is all above 60.")] = None
+    ay_m_s2: Annotated[_Range, Field(description="|a_y| from, to: integers; [12, 13] is all above 12.")] = None
+    friction: Annotated[_Range, Field(description="Median friction of the drive from, to.")] = None
+    car: Annotated[_Name | None, Field(description="Name of the car.")] = None
+    drives: Annotated[int, Field(ge=0, description="Least number of drives.")] = 0
+    minutes: Annotated[float, Field(ge=0.0, allow_inf_nan=False, description="Least minutes.")] = 0.0
+
+    @model_validator(mode="after")
+    def _agrees(self) -> ExposureNeed:
+        for bounds, step in ((self.speed_m_s, 5.0), (self.ay_m_s2, 1.0), (self.friction, None)):
+            off_grid = bounds is not None and step is not None and any(b % step for b in bounds)
+            if bounds is not None and (off_grid or not 0.0 <= bounds[0] < bounds[1]):
+                raise ValueError(f"{bounds} should be [from, to]{f', multiples of {step:g}' if off_grid else ''}")
+        if not self.drives and not self.minutes:
+            raise ValueError("give drives or minutes")
+        return self
 
     @property
     def label(self) -> str:
@@ -154,26 +167,6 @@ def shown(value: float, unit: str) -> str:
     return f"{value * factor:.3g}{'' if text.startswith('°') else ' '}{text}"
 
 
-_Name = Annotated[str, Field(min_length=1, max_length=200)]
-_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-
-
-_Range = Annotated[list[float] | None, Field(min_length=2, max_length=2)]
-
-
-class ExposureTable(BaseModel):
-    """A table ``[[requirement.exposure]]``: driving in conditions, from the operating space of each drive."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
-    speed_m_s: Annotated[_Range, Field(description="Speed from, to: multiples of 5; [60, 65] is all above 60.")] = None
-    ay_m_s2: Annotated[_Range, Field(description="|a_y| from, to: integers; [12, 13] is all above 12.")] = None
-    friction: Annotated[_Range, Field(description="Median friction of the drive from, to.")] = None
-    car: Annotated[_Name | None, Field(description="Name of the car.")] = None
-    drives: Annotated[int, Field(ge=0, description="Least number of drives.")] = 0
-    minutes: Annotated[float, Field(ge=0.0, allow_inf_nan=False, description="Least minutes.")] = 0.0
-
-
 class RequirementTable(BaseModel):
     """A table ``[[requirement]]`` of plan.toml."""
 
@@ -219,7 +212,7 @@ class RequirementTable(BaseModel):
     exposure_km: Annotated[
         float, Field(ge=0.0, allow_inf_nan=False, description="Least scored driving in kilometres.")
     ] = 0.0
-    exposure: Annotated[list[ExposureTable], Field(max_length=50, description="Least driving in conditions.")] = []
+    exposure: Annotated[list[ExposureNeed], Field(max_length=50, description="Least driving in conditions.")] = []
 
 
 class PlanTable(BaseModel):
@@ -306,23 +299,9 @@ def _read(raw: object, where: str, problems: list[str]) -> Requirement | None:
         segment=segment,
         limit=limit,
         quantile=None if matches is None else float(matches[1]),
-        exposure=tuple(_need(t, f"{where}.exposure[{i}]", problems) for i, t in enumerate(table.exposure)),
+        exposure=tuple(table.exposure),
         **table.model_dump(exclude=rest),
     )
-
-
-def _need(table: ExposureTable, where: str, problems: list[str]) -> ExposureNeed:
-    """Return the least driving in conditions; add what is wrong with it."""
-    ranges = {key: getattr(table, key) for key in ("speed_m_s", "ay_m_s2", "friction")}
-    for key, step in (("speed_m_s", 5.0), ("ay_m_s2", 1.0), ("friction", 0.0)):
-        bounds = ranges[key]
-        if bounds is not None and (not 0.0 <= bounds[0] < bounds[1] or (step and any(b % step for b in bounds))):
-            grid = f", multiples of {step:g}" if step else ""
-            problems.append(f"{where}.{key} = {bounds}: should be [from, to]{grid}")
-    if not table.drives and not table.minutes:
-        problems.append(f"{where}: give drives or minutes")
-    pairs = {key: None if bounds is None else (bounds[0], bounds[1]) for key, bounds in ranges.items()}
-    return ExposureNeed(**pairs, car=table.car, drives=table.drives, minutes=table.minutes)
 
 
 def comparable() -> tuple[str, ...]:

@@ -111,13 +111,14 @@ class Relation:
         with np.errstate(divide="ignore"):
             size = np.log(np.abs(gains))
         room = -math.log(max(abs(self.correlation), 1e-3))  # between the two regressions
+        # Blocks that differ show what changes: sliding, a frequency that tyres do not follow; a unit does not change.
+        apart = float(np.std(size)) if np.isfinite(size).all() else 0.0
         beyond = np.maximum(np.maximum(low - room - size, size - high - room), 0.0)
-        beyond /= EDGE if self.decides_unit else WIDE_EDGE
-        energy = 0.5 * beyond**2
+        energy = 0.5 * (beyond / math.hypot(EDGE if self.decides_unit else WIDE_EDGE, apart)) ** 2
         if self.decides_unit:
             middle = math.log(self.typical) if low < math.log(self.typical) < high else 0.5 * (low + high)
-            off = np.maximum(np.abs(size - middle) - room, 0.0) / max((high - low) / 6.0, LEAST_WIDTH)
-            energy = energy + 0.5 * off**2
+            off = np.maximum(np.abs(size - middle) - room, 0.0)
+            energy += 0.5 * (off / math.hypot(max((high - low) / 6.0, LEAST_WIDTH), apart)) ** 2
         energy = np.minimum(energy, MOST_ENERGY)
         return float(np.mean(energy if self.signless else np.where(gains > 0.0, energy, MOST_ENERGY)))
 
@@ -150,6 +151,7 @@ class Hypothesis:
         names = {"wheels" if n.startswith("wheel_speed") else n for n in self.factors}
         ranks = [_OFTEN_WRONG.index(n) if n in _OFTEN_WRONG else len(_OFTEN_WRONG) for n in names]
         seldom = 0.0 if max(ranks) < 2 else _SELDOM + _SELDOM_STEP * max(ranks)
+        seldom *= 2.0 if self.kind == "foreign" else 1.0
         return PRIORS[self.kind] + seldom + 0.5 * (len(names) - 1) + (0.0 if self.is_exact else 0.5)
 
     def acts_on(self, relation: Relation) -> float:
@@ -236,7 +238,8 @@ def known_hypotheses(names: Sequence[str], together: Sequence[tuple[str, ...]] =
     out: list[Hypothesis] = []
     groups = [[n for n in group if n in names] for group in together]
     parts = [part for group in groups for size in range(2, len(group) + 1) for part in combinations(group, size)]
-    for part in (*((n,) for n in names), *dict.fromkeys(parts)):
+    # The mean of the wheels is no signal.
+    for part in (*((n,) for n in names if n != "wheel_speeds"), *dict.fromkeys(parts)):
         words = _together(part)
         is_one = len(part) == 1
         units = units_of(part[0].removeprefix("truth."))
@@ -249,7 +252,7 @@ def known_hypotheses(names: Sequence[str], together: Sequence[tuple[str, ...]] =
         if is_one:
             both = "and has the wrong sign"
             out += [Hypothesis({part[0]: -f}, f"{words} {text} {both}", "sign and unit") for f, text in units]
-        if is_one or words.startswith("wheel"):
+        if is_one or (words.startswith("wheel") and list(part) in groups):
             out.append(Hypothesis(dict.fromkeys(part, math.nan), words, "field"))
         # A sensor is mounted upside down or backwards, or ground truth has another convention; speeds count ahead.
         if is_one or not _NEVER_TURNED & set(part):

@@ -212,3 +212,8 @@ def join_signals(windows: Sequence[Signals]) -> Signals:
 def has_gnss(names: Collection[str]) -> bool:
     """Return whether signals contain a GNSS velocity: its components, or speed and course."""
     return any(names_of <= set(names) for names_of in (GNSS_COMPONENTS, _GNSS_POLAR))
+
+
+def has_position(names: Collection[str]) -> bool:
+    """Return whether signals contain a GNSS position."""
+    return set(GNSS_POSITION) <= set(names)

@@ -111,7 +111,7 @@ def _worst(fleet: Fleet, charts: Charts) -> tuple[str, float | None] | None:
             for error, d in ranked[:_WORST]
         ]
         title = f"The {len(bars)} drives with the largest sideslip RMSE"
-        charts.intervals("worst", title, "°", bars, zero=0.0)
+        charts.intervals("worst", title, "RMSE in °", bars, zero=0.0)
     return ranked[0][1].label, ranked[0][0]
 
 
@@ -126,7 +126,7 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
         "medians",
         f"Median RMSE of sideslip over {first.drives} drives, 95 % interval"
         + ("" if len(near) == len(judged) else f" (beyond {_DRAWN:g} times the selected estimate's: table)"),
-        "°",
+        "RMSE in °",
         [
             Interval(d.estimator, d.median.low * degree, d.median.value * degree, d.median.high * degree, _colour(d))
             for d in near
@@ -136,7 +136,7 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
         values = first.values * degree
         edges, counts = _histogram(values)
         beyond = ", the last bar and beyond" if values[-1] > edges[-1] else ""
-        charts.bars("spread", f"Drives by RMSE of the selected estimate's sideslip{beyond}", "°", edges, counts)
+        charts.bars("spread", f"Drives by RMSE of the selected estimate's sideslip{beyond}", "RMSE in °", edges, counts)
     rival, drives = _rival(fleet), fleet.scored
     if rival is not None:
         ours, other = (np.array([d.error(name) * degree for d in drives]) for name in (ANSWER, rival))

@@ -128,11 +128,6 @@ def pdf_page(run: OpenedRun, *, positions: bool = False) -> bytes:
     )
 
 
-def _title(plan: Mapping[str, Any] | None) -> str:
-    """Return the title of a user's plan."""
-    return str(plan.get("title") or "") if plan is not None and plan.get("file") else ""
-
-
 def _report(log: OpenedLog) -> dict[str, Any] | None:
     try:
         report = log.report()

@@ -290,12 +290,16 @@ def _why_missing(
 ) -> str:
     """Return why no drive has the metric of a requirement."""
     if requirement.other_run is not None and against is None:
-        if requirement.other_run != RUN:
-            return f"the drives of {requirement.baseline} are compared by the verdict on the run"
-        return "the baseline is another run: pdhef compare A B --plan PLAN"
+        how = "pdhef compare A B --plan PLAN" if requirement.other_run == RUN else "see the verdict on the run"
+        return f"the baseline is another run: {how}"
     names = {d.log: name for d in drives if (name := requirement.estimator or figures.main(d))}
     if not names:
         return "there are several recorded estimates: name one with estimator" if figures.names else "no estimate"
+    return _why_unscored(requirement, figures, names)
+
+
+def _why_unscored(requirement: Requirement, figures: Figures, names: Mapping[str, str]) -> str:
+    """Return why no drive has the metric of the estimators ``names`` by log."""
     scored = [log for log, name in names.items() if figures.of(log, name, requirement, requirement.metric)]
     tainted = [log for log in scored if (log, names[log], requirement.signal, "all", NOT_INDEPENDENT) in figures.values]
     if scored and len(tainted) == len(scored):

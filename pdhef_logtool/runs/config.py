@@ -89,7 +89,7 @@ class RunConfig:
         log has shown so far (causal), on the ``pool`` of all logs, or ``off``.
     reference : sideslip reference (not causal, without tyre data): ``auto`` (where the log has no ground truth of
         sideslip), ``on`` (beside ground truth as well) or ``off``.
-    gnss : ``auto`` (the reference uses GNSS velocity where the log has it) or ``off``.
+    gnss : ``auto`` (``physics``, ``pd-hef`` and the reference use GNSS velocity where the log has it) or ``off``.
     no_position : keep latitude, longitude and all other positions and headings out of the outputs; topics that may
         contain one are not copied, and no reduced logs (``cache``) are written.
     waived : names of checks whose failure is ignored.
@@ -198,6 +198,17 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
         from pdhef_logtool.estimators.table import check_names  # inspect takes none, and no compiler
 
         check_names(config.estimators)
+    _check_cache(config)
+    if config.setup is not None and config.setup_from_s is not None:
+        raise UsageError(expected="--setup or --setup-from", got="both", where="--setup")
+    # Times are understood without a log, so that a typing error is given before the first log is opened.
+    for name, text in (("--start", config.start), ("--end", config.end)):
+        if text is not None:
+            parse_time(text, 0, 0, option=name)
+    return config
+
+
+def _check_cache(config: RunConfig) -> None:
     if config.cache is not None and config.annotate == "full":
         raise UsageError(
             expected="--annotate sidecar or none with --cache",
@@ -214,13 +225,6 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
         )
     if config.cache_max_gb is not None and (config.cache is None or is_url(config.cache)):
         raise UsageError(expected="--cache DIR", got=config.cache or "none", where="cache_max_gb")
-    if config.setup is not None and config.setup_from_s is not None:
-        raise UsageError(expected="--setup or --setup-from", got="both", where="--setup")
-    # Times are understood without a log, so that a typing error is given before the first log is opened.
-    for name, text in (("--start", config.start), ("--end", config.end)):
-        if text is not None:
-            parse_time(text, 0, 0, option=name)
-    return config
 
 
 def parse_assignments(texts: Sequence[str]) -> dict[str, Any]:

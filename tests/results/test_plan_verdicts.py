@@ -91,7 +91,7 @@ def test_the_estimated_reference_counts_only_without_ground_truth() -> None:
 @pytest.mark.parametrize(
     ("requirement", "reason"),
     [
-        (Requirement("A", "", "vx_m_s", limit=1.0), "no ground truth of vx_m_s"),
+        (Requirement("A", "", "vx_m_s", limit=1.0), "no ground truth of v_x"),
         (Requirement("A", "", "sideslip_rad", segment="slalom", limit=1.0), "no scored driving in slalom"),
         (Requirement("A", "", "sideslip_rad", estimator="ekf", limit=1.0), "ekf did not run: add it to --estimators"),
         (Requirement("A", "", "sideslip_rad", baseline="ekf", max_ratio=1.0), "ekf has no such value"),
@@ -213,12 +213,12 @@ def test_a_missing_earlier_run_ends_the_command_before_the_work(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("need", "outcome", "words"),
     [
-        ({"speed_m_s": (20.0, 30.0), "minutes": 1.0}, "PASS", ""),
-        ({"speed_m_s": (20.0, 30.0), "minutes": 5.0}, "INCONCLUSIVE", "2.0 of 5 minutes at 20 to 30 m/s"),
-        ({"ay_m_s2": (4.0, 13.0), "drives": 1}, "INCONCLUSIVE", "0 of 1 drives at |a_y| 4 to 13 m/s²"),
-        ({"friction": (0.0, 0.5), "drives": 3}, "PASS", ""),
+        ({"speed_m_s": [20.0, 30.0], "minutes": 1.0}, "PASS", ""),
+        ({"speed_m_s": [20.0, 30.0], "minutes": 5.0}, "INCONCLUSIVE", "2.0 of 5 minutes at 20 to 30 m/s"),
+        ({"ay_m_s2": [4.0, 13.0], "drives": 1}, "INCONCLUSIVE", "0 of 1 drives at |a_y| 4 to 13 m/s²"),
+        ({"friction": [0.0, 0.5], "drives": 3}, "PASS", ""),
         (
-            {"friction": (0.5, 1.2), "car": "golf", "drives": 4},
+            {"friction": [0.5, 1.2], "car": "golf", "drives": 4},
             "INCONCLUSIVE",
             "3 of 4 drives at μ 0.5 to 1.2, car golf",
         ),

@@ -91,13 +91,16 @@ def _judged(name: str, relations: Sequence[Relation], found: Posterior, measured
     bad = [r for r in relations if not r.accepts()]
     if not relations:
         return []
+    doubtful = bad or relations
     if wrong > DOUBTED:
         likely = [h for p, h in mistakes if p > NAMED * wrong]
         if math.isnan(likely[0].factors[name]):
-            remedy = "no single mistake explains it: look at the field, unit and sign of " + " and ".join(bad[0].powers)
-            checks = [UNIT.failed(bad[0].evidence, name, remedy=remedy)]
+            remedy = "no single mistake explains it: look at the field, unit and sign of " + " and ".join(
+                doubtful[0].powers
+            )
+            checks = [UNIT.failed(doubtful[0].evidence, name, remedy=remedy)]
         else:
-            checks = _failed(name, likely, bad or relations, measured)
+            checks = _failed(name, likely, doubtful, measured)
         return checks if wrong > FAILS else [replace(c, verdict="undecided") for c in checks]
     factors = {r.text: math.prod(h.acts_on(r) for h in chosen) for r in relations}
     usable = [r for r in relations if not math.isnan(factors[r.text])]

@@ -28,6 +28,7 @@ from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, STIFFNESS_TYRE_SHAPE, AxleTyre, Tyres, VehicleParameters
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
 from pdhef_logtool.estimators.calibration.single_track import (
+    BANK_HZ,
     OF_AY,
     OF_RATE,
     SPEED,
@@ -35,6 +36,7 @@ from pdhef_logtool.estimators.calibration.single_track import (
     TrackParameters,
     errors,
     low_pass,
+    slow_parts,
 )
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 
@@ -157,6 +159,9 @@ class JointProblem:
         self._drives, self._file = drives, vehicle_file
         self._filter = low_pass(CUTOFF_HZ, STEP_S)
         self._kept = [np.flatnonzero(counted(d))[::KEPT_STEPS] for d in drives]
+        self._columns = [np.concatenate([d.columns, np.empty((2, d.columns.shape[1]))]) for d in drives]
+        for d, columns in zip(drives, self._columns, strict=True):
+            slow_parts(columns, d.stretches, low_pass(BANK_HZ, STEP_S))
         self._out = [np.full((3, d.columns.shape[1]), np.nan) for d in drives]
         self._differences = [np.full((2, d.columns.shape[1]), np.nan) for d in drives]
         blocks, first = [], 0
@@ -219,8 +224,8 @@ class JointProblem:
         return track_of(self.vehicle(theta), self._file, self.values(theta)[STEER_DELAY])
 
     def _errors(self, p: TrackParameters) -> FloatArray:
-        for d, out, differences in zip(self._drives, self._out, self._differences, strict=True):
-            errors(d.columns, d.stretches, STEP_S, p, self._filter, out, differences)
+        for d, columns, out, differences in zip(self._drives, self._columns, self._out, self._differences, strict=True):
+            errors(columns, d.stretches, STEP_S, p, self._filter, out, differences)
             if not d.has_ay:
                 differences[OF_AY] = 0.0
         parts = [e[:, k] for e, k in zip(self._differences, self._kept, strict=True)]

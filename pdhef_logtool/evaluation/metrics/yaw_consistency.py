@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from pdhef_logtool.car.nominal_model import model_parameters, yaw_rates_at
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, corrected_anew
-from pdhef_logtool.evaluation.blocks import SegmentMasks, SegmentSums, blocks_with_halo
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.evaluation.blocks import SegmentSums, blocks_with_halo, packed
 from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, OfDrive, SensorErrors
 from pdhef_logtool.evaluation.metrics.sensor_residuals import MAX_STEP_S, carried_speed
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
@@ -16,8 +16,6 @@ from pdhef_logtool.records.tracks import StateTrack
 
 #: The yaw rate forgets its start within this time.
 SETTLE_S = 2.0
-#: Tyres are least certain beyond this share of the grip, and for some time after it.
-LINEAR_SHARE, LINEAR_S = 0.4, 0.5
 
 
 def _rows(drive: EvaluatedDrive) -> list[MetricRow]:
@@ -25,15 +23,16 @@ def _rows(drive: EvaluatedDrive) -> list[MetricRow]:
 
 
 def yaw_rows(
-    tracks: Sequence[StateTrack], signals: Signals, masks: SegmentMasks, *, log: str, sensors: SensorErrors
+    tracks: Sequence[StateTrack], signals: Signals, masks: Mapping[str, BoolArray], *, log: str, sensors: SensorErrors
 ) -> list[MetricRow]:
     """Return the figure of estimators at the same stamps as the signals [N], one row per segment."""
     if sensors.vehicle is None:
         return []
+    masks = packed(masks, len(signals))
     sums_by_track = [SegmentSums() for _ in tracks]
     for first, a, b, end in blocks_with_halo(signals, SETTLE_S, 1):
         core, inside = slice(a - first, b - first), dict(masks.rows(a, b))
-        part = signals.rows(first, end)
+        part = Signals.rows(signals, first, end)  # in memory
         for track, sums in zip(tracks, sums_by_track, strict=True):
             residual = yaw_residual(track.rows(first, end), part, sensors.vehicle, sensors)[core]
             sums.add(inside, residual, residual**2)
@@ -52,27 +51,20 @@ def yaw_residual(track: StateTrack, signals: Signals, vehicle: VehicleParameters
     The steering, its delay, the gyro's bias and the tyres are those of the calibrated ``vehicle``.
     """
     friction = signals.friction if sensors.friction is None else np.full(len(signals), sensors.friction)
-    read = corrected_anew(signals, sensors.read_with or vehicle, vehicle)
-    t = signals.stamps_ns
-    steer = np.interp(t - round(sensors.steer_delay_s * 1e9), t, read.steer_rad)
+    was = sensors.read_with or vehicle
+    before, after, t = was.sensors, vehicle.sensors, signals.stamps_ns
+    angle = (signals.steer_rad + was.steer_offset_rad) * (was.steering_ratio / vehicle.steering_ratio)
+    rate = signals.yaw_rate_rad_s * before.yaw_rate_gain + before.yaw_rate_bias_rad_s
+    rate = (rate - after.yaw_rate_bias_rad_s) / after.yaw_rate_gain
+    steer = np.interp(t - round(sensors.steer_delay_s * 1e9), t, angle - vehicle.steer_offset_rad)
     friction = np.where(np.isfinite(friction), friction, vehicle.assumed_friction)
     dt = np.diff(t, prepend=t[:1]) * 1e-9
     dt[dt > MAX_STEP_S] = np.nan
     vy = np.where(track.valid, track.vy_m_s, np.nan)
     modelled = np.full(len(t), np.nan)
-    inputs = (dt, carried_speed(signals), vy, steer, friction, read.yaw_rate_rad_s)
-    yaw_rates_at(inputs, model_parameters(vehicle), modelled)
-    residual = modelled - read.yaw_rate_rad_s
-    residual[~_linear(signals, friction)] = np.nan
-    return residual
-
-
-def _linear(signals: Signals, friction: FloatArray) -> BoolArray:
-    """Return where [N] the car has been in the linear range of its tyres for a while."""
-    t = signals.stamps_ns
-    beyond = np.abs(signals.ay_m_s2) > LINEAR_SHARE * GRAVITY_M_S2 * friction
-    last = np.maximum.accumulate(np.where(beyond, t, t[:1] - round(2e9 * LINEAR_S)))
-    return np.asarray(t - last > round(LINEAR_S * 1e9), dtype=np.bool_)
+    inputs = (dt, carried_speed(signals), vy, steer, friction, rate)
+    yaw_rates_at(inputs, max(vehicle.relaxation_length_m, 0.01), model_parameters(vehicle), modelled)
+    return modelled - rate
 
 
 METRICS = (
@@ -80,7 +72,7 @@ METRICS = (
         "yaw_consistency",
         "yaw consistency",
         "signal `yaw_rate_rad_s`: RMS of the gyro minus the yaw rate that the car's tyres have at the estimated v_y "
-        "and the measured steering, above the low-speed blend and up to 40 % of the grip; tyres, steering and gyro "
+        "and the measured steering, above the low-speed blend; tyres, steering and gyro "
         "bias as the log calibrated them",
         OfDrive(_rows),
         best="lower",

@@ -14,7 +14,6 @@ from typing import Any, Literal
 import numpy as np
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.drive.checks.running import misread_channels
 from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_proposals
 from pdhef_logtool.logs.byte_account import checksummed_share
@@ -167,6 +166,7 @@ class Inspection:
     lost : every loss and note of reading. sample : what was looked at; None: everything.
     checksummed_share : which share of the bytes that were read a verified checksum covers; None where none was read.
     lines : extremes in equal parts of the log [C] by section and signal, no part of the JSON.
+    refused : by channel why a run computes nothing from it.
     """
 
     path: str
@@ -188,13 +188,13 @@ class Inspection:
     sample: Sample | None = None
     checksummed_share: float | None = None
     lines: MappingABC[tuple[str, str], tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    refused: MappingABC[str, str] = field(default_factory=dict)
 
     @property
     def uses(self) -> MappingABC[str, str]:
         """What the log is good for (``can``), and what it lacks for sideslip (``sideslip_needs``, may be empty)."""
-        refused = misread_channels(self.checks)
-        signals = {n: s for n, s in self.mapping.signals.items() if n not in refused}
-        truth = {n: s for n, s in self.mapping.truth.items() if f"truth.{n}" not in refused}
+        signals = {n: s for n, s in self.mapping.signals.items() if n not in self.refused}
+        truth = {n: s for n, s in self.mapping.truth.items() if f"truth.{n}" not in self.refused}
         return uses_of(replace(self.mapping, signals=signals, truth=truth))
 
     @property
@@ -321,6 +321,7 @@ def inspect_drive_log(
         sample=None if look.sample is None else look.sample(),
         checksummed_share=checksummed_share(log.byte_ledgers),
         lines={key: (entry.line.low, entry.line.high) for key, entry in gathered.items()},
+        refused=looked_at.refused(),
     )
 
 
