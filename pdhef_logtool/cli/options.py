@@ -75,7 +75,8 @@ _OPTIONS: dict[str, Any] = {
         Option(
             "--mapping",
             "-m",
-            help="mapping.toml, which maps fields to signals. Default: recognised by message type, name and unit.",
+            help="mapping.toml, which maps fields to signals, or a folder with one per recorder. Default: recognised "
+            "by message type, name and unit.",
             rich_help_panel=INPUT,
         ),
     ],
@@ -148,7 +149,9 @@ _OPTIONS: dict[str, Any] = {
             rich_help_panel=ESTIMATION,
         ),
     ],
-    "gnss": Annotated[_Text, Option(help="GNSS velocity in the reference: auto or off.", rich_help_panel=ESTIMATION)],
+    "gnss": Annotated[
+        _Text, Option(help="GNSS velocity in filters and reference: auto or off.", rich_help_panel=ESTIMATION)
+    ],
     "no_position": Annotated[
         bool | None,
         Option(

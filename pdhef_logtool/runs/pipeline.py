@@ -76,7 +76,7 @@ from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 from pdhef_logtool.runs.reference_audit import audit_truth
 from pdhef_logtool.runs.referencing import DriveReference, reference_of
 from pdhef_logtool.runs.scoring import Evaluation, evaluate, in_time
-from pdhef_logtool.runs.selection import candidates, choose_main, contradiction, default_names
+from pdhef_logtool.runs.selection import choose_main, choose_over_time, contradiction, default_names
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore
 from pdhef_logtool.storage.documents import file_sha256, jsonable
@@ -86,6 +86,7 @@ from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder, check
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
     from pdhef_logtool.evaluation.metrics import MetricRow
+    from pdhef_logtool.evaluation.metrics.metric import SensorErrors
     from pdhef_logtool.evaluation.validation_plan import ValidationPlan
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
     from pdhef_logtool.results.run_report import DriveDetails
@@ -326,6 +327,10 @@ class _Job:
     requested: frozenset[str]
     validation: ValidationPlan
 
+    def sensors(self, calibration: SelfCalibration | None) -> SensorErrors:
+        """Return the errors of the log's sensors that a calibration states."""
+        return log_sensors(self.drive.car.vehicle, calibration, told_friction=self.drive.friction.bank is None)
+
 
 def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporter: Reporter) -> LogResult:
     """Estimate, score and write one drive."""
@@ -338,10 +343,15 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
         job = replace(job, ready=_without_failed(drive, job.ready, causality.failed))
         scored = _score(job, store, signals)
         main = choose_main(job.ready, scored.rows, proven=drive.car.has_evidence, named=config.estimators is not None)
-        left_out = frozenset(e.name for e in job.ready) - job.requested - {main.name}
+        if config.calibrate == "online" and job.calibration is not None and not drive.car.has_evidence:
+            main = replace(
+                main, over_time=choose_over_time(job.ready, job.calibration, store.read, signals, job.sensors)
+            )
+            main = replace(main, name=main.over_time[-1][1])
+        left_out = frozenset(e.name for e in job.ready) - job.requested - {name for _, name in main.spans}
         job, scored, main = _without(left_out, job, scored, main)
         shown = _shown(main, [e.name for e in job.ready])
-        sinks = opened.enter_context(_open_sinks(change, job, config, shown, outputs.path, len(signals)))
+        sinks = opened.enter_context(_open_sinks(change, job, config, shown, main.spans, outputs.path, len(signals)))
         _write(store, sinks, left_out | frozenset(causality.failed))
         if intervals.warning:
             drive.tell(intervals.warning)
@@ -368,7 +378,7 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
 def _score(job: _Job, store: TrackStore, signals: Signals) -> Evaluation:
     """Score the stored tracks; add the events of an estimated friction and a contradiction as a note of the drive."""
     drive = job.drive
-    sensors = log_sensors(drive.car.vehicle, job.calibration)
+    sensors = job.sensors(job.calibration)
     scored = evaluate(drive, [e.name for e in job.ready], store.read, signals, sensors)
     if drive.friction.bank is not None:
         observable = friction_events(drive.friction, signals)
@@ -524,10 +534,10 @@ def _choose_estimators(
     Candidates for the selected estimate run in any case. Raises EstimatorError if no requested estimator can.
     """
     names = config.estimators or default_names(car, drive.available)
-    options, refused = Options(drive.options.use_speed), drive.plan.refused
+    options, refused = Options(drive.options.use_speed, gnss=config.gnss == "auto"), drive.plan.refused
     estimators, skipped = runnable(names, car, drive.available, options, refused)
     requested = frozenset(e.name for e in estimators)
-    more = [name for name in candidates(car, drive.available) if name not in requested]
+    more = [name for name in default_names(car, drive.available) if name not in requested]
     estimators += runnable(more, car, drive.available, options, refused)[0] if more else []
     if not requested:
         raise EstimatorError(
@@ -555,11 +565,17 @@ def _causal_from_ns(drive: Drive, estimators: Sequence[Estimator]) -> dict[str, 
 
 @contextmanager
 def _open_sinks(
-    change: FolderTransaction, job: _Job, config: RunConfig, shown: Shown, output: Path, rows: int
+    change: FolderTransaction,
+    job: _Job,
+    config: RunConfig,
+    shown: Shown,
+    selected: Sequence[tuple[int, str]],
+    output: Path,
+    rows: int,
 ) -> Iterator[list[Sink]]:
     """Yield the outputs of a run that are fed window by window; on an exception they are aborted.
 
-    ``rows`` : stamps of a track.
+    ``selected`` : estimators, each from a stamp on. ``rows`` : stamps of a track.
     """
     from pdhef_logtool.mapping.recognition import FIX_TYPES
     from pdhef_logtool.results.layouts import LayoutsSink
@@ -572,7 +588,7 @@ def _open_sinks(
     try:
         if config.kept != "metrics":
             causal_from_ns = _causal_from_ns(drive, job.ready)
-            sinks.append(EstimatesSink(change.file(ESTIMATES_FILE), selected=shown.main, causal_from_ns=causal_from_ns))
+            sinks.append(EstimatesSink(change.file(ESTIMATES_FILE), selected=selected, causal_from_ns=causal_from_ns))
         if config.annotation != "none":
             source = drive.log if config.annotation == "full" else None
             if source is not None and source.messages is None:
@@ -814,7 +830,7 @@ def check_places(
     cars: Sequence[Path | None] = (),
 ) -> None:
     """Refuse to write over what is read; raises UsageError."""
-    can = () if mapping is None or mapping.can is None else mapping.can.dbc
+    can = () if mapping is None else mapping.dbc
     files = [] if output is None else [output / name for name in (METRICS_FILE, RUN_FILE, PAGE_FILE)]
     folders = [] if output is None else [output / log_place(i.stem) for i in inputs]
     files += [folder / name for folder in folders for name in LOG_FILES]

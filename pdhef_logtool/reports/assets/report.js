@@ -656,6 +656,13 @@
     }
   }
 
+  // Select the text, so that a browser that refuses leaves one key to press.
+  function copy(button) {
+    getSelection().selectAllChildren(document.getElementById(button.dataset.of));
+    const done = document.execCommand("copy");
+    button.parentElement.querySelector(".copied").textContent = done ? "Copied." : "Selected: press Ctrl+C.";
+  }
+
   function start() {
     readColours();
     for (const node of document.querySelectorAll("[data-figure]")) {
@@ -677,6 +684,7 @@
       });
     }
     for (const button of document.querySelectorAll("button.whole")) button.addEventListener("click", () => zoomTo(null));
+    for (const button of document.querySelectorAll("button.copy")) button.addEventListener("click", () => copy(button));
     let waiting = 0;
     addEventListener("resize", () => {
       clearTimeout(waiting);
