@@ -9,7 +9,7 @@ from typing import Self, cast
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.friction import FrictionSource, friction_source
+from pdhef_logtool.drive.friction import MODEL_STD, FrictionSource, friction_source
 from pdhef_logtool.drive.options import ReadOptions, time_slice
 from pdhef_logtool.drive.setup import CLOCK_START_S, LogUntil, Setup, is_device_clock, load_setup
 from pdhef_logtool.drive.windows import DrivePlan, DriveReader, DriveWindow, plan_drive, setup_of
@@ -343,6 +343,7 @@ def read_drive(
             told(note)
         _tell_doubts(plan, options, told)
         friction = friction_of(plan, car.vehicle, options)
+        friction.model_std = MODEL_STD[car.has_evidence]
         if friction.note:
             remarks.append(friction.note)
     except BaseException as error:
