@@ -1,6 +1,8 @@
 """Eight kinds of mistakes in a mapping x every signal: how many are named with the right remedy.
 
-``python -m studies.mapping_mistakes [LOG ...]`` counts them over logs, by default the sample logs. A mistake is *named*
+``python -m studies.mapping_mistakes [LOG ...]`` counts them over logs, by default the sample logs;
+``--sound COUNT SEED SECONDS`` counts failed checks and corrections over sound simulated drives instead: all manoeuvres,
+random cars of three classes, hills and banks included, for so much processor time at most. A mistake is *named*
 if a failed check of its signal has the factor or the axis that undoes it in its remedy, *stopped* if a check of its
 signal fails with another remedy, *open* if the checks of its signal are undecided, *silent* if they pass, and *other*
 if another signal fails instead.
@@ -10,11 +12,15 @@ from __future__ import annotations
 
 import re
 import sys
+import tempfile
+import time
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
@@ -24,6 +30,10 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, auto_map, fit_clocks, load_mapping
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.errors import PdhefError
+from truthsim.drive import simulate_drive, write_drive
+from truthsim.manoeuvres import MANOEUVRES
+from truthsim.vehicle_choice import choose_vehicle
 
 #: What a mapping's scale is wrong by, or for an axis the one that is read instead.
 _UNITS = {"57.3": 57.3, "9.81": 9.81, "3.6": 3.6}
@@ -140,9 +150,60 @@ def _outcome(log: DriveLog, right: Mapping, subject: str, kind: str, vehicle: Ve
     yield Outcome(Path(str(log.path)).stem, subject, kind, verdict(checks, members, subject, kind, scale), shown)
 
 
+#: Cars of the sound drives, each in random variants; their speeds over a manoeuvre's own, friction, and longest drive.
+CLASSES = ("sedan", "suv", "hatchback")
+SPEED_FACTORS, FRICTIONS, LONGEST_S = (0.7, 1.1), (0.4, 1.0), 60.0
+
+
+def sound_drives(count: int, seed: int, limit_s: float) -> Counter[str]:
+    """Count drives, those with a failed check and those with a correction; print the checks of both.
+
+    Parameters
+    ----------
+    limit_s : of processor time.
+    """
+    counts: Counter[str] = Counter()
+    rng = np.random.default_rng(seed)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "drive.mcap"
+        while counts["drives"] < count and time.process_time() < limit_s:
+            i = counts["drives"] + counts["not simulated"]
+            name = sorted(MANOEUVRES)[i % len(MANOEUVRES)]
+            manoeuvre, drawn = MANOEUVRES[name], int(rng.integers(1, 2**31))
+            car = f"{CLASSES[i // len(MANOEUVRES) % len(CLASSES)]}~{drawn}"
+            speed, friction = manoeuvre.speed_km_h * rng.uniform(*SPEED_FACTORS), float(rng.uniform(*FRICTIONS))
+            longest_s = min(manoeuvre.duration_s or LONGEST_S, LONGEST_S)
+            shorter_s = longest_s if (manoeuvre.duration_s or 0.0) > LONGEST_S else None
+            try:
+                drive = simulate_drive(
+                    name, speed_km_h=speed, friction=friction, seed=drawn, duration_s=shorter_s,
+                    vehicle=choose_vehicle(car), vehicle_name=car,
+                )  # fmt: skip
+            except PdhefError:  # it would spin, or the course is too fast for this car
+                counts["not simulated"] += 1
+                continue
+            path.unlink(missing_ok=True)
+            write_drive(drive, path)
+            log = open_log(path)
+            mapping = auto_map(log).mapping
+            clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+            checks = survey_log(log, mapping, clocks, (log.start_ns, log.end_ns)).checks
+            log.close()
+            failed = [c for c in checks if c.verdict == "failed"]
+            counts += Counter({"drives": 1, "with a failed check": bool(failed)})
+            counts["corrected"] += any(c.name.endswith(".corrected") for c in failed)
+            for check in failed:
+                print(f"{name} {car} {speed:.1f} km/h, friction {friction:.2f}: {check.name}: {check.evidence}")
+    return counts
+
+
 def main(arguments: Sequence[str]) -> int:
     """Count the outcomes over logs and print those that are not named."""
     warnings.simplefilter("error", RuntimeWarning)
+    if arguments[:1] == ["--sound"]:
+        counts = sound_drives(int(arguments[1]), int(arguments[2]), float(arguments[3]))
+        print(", ".join(f"{n} {what}" for what, n in counts.items()))
+        return 0
     samples = Path(__file__).parents[1] / "sample_logs"
     counts: Counter[str] = Counter()
     for path in [Path(a) for a in arguments if a != "-v"] or [samples / f"{name}.mcap" for name in SAMPLES]:

@@ -164,7 +164,7 @@ class Car:
             car = _with_parts(car, folder)
         name, home = _network_of(car, folder, network)
         bundle = None if home is None else load_bundle(home)
-        selected = _intervals_of(folder, name, intervals)
+        selected = _intervals_of(folder, intervals)
         car = replace(car, network=bundle, network_name=name, network_folder=home, intervals=selected)
         if str(intervals) == NO_INTERVALS and car.fitted_physics is not None:
             car = replace(car, fitted_physics=car.fitted_physics.model_copy(update={"varied": ()}))
@@ -175,8 +175,6 @@ class Car:
                 "pdhef learn --stages gain creates it again"
             )
         has_intervals_file = intervals is None and folder is not None and (folder / INTERVALS_FILE).is_file()
-        if intervals is None and not has_intervals_file and car.varied_physics:
-            car = replace(car, intervals=None)  # what its own drives left open states more than another car's intervals
         if has_intervals_file and selected is not None and selected.physics_sha256 != car.physics_sha256:
             stale.append(
                 f"{INTERVALS_FILE} was made with other physics; pdhef learn --stages intervals creates it again"
@@ -390,18 +388,18 @@ def _network_of(car: Car, folder: Path | None, chosen: Place) -> tuple[str, Path
     return name, home / NETWORK_FOLDER if (home / NETWORK_FOLDER / DOCUMENT_FILE).is_file() else home
 
 
-def _intervals_of(folder: Path | None, network: str, chosen: Place) -> Intervals | None:
-    """Return the intervals in force: the chosen ones, else the car's own, else those of the shipped network."""
+def _intervals_of(folder: Path | None, chosen: Place) -> Intervals | None:
+    """Return the intervals in force: the chosen ones, else the car's own."""
     if chosen is not None and str(chosen) == NO_INTERVALS:
         return None
     file = UNSURE_FILE if str(chosen) == UNSURE else INTERVALS_FILE
     if chosen is not None and str(chosen) != UNSURE:
         return load_intervals(Path(chosen))
-    shipped = SHIPPED_CARS.values() if network == SHIPPED else ()
-    homes = [h for h in (folder, *shipped) if h is not None and (h / file).is_file()]
-    if not homes and chosen is not None:
+    if folder is not None and (folder / file).is_file():
+        return load_intervals(folder / file)
+    if chosen is not None:
         raise UsageError(expected=f"a car with {file}", got="none", where=f"intervals = {UNSURE}")
-    return load_intervals(homes[0] / file) if homes else None
+    return None
 
 
 def load_intervals(path: Path) -> Intervals:

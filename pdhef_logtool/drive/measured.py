@@ -8,14 +8,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
-from pdhef_logtool.drive.columns import columns_on_grid, derivative, halves, moving_at
-from pdhef_logtool.drive.relations import Relation, measured_relations
+from pdhef_logtool.drive.columns import columns_on_grid, derivative, halves
+from pdhef_logtool.drive.hypotheses import Posterior, Relation, known_hypotheses, posterior
+from pdhef_logtool.drive.relations import direction_rate, measured_relations
 from pdhef_logtool.drive.truth import TruthTrack, channel_of
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
 
 #: Name of the column that is the mean of the wheel speeds.
 WHEEL_SPEEDS = "wheel_speeds"
+#: A wheel differs from the others by less in a bend; one that spins or locks counts with this.
+SPIN_SHARE = 0.2
 
 _TRUTH = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m")
 
@@ -55,6 +58,16 @@ class Measured:
         gone = set(names)
         columns = {n: c for n, c in self.columns.items() if n not in gone}
         return replace(self, columns=columns, topics={n: t for n, t in self.topics.items() if n not in gone})
+
+    def posterior(self, *, mounting_is_known: bool) -> Posterior:
+        """Return the probabilities of the mistakes that mappings make with these signals."""
+        groups = self.groups(mounting_is_known=mounting_is_known)
+        return posterior(self.relations, known_hypotheses(list(self.columns), groups))
+
+    def agrees(self, name: str, *, mounting_is_known: bool) -> bool:
+        """Return whether a signal is wrong by these relations too, if one of them counts."""
+        mistakes = self.posterior(mounting_is_known=mounting_is_known).of(name)
+        return sum(p for p, _ in mistakes) > 0.5 or not any(r.tells and name in r.powers for r in self.relations)
 
     def groups(self, *, mounting_is_known: bool) -> list[tuple[str, ...]]:
         """Return the signals whose signs or units are wrong together: those of one topic, and of ground truth."""
@@ -118,27 +131,19 @@ def drive_columns(
     if "truth.x_m" in columns and "truth.y_m" in columns:
         vx, vy = derivative(columns.pop("truth.x_m")), derivative(columns.pop("truth.y_m"))
         columns["truth.position_speed_m_s"] = np.hypot(vx, vy)
-        columns["truth.course_rate_rad_s"] = _turning(vx, vy)
+        columns["truth.course_rate_rad_s"] = direction_rate(vx, vy)
     return columns, _speed_of(columns)
 
 
 def _speed_of(columns: dict[str, FloatArray]) -> str | None:
-    """Return the name of the column used as the speed; the wheels' is added, since one alone turns in bends."""
+    """Return the name of the column used as the speed; the wheels' is added: one alone turns in bends, or spins."""
     if "speed_m_s" in columns:
         return "speed_m_s"
     for unit in ("m_s", "rad_s"):
         wheels = [columns[n] for w in WHEELS if (n := f"wheel_speed_{w}_{unit}") in columns]
         if wheels:
-            columns[WHEEL_SPEEDS] = np.asarray(np.mean(wheels, axis=0))
+            middle = np.median(wheels, axis=0)
+            most = SPIN_SHARE * np.abs(middle)
+            columns[WHEEL_SPEEDS] = np.asarray(np.mean(np.clip(wheels, middle - most, middle + most), axis=0))
             return WHEEL_SPEEDS
     return "truth.vx_m_s" if "truth.vx_m_s" in columns else None
-
-
-def _turning(vx: FloatArray, vy: FloatArray) -> FloatArray:
-    ax, ay = derivative(vx), derivative(vy)
-    speed = np.hypot(vx, vy)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rate = (vx * ay - vy * ax) / speed**2
-    # Slower, the noise of a position turns the path.
-    with np.errstate(invalid="ignore"):
-        return np.where(moving_at(speed) & (speed > 1.0), rate, np.nan)

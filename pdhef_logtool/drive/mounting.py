@@ -19,8 +19,9 @@ import numpy.typing as npt
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.checks import check_drive
-from pdhef_logtool.drive.checks.by_relations import explained_factors, is_wrong_by
-from pdhef_logtool.drive.checks.mounting import MOUNTING
+from pdhef_logtool.drive.checks.by_relations import explained_factors
+from pdhef_logtool.drive.checks.mounting import CORRECTED, MOUNTING
+from pdhef_logtool.drive.checks.running import misread_channels
 from pdhef_logtool.drive.columns import derivative, halves, independent_samples, moving_at
 from pdhef_logtool.drive.delays import LateSensor, late_sensors
 from pdhef_logtool.drive.faulty_samples import without_faulty_samples
@@ -33,9 +34,10 @@ from pdhef_logtool.drive.frames import (
     placed_rotation,
     rotation_text,
 )
+from pdhef_logtool.drive.hypotheses import units_told
 from pdhef_logtool.drive.measured import Measured, measure
 from pdhef_logtool.drive.other_fields import with_other_fields
-from pdhef_logtool.drive.relations import gentle_at, steering_references, units_told, yaw_references
+from pdhef_logtool.drive.relations import gentle_at, steering_references, yaw_references
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
     TruthPlan,
@@ -290,8 +292,11 @@ def _tilts_of_parts(
         usable = use & part
         if not usable.any():
             return None
-        mean = rotation @ f[usable].mean(axis=0)
-        mean -= np.array([driven[usable].real.mean(), driven[usable].imag.mean(), 0.0])
+        level = rotation @ f[usable].T
+        along = (driven[usable].real, driven[usable].imag)
+        # The body rolls and pitches with what it drives: a tilt is what is left without driving.
+        slopes = [float(np.cov(d, z)[0, 1] / max(float(d.var()), 1e-9)) for d, z in zip(along, level[:2], strict=True)]
+        mean = level.mean(axis=1) - np.array([*(s * d.mean() for s, d in zip(slopes, along, strict=True)), 0.0])
         ups.append(np.asarray(mean / max(float(np.linalg.norm(mean)), 1e-9)))
     return ups[0], ups[1]
 
@@ -374,7 +379,8 @@ def _level_only(rest: FloatArray) -> FloatArray:
 class Survey:
     """The first minutes of a log as its mapping reads them, the IMU turned into the car where that is certain.
 
-    ``vehicle``: from the vehicle file, or the default car. ``reread``: completes the checks of a mapping file.
+    ``vehicle``: from the vehicle file, or the default car. ``corrected``: what the drive changed in a recognised
+    mapping. ``reread``: completes the checks of a mapping file.
     """
 
     mapping: Mapping
@@ -388,6 +394,7 @@ class Survey:
     mounting: Mounting | None = None
     placed: Placement | None = None
     framed: Check | None = None
+    corrected: tuple[Check, ...] = ()
     reread: Callable[[tuple[Check, ...]], tuple[Check, ...]] | None = None
 
     @property
@@ -407,7 +414,7 @@ class Survey:
     def checks(self) -> tuple[Check, ...]:
         """The checks of the mounting with those of :func:`~pdhef_logtool.drive.checks.running.check_drive`."""
         drive_checks = self._drive_checks(self.channels.truth, self.truth, self.latency, self.measured)
-        checks = (*self.mounted, *self._of_names(drive_checks), *drive_checks)
+        checks = (*self.mounted, *self.corrected, *self._of_names(drive_checks), *drive_checks)
         return checks if self.reread is None else self.reread(checks)
 
     @cached_property
@@ -417,6 +424,17 @@ class Survey:
             return self.checks
         measured = measure(self.channels.signals, {}, None, self.vehicle, self.mapping)
         return (*self.mounted, *self._drive_checks({}, None, None, measured))
+
+    def refused(self, waived: Sequence[str] = (), *, is_causal: bool = False) -> dict[str, str]:
+        """Return by channel why nothing may be computed from it: sensors by one another, ground truth by everything.
+
+        Parameters
+        ----------
+        waived : names of checks that stop nothing. is_causal : no sensor may be refused because of later samples.
+        """
+        by_everything = misread_channels(self.checks, waived)
+        refused = {n: why for n, why in by_everything.items() if n.startswith("truth.")}
+        return refused if is_causal else refused | misread_channels(self.sensor_checks, waived)
 
     def _drive_checks(
         self,
@@ -495,7 +513,8 @@ def survey_log(
     for triad, names in zip(triads, (ACCELERATIONS, RATES), strict=True):
         extra |= {} if triad is None else triad.components(names)
     channels = read_signals(log, replace(mapping, signals={**mapping.signals, **extra}), clocks, *span_ns)
-    truth_plan = plan_truth(channels.truth, truth_position_m=vehicle.truth_position_m) if channels.truth else None
+    place, gradient = vehicle.truth_position_m, vehicle.roll_gradient_rad_per_m_s2
+    truth_plan = plan_truth(channels.truth, truth_position_m=place, roll_gradient_rad_per_m_s2=gradient)
     truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
     measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     # The input of an estimator must not depend on ground truth: with it, a mounting is only checked.
@@ -508,15 +527,21 @@ def survey_log(
     channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
     measured = measured.without(extra)
     trusted = blind or by_frames is not None
+    corrected: list[Check] = []
     if mounting is not None and mapping.origin == "auto" and trusted and not mounting.is_as_named:
         note = f"{mounting.text}, and is read so: {mounting.evidence}"
         signals = turned_signals(mapping, mounting, triads)
+        if by_frames is None:  # what the log itself states is no correction
+            corrected = [_corrected(n, s, note) for n, s in signals.items() if s != mapping.signals[n]]
         mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
         channels = read_signals(log, mapping, clocks, *span_ns)
         mounting = replace(mounting, named=mounting.rows)
         measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     latency = truth_latency(channels, truth)
-    survey = Survey(mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, placed, framed)
+    survey = Survey(
+        mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, placed, framed,
+        tuple(corrected),
+    )  # fmt: skip
     if not rescale:
         return survey
     if mapping.origin == "auto":
@@ -575,17 +600,24 @@ def _rescaled(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span
             )
     parts = [part.without_truth() for part in survey.measured.parts(survey.vehicle)] if factors else []
     signals, notes = dict(mapping.signals), list(mapping.notes)
+    checks = list(survey.corrected)
     for name, (factor, evidence) in factors.items():
-        if name in signals and all(is_wrong_by(part, name, factor) is not False for part in parts):
+        if name in signals and all(part.agrees(name, mounting_is_known=survey.is_mounted) for part in parts):
             signals[name] = scaled_source(signals[name], factor)
             notes.append(f"{name} is read with {factor:.6g} times its scale: {evidence}")
+            checks.append(_corrected(name, signals[name], notes[-1]))
     if signals == mapping.signals:
         return survey
     scaled = replace(mapping, signals=signals, notes=tuple(notes))
     corrected = survey_log(log, scaled, clocks, span_ns, survey.vehicle, rescale=False)
     # A failing sensor resembles a wrong unit of another one; after a right correction nothing contradicts any more.
     failed = [check.name for check in corrected.checks if check.verdict == "failed"]
-    return survey if any(n.endswith((".sign", ".unit", ".axis", ".fault")) for n in failed) else corrected
+    is_bad = any(n.endswith((".sign", ".unit", ".axis", ".fault")) for n in failed)
+    return survey if is_bad else replace(corrected, corrected=tuple(checks))
+
+
+def _corrected(name: str, source: SignalSource, note: str) -> Check:
+    return CORRECTED.failed(note, name, field=_shown(source.field), scale=_shown(source.scale))
 
 
 def scaled_source(source: SignalSource, factor: float) -> SignalSource:

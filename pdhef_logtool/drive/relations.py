@@ -1,50 +1,39 @@
-"""What rigid-body kinematics wants of pairs of signals, and the mistakes that explain where a drive contradicts it."""
+"""The table of relations between signals: what rigid-body kinematics and rolling wheels want of pairs of them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import combinations
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
+from pdhef_logtool.drive.hypotheses import MIN_SAMPLES, Relation, block_gains
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
-DEGREE = float(np.pi / 180.0)
-
-#: Below this correlation a gain gives no information; above it, it is known to its reciprocal.
-MIN_CORRELATION = 0.6
+#: Blocks of a drive whose gains are compared.
+BLOCKS = 8
 #: What is left of two columns by regression is small, and a car that slides leaves it related otherwise.
 MIN_PARTIAL_CORRELATION = 0.8
-#: And it must be so far from chance, by Fisher's z of the independent samples.
-MIN_CHANCE_Z = 3.0
-#: Independent samples below which nothing is stated: 3 s of driving.
-MIN_SAMPLES = 6.0
-#: Two sides that move, and not with one another: another field was mapped. Crossfall and grade alone move an
-#: accelerometer by less than this (5 % are 0.5 m/s^2), and noise of 1 Hz bandwidth moves a gyro by less.
-UNRELATED_CORRELATION = 0.25
+#: Share of the curvature that a_y must leave: at one speed they are one regressor.
+SEPARABLE = 0.15
+#: One of two sides that moves by more must move the other. Crossfall and grade alone move an accelerometer by less (5 %
+#: are 0.5 m/s^2), and noise of 1 Hz bandwidth moves a gyro by less.
 MOVES_M_S2 = 1.0
 MOVES_RAD_S = 0.06
-#: A gain that is off by less, or of a correlation below, may be the car's: it slides, a wheel spins, a brake locks.
-CLOSE, CLOSE_CORRELATION = 2.5, 0.8
-#: A wrong unit leaves the correlation of a right one.
-CLEAR_CORRELATION = 0.9
 #: Gains between these are tyres, roll, bank, grade and noise; beyond them they are units.
 GAIN_RANGE = (0.55, 1.8)
 #: The same quantity measured twice.
 SAME_RANGE = (0.75, 1.33)
 #: a_y - v_x r over the derivative of v_y: small differences of large quantities, of a body that rolls.
-SIDESLIP_RANGE = (0.4, 2.5)
+SIDESLIP_RANGE = (0.5, 2.0)
 #: Slip of a rear axle at 1 m/s^2: cornering stiffness over load is 4 to 40 per rad, and much less where a model car
 #: drifts. It gives a sign, no unit.
 COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
 #: Of ground truth ahead of the rear axle. Ground truth that is near that axle gives no information: its lever may
 #: be of any sign.
-REAR_LEVER_M = (1.0, 12.0)
-#: What is left of sideslip beside a_y must move by more: a good ground truth is not surer of it, nor is a road flatter.
-LEAST_SIDESLIP_RAD = 0.05 * DEGREE
+REAR_LEVER_M, REAR_LEVER_TYPICAL_M = (1.0, 12.0), 1.6
 #: Beyond, sideslip times lateral acceleration is no longer small beside the derivative of the speed.
 STRAIGHT_M_S2 = 3.0
 #: Rim speed over ground speed, 5 % of slip and 5 % of radius; angular over rim speed, wheels of 4 cm to 80 cm radius.
@@ -63,121 +52,6 @@ TRACK_M = (0.12, 3.0)
 #: Share of the drive's lateral acceleration up to which the steering angle is compared with the curvature: beyond, the
 #: front tyres slip.
 STEERING_SHARE = 0.6
-#: Typical values that recognise one quantity recorded as another.
-TYPICAL_STEERING_RATIO = 16.0
-TYPICAL_WHEEL_RADIUS_M = 0.3
-_TYPICAL = (*(f for t in (TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M) for f in (t, 1.0 / t)),)
-#: By so much in the logarithm must one unit fit better than another: km/h and mph are 0.48 apart.
-CLEARLY_NEARER = 0.25
-#: A range of gains that is narrower rules out all units but one; wider ones are lengths of any car.
-DECIDES_UNIT, SAME_QUANTITY = 13.0, 4.0
-#: Factors between units that mappings confuse for any quantity: degrees, g, km/h.
-_FOREIGN = (1.0 / DEGREE, GRAVITY_M_S2, 3.6)
-#: No more mistakes than this are looked for at once.
-MAX_MISTAKES = 2
-#: And no more signals for those that no mistake explains.
-MAX_CULPRITS = 4
-
-
-@dataclass(frozen=True, slots=True)
-class Relation:
-    """One relation with its measured gain; ``powers`` show how the gain grows with each signal's own scale.
-
-    Attributes
-    ----------
-    expected : range of a plausible gain. samples : independent ones. moves : both sides, or one of two that must move
-        together, move by more than what disturbs them. signless : a side is a size.
-    least_correlation : below it the gain gives no information. spread : 1-sigma of the measured side.
-    typical : the likeliest gain.
-    """
-
-    text: str
-    powers: dict[str, int]
-    correlation: float
-    gain: float
-    expected: tuple[float, float]
-    samples: float
-    moves: bool = False
-    signless: bool = False
-    least_correlation: float = MIN_CORRELATION
-    spread: float = 0.0
-    typical: float = 1.0
-
-    @property
-    def decides_unit(self) -> bool:
-        """Return whether no other unit that is met in mappings would be plausible as well."""
-        return self.expected[1] < DECIDES_UNIT * self.expected[0]
-
-    @property
-    def tells(self) -> bool:
-        """Return whether the drive excites the relation enough for a verdict."""
-        return abs(self.correlation) >= self.least_correlation and self._chance_z >= MIN_CHANCE_Z
-
-    @property
-    def is_close(self) -> bool:
-        """Return whether a gain that is not plausible is off by less than known mistakes make, or hardly known."""
-        return abs(self.correlation) < CLOSE_CORRELATION or self.is_near
-
-    @property
-    def is_near(self) -> bool:
-        """Return whether a gain is off by less than known mistakes make: a car that slides, a sensor that saturates."""
-        low, high = self.expected
-        return replace(self, expected=(low / CLOSE, high * CLOSE)).accepts()
-
-    @property
-    def is_vague(self) -> bool:
-        """Return whether it is close and its sides go with one another as they do with noise or sliding in between."""
-        return self.is_close and abs(self.correlation) < CLEAR_CORRELATION
-
-    @property
-    def unrelated(self) -> bool:
-        """Return whether the sides move, and not with one another."""
-        return self.moves and self.samples >= 4.0 * MIN_SAMPLES and abs(self.correlation) < UNRELATED_CORRELATION
-
-    @property
-    def _chance_z(self) -> float:
-        bounded = min(abs(self.correlation), 1.0 - 1e-9)
-        return float(np.arctanh(bounded) * np.sqrt(max(self.samples - 3.0, 0.0)))
-
-    def accepts(self, factor: float = 1.0) -> bool:
-        """Return whether the gain is plausible after multiplying it with ``factor``.
-
-        It lies between the two regressions, which are correlation x gain and gain / correlation.
-        """
-        gain, size = self.gain * factor, abs(self.correlation)
-        gain = abs(gain) if self.signless else gain
-        return size > 0.0 and gain / size >= self.expected[0] and gain * size <= self.expected[1]
-
-    @property
-    def evidence(self) -> str:
-        """What was measured, in words."""
-        low, high = self.expected
-        return (
-            f"{self.text}: gain {self.gain:.3g} where {low:.3g} to {high:.3g} is plausible, correlation "
-            f"{self.correlation:.2f}"
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class Mistake:
-    """A mistake that mappings are known to make: ``factors`` by signal undo it. ``kind``: sign or unit.
-
-    ``foreign``: the factor is that of another quantity's unit, as when a template's line is copied.
-    """
-
-    factors: dict[str, float]
-    words: str
-    kind: str
-    foreign: bool = False
-
-    @property
-    def is_exact(self) -> bool:
-        """Whether the factors are those of units and signs, not a typical steering ratio or wheel radius."""
-        return not any(abs(f) in _TYPICAL for f in self.factors.values())
-
-    def acts_on(self, relation: Relation) -> float:
-        """Return what undoing it multiplies the relation's gain with."""
-        return float(np.prod([f ** relation.powers.get(name, 0) for name, f in self.factors.items()]))
 
 
 def measured_relations(
@@ -205,199 +79,6 @@ def measured_relations(
     relations += _twice(columns, "yaw_rate_rad_s", "truth.yaw_rate_rad_s", MOVES_RAD_S)
     relations += _twice(columns, "ay_m_s2", "truth.ay_m_s2", MOVES_M_S2)
     return relations + _sideslips(columns)
-
-
-def smallest_explanations(relations: Sequence[Relation], mistakes: Sequence[Mistake]) -> list[tuple[Mistake, ...]]:
-    """Return the smallest sets of mistakes that make every relation that counts plausible; ``[()]``: none is needed.
-
-    Empty where no set of ``MAX_MISTAKES`` does. A sign explains without a unit, and either of them without the other.
-    """
-    telling = [r for r in relations if r.tells]
-    failed = [r for r in telling if not r.accepts()]
-    if not failed:
-        return [()]
-    names = {n for r in failed for n in r.powers}
-    useful = [m for m in mistakes if names & set(m.factors)]
-    for size in range(1, MAX_MISTAKES + 1):
-        candidates = combinations([m for m in useful if size == 1 or not m.foreign], size)
-        explanations = [chosen for chosen in candidates if _explains(chosen, telling)]
-        if explanations:
-            near = _nearest(relations, explanations)
-            simplest = min(_cost(chosen) for chosen in near)
-            cheap = sorted((e for e in near if _cost(e) == simplest), key=lambda e: _misfit(relations, e))
-            return [c for c in cheap if not any(_signals(other) < _signals(c) for other in cheap)]
-    return []
-
-
-def _explains(chosen: Sequence[Mistake], telling: Sequence[Relation]) -> bool:
-    """Return whether mistakes of different signals make all relations plausible."""
-    signals = [n for m in chosen for n in m.factors]
-    is_distinct = len(set(signals)) == len(signals)
-    return is_distinct and all(r.accepts(float(np.prod([m.acts_on(r) for m in chosen]))) for r in telling)
-
-
-def contradicting(relations: Sequence[Relation]) -> set[str]:
-    """Return the signals that must be wrong where relations contradict one another and no mistake explains it.
-
-    As few as possible, and of them those that the fewest other relations show to be right; the wheels are one.
-    """
-    telling = [(r.accepts(), {_sensor(n) for n in r.powers}) for r in relations if r.tells]
-    bad = [sensors for accepted, sensors in telling if not accepted]
-    good = [sensors for accepted, sensors in telling if accepted and len(sensors) > 1]
-    names = sorted(set().union(*bad))
-    sizes = range(1, min(len(names), MAX_CULPRITS) + 1)
-    possible = [set(c) for size in sizes for c in combinations(names, size) if all(s & set(c) for s in bad)]
-    culprits = min(possible, key=lambda c: len(c) + sum(bool(s & c) for s in good), default=set(names))
-    return {n for r in relations for n in r.powers if _sensor(n) in culprits}
-
-
-def _sensor(name: str) -> str:
-    return "wheel speeds" if name.startswith("wheel_speed") else name
-
-
-def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
-    """Return those of the signals of doubtful unit for which relations to others rule out every other unit.
-
-    A relation between two of them gives no information until one is given; the ground-truth v_y has the unit of its
-    v_x.
-    """
-    # Rim speed in m/s and in rad/s look alike where the radius is not known: wheels are never given.
-    open_, resolved = set(doubted), set[str]()
-    while True:
-        newly_resolved = {
-            n
-            for n in open_
-            if not n.startswith("wheel_speed")
-            and _is_told(n, [r for r in relations if not (set(r.powers) - {n}) & open_])
-        }
-        if "truth.vx_m_s" in newly_resolved | resolved:
-            newly_resolved |= open_ & {"truth.vy_m_s"}
-        if not newly_resolved:
-            return resolved
-        resolved |= newly_resolved
-        open_ -= newly_resolved
-
-
-def _is_told(name: str, relations: Sequence[Relation]) -> bool:
-    mine = [r for r in relations if name in r.powers and r.tells]
-    others = [factor for factor, _ in units_of(name.removeprefix("truth."))]
-    holds = bool(mine) and bool(others) and all(r.accepts() for r in mine)
-    return holds and all(any(not r.accepts(f ** r.powers[name]) for r in mine) for f in others)
-
-
-def best_explanation(
-    relations: Sequence[Relation], explanations: Sequence[tuple[Mistake, ...]]
-) -> tuple[Mistake, ...] | None:
-    """Return the one explanation, or of several for the same signals the one of gains near 1; None: neither."""
-    if not explanations or len({_signals(e) for e in explanations}) > 1:
-        return None
-
-    misfits = sorted((_misfit(relations, e), i) for i, e in enumerate(explanations))
-    if len(misfits) > 1 and not misfits[1][0] - misfits[0][0] > CLEARLY_NEARER:
-        return None
-    return explanations[misfits[0][1]]
-
-
-def _misfit(relations: Sequence[Relation], chosen: tuple[Mistake, ...]) -> float:
-    """Return how far, in the logarithm, the gains of relations are from the typical ones."""
-    touched = [r for r in relations if r.tells and r.decides_unit and _signals(chosen) & set(r.powers)]
-    touched = [r for r in touched if r.expected[0] < r.typical < r.expected[1]]
-    same = [r for r in touched if r.expected[1] < SAME_QUANTITY * r.expected[0]]
-    gains = [abs(r.gain / r.typical * float(np.prod([m.acts_on(r) for m in chosen]))) for r in same or touched]
-    return float(np.mean(np.abs(np.log(gains)))) if gains else np.inf
-
-
-def _nearest(relations: Sequence[Relation], explanations: Sequence[tuple[Mistake, ...]]) -> list[tuple[Mistake, ...]]:
-    """Return for each set of signals the explanations that no other explains clearly better."""
-    misfits = [_misfit(relations, e) for e in explanations]
-    best: dict[frozenset[str], float] = {}
-    for chosen, misfit in zip(explanations, misfits, strict=True):
-        best[_signals(chosen)] = min(misfit, best.get(_signals(chosen), np.inf))
-    return [e for e, m in zip(explanations, misfits, strict=True) if not m - best[_signals(e)] > CLEARLY_NEARER]
-
-
-def _signals(chosen: tuple[Mistake, ...]) -> frozenset[str]:
-    return frozenset(n for m in chosen for n in m.factors)
-
-
-def _cost(chosen: tuple[Mistake, ...]) -> int:
-    return sum((2 if m.kind == "sign and unit" else 1) + m.foreign for m in chosen)
-
-
-_NEVER_TURNED = frozenset({"speed_m_s", "steer_rad", "steering_wheel_rad"})
-
-
-def known_mistakes(names: Sequence[str], together: Sequence[tuple[str, ...]] = ()) -> list[Mistake]:
-    """List the mistakes that mappings are known to make with these signals.
-
-    Parameters
-    ----------
-    together : signals of one sensor, whose signs are wrong together where it is mounted upside down or backwards.
-    """
-    out: list[Mistake] = []
-    for name in names:
-        bare = name.removeprefix("truth.")
-        units = units_of(bare)
-        out += [Mistake({name: factor}, f"{name} {words}", "unit") for factor, words in units]
-        out += _foreign((name,), units)
-        out.append(Mistake({name: -1.0}, f"{name} has the wrong sign", "sign"))
-        out += [
-            Mistake({name: -factor}, f"{name} {words} and has the wrong sign", "sign and unit")
-            for factor, words in units
-        ]
-    for group in together:
-        present = [n for n in group if n in names]
-        for size in range(2, len(present) + 1):
-            for part in combinations(present, size):
-                words = f"{_together(part)} have the wrong sign"
-                # A sensor is mounted upside down or backwards, or ground truth has another convention; speeds count
-                # ahead.
-                if not _NEVER_TURNED & set(part):
-                    out.append(Mistake(dict.fromkeys(part, -1.0), words, "sign"))
-                shared = dict(units_of(part[0].removeprefix("truth.")))
-                for name in part[1:]:
-                    units_of_name = dict(units_of(name.removeprefix("truth.")))
-                    shared = {f: text for f, text in shared.items() if f in units_of_name}
-                words = _together(part)
-                out += [Mistake(dict.fromkeys(part, f), f"{words}: each {text}", "unit") for f, text in shared.items()]
-                out += _foreign(part, list(shared.items()))
-    return out
-
-
-def _together(names: Sequence[str]) -> str:
-    """Return signals in words; the wheel speeds and their mean as one."""
-    wheels = [n for n in names if n.startswith("wheel_speed")]
-    return "wheel speeds" if len(wheels) == len(names) > 2 else " and ".join(names)
-
-
-def _foreign(names: Sequence[str], units: Sequence[tuple[float, str]]) -> list[Mistake]:
-    """Return the mistakes by factors of units that other quantities have."""
-    factors = [f for size in _FOREIGN for f in (size, 1.0 / size)]
-    strange = [f for f in factors if all(abs(np.log(f / other)) > CLEARLY_NEARER for other, _ in units)]
-    words = _together(names)
-    text = f"{{}} {'are' if words.endswith('speeds') else 'is'} off by a factor of {{:.4g}}"
-    return [Mistake(dict.fromkeys(names, f), text.format(words, 1.0 / f), "unit", foreign=True) for f in strange]
-
-
-def units_of(name: str) -> list[tuple[float, str]]:
-    """Return by what a signal is off where its unit is taken for another, and how that is stated."""
-    to_radians = [(DEGREE, "is in degrees"), (1.0 / DEGREE, "was converted from degrees twice")]
-    of_speeds = [(1.0 / 3.6, "is in km/h"), (3.6, "was converted from km/h twice"), (0.44704, "is in mph")]
-    if name == "yaw_rate_rad_s" or name == "sideslip_rad":
-        return to_radians
-    if name == "steer_rad":
-        return [*to_radians, (1.0 / TYPICAL_STEERING_RATIO, "is the steering-wheel angle")]
-    if name == "steering_wheel_rad":
-        return [*to_radians, (TYPICAL_STEERING_RATIO, "is the road-wheel angle")]
-    if name in ("ax_m_s2", "ay_m_s2"):
-        return [(GRAVITY_M_S2, "is in g"), (1.0 / GRAVITY_M_S2, "was converted from g twice")]
-    if name in ("vx_m_s", "vy_m_s", "speed_m_s"):
-        return [*of_speeds, (1e-3, "is in mm/s")]
-    if name.startswith("wheel_speed") and name.endswith("_rad_s"):
-        return [(2.0 * np.pi / 60.0, "is in rpm"), (1.0 / TYPICAL_WHEEL_RADIUS_M, "is in m/s")]
-    if name.startswith("wheel_speed"):
-        return [*of_speeds, (TYPICAL_WHEEL_RADIUS_M, "is in rad/s")]
-    return []
 
 
 # ------------------------------------------------------------------------------------------- relations
@@ -433,7 +114,8 @@ def compare(
     correlation = float(np.mean(a * b) / (spread_a * spread_b))
     # The ratio of the spreads lies between the two regressions, as the position of the noise is unknown.
     gain = float(np.copysign(spread_b / spread_a, correlation))
-    return [Relation(text, powers, correlation, gain, expected, samples, both, spread=spread_b)]
+    gains = block_gains(a, b, BLOCKS)
+    return [Relation(text, powers, correlation, gain, expected, samples, both, blocks=gains)]
 
 
 def compare_at_ease(
@@ -576,8 +258,10 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
         samples = independent_samples(int(np.count_nonzero(use)))
         if samples < MIN_SAMPLES:
             continue
-        ratio = float(np.median(column[use] / speed[use]))
+        ratios = column[use] / speed[use]
+        ratio = float(np.median(ratios))
         relation = Relation(f"{name} over {speed_name}", {name: 1, speed_name: -1}, 1.0, ratio, expected, samples)
+        relation = replace(relation, blocks=tuple(float(np.median(b)) for b in np.array_split(ratios, BLOCKS)))
         relations.append(replace(relation, signless=name == "truth.position_speed_m_s"))
     return relations
 
@@ -643,14 +327,30 @@ def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relat
     course = columns.get("truth.course_rate_rad_s")
     if course is None:
         return []
+    turnings = [course]
+    if "truth.vx_m_s" in columns and "truth.vy_m_s" in columns:  # in a spin the sideslip turns as well
+        turnings.append(course - direction_rate(columns["truth.vx_m_s"], columns["truth.vy_m_s"]))
     relations = []
     moving = _moving(columns, speed)
     for name in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s"):
         if name in columns:
             text = f"{name} against the turning of the ground-truth path"
             use = (moving, gentle_at(columns[name] * speed, moving))
-            relations += compare_at_ease(text, {name: 1}, course, columns[name], use, GAIN_RANGE, moves=MOVES_RAD_S)
+            either = [
+                r
+                for turning in turnings
+                for r in compare_at_ease(text, {name: 1}, turning, columns[name], use, GAIN_RANGE, moves=MOVES_RAD_S)
+            ]
+            relations += sorted(either, key=lambda r: (r.tells and r.accepts(), abs(r.correlation)))[-1:]
     return relations
+
+
+def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:
+    """Return how fast the direction of a velocity turns, rad/s [N]; NaN where it is slow: noise turns it."""
+    ax, ay = derivative(vx), derivative(vy)
+    speed = np.hypot(vx, vy)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(moving_at(speed) & (speed > 1.0), (vx * ay - vy * ax) / speed**2, np.nan)
 
 
 def _twice(columns: Mapping[str, FloatArray], sensor: str, truth: str, moves: float) -> list[Relation]:
@@ -680,26 +380,25 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     sideslip = columns.get("truth.sideslip_rad", np.arctan2(vy, vx))
     moving, ones = _moving(columns, vx), np.ones_like(ay)
     text = f"ay_m_s2 - v_x r against the derivative of {subject}"
-    kinematic = _partial(
-        text, {subject: -1, "ay_m_s2": 1}, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving
-    )
+    of_vx = subject != "truth.sideslip_rad"  # the sideslip is then v_y over v_x, else v_y is v_x times its tangent
+    powers = {subject: -1, "ay_m_s2": 1} | ({} if of_vx else {"truth.vx_m_s": -1})
+    kinematic = _partial(text, powers, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving)
     with np.errstate(divide="ignore", invalid="ignore"):
         curvature = rate / vx
     text = f"{subject} against -ay_m_s2, apart from curvature"
     gentle = gentle_at(vx * rate, moving)
-    of_vx = subject != "truth.sideslip_rad"  # the sideslip is then v_y over v_x
     powers = {subject: 1, "ay_m_s2": -1} | ({"truth.vx_m_s": -1} if of_vx else {})
     handling = _partial(text, powers, -ay, sideslip, [curvature, ones], gentle)
     text = f"{subject} against curvature, apart from a_y"
     powers = {subject: 1, turning: -1} | ({} if of_vx else {"truth.vx_m_s": 1})
-    rolling = _partial(text, powers, curvature, sideslip, [ay, ones], gentle)
+    rolling = _partial(text, powers, curvature, sideslip, [ay, ones], gentle, SEPARABLE)
     return [
         *(replace(r, expected=SIDESLIP_RANGE) for r in kinematic),
         *(replace(r, expected=COMPLIANCE_RAD_PER_M_S2) for r in handling),
         *(
-            replace(r, expected=REAR_LEVER_M)
+            replace(r, expected=REAR_LEVER_M, typical=REAR_LEVER_TYPICAL_M)
             for r in rolling
-            if abs(r.gain) > REAR_LEVER_M[0] and r.spread > LEAST_SIDESLIP_RAD
+            if abs(r.gain) > REAR_LEVER_M[0]
         ),
     ]
 
@@ -711,8 +410,9 @@ def _partial(
     measured: FloatArray,
     others: list[FloatArray],
     use: BoolArray,
-) -> list[Relation]:
-    """Return the relation between what regression on other columns leaves of two columns."""
+    separable: float = 0.0,
+) -> list[Relation]:  # positional: both sides of a relation and what is wanted of them
+    """Return the relation between what regression on other columns leaves of two columns; none if that is little."""
     finite = use & np.isfinite(np.stack([reference, measured, *others])).all(axis=0)
     if independent_samples(int(np.count_nonzero(finite))) < 2.0 * MIN_SAMPLES:
         return []
@@ -722,5 +422,7 @@ def _partial(
         out = np.full(column.shape[0], np.nan)
         out[finite] = column[finite] - aside @ np.linalg.lstsq(aside, column[finite], rcond=None)[0]
         left.append(out)
+    if np.nanstd(left[0]) < separable * np.std(reference[finite]):
+        return []
     relations = compare(text, powers, left[0], left[1], finite, (0.0, np.inf))
     return [replace(r, least_correlation=MIN_PARTIAL_CORRELATION) for r in relations]

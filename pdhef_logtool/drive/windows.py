@@ -21,7 +21,6 @@ from pdhef_logtool.drive.alignment import (
     plan_alignment,
 )
 from pdhef_logtool.drive.channel_hash import ChannelHash
-from pdhef_logtool.drive.checks.running import misread_channels
 from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.setup import Setup, clocks_of
 from pdhef_logtool.drive.truth import (
@@ -163,9 +162,8 @@ def plan_drive(
         )
     else:
         alignment = no_alignment(survey.signals)
-    refused = {n: why for n, why in misread_channels(looked_at.checks, waived).items() if n.startswith("truth.")}
-    if setup is None:  # what a set-up reads must not depend on later samples
-        refused |= misread_channels(looked_at.sensor_checks, waived)
+    # What a set-up reads must not depend on later samples.
+    refused = looked_at.refused(waived, is_causal=setup is not None)
     mapping, sound = without_refused_truth(mapping, refused), looked_at
     if mapping is not looked_at.mapping:
         sound = survey_log(log, mapping, clocks, span_ns, vehicle, rescale=False)

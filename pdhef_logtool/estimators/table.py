@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Literal
@@ -16,11 +16,12 @@ from typing import Literal
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
+from pdhef_logtool.estimators.presets import AIDED, check_options, options_of, preset_of
 from pdhef_logtool.estimators.presets import Options as Options
-from pdhef_logtool.estimators.presets import check_options, options_of, preset_of
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED, SelfCalibrated
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.printable import printable
+from pdhef_logtool.records.signals import has_gnss
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 
 #: What drives the vehicle model; a filter uses a_y and yaw rate where the log has them, ``physics`` steering too.
@@ -101,6 +102,8 @@ class Spec:
         if isinstance(build, str):
             module, _, function = build.partition(":")
             build = getattr(import_module(f"{__package__}.{module}"), function)
+        if options.gnss and self.name in AIDED:
+            build = partial(_aided, build)
         if car.self_calibrated is None or (self.name != OPEN_LOOP and preset_of(self.name) not in SELF_CALIBRATED):
             estimator: Estimator = build(self.name, car, options)
             return estimator
@@ -112,6 +115,12 @@ class Spec:
             causal = self.causal and stage.causal
             stages.append(SelfCalibrated(build(self.name, calibrated, options), stage, car.vehicle, causal))
         return OnlineCalibrated(tuple(stages)) if online else stages[0]
+
+
+def _aided(build: Callable[[str, Car, Options], Estimator], name: str, car: Car, options: Options) -> Estimator:
+    from pdhef_logtool.estimators.gnss_aided import GnssAided  # compiled code is imported where it is needed
+
+    return GnssAided(build(name, car, options))  # type: ignore[arg-type]
 
 
 #: Estimators of other packages: each entry point names a :class:`Spec`.
@@ -280,6 +289,8 @@ def runnable(
     names : of estimators, or :data:`ALL_ESTIMATORS` alone. available : signals of the log.
     refused : signals that the log has and that nothing is computed from, because a check of them failed.
     """
+    options = options or Options()
+    options = replace(options, gnss=options.gnss and has_gnss(available))
     estimators: list[Estimator] = []
     skipped: list[Skipped] = []
     for spec in map(spec_of, all_names(car) if tuple(names) == (ALL_ESTIMATORS,) else names):
@@ -290,7 +301,7 @@ def runnable(
         if reason:
             skipped.append(Skipped(spec, reason))
         else:
-            estimators.append(spec.make(car, options or Options()))
+            estimators.append(spec.make(car, options))
     return estimators, skipped
 
 

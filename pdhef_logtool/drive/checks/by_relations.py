@@ -1,27 +1,23 @@
 """``SIGNAL.sign``, ``unit``, ``axis``: each signal by relations to others (:mod:`~pdhef_logtool.drive.relations`).
 
-Where they contradict one another, the smallest mistake that explains all of them states which signals fail.
+The posterior of all mistakes (:mod:`~pdhef_logtool.drive.hypotheses`) states which signals fail.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 from pdhef_logtool.drive.checks.kind import CheckKind
+from pdhef_logtool.drive.hypotheses import Hypothesis, Posterior, Relation
 from pdhef_logtool.drive.measured import WHEEL_SPEEDS, Measured
-from pdhef_logtool.drive.relations import (
-    Mistake,
-    Relation,
-    best_explanation,
-    contradicting,
-    known_mistakes,
-    smallest_explanations,
-)
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import GNSS
 
+#: Probability of a mistake from which on a check fails, below which it passes, and from which on it is undone at once;
+#: share of a signal's mistakes from which on one is named.
+FAILS, DOUBTED, CERTAIN, NAMED = 0.85, 0.005, 0.99, 0.05
 _LACKS_WHEELBASE = "needs the wheelbase of a vehicle file, or speeds that only full-size vehicles reach"
 _LACKS_SIDESLIP = "needs sideslip that changes fast"
 #: What a drive lacks that shows the sign of a signal and not its unit.
@@ -37,145 +33,68 @@ _BENDS = "bends to both sides at speed"
 
 
 def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int = 2) -> dict[str, tuple[float, str]]:
-    """Return by signal the factor that undoes its wrong unit or sign, with the evidence, where only one explains it.
+    """Return by signal the factor that undoes its wrong unit or sign, with the evidence, where one is certain.
 
     ``most``: mistakes at once that are accepted.
     """
-    relations = measured.relations
-    groups = measured.groups(mounting_is_known=mounting_is_known)
-    explanations = smallest_explanations(relations, known_mistakes(list(measured.columns), groups))
-    chosen = best_explanation(relations, explanations)
-    if chosen is None or len(chosen) > most or not all(m.is_exact for m in chosen):
+    probability, chosen = measured.posterior(mounting_is_known=mounting_is_known).best
+    if probability < CERTAIN or len(chosen) > most or not all(h.is_exact for h in chosen):
         return {}
-    bad = [r for r in relations if r.tells and not r.accepts()]
-    if all(r.is_near for r in bad):
-        return {}
+    bad = [r for r in measured.relations if r.tells and not r.accepts()]
     factor_by_name = {}
     for mistake in chosen:
         for name, factor in mistake.factors.items():
             evidence = next((r.evidence for r in bad if name in r.powers), "")
-            factor_by_name[name] = (factor, f"{mistake.words}: {evidence}")
+            factor_by_name[name] = (factor, f"{mistake.words} (probability {probability:.3f}): {evidence}")
     return factor_by_name
-
-
-def is_wrong_by(measured: Measured, name: str, factor: float) -> bool | None:
-    """Return whether the relations of a signal that count are plausible after a factor and not before; None: none."""
-    mine = [r for r in measured.relations if name in r.powers and r.tells]
-    if not mine:
-        return None
-    return all(r.accepts(factor ** r.powers[name]) for r in mine) and not all(r.accepts() for r in mine)
 
 
 def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Check, ...]:
     """Judge sign, unit and field of every signal that a relation is about."""
     columns, relations = measured.columns, measured.relations
-    groups = measured.groups(mounting_is_known=mounting_is_known)
     # The sideslip reference compares GNSS velocity with gyro and speed itself.
     names = [n for n in columns if (n in measured.topics and not n.startswith(GNSS)) or n in _JUDGED_TRUTH]
     if "truth.sideslip_rad" in names and "truth.vy_m_s" in names:  # which is v_x times its tangent
         names.remove("truth.vy_m_s")
-    explanations = smallest_explanations(relations, known_mistakes(list(columns), groups))
-    likeliest, others = _mistakes_by_signal(explanations)
-    culprits = set() if explanations else contradicting(relations)
-    explained = _Explained(likeliest, others, bool(explanations), culprits, measured.scales)
+    probable = measured.posterior(mounting_is_known=mounting_is_known)
     checks: list[Check] = []
     for name in names:
         # A wheel that contradicts others does so through the mean of the wheels, which is the speed.
-        blamed = culprits | likeliest.keys() | others.keys()
-        through = WHEEL_SPEEDS if name in blamed and name.startswith("wheel_speed_") else name
+        through = WHEEL_SPEEDS if probable.of(name) and name.startswith("wheel_speed_") else name
         mine = [r for r in relations if name in r.powers or through in r.powers]
         unrelated = [r for r in mine if r.unrelated and not _is_cleared(name, r, relations)]
-        judged = _judged(name, _of(name, [r for r in mine if r.tells]), explained)
+        judged = _judged(name, [r for r in mine if r.tells], probable, measured)
         checks += [_unrelated(name, r) for r in unrelated[:1]]
         checks += judged or ([] if unrelated else [_not_excited(name, mine)])
     return tuple(checks)
 
 
-def _of(name: str, relations: list[Relation]) -> list[Relation]:
-    """Return the relations without those of a wheel to the mean of the wheels, if others are left."""
-    others = [r for r in relations if not {name, WHEEL_SPEEDS} >= set(r.powers)]
-    return others if others and any(not r.accepts() for r in others) else relations
-
-
-class _Explained(NamedTuple):
-    """Mistakes by signal of the likeliest explanations and of the others, and signals to blame where there is none."""
-
-    likeliest: Mapping[str, list[Mistake]]
-    others: Mapping[str, list[Mistake]]
-    is_explained: bool
-    culprits: set[str]
-    scales: Mapping[str, float | tuple[float, ...]]
-
-    def scale(self, name: str, factor: float) -> str:
-        """Return the line of the mapping that multiplies the scale of a signal by a factor; empty if not known."""
-        scale = self.scales.get(name)
-        return "" if scale is None or isinstance(scale, tuple) else f"scale = {scale * factor:.6g}"
-
-
-def _judged(name: str, relations: Sequence[Relation], explained: _Explained) -> list[Check]:
+def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measured: Measured) -> list[Check]:
     """Return sign and unit checks of a signal by the relations that count; empty without any."""
-    bad, good = ([r for r in relations if r.accepts() is accepted] for accepted in (False, True))
-    if name in explained.likeliest or name in explained.others:
-        failed = _failed(name, explained.likeliest.get(name) or explained.others[name], bad or good, explained.scale)
-        is_sure = name in explained.likeliest and not (bad and all(r.is_vague for r in bad))
-        return failed if is_sure else [replace(c, verdict="undecided") for c in failed]
-    if name in explained.culprits and bad:
-        return [_unexplained(name, bad)]
-    if good or (bad and explained.is_explained):
-        return _passed(name, relations if explained.is_explained else good, is_explained=explained.is_explained)
-    return [_contradicted(name, bad[0], explained.culprits)] if bad else []
-
-
-def _passed(name: str, usable: Sequence[Relation], *, is_explained: bool) -> list[Check]:
-    """Return passed sign and unit checks; the unit is undecided where no relation decides it."""
-    best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
-    lacks = _LACKS_FOR_UNIT.get(name)
-    if is_explained and lacks and not any(r.decides_unit for r in usable):
-        return [SIGN.passed(best.evidence, name), UNIT.undecided(best.evidence, name, lacks)]
-    return [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
-
-
-def _mistakes_by_signal(
-    explanations: Sequence[tuple[Mistake, ...]],
-) -> tuple[dict[str, list[Mistake]], dict[str, list[Mistake]]]:
-    """Return by signal the mistakes of the likeliest explanations, and those of others that explain it as well."""
-    least = min((_likelihood(e) for e in explanations), default=())
-    blamed: dict[str, list[Mistake]] = {}
-    suspected: dict[str, list[Mistake]] = {}
-    for chosen in explanations:
-        by_signal = blamed if _likelihood(chosen) == least else suspected
-        for mistake in chosen:
-            for name in mistake.factors:
-                if mistake not in by_signal.setdefault(name, []):
-                    by_signal[name].append(mistake)
-    return blamed, suspected
-
-
-def _likelihood(explanation: tuple[Mistake, ...]) -> tuple[int, int]:
-    """Return how many signals an explanation has wrong, the wheels as one, and how seldom those are."""
-    signals = {"wheels" if n.startswith("wheel_speed") else n for m in explanation for n in m.factors}
-    seldom = max((_OFTEN_WRONG.index(n) if n in _OFTEN_WRONG else len(_OFTEN_WRONG) for n in signals), default=0)
-    return len(signals), seldom
-
-
-#: Of signals that explain a contradiction equally well the first is blamed: no standard states how a steering angle
-#: counts, and an axis of an IMU is turned more often than the sign of a gyro that is read from the right one.
-_OFTEN_WRONG = ("steering_wheel_rad", "steer_rad", "wheels", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
-
-
-def _unexplained(name: str, bad: Sequence[Relation]) -> Check:
-    """Return the check of a signal that contradicts others by what is no known unit or sign."""
-    first = next((r for r in bad if not r.is_close), bad[0])
-    if first.is_close:
+    if not relations:
+        return []
+    mistakes, chosen = probable.of(name), probable.best[1]
+    wrong = sum(p for p, _ in mistakes)
+    if wrong > DOUBTED:
+        likely = [h for p, h in mistakes if p > NAMED * wrong]
+        checks = _failed(name, likely, [r for r in relations if not r.accepts()] or relations, measured)
+        return checks if wrong > FAILS else [replace(c, verdict="undecided") for c in checks]
+    factors = {r.text: math.prod(h.acts_on(r) for h in chosen) for r in relations}
+    usable = [r for r in relations if not math.isnan(factors[r.text])]
+    if not usable:
+        others = " and ".join(sorted({n for h in chosen for n in h.factors} & set(relations[0].powers)))
+        return [UNIT.undecided(relations[0].evidence, name, f"needs {others} that is right")]
+    if not any(r.accepts(factors[r.text]) for r in usable):
         remedy = "no unit or sign explains it: the car may slide, or a sensor may fail for a while"
-        return UNIT.undecided(first.evidence, name, remedy)
-    remedy = "no single mistake explains it: look at the field, unit and sign of " + " and ".join(first.powers)
-    return UNIT.failed(first.evidence, name, remedy=remedy)
+        return [UNIT.undecided(usable[0].evidence, name, remedy)]
+    return _passed(name, usable)
 
 
-def _contradicted(name: str, relation: Relation, culprits: set[str]) -> Check:
-    others = " and ".join(sorted(culprits & set(relation.powers)))
-    return UNIT.undecided(relation.evidence, name, f"needs {others} that is right")
+def _passed(name: str, usable: Sequence[Relation]) -> list[Check]:
+    best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
+    if name in _LACKS_FOR_UNIT and not any(r.decides_unit for r in usable):
+        return [SIGN.passed(best.evidence, name), UNIT.undecided(best.evidence, name, _LACKS_FOR_UNIT[name])]
+    return [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
 
 
 _JUDGED_TRUTH = (*(f"truth.{n}" for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2")),)
@@ -198,21 +117,32 @@ def _unrelated(name: str, relation: Relation) -> Check:
 
 
 def _failed(
-    name: str, mistakes: Sequence[Mistake], relations: Sequence[Relation], scale: Callable[[str, float], str]
+    name: str, mistakes: Sequence[Hypothesis], relations: Sequence[Relation], measured: Measured
 ) -> list[Check]:
-    kinds = {m.kind for m in mistakes}
-    wrong = [c for a, c in (("sign", SIGN), ("unit", UNIT)) if any(a in k for k in kinds)]
+    if math.isnan(mistakes[0].factors[name]):
+        look_at = " and ".join(relations[0].powers)
+        remedy = f"no single mistake explains it: look at the field, unit and sign of {look_at}"
+        return [UNIT.failed(relations[0].evidence, name, remedy=remedy)]
+    mistakes = [h for h in mistakes if not math.isnan(h.factors[name])]
+    wrong = [c for a, c in (("sign", SIGN), ("unit", UNIT)) if any(a in _ASPECTS[h.kind] for h in mistakes)]
     evidence = "; ".join(r.evidence for r in relations[:2])
-    factors = list(dict.fromkeys(f for m in mistakes if (f := m.factors.get(name)) is not None))
-    if len(factors) == 1:
-        line = scale(name, factors[0])
-        words = " or ".join(dict.fromkeys(m.words for m in mistakes))
-        times = f"multiply its scale in the mapping by {factors[0]:.6g}"
+    scale = measured.scales.get(name)
+    lines = {
+        f: f"scale = {scale * f:.6g}" if isinstance(scale, float | int) else ""
+        for f in (h.factors[name] for h in mistakes)
+    }
+    if len(lines) == 1:
+        ((factor, line),) = lines.items()
+        words = " or ".join(dict.fromkeys(h.words for h in mistakes))
+        times = f"multiply its scale in the mapping by {factor:.6g}"
         remedy = f"perhaps {words}: {times}" + (f", {line}" if line else "")
     else:
-        lines = [f" ({line})" if (line := scale(name, m.factors[name])) else "" for m in mistakes]
-        remedy = "perhaps " + " or ".join(f"{m.words}{line}" for m, line in zip(mistakes, lines, strict=True))
+        shown = [f"{h.words} ({line})" if (line := lines[h.factors[name]]) else h.words for h in mistakes]
+        remedy = "perhaps " + " or ".join(shown)
     return [kind.failed(evidence, name, remedy=remedy) for kind in wrong]
+
+
+_ASPECTS = {"sign": ("sign",), "unit": ("unit",), "foreign": ("unit",), "sign and unit": ("sign", "unit")}
 
 
 def _not_excited(name: str, relations: Sequence[Relation]) -> Check:

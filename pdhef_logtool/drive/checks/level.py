@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
+from pdhef_logtool.drive.checks.fitting import fit
 from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind
 from pdhef_logtool.drive.columns import derivative, independent_samples, median_known
 from pdhef_logtool.drive.relations import gentle_at
@@ -41,7 +42,11 @@ def _levels(drive: CheckedDrive) -> Iterator[Check]:
         is_gentle_enough = independent_samples(int(np.count_nonzero(finite & at_ease))) >= LEVEL_SAMPLES
         use = finite & at_ease if is_gentle_enough else finite
         bias = sensors.ax_bias_m_s2 if name == "ax_m_s2" else sensors.ay_bias_m_s2
-        check = _level(name, float(np.mean(rest[use])) - bias, float(np.mean(columns[name][use])) - bias)
+        left = float(np.mean(rest[use]))
+        # Roll, and tyres near their limit, change the gain: what is left in the middle of no driving is a tilt.
+        line = fit(columns[name], [np.ones_like(driven), driven], use)
+        left = left if line is None else min(left, float(line[0][0]), key=abs)
+        check = _level(name, left - bias, float(np.mean(columns[name][use])) - bias)
         # A drive in circles has a mean too: without the yaw rate and the speed only all of gravity is gravity.
         is_known |= name == "ax_m_s2" and speed is not None
         is_gravity = is_known or abs(float(np.mean(rest[use]))) > GRAVITY_ALONE_M_S2

@@ -1,4 +1,4 @@
-"""``SIGNAL.mounting``: whether each of the IMU's signals is read from the right axis; judged by the survey of a log."""
+"""``SIGNAL.mounting``, ``corrected``: the axes of the IMU and what is read otherwise, judged by the survey of a log."""
 
 from __future__ import annotations
 
@@ -10,4 +10,10 @@ MOUNTING = CheckKind(
     fails="they are not the same",
     remedy="in the mapping: field = {field}, scale = {scale}",
 )
-CHECKS = (MOUNTING,)
+CORRECTED = CheckKind(
+    "SIGNAL.corrected",
+    compares="unit, sign and axis that recognition reads, without a mapping file, with what the drive shows",
+    fails="the drive contradicts them with certainty: the run reads what it shows",
+    remedy="confirm it in a mapping file: field = {field}, scale = {scale}",
+)
+CHECKS = (MOUNTING, CORRECTED)

@@ -59,6 +59,8 @@ VARIED = 5
 VARIED_BY_PRIOR = (FRONT_STIFFNESS, REAR_STIFFNESS, STEER_RATIO, STEER_OFFSET, AY_BIAS)
 #: Smallest difference of understeer gradients that is reported as a contradiction, rad/(m/s²).
 LEAST_CONTRADICTION = 1.5e-3
+#: 1-sigma of the understeer gradient by the limits of the single-track model, rad/(m/s²) (studies/plus_minus.py).
+UNDERSTEER_STD = 7e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,7 +287,7 @@ def _understeer(problem: JointProblem, fit: Fit, vehicle_file: VehicleParameters
     steps = DERIVATIVE_STEP * np.eye(fit.theta.size)
     slope = np.array([gradient(fit.theta + step) - centre for step in steps]) / DERIVATIVE_STEP
     file = vehicle_file.understeer_gradient_rad_per_m_s2(vehicle_file.assumed_friction)
-    return Understeer(file, centre, math.sqrt(float(slope @ fit.covariance @ slope)))
+    return Understeer(file, centre, math.hypot(math.sqrt(float(slope @ fit.covariance @ slope)), UNDERSTEER_STD))
 
 
 def _refusal(calibration: SelfCalibration, drives: Sequence[Driving], sliding: float, *, exported: bool) -> str:

@@ -36,7 +36,7 @@ def yaw_rows(
     sums_by_track = [SegmentSums() for _ in tracks]
     for first, a, b, end in blocks_with_halo(signals, SETTLE_S, 1):
         core, inside = slice(a - first, b - first), dict(masks.rows(a, b))
-        part = signals.rows(first, end)
+        part = Signals.rows(signals, first, end)  # in memory
         for track, sums in zip(tracks, sums_by_track, strict=True):
             residual = yaw_residual(track.rows(first, end), part, sensors.vehicle, sensors)[core]
             sums.add(inside, residual, residual**2)

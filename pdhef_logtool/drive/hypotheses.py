@@ -1,0 +1,306 @@
+"""One engine for wrong units, signs and fields: the posterior of each hypothesis, given the relations between signals.
+
+A relation has the gains of the blocks of a drive. A hypothesis multiplies them with what undoes it; its energy is its
+prior plus what the gains then miss the plausible range by, bounded for each block: a car that slides, a wheel that
+spins, or a bank is wrong in some blocks, a unit in all of them. Probabilities are exp(-energy), normalised.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations
+
+import numpy as np
+
+from pdhef_logtool.mapping.naming import G_M_S2
+from pdhef_logtool.records.signals import FloatArray
+
+DEGREE = float(np.pi / 180.0)
+#: Below this correlation a gain gives no information, and above it, it is between the two regressions. It must be so
+#: far from chance, by Fisher's z of the independent samples; below so many of them (3 s) nothing is stated.
+MIN_CORRELATION, MIN_CHANCE_Z, MIN_SAMPLES = 0.6, 3.0, 6.0
+#: Two sides that move, and not with one another: another field was mapped.
+UNRELATED_CORRELATION = 0.25
+#: Typical values that recognise one quantity recorded as another.
+TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M = 16.0, 0.3
+_TYPICAL = (*(f for t in (TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M) for f in (t, 1.0 / t)),)
+#: Factors between units that mappings confuse for any quantity: degrees, g, km/h.
+_FOREIGN = (1.0 / DEGREE, G_M_S2, 3.6)
+#: Factors that differ by less in the logarithm are one unit (km/h and mph are 0.48 apart), and ranges of gains that are
+#: narrower rule out all units but one: wider ones are lengths of any car.
+SAME_FACTOR, DECIDES_UNIT = 0.25, 13.0
+
+#: 1-sigma of the logarithm of a gain within a range that decides units, beyond its edges, and beyond those of a range
+#: that has room for any car.
+LEAST_WIDTH, EDGE, WIDE_EDGE = 0.05, 0.15, 0.04
+#: Largest energy of one relation (sensors fail and cars slide), and its energy with a field that is something else.
+MOST_ENERGY, _ANY_GAIN = 20.0, 2.0
+#: Energies of hypotheses (negative logarithms of their prior odds): mistakes are seldom, two of them more so, units of
+#: another quantity are the slips of templates, and a field that is something else explains any gain.
+PRIORS = {"unit": 5.0, "sign": 5.0, "sign and unit": 9.0, "foreign": 5.7, "field": 14.0, "open": 0.0}
+#: Of signals that explain a contradiction equally well the first is the likeliest: no standard states how a steering
+#: angle counts, and an axis of an IMU is turned more often than the sign of a gyro that is read from the right one.
+_OFTEN_WRONG = ("steering_wheel_rad", "steer_rad", "wheels", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
+_SELDOM, _SELDOM_STEP = 1.0, 0.3
+#: Likeliest mistakes that are combined with another one; probability of another unit below which it is ruled out.
+BEAM, RULED_OUT = 12, 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Relation:
+    """One relation with its measured gain; ``powers`` show how the gain grows with each signal's own scale.
+
+    Attributes
+    ----------
+    expected : range of a plausible gain. samples : independent ones. moves : both sides, or one of two that must move
+        together, move by more than what disturbs them. signless : a side is a size.
+    least_correlation : below it the gain gives no information.
+    typical : the likeliest gain. blocks : gains of blocks of the drive, each without its own means.
+    """
+
+    text: str
+    powers: dict[str, int]
+    correlation: float
+    gain: float
+    expected: tuple[float, float]
+    samples: float
+    moves: bool = False
+    signless: bool = False
+    least_correlation: float = MIN_CORRELATION
+    typical: float = 1.0
+    blocks: tuple[float, ...] = ()
+
+    @property
+    def decides_unit(self) -> bool:
+        """Return whether no other unit that is met in mappings would be plausible as well."""
+        return self.expected[1] < DECIDES_UNIT * self.expected[0]
+
+    @property
+    def tells(self) -> bool:
+        """Return whether the drive excites the relation enough for a verdict."""
+        bounded = min(abs(self.correlation), 1.0 - 1e-9)
+        chance_z = math.atanh(bounded) * math.sqrt(max(self.samples - 3.0, 0.0))
+        return abs(self.correlation) >= self.least_correlation and chance_z >= MIN_CHANCE_Z
+
+    @property
+    def unrelated(self) -> bool:
+        """Return whether the sides move, and not with one another."""
+        return self.moves and self.samples >= 4.0 * MIN_SAMPLES and abs(self.correlation) < UNRELATED_CORRELATION
+
+    def accepts(self, factor: float = 1.0) -> bool:
+        """Return whether the gain is plausible after multiplying it with ``factor``.
+
+        It lies between the two regressions, which are correlation x gain and gain / correlation.
+        """
+        gain, size = self.gain * factor, abs(self.correlation)
+        gain = abs(gain) if self.signless else gain
+        return size > 0.0 and gain / size >= self.expected[0] and gain * size <= self.expected[1]
+
+    def energy(self, factor: float) -> float:
+        """Return the negative log likelihood of the blocks' gains after multiplying them with ``factor``."""
+        gains = np.array(self.blocks or (self.gain,)) * factor
+        low, high = (math.log(max(e, 1e-12)) for e in self.expected)
+        with np.errstate(divide="ignore"):
+            size = np.log(np.abs(gains))
+        room = -math.log(max(abs(self.correlation), 1e-3))  # between the two regressions
+        # Blocks that differ show what changes: sliding, a frequency that tyres do not follow; a unit does not change.
+        apart = float(np.std(size)) if np.isfinite(size).all() else 0.0
+        beyond = np.maximum(np.maximum(low - room - size, size - high - room), 0.0)
+        energy = 0.5 * (beyond / math.hypot(EDGE if self.decides_unit else WIDE_EDGE, apart)) ** 2
+        if self.decides_unit:
+            middle = math.log(self.typical) if low < math.log(self.typical) < high else 0.5 * (low + high)
+            off = np.maximum(np.abs(size - middle) - room, 0.0)
+            energy += 0.5 * (off / math.hypot(max((high - low) / 6.0, LEAST_WIDTH), apart)) ** 2
+        energy = np.minimum(energy, MOST_ENERGY)
+        return float(np.mean(energy if self.signless else np.where(gains > 0.0, energy, MOST_ENERGY)))
+
+    @property
+    def evidence(self) -> str:
+        """What was measured, in words."""
+        low, high = self.expected
+        return (
+            f"{self.text}: gain {self.gain:.3g} where {low:.3g} to {high:.3g} is plausible, correlation "
+            f"{self.correlation:.2f}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """A mistake of a mapping: ``factors`` by signal undo it, NaN: nothing does. ``kind``: a key of :data:`PRIORS`."""
+
+    factors: dict[str, float]
+    words: str
+    kind: str
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the factors are those of units and signs, not a typical steering ratio or wheel radius."""
+        return not any(abs(f) in _TYPICAL or math.isnan(f) for f in self.factors.values())
+
+    @property
+    def energy(self) -> float:
+        """The negative logarithm of its prior odds."""
+        if self.kind == "open":
+            return 0.0
+        names = {"wheels" if n.startswith("wheel_speed") else n for n in self.factors}
+        rank = max(_OFTEN_WRONG.index(n) if n in _OFTEN_WRONG else len(_OFTEN_WRONG) for n in names)
+        seldom = 0.0 if rank < 2 else (_SELDOM + _SELDOM_STEP * rank) * (2.0 if self.kind == "foreign" else 1.0)
+        return PRIORS[self.kind] + seldom + 0.5 * (len(names) - 1) + (0.0 if self.is_exact else 0.5)
+
+    def acts_on(self, relation: Relation) -> float:
+        """Return what undoing it multiplies the relation's gain with."""
+        return math.prod(f ** relation.powers[n] for n, f in self.factors.items() if n in relation.powers)
+
+
+@dataclass(frozen=True, slots=True)
+class Posterior:
+    """Sets of mistakes with their probabilities, the likeliest first; the empty set: the mapping is right."""
+
+    sets: tuple[tuple[float, tuple[Hypothesis, ...]], ...]
+
+    @property
+    def best(self) -> tuple[float, tuple[Hypothesis, ...]]:
+        """The likeliest set and its probability."""
+        return self.sets[0]
+
+    def of(self, name: str) -> list[tuple[float, Hypothesis]]:
+        """Return the mistakes of a signal with their probabilities, the likeliest first."""
+        mistakes = {id(h): h for _, chosen in self.sets for h in chosen if name in h.factors}
+        shares = [(sum(p for p, chosen in self.sets if any(h is m for h in chosen)), m) for m in mistakes.values()]
+        return sorted(shares, key=lambda x: -x[0])
+
+
+def posterior(relations: Sequence[Relation], hypotheses: Sequence[Hypothesis]) -> Posterior:
+    """Return the probabilities of sets of at most two hypotheses, given the relations that count."""
+    telling = [r for r in relations if r.tells]
+    touched = {n for r in telling for n in r.powers}
+    useful = [h for h in hypotheses if touched & h.factors.keys()]
+
+    @cache
+    def of_relation(i: int, factor: float) -> float:
+        return _ANY_GAIN if math.isnan(factor) else telling[i].energy(factor)
+
+    def of_set(*chosen: Hypothesis) -> float:
+        factors = (math.prod(h.acts_on(r) for h in chosen) for r in telling)
+        return sum(h.energy for h in chosen) + sum(of_relation(i, f) for i, f in enumerate(factors))
+
+    alone = sorted(((of_set(h), i) for i, h in enumerate(useful)))
+    scored = {(): of_set(), **{(i,): energy for energy, i in alone}}
+    pairs = {tuple(sorted((i, j))) for _, i in alone[:BEAM] for j in range(len(useful)) if j != i}
+    for i, j in pairs:
+        a, b = useful[i], useful[j]
+        if not a.factors.keys() & b.factors.keys() and "foreign" not in (a.kind, b.kind):
+            scored[i, j] = of_set(a, b)
+    least = min(scored.values())
+    weights = {k: math.exp(least - e) for k, e in scored.items() if e < least + 25.0}
+    total = sum(weights.values())
+    ordered = sorted(weights.items(), key=lambda x: (-x[1], x[0]))
+    return Posterior(tuple((w / total, tuple(useful[i] for i in k)) for k, w in ordered))
+
+
+def known_hypotheses(names: Sequence[str], together: Sequence[tuple[str, ...]] = ()) -> list[Hypothesis]:
+    """List the mistakes that mappings make with these signals.
+
+    Parameters
+    ----------
+    together : signals of one sensor, whose units or signs are wrong together.
+    """
+    groups = [[n for n in group if n in names] for group in together]
+    parts = [part for group in groups for size in range(2, len(group) + 1) for part in combinations(group, size)]
+    # The mean of the wheels is no signal.
+    alone = [(n,) for n in names if n != "wheel_speeds"]
+    out = [h for part in (*alone, *dict.fromkeys(parts)) for h in _of_part(part)]
+    wheels = [(*g,) for g in groups if g and all(n.startswith("wheel_speed") for n in g)]
+    return out + [Hypothesis(dict.fromkeys(part, math.nan), _together(part), "field") for part in (*alone, *wheels)]
+
+
+def _of_part(part: tuple[str, ...]) -> Iterator[Hypothesis]:
+    """Yield the wrong units and signs that signals have together."""
+    words, is_one = _together(part), len(part) == 1
+    units = units_of(part[0].removeprefix("truth."))
+    for name in part[1:]:
+        shared = {f for f, _ in units_of(name.removeprefix("truth."))}
+        units = [(f, text) for f, text in units if f in shared]
+    for factor, text in units:
+        yield Hypothesis(dict.fromkeys(part, factor), f"{words if is_one else f'{words}: each'} {text}", "unit")
+        if is_one:
+            both = f"{words} {text} and has the wrong sign"
+            yield Hypothesis({part[0]: -factor}, both, "sign and unit")
+    # A sensor is mounted upside down or backwards, or ground truth has another convention; speeds count ahead.
+    if is_one or not _NEVER_TURNED & set(part):
+        has = "has" if is_one else "have"
+        yield Hypothesis(dict.fromkeys(part, -1.0), f"{words} {has} the wrong sign", "sign")
+    verb = "are" if words.endswith("speeds") else "is"
+    for factor in (f for size in _FOREIGN for f in (size, 1.0 / size)):
+        if all(abs(math.log(factor / other)) > SAME_FACTOR for other, _ in units):
+            text = f"{words} {verb} off by a factor of {1.0 / factor:.4g}"
+            yield Hypothesis(dict.fromkeys(part, factor), text, "foreign")
+
+
+_NEVER_TURNED = frozenset({"speed_m_s", "steer_rad", "steering_wheel_rad"})
+
+
+def _together(names: Sequence[str]) -> str:
+    """Return signals in words; the wheel speeds and their mean as one."""
+    wheels = [n for n in names if n.startswith("wheel_speed")]
+    return "wheel speeds" if len(wheels) == len(names) > 2 else " and ".join(names)
+
+
+def units_of(name: str) -> list[tuple[float, str]]:
+    """Return by what a signal is off where its unit is taken for another, and how that is stated."""
+    to_radians = [(DEGREE, "is in degrees"), (1.0 / DEGREE, "was converted from degrees twice")]
+    of_speeds = [(1.0 / 3.6, "is in km/h"), (3.6, "was converted from km/h twice"), (0.44704, "is in mph")]
+    if name in ("yaw_rate_rad_s", "sideslip_rad"):
+        return to_radians
+    if name == "steer_rad":
+        return [*to_radians, (1.0 / TYPICAL_STEERING_RATIO, "is the steering-wheel angle")]
+    if name == "steering_wheel_rad":
+        return [*to_radians, (TYPICAL_STEERING_RATIO, "is the road-wheel angle")]
+    if name in ("ax_m_s2", "ay_m_s2"):
+        return [(G_M_S2, "is in g"), (1.0 / G_M_S2, "was converted from g twice")]
+    if name in ("vx_m_s", "vy_m_s", "speed_m_s"):
+        return [*of_speeds, (1e-3, "is in mm/s")]
+    if name.startswith("wheel_speed") and name.endswith("_rad_s"):
+        return [(2.0 * np.pi / 60.0, "is in rpm"), (1.0 / TYPICAL_WHEEL_RADIUS_M, "is in m/s")]
+    if name.startswith("wheel_speed"):
+        return [*of_speeds, (TYPICAL_WHEEL_RADIUS_M, "is in rad/s")]
+    return []
+
+
+def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
+    """Return those of the signals of doubtful unit for which the relations rule out every other unit.
+
+    Each unit is as likely as the others before. The ground-truth v_y has the unit of its v_x.
+    """
+    # Rim speed in m/s and in rad/s look alike where the radius is not known: wheels are never given.
+    names = {n for n in doubted if not n.startswith("wheel_speed")}
+    units = [Hypothesis({n: f}, "", "open") for n in sorted(names) for f, _ in units_of(n.removeprefix("truth."))]
+    probable = posterior(relations, units)
+    telling = [r for r in relations if r.tells]
+    resolved = {
+        n
+        for n in names & {n for h in units for n in h.factors} & {n for r in telling for n in r.powers}
+        if sum(p for p, _ in probable.of(n)) < RULED_OUT and all(r.accepts() for r in telling if n in r.powers)
+    }
+    return resolved | (names & {"truth.vy_m_s"} if "truth.vx_m_s" in resolved else set())
+
+
+def block_gains(reference: FloatArray, measured: FloatArray, blocks: int) -> tuple[float, ...]:
+    """Return the gains [at most ``blocks``] of blocks of a drive that move; each has its own means: a bank, a bias.
+
+    Parameters
+    ----------
+    reference, measured : float64 [N], known everywhere.
+    """
+    least, gains = 0.3 * float(reference.std()), []
+    for a, b in zip(np.array_split(reference, blocks), np.array_split(measured, blocks), strict=True):
+        spread_a, spread_b = float(a.std()), float(b.std())
+        if a.size < 2 or min(spread_a - least, spread_b) <= 1e-12:
+            continue
+        correlation = float(np.mean((a - a.mean()) * (b - b.mean()))) / (spread_a * spread_b)
+        if abs(correlation) >= MIN_CORRELATION:
+            gains.append(math.copysign(spread_b / spread_a, correlation))
+    return tuple(gains) if len(gains) >= 3 else ()
