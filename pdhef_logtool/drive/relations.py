@@ -9,7 +9,7 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
-from pdhef_logtool.mapping.hypotheses import MIN_SAMPLES, Relation, block_gains
+from pdhef_logtool.drive.hypotheses import MIN_SAMPLES, Relation, block_gains
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
 #: Blocks of a drive whose gains are compared.

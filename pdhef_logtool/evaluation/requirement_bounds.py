@@ -98,8 +98,8 @@ def _studentised(
     most_deviation = _MOST_DEVIATION * float(stdtrit(len(top) - 1, 1.0 - tail))
     least, most = np.clip(np.quantile(deviations, [tail, 1.0 - tail]), -most_deviation, most_deviation)
     if effect.by:  # few days: their number limits what is known of the spread
-        known = deviate(1.0 - tail, effect.freedom)
-        least, most = min(least, -known), max(most, known)
+        reach = deviate(1.0 - tail, effect.freedom)
+        least, most = min(least, -reach), max(most, reach)
     error *= math.sqrt(effect.design_effect)
     return float(most) * error, -float(least) * error
 
