@@ -12,11 +12,15 @@ from pdhef_logtool.residual_model.ladder import LadderModel
 
 
 class TaughtParameter(Record):
-    """Prior of a parameter of the calibration: mean and standard deviation, of its logarithm where that is fitted."""
+    """Prior of a parameter of the calibration: mean and standard deviation, of its logarithm where that is fitted.
+
+    ``ay_m_s2`` : lateral acceleration of the driving that taught it; 0 = not stated.
+    """
 
     name: str
     value: float
     std: Positive
+    ay_m_s2: Annotated[float, Field(ge=0)] = 0.0
 
 
 class Taught(Record):

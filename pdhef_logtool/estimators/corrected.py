@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from pdhef_logtool.residual_model.ladder import LadderModel
 
 _BAD_AY = BURST_AY | SPIKE_AY | STUCK_AY | DEAD_AY | MISSING_AY
-#: Sideslip of the features is v_y over at least this speed, m/s.
-_LEAST_SPEED_M_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +63,7 @@ def features_of(
     x = np.sum(filters, axis=0)
     measured = without_impossible(physics.physics.corrected(signals))
     good = np.isfinite(measured.ay_m_s2) & (np.bitwise_and(steps.reason, _BAD_AY) == 0)
-    sideslip = x[:, VY] / np.maximum(x[:, VX], _LEAST_SPEED_M_S)
+    sideslip = x[:, VY] / np.maximum(x[:, VX], 1.0)  # m/s
     columns = [
         steps.filters[0].inputs[:, U_STEER],
         x[:, YAW_RATE],

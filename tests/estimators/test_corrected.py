@@ -150,9 +150,14 @@ def test_a_taught_prior_moves_mean_and_width_of_the_calibration() -> None:
         TaughtParameter(name=parameters[1].name, value=parameters[1].mean, std=9.0),
     )
     moved = with_taught(parameters, taught)
-    assert (moved[0].mean, moved[0].std) == (1.1 * first.mean, 0.5 * first.std)
+    assert (moved[0].mean, moved[0].std) == pytest.approx((1.1 * first.mean, 0.5 * first.std))
     assert moved[1].std == parameters[1].std  # no teaching makes a prior wider
     assert moved[2:] == parameters[2:]
+    of_road = (taught[0].model_copy(update={"ay_m_s2": 2.0}),)
+    unlike, near, alike = (with_taught(parameters, of_road, level)[0] for level in (8.0, 5.0, 3.0))
+    assert unlike.mean == pytest.approx(first.mean) and unlike.std == first.std
+    assert first.mean < near.mean < alike.mean and first.std > near.std > alike.std
+    assert (alike.mean, alike.std) == pytest.approx((moved[0].mean, moved[0].std))
     vehicles = (*prior_vehicles(SEDAN), *prior_vehicles(SEDAN, taught))
     before, after = (v.cornering_stiffness_n_per_rad(True, v.assumed_friction) for v in vehicles)
     assert after == pytest.approx(1.1 * before, rel=1e-4)

@@ -10,18 +10,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from reference_car import drive, slalom
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, TriedParts
-from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Sensors, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Sensors, Tyres, default_vehicle
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.phy_ukf import PHY_UKF_Q_STD, PhysicsUkf, physics_ukf_tuned
 from pdhef_logtool.estimators.physics_filter import physics_filter
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.learning.car import fit_data, identify, identify_plot
+from pdhef_logtool.learning.car import fit_data, identify
 from pdhef_logtool.learning.car.axle_forces import AxleCurve, AxleSamples, axle_samples, fit_axle, usable_stamps
 from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive, split_drive
 from pdhef_logtool.learning.car.identify import (
@@ -577,7 +576,6 @@ FOUND = Identification(
     PARAMETERS,
     (),
     (PartScore("fit", 60.0, 3.0, 2.0, 1.0, 0.5), PartScore("held out", 20.0, 3.5, 2.5, 1.5, 0.75)),
-    AxleSamples(*(np.linspace(-1.0, 1.0, 12_000) * k for k in (0.1, 5000.0, 0.05, 4000.0))),
     ("a note",),
 )
 
@@ -625,7 +623,6 @@ def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
 
     monkeypatch.setattr(stage, "load_fit_drive", load)
     monkeypatch.setattr(stage, "fit_car", fit)
-    monkeypatch.setattr(Figure, "savefig", lambda _, file, **__: file.write(b"png"))
     told: list[tuple[str, float]] = []
     warned: list[str] = []
     settings = LearnSettings(config=RunConfig(), stages=("identify",), holdout=0.1)
@@ -640,7 +637,6 @@ def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
     ]
     assert asked == [(2, 0, default_vehicle(), True)]
     car = Car.load(tmp_path / "car")
-    assert (tmp_path / "car/fit.png").read_bytes() == b"png"
     # To the hundredth of a second, which is what two slices are compared by.
     assert [(d.name, d.sha256[0], d.start_s, d.end_s) for d in car.learnt_on] == [
         ("made", "0", 1.23, 6.62),
@@ -667,41 +663,3 @@ def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
         learn([str(folder)], tmp_path / "other", settings)
     with pytest.raises(UsageError, match="holdout"):
         replace(settings, holdout=0.9)
-
-
-def test_the_plot_shows_samples_curves_intervals_and_errors(monkeypatch: pytest.MonkeyPatch) -> None:
-    figures: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: (figures.append(self), file.write(b"png")))
-    identify_plot.plot_identification(FOUND)
-    front, rear, parameters, scores = figures[0].axes
-    assert [a.get_title() for a in figures[0].axes] == ["front axle", "rear axle", "parameters", "error of the filter"]
-    assert (front.get_xlabel(), scores.get_ylabel()) == ("slip angle (°)", "sideslip RMSE (°)")
-    for axes, is_front, slip, force in ((front, True, 0.1, 5.0), (rear, False, 0.05, 4.0)):
-        dots, curve = axes.get_lines()
-        assert len(dots.get_xdata()) == 6000
-        np.testing.assert_allclose(dots.get_ydata()[0], -force)
-        np.testing.assert_allclose(dots.get_xdata()[0], -math.degrees(slip))
-        x, y = curve.get_xdata(), curve.get_ydata()
-        np.testing.assert_allclose([x[0], x[-1]], np.degrees(1.1 * slip) * np.array([-1, 1]))
-        b, c, d, _ = FOUND.vehicle.magic_formula(is_front, 0.85)
-        np.testing.assert_allclose(y[-1], d * math.sin(c * math.atan(b * 1.1 * slip)) * 1e-3)
-    assert [t.get_text() for t in parameters.get_yticklabels()] == [*NAMES, "yaw inertia (kept)", "a_y bias"]
-    lines = parameters.get_lines()
-    np.testing.assert_allclose(lines[0].get_xdata(), [-1500 / 55, 500 / 55])  # per cent of the prior
-    assert lines[0].get_ydata().tolist() == [7, 7]
-    (kept,) = [line for line in lines if list(line.get_ydata()) == [1]]
-    assert list(kept.get_xdata()) == [0.0]  # yaw inertia stands at its prior
-    np.testing.assert_allclose(lines[-2].get_xdata(), [0.05 / 0.11 * 100])  # a prior of 0 has no per cent
-    assert [[round(p.get_height(), 3) for p in bars] for bars in scores.containers] == [
-        [3.0, 2.0, 1.0, 0.5],
-        [3.5, 2.5, 1.5, 0.75],
-    ]
-    np.testing.assert_allclose([p.get_x() + p.get_width() / 2 for p in scores.containers[0]], [-0.2, 0.8, 1.8, 2.8])
-    np.testing.assert_allclose([p.get_x() + p.get_width() / 2 for p in scores.containers[1]], [0.2, 1.2, 2.2, 3.2])
-
-
-def test_a_curved_tyre_is_drawn_with_its_curvature() -> None:
-    vehicle: VehicleParameters = default_vehicle()
-    found = identify_plot._force(vehicle, True, np.array([0.1]))
-    inner = 1.23 - 0.30 * (1.23 - math.atan(1.23))
-    assert found[0] == pytest.approx(0.85 * 7600.0 * math.sin(1.41 * math.atan(inner)))

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 
 #: Files by the command that writes them; the first is the part.
 FILES = {
-    "identify": ("fit.toml", "fit.png"),
+    "identify": ("fit.toml",),
     "noise": ("noise.toml", "noise.record.json"),
     "gain": ("network.toml", "network.record.json"),
     "intervals": ("intervals.json",),

@@ -16,7 +16,8 @@ from pdhef_logtool.car.parts import Fit, LearntOn
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.cli.learning_tables import render_learning
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.estimators.calibration.joint import parameters_of
+from pdhef_logtool.estimators.calibration.joint import FRONT_STIFFNESS, PEAK, parameters_of
+from pdhef_logtool.learning.car.taught_prior import TYRES, taught_parameters
 from pdhef_logtool.learning.drives import TEACH, LearnSettings
 from pdhef_logtool.learning.engine import LearnResult, learn
 from pdhef_logtool.learning.stages.teach import OpenedDrive, learn_from, open_drive
@@ -60,17 +61,28 @@ def test_a_drive_teaches_a_prior_that_later_drives_start_from(result: LearnResul
     car = Car.load(result.car, network="none")
     assert car.taught is not None and not car.has_evidence and car.notes == ()
     by_name = {p.name: p for p in car.taught_prior}
-    parameters = parameters_of(car.vehicle)
-    assert by_name.keys() == {p.name for p in parameters}
-    assert all(by_name[p.name].std <= 1.00001 * p.std for p in parameters)
+    parameters = {p.name: p for p in parameters_of(car.vehicle)}
+    assert by_name.keys() == set(TYRES)
+    assert all(p.std <= 1.00001 * parameters[p.name].std and p.ay_m_s2 > 0.0 for p in by_name.values())
     right = Car.load(sample_logs_dir / "vehicle.toml").vehicle
     true = right.cornering_stiffness_n_per_rad(True, right.assumed_friction)
-    front = parameters[0]
+    front = parameters[FRONT_STIFFNESS]
     assert abs(np.log(by_name[front.name].value / true)) < 0.2
-    with read_drive(sample_logs_dir / "sweep.mcap", car, None) as drive:
+    with read_drive(sample_logs_dir / "road.mcap", car, None) as drive:
         calibration = calibrate_drive(drive, RunConfig())
     assert calibration is not None
-    assert [p.prior for p in calibration.parameters] == [by_name[p.name].value for p in calibration.parameters]
+    prior = {p.name: p.prior for p in calibration.parameters}
+    assert [prior[name] for name in TYRES] == pytest.approx([by_name[name].value for name in TYRES])
+
+
+def test_what_a_drive_does_not_excite_keeps_its_prior(drive: OpenedDrive) -> None:
+    vehicle = drive.drive.car.vehicle
+    first = drive.driving.stretches[0][0]
+    short = drive.driving.between(first, first + 100)
+    taught = {p.name: p for p in taught_parameters([short], [drive.slopes], vehicle)}
+    parameters = {p.name: p for p in parameters_of(vehicle)}
+    assert taught[PEAK].std > 0.97 * parameters[PEAK].std
+    assert taught[PEAK].value == pytest.approx(parameters[PEAK].mean, rel=0.02)
 
 
 def test_the_figures_say_which_rung_and_what_to_drive_next(result: LearnResult) -> None:
@@ -104,7 +116,7 @@ def test_the_prior_of_several_drives_is_tested_with_each_left_out(sample_logs_di
     drives = [opened(sample_logs_dir / "road.mcap", bare, start=a, end=b) for a, b in (("60", "90"), ("95", "125"))]
     taught = learn_from(drives)
     assert taught.prior_test is not None and taught.prior_test.blocks >= 4
-    assert bool(taught.parameters) is not (taught.prior_test.low > 0.0)
+    assert not (taught.parameters and taught.prior_test.value > 0.0)
 
 
 def test_a_changed_vehicle_file_makes_it_stale(result: LearnResult, tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, STIFFNESS_TYRE_SHAPE, AxleTyre, Tyres, VehicleParameters
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
 from pdhef_logtool.estimators.calibration.single_track import (
+    AY,
     BANK_HZ,
     OF_AY,
     OF_RATE,
@@ -57,6 +58,8 @@ PARTS = ("lag", "roll", "bank")
 #: Cornering stiffness over axle load of any car, 1/rad, front and rear, and the standard deviations of the logarithm
 #: about it and about the file's value. The compliance of the steering makes front axles softer.
 USUAL_STIFFNESS, USUAL_STIFFNESS_STD, FILE_STIFFNESS_STD = (13.5, 18.0), 0.35, 0.5
+#: Ratio of the levels of a_y of two drives up to which one teaches the other nothing, and from which on all.
+LIKE = (0.3, 0.5)
 #: Usual share of gravity in a_y by body roll, rad/(m/s²), where the file has none (3 degrees per g).
 USUAL_ROLL_GRADIENT = 0.005
 
@@ -132,13 +135,29 @@ def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
     )
 
 
-def with_taught(parameters: Sequence[Parameter], taught: Sequence[TaughtParameter]) -> tuple[Parameter, ...]:
-    """Return the parameters with the mean and standard deviation that drives with ground truth gave them."""
+def with_taught(
+    parameters: Sequence[Parameter], taught: Sequence[TaughtParameter], level_m_s2: float = 0.0
+) -> tuple[Parameter, ...]:
+    """Return the parameters with the prior that drives with ground truth gave them, for driving at a level of a_y.
+
+    Tyres at 8 m/s² are others than on a road: of unlike driving, a part of what it taught is not used.
+    """
     by_name = {t.name: t for t in taught}
-    return tuple(
-        replace(p, mean=t.value, std=min(t.std, p.std)) if (t := by_name.get(p.name)) is not None else p
-        for p in parameters
-    )
+
+    def moved(p: Parameter, t: TaughtParameter) -> Parameter:
+        levels = sorted((t.ay_m_s2, level_m_s2))
+        share = float(np.interp(levels[0] / levels[1], LIKE, (0.0, 1.0))) if levels[0] > 0.0 else 1.0
+        distance = (math.log(t.value / p.mean) if p.log else t.value - p.mean) / p.std
+        variance = p.std**2 - share**2 * max(p.std**2 - t.std**2, 0.0)
+        return replace(p, mean=p.value(share * distance), std=math.sqrt(variance))
+
+    return tuple(moved(p, by_name[p.name]) if p.name in by_name else p for p in parameters)
+
+
+def level_of(drives: Sequence[Driving]) -> float:
+    """Return the RMS of a_y, m/s², weighted by its square: straight driving hardly counts."""
+    ay2 = np.concatenate([d.columns[AY, counted(d)] ** 2 for d in drives])
+    return math.sqrt(float(np.nansum(ay2**2)) / max(float(np.nansum(ay2)), 1e-9))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,7 +174,7 @@ class JointProblem:
     def __init__(
         self, drives: Sequence[Driving], vehicle_file: VehicleParameters, taught: Sequence[TaughtParameter] = ()
     ) -> None:
-        self.parameters = with_taught(parameters_of(vehicle_file), taught)
+        self.parameters = with_taught(parameters_of(vehicle_file), taught, level_of(drives))
         self._drives, self._file = drives, vehicle_file
         self._filter = low_pass(CUTOFF_HZ, STEP_S)
         self._kept = [np.flatnonzero(counted(d))[::KEPT_STEPS] for d in drives]

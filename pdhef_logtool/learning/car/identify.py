@@ -114,7 +114,6 @@ class Identification:
     parameters: tuple[Identified, ...]
     physics_parameters: tuple[Identified, ...]
     scores: tuple[PartScore, ...]
-    samples: AxleSamples
     notes: tuple[str, ...]
 
 
@@ -185,7 +184,7 @@ def fit_car(
     parameters = _identified(priors, theta, std, active)
     of_physics = _identified(estimate.priors, estimate.theta, estimate.std, estimate.std < NOT_EXCITED)
     notes = (*_notes(parameters, fit, usable_s), _told(physics))
-    return Identification(vehicle, noise, physics, parameters, of_physics, tuple(scores), samples, notes)
+    return Identification(vehicle, noise, physics, parameters, of_physics, tuple(scores), notes)
 
 
 def _identified(

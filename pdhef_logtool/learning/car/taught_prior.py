@@ -2,7 +2,8 @@
 
 The sideslip of the model is a third channel beside yaw rate and a_y, without its mean over a few seconds: offsets of
 the ground truth are 0.2 to 0.3 degrees and differ between days, and the bank of the road, which the model lacks, would
-be taken for the tyres. Standard deviations include what differs between two drives of a car.
+be taken for the tyres. Only the tyres are taught: biases, gains and delays of sensors are those of a drive, and the
+bank of a road enters them.
 """
 
 from __future__ import annotations
@@ -16,8 +17,13 @@ from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
 from pdhef_logtool.estimators.calibration.joint import (
+    FRONT_STIFFNESS,
     KEPT_STEPS,
+    PEAK,
+    REAR_STIFFNESS,
+    RELAXATION,
     JointProblem,
+    level_of,
     parameters_of,
 )
 from pdhef_logtool.estimators.calibration.single_track import SPEED
@@ -25,9 +31,10 @@ from pdhef_logtool.records.signals import FloatArray, IntArray
 
 #: Error of the sideslip of a single track, rad; larger errors count linearly.
 SIDESLIP_STD_RAD = math.radians(0.3)
-#: Share of the prior's standard deviation by which two drives of a car differ. Of 0.28, 0.5 and 0.8 the one at which no
-#: recorded drive became worse (docs/teaching.md); what a drive teaches is above all where the prior has its mean.
-BETWEEN_DRIVES = 0.8
+#: What ground truth teaches.
+TYRES = (FRONT_STIFFNESS, REAR_STIFFNESS, PEAK, RELAXATION)
+#: Correlation of a parameter between two drives of a car, about the mean of its prior (docs/teaching.md).
+CORRELATION = 0.6
 #: Mean over so many seconds that does not count. On simulated roads with bank, a constant alone doubles the sideslip
 #: error of other drives.
 SLOW_S = 4.0
@@ -49,22 +56,24 @@ class TaughtProblem(JointProblem):
         rows = [_without_slow(out[2, k] / d.columns[SPEED, k] - slope) for d, out, k, slope in of_drives]
         return np.concatenate([errors, np.concatenate(rows)[None] / SIDESLIP_STD_RAD])
 
-    def _covariance(self, theta: FloatArray) -> FloatArray:
-        inverse, gradients = self._curvature(theta)
-        spread = inverse @ gradients.T @ gradients @ inverse
-        return np.asarray(inverse + spread + BETWEEN_DRIVES**2 * np.eye(theta.size), dtype=np.float64)
-
 
 def taught_parameters(
     drives: Sequence[Driving], slopes: Sequence[FloatArray], vehicle_file: VehicleParameters
 ) -> tuple[TaughtParameter, ...]:
     """Return the prior of a car's calibration from its drives, which were read with ``vehicle_file``."""
     problem = TaughtProblem(drives, slopes, vehicle_file)
-    fit = problem.solve()
-    sigmas = np.sqrt(np.diag(fit.covariance))
+    fit, level = problem.solve(), float(f"{level_of(drives):.4g}")
+    variances = np.minimum(np.diag(fit.covariance), 1.0)
+    stds = np.sqrt(1.0 - CORRELATION**2 * (1.0 - variances))
     return tuple(
-        TaughtParameter(name=p.name, value=float(f"{p.value(float(t)):.9g}"), std=float(f"{min(s, 1.0) * p.std:.6g}"))
-        for p, t, s in zip(parameters_of(vehicle_file), fit.theta, sigmas, strict=True)
+        TaughtParameter(
+            name=p.name,
+            value=float(f"{p.value(CORRELATION * float(t)):.9g}"),
+            std=float(f"{s * p.std:.6g}"),
+            ay_m_s2=level,
+        )
+        for p, t, s in zip(parameters_of(vehicle_file), fit.theta, stds, strict=True)
+        if p.name in TYRES
     )
 
 

@@ -15,7 +15,6 @@ from pdhef_logtool.drive.proposals import apply_proposals
 from pdhef_logtool.estimators.phy_ukf import TUNED
 from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive, sensors_of, split_drive
 from pdhef_logtool.learning.car.identify import Identification, Identified, fit_car, understeer_deg_per_g
-from pdhef_logtool.learning.car.identify_plot import plot_identification
 from pdhef_logtool.learning.drives import IDENTIFY, DriveRecord, no_drive
 from pdhef_logtool.learning.split import TRAINING
 from pdhef_logtool.learning.stages.task import StageOutput, Task
@@ -72,10 +71,7 @@ def identify(task: Task) -> StageOutput:
         LearntOn(name=d.name, sha256=r.sha256, start_s=round(d.span_s[0], 2), end_s=round(d.span_s[1], 2))
         for d, r in zip(fit, used, strict=True)
     )
-    files = {
-        FIT_FILE: _fit_toml(identification, start, drives).encode(),
-        "fit.png": plot_identification(identification),
-    }
+    files = {FIT_FILE: _fit_toml(identification, start, drives).encode()}
     change = Change(f"learn --stages {IDENTIFY}", FIT_FILE, files, settings=task.settings.to_dict(), drives=drives)
     return StageOutput(change, records, "; ".join(identification.notes), _figures(identification))
 

@@ -30,7 +30,7 @@ from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
 from pdhef_logtool.estimators.table import FEATURES, make_estimator
 from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference
 from pdhef_logtool.evaluation.comparison import end_to_end
-from pdhef_logtool.evaluation.metrics import signal_error
+from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.learning.car.taught_prior import slopes_of, taught_parameters
 from pdhef_logtool.learning.drives import TEACH, DriveRecord, no_drive, no_true_sideslip, record_of
 from pdhef_logtool.learning.split import TRAINING
@@ -40,7 +40,13 @@ from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.steps import release
 from pdhef_logtool.residual_model.ladder import NONE
-from pdhef_logtool.residual_model.ladder_fit import LadderFit, TaughtDrive, corrected_rmse_deg, fit_ladder
+from pdhef_logtool.residual_model.ladder_fit import (
+    STANDARD_ERRORS,
+    LadderFit,
+    TaughtDrive,
+    corrected_rmse_deg,
+    fit_ladder,
+)
 from pdhef_logtool.residual_model.slow_features import SlowFeatures
 from pdhef_logtool.runs.self_calibrating import lacking, read_driving, self_calibrated
 
@@ -150,8 +156,8 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
     progress("fitting the prior", 0.3)
     parameters = taught_parameters([d.driving for d in drives], [d.slopes for d in drives], vehicle)
     test = _prior_test(drives, progress)
-    if test is not None and test.low > 0.0:
-        parameters = ()
+    if test is None or not test.value + STANDARD_ERRORS * (test.high - test.value) / NORMAL_95 < 0.0:
+        parameters = ()  # no lower error on driving that it has not seen
     calibrations = [_calibration(d, parameters) for d in drives]
     progress("fitting the residual", 0.8)
     lacks = [lacking_of(d, c) for d, c in zip(drives, calibrations, strict=True)]
@@ -227,8 +233,10 @@ def _folds(drives: Sequence[OpenedDrive]) -> list[_Fold]:
         return folds
     (drive,) = drives
     cells, stamps = len(drive.driving.stamps_ns), drive.whole.signals.stamps_ns
-    middle = int(np.searchsorted(stamps, drive.driving.stamps_ns[cells // 2]))
-    for first, last, part in ((0, cells // 2, slice(middle, None)), (cells // 2, cells, slice(0, middle))):
+    taught = np.cumsum(np.isfinite(drive.slopes))
+    half_way = int(np.searchsorted(taught, taught[-1] // 2))
+    middle = int(np.searchsorted(stamps, drive.driving.stamps_ns[half_way]))
+    for first, last, part in ((0, half_way, slice(middle, None)), (half_way, cells, slice(0, middle))):
         half = drive.driving.between(first, last)
         if half.seconds >= LEAST_HALF_S:
             folds.append(_Fold((half,), (drive.slopes,), drive, part))
