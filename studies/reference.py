@@ -171,11 +171,10 @@ def simulated_drive(spec: DriveSpec, vehicle: VehicleParameters | None = None) -
             prior = prior_of(car.vehicle, calibrate_drive(opened, RunConfig()))
             signals = opened.whole().signals
     t = (signals.stamps_ns - drive.start_ns) * 1e-9
-    columns = tuple(
-        np.interp(t, drive.times_s, drive.truth[name]) for name in ("vx_m_s", "vy_m_s", "yaw_rad", "roll_rate_rad_s")
-    )
+    names = ("vx_m_s", "vy_m_s", "yaw_rad", "roll_rate_rad_s")
+    vx, vy, heading, roll_rate = (np.interp(t, drive.times_s, drive.truth[name]) for name in names)
     bare = Car.of(car.vehicle)
-    return ScoredDrive(signals, prior, *columns, car=bare, estimates=_estimates(bare, signals))
+    return ScoredDrive(signals, prior, vx, vy, heading, roll_rate, bare, _estimates(bare, signals))
 
 
 def with_gnss(drive: ScoredDrive, receiver: Receiver, seed: int = 7) -> Signals:
