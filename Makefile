@@ -15,7 +15,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 # Tests run in random order. The head of their output has the seed: make test ORDER_SEED=17 repeats an order.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(if $(ORDER_SEED),--randomly-seed=$(ORDER_SEED))
 
-.PHONY: help demo test quick fleet pages mutants mutants-fixed check lint format bench train-default samples conditions real peers torture \
+.PHONY: help demo test quick fleet pages mutants mutants-fixed check lint format bench train-default samples conditions peers torture \
   recalibrate retrain docs docs-truthsim paper strangers wheel release lock clean
 
 help:
@@ -35,7 +35,6 @@ help:
 	@echo "make retrain LOGS=drives/ CAR=mycar OUT=folder  train the network of a car again, behind a gate (docs/retrain.md)"
 	@echo "make samples  write sample_logs/ anew with the simulator"
 	@echo "make conditions CAR=car NETWORK=folder  docs/conditions.md: every estimator on the condition table"
-	@echo "make real NETWORK=folder  docs/real.md: every estimator on the recorded drives in ../shared"
 	@echo "make peers    docs/peers.md: published sideslip estimators on the recorded drives in ../shared (three minutes)"
 	@echo "make docs     the documentation as a site: out/site/index.html (a broken link is an error)"
 	@echo "make docs-truthsim  figures and tables of docs/truthsim.md anew"
@@ -156,9 +155,6 @@ DRIVES ?= 30
 conditions: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.conditions --drives $(DRIVES) --jobs $(JOBS) \
 	  --car $(CAR) $(if $(NETWORK),--network $(NETWORK))
-
-real: $(VENV)/installed-dev $(VENV)/compiled
-	OMP_NUM_THREADS=1 $(BIN)/python -m studies.real $(if $(NETWORK),--network $(NETWORK))
 
 peers: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.peers

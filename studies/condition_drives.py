@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -95,13 +96,20 @@ def read_drive(path: Path, car: Car, *, friction: float | None = None) -> Condit
     return ConditionDrive(whole.name, signals, truth, car.vehicle.low_speed_blend_m_s)
 
 
-def as_logged(drive: Drive, car: Car) -> reading.WholeDrive:
-    """Return a simulated drive the way of every log: written as MCAP, mapped by recognition, read; without friction."""
+@contextmanager
+def as_read(drive: Drive, car: Car, options: ReadOptions) -> Iterator[reading.Drive]:
+    """Open a simulated drive the way of every log: written as MCAP, mapped by recognition, read."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.mcap"
         write_drive(drive, path)
-        with reading.read_drive(path, car, options=ReadOptions(friction=None)) as read:
-            return read.whole()
+        with reading.read_drive(path, car, options=options) as read:
+            yield read
+
+
+def as_logged(drive: Drive, car: Car) -> reading.WholeDrive:
+    """Return the whole of a simulated drive without friction."""
+    with as_read(drive, car, ReadOptions(friction=None)) as read:
+        return read.whole()
 
 
 def told(drive: ConditionDrive, assume: dict[str, Any]) -> Signals:

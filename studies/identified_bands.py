@@ -25,7 +25,7 @@ from pdhef_logtool.runs.estimating import calibrator
 from studies.condition_drives import root_mean_square
 from studies.many_cars import FIT_ITERATIONS, PARTS
 from studies.pages import number, table
-from studies.self_calibration import COVERAGE_HEAD, Simulated, coverage_cells, make_wrong, say, simulate
+from studies.self_calibration import COVERAGE_HEAD, Simulated, coverage_cells, say, simulate
 
 #: Manoeuvre, km/h, seconds (None: its own). The first of each kind is identified on where it is one of ``FIT_ON``.
 DRIVEN = (
@@ -56,7 +56,7 @@ class Judged:
 
 def identified(simulated: Simulated) -> Car:
     """Return the car as the tool identifies ``physics`` on a drive, from a file with the root of its factors wrong."""
-    file = make_wrong(simulated.file, *np.sqrt(simulated.factors))
+    file = simulated.file.with_stiffness(*np.sqrt(simulated.factors))
     drive = simulated.drive
     assert drive.truth is not None
     fit = [FitDrive(drive.name, drive.signals, drive.truth, independent_yaw_rate=True, log_start_ns=drive.log_start_ns)]

@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +27,17 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference, refer, sideslip_std
-from pdhef_logtool.estimators.reference.estimator import steps_at
+from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator, steps_at
+from pdhef_logtool.estimators.table import make_estimator
+from pdhef_logtool.evaluation.metrics import ALL
+from pdhef_logtool.evaluation.metrics.reference import reference_rows
 from pdhef_logtool.mapping import Mapping, SignalSource
+from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.referencing import prior_of
 from pdhef_logtool.runs.self_calibrating import calibrate_drive
@@ -48,6 +56,10 @@ SPIN_CHECKS = ("yaw_rate_rad_s.unit", "truth.yaw_rate_rad_s.unit", "truth.sidesl
 LEAST_SPEED_M_S, NORMAL_95 = 3.0, 1.96
 #: Where the antenna of made GNSS is from the CG, forward and left, and above the roll axis, m.
 ANTENNA_M, ANTENNA_HEIGHT_M = (-0.4, 0.1), 1.2
+#: From the stamp of made GNSS to its arrival, s.
+LATE_S = 0.06
+#: Estimates that rankings compare, and a clear difference of two of them.
+RANKED, CLEAR_DEG = ("zero", "kinematic", "open-loop", "phy-ukf", "physics"), 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +104,10 @@ class Case:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoredDrive:
-    """What the reference gets of a drive, and ground truth [N] at the same stamps; ``heading_rad`` up to a constant."""
+    """What the reference gets of a drive, and ground truth [N] at the same stamps; ``heading_rad`` up to a constant.
+
+    ``estimates``: those of the vehicle file as it is, without GNSS, that rankings compare.
+    """
 
     signals: Signals
     prior: ReferencePrior
@@ -100,6 +115,14 @@ class ScoredDrive:
     vy_m_s: FloatArray
     heading_rad: FloatArray
     roll_rate_rad_s: FloatArray
+    car: Car | None = None
+    estimates: tuple[StateTrack, ...] = ()
+
+    def error_rad(self, track: StateTrack, least_speed_m_s: float) -> FloatArray:
+        """Return the sideslip error of an estimate where it is scored."""
+        scored = track.valid & (self.vx_m_s > least_speed_m_s)
+        error = wrap_angle(track.sideslip_rad - np.arctan2(self.vy_m_s, self.vx_m_s))[scored]
+        return np.asarray(error[np.isfinite(error)])
 
 
 def recorded_drive(drive: PeerDrive) -> ScoredDrive:
@@ -114,7 +137,12 @@ def recorded_drive(drive: PeerDrive) -> ScoredDrive:
     assert whole.truth is not None
     truth = whole.truth
     heading = np.cumsum(np.nan_to_num(truth.yaw_rate_rad_s) * np.gradient(truth.stamps_ns * 1e-9))
-    return ScoredDrive(whole.signals, prior, truth.vx_m_s, truth.vy_m_s, heading, np.zeros(len(truth)))
+    columns = (truth.vx_m_s, truth.vy_m_s, heading, np.zeros(len(truth)))
+    return ScoredDrive(whole.signals, prior, *columns, car, _estimates(car, whole.signals))
+
+
+def _estimates(car: Car, signals: Signals) -> tuple[StateTrack, ...]:
+    return tuple(run_window(make_estimator(name, car), signals)[0] for name in RANKED)
 
 
 def _with_receiver(mapping: Mapping) -> Mapping:
@@ -146,7 +174,8 @@ def simulated_drive(spec: DriveSpec, vehicle: VehicleParameters | None = None) -
     columns = (
         np.interp(t, drive.times_s, drive.truth[name]) for name in ("vx_m_s", "vy_m_s", "yaw_rad", "roll_rate_rad_s")
     )
-    return ScoredDrive(signals, prior, *columns)
+    bare = Car.of(car.vehicle)
+    return ScoredDrive(signals, prior, *columns, bare, _estimates(bare, signals))
 
 
 def with_gnss(drive: ScoredDrive, receiver: Receiver, seed: int = 7) -> Signals:
@@ -172,7 +201,8 @@ def with_gnss(drive: ScoredDrive, receiver: Receiver, seed: int = 7) -> Signals:
         made = np.interp(sampled - receiver.delay_s, t[good], component[good])
         made += receiver.correlated_m_s * correlated + receiver.white_m_s * rng.standard_normal(len(sampled))
         velocity[at, column] = made
-    return replace(signals, gnss_velocity_m_s=velocity)
+    late_s = np.where(np.isfinite(velocity[:, 0]), LATE_S, np.nan)
+    return replace(signals, gnss_velocity_m_s=velocity, gnss_late_s=late_s)
 
 
 def _outage(signals: Signals) -> Signals:
@@ -275,7 +305,11 @@ def cases() -> Iterator[Case]:
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """Figures of a case; angles in degrees. ``truth``: RMS of the ground truth; ``sigmas``: RMSE over RMS 1-sigma."""
+    """Figures of a case; angles in degrees. ``truth``: RMS of the ground truth.
+
+    ``physics``, ``aided``: RMSE of ``physics`` without and with GNSS. ``pairs`` of estimates: that the reference ranks,
+    of these as by ground truth; that differ by more than ``CLEAR_DEG``, of these that the reference ranks.
+    """
 
     truth: float
     rmse: float
@@ -286,6 +320,9 @@ class Figures:
     used_gnss: bool
     refused: str
     seconds: float
+    physics: float = math.nan
+    aided: float = math.nan
+    pairs: tuple[int, int, int, int] = (0, 0, 0, 0)
 
 
 def figures(case: Case, drive: ScoredDrive) -> Figures:
@@ -300,7 +337,33 @@ def figures(case: Case, drive: ScoredDrive) -> Figures:
     start = time.process_time()
     found = refer(signals, prior, use_gnss=case.gnss != NONE)
     seconds = time.process_time() - start
-    return _scored(found, drive, case.least_speed_m_s, seconds)
+    scored = _scored(found, drive, case.least_speed_m_s, seconds)
+    if drive.car is None or not np.isfinite(signals.gnss_velocity_m_s).any() or case.gnss == NONE:
+        return scored
+
+    def rmse(gnss: bool) -> float:
+        track, _ = run_window(make_estimator("physics", drive.car, Options(gnss=gnss)), signals)
+        return _rms_deg(drive.error_rad(track, case.least_speed_m_s))
+
+    pairs = (0, 0, 0, 0) if found.refused else _pairs(found, drive, case.least_speed_m_s)
+    return replace(scored, physics=rmse(gnss=False), aided=rmse(gnss=True), pairs=pairs)
+
+
+def _rms_deg(values_rad: FloatArray) -> float:
+    return float(np.degrees(np.sqrt(np.mean(values_rad**2)))) if values_rad.size else math.nan
+
+
+def _pairs(found: SideslipReference, drive: ScoredDrive, least_speed_m_s: float) -> tuple[int, int, int, int]:
+    """Return ``pairs`` of :class:`Figures`."""
+    reference = ReferenceEstimator((found,)).at(drive.signals.stamps_ns)
+    everywhere = {ALL: np.ones(len(reference), dtype=np.bool_)}
+    rows = reference_rows(drive.estimates, reference, everywhere, log="", low_speed_m_s=least_speed_m_s)
+    claims = {row.estimator: row.value for row in rows if row.metric == "reference_further"}
+    errors = {t.name: _rms_deg(drive.error_rad(t, least_speed_m_s)) for t in drive.estimates}
+    further = {f"{a}~{b}": errors[a] - errors[b] for a, b in combinations(errors, 2)}
+    agreed = sum(claim * further[pair] > 0.0 for pair, claim in claims.items())
+    clear = [pair for pair, value in further.items() if abs(value) > CLEAR_DEG]
+    return len(claims), agreed, len(clear), sum(pair in claims for pair in clear)
 
 
 def _scored(found: SideslipReference, drive: ScoredDrive, least_speed_m_s: float, seconds: float) -> Figures:
@@ -348,6 +411,18 @@ of the RAV4 is turned by about 0.8°, that of the Polaris by 0.5 to 2.3°.
 ## Faults, simulated
 {faults}
 
+## GNSS in the causal filter
+`physics` of the vehicle file as it is, without calibration, and with the GNSS velocity, which arrives {late:.0f} ms
+late. In {worse} of {all} rows it is worse with GNSS by more than 5 % and 0.003°.
+
+{causal}
+
+## Rankings
+Pairs of {ranked} on the drives above with GNSS, ranked by the reference where it
+[claims](metrics.md) a difference, and by the RMSE against ground truth.
+
+{rankings}
+
 ## Targets
 {targets}
 
@@ -364,9 +439,22 @@ def _row(case: Case, got: Figures) -> list[str]:
     return [case.title, gnss, *cells, valid, number(got.valid_rmse, 2), got.refused.partition(" (")[0] or "–"]
 
 
+def _rankings(done: Sequence[tuple[Case, Figures]]) -> list[list[str]]:
+    rows = []
+    for name, is_one in (("recorded", lambda c: bool(c.log)), ("simulated", lambda c: not c.log)):
+        sums = np.sum([f.pairs for c, f in done if is_one(c)], axis=0)
+        claimed, agreed, clear, found = (int(n) for n in sums)
+        agree = "–" if not claimed else f"{100.0 * agreed / claimed:.0f} %"
+        share = "–" if not clear else f"{100.0 * found / clear:.0f} %"
+        rows.append([name, str(claimed), agree, str(clear), share])
+    return rows
+
+
 def page(results: dict[str, Figures]) -> str:
     """Return the page of the stored figures."""
     done = [(case, results[case.name]) for case in cases() if case.name in results]
+    aided = [(c, f) for c, f in done if math.isfinite(f.aided)]
+    worse = sum(f.aided > f.physics + max(0.05 * f.physics, 0.003) for _, f in aided)
     recorded = [_row(c, f) for c, f in done if c.log]
     simulated = [_row(c, f) for c, f in done if c.spec is not None and not c.fault]
     faults = [[c.fault, *_row(c, f)] for c, f in done if c.fault]
@@ -379,6 +467,23 @@ def page(results: dict[str, Figures]) -> str:
     with_doppler, alone = hour.get(MADE, math.nan), hour.get(NONE, math.nan)
     return PAGE.format(
         made=MADE,
+        late=1e3 * LATE_S,
+        worse=worse,
+        all=len(aided),
+        causal=table(
+            ("drive", "physics", "with GNSS"), [[c.name, number(f.physics, 3), number(f.aided, 3)] for c, f in aided]
+        ),
+        ranked=", ".join(f"`{name}`" for name in RANKED),
+        rankings=table(
+            (
+                "drives",
+                "ranked",
+                "as by ground truth",
+                f"pairs that differ by more than {CLEAR_DEG}°",
+                "of these ranked",
+            ),
+            _rankings(done),
+        ),
         recorded=table(_HEAD, recorded),
         simulated=table(_HEAD, simulated),
         faults=table(("fault", *_HEAD), faults),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +19,7 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.toml_files import load_vehicle
-from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import DrivingReader
@@ -41,7 +41,8 @@ from studies.condition_drives import SIDESLIP, as_logged
 from studies.many_cars import BASE, KINDS, draw_car
 from studies.pages import DRIVES, ROOT, number, table
 from truthsim.batch import sensor_noise
-from truthsim.drive import simulate_drive
+from truthsim.drive import Drive, simulate_drive
+from truthsim.sensors import SensorNoise
 from truthsim.vehicle_choice import choose_vehicle
 
 #: Manoeuvre, km/h, seconds (None: its own).
@@ -79,22 +80,15 @@ class Simulated:
         return signal_error(track, self.drive.truth, SIDESLIP, self.file.low_speed_blend_m_s)
 
 
-def make_wrong(vehicle: VehicleParameters, front: float, rear: float) -> VehicleParameters:
-    """Return a vehicle with the stiffness of its axles multiplied; peaks stay."""
-
-    def tyre(of: AxleTyre, factor: float) -> AxleTyre:
-        if of.B is not None:
-            return of.model_copy(update={"B": factor * of.B})
-        assert of.cornering_stiffness_n_per_rad is not None
-        return of.model_copy(update={"cornering_stiffness_n_per_rad": factor * of.cornering_stiffness_n_per_rad})
-
-    tyres = Tyres(front=tyre(vehicle.tyres.front, front), rear=tyre(vehicle.tyres.rear, rear))
-    return vehicle.model_copy(update={"tyres": tyres})
-
-
 def simulate(cars: int, seed: int, driven: Sequence[tuple[str, float, float | None]] = DRIVEN) -> list[Simulated]:
     """Return the drives of the cars; one that cannot be driven is left out, with a message."""
-    drives_of_cars = []
+    return [simulated for simulated, _, _ in simulated_drives(cars, seed, driven)]
+
+
+def simulated_drives(
+    cars: int, seed: int, driven: Sequence[tuple[str, float, float | None]], **sensors: float
+) -> Iterator[tuple[Simulated, Drive, SensorNoise]]:
+    """Yield what :func:`simulate` returns, with the drive as it is simulated and its sensors; ``sensors`` are given."""
     for index in range(cars):
         rng = np.random.default_rng([seed, index])
         car = draw_car(rng, load_vehicle(BASE), (*KINDS, "hatchback"))
@@ -102,6 +96,7 @@ def simulate(cars: int, seed: int, driven: Sequence[tuple[str, float, float | No
         friction = float(rng.choice(FRICTIONS))
         file = car.vehicle.model_copy(update={"friction": friction})
         for manoeuvre, speed, duration_s in driven:
+            noise = sensor_noise(dict(car.sensors) | sensors)
             try:
                 drive = simulate_drive(
                     manoeuvre,
@@ -111,14 +106,13 @@ def simulate(cars: int, seed: int, driven: Sequence[tuple[str, float, float | No
                     duration_s=duration_s,
                     vehicle=choose_vehicle(car.text),
                     vehicle_name=car.text,
-                    noise=sensor_noise(dict(car.sensors)),
+                    noise=noise,
                 )
             except SimulationError as error:
                 say(f"car {index}, {manoeuvre} is left out: {error}")
                 continue
             logged = as_logged(drive, Car.of(file))
-            drives_of_cars.append(Simulated(index, manoeuvre, logged, file, (float(front), float(rear))))
-    return drives_of_cars
+            yield Simulated(index, manoeuvre, logged, file, (float(front), float(rear))), drive, noise
 
 
 def calibrate(signals: Signals, file: VehicleParameters) -> SelfCalibration:
@@ -187,7 +181,7 @@ class Outcome:
 
 def outcome_of(simulated: Simulated) -> Outcome:
     """Run a drive with its files."""
-    wrong = make_wrong(simulated.file, *simulated.factors)
+    wrong = simulated.file.with_stiffness(*simulated.factors)
     calibration, from_right = (
         calibrate(simulated.drive.signals, wrong),
         calibrate(simulated.drive.signals, simulated.file),

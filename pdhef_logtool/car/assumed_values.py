@@ -19,6 +19,9 @@ from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 #: A passenger car's: the share of the static weight on the front axle, where the file gives none. 0.63 for front-wheel
 #: drive, 0.50 for rear-engined and sports cars.
 FRONT_WEIGHT_SHARE, FRONT_WEIGHT_SHARE_SPREAD = 0.56, 0.08
+#: Relative distance between the default sedan's centre of gravity over the rear axle, 1.71 m, and that of a car without
+#: any file: wheelbases of 2.4 to 3.0 m with 45 to 62 % on the front axle, 1.46 ± 0.18 m.
+DEFAULT_CG_SPREAD = 0.18
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pdhef_logtool.car.assumed_values import AssumedValue
+from pdhef_logtool.car.assumed_values import DEFAULT_CG_SPREAD, AssumedValue
 from pdhef_logtool.car.parts import (
     PHYSICS,
     FilterNoise,
@@ -29,7 +29,7 @@ from pdhef_logtool.car.parts import (
 )
 from pdhef_logtool.car.taught import Taught, TaughtParameter
 from pdhef_logtool.car.toml_files import VehicleFile, read_vehicle_file, with_sensors
-from pdhef_logtool.car.vehicle import Record, VehicleParameters, default_vehicle
+from pdhef_logtool.car.vehicle import DEFAULT_VEHICLE_NAME, Record, VehicleParameters, default_vehicle
 from pdhef_logtool.records.errors import UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
@@ -80,6 +80,7 @@ class WithoutTruth:
     ``varied`` : the vehicle one posterior 1-sigma away, in independent directions. ``driven_d2_m_s`` : v̇_y residual of
     ``physics`` on the log, the part that correlates with the driving, NaN if unknown. ``earlier`` : what applied
     before, in time order, where the log calibrates its car as it goes on; each applies from its ``since_ns``.
+    ``causal`` : whether it depends on nothing that follows ``since_ns``. ``cg_std_m`` : as :attr:`Car.cg_std_m`.
     """
 
     vehicle: VehicleParameters
@@ -90,6 +91,8 @@ class WithoutTruth:
     driven_d2_m_s: float = math.nan
     since_ns: int = 0
     earlier: tuple[WithoutTruth, ...] = ()
+    causal: bool = False
+    cg_std_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,7 +164,7 @@ class Car:
             car = _with_parts(car, folder)
         name, home = _network_of(car, folder, network)
         bundle = None if home is None else load_bundle(home)
-        selected = _intervals_of(folder, name, intervals)
+        selected = _intervals_of(folder, intervals)
         car = replace(car, network=bundle, network_name=name, network_folder=home, intervals=selected)
         if str(intervals) == NO_INTERVALS and car.fitted_physics is not None:
             car = replace(car, fitted_physics=car.fitted_physics.model_copy(update={"varied": ()}))
@@ -172,8 +175,6 @@ class Car:
                 "pdhef learn --stages gain creates it again"
             )
         has_intervals_file = intervals is None and folder is not None and (folder / INTERVALS_FILE).is_file()
-        if intervals is None and not has_intervals_file and car.varied_physics:
-            car = replace(car, intervals=None)  # what its own drives left open states more than another car's intervals
         if has_intervals_file and selected is not None and selected.physics_sha256 != car.physics_sha256:
             stale.append(
                 f"{INTERVALS_FILE} was made with other physics; pdhef learn --stages intervals creates it again"
@@ -270,6 +271,14 @@ class Car:
         fitted = bool(self.learnt_on) or self.fitted_physics is not None
         tried = self.trust is not None and self.trust.has_evidence and not self._other_than_tried
         return fitted or tried
+
+    @property
+    def cg_std_m(self) -> float:
+        """1-sigma of the distance from the rear axle to the centre of gravity where no file gives it; else 0."""
+        share = next((a.spread for a in self.assumed if a.entry == "front_weight_share"), 0.0)
+        if self.source is None and self.datasheet.name == DEFAULT_VEHICLE_NAME:
+            share = DEFAULT_CG_SPREAD
+        return share * self.datasheet.cg_to_rear_axle_m
 
     @property
     def calibrated_car(self) -> Car:
@@ -379,18 +388,18 @@ def _network_of(car: Car, folder: Path | None, chosen: Place) -> tuple[str, Path
     return name, home / NETWORK_FOLDER if (home / NETWORK_FOLDER / DOCUMENT_FILE).is_file() else home
 
 
-def _intervals_of(folder: Path | None, network: str, chosen: Place) -> Intervals | None:
-    """Return the intervals in force: the chosen ones, else the car's own, else those of the shipped network."""
+def _intervals_of(folder: Path | None, chosen: Place) -> Intervals | None:
+    """Return the intervals in force: the chosen ones, else the car's own."""
     if chosen is not None and str(chosen) == NO_INTERVALS:
         return None
     file = UNSURE_FILE if str(chosen) == UNSURE else INTERVALS_FILE
     if chosen is not None and str(chosen) != UNSURE:
         return load_intervals(Path(chosen))
-    shipped = SHIPPED_CARS.values() if network == SHIPPED else ()
-    homes = [h for h in (folder, *shipped) if h is not None and (h / file).is_file()]
-    if not homes and chosen is not None:
+    if folder is not None and (folder / file).is_file():
+        return load_intervals(folder / file)
+    if chosen is not None:
         raise UsageError(expected=f"a car with {file}", got="none", where=f"intervals = {UNSURE}")
-    return load_intervals(homes[0] / file) if homes else None
+    return None
 
 
 def load_intervals(path: Path) -> Intervals:

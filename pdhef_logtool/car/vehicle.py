@@ -295,6 +295,16 @@ class VehicleParameters(Record):
         b, c, d, _ = self.magic_formula(front, friction)
         return b * c * d
 
+    def with_stiffness(self, front: float, rear: float) -> VehicleParameters:
+        """Return the vehicle with the cornering stiffness of its axles multiplied; peak forces stay."""
+
+        def tyre(of: AxleTyre, factor: float) -> AxleTyre:
+            name = "B" if of.B is not None else "cornering_stiffness_n_per_rad"
+            return of.model_copy(update={name: factor * getattr(of, name)})
+
+        tyres = Tyres(front=tyre(self.tyres.front, front), rear=tyre(self.tyres.rear, rear))
+        return self.model_copy(update={"tyres": tyres})
+
     def understeer_gradient_rad_per_m_s2(self, friction: float = 1.0) -> float:
         """Linear understeer gradient dδ/da_y = m (l_r C_r − l_f C_f) / (L C_f C_r)."""
         cf = self.cornering_stiffness_n_per_rad(True, friction)

@@ -41,21 +41,10 @@ def compare(
         Path | None,
         Option(metavar="FILE", help='Validation plan for B. baseline = "run" means run A. Exit code 4 if one fails.'),
     ] = None,
-    max_regression: Annotated[
-        str | None, Option(metavar="SHARE", help="Largest accepted increase of the metric: 5% or 0.05.")
-    ] = None,
-    estimator: Annotated[
-        str | None, Option(help="Estimator to compare. Default: the selected estimate of A, per drive.")
-    ] = None,
-    metric: Annotated[str | None, Option(help="Metric of sideslip over the whole drive. Default: rmse.")] = None,
-    cluster: Annotated[
-        str | None,
-        Option(
-            metavar="KEY",
-            help="Groups of dependent drives: car, day, route, a metadata key, or none. Default: the dependence by "
-            "day, car and route is estimated.",
-        ),
-    ] = None,
+    max_regression: options.MaxRegression = None,
+    estimator: options.ComparedEstimator = None,
+    metric: options.ComparedMetric = None,
+    cluster: options.Cluster = None,
     allow_unpaired: Annotated[
         bool, Option("--allow-unpaired", help="Accept drives that only one run contains.")
     ] = False,

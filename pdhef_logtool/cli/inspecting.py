@@ -23,6 +23,7 @@ commands = typer.Typer()
     "pdhef inspect drive.mcap",
     "pdhef inspect drive.bag --json | jq .signals",
     "pdhef inspect drive.mcap --write-mapping mapping.toml",
+    "pdhef inspect drive.mcap --report inspection.html",
     "pdhef inspect drive.mcap --fields /imu/data",
     "pdhef inspect https://host/drive.mcap --all",
     panel=panels.LOOK,
@@ -32,6 +33,10 @@ def inspect(
     config: RunConfig,
     write_mapping: Annotated[
         Path | None, Option(help="Write a mapping.toml to edit. An existing file is not overwritten.")
+    ] = None,
+    report: Annotated[
+        Path | None,
+        Option(metavar="FILE", help="HTML page: a picture of each candidate field, clocks, checks, mapping to paste."),
     ] = None,
     fields: Annotated[
         bool, Option("--fields", help="Show the numeric fields of TOPIC, or of all topics, instead.")
@@ -53,6 +58,8 @@ def inspect(
     reading = config.read_options
     if topic is not None and not fields:
         raise UsageError(expected="one log", got=f"{log} and {topic}", where="LOG", remedy="a topic goes with --fields")
+    if fields and (report or write_mapping) is not None:
+        raise UsageError(expected="--fields alone", got="--report or --write-mapping as well", where="--fields")
     place = one_place(log, private_redirects=config.allow_private_redirects)
     if fields:
         topic_fields = fields_of_log(place, topic, budget=reading.limits, msgs=reading.msgs)
@@ -68,6 +75,11 @@ def inspect(
     if write_mapping is not None:
         write_mapping_file(inspection, write_mapping)
         console.say(f"mapping written to {write_mapping}")
+    if report is not None:
+        from pdhef_logtool.runs.inspection.page import write_page
+
+        write_page(inspection, report, place, budget=reading.limits, msgs=reading.msgs)
+        console.say(f"page written to {report}")
     lost = any(loss.severity == "lost" for loss in inspection.lost)
     console.finish(inspection, render_inspection, as_json, exit_code=EXIT_PARTIAL if lost else EXIT_OK)
 

@@ -75,7 +75,8 @@ _OPTIONS: dict[str, Any] = {
         Option(
             "--mapping",
             "-m",
-            help="mapping.toml, which maps fields to signals. Default: recognised by message type, name and unit.",
+            help="mapping.toml, which maps fields to signals, or a folder with one per recorder. Default: recognised "
+            "by message type, name and unit.",
             rich_help_panel=INPUT,
         ),
     ],
@@ -148,7 +149,9 @@ _OPTIONS: dict[str, Any] = {
             rich_help_panel=ESTIMATION,
         ),
     ],
-    "gnss": Annotated[_Text, Option(help="GNSS velocity in the reference: auto or off.", rich_help_panel=ESTIMATION)],
+    "gnss": Annotated[
+        _Text, Option(help="GNSS velocity in filters and reference: auto or off.", rich_help_panel=ESTIMATION)
+    ],
     "no_position": Annotated[
         bool | None,
         Option(
@@ -268,3 +271,21 @@ def run_config(options: dict[str, Any]) -> RunConfig:
 def split_names(text: str) -> tuple[str, ...]:
     """Split a comma-separated list."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+#: Options of commands that compare runs.
+MaxRegression = Annotated[
+    str | None, Option(metavar="SHARE", help="Largest accepted increase of the metric: 5% or 0.05.")
+]
+ComparedEstimator = Annotated[
+    str | None, Option(help="Estimator to compare. Default: the selected estimate of the first run, per drive.")
+]
+ComparedMetric = Annotated[str | None, Option(help="Metric of sideslip over the whole drive. Default: rmse.")]
+Cluster = Annotated[
+    str | None,
+    Option(
+        metavar="KEY",
+        help="Groups of dependent drives: car, day, route, a metadata key, or none. Default: the dependence by day, "
+        "car and route is estimated.",
+    ),
+]

@@ -31,21 +31,10 @@ commands = typer.Typer()
 def trend(
     runs: Annotated[list[str], Argument(metavar="RUN", help="Outputs of runs, the oldest first: folders or URLs.")],
     *,
-    max_regression: Annotated[
-        str | None, Option(metavar="SHARE", help="Largest increase that is not marked: 5% or 0.05. Default: 0.")
-    ] = None,
-    estimator: Annotated[
-        str | None, Option(help="Estimator to compare. Default: the selected estimate of the earlier run, per drive.")
-    ] = None,
-    metric: Annotated[str | None, Option(help="Metric of sideslip over the whole drive. Default: rmse.")] = None,
-    cluster: Annotated[
-        str | None,
-        Option(
-            metavar="KEY",
-            help="Groups of dependent drives: car, day, route, a metadata key, or none. Default: the dependence by "
-            "day, car and route is estimated.",
-        ),
-    ] = None,
+    max_regression: options.MaxRegression = None,
+    estimator: options.ComparedEstimator = None,
+    metric: options.ComparedMetric = None,
+    cluster: options.Cluster = None,
     html: Annotated[Path | None, Option(help="HTML file for the trend.")] = None,
     as_json: options.JsonFlag = False,
 ) -> None:

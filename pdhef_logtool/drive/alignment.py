@@ -18,6 +18,7 @@ Rules
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
@@ -25,6 +26,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.geometry import WGS84_A_M
 from pdhef_logtool.records.signals import (
     ALIGNED_SIGNALS,
     GNSS,
@@ -37,6 +39,7 @@ from pdhef_logtool.records.signals import (
     IntArray,
     Signals,
     has_gnss,
+    has_position,
 )
 from pdhef_logtool.records.steps import MAX_PREDICTION_S
 from pdhef_logtool.storage.documents import jsonable
@@ -64,6 +67,9 @@ DELAY_DRIFT_S = 2.0
 SAME_CLOCK_SHARE = 0.9
 
 
+#: Longest step between positions that give a velocity; largest and least 1-sigma of a position's change, m: most of the
+#: error of a position lasts longer than a step.
+LONGEST_FIX_STEP_S, FIX_STD_M, LEAST_FIX_STD_M = 2.5, 0.05, 0.005
 _IMU = ("yaw_rate_rad_s", "ay_m_s2", "ax_m_s2")
 #: What only the sideslip reference uses, which is not causal: never waited for.
 _TILT_RATES = frozenset({"roll_rate_rad_s", "pitch_rate_rad_s"})
@@ -188,7 +194,7 @@ def plan_alignment(
     ------
     MappingError : No IMU channel has two samples in the survey, so that there is no grid.
     """
-    survey = _cut_to_survey(channels)
+    survey = _cut_to_survey(with_gnss_velocity(channels))
     periods = {name: _median_period_s(c) for name, c in survey.items()}
     grid = _grid_channel(periods)
     grid_period = periods[grid]
@@ -238,7 +244,7 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
     channels : with ``plan.margin_ns`` of samples before ``start_ns`` and after ``end_ns``, as far as the log has them.
         A channel that is absent has no sample here.
     """
-    margin = plan.margin_ns
+    margin, channels = plan.margin_ns, with_gnss_velocity(channels)
     usable = {
         p.name: _without_late(channels[p.name].between(start_ns - margin, end_ns + margin), p)
         for p in plan.channels
@@ -246,11 +252,13 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
     }
     stamps = _grid_stamps(channels, plan, start_ns - margin, end_ns)
     columns = {p.target: np.full(stamps.shape[0], np.nan) for p in plan.channels}
-    ready = stamps.copy()
+    ready, gnss_ready = stamps.copy(), stamps.copy()
     for p in plan.channels:
         if p.name in usable and stamps.size:
             values, arrival = _to_grid(usable[p.name], p, stamps, _ns(_max_gap_s(plan.grid_period_s)))
             columns[p.target] = p.scale * values if p.scale != 1.0 else values
+            if p.name.startswith(GNSS):
+                np.maximum(gnss_ready, arrival, out=gnss_ready)
             if p.name not in _TILT_RATES and (not p.name.startswith(GNSS) or plan.speed_from == "GNSS"):
                 np.maximum(ready, arrival, out=ready)
     ready = np.maximum.accumulate(ready)
@@ -275,6 +283,7 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
         available=plan.available,
         gnss_velocity_m_s=velocity[inside].copy(),
         gnss_velocity_std_m_s=columns.get("gnss_velocity_accuracy_m_s", missing)[inside].copy(),
+        gnss_late_s=np.where(np.isfinite(velocity[inside, 0]), (gnss_ready - stamps)[inside] * 1e-9, np.nan),
         gnss_position_deg=np.stack([columns.get(name, missing)[inside] for name in GNSS_POSITION], axis=1),
         gnss_position_std_m=columns.get("gnss_position_accuracy_m", missing)[inside].copy(),
         **made,
@@ -290,6 +299,30 @@ def gnss_velocity(columns: Mapping[str, FloatArray]) -> FloatArray:
         velocity = np.stack([speed * np.cos(course), speed * np.sin(course)], axis=1)
     velocity[columns.get("gnss_fix_type", np.ones(len(velocity))) < 1.0] = np.nan
     return velocity
+
+
+def with_gnss_velocity(channels: Mapping[str, Channel]) -> Mapping[str, Channel]:
+    """Return the channels with GNSS velocity halfway between successive positions where no receiver states one."""
+    if has_gnss(channels) or not has_position(channels):
+        return channels
+    north, east = (channels[name] for name in GNSS_POSITION)
+    stamps, i, j = np.intersect1d(north.stamps_ns, east.stamps_ns, assume_unique=True, return_indices=True)
+    near = np.flatnonzero(np.diff(stamps) <= _ns(LONGEST_FIX_STEP_S))
+    step_s = (stamps[near + 1] - stamps[near]) * 1e-9
+    arrival = np.maximum(north.arrival_ns[i], east.arrival_ns[j])[near + 1]
+    middle = (stamps[near] + stamps[near + 1]) // 2
+    std = np.full(len(near), FIX_STD_M)
+    if (accuracy := channels.get("gnss_position_accuracy_m")) is not None and len(accuracy):
+        stated = np.interp(middle, accuracy.stamps_ns, accuracy.values)
+        std = np.clip(stated, LEAST_FIX_STD_M, FIX_STD_M)
+    m_s = np.radians(1.0) * WGS84_A_M / step_s
+    narrowed = np.cos(np.radians(north.values[i][near]))
+    made = {
+        "gnss_velocity_north_m_s": np.diff(north.values[i])[near] * m_s,
+        "gnss_velocity_east_m_s": np.diff(east.values[j])[near] * narrowed * m_s,
+        "gnss_velocity_accuracy_m_s": math.sqrt(2.0) * std / step_s,
+    }
+    return {**channels, **{n: Channel(n, "m/s", north.source, middle, arrival, v) for n, v in made.items()}}
 
 
 def count_late(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, end_ns: int) -> dict[str, int]:

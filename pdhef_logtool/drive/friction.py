@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 #: What may be asked for beside a number.
 CHOICES = ("auto", "file", "estimate")
+#: 1-sigma of an estimate by the tyres of the vehicle file: without evidence, when the stiffness may be wrong by a
+#: factor of two at each axle, and with it (simulated cars, studies/plus_minus.py, seeds 555 and 99004).
+MODEL_STD = {False: 0.5, True: 0.015}
 
 
 def parse_friction(text: str | float) -> str | float:
@@ -55,6 +58,7 @@ class FrictionSource:
     bank : estimates it; None where nothing is estimated.
     factor : error made on purpose in the friction of topic or option, for training (docs/method.md#limits).
     stamps, observable_stamps : of the windows so far.
+    model_std : 1-sigma of the estimate's error that comes of the vehicle file (:data:`MODEL_STD`).
     """
 
     label: str
@@ -64,13 +68,14 @@ class FrictionSource:
     factor: float = 1.0
     stamps: int = 0
     observable_stamps: int = 0
+    model_std: float = 0.0
     _carry: FrictionState | None = None
     _std: list[FloatArray] = field(default_factory=list)
     _observable: list[BoolArray] = field(default_factory=list)
 
     def afresh(self) -> FrictionSource:
         """Return the same source at the start of a drive."""
-        return FrictionSource(self.label, self.note, self.constant, self.bank, self.factor)
+        return FrictionSource(self.label, self.note, self.constant, self.bank, self.factor, model_std=self.model_std)
 
     def fill(self, signals: Signals) -> Signals:
         """Return the next window's signals with their friction."""
@@ -96,6 +101,11 @@ class FrictionSource:
         return self.label.startswith("topic")
 
     @property
+    def std(self) -> FloatArray:
+        """1-sigma of the estimate at each stamp so far; of length 0 where nothing is estimated."""
+        return np.hypot(np.concatenate(self._std), self.model_std) if self._std else np.empty(0)
+
+    @property
     def observable(self) -> BoolArray:
         """Whether the drive shows its friction, at each stamp so far; of length 0 where nothing is estimated."""
         return np.concatenate(self._observable) if self._observable else np.zeros(0, dtype=np.bool_)
@@ -108,7 +118,7 @@ class FrictionSource:
     @property
     def observable_std(self) -> float:
         """Median 1-sigma of the estimate where it is observable; NaN where it never is."""
-        return float(np.median(np.concatenate(self._std)[self.observable])) if self.observable_stamps else math.nan
+        return float(np.median(self.std[self.observable])) if self.observable_stamps else math.nan
 
     @property
     def summary(self) -> str:

@@ -513,7 +513,8 @@ def survey_log(
     for triad, names in zip(triads, (ACCELERATIONS, RATES), strict=True):
         extra |= {} if triad is None else triad.components(names)
     channels = read_signals(log, replace(mapping, signals={**mapping.signals, **extra}), clocks, *span_ns)
-    truth_plan = plan_truth(channels.truth, truth_position_m=vehicle.truth_position_m) if channels.truth else None
+    place, gradient = vehicle.truth_position_m, vehicle.roll_gradient_rad_per_m_s2
+    truth_plan = plan_truth(channels.truth, truth_position_m=place, roll_gradient_rad_per_m_s2=gradient)
     truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
     measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     # The input of an estimator must not depend on ground truth: with it, a mounting is only checked.

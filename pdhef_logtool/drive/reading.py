@@ -9,7 +9,7 @@ from typing import Self, cast
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.friction import FrictionSource, friction_source
+from pdhef_logtool.drive.friction import MODEL_STD, FrictionSource, friction_source
 from pdhef_logtool.drive.options import ReadOptions, time_slice
 from pdhef_logtool.drive.setup import CLOCK_START_S, LogUntil, Setup, is_device_clock, load_setup
 from pdhef_logtool.drive.windows import DrivePlan, DriveReader, DriveWindow, plan_drive, setup_of
@@ -32,7 +32,7 @@ from pdhef_logtool.mapping import (
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import EstimatorError, MappingError, UsageError
 from pdhef_logtool.records.ledger import SampleCount, damage
-from pdhef_logtool.records.signals import Loss, Signals, join_signals
+from pdhef_logtool.records.signals import GNSS_POSITION, Loss, Signals, join_signals
 from pdhef_logtool.records.steps import MAX_PREDICTION_S
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
@@ -152,7 +152,9 @@ class Drive:
         return f"not causal: {shown} read by stamp, not by arrival"
 
     def _delay_known(self, signal: str) -> bool:
-        return self.plan.clocks.get(clock_key(self.mapping.signals[signal]), ClockModel()).delay_known
+        sources = self.mapping.signals
+        source = sources[signal if signal in sources else GNSS_POSITION[0]]  # a velocity may be that of positions
+        return self.plan.clocks.get(clock_key(source), ClockModel()).delay_known
 
     @property
     def checks(self) -> tuple[Check, ...]:
@@ -341,6 +343,7 @@ def read_drive(
             told(note)
         _tell_doubts(plan, options, told)
         friction = friction_of(plan, car.vehicle, options)
+        friction.model_std = MODEL_STD[car.has_evidence]
         if friction.note:
             remarks.append(friction.note)
     except BaseException as error:

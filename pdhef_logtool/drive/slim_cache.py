@@ -97,9 +97,12 @@ class SlimCache:
     def _setting(self) -> str:
         """Digest of all that decides what is kept of a log, as files are and not as they are called."""
         mapping: dict[str, Any] = jsonable(self.mapping) or {}
-        if self.mapping is not None and self.mapping.can is not None:
-            mapping["can"]["dbc"] = [hash_log(path) for path in self.mapping.can.dbc]
-        vendors = repr(load_vendors()) if self.mapping is None or self.mapping.fill_recognised else ""
+        mapping["file"], vendors = "", repr(load_vendors())
+        if self.mapping is not None:
+            if self.mapping.can is not None:
+                mapping["can"]["dbc"] = ""
+            mapping["dbc"] = [hash_log(path) for path in self.mapping.dbc]
+            vendors = vendors if self.mapping.fill_recognised or self.mapping.recorders else ""
         msgs = "" if self.options.msgs is None else hash_log(self.options.msgs)
         said = (FORMAT, __version__, mapping, vendors, msgs, self.options.prefer_truth, self.options.budget)
         return digest(said)[:16]

@@ -5,7 +5,9 @@ Derivations (``TruthTrack.derivation`` states which applied):
 * body velocity from v_x and v_y; v_x and sideslip; ENU or ECEF velocity and heading (quaternion or yaw); position and
   heading; v_x, course and yaw; ground speed and sideslip; ground speed alone (then v_x only);
 * moved to the CG by v_cg = v − ω × p, and position, a_y likewise;
-* yaw rate from heading, a_y = v̇_y + v_x r, when they are not mapped;
+* yaw rate from heading when it is not mapped;
+* a_y, the lateral specific force in the road plane: mapped, or (v̇_y + v_x r + g sin φ) / (1 + g K_φ) with the roll φ of
+  the attitude, to which body roll adds K_φ a_y. It is unknown without roll: v̇_y + v_x r lacks g sin(bank);
 * derivatives by Savitzky–Golay over the true stamps: a cubic by least squares over ± ``DIFFERENTIATION_HALF_S``, its
   slope at the centre; none where the window would cross a gap or the end of the data.
 
@@ -20,6 +22,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.columns import median_known
 from pdhef_logtool.drive.correlation import GAP_PERIODS, find_shift, on_common_grid
 from pdhef_logtool.drive.interpolation import Bracket
@@ -52,7 +55,10 @@ _COLUMNS = {
     **{name: (name,) for name in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "yaw_rad")},
     "position_m": ("x_m", "y_m"),
 }
-_AY_DERIVED = "smoothing derivative of v_y plus v_x times yaw rate"
+_AY_DERIVED = "smoothing derivative of v_y plus v_x times yaw rate plus g sin(roll), without body roll"
+_AY_UNKNOWN = "not scored: needs a mapped a_y, or an attitude with roll and the car's roll gradient"
+#: An attitude whose roll changes by less, in rad, is a heading.
+_ROLLS_RAD = 1e-6
 _SURVEY_NS = 600_000_000_000
 _CHUNK = 16384
 _ANGLES = frozenset({"yaw_rad", "course_rad", "sideslip_rad"})
@@ -74,10 +80,14 @@ VelocitySource: TypeAlias = Literal[
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """What a quaternion means: it turns ``body`` axes (FLU or FRD) into ``frame`` (ENU, NED or ECEF)."""
+    """What a quaternion means: it turns ``body`` axes (FLU or FRD) into ``frame`` (ENU, NED or ECEF).
+
+    ``has_roll``: it is more than a heading.
+    """
 
     frame: Literal["ENU", "NED", "ECEF"]
     body: Literal["FLU", "FRD"]
+    has_roll: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +107,7 @@ class TruthPlan:
     ----------
     base : channel whose stamps are the ground-truth clock. period_s : its median period.
     max_gap_s : longest step that is bridged, by channel. half_window : samples on each side of a derivative.
-    position_m : where ground truth is measured, from the CG, ISO 8855.
+    position_m : where ground truth is measured, from the CG, ISO 8855. roll_gradient_rad_per_m_s2 : of the car.
     delay_s : largest median arrival − stamp of the channels.
     """
 
@@ -111,6 +121,7 @@ class TruthPlan:
     attitude: Attitude | None
     position_m: tuple[float, float, float]
     delay_s: float
+    roll_gradient_rad_per_m_s2: float = 0.0
 
     @property
     def margin_ns(self) -> int:
@@ -155,6 +166,7 @@ def plan_truth(
     *,
     truth_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
     max_gap_s: float | None = None,
+    roll_gradient_rad_per_m_s2: float = 0.0,
 ) -> TruthPlan | None:
     """Decide clock, derivation, local frame and the meaning of the quaternion from the first 600 s.
 
@@ -162,6 +174,7 @@ def plan_truth(
     ----------
     channels : truth channels by name, quality gate applied (samples that failed are absent).
     truth_position_m : where ground truth is measured, from the CG. max_gap_s : default three median periods.
+    roll_gradient_rad_per_m_s2 : of the car: the share of roll that is no bank of the road.
 
     Returns
     -------
@@ -186,6 +199,7 @@ def plan_truth(
         attitude=None,
         position_m=truth_position_m,
         delay_s=max(float(np.median(c.arrival_ns - c.stamps_ns)) * 1e-9 for c in survey.values()),
+        roll_gradient_rad_per_m_s2=roll_gradient_rad_per_m_s2,
     )
     if "quat_wxyz" not in has:
         return plan
@@ -291,7 +305,7 @@ def valid_as_a_whole(truth: StateTrack, derivation: Mapping[str, str], standstil
     standing = np.hypot(truth.vx_m_s, truth.vy_m_s) < standstill_m_s
     complete = truth.valid & (np.isfinite(truth.sideslip_rad) | standing | ("sideslip_rad" not in derivation))
     for name, how in derivation.items():
-        for column in () if how == _AY_DERIVED else _COLUMNS.get(name, ()):
+        for column in () if how in (_AY_DERIVED, _AY_UNKNOWN) else _COLUMNS.get(name, ()):
             complete &= np.isfinite(getattr(truth, column))
     return replace(truth, valid=complete)
 
@@ -487,7 +501,9 @@ def _find_attitude(source: _Source) -> Attitude:
         score = (1.0 if up > 0.5 else -1.0) + _forward_share(rotation, velocity)
         if score > best_score + 0.05:
             best, best_score = Attitude(frame, body), score
-    return best
+    left_up = source.rotation(best)[:, 2, 1]
+    rolls = np.abs(left_up - median_known(left_up)) > _ROLLS_RAD  # NaN compares False
+    return replace(best, has_roll=source.reference == "ENU" and bool(rolls.any()))
 
 
 def _forward_share(rotation: FloatArray, velocity: FloatArray) -> float:
@@ -745,8 +761,12 @@ def _lateral_acceleration(
             ay = ay - source.derivative(rate) * x + rate * rate * y
         return ay
     if "vy_m_s" in says and "yaw_rate_rad_s" in says:
-        says["ay_m_s2"] = _AY_DERIVED
-        return source.derivative(vy) + vx * rate
+        attitude, gradient = source.plan.attitude, source.plan.roll_gradient_rad_per_m_s2
+        if attitude is not None and attitude.has_roll and gradient != 0.0:
+            says["ay_m_s2"] = _AY_DERIVED
+            gravity = GRAVITY_M_S2 * source.rotation(attitude)[:, 2, 1]
+            return (source.derivative(vy) + vx * rate + gravity) / (1.0 + GRAVITY_M_S2 * gradient)
+        says["ay_m_s2"] = _AY_UNKNOWN
     return np.full(source.stamps_ns.shape[0], np.nan)
 
 

@@ -45,8 +45,8 @@ Z_AY, Z_YAW_RATE, Z_SPEED = 0, 1, 2
 MEASUREMENTS = 3
 MOTION = 3  # entries of the state that an output has a covariance of
 # Inputs of a step; a_x is 0 where U_AX_KNOWN is 0. U_SPEED is the last speed sample that was accepted, 0 before any.
-U_STEER, U_AX, U_FRICTION, U_AX_KNOWN, U_SPEED = 0, 1, 2, 3, 4
-INPUTS = 5
+U_STEER, U_AX, U_FRICTION, U_AX_KNOWN, U_SPEED, U_STEER_KNOWN = range(6)
+INPUTS = 6
 
 #: Speed process noise where the log has no longitudinal accelerometer: the speed is then a random walk
 #: (docs/method.md#frame).
@@ -77,7 +77,8 @@ M_RATE_VY, M_RATE_R = 9, 10  # residual of the step before
 M_REJECTED = 11  # and the two after it, one a measurement: time since the first sample of an unbroken rejection
 M_SPEED = 14  # last speed sample
 M_GRIP = 15  # largest recent share of the grip that is used, decaying (``physics`` only)
-MEMORY = 16
+M_STEER_ROW = 16  # and those behind it: covariance of an unknown steering angle with the state (``physics`` only)
+MEMORY = 32
 #: What M_REJECTED contains at the first rejected sample itself; 0 is "the last sample was accepted".
 JUST_REJECTED_S = 1e-9
 
@@ -108,6 +109,7 @@ class Rules(NamedTuple):
     default_friction: float
     dynamic_speed_m_s: float  # above it a sideslip beyond DIVERGED_SIDESLIP_RAD is divergence
     steer_hold_s: float
+    needs_steer: bool  # False: without steering for ``steer_hold_s`` the filter estimates it
     still_speed_m_s: float
     still_yaw_rate_rad_s: float
 
@@ -181,7 +183,7 @@ class Sample(NamedTuple):
 class StepInputs(NamedTuple):
     """Inputs at step k, held where they are missing, and its measurements.
 
-    ``steers`` states that the steering was measured, ``steer_ok`` that it is not held for too long.
+    ``steers`` states that the filter may start with the steering, ``steer_ok`` that it may go on with it.
     """
 
     dt: float
@@ -283,6 +285,10 @@ def begin_step(sample, rules, memory):  # type: ignore[no-untyped-def]
     else:
         memory[M_STEER_AGE] += 0.0 if restart else sample.dt
     steer_ok = steers or (memory[M_INITIALISED] > 0.0 and memory[M_STEER_AGE] <= rules.steer_hold_s)
+    if not rules.needs_steer:
+        lateral = math.isfinite(sample.yaw_rate) or math.isfinite(sample.ay)
+        steers = steers or (memory[M_STEER_AGE] > rules.steer_hold_s and lateral)
+        steer_ok = True
     has_ax = math.isfinite(sample.ax)
     friction = sample.friction
     if not math.isfinite(friction):
@@ -441,18 +447,19 @@ def remember(k, now, residual_rate, memory):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def finish_step(k, now, residual_rate, rules, memory, inputs):  # type: ignore[no-untyped-def]
-    """Keep inputs and residual of step k for the next one, and write its row of the inputs [K, 5]."""
+    """Keep inputs and residual of step k for the next one, and write its row of the inputs [K, 6]."""
     remember(k, now, residual_rate, memory)
     inputs[k, U_STEER] = now.steer
     inputs[k, U_AX] = now.ax
     inputs[k, U_FRICTION] = now.friction
     inputs[k, U_AX_KNOWN] = memory[M_AX_KNOWN]
     inputs[k, U_SPEED] = memory[M_SPEED] if rules.use_speed else 0.0
+    inputs[k, U_STEER_KNOWN] = 1.0 if memory[M_STEER_AGE] <= rules.steer_hold_s else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosteriorSteps(StepColumns):
-    """Filter posteriors on measurement time: [K] each, state [K, n], covariance [K, n, n], inputs [K, 5].
+    """Filter posteriors on measurement time: [K] each, state [K, n], covariance [K, n, n], inputs [K, 6].
 
     ``prior`` [K, n] is the state before the update, NaN where the filter starts. ``residual_rate``
     [K, 2] is what is added to v̇_y and ṙ from the step on; 0 in the pure physics filter.
@@ -538,6 +545,7 @@ def make_tuning(
     *,
     use_speed: bool,
     standstill: bool = True,
+    needs_steer: bool = True,
 ) -> Tuning:
     """Return the tuning of a filter of as many states as ``initial_std`` has entries; the rest of ``q_std`` is 0."""
     n = len(initial_std)
@@ -556,6 +564,7 @@ def make_tuning(
             vehicle.assumed_friction,
             vehicle.low_speed_blend_m_s,
             vehicle.sensors.steer_hold_s,
+            needs_steer,
             vehicle.sensors.speed_zero_m_s,
             vehicle.sensors.still_yaw_rate_rad_s,
         ),

@@ -45,7 +45,7 @@ MAX_SIDESLIP_STD_RAD = 1.0
 #: Function of the next window of a track and its signals that returns the track with wider intervals.
 Widening = Callable[[StateTrack, Signals], StateTrack]
 #: Note for intervals that contain the uncertainty of a car's parameters.
-POSTERIOR_NOTE = "intervals: own, identified parameters and sensors"
+POSTERIOR_NOTE = "intervals: own, parameters and sensors"
 
 
 @dataclass(slots=True)

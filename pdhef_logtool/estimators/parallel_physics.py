@@ -18,6 +18,7 @@ from pdhef_logtool.estimators.filter_base import (
     U_FRICTION,
     U_SPEED,
     U_STEER,
+    U_STEER_KNOWN,
     VX,
     FilterState,
     PosteriorSteps,
@@ -107,7 +108,8 @@ def run_features(
 
     Returns
     -------
-    features : [K, 28], NaN where the filter has no state, or one that goes backwards against the speed sensor.
+    features : [K, 28], NaN without steering, or where the filter has no state or one that goes backwards against the
+        speed sensor.
     steps, state : of the filter.
     """
     steps, after = physics.run(signals, state, extra_r=extra_r)
@@ -129,7 +131,8 @@ def run_features(
         steps.inputs[:, U_STEER], usable.ay_m_s2, usable.yaw_rate_rad_s, steps.x, steps.prior, predicted,
         friction, usable.ax_m_s2, body, np.concatenate([car_features(physics.vehicle, friction), parameters], axis=1),
     )  # fmt: skip
-    features[~(steps.valid & rolls_forward(steps.x[:, VX], steps.inputs[:, U_SPEED]))] = np.nan
+    steers = steps.inputs[:, U_STEER_KNOWN] > 0.0
+    features[~(steps.valid & steers & rolls_forward(steps.x[:, VX], steps.inputs[:, U_SPEED]))] = np.nan
     return features, steps, after
 
 

@@ -8,7 +8,9 @@ their centre.
 A residual rate of v̇_y and ṙ enters as in ``phy-ukf``: half before and half after the model's step, and in the
 predicted a_y, times the force scale where that is a state. Zeros change no bit.
 
-Inputs, gate, standstill, restart, wheel speed and delay are those of ``phy-ukf``.
+Inputs, gate, standstill, restart, wheel speed and delay are those of ``phy-ukf``. Where the steering is missing for
+longer than it may be held, its error is a state that walks at random, with the place of the steering bias: the rear
+axle's tyres, a_y and yaw rate then determine v_y.
 """
 
 from __future__ import annotations
@@ -49,6 +51,7 @@ from pdhef_logtool.estimators.physics_model import (
     PLACES,
     RATE_BIAS,
     REAR,
+    STEER_BIAS,
     VX,
     VY,
     WIDTH,
@@ -86,6 +89,9 @@ _BANK_STD = 0.02
 BIAS_WALK_STD = (0.004, 0.00008, 0.00002)
 #: Spread of the force scale (docs/method.md#adaptation).
 FORCE_SCALE_STD = 0.05
+
+#: 1-sigma of an unknown steering angle at the start and at most, rad, and its walk per √s (docs/method.md#physics).
+UNKNOWN_STEER_STD, MAX_STEER_STD, UNKNOWN_STEER_WALK = 0.1, 0.2, 0.2
 
 #: Beyond this share of the grip, the largest of about the last ``LIMIT_TIME_S``, tyre models are least certain
 #: (docs/method.md#limit).
@@ -390,6 +396,16 @@ def _write_prediction(m, x, P, steer, rate_vy, places, p, predicted):  # type: i
 
 
 # positional: as _predict.
+@_compiled
+def _find_steering(x, P, std):  # type: ignore[no-untyped-def]
+    """End the estimate of an unknown steering angle: its bias restarts with ``std``."""
+    x[STEER_BIAS] = 0.0
+    P[STEER_BIAS, :] = 0.0
+    P[:, STEER_BIAS] = 0.0
+    P[STEER_BIAS, STEER_BIAS] = std * std
+
+
+# positional: as _predict.
 @njit(cache=True)
 def _filter(window, tuning, limit_gain, layout, p, f, estimate, out, links):  # type: ignore[no-untyped-def]
     """Run over one window; ``estimate`` is moved in place. ``links`` are of length 0 where nobody asks for them."""
@@ -411,16 +427,35 @@ def _filter(window, tuning, limit_gain, layout, p, f, estimate, out, links):  # 
     _, _, _, z_hat, S, _, nu, at_gate, given, use = base.make_work(base.MEASUREMENTS)
     index, root, w = np.empty(base.MEASUREMENTS, np.int64), np.empty_like(S), np.empty_like(nu)
     noise, constants = (q_std, aligned(ROOM), scale), _make_constants()
-    front_std, rear_std = q_std[FRONT], q_std[REAR]
+    front_std, rear_std, steer_std = q_std[FRONT], q_std[REAR], q_std[STEER_BIAS]
+    hidden, row_of = layout.steer_bias < 0, memory[base.M_STEER_ROW :]
+    if hidden:
+        P[STEER_BIAS, :] = row_of
+        P[:, STEER_BIAS] = row_of
     factored = False  # whether L is the factor of P
     for k in range(dt.shape[0]):
         sample = base.Sample(dt[k], steer[k], ax[k], ay[k], yaw_rate[k], speed[k], friction[k])
+        guessed = memory[base.M_INITIALISED] > 0.0 and memory[base.M_STEER_AGE] > rules.steer_hold_s
+        if guessed:  # the likeliest angle is the input
+            memory[base.M_STEER] -= x[STEER_BIAS]
+            x[STEER_BIAS] = 0.0
         now = base.begin_step(sample, rules, memory)
+        unknown = memory[base.M_STEER_AGE] > rules.steer_hold_s
+        if guessed and not unknown:
+            _find_steering(x, P, initial_std[STEER_BIAS])
+            guessed, factored = False, False
+        q_std[STEER_BIAS] = UNKNOWN_STEER_WALK if unknown else steer_std
+        if unknown and x[VX] < p.blend_high_m_s and P[STEER_BIAS, STEER_BIAS] > UNKNOWN_STEER_STD**2:
+            q_std[STEER_BIAS] = 0.0  # a slow car shows no steering
+        there[STEER_BIAS] = guessed or not hidden
         if memory[base.M_INITIALISED] == 0.0:
             factored = False
             out_valid[k] = base.starts(now, p.rear_m, initial_std, x, P, memory)
             if out_valid[k]:
-                settle_forces(x, now.steer, now.ax, now.friction, layout, p, f)
+                if unknown:
+                    x[STEER_BIAS] = -(p.front_m + p.rear_m) * x[YAW_RATE] / max(x[VX], p.blend_low_m_s)
+                    P[STEER_BIAS, STEER_BIAS] = UNKNOWN_STEER_STD**2
+                settle_forces(x, now.steer - x[STEER_BIAS], now.ax, now.friction, layout, p, f)
         else:
             over = base.held_over_step(now, memory)
             rate = (memory[base.M_RATE_VY], memory[base.M_RATE_R])
@@ -430,13 +465,15 @@ def _filter(window, tuning, limit_gain, layout, p, f, estimate, out, links):  # 
             if limit_gain > 0.0:
                 factor = _limit_factor(x, over.friction, now.dt, limit_gain, p, memory)
                 q_std[FRONT], q_std[REAR] = factor * front_std, factor * rear_std
-            _draw(x, L, scale, constants, points)
+            noise = (q_std, noise[1], scale + 1.0 if guessed and hidden else scale)
+            _draw(x, L, noise[2], constants, points)
             if linked:
                 _keep_before(points, x, P, places, before, out_cross[k])
             _predict(x, P, over, rate, now.dt, noise, layout, p, f, constants, points, True)
+            there[STEER_BIAS] = unknown or not hidden
             alive = _finite(x, P)
             if linked:
-                _cross(before, points, scale, places, out_cross[k])
+                _cross(before, points, noise[2], places, out_cross[k])
                 _take_matrix(P, places, out_predicted_P[k])
             _take(x, places, out_prior[k])
             if alive:
@@ -467,15 +504,20 @@ def _filter(window, tuning, limit_gain, layout, p, f, estimate, out, links):  # 
                 if memory[base.M_STILL] >= rules.still_after_s:
                     factored = False
                 alive = _finite(x, P)
-            out_valid[k] = alive and now.steer_ok
+            # Without steering, a_y and yaw rate nothing determines the motion: the filter ends, and waits for them.
+            determined = alive and not (unknown and P[STEER_BIAS, STEER_BIAS] > MAX_STEER_STD**2)
+            out_valid[k] = determined
             out_diverged[k] = not alive or base.diverges(rules, x, memory)
-            if not alive:
+            if not determined:
                 memory[base.M_INITIALISED] = 0.0
             elif linked and memory[base.M_STILL] < rules.still_after_s:
                 out_link[k] = LINK_WHOLE
         base.finish_step(k, now, residual_rate, rules, memory, out_inputs)
         _take(x, places, out_x[k])
         _take_matrix(P, places, out_P[k])
+    if hidden:
+        memory[base.M_STEER] -= x[STEER_BIAS]
+        row_of[:] = P[STEER_BIAS]
     _take(x, places, state_x)
     _take_matrix(P, places, state_P)
 
@@ -577,6 +619,7 @@ class PhysicsFilter(base.LinkedFilter):
             still.tolist(),
             use_speed=self.use_speed,
             standstill=self.standstill,
+            needs_steer=False,
         )
 
     def corrected(self, signals: Signals) -> Signals:

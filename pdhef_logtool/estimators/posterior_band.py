@@ -1,16 +1,18 @@
-"""95 % confidence intervals of an identified car, from the spread of its parameters after identification.
+"""95 % confidence intervals from the spread of a car's parameters: what identification left of it, else their prior.
 
     s² = (k_o s_own)² + Σ_i (v_y,i − v_y)² / v_x² + w²
 
-v_y,i is that of the physics filter on the vehicle one posterior 1-sigma away in direction i, without the states that
-cure what a car lacks. w is what accelerometer and gyro state against the estimate's own changes, ``kinematic`` of
+v_y,i is that of the physics filter on the vehicle one 1-sigma away in direction i of the posterior, or of the prior if
+no drive has shown the vehicle file to be right, without the states that cure what a car lacks. w is the disagreement of
+accelerometer and gyro with the estimate's own changes, ``kinematic`` of
 :mod:`~pdhef_logtool.estimators.error_features`: driving unlike that of the identification shows there. Both are
-available online, so that the confidence interval is causal. The own one counts less, for the
-noise of an identified car includes what its model leaves of a_y.
+available online, so that the confidence interval is causal. The own one counts less, for the noise of an identified car
+includes what its model leaves of a_y.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,6 +20,7 @@ import numpy as np
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.adaptive_physics import CURES
+from pdhef_logtool.estimators.calibration.joint import FILE_STIFFNESS_STD, IMU_X, PEAK, STEER_OFFSET, parameters_of
 from pdhef_logtool.estimators.error_features import TERMS, FeatureState, error_terms
 from pdhef_logtool.estimators.latency_compensation import WindowState, run_window
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter, of_car
@@ -60,8 +63,9 @@ class PosteriorBand:
 
 
 def posterior_band(car: Car, *, use_speed: bool = True) -> PosteriorBand | None:
-    """Return the intervals of a car; None where identification has kept no posterior, or its log has calibrated it."""
-    if car.self_calibrated is not None or not car.varied_physics:
+    """Return the intervals of a car; None where its log has calibrated it, or evidence has left no posterior."""
+    varied = prior_variations(car.physics_vehicle) if car.fitted_physics is None else car.varied_physics
+    if car.self_calibrated is not None or not varied:
         return None
     physics, none = of_car(car, use_speed=use_speed), dict.fromkeys(CURES, False)
     read_with = physics.read_with or physics.vehicle
@@ -70,4 +74,21 @@ def posterior_band(car: Car, *, use_speed: bool = True) -> PosteriorBand | None:
         bare = vehicle.model_copy(update={"physics": vehicle.physics.model_copy(update=none)})
         return replace(physics, vehicle=bare, read_with=read_with)
 
-    return PosteriorBand(tuple(on(v) for v in (physics.vehicle, *car.varied_physics)))
+    return PosteriorBand(tuple(on(v) for v in (physics.vehicle, *varied)))
+
+
+def prior_variations(vehicle: VehicleParameters) -> tuple[VehicleParameters, ...]:
+    """Return a vehicle file with one error of 1-sigma each, in the parameters that move the sideslip most.
+
+    Stiffness of each axle, friction in place of peak force, steering offset, position of the accelerometer: the
+    priors of the joint calibration.
+    """
+    prior = {p.name: p.std for p in parameters_of(vehicle)}
+    stiffer, (x, y, z) = math.exp(FILE_STIFFNESS_STD), vehicle.imu_position_m
+    return (
+        vehicle.with_stiffness(stiffer, 1.0),
+        vehicle.with_stiffness(1.0, stiffer),
+        vehicle.model_copy(update={"friction": math.exp(-prior[PEAK]) * vehicle.assumed_friction}),
+        vehicle.model_copy(update={"steer_offset_rad": vehicle.steer_offset_rad + prior[STEER_OFFSET]}),
+        vehicle.model_copy(update={"imu_position_m": (x + prior[IMU_X], y, z)}),
+    )

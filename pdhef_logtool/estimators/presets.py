@@ -19,6 +19,8 @@ OPTIONS: Mapping[str, Mapping[str, tuple[float, float] | None]] = {
     "phy-ukf": {"tuned": None},
     "pd-hef": {"gain": (0.0, 1.0), "fixed-r": None},
 }
+#: Presets that GNSS velocity corrects.
+AIDED = frozenset({"physics", "pd-hef"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +31,14 @@ class Options:
     ----------
     use_speed : False is the paper's ``esp`` suite for the filters: the speed sensor only initializes them.
     trust : residual gain of the hybrid filters, in [0, 1]; None: as far as the car's evidence allows.
+    gnss : whether GNSS velocity corrects :data:`AIDED` where the log has it.
     network : the car's network, ready to run, where several estimators share it; None: loaded by each estimator.
     """
 
     use_speed: bool = True
     trust: float | None = None
     network: NetworkService | None = field(default=None, compare=False)
+    gnss: bool = False
 
     def service(self, car: Car) -> NetworkService:
         """Return the car's network, ready to run."""

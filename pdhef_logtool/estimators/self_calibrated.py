@@ -5,12 +5,13 @@ What a whole log states of its car is known only at its end: none of them is cau
 Their variance of sideslip is their own, what the parameters leave open, and what the sensors contradict
 (docs/method.md#intervals):
 
-    s² = s_own² + s_car² + (Σ_i (2 (v_y,i − v_y))² + (lateral kinematic consistency / 2)²) / v_x²,
+    s² = s_own² + s_car² + (Σ_i (2 (v_y,i − v_y))² + (lateral kinematic consistency / 2)² + (s_l r)²) / v_x²,
 
 where v_y,i is that of the physics filter on the vehicle one posterior 1-sigma away in direction i, and d² that of
 the whole log as far as it goes with the driving. The posterior is doubled, for the directions are only the five that
 move the sideslip most. s_car is what no parameter of a single track explains: nearly constant within a drive, it
-differs between drives and cars. That of v_y is the same sum as a velocity.
+differs between drives and cars. s_l is that of the distance from the rear axle to the centre of gravity where no file
+gives it: the rear axle determines its own lateral velocity. That of v_y is the same sum as a velocity.
 Estimates themselves do not change.
 """
 
@@ -65,6 +66,7 @@ class CalibratedBand:
             self._states = tuple(state for _, state in runs)
         d2 = calibration.driven_d2_m_s
         contradicted = np.hypot(CAR_STD_RAD * track.vx_m_s, D2_SHARE * d2 if math.isfinite(d2) else 0.0)
+        contradicted = np.hypot(contradicted, calibration.cg_std_m * track.yaw_rate_rad_s)
         away = [self._vy[0] + POSTERIOR_SHARE * (vy - self._vy[0]) for vy in self._vy] if self._vy else []
         return widened(track, away, contradicted, calibration.vehicle.low_speed_blend_m_s, own_share=1.0)
 

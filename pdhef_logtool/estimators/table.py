@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Literal
@@ -16,15 +16,18 @@ from typing import Literal
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
+from pdhef_logtool.estimators.presets import AIDED, check_options, options_of, preset_of
 from pdhef_logtool.estimators.presets import Options as Options
-from pdhef_logtool.estimators.presets import check_options, options_of, preset_of
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED, SelfCalibrated
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.printable import printable
+from pdhef_logtool.records.signals import has_gnss
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 
-#: What drives the vehicle model; a filter uses a_y and yaw rate where the log has them.
-_INPUTS = frozenset({"steer_rad", "speed_m_s"})
+#: What drives the vehicle model; a filter uses a_y and yaw rate where the log has them, ``physics`` steering too.
+_SPEED = frozenset({"speed_m_s"})
+_INPUTS = _SPEED | {"steer_rad"}
+_LATERAL = frozenset({"steer_rad", "yaw_rate_rad_s", "ay_m_s2"})
 #: What the features of a network and the evidence of learning are made of.
 FEATURES: frozenset[str] = _INPUTS | {"ay_m_s2", "yaw_rate_rad_s"}
 
@@ -37,7 +40,7 @@ class Spec:
     ----------
     build : called with the name, the :class:`Car` and :class:`Options`: a function, or ``module:function`` under
         :mod:`pdhef_logtool.estimators`, imported when it is first needed.
-    needs : aligned signals without which it cannot run.
+    needs : aligned signals without which it cannot run. one_of : signals; it needs at least one of them; empty: none.
     colour : 0xRRGGBB in every plot, tellable apart with any colour vision (Okabe and Ito 2008; Tol's muted scheme).
     causal : whether an estimate at t uses only what had arrived by t.
     in_all : whether it is one of :data:`ALL_ESTIMATORS`.
@@ -56,6 +59,11 @@ class Spec:
     network: Literal["", "optional", "residual", "paper", "pure_lstm", "linear_regression"] = ""
     needs_noise: bool = False
     tunable: bool = False
+    one_of: frozenset[str] = frozenset()
+
+    def lacking(self, available: frozenset[str]) -> list[str]:
+        """Return the signals that a log would have to provide for it, beside those that it has."""
+        return sorted(self.needs - available | (self.one_of if self.one_of.isdisjoint(available) else frozenset()))
 
     def missing(self, car: Car) -> str:
         """Return why a car does not let it run, empty if it does."""
@@ -94,6 +102,8 @@ class Spec:
         if isinstance(build, str):
             module, _, function = build.partition(":")
             build = getattr(import_module(f"{__package__}.{module}"), function)
+        if options.gnss and self.name in AIDED:
+            build = partial(_aided, build)
         if car.self_calibrated is None or (self.name != OPEN_LOOP and preset_of(self.name) not in SELF_CALIBRATED):
             estimator: Estimator = build(self.name, car, options)
             return estimator
@@ -102,8 +112,15 @@ class Spec:
         stages = []
         for stage in (*calibration.earlier, calibration) if online else (calibration,):
             calibrated = replace(car, self_calibrated=stage).calibrated_car
-            stages.append(SelfCalibrated(build(self.name, calibrated, options), stage, car.vehicle))
+            causal = self.causal and stage.causal
+            stages.append(SelfCalibrated(build(self.name, calibrated, options), stage, car.vehicle, causal))
         return OnlineCalibrated(tuple(stages)) if online else stages[0]
+
+
+def _aided(build: Callable[[str, Car, Options], Estimator], name: str, car: Car, options: Options) -> Estimator:
+    from pdhef_logtool.estimators.gnss_aided import GnssAided  # compiled code is imported where it is needed
+
+    return GnssAided(build(name, car, options))  # type: ignore[arg-type]
 
 
 #: Estimators of other packages: each entry point names a :class:`Spec`.
@@ -145,7 +162,7 @@ SPECS: tuple[Spec, ...] = (
     ),
     Spec(
         "physics", "the strongest filter on physics alone, with the parts that driving of the car gave evidence for",
-        "adaptive_physics:build", _INPUTS, 0x44AA99, tunable=True,
+        "adaptive_physics:build", _SPEED, 0x44AA99, tunable=True, one_of=_LATERAL,
     ),
     Spec(
         "phy-ukf:tuned", "phy-ukf with the noise of an identified car, corrected for body roll",
@@ -157,7 +174,7 @@ SPECS: tuple[Spec, ...] = (
     ),
     Spec(
         "pd-hef", "physics plus the residual of its network, as far as the car's evidence lets it",
-        "pd_hef:build", _INPUTS, 0xD55E00, network="optional",
+        "pd_hef:build", _SPEED, 0xD55E00, network="optional", one_of=_LATERAL,
     ),
     Spec(
         "pd-hef:fixed-r", "pd-hef at gain 1 without the adaptive mechanism (needs a network)",
@@ -165,7 +182,7 @@ SPECS: tuple[Spec, ...] = (
     ),
     Spec(
         "pd-hef-smoothed", "pd-hef smoothed with what came later: not causal, ranked apart",
-        "pd_hef:build_smoothed", _INPUTS, 0x332288, causal=False, network="optional",
+        "pd_hef:build_smoothed", _SPEED, 0x332288, causal=False, network="optional", one_of=_LATERAL,
     ),
     Spec(
         "pd-hef:gain=1",
@@ -272,17 +289,19 @@ def runnable(
     names : of estimators, or :data:`ALL_ESTIMATORS` alone. available : signals of the log.
     refused : signals that the log has and that nothing is computed from, because a check of them failed.
     """
+    options = options or Options()
+    options = replace(options, gnss=options.gnss and has_gnss(available))
     estimators: list[Estimator] = []
     skipped: list[Skipped] = []
     for spec in map(spec_of, all_names(car) if tuple(names) == (ALL_ESTIMATORS,) else names):
-        lacking = sorted(spec.needs - available)
+        lacking = spec.lacking(available)
         bad = sorted(_sources_of(lacking, refused))
         lacks = f"a check of {', '.join(bad)} failed" if bad else f"the log has no {', '.join(lacking)}"
         reason = spec.missing(car) or (lacks if lacking else "")
         if reason:
             skipped.append(Skipped(spec, reason))
         else:
-            estimators.append(spec.make(car, options or Options()))
+            estimators.append(spec.make(car, options))
     return estimators, skipped
 
 

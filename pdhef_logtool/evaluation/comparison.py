@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -76,10 +75,3 @@ def end_to_end(stamps_ns: Sequence[IntArray]) -> IntArray:
         moved.append(stamps - stamps[0] + begin)
         begin = int(moved[-1][-1]) + round(BLOCK_S * 1e9)
     return np.concatenate(moved) if moved else np.empty(0, dtype=np.int64)
-
-
-def shown_interval(interval: Interval, sign: str = "") -> str:
-    """Return a figure in rad with its bounds in degrees, as it is in tables; ``sign`` ``+`` shows it always."""
-    value, low, high = (math.degrees(x) for x in (interval.value, interval.low, interval.high))
-    shown = f"{value:{sign}.3f}" if math.isfinite(value) else "–"
-    return f"{shown} [{low:.3f}, {high:.3f}]" if math.isfinite(low) else shown

@@ -8,6 +8,8 @@ pose or a gap does not count.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from pdhef_logtool.evaluation.blocks import row_blocks
@@ -16,6 +18,7 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
 
 ANCHOR_S = 1.0
+_MOST_POINTS = 500
 #: No second of dead reckoning may contain a longer step between stamps.
 MAX_STEP_S = 0.2
 
@@ -24,6 +27,43 @@ def position_error(estimate: StateTrack, truth: StateTrack) -> FloatArray:
     """Return the distance [N] in m between ground truth and dead reckoning; NaN before the start and without a pose."""
     path = Path()
     return np.concatenate([path.add(estimate.rows(a, b), truth.rows(a, b)) for a, b in row_blocks(len(truth))])
+
+
+@dataclass(frozen=True, slots=True)
+class PathDrift:
+    """Distance of a dead-reckoned path from that of the ground truth in m.
+
+    ``end_m`` at the end of ``length_m`` from a common start; ``largest_aligned_m`` after the rotation and translation
+    (SE(2)) that bring the paths closest to one another.
+    """
+
+    end_m: float
+    length_m: float
+    largest_aligned_m: float
+
+
+def path_drift(estimate: StateTrack, truth: StateTrack) -> PathDrift | None:
+    """Return the drift of the path of an estimate [N], by its pose at :data:`_MOST_POINTS`; None without a path."""
+    count = min(len(truth), _MOST_POINTS)
+    rows = np.unique(np.linspace(0, max(len(truth) - 1, 0), count).astype(np.int64)).tolist()
+    poses = [(t.x_m[0], t.y_m[0]) for track in (estimate, truth) for t in (track.rows(i, i + 1) for i in rows)]
+    source, target = np.array(poses, dtype=np.float64).reshape(2, -1, 2).transpose(0, 2, 1)
+    finite = np.isfinite(source + target).all(axis=0)
+    source, target = source[:, finite], target[:, finite]
+    length = float(np.hypot(*np.diff(target, axis=1)).sum())
+    if not length > 0.0:
+        return None
+    end = float(np.hypot(*((source - source[:, :1]) - (target - target[:, :1]))[:, -1]))
+    return PathDrift(end, length, float(np.hypot(*(aligned_path(source, target) - target)).max()))
+
+
+def aligned_path(source: FloatArray, target: FloatArray) -> FloatArray:
+    """Return points [2, K] after the rotation and translation that bring them closest to ``target`` [2, K]."""
+    a, b = (p - p.mean(axis=1, keepdims=True) for p in (source, target))
+    angle = np.arctan2(np.sum(a[0] * b[1] - a[1] * b[0]), np.sum(a * b))
+    cosine, sine = np.cos(angle), np.sin(angle)
+    rotated = np.stack([cosine * a[0] - sine * a[1], sine * a[0] + cosine * a[1]])
+    return np.asarray(rotated + target.mean(axis=1, keepdims=True), dtype=np.float64)
 
 
 class Path:

@@ -11,7 +11,7 @@ import numpy as np
 from pdhef_logtool.evaluation.blocks import SegmentMasks, median_step_ns, row_blocks
 from pdhef_logtool.evaluation.track_errors import NORMAL_95, raw_error, scorable, total_std, truth_speed
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
-from pdhef_logtool.evaluation.validation_plan import MEANS, POOLED, RUN, SQUARES, Requirement
+from pdhef_logtool.evaluation.validation_plan import MEANS, POOLED, SQUARES, Requirement
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
@@ -79,7 +79,7 @@ def requirement_blocks(
         name = requirement.estimator or main
         if any(b.of == requirement.measured for b in results) or name is None or not _has_blocks(requirement, drive):
             continue
-        named = [name, *([requirement.baseline] if requirement.baseline not in (None, RUN) else [])]
+        named = [name, *([requirement.baseline] if requirement.baseline != requirement.other_run else [])]
         tracks = [drive.read(n) for n in named if n is not None]
         if all(track is not None and len(track) == len(drive.truth) for track in tracks):
             blocks = _blocks(requirement, name, [t for t in tracks if t is not None], drive, most)

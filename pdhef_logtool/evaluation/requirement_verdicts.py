@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from pdhef_logtool.evaluation.dependence import FACTORS, Factors
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
 from pdhef_logtool.evaluation.requirement_bounds import (
     LEAST_BLOCKS,
@@ -19,7 +20,15 @@ from pdhef_logtool.evaluation.requirement_bounds import (
     quantile,
 )
 from pdhef_logtool.evaluation.units import AY_NOTE
-from pdhef_logtool.evaluation.validation_plan import AT_LEAST, POOLED, RUN, SQUARES, WORST_DRIVE, Requirement, shown
+from pdhef_logtool.evaluation.validation_plan import (
+    AT_LEAST,
+    POOLED,
+    SQUARES,
+    WORST_DRIVE,
+    ExposureNeed,
+    Requirement,
+    shown,
+)
 from pdhef_logtool.records.signals import FloatArray
 
 Outcome: TypeAlias = Literal["PASS", "FAIL", "INCONCLUSIVE"]
@@ -40,7 +49,8 @@ class DriveValue:
     estimator : that was scored. n : stamps behind ``value``; ``baseline`` None without one.
     seconds, metres : scored driving, NaN where unknown. std : root mean square of the 1-sigma of the estimated
         reference; NaN for ground truth. blocks : None where the run kept none. same : estimator and baseline are the
-        same algorithm.
+        same algorithm. factors : its day, car and route; None: the log does not state it.
+    space, friction : seconds by the lower edges of speed and |a_y|, and the median friction, where a plan asks for it.
     """
 
     log: str
@@ -53,6 +63,21 @@ class DriveValue:
     std: float = math.nan
     blocks: RequirementBlocks | None = None
     same: bool = False
+    factors: Mapping[str, object] = field(default_factory=dict)
+    space: Mapping[tuple[float, float], float] = field(default_factory=dict)
+    friction: float = math.nan
+
+    def seconds_in(self, need: ExposureNeed) -> float:
+        """Return the driving in conditions."""
+        if not _inside(need.friction, self.friction) or need.car not in (None, self.factors.get("car")):
+            return 0.0
+        return math.fsum(
+            s for (speed, ay), s in self.space.items() if _inside(need.speed_m_s, speed) and _inside(need.ay_m_s2, ay)
+        )
+
+
+def _inside(bounds: Sequence[float] | None, value: float) -> bool:
+    return bounds is None or bounds[0] <= value < bounds[1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +98,7 @@ class RequirementVerdict:
     value, low, high : statistic and its two-sided interval; None where there is none.
     margin : distance of the value to the limit, negative beyond it. estimators : that were scored.
     basis : ``drives`` or ``blocks``: what the interval is drawn from; ``units`` of them, ``block_s`` long.
+        ``design_effect`` of drives that depend on one another.
     against : ``ground truth`` or ``estimated reference``. worst : the drive with the largest error.
     reason : the verdict in words. next : what to do, empty after a PASS. notes : what limits the verdict.
     """
@@ -93,6 +119,7 @@ class RequirementVerdict:
     reason: str
     next: str = ""
     notes: tuple[str, ...] = field(default=())
+    design_effect: float = 1.0
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict as JSON-able values."""
@@ -100,6 +127,7 @@ class RequirementVerdict:
         del values["requirement"]
         requirement = {**asdict(self.requirement), "label": self.requirement.label, "unit": self.requirement.unit}
         requirement["title"] = self.requirement.title or self.requirement.label
+        requirement["exposure_in"] = [need.model_dump() for need in requirement.pop("exposure")]
         return {
             **requirement,
             "at_least": self.requirement.metric in AT_LEAST,
@@ -124,7 +152,10 @@ def judge(requirement: Requirement, drives: Sequence[DriveValue], missing: str =
     bound, at_least = requirement.bound, requirement.metric in AT_LEAST
     worst = _worst(requirement, drives)
     notes = _notes(requirement, drives, basis, block_s, estimated)
-    outcome, reason, to_do = _decide(requirement, bounded, exposure, sd, basis, missing)
+    if basis == "drives" and bounded.effect.levels:
+        notes.append(bounded.effect.text(len(drives)))
+    lacking = _lacking(requirement, exposure, drives)
+    outcome, reason, to_do = _decide(requirement, bounded, exposure, lacking, sd, basis, missing)
     value = bounded.value if math.isfinite(bounded.value) else None
     margin = None if value is None else (value - bound if at_least else bound - abs(value))
     return RequirementVerdict(
@@ -144,6 +175,7 @@ def judge(requirement: Requirement, drives: Sequence[DriveValue], missing: str =
         reason,
         to_do,
         tuple(notes),
+        bounded.effect.design_effect,
     )
 
 
@@ -178,23 +210,23 @@ class _Statistic:
 
 def _statistic(requirement: Requirement, drives: Sequence[DriveValue]) -> _Statistic:
     """Return the statistic of a requirement over drives, with bounds from drives or from blocks within them."""
-    count = len(drives)
+    count, factors = len(drives), {name: [d.factors.get(name) for d in drives] for name in FACTORS}
     if requirement.statistic != POOLED:
-        return _Statistic(_of_drives(requirement, _ratios(drives)), units=count)
-    if count >= LEAST_DRIVES and requirement.baseline == RUN:
-        return _Statistic(_typical_ratio(_ratios(drives), requirement.confidence), units=count)
+        return _Statistic(_of_drives(requirement, _ratios(drives), factors), units=count)
+    if count >= LEAST_DRIVES and requirement.other_run is not None:
+        return _Statistic(_typical_ratio(_ratios(drives), requirement.confidence, factors), units=count)
     weights, values = (np.array([getattr(d, key) for d in drives], dtype=np.float64) for key in ("n", "value"))
     others = np.array([d.baseline for d in drives], dtype=np.float64) if requirement.baseline else None
-    total = _pooled(requirement, weights, values, others)
+    total = _pooled(requirement, weights, values, others, factors)
     if count >= LEAST_DRIVES or not count:
         return _Statistic(total, units=count)
     return _from_blocks(requirement, total, [d.blocks for d in drives])
 
 
-def _of_drives(requirement: Requirement, values: FloatArray) -> Bounded:
+def _of_drives(requirement: Requirement, values: FloatArray, factors: Factors) -> Bounded:
     """Return a quantile of the drives, or the worst one, which has no bounds beside itself."""
     if requirement.quantile is not None:
-        return quantile(values, requirement.quantile, requirement.confidence)
+        return quantile(values, requirement.quantile, requirement.confidence, factors)
     if not len(values):
         return Bounded(math.nan, math.nan, math.nan, 0)
     worst = np.min if requirement.metric in AT_LEAST else np.max
@@ -214,7 +246,13 @@ def _from_blocks(requirement: Requirement, total: Bounded, blocks: Sequence[Requ
     return _Statistic(Bounded(total.value, low, high, units), "blocks", units, max(b.block_s for b in present))
 
 
-def _pooled(requirement: Requirement, weights: FloatArray, values: FloatArray, others: FloatArray | None) -> Bounded:
+def _pooled(
+    requirement: Requirement,
+    weights: FloatArray,
+    values: FloatArray,
+    others: FloatArray | None,
+    factors: Factors | None = None,
+) -> Bounded:
     metric = requirement.metric
     bounded = pooled(
         weights.astype(np.float64),
@@ -223,22 +261,23 @@ def _pooled(requirement: Requirement, weights: FloatArray, values: FloatArray, o
         squares=metric in SQUARES,
         positive=metric != "bias" and metric not in AT_LEAST,
         level=requirement.confidence,
+        factors=factors,
     )
     if metric == "bias":  # limited in size
         low = 0.0 if bounded.low <= 0.0 <= bounded.high else min(abs(bounded.low), abs(bounded.high))
-        return Bounded(abs(bounded.value), low, max(abs(bounded.low), abs(bounded.high)), bounded.units)
+        return replace(bounded, value=abs(bounded.value), low=low, high=max(abs(bounded.low), abs(bounded.high)))
     if metric in AT_LEAST:
-        return Bounded(bounded.value, max(bounded.low, 0.0), min(bounded.high, 1.0), bounded.units)
+        return replace(bounded, low=max(bounded.low, 0.0), high=min(bounded.high, 1.0))
     return bounded
 
 
-def _typical_ratio(ratios: FloatArray, level: float) -> Bounded:
+def _typical_ratio(ratios: FloatArray, level: float, factors: Factors) -> Bounded:
     """Return the geometric mean of the drives' ratios to another run: each drive is its values yardstick."""
     with np.errstate(divide="ignore"):
         logs = np.log(ratios)
-    bounded = pooled(np.ones(len(logs)), logs, None, squares=False, positive=False, level=level)
+    bounded = pooled(np.ones(len(logs)), logs, None, squares=False, positive=False, level=level, factors=factors)
     value, low, high = (float(np.exp(x)) for x in (bounded.value, bounded.low, bounded.high))
-    return Bounded(value, low, high, len(logs))
+    return replace(bounded, value=value, low=low, high=high)
 
 
 def _reference_sd(requirement: Requirement, drives: Sequence[DriveValue]) -> float:
@@ -260,13 +299,19 @@ def _worst(requirement: Requirement, drives: Sequence[DriveValue]) -> str | None
 
 
 def _decide(
-    requirement: Requirement, bounded: Bounded, exposure: Exposure, sd: float, basis: str, missing: str
+    requirement: Requirement,
+    bounded: Bounded,
+    exposure: Exposure,
+    lacking: Sequence[tuple[str, str]],
+    sd: float,
+    basis: str,
+    missing: str,
 ) -> tuple[Outcome, str, str]:
     """Return outcome, reason and next step."""
     where = "" if requirement.segment == "all" else f" of {requirement.segment}"
     if not exposure.drives or not math.isfinite(bounded.value):
         return "INCONCLUSIVE", missing or "no drive has this metric", _what_to_record(requirement)
-    if lacking := _lacking(requirement, exposure):
+    if lacking:
         return "INCONCLUSIVE", f"too little driving: {'; '.join(w for w, _ in lacking)}", _more(lacking, where)
     if _without_bounds(requirement, bounded):
         return "INCONCLUSIVE", *_too_few(requirement, bounded, basis, where)
@@ -311,13 +356,17 @@ def _interval(requirement: Requirement, bounded: Bounded, exposure: Exposure, ou
     return f"{text}; at least {share:.0%} of drives like these are within it, with this confidence"
 
 
-def _lacking(requirement: Requirement, exposure: Exposure) -> list[tuple[str, str]]:
+def _lacking(requirement: Requirement, exposure: Exposure, drives: Sequence[DriveValue]) -> list[tuple[str, str]]:
     """Return what of the required driving is missing: in words, and how much more."""
-    needs = (
+    needs: list[tuple[str, float, float | None, str]] = [
         ("drives", float(requirement.exposure_drives), float(exposure.drives), "{:.0f}"),
         ("minutes", requirement.exposure_minutes, exposure.minutes, "{:.1f}"),
         ("km", requirement.exposure_km, exposure.km, "{:.1f}"),
-    )
+    ]
+    for need in requirement.exposure:
+        seconds = [d.seconds_in(need) for d in drives]
+        needs.append((f"drives at {need.label}", float(need.drives), float(sum(s > 0.0 for s in seconds)), "{:.0f}"))
+        needs.append((f"minutes at {need.label}", need.minutes, math.fsum(seconds) / 60.0, "{:.1f}"))
     lacking = []
     for word, needed, has, layout in needs:
         if needed > 0.0 and (has is None or has < needed):
@@ -332,7 +381,7 @@ def _more(lacking: Sequence[tuple[str, str]], where: str) -> str:
 
 def _what_to_record(requirement: Requirement) -> str:
     where = "" if requirement.segment == "all" else f" with {requirement.segment}"
-    if requirement.baseline == RUN:
+    if requirement.other_run is not None:
         return "compare with another run: pdhef compare A B --plan PLAN"
     return f"record drives{where} with ground truth"
 
@@ -381,7 +430,8 @@ def _notes(
     if requirement.signal == "ay_m_s2":
         notes.append(AY_NOTE)
     if drives and all(d.same for d in drives):
-        notes.append(f"{drives[0].estimator} equals {requirement.baseline} in these drives (residual gain 0)")
+        why = "" if requirement.other_run is not None else " (residual gain 0)"
+        notes.append(f"{drives[0].estimator} equals {requirement.baseline} in these drives{why}")
     return notes
 
 

@@ -14,10 +14,10 @@ SCORED_SIGNALS: dict[str, str] = {
 }
 #: Every signal of metrics.parquet, with its unit. ``state``: all of an estimate.
 SIGNALS: dict[str, str] = {**SCORED_SIGNALS, "position_m": "m", "lateral_1s_m": "m", "state": "1"}
-#: a_y of an estimate is the specific force, as an accelerometer measures it; derived ground truth is kinematic.
+#: The definition of a_y of estimates and ground truth; a ground truth without it is not scored.
 AY_NOTE = (
-    "a_y of an estimate is the specific force of the axles; ground truth derived from v_y is kinematic (v̇_y + v_x r): "
-    "on a banked road they differ by g sin(bank)"
+    "a_y is the lateral specific force at the CG in the road plane, the axles' forces over the mass: "
+    "v̇_y + v_x r + g sin(bank)"
 )
 #: What people call them, in the order of tables.
 LABELS = {

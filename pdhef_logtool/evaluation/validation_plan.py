@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.segments import SEGMENTS
@@ -16,8 +16,10 @@ from pdhef_logtool.evaluation.units import LABELS, SIGNALS, read_unit
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.storage.documents import checked, digest, read_toml, unknown
+from pdhef_logtool.storage.object_store import is_url
 
-#: Baseline of a requirement: run A of ``pdhef compare``, in place of an estimator of the same run.
+#: Baseline of a requirement: run A of ``pdhef compare``; a path or URL with a slash is another run's output, all else
+#: an estimator of the same run.
 RUN = "run"
 POOLED, WORST_DRIVE, QUANTILE = "pooled", "worst drive", "quantile"
 #: Metrics that are means over stamps: the value of several drives is their mean (root mean square) weighted by stamps.
@@ -28,6 +30,41 @@ AT_LEAST = frozenset({"coverage95", "availability"})
 _QUANTILE = re.compile(r"quantile (0\.\d+)")
 
 
+_Name = Annotated[str, Field(min_length=1, max_length=200)]
+_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+_Range = Annotated[list[float] | None, Field(min_length=2, max_length=2)]
+
+
+class ExposureNeed(BaseModel):
+    """A table ``[[requirement.exposure]]``: the least driving in conditions, of the drives that are scored."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    speed_m_s: Annotated[_Range, Field(description="Speed from, to: multiples of 5; [60, 65] is all above 60.")] = None
+    ay_m_s2: Annotated[_Range, Field(description="|a_y| from, to: integers; [12, 13] is all above 12.")] = None
+    friction: Annotated[_Range, Field(description="Median friction of the drive from, to.")] = None
+    car: Annotated[_Name | None, Field(description="Name of the car.")] = None
+    drives: Annotated[int, Field(ge=0, description="Least number of drives.")] = 0
+    minutes: Annotated[float, Field(ge=0.0, allow_inf_nan=False, description="Least minutes.")] = 0.0
+
+    @model_validator(mode="after")
+    def _agrees(self) -> ExposureNeed:
+        for bounds, step in ((self.speed_m_s, 5.0), (self.ay_m_s2, 1.0), (self.friction, None)):
+            off_grid = bounds is not None and step is not None and any(b % step for b in bounds)
+            if bounds is not None and (off_grid or not 0.0 <= bounds[0] < bounds[1]):
+                raise ValueError(f"{bounds} should be [from, to]{f', multiples of {step:g}' if off_grid else ''}")
+        if not self.drives and not self.minutes:
+            raise ValueError("give drives or minutes")
+        return self
+
+    @property
+    def label(self) -> str:
+        """``20 to 30 m/s, μ 0 to 0.4``, as people read it."""
+        ranges = (("", self.speed_m_s, " m/s"), ("|a_y| ", self.ay_m_s2, " m/s²"), ("μ ", self.friction, ""))
+        words = [f"{name}{r[0]:g} to {r[1]:g}{unit}" for name, r, unit in ranges if r is not None]
+        return ", ".join([*words, *([] if self.car is None else [f"car {self.car}"])])
+
+
 @dataclass(frozen=True, slots=True)
 class Requirement:
     """One requirement; values in the unit of metrics.parquet.
@@ -36,10 +73,11 @@ class Requirement:
     ----------
     estimator : None: the selected estimate of each drive, or the recorded estimate.
     limit : maximum of the metric (:data:`AT_LEAST`: minimum). None for a requirement on the ratio to ``baseline``, an
-        estimator of the same run or :data:`RUN`, which is at most ``max_ratio``.
+        estimator of the same run, :data:`RUN`, or the output of another run, which is at most ``max_ratio``.
     statistic : of several drives: :data:`POOLED` over all their stamps, :data:`WORST_DRIVE`, or the ``quantile`` of the
         drives. confidence : of the interval that decides.
-    exposure_drives, exposure_minutes, exposure_km : the least scored driving for a verdict.
+    exposure_drives, exposure_minutes, exposure_km : the least scored driving for a verdict; ``exposure``: that in
+        conditions.
     """
 
     id: str
@@ -57,17 +95,25 @@ class Requirement:
     exposure_drives: int = 1
     exposure_minutes: float = 0.0
     exposure_km: float = 0.0
+    exposure: tuple[ExposureNeed, ...] = ()
+
+    @property
+    def other_run(self) -> str | None:
+        """:data:`RUN`, or the output of the run that is the baseline; None without one."""
+        return self.baseline if self.baseline is not None and (self.baseline == RUN or "/" in self.baseline) else None
 
     @property
     def unit(self) -> str:
-        """Unit of its value: that of the metric, or 1 for a ratio."""
-        return "1" if self.baseline is not None else registered()[self.metric].unit_of(self.signal)
+        """Unit of its value: that of the metric, 1 for a ratio, ``share`` of coverage and availability."""
+        if self.baseline is not None:
+            return "1"
+        return "share" if self.metric in AT_LEAST else registered()[self.metric].unit_of(self.signal)
 
     @property
     def measured(self) -> str:
         """What is measured of a drive, independent of the limit: requirements with equal values share blocks."""
         of = self.estimator or "selected"
-        against = "" if self.baseline in (None, RUN) else f" / {self.baseline}"
+        against = "" if self.baseline == self.other_run else f" / {self.baseline}"
         return f"{self.signal} {self.metric} {self.segment} {of}{against}"
 
     @property
@@ -84,7 +130,8 @@ class Requirement:
         if self.baseline is None:
             limit = f"{'≥' if self.metric in AT_LEAST else '≤'} {shown(self.bound, self.unit)}"
         else:
-            limit = f"≤ {self.bound:.4g} × {'run A' if self.baseline == RUN else self.baseline}"
+            baseline = self.baseline if self.other_run is None else "run A" if self.baseline == RUN else "earlier run"
+            limit = f"≤ {self.bound:.4g} × {baseline}"
         of = [
             "" if self.segment == "all" else self.segment,
             "" if self.statistic == POOLED else self.statistic,
@@ -113,13 +160,11 @@ class ValidationPlan:
 def shown(value: float, unit: str) -> str:
     """Return a value with its unit as people read it."""
     text, factor = read_unit(unit)
+    if unit == "share":
+        return f"{100.0 * value:.3g} %"
     if unit == "1":
         return f"{value:.3g}"
     return f"{value * factor:.3g}{'' if text.startswith('°') else ' '}{text}"
-
-
-_Name = Annotated[str, Field(min_length=1, max_length=200)]
-_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
 class RequirementTable(BaseModel):
@@ -145,7 +190,8 @@ class RequirementTable(BaseModel):
     baseline: Annotated[
         _Name | None,
         Field(
-            description="In place of a limit: an estimator of the same run (physics, zero), or run: run A of compare."
+            description="In place of a limit: an estimator of the same run (physics, zero), run (run A of compare), or "
+            "the output of another run: a path with a slash, relative to the plan, or a URL."
         ),
     ] = None
     max_ratio: Annotated[_Positive | None, Field(description="Largest ratio of the metric to the baseline's.")] = None
@@ -166,6 +212,7 @@ class RequirementTable(BaseModel):
     exposure_km: Annotated[
         float, Field(ge=0.0, allow_inf_nan=False, description="Least scored driving in kilometres.")
     ] = 0.0
+    exposure: Annotated[list[ExposureNeed], Field(max_length=50, description="Least driving in conditions.")] = []
 
 
 class PlanTable(BaseModel):
@@ -186,7 +233,16 @@ def load_plan(path: Path) -> ValidationPlan:
         The file is missing, is no TOML, or contains wrong, unknown, missing or contradicting entries; all are named.
     """
     raw = read_toml(path, "a validation plan (TOML)", UsageError, "pdhef plan init -o plan.toml writes an example")
-    return plan_from_dict(raw, where=str(path), file=path.name)
+    plan = plan_from_dict(raw, where=str(path), file=path.name)
+    return replace(plan, requirements=tuple(_placed(r, path.parent) for r in plan.requirements))
+
+
+def _placed(requirement: Requirement, folder: Path) -> Requirement:
+    """Return a requirement whose baseline, if it is a path, is relative to the working folder."""
+    baseline = requirement.other_run
+    if baseline is None or baseline == RUN or is_url(baseline):
+        return requirement
+    return replace(requirement, baseline=f"{(folder / baseline).as_posix()}/")
 
 
 def plan_from_dict(raw: dict[str, Any], *, where: str, file: str = "") -> ValidationPlan:
@@ -237,12 +293,13 @@ def _read(raw: object, where: str, problems: list[str]) -> Requirement | None:
     if len(problems) > before:
         return None
     matches = _QUANTILE.fullmatch(table.statistic)
-    rest = {"title", "segment", "manoeuvre", "limit", "limit_deg", "limit_deg_s"}
+    rest = {"title", "segment", "manoeuvre", "limit", "limit_deg", "limit_deg_s", "exposure"}
     return Requirement(
         title=table.title or "",
         segment=segment,
         limit=limit,
         quantile=None if matches is None else float(matches[1]),
+        exposure=tuple(table.exposure),
         **table.model_dump(exclude=rest),
     )
 
@@ -301,4 +358,4 @@ def default_plan() -> ValidationPlan:
 def names_of(requirements: Sequence[Requirement]) -> frozenset[str]:
     """Return the estimators of the run that requirements name, as subject or baseline."""
     named = {r.estimator for r in requirements} | {r.baseline for r in requirements}
-    return frozenset(name for name in named if name is not None and name != RUN)
+    return frozenset(name for name in named if name is not None and name != RUN and "/" not in name)

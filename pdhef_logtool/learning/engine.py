@@ -8,7 +8,6 @@ is kept. A rerun takes every stage whose inputs are as they were.
 
 from __future__ import annotations
 
-import hashlib
 import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -339,7 +338,7 @@ def _basis(task: Task, start: Path, records: Sequence[DriveRecord]) -> dict[str,
     return {
         **record_head(FORMAT, FORMAT_VERSION, task.settings, task.car),
         "start": hash_log(start),
-        "mapping": None if config.mapping is None else hashlib.sha256(config.mapping.read_bytes()).hexdigest(),
+        "mapping": None if config.mapping is None else hash_log(config.mapping),
         "network": str(config.network) if network is None else network.sha256,
         "drives": [[r.name, r.sha256, r.left_out] for r in records],
         "split": {p: [[s.stem, *(s.span_s or ())] for s in task.split.parts[p]] for p in PARTS},

@@ -41,11 +41,7 @@ class CdrEncoder:
     """
 
     def __init__(
-        self,
-        topic: str,
-        type_name: str,
-        definition: str,
-        constants: Mapping[str, str | float | Sequence[float]],
+        self, topic: str, type_name: str, definition: str, constants: Mapping[str, str | float | Sequence[float]]
     ) -> None:
         self.topic = topic
         try:

@@ -11,13 +11,7 @@ from typing import Any
 from pdhef_logtool.logs.byte_source import require_regular
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.compression import decompress_file
-from pdhef_logtool.logs.container import (
-    EVERYTHING,
-    MCAP_MAGIC,
-    Container,
-    Wanted,
-    describe_damage,
-)
+from pdhef_logtool.logs.container import EVERYTHING, MCAP_MAGIC, Container, Wanted, describe_damage
 from pdhef_logtool.logs.definitions import dbc_files, read_definitions
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.formats import (

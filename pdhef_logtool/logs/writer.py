@@ -261,11 +261,7 @@ class McapLogWriter:
         elif channel_id in self._channels:
             raise self._taken("channel", channel_id)
         channel = Channel(
-            id=channel_id,
-            topic=topic,
-            message_encoding=message_encoding,
-            metadata=dict(metadata),
-            schema_id=schema,
+            id=channel_id, topic=topic, message_encoding=message_encoding, metadata=dict(metadata), schema_id=schema
         )
         self._channels[channel_id] = channel
         self._emit_record(channel)
@@ -507,9 +503,7 @@ class McapLogWriter:
             if records:
                 offsets.append(
                     SummaryOffset(
-                        group_opcode=opcode,
-                        group_start=start + group_start,
-                        group_length=builder.count - group_start,
+                        group_opcode=opcode, group_start=start + group_start, group_length=builder.count - group_start
                     )
                 )
         offset_start = start + builder.count

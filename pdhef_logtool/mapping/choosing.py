@@ -95,6 +95,7 @@ def choose_mapping(
     MappingError : The mapping names what the log lacks; or, with ``require_signals``, no type of the log is recognised.
     """
     if mapping is not None:
+        mapping = mapping_for_recorder(log, mapping)
         if mapping.fill_recognised:
             mapping = _filled(mapping, recognise(log, prefer_truth=prefer_truth).mapping)
         check_mapping(mapping, log)
@@ -112,6 +113,48 @@ def choose_mapping(
         )
     remarks = (*auto.mapping.notes, *_borrowed(log, auto.mapping))
     return ChosenMapping(auto.mapping, auto.missing, prefer_truth, auto.ambiguities, remarks)
+
+
+def mapping_for_recorder(log: DriveLog, mapping: Mapping) -> Mapping:
+    """Return the mapping of a folder whose topics, fields and types the log contains; of several the one with most.
+
+    Raises
+    ------
+    MappingError : None is for this recorder, or several are and none contains all sources of the others.
+    """
+    if not mapping.recorders:
+        if mapping.recorder and (problem := _misfit(log, mapping)):
+            raise MappingError(
+                expected=f"a log of the recorder that {mapping.file} is for", got=problem, where=str(log.path),
+                remedy="give the mapping of this recorder, or a folder with the mappings of all",
+            )  # fmt: skip
+        return mapping
+    problems = {m.file: _misfit(log, m) for m in mapping.recorders}
+    sources = {m.file: {(s.topic, s.field) for s in m.sources()} for m in mapping.recorders if not problems[m.file]}
+    best = [m for m in mapping.recorders if m.file in sources and all(sources[m.file] >= s for s in sources.values())]
+    if len(best) == 1:
+        return replace(best[0], notes=(*best[0].notes, f"mapping {best[0].file}: it is for this recorder"))
+    names = f"{len(sources)} ({', '.join(sources)})" if sources else "; ".join(f"{n}: {p}" for n, p in problems.items())
+    remedy = "add one: pdhef inspect LOG --write-mapping FOLDER/NAME.toml"
+    raise MappingError(
+        expected=f"one mapping in {mapping.file} for the recorder of this log",
+        got=names,
+        where=str(log.path),
+        remedy="[recorder] in a mapping file names the types of its topics" if sources else remedy,
+    )
+
+
+def _misfit(log: DriveLog, mapping: Mapping) -> str:
+    """Return why a mapping is not for the recorder of a log; empty if it is."""
+    types = {t.name: t.type_name.replace("/msg/", "/") for t in log.topics}
+    for topic, kind in mapping.recorder:
+        if types.get(topic) != kind.replace("/msg/", "/"):
+            return f"{topic} is {types.get(topic, 'not in the log')}, not {kind}"
+    try:
+        check_mapping(mapping, log)
+    except MappingError as error:
+        return error.got
+    return ""
 
 
 def _filled(mapping: Mapping, auto: Mapping) -> Mapping:

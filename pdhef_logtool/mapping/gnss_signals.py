@@ -15,6 +15,7 @@ _DEGREE = 0.017453292519943295
 #: Clockwise from north in degrees to counter-clockwise from east in rad.
 _COURSE = (-_DEGREE, 1.5707963267948966)
 _EAST, _NORTH = "gnss_velocity_east_m_s", "gnss_velocity_north_m_s"
+_POSITION_ACCURACY = "gnss_position_accuracy_m"
 #: Ground truth with one of these states a heading, or motion that needs one.
 HEADING = frozenset({"quat_wxyz", "yaw_rad", "vy_m_s", "sideslip_rad"})
 
@@ -58,80 +59,53 @@ class Receiver:
     heading: frozenset[str] = frozenset()
 
 
-def _receiver(fields: str, *signals: tuple[str, str, float, float], heading: str = "") -> Receiver:
-    return Receiver(frozenset(fields.split()), signals, frozenset(heading.split()))
+#: Signals by their letters in the table below.
+_LETTERS = {
+    "E": _EAST, "N": _NORTH, "V": "gnss_speed_m_s", "C": "gnss_course_rad", "F": "gnss_fix_type",
+    "A": "gnss_latitude_deg", "O": "gnss_longitude_deg", "v": "gnss_velocity_accuracy_m_s", "p": _POSITION_ACCURACY,
+}  # fmt: skip
+#: Course of a single antenna beside the heading of two: a sensor, even of an instrument that is ground truth.
+RAW_COURSE = "heading_raw"
+#: A receiver a line: fields that recognise it, signals as letter=field*scale+offset, fields of a heading. Scales as
+#: documented: mm/s, cm/s, km/h, 1e-7 deg, rad, mm, uncertainties of 95 % or twice the RMS; courses are in deg clockwise
+#: from north. gps_common/GPSFix; u-blox NAV-PVT in two spellings, NAV-VELNED, NAV-POSLLH; Piksi VelNed, PosLlh; raw
+#: columns of a VBO file; NovAtel BESTVEL in three spellings; Septentrio PVTGeodetic; NovAtel INSPVA; NavSatFix.
+_TABLE = f"""
+track speed err_track err_horz | V=speed C=track A=latitude O=longitude F=status.status*1+1 v=err_speed*0.5 \
+p=err_horz*0.5
+vel_n vel_e g_speed h_acc | E=vel_e*1e-3 N=vel_n*1e-3 A=lat*1e-7 O=lon*1e-7 F=fix_type F=gps_fix.fix_type v=s_acc*1e-3 \
+p=h_acc*1e-3
+velN velE gSpeed hAcc | E=velE*1e-3 N=velN*1e-3 A=lat*1e-7 O=lon*1e-7 F=fixType v=sAcc*1e-3 p=hAcc*1e-3
+vel_n vel_e g_speed c_acc | E=vel_e*1e-2 N=vel_n*1e-2 v=s_acc*1e-2
+lat lon h_msl h_acc v_acc | A=lat*1e-7 O=lon*1e-7 p=h_acc*1e-3
+n e d h_accuracy n_sats | E=e*1e-3 N=n*1e-3 v=h_accuracy*1e-3
+lat lon height h_accuracy n_sats | A=lat O=lon p=h_accuracy*1e-3
+speed_raw {RAW_COURSE} | V=speed_raw*{1.0 / 3.6} C={RAW_COURSE}
+hor_speed trk_gnd | V=hor_speed C=trk_gnd
+hor_spd trk_gnd | V=hor_spd C=trk_gnd
+horizontal_speed track_ground | V=horizontal_speed C=track_ground
+vn ve cog | E=ve N=vn A=latitude*{1.0 / _DEGREE} O=longitude*{1.0 / _DEGREE} F=mode p=h_accuracy*0.005 | heading azimuth
+north_velocity east_velocity | E=east_velocity N=north_velocity | azimuth heading yaw
+latitude longitude position_covariance_type | A=latitude O=longitude F=status.status*1+1
+"""
 
 
-_SPEED, _COURSE_NAME, _FIX = "gnss_speed_m_s", "gnss_course_rad", "gnss_fix_type"
-_LATITUDE, _LONGITUDE = "gnss_latitude_deg", "gnss_longitude_deg"
-_VELOCITY_ACCURACY, _POSITION_ACCURACY = "gnss_velocity_accuracy_m_s", "gnss_position_accuracy_m"
-#: gps_common/GPSFix; u-blox NAV-PVT in the drivers' spellings, NAV-VELNED; NovAtel BESTVEL in those of its drivers;
-#: Septentrio PVTGeodetic; NovAtel INSPVA; sensor_msgs/NavSatFix. Scales as documented: mm/s, cm/s, deg clockwise from
-#: north, uncertainties of 95 % or twice the RMS.
-RECEIVERS = (
-    _receiver(
-        "track speed err_track err_horz",
-        (_SPEED, "speed", 1.0, 0.0),
-        (_COURSE_NAME, "track", *_COURSE),
-        (_LATITUDE, "latitude", 1.0, 0.0),
-        (_LONGITUDE, "longitude", 1.0, 0.0),
-        (_FIX, "status.status", 1.0, 1.0),
-        (_VELOCITY_ACCURACY, "err_speed", 0.5, 0.0),
-        (_POSITION_ACCURACY, "err_horz", 0.5, 0.0),
-    ),
-    _receiver(
-        "vel_n vel_e g_speed h_acc",
-        (_EAST, "vel_e", 1e-3, 0.0),
-        (_NORTH, "vel_n", 1e-3, 0.0),
-        (_FIX, "fix_type", 1.0, 0.0),
-        (_FIX, "gps_fix.fix_type", 1.0, 0.0),
-        (_VELOCITY_ACCURACY, "s_acc", 1e-3, 0.0),
-        (_POSITION_ACCURACY, "h_acc", 1e-3, 0.0),
-    ),
-    _receiver(
-        "velN velE gSpeed hAcc",
-        (_EAST, "velE", 1e-3, 0.0),
-        (_NORTH, "velN", 1e-3, 0.0),
-        (_FIX, "fixType", 1.0, 0.0),
-        (_VELOCITY_ACCURACY, "sAcc", 1e-3, 0.0),
-        (_POSITION_ACCURACY, "hAcc", 1e-3, 0.0),
-    ),
-    _receiver(
-        "vel_n vel_e g_speed c_acc",
-        (_EAST, "vel_e", 1e-2, 0.0),
-        (_NORTH, "vel_n", 1e-2, 0.0),
-        (_VELOCITY_ACCURACY, "s_acc", 1e-2, 0.0),
-    ),
-    _receiver("hor_speed trk_gnd", (_SPEED, "hor_speed", 1.0, 0.0), (_COURSE_NAME, "trk_gnd", *_COURSE)),
-    _receiver("hor_spd trk_gnd", (_SPEED, "hor_spd", 1.0, 0.0), (_COURSE_NAME, "trk_gnd", *_COURSE)),
-    _receiver(
-        "horizontal_speed track_ground",
-        (_SPEED, "horizontal_speed", 1.0, 0.0),
-        (_COURSE_NAME, "track_ground", *_COURSE),
-    ),
-    _receiver(
-        "vn ve cog",
-        (_EAST, "ve", 1.0, 0.0),
-        (_NORTH, "vn", 1.0, 0.0),
-        (_LATITUDE, "latitude", 1.0 / _DEGREE, 0.0),
-        (_LONGITUDE, "longitude", 1.0 / _DEGREE, 0.0),
-        (_FIX, "mode", 1.0, 0.0),
-        (_POSITION_ACCURACY, "h_accuracy", 0.005, 0.0),
-        heading="heading azimuth",
-    ),
-    _receiver(
-        "north_velocity east_velocity",
-        (_EAST, "east_velocity", 1.0, 0.0),
-        (_NORTH, "north_velocity", 1.0, 0.0),
-        heading="azimuth heading yaw",
-    ),
-    _receiver(
-        "latitude longitude position_covariance_type",
-        (_LATITUDE, "latitude", 1.0, 0.0),
-        (_LONGITUDE, "longitude", 1.0, 0.0),
-        (_FIX, "status.status", 1.0, 1.0),
-    ),
-)
+def _receiver(line: str) -> Receiver:
+    fields, signals, heading = f"{line} |".split("|")[:3]
+    pairs = [entry.split("=") for entry in signals.split()]
+    return Receiver(
+        frozenset(fields.split()),
+        tuple((_LETTERS[letter], *_scaled(letter, *text.partition("*")[::2])) for letter, text in pairs),
+        frozenset(heading.split()),
+    )
+
+
+def _scaled(letter: str, path: str, factor: str) -> tuple[str, float, float]:
+    scale, _, offset = factor.partition("+")
+    return (path, *_COURSE) if letter == "C" else (path, float(scale or 1.0), float(offset or 0.0))
+
+
+RECEIVERS = tuple(map(_receiver, _TABLE.strip().splitlines()))
 
 
 def receiver_signals(topic: str, stamp: str, paths: Collection[str]) -> dict[str, SignalSource]:

@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Mapping as MappingABC
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -117,7 +117,7 @@ def mapping_of(given: Mapping | Path | str | None) -> Mapping | None:
 
 
 def load_mapping(path: Path | str) -> Mapping:
-    """Read mapping.toml.
+    """Read mapping.toml, or the mappings of a folder, from which each log takes that of its recorder.
 
     Raises
     ------
@@ -125,8 +125,13 @@ def load_mapping(path: Path | str) -> Mapping:
         The file is missing, is no TOML, or contains wrong, unknown, missing or contradicting entries; all are named.
     """
     path = Path(path)
+    if path.is_dir():
+        files = sorted(path.glob("*.toml"))
+        if not files:
+            raise MappingFileError(expected="mapping files (*.toml)", got="none in the folder", where=str(path))
+        return Mapping(file=str(path), recorders=tuple(load_mapping(file) for file in files))
     raw = read_toml(path, "a mapping TOML file", MappingFileError)
-    return mapping_from_dict(raw, where=str(path), folder=path.parent)
+    return replace(mapping_from_dict(raw, where=str(path), folder=path.parent), file=path.name)
 
 
 def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path()) -> Mapping:
@@ -136,7 +141,7 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
     ------
     MappingFileError : Entries are wrong, unknown, missing or contradict one another.
     """
-    sections = ("signals", "truth", "truth_quality", "estimates", "can", "fill_recognised")
+    sections = ("signals", "truth", "truth_quality", "estimates", "can", "fill_recognised", "recorder")
     problems = [unknown(key, sections) for key in raw if key not in sections]
     signals = _read_section(raw.get("signals", {}), "signals", tuple(SIGNAL_UNITS), tuple(TRUTH_UNITS), problems)
     truth = _read_section(raw.get("truth", {}), "truth", tuple(TRUTH_UNITS), tuple(SIGNAL_UNITS), problems)
@@ -147,7 +152,8 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
     if not isinstance(fill, bool):
         problems.append("fill_recognised: should be true or false")
         fill = False
-    mapping = Mapping(signals, truth, quality, can=can, estimates=estimates, fill_recognised=fill)
+    recorder = _read_recorder(raw.get("recorder", {}), problems)
+    mapping = Mapping(signals, truth, quality, can=can, estimates=estimates, fill_recognised=fill, recorder=recorder)
     if "can" not in raw:
         # Others than estimators read the estimates, so that they are looked through as well.
         every = (*mapping.sources(), *(s for e in estimates.values() for s in e.values()))
@@ -204,6 +210,13 @@ def _read_estimates(raw: object, problems: list[str]) -> dict[str, dict[str, Sig
         else:
             out[name] = _read_section(tables, f"estimates.{name}", tuple(ESTIMATE_UNITS), (), problems)
     return out
+
+
+def _read_recorder(raw: object, problems: list[str]) -> tuple[tuple[str, str], ...]:
+    if isinstance(raw, dict) and all(isinstance(kind, str) for kind in raw.values()):
+        return tuple(raw.items())
+    problems.append('recorder: should be a type by topic, such as "/imu/data" = "sensor_msgs/msg/Imu"')
+    return ()
 
 
 def _read_can(raw: object, folder: Path, problems: list[str]) -> CanSettings | None:
@@ -310,6 +323,8 @@ def mapping_to_toml(
         "# ISO 8855: x forward, y left, z up; angles and rates are positive to the left. See docs/formats.md.",
     ]
     lines += _comment("\n".join([notes.get("", ""), *mapping.notes]))
+    if mapping.recorder:
+        lines += ["", "[recorder]", *(f"{_toml(topic)} = {_toml(kind)}" for topic, kind in mapping.recorder)]
     if mapping.can is not None:
         lines += ["", *_can_lines(mapping.can)]
     for section, sources, units in (("signals", mapping.signals, SIGNAL_UNITS), ("truth", mapping.truth, TRUTH_UNITS)):

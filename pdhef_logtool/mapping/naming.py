@@ -100,7 +100,8 @@ _SYNONYMS = {
     "quergeschwindigkeit": "lateral velocity", "laengsgeschwindigkeit": "longitudinal velocity",
     "geschwindigkeit": "speed", "fahrzeuggeschwindigkeit": "vehicle speed", "raddrehzahl": "wheel speed",
     "radgeschwindigkeit": "wheel speed", "radgeschw": "wheel speed", "strg": "steering", "stwhl": "steering wheel",
-    "strwhl": "steering wheel", "psidot": "yaw rate", "yawdot": "yaw rate", "sog": "ground speed",
+    "strwhl": "steering wheel", "stwhlang": "steering wheel angle", "lgt": "longitudinal",
+    "inline": "longitudinal", "psidot": "yaw rate", "yawdot": "yaw rate", "sog": "ground speed",
 }  # fmt: skip
 
 
@@ -197,9 +198,7 @@ _OF_DELTA = _set(
     """
 )
 #: Devices whose quantities have the names of a car's.
-_OTHER_DEVICES = _set(
-    "joint joints arm camera lidar disparity image battery temperature esc gimbal turtle radar tracks"
-)
+_OTHER_DEVICES = _set("joint joints arm camera lidar disparity image battery temperature gimbal turtle radar tracks")
 
 
 def is_command(*names: str) -> bool:
@@ -307,7 +306,7 @@ _TRAITS = tuple(
                    "angular speed|twist")),
         ("@accelerates", ("accel|acceleration|accelerometer|accelerations|accels|acc|specific", ".ax|.ay|.az",
                           ".a|.g .lat|.long")),
-        ("@steers", ("steer|steering|swa|handwheel|roadwheel|roadwheels", "@delta", "road|hand wheel angle",
+        ("@steers", ("steer|steering|swa|handwheel|roadwheel|roadwheels", "@delta", "road|hand|front wheel angle",
                      "@corner wheel angle")),
         ("@slips", ("sideslip|beta", "slip angle", "side slip")),
         ("@turns", ("@rate", "yaw vel|velocity|speed", ".yawrate|.wz")),

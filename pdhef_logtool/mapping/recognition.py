@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -14,7 +14,7 @@ from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.candidates import Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.clocks import with_usable_stamps
-from pdhef_logtool.mapping.gnss_signals import gnss_signals, has_heading, receiver_signals
+from pdhef_logtool.mapping.gnss_signals import RAW_COURSE, gnss_signals, has_heading, receiver_signals
 from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, length_of, speed_over_ground
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
@@ -27,7 +27,7 @@ from pdhef_logtool.records.signals import WHEELS, FloatArray, has_gnss
 
 #: Words of a topic's name that make it a reference to score against; never an input.
 TRUTH_WORDS = frozenset(
-    {"truth", "groundtruth", "gt", "perfect", "mocap", "optitrack", "vicon", "qualisys", "correvit"}
+    {"truth", "groundtruth", "gt", "perfect", "mocap", "optitrack", "vicon", "qualisys", "correvit", "reference"}
 )
 #: Words of satellite and inertial navigation: velocities and poses of such topics are ground truth, their IMU is a
 #: sensor.
@@ -194,6 +194,11 @@ class _Draft:
         """Note an ambiguity."""
         self.ambiguities.append(Ambiguity(subject, candidates, chosen, reason))
 
+    def replace_truth(self, truth: dict[str, SignalSource]) -> None:
+        """Take other ground truth in place of what there is, whose quality states nothing of it."""
+        self.truth, self.quality = truth, None
+        self.notes = [n for n in self.notes if not n.startswith("ground truth is used where")]
+
     def choose(
         self, subject: str, topics: list[TopicInfo], rank: Callable[[TopicInfo], tuple[object, ...]], why: str
     ) -> TopicInfo | None:
@@ -228,8 +233,9 @@ def auto_map(
     draft.notes += [
         f"{t.name} ({_type(t)}) has no messages" for t in log.topics if not t.messages and _is_well_known(t)
     ]
+    by_file = "by --set msgs=car.dbc, or " if log.messages is None else ""  # only tables are decoded as a whole
     draft.notes += [
-        f"{t.name} contains raw CAN frames: describe them by --set msgs=car.dbc, or in a mapping file with [can]"
+        f"{t.name} contains raw CAN frames: describe them {by_file}in a mapping file with [can] dbc"
         for t in topics
         if not any(o.type_name.startswith("can/msg/") and o.name != t.name for o in topics)
         if "can" in _words(f"{t.name} {t.type_name}") and holds_frames(t.name, log.fields(t.name, quiet=True))
@@ -305,7 +311,8 @@ def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
         for t, role in rest
         if is_joints(t) and role != "command" and not joint_names(draft.log, t)
     ]
-    draft.truth.update(weighed.truth)
+    if weighed.truth:
+        draft.replace_truth(weighed.truth)
     draft.notes += weighed.notes
     for name, fields in weighed.rivals:
         draft.doubt(name, fields, fields[0], "the best score, then most messages")
@@ -334,9 +341,8 @@ def _map_documented_truth(draft: _Draft, topics: list[TopicInfo], vendors: Vendo
         return
     if draft.truth:
         others = ", ".join(sorted({s.topic for s in draft.truth.values()}))
-        draft.notes = [n for n in draft.notes if not n.startswith("ground truth is used where")]
         draft.notes.append(f"ground truth is taken from {chosen.name}, which also has a velocity; {others} is not used")
-    draft.truth, draft.quality = whole[chosen.name], None
+    draft.replace_truth(whole[chosen.name])
 
 
 def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
@@ -347,8 +353,7 @@ def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
     truth = navigation_truth(draft.log, [t for t in unknown if _role(t) in ("navigation", "truth")])
     if truth is None or (draft.truth and len(truth[0]) <= len(draft.truth)):
         return
-    draft.truth, draft.quality = truth[0], None
-    draft.notes = [n for n in draft.notes if not n.startswith("ground truth is used where")]
+    draft.replace_truth(truth[0])
     draft.notes.append(truth[1])
 
 
@@ -356,19 +361,26 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
     """Take GNSS as a sensor: of ground truth without heading, else of a receiver that is not ground truth."""
     draft.signals |= gnss_signals(draft.signals, draft.truth)
     instruments = {_device(source.topic) for source in draft.truth.values()} if has_heading(draft.truth) else set()
-    topics = [t for t in topics if not _words(t.name) & TRUTH_WORDS and _device(t.name) not in instruments]
-    receivers = [
-        receiver_signals(t.name, stamp_path_of(fields), {f.path for f in fields})
-        for t in topics
-        if not _type(t).startswith(NO_SENSORS) and (fields := draft.log.fields(t.name, quiet=True))
-    ]
+    topics = [t for t in topics if not _words(t.name) & TRUTH_WORDS]
+    others = [t for t in topics if _device(t.name) not in instruments]
+    receivers = list(_receivers(draft, topics, others))
     for signals in sorted(receivers, key=lambda s: not has_gnss(s)):
         if has_gnss(signals) if not has_gnss(draft.signals) else not set(signals) & set(draft.signals):
             draft.signals |= signals
     if not has_gnss(draft.signals):
-        _map_twist(draft, topics)
-        if has_gnss(draft.signals):
-            draft.signals |= next((signals for signals in receivers if signals and not has_gnss(signals)), {})
+        _map_twist(draft, others)
+        if has_gnss(draft.signals) or not has_heading(draft.truth):
+            draft.signals |= next((signals for signals in receivers if not has_gnss(signals)), {})
+
+
+def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo]) -> Iterator[dict[str, SignalSource]]:
+    """Yield the signals of receivers: those of ``others``, and of any topic with the course of a single antenna."""
+    for topic in topics:
+        fields = () if _type(topic).startswith(NO_SENSORS) else draft.log.fields(topic.name, quiet=True)
+        if fields and (topic in others or has_path(fields, RAW_COURSE)):
+            signals = receiver_signals(topic.name, stamp_path_of(fields), {f.path for f in fields})
+            if signals:
+                yield signals
 
 
 def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:

@@ -174,6 +174,8 @@ class Mapping:
         are no part of :meth:`sources`: only ``pdhef metrics`` reads them.
     fill_recognised : what the file does not name is taken from recognised types.
     checks : what stays undecided of fields that were taken by their names.
+    file : it was read from. recorder : type by topic of the logs that it is for.
+    recorders : the mappings of a folder; a log takes that of its recorder.
     """
 
     signals: dict[str, SignalSource] = field(default_factory=dict)
@@ -185,6 +187,15 @@ class Mapping:
     estimates: dict[str, dict[str, SignalSource]] = field(default_factory=dict)
     fill_recognised: bool = False
     checks: tuple[Check, ...] = ()
+    file: str = field(default="", compare=False, repr=False)
+    recorder: tuple[tuple[str, str], ...] = ()
+    recorders: tuple[Mapping, ...] = ()
+
+    @property
+    def dbc(self) -> tuple[Path, ...]:
+        """All DBC files that it names."""
+        mine = () if self.can is None else self.can.dbc
+        return (*mine, *(path for mapping in self.recorders for path in mapping.dbc))
 
     @property
     def sha256(self) -> str:

@@ -29,6 +29,7 @@ from pdhef_logtool.mapping.candidates import (
 from pdhef_logtool.mapping.checking import has_path
 from pdhef_logtool.mapping.evidence import Fit, fit, is_of_both_signs, is_of_one_sign, ratio, spread
 from pdhef_logtool.mapping.fields import CLEAR, Fields, mean_of
+from pdhef_logtool.mapping.gnss_signals import has_heading
 from pdhef_logtool.mapping.naming import words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.signs import SLOW_M_S, WITNESSES, WORDS, judge_signs
@@ -86,7 +87,7 @@ def weigh(
     Parameters
     ----------
     topics : those that may contain candidates, with what their names make of them.
-    signals, truth : what recognised types give already.
+    signals, truth : what recognised types give already; a topic named as ground truth replaces one without heading.
     """
     wanted = [
         n for n in named_fields(log, topics, vendors) if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)
@@ -104,12 +105,12 @@ def weigh(
     unlabelled = unlabelled_columns(log, topics, pieces) if without_names else []
     meant, named, evidence = identified(fields, unlabelled) if unlabelled else ([], "", "")
     fields.candidates += meant
-    weighing = _Weighing(fields, "" if truth else truth_topic(fields.candidates))
+    may_be_true = [f for f in fields.candidates if not truth or (f.role == "truth" and not has_heading(truth))]
+    weighing = _Weighing(fields, truth_topic(may_be_true))
     if named:
         weighing.note_unlabelled(named, evidence)
     weighing.choose_signals(set(signals))
-    if not truth:
-        weighing.choose_truth()
+    weighing.choose_truth()
     return weighing.result()
 
 
@@ -136,6 +137,7 @@ def _is_wanted(
     if open_ and quantity == "speed" and "speed_m_s" not in signals and any(n.startswith("wheel") for n in signals):
         open_ = role in ("sensor", "truth", "estimate", "command")
     for_truth = not truth and (role in ("truth", "navigation") or quantity in ("sideslip", "velocity"))
+    for_truth |= role == "truth" and not has_heading(truth)
     return open_ or for_truth
 
 

@@ -159,7 +159,8 @@ class Signals:
     wheel_speed_m_s : float64 [N, 4] in the order fl, fr, rl, rr.
     available : names of the signals that the log's mapping provides at all.
     gnss_velocity_m_s : float64 [N, 2], east and north, of the antenna, finite only at the first stamp after a new
-        sample. gnss_velocity_std_m_s : float64 [N], as the receiver states it. NaN where they are not given.
+        sample. gnss_velocity_std_m_s : float64 [N], as the receiver states it. gnss_late_s : float64 [N], from the
+        stamp to the arrival of a velocity that ``ready_ns`` does not wait for. NaN where they are not given.
     gnss_position_deg : float64 [N, 2], latitude and longitude; gnss_position_std_m, gnss_heading_rad : float64 [N].
     roll_rate_rad_s, pitch_rate_rad_s : float64 [N]. All of these are NaN where they are not given.
     """
@@ -176,6 +177,7 @@ class Signals:
     available: frozenset[str] = field(default_factory=frozenset)
     gnss_velocity_m_s: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     gnss_velocity_std_m_s: FloatArray = field(default_factory=lambda: np.empty(0))
+    gnss_late_s: FloatArray = field(default_factory=lambda: np.empty(0))
     gnss_position_deg: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     gnss_position_std_m: FloatArray = field(default_factory=lambda: np.empty(0))
     gnss_heading_rad: FloatArray = field(default_factory=lambda: np.empty(0))
@@ -210,3 +212,8 @@ def join_signals(windows: Sequence[Signals]) -> Signals:
 def has_gnss(names: Collection[str]) -> bool:
     """Return whether signals contain a GNSS velocity: its components, or speed and course."""
     return any(names_of <= set(names) for names_of in (GNSS_COMPONENTS, _GNSS_POLAR))
+
+
+def has_position(names: Collection[str]) -> bool:
+    """Return whether signals contain a GNSS position."""
+    return set(GNSS_POSITION) <= set(names)

@@ -190,10 +190,12 @@ def _told(report: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 def verdicts_of(report: Mapping[str, Any]) -> list[Verdict]:
     """Return the sentences at the head of a page; without verdicts, the words of the selected estimate."""
-    verdicts = []
+    signals: dict[tuple[str, str, str], list[str]] = {}
     for v in _told(report):
         word, kind = _OUTCOMES.get(str(v.get("outcome")), (str(v.get("outcome")), ""))
-        verdicts.append(Verdict(LABELS.get(str(v.get("signal")), ""), word, str(v.get("text", "")), kind))
+        text = str(v.get("text", "")).removeprefix(f"{word}: ")
+        signals.setdefault((word, text, kind), []).append(LABELS.get(str(v.get("signal")), ""))
+    verdicts = [Verdict(", ".join(names), *of) for of, names in signals.items()]
     answer = report.get("answer")
     if verdicts or answer is None:
         return verdicts

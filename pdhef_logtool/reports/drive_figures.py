@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.evaluation.dead_reckoned import aligned_path
 from pdhef_logtool.evaluation.largest_errors import largest_places
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
@@ -130,7 +131,7 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles, low_speed
     _add_filter(charts, series, roles)
     _add_motion(charts, series, roles)
     charts.strip("strip", "Faults, gaps and segments", _rows(report, series, roles, stamps, origin_ns))
-    path_text = _add_path(charts, series, roles) if TRUTH in series else ""
+    path_text = _add_path(charts, series, roles, report.get("path_drift")) if TRUTH in series else ""
     _add_planes(charts, [series[n] for n in (TRUTH, roles.main) if n in series])
     _add_worst(charts, answer, reference, peaks, origin_ns)
     absent = [n for n in roles.names if n not in tracks.names]
@@ -233,7 +234,7 @@ def _add_filter(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles)
 def _add_motion(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> None:
     for key, title, unit in (
         ("speed", "Speed, longitudinal", "m/s"),
-        ("ay", "Lateral acceleration: specific force of the estimate, ground truth as in the table", "m/s²"),
+        ("ay", "Lateral acceleration, specific force", "m/s²"),
     ):
         if lines := _lines(series, roles, key, (TRUTH, roles.main)):
             charts.time(key, title, unit, lines, resolution=_SEEN, height=120)
@@ -308,7 +309,9 @@ def _add_worst(
     charts.points("worst", title, "s from the log's start", "sideslip in °", clouds)
 
 
-def _add_path(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> str:
+def _add_path(
+    charts: Charts, series: Mapping[str, DriveSeries], roles: Roles, drift: Mapping[str, float] | None
+) -> str:
     """Add the dead-reckoned path, aligned with that of the ground truth; return its drift in words."""
     truth, estimate = (series[n].path.thinned(_MOST_POINTS) for n in (TRUTH, roles.main))
     if truth.shape[1] < 2 or max(np.ptp(truth[1]), np.ptp(truth[2])) < _LEAST_PATH_M:
@@ -319,27 +322,17 @@ def _add_path(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -
         charts.points("path", "Path of the ground truth", "m east", "m north", clouds, equal=True)
         return ""
     target, source = truth[1:, at_truth], estimate[1:, at_own]
-    aligned = _aligned(source, target)
-    apart = np.hypot(*(aligned - target))
-    length = float(np.hypot(*np.diff(target, axis=1)).sum())
-    end = float(np.hypot(*(source - target)[:, -1]))
+    aligned = aligned_path(source, target)
     clouds += _by_error(aligned, common, series[roles.main], charts)
     charts.points("path", "Path, aligned with the ground truth", "m east", "m north", clouds, equal=True)
-    share = f" ({end / length:.1%})" if length > 0.0 else ""
+    if drift is None:
+        return ""
     return (
-        f"Path: {roles.main} integrates its velocity without position measurements. Drift: {end:.1f} m{share} at the "
-        f"end of {length / 1000.0:.2f} km from a common start. The figure shows it after one rotation and translation "
-        f"(SE(2)); the largest remaining distance is {apart.max():.1f} m. Colours: absolute sideslip error."
+        f"Path: {roles.main} integrates its velocity without position measurements. Drift: {drift['end_m']:.1f} m "
+        f"({drift['end_m'] / drift['length_m']:.1%}) at the end of {drift['length_m'] / 1000.0:.2f} km from a common "
+        f"start. The figure shows it after one rotation and translation (SE(2)); the largest remaining distance is "
+        f"{drift['largest_aligned_m']:.1f} m. Colours: absolute sideslip error."
     )
-
-
-def _aligned(source: FloatArray, target: FloatArray) -> FloatArray:
-    """Return points [2, K] after the rotation and translation that bring them closest to ``target`` [2, K]."""
-    a, b = (p - p.mean(axis=1, keepdims=True) for p in (source, target))
-    angle = np.arctan2(np.sum(a[0] * b[1] - a[1] * b[0]), np.sum(a * b))
-    cosine, sine = np.cos(angle), np.sin(angle)
-    rotated = np.stack([cosine * a[0] - sine * a[1], sine * a[0] + cosine * a[1]])
-    return np.asarray(rotated + target.mean(axis=1, keepdims=True), dtype=np.float64)
 
 
 def _by_error(aligned: FloatArray, at_ns: FloatArray, estimate: DriveSeries, charts: Charts) -> list[Cloud]:

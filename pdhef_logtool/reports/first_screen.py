@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import datetime as dt
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from pdhef_logtool.evaluation.requirement_verdicts import of_documents
+from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import shown
 from pdhef_logtool.records.printable import printable
 
@@ -17,6 +19,7 @@ _KINDS = {"PASS": "pass", "FAIL": "fail", "INCONCLUSIVE": "unknown"}
 #: Versions that a first screen names; the appendix has all.
 _VERSIONS = ("pdhef-logtool", "python", "numpy")
 _MOST_NEXT = 4
+_UNIT = re.compile(r"_(rad_s|rad|m_s2|m_s)$")
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +174,7 @@ def _upper(edges: Sequence[float], index: int) -> str:
 def _sensors(report: Mapping[str, Any]) -> str:
     names = [str(s["name"]) for s in report["mapping"]["signals"]]
     wheels = [n for n in names if n.startswith("wheel_speed_")]
-    others = [n for n in names if n not in wheels]
+    others = [LABELS.get(n, _UNIT.sub("", n).replace("_", " ")) for n in names if n not in wheels]
     return ", ".join([*others, *([f"{len(wheels)} wheel speeds"] if wheels else [])])
 
 

@@ -17,7 +17,6 @@ from pdhef_logtool.reports.colours import INK, PLAIN, colour
 from pdhef_logtool.reports.first_screen import next_steps, plan_head, tested_run
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.breakdown import LEAST_DRIVES
-from pdhef_logtool.results.comparison_words import design_effect_text
 from pdhef_logtool.results.fleet import ANSWER, JUDGED, Distribution, Fleet, Space, read_fleet
 from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
 
@@ -87,7 +86,7 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
         mains={ANSWER} if len(mains) > 1 else mains,
         names=list(dict.fromkeys(d.estimator for d in fleet.distributions if d.estimator != ANSWER)),
         ranked=any(r.place is not None for r in fleet.ranking),
-        dependence=design_effect_text(fleet.dependence, len(fleet.scored)),
+        dependence=fleet.dependence.text(len(fleet.scored)),
         breakdowns=shown,
         comparisons=sum(b.comparisons for b in fleet.breakdowns),
         idle_keys=[b.key for b in fleet.breakdowns if b not in shown],
@@ -112,7 +111,7 @@ def _worst(fleet: Fleet, charts: Charts) -> tuple[str, float | None] | None:
             for error, d in ranked[:_WORST]
         ]
         title = f"The {len(bars)} drives with the largest sideslip RMSE"
-        charts.intervals("worst", title, "°", bars, zero=0.0)
+        charts.intervals("worst", title, "RMSE in °", bars, zero=0.0)
     return ranked[0][1].label, ranked[0][0]
 
 
@@ -127,7 +126,7 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
         "medians",
         f"Median RMSE of sideslip over {first.drives} drives, 95 % interval"
         + ("" if len(near) == len(judged) else f" (beyond {_DRAWN:g} times the selected estimate's: table)"),
-        "°",
+        "RMSE in °",
         [
             Interval(d.estimator, d.median.low * degree, d.median.value * degree, d.median.high * degree, _colour(d))
             for d in near
@@ -137,7 +136,7 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
         values = first.values * degree
         edges, counts = _histogram(values)
         beyond = ", the last bar and beyond" if values[-1] > edges[-1] else ""
-        charts.bars("spread", f"Drives by RMSE of the selected estimate's sideslip{beyond}", "°", edges, counts)
+        charts.bars("spread", f"Drives by RMSE of the selected estimate's sideslip{beyond}", "RMSE in °", edges, counts)
     rival, drives = _rival(fleet), fleet.scored
     if rival is not None:
         ours, other = (np.array([d.error(name) * degree for d in drives]) for name in (ANSWER, rival))

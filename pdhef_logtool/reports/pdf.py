@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import os
+import re
 import shutil
 import subprocess
 import tempfile
@@ -64,10 +65,29 @@ def write_pdf(run: OpenedRun, *, positions: bool = False) -> Path:
         )
     with tempfile.TemporaryDirectory(prefix="pdhef-pdf-") as scratch:
         page, made = Path(scratch) / "report.html", Path(scratch) / PDF_FILE
-        page.write_bytes(pdf_page(run, positions=positions))
+        document = pdf_page(run, positions=positions)
+        page.write_bytes(document)
+        _print(browser, page, made, target)
+        page.write_bytes(_numbered(document, made))
         _print(browser, page, made, target)
         write_bytes(target, made.read_bytes())
     return target
+
+
+def _numbered(document: bytes, printed: Path) -> bytes:
+    """Return the document with the page of each section in its contents, as it was printed without."""
+    from pypdf import PdfReader
+
+    reader = PdfReader(printed)
+    pages = {
+        name.lstrip("/"): reader.get_destination_page_number(place) for name, place in reader.named_destinations.items()
+    }
+
+    def numbered(match: re.Match[bytes]) -> bytes:
+        page = pages.get(match[1].decode())
+        return match[0] + (b"" if page is None else str(page + 1).encode())
+
+    return re.sub(rb'<span class="at" data-of="([^"]+)">', numbered, document)
 
 
 def _print(browser: str, page: Path, made: Path, target: Path) -> None:
@@ -108,11 +128,6 @@ def pdf_page(run: OpenedRun, *, positions: bool = False) -> bytes:
         versions=document.get("versions") or {},
         positions=positions,
     )
-
-
-def _title(plan: Mapping[str, Any] | None) -> str:
-    """Return the title of a user's plan."""
-    return str(plan.get("title") or "") if plan is not None and plan.get("file") else ""
 
 
 def _report(log: OpenedLog) -> dict[str, Any] | None:

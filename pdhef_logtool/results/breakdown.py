@@ -15,9 +15,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from pdhef_logtool.evaluation.dependence import FACTORS, dependence, deviate, numbered
 from pdhef_logtool.records.signals import BoolArray, FloatArray
-from pdhef_logtool.results.dependence import FACTORS, dependence, numbered
-from pdhef_logtool.results.paired_change import holm, quantile
+from pdhef_logtool.results.paired_change import holm
 
 #: Scored drives on each side of a comparison, at least.
 LEAST_DRIVES = 5
@@ -106,7 +106,7 @@ class _Test:
 
     def effect(self, p: float, level: float) -> Effect:
         """Return it with a corrected p-value, and the interval at a level (0.05: 95 %)."""
-        width = quantile(1.0 - 0.5 * level, self.freedom) * self.error
+        width = deviate(1.0 - 0.5 * level, self.freedom) * self.error
         low, high = self.difference - width, min(self.difference + width, _LARGEST_LOG)
         return Effect(math.expm1(self.difference), math.expm1(low), math.expm1(high), p)
 

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
+from pdhef_logtool.evaluation.dependence import FACTORS, factors_of
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.metrics.sensor_residuals import SENSORS
 from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.units import SIGNALS
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.results.changed_signals import ChangedSignal, changed_signals
-from pdhef_logtool.results.dependence import FACTORS, factors_of
 from pdhef_logtool.results.gate import MAIN, Figure, Gate
 from pdhef_logtool.results.opened_run import METRICS_FILE, OpenedLog, OpenedRun
 from pdhef_logtool.results.paired_change import PairedChange, Verdict, holm, log_ratios, paired_change

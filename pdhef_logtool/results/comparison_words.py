@@ -7,7 +7,6 @@ import math
 from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.results.changed_signals import ChangedSignal
 from pdhef_logtool.results.comparing import INDEPENDENT, ComparedFigure, Comparison
-from pdhef_logtool.results.dependence import Dependence
 from pdhef_logtool.results.paired_change import LEAST_CLUSTERS
 from pdhef_logtool.results.sink import TRUTH
 
@@ -81,22 +80,7 @@ def dependence_text(figure: ComparedFigure, cluster: str | None) -> str:
         return "Drives are taken as independent (--cluster none)."
     if cluster is not None:
         return f"Design effect {of.design_effect:.2g} of {figure.change.clusters} clusters by {cluster}."
-    return design_effect_text(of, figure.change.drives)
-
-
-def design_effect_text(of: Dependence, drives: int) -> str:
-    """Return a sentence on the dependence of drives of one day, car or route."""
-    groups = [f"{count} {name}s" for name, count in of.levels if count > 1]
-    if not groups:
-        return "Drives are taken as independent: days, cars and routes are the same in all drives, or not recorded."
-    among = f"{drives} drives of {', '.join(groups)}"
-    if of.design_effect == 1.0:
-        return f"Design effect 1: no dependence between {among}."
-    effective = drives / of.design_effect
-    return (
-        f"Design effect {of.design_effect:.2g} by {' and '.join(of.by)}: {among} have the evidence of "
-        f"{effective:.0f} independent drives."
-    )
+    return of.text(figure.change.drives)
 
 
 def interval_text(figure: ComparedFigure) -> str:

@@ -42,6 +42,24 @@ def drive_rows(runs: Sequence[tuple[str, OpenedRun]]) -> pl.DataFrame:
     return pl.concat(tables).with_row_index("number")
 
 
+def independent_figures(run: OpenedRun, signal: str, metric: str, segment: str = "all") -> pl.DataFrame:
+    """Return log, estimator, value, unit and main (selected estimator) of a figure with independent ground truth.
+
+    Raises
+    ------
+    OutputError : metrics.parquet of the run is damaged.
+    """
+    import polars as pl
+
+    texts = {"log": pl.String, "main": pl.String}
+    mains = pl.DataFrame([(log.label, log.main()) for log in run.logs], schema=texts, orient="row")
+    rows = run.metrics().filter(pl.col("signal") == signal)
+    dependent = rows.filter(pl.col("metric") == "not_independent").select("log", "estimator")
+    scored = rows.filter(pl.col("metric") == metric, pl.col("segment") == segment, pl.col("value").is_finite())
+    scored = scored.select("log", "estimator", "value", "unit").join(dependent, on=["log", "estimator"], how="anti")
+    return scored.collect().join(mains, on="log").sort("log", "estimator")
+
+
 def _rows(name: str, run: OpenedRun) -> pl.DataFrame:
     import polars as pl
 

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.evaluation.dependence import FACTORS, Dependence, dependence, factors_of
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.results.breakdown import LEAST_DRIVES, SIGNIFICANT, Breakdown, BreakdownDrive, breakdowns
-from pdhef_logtool.results.dependence import FACTORS, Dependence, dependence, factors_of
 from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun
 from pdhef_logtool.results.paired_change import PairedChange, holm, log_ratios, paired_change
 

@@ -309,11 +309,11 @@ def metrics_record(report: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _attached(report: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the report without the figures of estimators that are not selected: the metrics record has them all."""
+    """Return the report with the figures of the selected estimate over the drive: the metrics record has them all."""
     selected = report.get("selected_estimate")
     if selected is None:
         return report
-    return {**report, "metrics": [m for m in report["metrics"] if m["estimator"] == selected]}
+    return {**report, "metrics": [m for m in report["metrics"] if (m["estimator"], m["segment"]) == (selected, "all")]}
 
 
 def _is_our_report(attachment: Attachment) -> bool:

@@ -10,7 +10,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ConfigDict
@@ -224,14 +224,14 @@ def open_run(output: Path | str) -> OpenedRun:
         got = f"format {document.get('format')!r}"
         raise OutputError(expected=what, got=got, where=str(path), remedy=_REMEDY)
     validated(_Run, document, str(path), OutputError, expected=what, remedy=_REMEDY)
-    return OpenedRun(folder, document, tuple(_opened(entry, folder, mirror) for entry in document["logs"]), mirror)
+    logs = tuple(_opened(entry, folder / LOGS, mirror) for entry in document["logs"])
+    return OpenedRun(folder, document, logs, mirror)
 
 
 def _opened(entry: dict[str, Any], folder: Path, mirror: Mirror | None) -> OpenedLog:
     label = entry.get("log")
-    if not isinstance(label, str) or PurePath(label).name != label or label in {"", ".."}:
+    if not isinstance(label, str) or label in {"", ".", ".."} or {"/", "\\"} & set(label):
         # A label names a folder that reports are written to: it may not lead out of the run's.
-        raise OutputError(
-            expected="the name of a log's folder", got=repr(label)[:80], where=str(folder / RUN_FILE), remedy=_REMEDY
-        )
-    return OpenedLog(label, str(entry.get("outcome", "")), folder / LOGS / label, entry, mirror)
+        where = str(folder.parent / RUN_FILE)
+        raise OutputError(expected="the name of a log's folder", got=repr(label)[:80], where=where, remedy=_REMEDY)
+    return OpenedLog(label, str(entry.get("outcome", "")), folder / label, entry, mirror)

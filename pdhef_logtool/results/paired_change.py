@@ -2,7 +2,7 @@
 
 Each drive is compared with itself, because drives differ more from one another than runs do. The median limits the
 influence of single drives. Its bounds are order statistics, as in the sign test, whose variance is multiplied by the
-design effect of drives of one day, car or route (:mod:`pdhef_logtool.results.dependence`).
+design effect of drives of one day, car or route (:mod:`pdhef_logtool.evaluation.dependence`).
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from pdhef_logtool.evaluation.dependence import Dependence, Factors, dependence, deviate, numbered
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.results.dependence import Dependence, Factors, dependence, numbered
 
 Verdict: TypeAlias = Literal["equal", "worse", "not worse", "better", "inconclusive"]
 
@@ -111,7 +111,7 @@ def _bounds(ascending: FloatArray, share: float, effect: Dependence) -> tuple[fl
     n = len(ascending)
     if n < _LEAST_EFFECTIVE * effect.design_effect:
         return math.nan, math.nan
-    place = 0.5 * (n - 1) - 0.5 * quantile(share, effect.freedom) * math.sqrt(n * effect.design_effect)
+    place = 0.5 * (n - 1) - 0.5 * deviate(share, effect.freedom) * math.sqrt(n * effect.design_effect)
     return _at(ascending, max(place, 0.0)), -_at(-ascending[::-1], max(place, 0.0))
 
 
@@ -120,13 +120,6 @@ def _at(ascending: FloatArray, place: float) -> float:
     i = math.floor(place)
     low, high = float(ascending[i]), float(ascending[min(i + 1, len(ascending) - 1)])
     return low if low == high or not (math.isfinite(low) and math.isfinite(high)) else low + (place - i) * (high - low)
-
-
-def quantile(share: float, freedom: float) -> float:
-    """Return a quantile of Student's t, or of the normal distribution with infinite degrees of freedom."""
-    from scipy.special import ndtri, stdtrit  # scipy.stats takes half a second longer to load
-
-    return float(ndtri(share) if math.isinf(freedom) else stdtrit(freedom, share))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

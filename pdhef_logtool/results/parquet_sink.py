@@ -141,7 +141,7 @@ class EstimatesSink(Sink):
     ----------
     path : where the finished file is.
     rows_a_group : rows of one row group.
-    selected : estimator whose track is written a second time, as :data:`SELECTED`.
+    selected : estimators whose track is written a second time, as :data:`SELECTED`, each from a stamp on.
     causal_from_ns : first stamp from which the rows of an estimator depend on nothing later; an estimator without one
         is causal nowhere. None: unknown, and ``causal`` is null.
 
@@ -155,7 +155,7 @@ class EstimatesSink(Sink):
         path: Path,
         rows_a_group: int = ROWS_A_GROUP,
         *,
-        selected: str = "",
+        selected: Sequence[tuple[int, str]] = (),
         causal_from_ns: Mapping[str, int] | None = None,
     ) -> None:
         self._selected, self._causal_from_ns = selected, causal_from_ns
@@ -168,8 +168,15 @@ class EstimatesSink(Sink):
         """Take one track of this window; [N] rows."""
         causal = self._causal(track)
         self._file.append(track.name, track_table(track, as_written=True, causal=causal))
-        if track.name == self._selected:
-            self._file.append(SELECTED, track_table(replace(track, name=SELECTED), as_written=True, causal=causal))
+        ends = [since_ns for since_ns, _ in self._selected[1:]] + [None]
+        for (since_ns, name), until_ns in zip(self._selected, ends, strict=False):
+            if track.name == name:
+                first = int(np.searchsorted(track.stamps_ns, since_ns))
+                last = len(track) if until_ns is None else int(np.searchsorted(track.stamps_ns, until_ns))
+                part = replace(track.rows(first, last), name=SELECTED)
+                self._file.append(
+                    SELECTED, track_table(part, as_written=True, causal=None if causal is None else causal[first:last])
+                )
 
     def _causal(self, track: StateTrack) -> BoolArray | None:
         if self._causal_from_ns is None or track.name == TRUTH:

@@ -1,41 +1,51 @@
-"""The verdicts of a validation plan on run B of a comparison, with run A as a possible baseline."""
+"""The verdicts of a validation plan with another run as baseline: run A of a comparison, or an earlier output."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
+from typing import Any
 
-from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
-from pdhef_logtool.evaluation.validation_plan import ValidationPlan
+from pdhef_logtool.evaluation.dependence import factors_of
+from pdhef_logtool.evaluation.validation_plan import RUN, ValidationPlan
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun
+from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun, open_run
 from pdhef_logtool.results.pairing import pair_logs
-from pdhef_logtool.results.plan_verdicts import (
-    JudgedDrive,
-    PlanVerdicts,
-    blocks_of,
-    figures_of_file,
-    plan_verdicts,
-)
+from pdhef_logtool.results.plan_verdicts import Against, JudgedDrive, PlanVerdicts, figures_of_file, plan_verdicts
 
 
 def plan_verdicts_against(plan: ValidationPlan, a: OpenedRun, b: OpenedRun, *, strict: bool) -> PlanVerdicts:
     """Return the verdicts on the drives of B; raises OutputError where metrics.parquet is damaged."""
-    pairs = pair_logs(a.logs, b.logs).pairs
-    drives_b = [_judged(log) for log in b.logs]
-    partners = {pair.b.label: _judged(pair.a) for pair in pairs}
-    figures_a = figures_of_file(a.metrics(), plan, [d.main for d in partners.values()])
-    figures_b = figures_of_file(b.metrics(), plan, [d.main for d in drives_b])
-    return plan_verdicts(plan, figures_b, drives_b, strict=strict, against=(figures_a, partners))
+    drives = [_judged(log) for log in b.logs]
+    figures = figures_of_file(b.metrics(), plan, [d.main for d in drives])
+    against = {**other_runs(plan, b.logs), RUN: _against(plan, a, b.logs)}
+    return plan_verdicts(plan, figures, drives, strict=strict, against=against)
+
+
+def other_runs(plan: ValidationPlan, logs: Sequence[OpenedLog]) -> dict[str, Against]:
+    """Return the outputs that requirements name as baseline, by their path or URL, paired with logs of this run.
+
+    Raises
+    ------
+    OutputError : One of them is missing (exit code 2) or damaged.
+    """
+    names = dict.fromkeys(n for r in plan.requirements if (n := r.other_run) not in (None, RUN))
+    return {name: _against(plan, open_run(name), logs) for name in names if name is not None}
+
+
+def _against(plan: ValidationPlan, run: OpenedRun, logs: Sequence[OpenedLog]) -> Against:
+    partners = {pair.b.label: _judged(pair.a) for pair in pair_logs(run.logs, logs).pairs}
+    return figures_of_file(run.metrics(), plan, [d.main for d in partners.values()]), partners
 
 
 def _judged(log: OpenedLog) -> JudgedDrive:
     main = log.entry.get("main")
-    return JudgedDrive(log.label, None if main is None else str(main), partial(_blocks, log))
+    factors = factors_of(log.entry, None)
+    return JudgedDrive(log.label, None if main is None else str(main), partial(_report, log), factors)
 
 
-def _blocks(log: OpenedLog) -> list[RequirementBlocks]:
-    report = None
+def _report(log: OpenedLog) -> Mapping[str, Any] | None:
     with suppress(OutputError):  # the comparison states it
-        report = log.report()
-    return blocks_of(report)
+        return log.report()
+    return None

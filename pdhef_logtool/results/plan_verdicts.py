@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.metrics.independence import NOT_INDEPENDENT
@@ -13,6 +13,7 @@ from pdhef_logtool.evaluation.metrics.sensor_residuals import SENSORS
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks, from_document
 from pdhef_logtool.evaluation.requirement_bounds import LEAST_DRIVES
 from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, RequirementVerdict, gates, judge
+from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import POOLED, RUN, Requirement, ValidationPlan, names_of
 from pdhef_logtool.records.tracks import REFERENCE
 from pdhef_logtool.results.sink import TRUTH
@@ -30,12 +31,14 @@ _Key = tuple[str, str, str, str, str]
 class JudgedDrive:
     """A drive of a run: its label, and its selected estimate (None: its only recorded estimate).
 
-    ``read_blocks`` returns its blocks of time; called where too few drives are scored for a bootstrap over drives.
+    ``read_report`` returns its report.json: its blocks of time are used where too few drives are scored for a bootstrap
+    over drives, its operating space where the plan asks for exposure. ``factors``: its day, car and route.
     """
 
     log: str
     main: str | None
-    read_blocks: Callable[[], Sequence[RequirementBlocks]] = tuple
+    read_report: Callable[[], Mapping[str, Any] | None] = dict
+    factors: Mapping[str, object] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,9 +121,8 @@ def _is_estimator(name: str) -> bool:
     return "~" not in name and name not in (SENSORS, TRUTH, REFERENCE)
 
 
-def blocks_of(report: Mapping[str, Any] | None) -> list[RequirementBlocks]:
-    """Return the blocks of a report.json."""
-    return from_document((report or {}).get("requirement_blocks") or ())
+#: Figures of another run, and its drive by the label of this run's.
+Against: TypeAlias = tuple[Figures, Mapping[str, JudgedDrive]]
 
 
 def plan_verdicts(
@@ -129,87 +131,67 @@ def plan_verdicts(
     drives: Sequence[JudgedDrive],
     *,
     strict: bool = False,
-    against: tuple[Figures, Mapping[str, JudgedDrive]] | None = None,
+    against: Mapping[str, Against] | None = None,
 ) -> PlanVerdicts:
     """Return the verdicts of a plan.
 
     Parameters
     ----------
-    figures : of the drives. against : figures of run A, and its drive by the label of this run's, for requirements
-        with another run as baseline.
+    figures : of the drives. against : the other run by the baseline of a requirement.
     """
+    others = against or {}
     verdicts = []
     for requirement in plan.requirements:
-        measured = {d.log: _measured(requirement, figures, d, against) for d in drives}
+        other = None if requirement.other_run is None else others.get(requirement.other_run)
+        measured = {d.log: _measured(requirement, figures, d, other) for d in drives}
         by_truth = [v for truth, _ in measured.values() if (v := truth) is not None]
         values = by_truth or [v for _, estimated in measured.values() if (v := estimated) is not None]
+        by_label = {d.log: d for d in drives}
         if requirement.statistic == POOLED and len(values) < LEAST_DRIVES:
-            by_label = {d.log: d for d in drives}
-            values = [_with_blocks(requirement, v, by_label[v.log], against) for v in values]
-        missing = "" if values else _why_missing(requirement, figures, drives, against)
+            values = [_with_blocks(requirement, v, by_label[v.log], other) for v in values]
+        if requirement.exposure:
+            values = [_with_space(v, by_label[v.log].read_report() or {}) for v in values]
+        missing = "" if values else _why_missing(requirement, figures, drives, other)
         verdicts.append(judge(requirement, values, missing))
     return PlanVerdicts(plan, tuple(verdicts), strict)
 
 
 def _measured(
-    requirement: Requirement,
-    figures: Figures,
-    drive: JudgedDrive,
-    against: tuple[Figures, Mapping[str, JudgedDrive]] | None,
+    requirement: Requirement, figures: Figures, drive: JudgedDrive, against: Against | None
 ) -> tuple[DriveValue | None, DriveValue | None]:
     """Return the metric of a drive against ground truth, and against the estimated reference."""
     name = requirement.estimator or figures.main(drive)
     if name is None:
         return None, None
-    other = _Baseline.of(requirement, figures, drive, against)
     truth = None
     tainted = (drive.log, name, requirement.signal, "all", NOT_INDEPENDENT) in figures.values
     if not tainted:
-        truth = _value(requirement, figures, drive, name, requirement.metric, other)
+        truth = _value(requirement, figures, drive, name, requirement.metric, against)
     if (requirement.signal, requirement.metric) != ("sideslip_rad", "rmse"):
         return truth, None
-    return truth, _value(requirement, figures, drive, name, "reference_rms", other)
+    return truth, _value(requirement, figures, drive, name, "reference_rms", against)
 
 
-@dataclass(frozen=True, slots=True)
-class _Baseline:
-    """Where the baseline of a requirement is: figures, drive and estimator; ``needed``: whether there must be one."""
-
-    needed: bool
-    figures: Figures | None = None
-    drive: JudgedDrive | None = None
-    name: str | None = None
-
-    @classmethod
-    def of(
-        cls,
-        requirement: Requirement,
-        figures: Figures,
-        drive: JudgedDrive,
-        against: tuple[Figures, Mapping[str, JudgedDrive]] | None,
-    ) -> _Baseline:
-        if requirement.baseline is None:
-            return cls(False)
-        if requirement.baseline != RUN:
-            return cls(True, figures, drive, requirement.baseline)
-        partner = None if against is None else against[1].get(drive.log)
-        if against is None or partner is None:
-            return cls(True)
-        return cls(True, against[0], partner, requirement.estimator or against[0].main(partner))
-
-    def value(self, requirement: Requirement, metric: str) -> float | None:
-        if self.figures is None or self.drive is None or self.name is None:
+def _baseline(
+    requirement: Requirement, figures: Figures, drive: JudgedDrive, metric: str, against: Against | None
+) -> float | None:
+    """Return the metric of the baseline: an estimator of the drive, or of the drive in the other run."""
+    other, name = drive, requirement.baseline
+    if requirement.other_run is not None:
+        if against is None or drive.log not in against[1]:
             return None
-        figure = self.figures.of(self.drive.log, self.name, requirement, metric)
-        return None if figure is None else figure[0]
+        figures, other = against[0], against[1][drive.log]
+        name = requirement.estimator or figures.main(other)
+    figure = None if name is None else figures.of(other.log, name, requirement, metric)
+    return None if figure is None else figure[0]
 
 
 def _value(
-    requirement: Requirement, figures: Figures, drive: JudgedDrive, name: str, metric: str, other: _Baseline
+    requirement: Requirement, figures: Figures, drive: JudgedDrive, name: str, metric: str, against: Against | None
 ) -> DriveValue | None:
     figure = figures.of(drive.log, name, requirement, metric)
-    baseline = other.value(requirement, metric)
-    if figure is None or (other.needed and baseline is None):
+    needed, baseline = requirement.baseline is not None, _baseline(requirement, figures, drive, metric, against)
+    if figure is None or (needed and baseline is None):
         return None
     std = figures.of(drive.log, name, requirement, "reference_std") if metric == "reference_rms" else None
     if metric == "reference_rms" and std is None:
@@ -218,7 +200,7 @@ def _value(
     seconds, metres = _exposure(requirement, figures, drive, n)
     return DriveValue(
         drive.log, name, value, n, baseline, seconds, metres,
-        math.nan if std is None else std[0], same=other.needed and value == baseline,
+        math.nan if std is None else std[0], same=needed and value == baseline, factors=drive.factors,
     )  # fmt: skip
 
 
@@ -226,12 +208,12 @@ def _with_blocks(
     requirement: Requirement,
     value: DriveValue,
     drive: JudgedDrive,
-    against: tuple[Figures, Mapping[str, JudgedDrive]] | None,
+    against: Against | None,
 ) -> DriveValue:
     """Return the metric of a drive with its blocks, which also state the exposure."""
     estimated = math.isfinite(value.std)
     blocks = _blocks_of(requirement, drive, estimated=estimated)
-    if requirement.baseline == RUN:
+    if requirement.other_run is not None:
         partner = None if against is None else against[1].get(drive.log)
         theirs = None if partner is None else _blocks_of(requirement, partner, estimated=estimated)
         blocks = _paired(blocks, theirs)
@@ -242,7 +224,17 @@ def _with_blocks(
 
 def _blocks_of(requirement: Requirement, drive: JudgedDrive, *, estimated: bool) -> RequirementBlocks | None:
     measured = requirement.measured
-    return next((b for b in drive.read_blocks() if b.of == measured and b.estimated == estimated), None)
+    blocks = from_document((drive.read_report() or {}).get("requirement_blocks") or ())
+    return next((b for b in blocks if b.of == measured and b.estimated == estimated), None)
+
+
+def _with_space(value: DriveValue, report: Mapping[str, Any]) -> DriveValue:
+    """Return the metric of a drive with its operating space."""
+    space = report.get("operating_space") or {"cells": ()}
+    edges = [space.get(key) or () for key in ("speed_edges_m_s", "ay_edges_m_s2")]
+    cells = {(edges[0][c["speed"]], edges[1][c["ay"]]): c["seconds"] for c in space["cells"]}
+    friction = space.get("friction_median")
+    return replace(value, space=cells, friction=math.nan if friction is None else float(friction))
 
 
 def _exposure(requirement: Requirement, figures: Figures, drive: JudgedDrive, n: int) -> tuple[float, float]:
@@ -270,19 +262,25 @@ def _why_missing(
     requirement: Requirement,
     figures: Figures,
     drives: Sequence[JudgedDrive],
-    against: tuple[Figures, Mapping[str, JudgedDrive]] | None,
+    against: Against | None,
 ) -> str:
     """Return why no drive has the metric of a requirement."""
-    if requirement.baseline == RUN and against is None:
-        return "the baseline is another run: pdhef compare A B --plan PLAN"
+    if requirement.other_run is not None and against is None:
+        how = "pdhef compare A B --plan PLAN" if requirement.other_run == RUN else "see the verdict on the run"
+        return f"the baseline is another run: {how}"
     names = {d.log: name for d in drives if (name := requirement.estimator or figures.main(d))}
     if not names:
         return "there are several recorded estimates: name one with estimator" if figures.names else "no estimate"
+    return _why_unscored(requirement, figures, names)
+
+
+def _why_unscored(requirement: Requirement, figures: Figures, names: Mapping[str, str]) -> str:
+    """Return why no drive has the metric of the estimators ``names`` by log."""
     scored = [log for log, name in names.items() if figures.of(log, name, requirement, requirement.metric)]
     tainted = [log for log in scored if (log, names[log], requirement.signal, "all", NOT_INDEPENDENT) in figures.values]
     if scored and len(tainted) == len(scored):
         return "the ground truth is an input of the estimator: not an independent check"
-    if scored and requirement.baseline not in (None, RUN):
+    if scored and requirement.baseline != requirement.other_run:
         return f"{requirement.baseline} has no such value: add it to --estimators"
     if requirement.segment != "all" and any(
         (log, name, requirement.signal, "all", requirement.metric) in figures.values for log, name in names.items()
@@ -290,4 +288,5 @@ def _why_missing(
         return f"no scored driving in {requirement.segment}"
     if requirement.estimator is not None and not any(requirement.estimator in n for n in figures.names.values()):
         return f"{requirement.estimator} did not run: add it to --estimators"
-    return f"no ground truth of {requirement.signal}"
+    above = " above the low-speed limit" if requirement.signal == "sideslip_rad" else ""
+    return f"no ground truth of {LABELS[requirement.signal]}{above}"

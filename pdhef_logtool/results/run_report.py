@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.compiled.sources import compiled_digest
+from pdhef_logtool.evaluation.dead_reckoned import PathDrift
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S, Cell
 from pdhef_logtool.evaluation.reasons import ReasonFacts, SensorFault
 from pdhef_logtool.evaluation.standing import Standing
-from pdhef_logtool.evaluation.units import typed_unit
 from pdhef_logtool.logs.byte_account import ByteLedger, checksummed_share
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.ledger import SampleCount
@@ -160,6 +160,18 @@ class DriveDetails:
     operating_space: Sequence[Cell]
     metadata: Mapping[str, str]
     largest_errors: Sequence[LargestError] = ()
+    friction_median: float | None = None
+    path_drift: PathDrift | None = None
+
+    @property
+    def space(self) -> dict[str, Any]:
+        """The operating space as JSON-able values."""
+        return {
+            "speed_edges_m_s": SPEED_EDGES_M_S,
+            "ay_edges_m_s2": AY_EDGES_M_S2,
+            "cells": self.operating_space,
+            "friction_median": self.friction_median,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +248,7 @@ class LogOutcome:
     ``failed`` is the one-line reason if nothing came out; ``lost`` states what of the log could not be used.
     ``main``: the estimator of the selected estimate. ``folder`` of the log, below the folder of the run.
     ``algorithms``: the identity of each estimator that ran. ``files``: sha256 by name of the files in the log's folder
-    that commands read back.
+    that commands read back. ``day`` (UTC) and ``route``: drives that share them depend on one another.
     """
 
     log: str
@@ -252,6 +264,8 @@ class LogOutcome:
     folder: str = ""
     algorithms: Mapping[str, str] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
+    day: str | None = None
+    route: str | None = None
 
     @property
     def outcome(self) -> str:
@@ -358,12 +372,12 @@ def _selected(document: Mapping[str, Any], main: MainFacts | None, details: Driv
 
 def _detailed(details: DriveDetails) -> dict[str, Any]:
     """Return the keys that only a run writes."""
-    space = {"speed_edges_m_s": SPEED_EDGES_M_S, "ay_edges_m_s2": AY_EDGES_M_S2, "cells": details.operating_space}
     values = {
         "faults": details.faults,
         "innovations": details.innovations,
         "error_budget": details.error_budget,
-        "operating_space": space,
+        "operating_space": details.space,
+        "path_drift": details.path_drift,
         "metadata": dict(details.metadata),
         "largest_errors": details.largest_errors,
     }
@@ -463,6 +477,8 @@ def build_run(
                 "algorithms": o.algorithms,
                 "car": o.car,
                 "files": o.files,
+                "day": o.day,
+                "route": o.route,
             }
             for o in outcomes
         ],
@@ -486,39 +502,23 @@ def write_json(path: Path, document: Mapping[str, Any], *, brief: bool = False) 
 
 
 def report_markdown(report: Mapping[str, Any]) -> str:
-    """Return the document of :func:`build_report` as Markdown for people; angles in degrees."""
-    log = report["log"]
-    lines = [
-        f"# {log['name']}",
-        "",
-        f"{log['file']} ({log['kind']}), {log['duration_s']:.1f} s, sha256 {log['sha256'][:12]}; "
-        f"vehicle {report['vehicle']['name']}",
-        "",
-    ]
+    """Return the document of :func:`build_report` in a few words, as Markdown for viewers; the page has the figures."""
+    log, requirements = report["log"], (report.get("plan") or {}).get("requirements") or ()
+    lines = [f"# {log['name']}", "", f"{log['file']} ({log['kind']}), {log['duration_s']:.1f} s", ""]
+    lines += _bullets("Requirements", [f"**{r['outcome']}** {r['label']}: {r['reason']}" for r in requirements])
     if answer := report.get("answer"):
-        lines += _bullets("Answer", [text for text in answer["texts"].values() if text])
+        lines += _bullets("Selected estimate", [text for text in answer["texts"].values() if text])
     lines += _bullets("Warnings", report["warnings"])
     lines += _bullets("Remarks", report.get("remarks", ()))
     lines += _bullets("Losses", [f"{x['what']} ({x['where']})" for x in report["losses"]])
-    lines += _truth_lines(report["truth"])
-    if friction := friction_line(report):
-        lines += [f"Friction: {friction}", ""]
-    not_causal = {e["name"] for e in report["estimators"] if not e["causal"]}
-    signals = dict.fromkeys(m["signal"] for m in report["metrics"])
-    for signal in sorted(signals, key=lambda s: s != "sideslip_rad"):
-        lines += _metric_table(signal, [m for m in report["metrics"] if m["signal"] == signal], not_causal)
-    lines += ["## Estimators", ""]
+    estimators = []
     for e in report["estimators"]:
         happened = [diverged_line(report, e["name"]), reasons_line(e, log["start_ns"])]
         skipped = [f"skipped: {e['reason']}"] if e["reason"] else []
         notes = "; ".join([*skipped, *e["notes"], *e.get("intervals", ()), *filter(None, happened)])
         kind = "causal" if e["causal"] else "not causal"
-        lines.append(f"- **{e['name']}** ({kind})" + (f": {notes}" if notes else ""))
-    lines += ["", "## Signals", ""]
-    lines += [_source_line(s) for s in report["mapping"]["signals"]]
-    lines += [f"- {name}: missing" for name in report["mapping"]["missing"]]
-    lines += ["", "Versions: " + ", ".join(f"{k} {v}" for k, v in sorted(report["versions"].items()))]
-    return "\n".join(lines) + "\n"
+        estimators.append(f"**{e['name']}** ({kind})" + (f": {notes}" if notes else ""))
+    return "\n".join([*lines, *_bullets("Estimators", estimators)])
 
 
 def diverged_line(report: Mapping[str, Any], name: str) -> str:
@@ -559,58 +559,5 @@ def _reason_text(reason: Mapping[str, Any], start_ns: int) -> str:
     return text if within > _THROUGHOUT else f"{text} ({within:.0%} of it)"
 
 
-def friction_line(report: Mapping[str, Any]) -> str:
-    """Return where a report's friction came from and what its estimate was worth; empty where none was needed."""
-    friction = report.get("friction")
-    if friction is None:
-        return ""
-    text: str = friction["source"]
-    return f"{text}, {friction['summary']}" if friction["summary"] else text
-
-
 def _bullets(title: str, items: Sequence[str]) -> list[str]:
     return [f"## {title}", "", *(f"- {item}" for item in items), ""] if items else []
-
-
-def _source_line(source: Mapping[str, Any]) -> str:
-    how = f"; {source['derivation']}" if source["derivation"] else ""
-    return f"- {source['name']}: `{source['source']}`, {source['samples']} samples{how}"
-
-
-def _truth_lines(truth: Mapping[str, Any]) -> list[str]:
-    lines = ["## Ground truth", ""]
-    if not truth["available"]:
-        lines.append("- no ground truth in this log")
-    lines += [_source_line(q) for q in truth["quantities"]]
-    if truth["latency_s"] is not None:
-        lines.append(f"- latency {truth['latency_s'] * 1e3:.1f} ms")
-    if truth["not_independent"]:
-        lines.append(f"- not independent of the estimators' inputs: {', '.join(truth['not_independent'])}")
-    return [*lines, *(f"- {note}" for note in truth["notes"]), ""]
-
-
-def _metric_table(signal: str, rows: Sequence[Mapping[str, Any]], not_causal: set[str]) -> list[str]:
-    metrics = list(dict.fromkeys((m["metric"], m["unit"]) for m in rows))
-    shown = [(name, unit, typed_unit(unit) if unit in ("rad", "rad/s") else (unit, 1.0)) for name, unit in metrics]
-    heads = [name if unit[0] in ("", "1") else f"{name} [{unit[0]}]" for name, _, unit in shown]
-    lines = [
-        f"## {signal}",
-        "",
-        "| estimator | segment | " + " | ".join(heads) + " |",
-        "| --- | --- |" + " ---: |" * len(heads),
-    ]
-    groups = dict.fromkeys((m["estimator"], m["segment"]) for m in rows)
-    for estimator, segment in sorted(groups, key=lambda g: g[0] in not_causal):  # those are apart, below
-        values = {
-            (m["metric"], m["unit"]): m["value"]
-            for m in rows
-            if m["estimator"] == estimator and m["segment"] == segment
-        }
-        cells = [_number(values.get((name, unit)), factor) for name, unit, (_, factor) in shown]
-        mark = " (not causal)" if estimator in not_causal else ""
-        lines.append(f"| {estimator}{mark} | {segment} | " + " | ".join(cells) + " |")
-    return [*lines, ""]
-
-
-def _number(value: float | None, factor: float) -> str:
-    return "-" if value is None else f"{value * factor:.4g}"

@@ -44,6 +44,7 @@ class MainFacts:
     distrusted : whether the lateral consistency contradicts the preferred one.
     naive : what an estimate is worth anything against, None if it did not run. shown : what a person is shown; all that
         ran where the estimators were ``named``.
+    over_time : estimators selected on line with the stamp, ns, from which on each is; empty: ``name`` throughout.
     """
 
     name: str
@@ -53,6 +54,12 @@ class MainFacts:
     naive: str | None
     shown: Sequence[str]
     named: bool
+    over_time: Sequence[tuple[int, str]] = ()
+
+    @property
+    def spans(self) -> Sequence[tuple[int, str]]:
+        """The selected estimators, each with the stamp from which on it is selected."""
+        return self.over_time or ((0, self.name),)
 
 
 def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
@@ -76,6 +83,7 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
         "naive": main.naive,
         "shown": list(main.shown),
         "named": main.named,
+        **({"over_time": [{"since_ns": t, "name": name} for t, name in main.over_time]} if main.over_time else {}),
         "best_in_hindsight": best,
         "texts": texts,
     }
@@ -228,6 +236,8 @@ def _assumed(report: Report, main: MainFacts) -> list[str]:
     if calibration is not None and modelled:
         if calibration["refused"]:
             said.append(f"not calibrated on this log: {calibration['refused']}")
+        elif not calibration["parameters"]:
+            said.append(calibration["text"])
         if calibration["understeer"] is not None and calibration["understeer"]["contradicts"]:
             said.append("the understeer gradient of the drive contradicts the file")
     if friction is not None and modelled:

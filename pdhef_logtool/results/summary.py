@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pdhef_logtool.results.drive_rows import independent_figures
 from pdhef_logtool.results.fleet import ANSWER, JUDGED, Failures, grouped
 from pdhef_logtool.results.opened_run import OpenedRun
 
@@ -75,7 +76,7 @@ def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> R
     """Return the summary of a run; raises OutputError where metrics.parquet is damaged."""
     import polars as pl
 
-    errors = _sideslip_errors(run)
+    errors = independent_figures(run, JUDGED, "rmse")
     answers = errors.filter(pl.col("estimator") == pl.col("main"))
     error_rows = [ErrorsOf(ANSWER, *_spread(answers))] if answers.height else []
     for name in _RIVALS:
@@ -97,21 +98,6 @@ def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> R
         checks_failed=tuple(checks_failed),
         plan=run.document.get("plan"),
     )
-
-
-def _sideslip_errors(run: OpenedRun) -> pl.DataFrame:
-    """Return log, estimator, value (RMSE of sideslip in rad) and main (selected), where ground truth is independent."""
-    import polars as pl
-
-    mains = pl.DataFrame(
-        {"log": [log.label for log in run.logs], "main": [str(log.entry.get("main") or "") for log in run.logs]},
-        schema={"log": pl.String, "main": pl.String},
-    )
-    rows = run.metrics().filter((pl.col("segment") == "all") & (pl.col("signal") == JUDGED))
-    dependent = rows.filter(pl.col("metric") == "not_independent").select("log", "estimator")
-    scored = rows.filter((pl.col("metric") == "rmse") & pl.col("value").is_finite())
-    scored = scored.select("log", "estimator", "value").join(dependent, on=["log", "estimator"], how="anti")
-    return scored.collect().join(mains, on="log").sort("log", "estimator")
 
 
 def _spread(errors: pl.DataFrame) -> tuple[int, float, float, float]:

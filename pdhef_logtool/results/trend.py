@@ -11,6 +11,7 @@ import numpy as np
 
 from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.results.comparing import ComparedFigure, compared_figure
+from pdhef_logtool.results.drive_rows import independent_figures
 from pdhef_logtool.results.gate import MAIN, Figure
 from pdhef_logtool.results.opened_run import OpenedRun
 from pdhef_logtool.results.paired_change import holm
@@ -74,18 +75,9 @@ class Trend:
 
 
 def _to_dict(row: TrendRow) -> dict[str, Any]:
-    return {
-        "run": row.run,
-        "logs": row.logs,
-        "failed": row.failed,
-        "scored": row.scored,
-        "median": row.median,
-        "unit": row.unit,
-        "previous": _change(row.previous, row.p_previous),
-        "first": _change(row.first, row.p_first),
-        "differences": row.differences,
-        "regression": row.regression,
-    }
+    plain = ("run", "logs", "failed", "scored", "median", "unit", "differences", "regression")
+    changes = {"previous": _change(row.previous, row.p_previous), "first": _change(row.first, row.p_first)}
+    return {**{key: getattr(row, key) for key in plain}, **changes}
 
 
 def _change(figure: ComparedFigure | None, p: float) -> dict[str, Any] | None:
@@ -154,28 +146,11 @@ def trend_of(runs: Sequence[OpenedRun], figure: Figure, cluster: str | None = No
 
 def _median(run: OpenedRun, figure: Figure) -> tuple[int, float, str]:
     """Return how many drives of a run have the figure, its median over them, and its unit."""
-    import polars as pl
-
-    mains = {log.label: log.main() for log in run.logs}
-    rows = (
-        run.metrics()
-        .filter(
-            (pl.col("signal") == figure.signal)
-            & pl.col("segment").is_in(["all", figure.segment])
-            & pl.col("metric").is_in(["not_independent", figure.metric])
-        )
-        .select("log", "estimator", "segment", "metric", "value", "unit")
-        .collect()
-    )
-    dependent = set(rows.filter(pl.col("metric") == "not_independent").select("log", "estimator").iter_rows())
-    values, unit = [], ""
-    for log, estimator, segment, metric, value, of_unit in rows.iter_rows():
-        wanted = mains.get(log) if figure.estimator == MAIN else figure.estimator
-        is_figure = (segment, metric, estimator) == (figure.segment, figure.metric, wanted)
-        if is_figure and value is not None and math.isfinite(value) and (log, estimator) not in dependent:
-            values.append(value)
-            unit = of_unit
-    return len(values), float(np.median(values)) if values else math.nan, unit
+    rows = independent_figures(run, figure.signal, figure.metric, figure.segment)
+    wanted = rows["main"] if figure.estimator == MAIN else figure.estimator
+    values = rows.filter(rows["estimator"] == wanted)
+    unit = str(values["unit"][0]) if len(values) else ""
+    return len(values), float(np.median(values["value"].to_numpy())) if len(values) else math.nan, unit
 
 
 def shown_median(row: TrendRow) -> str:

@@ -58,7 +58,7 @@ def compile_part(part: str, tell: Tell) -> None:
     elif part == _CHECKS:
         _compile_checks()
     else:
-        estimator, state = make_estimator(part, Car.load("saloon")), None
+        estimator, state = make_estimator(part, Car.load("saloon"), Options(gnss=True)), None
         for window in _windows():
             _, state = run_window(estimator, window, state)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import tomllib
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -89,9 +89,9 @@ class RunConfig:
         log has shown so far (causal), on the ``pool`` of all logs, or ``off``.
     reference : sideslip reference (not causal, without tyre data): ``auto`` (where the log has no ground truth of
         sideslip), ``on`` (beside ground truth as well) or ``off``.
-    gnss : ``auto`` (the reference uses GNSS velocity where the log has it) or ``off``.
+    gnss : ``auto`` (``physics``, ``pd-hef`` and the reference use GNSS velocity where the log has it) or ``off``.
     no_position : keep latitude, longitude and all other positions and headings out of the outputs; topics that may
-        contain one are not copied. Reduced logs (``cache``) keep them.
+        contain one are not copied, and no reduced logs (``cache``) are written.
     waived : names of checks whose failure is ignored.
     setup : setup.toml of another run of the same car and recorder, from which mounting, units, delays and clocks are
         taken; None = decided on the log.
@@ -141,7 +141,8 @@ class RunConfig:
     @property
     def read_options(self) -> ReadOptions:
         """What of it decides how a log is read."""
-        return ReadOptions(**{f.name: getattr(self, f.name) for f in fields(ReadOptions)})
+        options = ReadOptions(**{f.name: getattr(self, f.name) for f in fields(ReadOptions)})
+        return replace(options, cache=None) if self.no_position else options
 
     @property
     def kept(self) -> Keep:
@@ -197,15 +198,7 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
         from pdhef_logtool.estimators.table import check_names  # inspect takes none, and no compiler
 
         check_names(config.estimators)
-    if config.cache is not None and config.annotate == "full":
-        raise UsageError(
-            expected="--annotate sidecar or none with --cache",
-            got="full",
-            where="--annotate",
-            remedy="a full copy reads all of each log: leave out --cache",
-        )
-    if config.cache_max_gb is not None and (config.cache is None or is_url(config.cache)):
-        raise UsageError(expected="--cache DIR", got=config.cache or "none", where="cache_max_gb")
+    _check_cache(config)
     if config.setup is not None and config.setup_from_s is not None:
         raise UsageError(expected="--setup or --setup-from", got="both", where="--setup")
     # Times are understood without a log, so that a typing error is given before the first log is opened.
@@ -213,6 +206,25 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
         if text is not None:
             parse_time(text, 0, 0, option=name)
     return config
+
+
+def _check_cache(config: RunConfig) -> None:
+    if config.cache is not None and config.annotate == "full":
+        raise UsageError(
+            expected="--annotate sidecar or none with --cache",
+            got="full",
+            where="--annotate",
+            remedy="a full copy reads all of each log: leave out --cache",
+        )
+    if config.cache is not None and config.no_position:
+        raise UsageError(
+            expected="--cache or --no-position",
+            got="both",
+            where="--cache",
+            remedy="reduced logs contain the positions of their logs: leave out --cache",
+        )
+    if config.cache_max_gb is not None and (config.cache is None or is_url(config.cache)):
+        raise UsageError(expected="--cache DIR", got=config.cache or "none", where="cache_max_gb")
 
 
 def parse_assignments(texts: Sequence[str]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.corrected import CorrectedPhysics
+from pdhef_logtool.estimators.gnss_aided import GnssAided
 from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
 from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
 from pdhef_logtool.evaluation.blocks import row_blocks
@@ -87,7 +88,7 @@ def sample_drive(signals: Signals, truth: StateTrack | None, weight: FloatArray)
 
 def bare_filter(estimator: Estimator, signals: Signals) -> tuple[Estimator, Signals]:
     """Return what runs under a fallback and self-calibration, and what it is given of a drive's signals."""
-    while isinstance(estimator, SelfCalibrated | OnlineCalibrated | CorrectedPhysics):
+    while isinstance(estimator, SelfCalibrated | OnlineCalibrated | GnssAided | CorrectedPhysics):
         if isinstance(estimator, SelfCalibrated):
             signals = estimator.given(signals)
         estimator = estimator.physics if isinstance(estimator, CorrectedPhysics) else estimator.estimator

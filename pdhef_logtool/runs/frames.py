@@ -50,7 +50,8 @@ class Estimates:
 def choose(drive: Drive, names: Sequence[str] | None = None) -> tuple[list[Estimator], list[Skipped]]:
     """Return the estimators that a drive and its car let run, and those that they do not; ``names`` as for estimate."""
     names = default_names(drive.car, drive.available) if names is None else names
-    return runnable(names, drive.car, drive.available, Options(drive.options.use_speed), drive.plan.refused)
+    options = Options(drive.options.use_speed, gnss=True)
+    return runnable(names, drive.car, drive.available, options, drive.plan.refused)
 
 
 def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from hashlib import sha256
 from pathlib import Path
@@ -23,6 +23,7 @@ from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.intervals import TrackCalibrator
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, Skipped, all_specs, runnable
+from pdhef_logtool.evaluation.dependence import day_and_route, factors_of
 from pdhef_logtool.evaluation.requirement_bounds import LEAST_DRIVES
 from pdhef_logtool.evaluation.validation_plan import default_plan
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
@@ -75,7 +76,7 @@ from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 from pdhef_logtool.runs.reference_audit import audit_truth
 from pdhef_logtool.runs.referencing import DriveReference, reference_of
 from pdhef_logtool.runs.scoring import Evaluation, evaluate, in_time
-from pdhef_logtool.runs.selection import candidates, choose_main, contradiction, default_names
+from pdhef_logtool.runs.selection import choose_main, choose_over_time, contradiction, default_names
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore
 from pdhef_logtool.storage.documents import file_sha256, jsonable
@@ -85,9 +86,10 @@ from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder, check
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
     from pdhef_logtool.evaluation.metrics import MetricRow
-    from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
+    from pdhef_logtool.evaluation.metrics.metric import SensorErrors
     from pdhef_logtool.evaluation.validation_plan import ValidationPlan
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
+    from pdhef_logtool.results.run_report import DriveDetails
     from pdhef_logtool.results.selected_estimate import MainFacts
     from pdhef_logtool.storage.object_store import Mirror
 
@@ -218,9 +220,12 @@ class RunResult:
 def read_validation_plan(config: RunConfig, junit: Path | None) -> ValidationPlan:
     """Return the configured plan or the default one; raises UsageError when it is wrong or misses for ``junit``."""
     from pdhef_logtool.evaluation.validation_plan import load_plan
+    from pdhef_logtool.results.plan_against import other_runs
 
     if config.plan is not None:
-        return load_plan(config.plan)
+        plan = load_plan(config.plan)
+        other_runs(plan, ())  # a missing one ends the command before the work
+        return plan
     if junit is not None:
         raise UsageError(
             expected="a validation plan to give verdicts on", got="none", where="--junit", remedy="--plan FILE"
@@ -235,29 +240,26 @@ def judge(
 
     ``metrics``: the figures of all logs, None where they are at hand.
     """
-    from pdhef_logtool.results.plan_verdicts import (
-        JudgedDrive,
-        figures_of_file,
-        figures_of_rows,
-        plan_verdicts,
-    )
+    from pdhef_logtool.results.plan_against import other_runs
+    from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_file, figures_of_rows, plan_verdicts
 
     done = [r for r in results if r.outcome.failed is None or r.document is not None]
-    drives = [JudgedDrive(r.outcome.log, r.outcome.main, partial(_blocks, r)) for r in done]
+    drives = [
+        JudgedDrive(o.log, o.main, partial(_report, r), factors_of(asdict(o), None)) for r in done if (o := r.outcome)
+    ]
     if metrics is None:
         figures = figures_of_rows(row for r in done for row in r.rows)
     else:
         import polars as pl
 
         figures = figures_of_file(pl.scan_parquet(metrics), plan, [d.main for d in drives])
-    return plan_verdicts(plan, figures, drives, strict=strict)
+    logs = [OpenedLog(o.log, o.outcome, Path(), asdict(o)) for r in done if (o := r.outcome)]
+    return plan_verdicts(plan, figures, drives, strict=strict, against=other_runs(plan, logs))
 
 
 @lru_cache(maxsize=LEAST_DRIVES)
-def _blocks(result: LogResult) -> list[RequirementBlocks]:
-    from pdhef_logtool.results.plan_verdicts import blocks_of
-
-    return blocks_of(result.report)
+def _report(result: LogResult) -> dict[str, Any] | None:
+    return result.report
 
 
 def write_verdicts(junit: Path | None, verdicts: PlanVerdicts, results: Sequence[LogResult]) -> None:
@@ -325,6 +327,10 @@ class _Job:
     requested: frozenset[str]
     validation: ValidationPlan
 
+    def sensors(self, calibration: SelfCalibration | None) -> SensorErrors:
+        """Return the errors of the log's sensors that a calibration states."""
+        return log_sensors(self.drive.car.vehicle, calibration, told_friction=self.drive.friction.bank is None)
+
 
 def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporter: Reporter) -> LogResult:
     """Estimate, score and write one drive."""
@@ -337,10 +343,15 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
         job = replace(job, ready=_without_failed(drive, job.ready, causality.failed))
         scored = _score(job, store, signals)
         main = choose_main(job.ready, scored.rows, proven=drive.car.has_evidence, named=config.estimators is not None)
-        left_out = frozenset(e.name for e in job.ready) - job.requested - {main.name}
+        if config.calibrate == "online" and job.calibration is not None and not drive.car.has_evidence:
+            main = replace(
+                main, over_time=choose_over_time(job.ready, job.calibration, store.read, signals, job.sensors)
+            )
+            main = replace(main, name=main.over_time[-1][1])
+        left_out = frozenset(e.name for e in job.ready) - job.requested - {name for _, name in main.spans}
         job, scored, main = _without(left_out, job, scored, main)
         shown = _shown(main, [e.name for e in job.ready])
-        sinks = opened.enter_context(_open_sinks(change, job, config, shown, outputs.path, len(signals)))
+        sinks = opened.enter_context(_open_sinks(change, job, config, shown, main.spans, outputs.path, len(signals)))
         _write(store, sinks, left_out | frozenset(causality.failed))
         if intervals.warning:
             drive.tell(intervals.warning)
@@ -367,7 +378,7 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
 def _score(job: _Job, store: TrackStore, signals: Signals) -> Evaluation:
     """Score the stored tracks; add the events of an estimated friction and a contradiction as a note of the drive."""
     drive = job.drive
-    sensors = log_sensors(drive.car.vehicle, job.calibration)
+    sensors = job.sensors(job.calibration)
     scored = evaluate(drive, [e.name for e in job.ready], store.read, signals, sensors)
     if drive.friction.bank is not None:
         observable = friction_events(drive.friction, signals)
@@ -440,18 +451,21 @@ def _facts(
     estimators += [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in job.skipped]
     digests = {name: a.sha256[:SHOWN_DIGITS] for name, a in algorithms.items()}
     rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows]
+    details = drive_details(drive, job.ready, main.name, store.read, signals, brief=config.kept != "full")
     return replace(
         report_facts(drive, job.car, estimators, rows, scored.events, losses),
         friction=friction_facts(drive.friction),
         calibration=None if job.calibration is None else job.calibration.to_dict(),
         reference=None if job.reference is None else job.reference.document,
         main=main,
-        details=drive_details(drive, job.ready, main.name, store.read, signals, brief=config.kept != "full"),
-        requirements=_requirements(job, main.name, scored, store, brief=config.kept == "metrics"),
+        details=details,
+        requirements=_requirements(job, main.name, scored, store, details, brief=config.kept == "metrics"),
     )
 
 
-def _requirements(job: _Job, main: str, scored: Evaluation, store: TrackStore, *, brief: bool) -> RequirementFacts:
+def _requirements(
+    job: _Job, main: str, scored: Evaluation, store: TrackStore, details: DriveDetails, *, brief: bool
+) -> RequirementFacts:
     """Return the blocks of the plan's requirements in this drive, and the verdicts on the drive alone."""
     from pdhef_logtool.evaluation.requirement_blocks import MOST_BLOCKS, ScoredDrive, requirement_blocks
     from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_rows, plan_verdicts
@@ -464,7 +478,8 @@ def _requirements(job: _Job, main: str, scored: Evaluation, store: TrackStore, *
         slow, dependent = drive.car.vehicle.low_speed_blend_m_s, frozenset(drive.plan.dependent)
         tracks = ScoredDrive(store.read, base, scored.masks, slow, dependent, estimated=truth is None)
         blocks = requirement_blocks(job.validation.requirements, main, tracks, _BRIEF_BLOCKS if brief else MOST_BLOCKS)
-    judged = JudgedDrive(drive.name, main, lambda: blocks)
+    report = {"requirement_blocks": jsonable(blocks), "operating_space": jsonable(details.space)}
+    judged = JudgedDrive(drive.name, main, lambda: report, {"car": job.car.vehicle.name})
     return RequirementFacts(plan_verdicts(job.validation, figures_of_rows(scored.rows), [judged]), blocks)
 
 
@@ -507,6 +522,7 @@ def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
         truth_sha256=drive.truth_sha256,
         mapping_sha256=drive.mapping.sha256,
         lost=lost_texts(losses),
+        **day_and_route(drive.plan.start_ns, drive.log.metadata()),
     )
 
 
@@ -518,10 +534,10 @@ def _choose_estimators(
     Candidates for the selected estimate run in any case. Raises EstimatorError if no requested estimator can.
     """
     names = config.estimators or default_names(car, drive.available)
-    options, refused = Options(drive.options.use_speed), drive.plan.refused
+    options, refused = Options(drive.options.use_speed, gnss=config.gnss == "auto"), drive.plan.refused
     estimators, skipped = runnable(names, car, drive.available, options, refused)
     requested = frozenset(e.name for e in estimators)
-    more = [name for name in candidates(car, drive.available) if name not in requested]
+    more = [name for name in default_names(car, drive.available) if name not in requested]
     estimators += runnable(more, car, drive.available, options, refused)[0] if more else []
     if not requested:
         raise EstimatorError(
@@ -549,11 +565,17 @@ def _causal_from_ns(drive: Drive, estimators: Sequence[Estimator]) -> dict[str, 
 
 @contextmanager
 def _open_sinks(
-    change: FolderTransaction, job: _Job, config: RunConfig, shown: Shown, output: Path, rows: int
+    change: FolderTransaction,
+    job: _Job,
+    config: RunConfig,
+    shown: Shown,
+    selected: Sequence[tuple[int, str]],
+    output: Path,
+    rows: int,
 ) -> Iterator[list[Sink]]:
     """Yield the outputs of a run that are fed window by window; on an exception they are aborted.
 
-    ``rows`` : stamps of a track.
+    ``selected`` : estimators, each from a stamp on. ``rows`` : stamps of a track.
     """
     from pdhef_logtool.mapping.recognition import FIX_TYPES
     from pdhef_logtool.results.layouts import LayoutsSink
@@ -566,7 +588,7 @@ def _open_sinks(
     try:
         if config.kept != "metrics":
             causal_from_ns = _causal_from_ns(drive, job.ready)
-            sinks.append(EstimatesSink(change.file(ESTIMATES_FILE), selected=shown.main, causal_from_ns=causal_from_ns))
+            sinks.append(EstimatesSink(change.file(ESTIMATES_FILE), selected=selected, causal_from_ns=causal_from_ns))
         if config.annotation != "none":
             source = drive.log if config.annotation == "full" else None
             if source is not None and source.messages is None:
@@ -808,7 +830,7 @@ def check_places(
     cars: Sequence[Path | None] = (),
 ) -> None:
     """Refuse to write over what is read; raises UsageError."""
-    can = () if mapping is None or mapping.can is None else mapping.can.dbc
+    can = () if mapping is None else mapping.dbc
     files = [] if output is None else [output / name for name in (METRICS_FILE, RUN_FILE, PAGE_FILE)]
     folders = [] if output is None else [output / log_place(i.stem) for i in inputs]
     files += [folder / name for folder in folders for name in LOG_FILES]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,10 +28,13 @@ from pdhef_logtool.drive.truth import (
     valid_as_a_whole,
 )
 from pdhef_logtool.drive.windows import DrivePlan, sample_ledger
+from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.drive_log import DriveLog, windows
+from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import check_mapping, join_channels, mapping_of, merge_losses, read_signals
+from pdhef_logtool.mapping.choosing import mapping_for_recorder
 from pdhef_logtool.mapping.estimates import EstimateSource, choose_estimates, sources_of
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.ledger import Role, damage
@@ -69,6 +72,7 @@ from pdhef_logtool.runs.pipeline import (
     write_verdicts,
 )
 from pdhef_logtool.runs.scoring import diverged_events, in_time, segment_events
+from pdhef_logtool.storage.documents import jsonable
 from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder
 
 if TYPE_CHECKING:
@@ -112,6 +116,10 @@ def score_log(
     log_input = one_log(argument, config.read_options)
     car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS, sensors=config.sensor_profile)
     mapping = mapping_of(config.mapping)
+    if mapping is not None and mapping.recorders:
+        reading = config.read_options
+        with closing(open_log(log_input.path, reading.limits, reading.msgs, Wanted(frozenset()))) as log:
+            mapping = mapping_for_recorder(log, mapping)
     validation = read_validation_plan(config, junit)
     if config.car is None:
         slow = car.vehicle.low_speed_blend_m_s
@@ -363,7 +371,7 @@ class _Scoring:
         """Return the verdicts of the plan on the log."""
         from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_rows, plan_verdicts
 
-        judged = JudgedDrive(log, None, lambda: blocks)
+        judged = JudgedDrive(log, None, lambda: {"requirement_blocks": jsonable(blocks)})
         return RequirementFacts(plan_verdicts(self.validation, figures_of_rows(rows), [judged]), blocks)
 
     def _events(

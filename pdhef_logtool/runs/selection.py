@@ -5,9 +5,12 @@ See docs/method.md#selection.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
+
+import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import PHYSICS
@@ -17,15 +20,22 @@ from pdhef_logtool.records.tracks import REFERENCE
 from pdhef_logtool.results.selected_estimate import MainFacts
 
 if TYPE_CHECKING:
+    from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
     from pdhef_logtool.evaluation.metrics import MetricRow
+    from pdhef_logtool.evaluation.metrics.metric import SensorErrors
+    from pdhef_logtool.records.signals import Signals
+    from pdhef_logtool.records.tracks import StateTrack
 
-#: The preferred estimator, and those it is checked against: models that explain the yaw rate by the steering. ``zero``
-#: agrees with an accelerometer near the rear axle, and ``kinematic`` integrates the residual that ``d2`` measures.
+#: The preferred estimator, and those that run beside it where no driving has validated the car.
 PREFERRED = "pd-hef"
 SIMPLE = ("open-loop", "open-loop:calibrated", "phy-ukf", "physics")
-#: On simulated drives with right and wrong files any estimate beyond 1.05 times the least ``d2`` had at least 1.7 times
-#: its sideslip error (docs/calibration.md).
-FACTOR = 1.2
+#: The two tests: lateral consistency within this factor of the lowest one, yaw consistency within the other. On
+#: simulated drives with right and wrong files this selection has the lowest error (docs/method.md#selection).
+FACTOR, YAW_FACTOR = 1.2, 3.0
+#: Its lateral figure shows nothing, for it integrates the residual that ``d2`` measures.
+_NOT_JUDGED = "kinematic"
+#: Longest driving before a choice on line that decides it.
+_LOOK_BACK_NS = 3600 * 10**9
 #: The baseline of every score. It needs the fewest signals and cannot drift; ``kinematic`` follows the accelerometer's
 #: bias and has a higher error on half of the recorded drives.
 NAIVE = "zero"
@@ -36,35 +46,51 @@ _LAST = (NAIVE, "zero:no-lateral", REFERENCE)
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """An estimate whose ``d2`` exceeds that of the ``best`` simple estimator by over :data:`FACTOR`; both in m/s."""
+    """An estimate that fails a test, and the ``best`` one that passes both.
+
+    ``figures``, ``other`` : lateral consistency in m/s and yaw consistency in rad/s of the two, NaN where unknown.
+    """
 
     best: str
-    own_d2: float
-    best_d2: float
+    figures: tuple[float, float]
+    other: tuple[float, float]
     name: str = PREFERRED
 
     @property
     def text(self) -> str:
         """The warning of the report."""
+        (d2, yaw), (of_best, yaw_of_best) = self.figures, self.other
         return (
-            f"{self.name} contradicts the sensors: its lateral kinematic consistency is {self.own_d2:.3g} m/s, "
-            f"that of {self.best} {self.best_d2:.3g}; the vehicle file may be wrong"
+            f"{self.name} contradicts the sensors: its lateral consistency is {d2:.3g} m/s and its yaw consistency "
+            f"{yaw:.3g} rad/s, those of {self.best} {of_best:.3g} and {yaw_of_best:.3g}; the vehicle file may be wrong"
         )
 
 
 def contradiction(rows: Iterable[MetricRow], name: str = PREFERRED) -> Contradiction | None:
-    """Return how ``d2`` contradicts an estimate; None if it does not, or without a simple estimator to compare with."""
-    d2 = {r.estimator: r.value for r in rows if (r.metric, r.segment) == ("d2", "all")}
-    simple = {other: d2[other] for other in SIMPLE if other in d2 and other != name}
-    if name not in d2 or not simple:
+    """Return how the tests contradict an estimate; None if they do not, or no other one passes the yaw-rate test.
+
+    A log without steering has no yaw-rate test, and then no estimate to compare with.
+    """
+    d2, yaw = _figures(rows)
+    explain = [n for n, value in yaw.items() if n in d2 and value <= YAW_FACTOR * min(yaw.values())]
+    best = min((n for n in explain if n not in (name, _NOT_JUDGED)), key=lambda n: d2[n], default=None)
+    if name not in d2 or best is None:
         return None
-    best = min(simple, key=lambda other: simple[other])
-    return Contradiction(best, d2[name], simple[best], name) if d2[name] > FACTOR * simple[best] else None
+    passes = d2[name] <= FACTOR * d2[best] and (name in explain or name not in yaw)
+    figures = d2[name], yaw.get(name, math.nan)
+    return None if passes else Contradiction(best, figures, (d2[best], yaw[best]), name)
+
+
+def _figures(rows: Iterable[MetricRow]) -> tuple[dict[str, float], dict[str, float]]:
+    """Return lateral and yaw consistency of a whole drive by estimator."""
+    of_all = [r for r in rows if r.segment == "all"]
+    d2, yaw = ({r.estimator: r.value for r in of_all if r.metric == m} for m in ("d2", "yaw_consistency"))
+    return d2, yaw
 
 
 def _fails(rows: Iterable[MetricRow], name: str) -> bool:
     """Return whether sideslip 0 agrees better with the sensors, at their estimated positions, than an estimate."""
-    d2 = {r.estimator: r.value for r in rows if (r.metric, r.segment) == ("d2", "all")}
+    d2, _ = _figures(rows)
     return name in d2 and NAIVE in d2 and name != NAIVE and d2[name] > FACTOR * d2[NAIVE]
 
 
@@ -79,19 +105,14 @@ def default_names(car: Car, available: frozenset[str]) -> tuple[str, ...]:
     available : signals of the log.
     """
     more = set() if car.has_evidence else set(SIMPLE)
-    if not spec_of(PHYSICS).needs <= available:
+    if "steer_rad" not in available or spec_of(PHYSICS).lacking(available):
         more |= {"open-loop", "kinematic"}
-    able = {name for name in more if spec_of(name).needs <= available}
+    able = {name for name in more if not spec_of(name).lacking(available)}
     return tuple(name for name in all_names(car) if name in {PREFERRED, PHYSICS, NAIVE, *able})
 
 
-def candidates(car: Car, available: frozenset[str]) -> tuple[str, ...]:
-    """Return the estimators that the selected estimate is chosen from, whichever of them a user asks for."""
-    return default_names(car, available)
-
-
 def choose_main(ran: Sequence[Estimator], rows: Iterable[MetricRow], *, proven: bool, named: bool) -> MainFacts:
-    """Return the selected estimator of a log and why; of the figures only ``d2`` counts, which needs no ground truth.
+    """Return the selected estimator of a log and why; of the figures the consistencies count, without ground truth.
 
     Parameters
     ----------
@@ -125,3 +146,36 @@ def choose_main(ran: Sequence[Estimator], rows: Iterable[MetricRow], *, proven: 
         shown=names if named else [n for n in dict.fromkeys((name, PHYSICS, NAIVE)) if n in names],
         named=named,
     )
+
+
+def choose_over_time(
+    ran: Sequence[Estimator],
+    calibration: SelfCalibration,
+    read: Callable[[str], StateTrack | None],
+    signals: Signals,
+    sensors_of: Callable[[SelfCalibration], SensorErrors],
+) -> list[tuple[int, str]]:
+    """Return the selected estimators of a calibration on line, each with the stamp from which on it is selected.
+
+    Each stage of the calibration chooses among the causal estimators by their tests on what came before it.
+
+    Parameters
+    ----------
+    read : returns the track of an estimator [N]. signals : of the drive [N]. sensors_of : a stage of the calibration.
+    """
+    from pdhef_logtool.evaluation.metrics.lateral_consistency import consistency_rows
+    from pdhef_logtool.evaluation.metrics.yaw_consistency import yaw_rows
+
+    causal = [e for e in ran if e.causal]
+    chosen = [(0, choose_main(causal, (), proven=False, named=False).name)]
+    for stage in (*calibration.earlier, calibration)[1:]:
+        first, last = np.searchsorted(signals.stamps_ns, [stage.since_ns - _LOOK_BACK_NS, stage.since_ns]).tolist()
+        tracks = [track.rows(first, last) for e in causal if (track := read(e.name)) is not None]
+        part, masks, sensors = signals.rows(first, last), {"all": np.ones(last - first, np.bool_)}, sensors_of(stage)
+        slow = stage.vehicle_file.low_speed_blend_m_s
+        rows = consistency_rows(tracks, part, masks, log="", low_speed_m_s=slow, sensors=sensors)
+        rows += yaw_rows(tracks, part, masks, log="", sensors=sensors)
+        name = choose_main(causal, rows, proven=False, named=False).name
+        if name != chosen[-1][1]:
+            chosen.append((stage.since_ns, name))
+    return chosen

@@ -31,15 +31,17 @@ if TYPE_CHECKING:
 
 #: Squares are summed window by window, over spans that no window cuts: another length would be another figure.
 _WINDOW_S = 600.0
-_NEEDS = ("steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
+_NEEDS = ("steer_rad", "yaw_rate_rad_s", "speed_m_s")
 
 
 def calibrate_drive(drive: Drive, config: RunConfig) -> SelfCalibration | None:
-    """Return what a drive states of its car; None where nobody asks or the log lacks a sensor for it."""
-    if config.calibrate == "off" or not _asked(config, drive.car) or lacking(drive):
+    """Return what a drive states of its car, its prior where the log lacks a sensor for more; None if nobody asks."""
+    if config.calibrate == "off" or not _asked(config, drive.car):
         return None
-    from pdhef_logtool.estimators.calibration.calibration import calibrate_online, self_calibrate
+    from pdhef_logtool.estimators.calibration.calibration import calibrate_online, prior_calibration, self_calibrate
 
+    if lacking(drive):
+        return prior_calibration(drive.car.vehicle, drive.car.taught_prior)
     if config.calibrate == "online":
         return calibrate_online(read_driving(drive), drive.car.vehicle, taught=drive.car.taught_prior)
     return self_calibrate([read_driving(drive)], drive.car.vehicle, taught=drive.car.taught_prior)
@@ -109,8 +111,11 @@ def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
     """Return the car of a drive with what was found, unless it was refused."""
     if calibration is None or calibration.refused:
         return drive.car
-    online = "its car is calibrated on what the log has shown so far, without ground truth"
-    note = online if calibration.earlier else "not causal: car calibrated on the whole log, without ground truth"
+    causal, note = bool(calibration.earlier), "not causal: car calibrated on the whole log, without ground truth"
+    if causal:
+        note = "its car is calibrated on what the log has shown so far, without ground truth"
+    elif not calibration.parameters:
+        causal, note = True, calibration.text
 
     def applied(stage: SelfCalibration) -> WithoutTruth:
         return WithoutTruth(
@@ -122,28 +127,36 @@ def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
             driven_d2_m_s=stage.driven_d2_m_s,
             since_ns=stage.since_ns,
             earlier=tuple(map(applied, stage.earlier)),
+            cg_std_m=drive.car.cg_std_m,
+            causal=causal,
         )
 
     return replace(drive.car, self_calibrated=applied(calibration))
 
 
-def log_sensors(vehicle: VehicleParameters, calibration: SelfCalibration | None) -> SensorErrors:
+def log_sensors(
+    vehicle: VehicleParameters, calibration: SelfCalibration | None, *, told_friction: bool = True
+) -> SensorErrors:
     """Return what the sensors of a log have that was read with a vehicle: as calibrated on it, else as its file states.
 
-    What is refused for its tyres is no worse for its sensors.
+    What is refused for its tyres is no worse for its sensors. ``told_friction`` : whether that of the signals is given.
     """
-    from pdhef_logtool.estimators.calibration.joint import AY_BIAS, AY_GAIN, IMU_X, RATE_BIAS
+    from pdhef_logtool.estimators.calibration.joint import AY_BIAS, AY_GAIN, IMU_X, RATE_BIAS, STEER_DELAY
     from pdhef_logtool.evaluation.metrics.metric import SensorErrors
 
     if calibration is None or not calibration.parameters:
         gain = 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2
-        return SensorErrors(ay_gain=gain, lever_m=vehicle.imu_position_m[0])
+        return SensorErrors(ay_gain=gain, lever_m=vehicle.imu_position_m[0], vehicle=vehicle)
     fitted = {p.name: p.value for p in calibration.parameters}
     return SensorErrors(
         ay_bias_m_s2=fitted[AY_BIAS] - vehicle.sensors.ay_bias_m_s2,
         yaw_rate_bias_rad_s=fitted[RATE_BIAS] - vehicle.sensors.yaw_rate_bias_rad_s,
         ay_gain=fitted[AY_GAIN],
         lever_m=fitted[IMU_X],
+        vehicle=vehicle if calibration.refused else calibration.vehicle,
+        read_with=vehicle,
+        steer_delay_s=0.0 if calibration.refused else fitted[STEER_DELAY],
+        friction=None if told_friction else calibration.vehicle.assumed_friction,
     )
 
 

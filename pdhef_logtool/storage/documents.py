@@ -277,6 +277,8 @@ def jsonable(value: Any) -> Any:
         return [jsonable(v) for v in value]
     if isinstance(value, PurePath):
         return utf8(str(value))
+    if hasattr(value, "model_dump"):  # of pydantic
+        return jsonable(value.model_dump())
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: jsonable(getattr(value, f.name)) for f in fields(value)}
     import numpy as np

@@ -26,7 +26,7 @@ from pdhef_logtool.storage.files import write_bytes
 from studies.condition_drives import root_mean_square
 from studies.identified_bands import DRIVEN, fit_drives, identified
 from studies.pages import options
-from studies.self_calibration import Simulated, calibrate, make_wrong, simulate, taken
+from studies.self_calibration import Simulated, calibrate, simulate, taken
 
 SEED, CARS = 79_000, 8
 PAIRS = tuple(product((1.0, 0.7, 0.5, 0.35), (1.0, 2.0, 3.0)))
@@ -38,7 +38,7 @@ WORSE = 1.05
 def cases(of_car: list[Simulated]) -> Iterator[tuple[str, Car, Simulated]]:
     """Yield how the car of some drives was taught, the car, and a drive that it is smoothed on."""
     for simulated in of_car:
-        file = make_wrong(simulated.file, *simulated.factors)
+        file = simulated.file.with_stiffness(*simulated.factors)
         calibration = calibrate(simulated.drive.signals, file)
         if not calibration.refused:
             yield "self-calibrated", taken(simulated.drive.signals, file, calibration).calibrated_car, simulated

@@ -31,6 +31,7 @@ from studies.pages import DOCS, DRIVES, RESULTS, options, write
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_of, read_peer_drive, vehicle_of
 from studies.peers.models import Peer, open_loop, peers_of
 from studies.peers.page import OURS, page
+from studies.peers.parameters import pairs_table, parameters_of_drive
 from studies.peers.scoring import DriveErrors, score, usable_sideslip
 
 SEDAN = "open-loop-sedan"
@@ -40,14 +41,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run and score all estimators; write page and results."""
     parser = options("peers", __doc__)
     parser.add_argument("--out", type=Path, default=DOCS, help="folder of peers.md")
-    parser.add_argument("--results", type=Path, default=RESULTS / "peers", help="folder of errors.json")
+    parser.add_argument(
+        "--results", type=Path, default=RESULTS / "peers", help="folder of errors.json and parameters.json"
+    )
     given = parser.parse_args(arguments)
     if not DRIVES.is_dir():
         print("nothing is compared: needs ../shared beside the repository")
         return 0
     documents = [drive_errors(drive).document() for drive in PEER_DRIVES]
     write(given.results / "errors.json", json.dumps(documents, indent=1) + "\n")
-    write(given.out / "peers.md", page([DriveErrors.of(document) for document in documents]))
+    parameters = [found for drive in PEER_DRIVES if (found := parameters_of_drive(drive)) is not None]
+    write(given.results / "parameters.json", json.dumps(parameters, indent=1) + "\n")
+    write(given.out / "peers.md", page([DriveErrors.of(document) for document in documents], pairs_table(parameters)))
     return 0
 
 

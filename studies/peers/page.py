@@ -32,8 +32,8 @@ MARKED = 0.05
 PAGE = Path(__file__).with_suffix(".md")
 
 
-def page(errors: Sequence[DriveErrors]) -> str:
-    """Return the page."""
+def page(errors: Sequence[DriveErrors], parameters: str) -> str:
+    """Return the page; ``parameters`` : table of their agreement."""
     groups = {group: [e for e in errors if e.drive.group == group] for group in (FULL_SIZE, SMALL, OFFSET)}
     full_size = groups[FULL_SIZE]
     offsets = ", ".join(f"{_name(e)} {number(e.offset_deg, 2)}°" for e in groups[OFFSET])
@@ -49,6 +49,7 @@ def page(errors: Sequence[DriveErrors]) -> str:
         offsets=offsets,
         offset=drives_table(groups[OFFSET]),
         marked=MARKED,
+        parameters=parameters,
     )
 
 

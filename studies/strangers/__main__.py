@@ -26,8 +26,11 @@ from studies.strangers.recordings import ITEMS, Recording
 from studies.strangers.scoring import Score, look, score_log
 
 #: What layouts held out gave when they were run for the first time: those now held out, and those that were before.
-FIRST_RUN = RESULTS / "third_party_logs" / "held_out_first_run.json"
-FIRST_RUN_BEFORE = RESULTS / "third_party_logs" / "vehicles_first_run.json"
+FIRST_RUNS = {
+    "held_out": "held-out layouts of table formats were built last",
+    "sensors": "layouts of sensors and controllers were held out before",
+    "vehicles": "layouts of vehicles, simulators and data sets were held out earlier",
+}
 
 
 def result_of(score: Score, name: str, group: str, what: str, page_url: str = "") -> Result:
@@ -100,10 +103,8 @@ def score_others(only: Sequence[str]) -> Iterator[tuple[str, Result]]:
 def first_run() -> str:
     """Return the figures of the first runs of layouts held out, where they are over."""
     said = ""
-    for file, what in (
-        (FIRST_RUN, "held-out layouts were built last"),
-        (FIRST_RUN_BEFORE, "layouts of vehicles, simulators and data sets were held out earlier"),
-    ):
+    for name, what in FIRST_RUNS.items():
+        file = RESULTS / "third_party_logs" / f"{name}_first_run.json"
         if file.is_file():
             logs = json.loads(file.read_text(encoding="utf-8"))
             ends = Counter(outcome for log in logs.values() for outcome in log["items"].values())

@@ -156,7 +156,10 @@ def test_named_estimators_keep_their_table_a_log() -> None:
 
 def test_what_channels_share_stands_once_and_below_the_answer() -> None:
     gaps = [Loss("gap", "no samples for 2 s", f"/a.{i}", 0, 2 * 10**9, severity="note") for i in range(5)]
-    text = shown(named("drive", losses=[*gaps, Loss("bad-chunk", "a chunk", "a.mcap", count=2)]))
+    drive = named("drive", losses=[*gaps, Loss("bad-chunk", "a chunk", "a.mcap", count=2)])
+    text = shown(drive, width=300)
+    interval = rows(text, "95 % CI")[0]
+    assert interval.split("95 % CI")[1].strip() == drive["answer"]["texts"]["band"]
     assert text.count("no samples") == 1
     assert "note: no samples for 2 s (/a.0, /a.1, /a.2 and 2 more, 0.00 to 2.00 s)" in text
     assert text.index("Result") < text.index("lost: 2 × a chunk (a.mcap)") < text.index("note: no samples")

@@ -453,3 +453,40 @@ def test_an_empty_window_and_a_json_plan():
     assert len(align(channels, plan, T0 - 10**12, T0 - 10**11)) == 0
     assert len(align({}, plan, T0, T0 + 10**10)) == 0
     assert json.loads(json.dumps(plan.to_dict())) == plan.to_dict()
+
+
+def test_a_receiver_with_positions_alone_gives_a_velocity_halfway_between_them():
+    fixes = regular(0.0, 10.0, 5)
+    north_m, east_m = 3.0 * seconds(fixes), 2.0 * seconds(fixes) ** 2
+    degree_m = np.radians(1.0) * 6_378_137.0
+    channels = {
+        **imu(),
+        "gnss_latitude_deg": channel("gnss_latitude_deg", fixes, 60.0 + north_m / degree_m, 80 * MS),
+        "gnss_longitude_deg": channel("gnss_longitude_deg", fixes, 18.0 + 2.0 * east_m / degree_m, 80 * MS),
+        "gnss_position_accuracy_m": channel("gnss_position_accuracy_m", fixes, np.full(fixes.size, 0.02), 80 * MS),
+    }
+    plan = plan_of(channels)
+    assert {"gnss_velocity_east_m_s", "gnss_velocity_north_m_s"} <= plan.available
+    signals = whole(channels, plan)
+    seen = np.isfinite(signals.gnss_velocity_m_s[:, 0])
+    assert seen.sum() == fixes.size - 1
+    t = seconds(signals.stamps_ns[seen])
+    east, north = signals.gnss_velocity_m_s[seen].T
+    np.testing.assert_allclose(north, 3.0, atol=1e-3)
+    np.testing.assert_allclose(east, 4.0 * t, atol=0.06)
+    np.testing.assert_allclose(signals.gnss_velocity_std_m_s[seen], np.sqrt(2.0) * 0.02 * 5.0, rtol=1e-6)
+    np.testing.assert_allclose(signals.gnss_late_s[seen], 0.18, atol=0.011)  # half a step, and the delay
+
+
+def test_a_late_velocity_is_at_its_stamp_with_its_delay_and_is_not_waited_for():
+    fixes = regular(0.0, 10.0, 10)
+    velocity = {
+        name: channel(name, fixes, np.full(fixes.size, 7.0), 150 * MS)
+        for name in ("gnss_velocity_east_m_s", "gnss_velocity_north_m_s")
+    }
+    channels = {**imu(), "speed_m_s": channel("speed_m_s", fixes, np.full(fixes.size, 9.0)), **velocity}
+    signals = whole(channels, plan_of(channels))
+    seen = np.isfinite(signals.gnss_velocity_m_s[:, 0])
+    np.testing.assert_allclose(signals.gnss_late_s[seen], 0.15, atol=0.011)
+    assert np.isnan(signals.gnss_late_s[~seen]).all()
+    assert (signals.ready_ns - signals.stamps_ns).max() < 20 * MS

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from itertools import pairwise
+from itertools import islice, pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
 from pdhef_logtool.drive.correlation import parabolic_peak
+from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.drive.truth import (
     dependent_signals,
     derive_truth,
@@ -144,11 +147,11 @@ def test_every_source_gives_the_same_body_velocity(kind):
     np.testing.assert_allclose(track.vx_m_s[good], d.vx[good], atol=2e-4)
     np.testing.assert_allclose(track.vy_m_s[good], d.vy[good], atol=2e-4)
     np.testing.assert_allclose(track.sideslip_rad[good], d.beta[good], atol=1e-5)
+    assert np.isnan(track.ay_m_s2).all()  # a heading has no roll: the specific force is unknown
     if kind != "ecef velocity without position":
-        inner = np.isfinite(track.ay_m_s2)
-        assert inner.mean() > 0.95
+        inner = np.isfinite(track.yaw_rate_rad_s)
+        assert inner.mean() > 0.95 and truth.derivation["ay_m_s2"].startswith("not scored")
         np.testing.assert_allclose(track.yaw_rate_rad_s[inner], d.r[inner], atol=2e-5)
-        np.testing.assert_allclose(track.ay_m_s2[inner], d.ay[inner], atol=2e-3)
     assert {"vx_m_s", "vy_m_s", "sideslip_rad"} <= set(truth.derivation)
     if "position_m" in truth.derivation:
         known = np.isfinite(track.x_m)
@@ -217,8 +220,42 @@ def test_without_a_yaw_rate_velocities_stay_and_the_report_says_so():
     assert np.isnan(truth.track.ay_m_s2).all()
 
 
+@settings(max_examples=20, deadline=None)
+@given(st.floats(-0.2, 0.2), st.floats(0.002, 0.02), st.sampled_from(("quat", "ned frd")))
+def test_specific_force_on_a_bank(bank, gradient, axes):
+    """The oracle: roll of the body = bank + gradient x force, force = v̇_y + v_x r + g sin(bank)."""
+    stamps, d = drive(4.0)
+    force = d.ay + 9.80665 * np.sin(bank * np.sin(d.t))
+    turn = body_to_enu(d) * Rotation.from_rotvec((bank * np.sin(d.t) + gradient * force)[:, None] * [1.0, 0.0, 0.0])
+    attitude = quat(turn if axes == "quat" else NED * turn * FRD)
+    values = {"enu_velocity_m_s": d.velocity, "vx_m_s": d.vx, "vy_m_s": d.vy, "yaw_rate_rad_s": d.r}
+    channels = {n: channel(n, stamps, v) for n, v in {**values, "quat_wxyz": attitude}.items()}
+    plan = plan_truth(channels, roll_gradient_rad_per_m_s2=gradient)
+    track = derive_truth(channels, plan=plan).track
+    inner = np.isfinite(track.ay_m_s2)
+    assert inner.mean() > 0.85
+    np.testing.assert_allclose(track.ay_m_s2[inner], force[inner], atol=0.02)
+    unknown = derive_truth(channels)
+    assert np.isnan(unknown.track.ay_m_s2).all() and "roll gradient" in unknown.derivation["ay_m_s2"]
+
+
+def test_specific_force_of_the_simulated_road(sample_logs_dir):
+    """The simulator's own acceleration in the plane of its road, plus gravity along its bank."""
+    times, force = [], []
+    with (sample_logs_dir / "road.mcap").open("rb") as file:
+        log = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, _, message, state in islice(log.iter_decoded_messages(topics=["/truth/perfect/state"]), 3000):
+            times.append(message.publish_time)
+            force.append(state.ay_m_s2 + 9.80665 * np.sin(state.bank_rad))
+    with read_drive(str(sample_logs_dir / "road.mcap"), str(sample_logs_dir / "vehicle.toml")) as drive:
+        track = derive_truth(drive.plan.survey_truth, plan=drive.plan.truth).track
+    known = np.isfinite(track.ay_m_s2) & (track.stamps_ns < times[-1])
+    error = track.ay_m_s2[known] - np.interp(track.stamps_ns[known], times, force)
+    assert known.sum() > 2500 and np.sqrt(np.mean(error**2)) < 0.02 < 0.2 < np.std(force)
+
+
 def test_a_circle_driven_with_constant_slip():
-    """Closed form: on a circle v_x, v_y, r are constant and a_y = v_x r; position alone must tell them."""
+    """Closed form: on a circle v_x, v_y, r are constant; position alone must tell them."""
     stamps, _ = drive(30.0, rate=50)
     t = (stamps - T0) * 1e-9
     r, beta, speed = 0.5, -0.06, 12.0
@@ -229,10 +266,9 @@ def test_a_circle_driven_with_constant_slip():
         "yaw_rad": channel("yaw_rad", stamps, np.angle(np.exp(1j * (course - beta)))),
     }
     track = derive_truth(channels).track
-    good = np.isfinite(track.ay_m_s2)
+    good = np.isfinite(track.sideslip_rad) & np.isfinite(track.yaw_rate_rad_s)
     np.testing.assert_allclose(track.sideslip_rad[good], beta, atol=1e-6)
     np.testing.assert_allclose(track.yaw_rate_rad_s[good], r, atol=1e-9)
-    np.testing.assert_allclose(track.ay_m_s2[good], speed * np.cos(beta) * r, rtol=1e-4)
     mirrored = {n: channel(n, stamps, c.values * (1 if n == "x_m" else -1)) for n, c in channels.items()}
     mirror = derive_truth(mirrored).track
     np.testing.assert_allclose(mirror.vx_m_s, track.vx_m_s, atol=1e-9)

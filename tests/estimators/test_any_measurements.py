@@ -1,32 +1,165 @@
-"""The filters take the measurements that there are: without a_y, without yaw rate, without both."""
+"""The filters take the measurements that there are: any of them may be missing for a while, or from the whole log."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pdhef_logtool import Car, read_drive
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.drive.reading import WholeDrive
+from pdhef_logtool.estimators.calibration.calibration import VARIED_BY_PRIOR, self_calibrate
+from pdhef_logtool.estimators.calibration.joint import FRONT_STIFFNESS, REAR_STIFFNESS
+from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.table import make_estimator, runnable
+from pdhef_logtool.records.signals import ALIGNED_SIGNALS
+from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.frames import estimate, score
+from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, read_driving, self_calibrated
 
 NAMES = ("open-loop", "phy-ukf", "physics", "pd-hef")
+STEERING = ("steer_rad", "steering_wheel_rad")
+SALOON = Car.load("saloon")
+GAP_S = (60.0, 80.0)
 
 
-def sideslip_rmse(log: Path, *missing: str) -> dict[str, float]:
+def without(*missing: str) -> object:
+    """Return what takes signals out of a mapping."""
+    return lambda _log, mapping, _tell: replace(
+        mapping, signals={k: v for k, v in mapping.signals.items() if k not in missing}
+    )
+
+
+def sideslip_rmse(log: Path, names: tuple[str, ...], *missing: str) -> dict[str, float]:
     """Return the RMSE by estimator of a log that lacks signals."""
-
-    def without(_log: object, mapping: object, _tell: object) -> object:
-        return replace(mapping, signals={k: v for k, v in mapping.signals.items() if k not in missing})  # type: ignore[type-var, attr-defined]
-
-    with read_drive(log, Car.load("saloon"), adjust=without) as drive:  # type: ignore[arg-type]
-        rows = score(estimate(drive, NAMES)).filter(signal="sideslip_rad", segment="all", metric="rmse")
+    with read_drive(log, SALOON, adjust=without(*missing)) as drive:  # type: ignore[arg-type]
+        rows = score(estimate(drive, names)).filter(signal="sideslip_rad", segment="all", metric="rmse")
     return dict(zip(rows["estimator"], rows["value"], strict=True))
 
 
 @pytest.mark.parametrize("missing", [("ay_m_s2",), ("yaw_rate_rad_s",), ("ay_m_s2", "yaw_rate_rad_s")])
 def test_physics_runs_on_what_there_is_and_what_there_is_helps(missing: tuple[str, ...], sample_logs_dir: Path) -> None:
-    whole = sideslip_rmse(sample_logs_dir / "dlc.mcap")
-    less = sideslip_rmse(sample_logs_dir / "dlc.mcap", *missing)
+    whole = sideslip_rmse(sample_logs_dir / "dlc.mcap", NAMES)
+    less = sideslip_rmse(sample_logs_dir / "dlc.mcap", NAMES, *missing)
     assert less.keys() == whole.keys() == set(NAMES)
     assert whole["physics"] < less["physics"] < 1.02 * less["open-loop"]
+
+
+@pytest.mark.parametrize("also", [(), ("ay_m_s2",), ("ax_m_s2",)])
+def test_without_steering_the_rear_axle_determines_the_sideslip(also: tuple[str, ...], sample_logs_dir: Path) -> None:
+    less = sideslip_rmse(sample_logs_dir / "dlc.mcap", ("zero", "physics", "pd-hef"), *STEERING, *also)
+    assert less["physics"] == less["pd-hef"] < 0.1 * less["zero"]
+
+
+def test_speed_alone_is_not_enough() -> None:
+    names = ("physics", "pd-hef", "pd-hef-smoothed")
+    ready, skipped = runnable(names, SALOON, frozenset({"speed_m_s", "ax_m_s2"}))
+    assert (ready, len(skipped)) == ([], 3)
+    assert {s.reason for s in skipped} == {"the log has no ay_m_s2, steer_rad, yaw_rate_rad_s"}
+
+
+@pytest.fixture(scope="module")
+def road(sample_logs_dir: Path) -> WholeDrive:
+    with read_drive(sample_logs_dir / "road.mcap", SALOON) as drive:
+        return drive.whole()
+
+
+def with_gap(road: WholeDrive, *names: str) -> tuple[WholeDrive, np.ndarray]:
+    """Return two minutes of the road without some signals for 20 s, and where that is."""
+    time_s = (road.signals.stamps_ns - road.signals.stamps_ns[0]) * 1e-9
+    end = int(np.searchsorted(time_s, 120.0))
+    gap = ((time_s > GAP_S[0]) & (time_s < GAP_S[1]))[:end]
+    signals = road.signals.rows(0, end)
+    for name in names:
+        signals = replace(signals, **{name: np.where(gap, np.nan, getattr(signals, name))})
+    assert road.truth is not None
+    return replace(road, signals=signals, truth=road.truth.rows(0, end)), gap
+
+
+def physics_of(drive: WholeDrive) -> StateTrack:
+    return run_window(make_estimator("physics", SALOON), drive.signals)[0]
+
+
+@pytest.mark.parametrize("names", [("steer_rad",), ("ay_m_s2",), ("yaw_rate_rad_s",), ("ax_m_s2",), ("speed_m_s",)])
+def test_a_gap_of_20_s_widens_the_interval_that_covers(names: tuple[str, ...], road: WholeDrive) -> None:
+    drive, gap = with_gap(road, *names)
+    whole, track = physics_of(with_gap(road)[0]), physics_of(drive)
+    assert track.valid[10:].all()
+    assert np.isfinite(track.sideslip_rad[10:]).all()
+    assert drive.truth is not None
+    scored = gap & drive.truth.valid & (drive.truth.vx_m_s > 3.0)
+    error = (track.sideslip_rad - drive.truth.sideslip_rad)[scored]
+    zero = drive.truth.sideslip_rad[scored]
+    assert np.sqrt(np.mean(error**2)) <= 1.02 * np.sqrt(np.mean(zero**2))
+    assert np.mean(np.abs(error) < 1.96 * track.sideslip_std_rad[scored]) >= 0.9
+    assert np.median((track.sideslip_std_rad / whole.sideslip_std_rad)[gap]) >= 1.0 - 1e-9
+    after = np.flatnonzero(gap)[-1] + 500
+    np.testing.assert_allclose(track.sideslip_rad[after:], whole.sideslip_rad[after:], atol=2e-4)
+
+
+def test_without_steering_a_y_and_yaw_rate_there_is_no_estimate(road: WholeDrive) -> None:
+    drive, gap = with_gap(road, "steer_rad", "yaw_rate_rad_s", "ay_m_s2")
+    track, within = physics_of(drive), np.flatnonzero(gap)
+    assert not track.valid[within[-1] - 500 : within[-1]].any()
+    assert track.valid[within[-1] + 100 :].all()
+
+
+def test_windows_change_no_bit_while_the_steering_is_unknown(road: WholeDrive) -> None:
+    drive, gap = with_gap(road, "steer_rad")
+    estimator, state, parts = make_estimator("physics", Car.of(default_vehicle())), None, []
+    cuts = [0, *(np.flatnonzero(gap)[0] + np.array([3, 500, 1200])), np.flatnonzero(gap)[-1] + 2, len(drive.signals)]
+    for first, last in pairwise(cuts):
+        track, state = run_window(estimator, drive.signals.rows(int(first), int(last)), state)
+        parts.append(track)
+    joined, whole = concatenate(parts), run_window(estimator, drive.signals)[0]
+    np.testing.assert_array_equal(joined.sideslip_rad, whole.sideslip_rad)
+    np.testing.assert_array_equal(joined.sideslip_std_rad, whole.sideslip_std_rad)
+
+
+def test_a_log_without_steering_keeps_the_prior_of_its_car(sample_logs_dir: Path) -> None:
+    car = Car.of(default_vehicle())
+    with read_drive(sample_logs_dir / "dlc.mcap", car, adjust=without(*STEERING)) as drive:  # type: ignore[arg-type]
+        calibration = checked(drive, calibrate_drive(drive, RunConfig()))
+        assert calibration is not None
+        assert calibration.text == "not calibrated: all parameters keep their prior"
+        assert (calibration.parameters, calibration.refused) == ((), "")
+        assert len(calibration.varied) == len(VARIED_BY_PRIOR)
+        estimator = make_estimator("physics", self_calibrated(drive, calibration))
+        assert estimator.causal  # nothing of the log is in it
+
+
+def test_without_a_y_the_yaw_rate_calibrates(sample_logs_dir: Path) -> None:
+    car, fits = Car.of(default_vehicle()), []
+    for missing in ((), ("ay_m_s2",)):
+        with read_drive(sample_logs_dir / "sweep.mcap", car, adjust=without(*missing)) as drive:  # type: ignore[arg-type]
+            driving = read_driving(drive)
+        assert driving.has_ay is not bool(missing)
+        fits.append({p.name: p for p in self_calibrate([driving], car.vehicle).parameters})
+    for name in (FRONT_STIFFNESS, REAR_STIFFNESS):
+        both, alone = (fit[name] for fit in fits)
+        assert both.sd < alone.sd
+        assert abs(np.log(both.value / alone.value)) < 1.96 * np.hypot(both.sd, alone.sd)
+
+
+def test_a_recorded_drive_without_steering(shared_dir: Path) -> None:
+    from studies.peers.drives import PEER_DRIVES, mapping_of, vehicle_of
+
+    peer = next(d for d in PEER_DRIVES if d.log == "v40_slalom.mcap")
+    folder = shared_dir / "data" / "drives"
+    car, mapping = Car.of(vehicle_of(peer, folder)), mapping_of(peer, folder)
+    with read_drive(folder / peer.log, car, mapping, adjust=without(*STEERING)) as drive:  # type: ignore[arg-type]
+        names = ("zero", "physics")
+        rows = score(estimate(drive, names)).filter(signal="sideslip_rad", segment="all", metric="rmse")
+    errors = dict(zip(rows["estimator"], rows["value"], strict=True))
+    assert errors["physics"] <= 1.02 * errors["zero"]
+
+
+def test_every_lateral_signal_alone_lets_physics_run() -> None:
+    for name in ("steer_rad", "yaw_rate_rad_s", "ay_m_s2"):
+        assert len(runnable(("physics",), SALOON, frozenset({"speed_m_s", name}))[0]) == 1
+    assert frozenset({"speed_m_s", "steer_rad"}) <= frozenset(ALIGNED_SIGNALS)

@@ -27,7 +27,7 @@ from pdhef_logtool.estimators.error_features import TERMS, error_terms
 from pdhef_logtool.estimators.intervals import POSTERIOR_NOTE, make_inflation
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_filter import physics_filter
-from pdhef_logtool.estimators.posterior_band import OWN_SHARE
+from pdhef_logtool.estimators.posterior_band import OWN_SHARE, posterior_band, prior_variations
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -98,6 +98,22 @@ def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
 def test_what_is_known_less_has_the_wider_band(signals: Signals) -> None:
     (_, (narrow,)), (_, (wide,)) = (banded(identified(share), signals) for share in (0.05, 0.4))
     assert np.mean(wide.sideslip_std_rad) > 1.3 * np.mean(narrow.sideslip_std_rad)
+
+
+def test_a_file_that_no_drive_has_shown_to_be_right_has_the_interval_of_its_prior() -> None:
+    """Errors of a file with a wrong rear axle are inside; an identified car's interval contains its posterior only."""
+    true = with_noise(drive(slalom(0.03, 0.5), 6.0, speed=22.0).signals, seed=3)
+    signals = replace(true, friction=np.full(len(true), 0.85))
+    right, wrong = Car.of(OWN), Car.of(OWN.with_stiffness(1.0, 0.6))
+    ((truth,), _), ((plain,), (wide,)) = (banded(car, signals) for car in (right, wrong))
+    error = np.abs(plain.sideslip_rad - truth.sideslip_rad)[50:]
+    assert np.mean(error <= 1.96 * plain.sideslip_std_rad[50:]) < 0.5
+    assert np.mean(error <= 1.96 * wide.sideslip_std_rad[50:]) > 0.95
+    assert np.mean(1.96 * wide.sideslip_std_rad[50:]) < 0.03
+    np.testing.assert_array_equal(wide.sideslip_rad, plain.sideslip_rad)
+    found = FittedPhysics(values=VALUES, noise=NOISE)
+    assert posterior_band(Car.of(OWN, fitted_physics=found).with_noise(PHYSICS, NOISE)) is None
+    assert len({vehicle.model_dump_json() for vehicle in (OWN, *prior_variations(OWN))}) == 6
 
 
 def test_only_what_runs_on_physics_has_it_and_it_is_told(signals: Signals) -> None:

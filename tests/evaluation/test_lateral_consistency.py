@@ -13,7 +13,7 @@ from pdhef_logtool.evaluation.metrics.lateral_consistency import consistency_row
 from pdhef_logtool.evaluation.metrics.metric import SensorErrors
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
-from pdhef_logtool.runs.selection import FACTOR, contradiction
+from pdhef_logtool.runs.selection import FACTOR, YAW_FACTOR, contradiction
 
 T = np.arange(0, 60, 0.01)
 STAMPS = 1_700_000_000_000_000_000 + np.round(T * 1e9).astype(np.int64)
@@ -121,19 +121,32 @@ def test_blocks_change_no_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     assert parts.value == pytest.approx(whole.value, rel=1e-9)
 
 
-def rows(**values: float) -> list[MetricRow]:
-    return [MetricRow("drive", k.replace("_", "-"), "vy_m_s", "all", "d2", v, "m/s", 100) for k, v in values.items()]
+def rows(yaw: dict[str, float], **values: float) -> list[MetricRow]:
+    lateral = [("vy_m_s", "d2", "m/s", k.replace("_", "-"), v) for k, v in values.items()]
+    of_yaw = [("yaw_rate_rad_s", "yaw_consistency", "rad/s", k.replace("_", "-"), v) for k, v in yaw.items()]
+    return [MetricRow("drive", e, s, "all", m, v, u, 100) for s, m, u, e, v in (*lateral, *of_yaw)]
 
 
-def test_the_guard_speaks_where_the_default_estimate_is_much_worse_than_a_simple_one() -> None:
-    assert contradiction(rows(zero=1.0, pd_hef=FACTOR * 0.99)) is None
-    found = contradiction(rows(zero=1.0, phy_ukf=0.5, pd_hef=FACTOR))
+def test_an_estimate_that_is_much_worse_than_one_that_explains_the_yaw_rate_is_contradicted() -> None:
+    yaw = {"zero": 0.1, "phy_ukf": 0.01, "pd_hef": 0.01}
+    assert contradiction(rows(yaw, phy_ukf=1.0, pd_hef=FACTOR * 0.99)) is None
+    found = contradiction(rows(yaw, zero=0.1, phy_ukf=0.5, pd_hef=FACTOR))
     assert found is not None
-    assert found.best == "phy-ukf"
+    assert found.best == "phy-ukf"  # zero agrees better, but explains no yaw rate
     assert "pd-hef contradicts the sensors" in found.text
 
 
-def test_the_guard_is_silent_without_something_to_compare_with() -> None:
-    assert contradiction(rows(pd_hef=3.0)) is None
-    assert contradiction(rows(kinematic=0.01, pd_hef=3.0)) is None  # it integrates what d2 compares with
-    assert contradiction(rows(zero=1.0)) is None
+def test_an_estimate_that_does_not_explain_the_yaw_rate_is_contradicted() -> None:
+    yaw = {"phy_ukf": 0.01, "pd_hef": 1.01 * 0.01 * YAW_FACTOR}
+    found = contradiction(rows(yaw, phy_ukf=1.0, pd_hef=0.9))
+    assert found is not None
+    assert (found.best, found.figures, found.other) == ("phy-ukf", (0.9, yaw["pd_hef"]), (1.0, 0.01))
+    assert contradiction(rows({**yaw, "pd_hef": 0.99 * 0.01 * YAW_FACTOR}, phy_ukf=1.0, pd_hef=0.9)) is None
+
+
+def test_without_something_to_compare_with_nothing_is_contradicted() -> None:
+    assert contradiction(rows({"pd_hef": 1.0}, pd_hef=3.0)) is None
+    assert contradiction(rows({}, phy_ukf=1.0, pd_hef=3.0)) is None  # no steering, no yaw-rate test
+    # it integrates what d2 compares with
+    assert contradiction(rows({"kinematic": 0.01, "pd_hef": 0.01}, kinematic=0.01, pd_hef=3.0)) is None
+    assert contradiction(rows({"zero": 0.01}, zero=1.0)) is None

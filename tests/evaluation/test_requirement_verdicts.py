@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -37,7 +36,7 @@ def blocks(values: Sequence[float], baseline: Sequence[float] = (), std: Sequenc
     return RequirementBlocks("x", "pd-hef", 10.0, range(k), [1000] * k, [10.0] * k, [200.0] * k, values, baseline, std)
 
 
-@pytest.mark.parametrize("spread", [0.3, 0.5])
+@pytest.mark.parametrize("spread", [0.3, 0.5, 0.8])
 @pytest.mark.parametrize("count", [5, 20, 100])
 def test_the_bound_covers_the_true_value_as_often_as_it_says(spread: float, count: int) -> None:
     rng = np.random.default_rng(count)
@@ -48,18 +47,7 @@ def test_the_bound_covers_the_true_value_as_often_as_it_says(spread: float, coun
         verdict = judge(LIMIT, drives(values, n=n))
         assert verdict.high is not None
         covered += verdict.high >= true
-    assert 86 <= covered <= 100  # 90–98 % of many: 0.90 to 0.96 of 200 when this was chosen
-
-
-@pytest.mark.parametrize(("worse", "outcome", "least", "most"), [(1.1, "FAIL", 95, 100), (1.0, "FAIL", 0, 5)])
-def test_a_planted_regression_fails_and_equal_runs_do_not(worse: float, outcome: str, least: int, most: int) -> None:
-    rng = np.random.default_rng(3)
-    found: Counter[str] = Counter()
-    for _ in range(100):
-        common = 0.01 * np.exp(rng.normal(0.0, 0.5, 100))
-        a, b = (common * np.exp(rng.normal(0.0, 0.1, 100)) for _ in "ab")
-        found[judge(RATIO, drives(worse * b, a)).outcome] += 1
-    assert least <= found[outcome] <= most
+    assert 90 <= covered <= 100
 
 
 @pytest.mark.parametrize(("limit", "outcome"), [(0.0130, "PASS"), (0.0100, "INCONCLUSIVE"), (0.0080, "FAIL")])

@@ -40,7 +40,7 @@ def test_the_example_is_valid_and_is_read(tmp_path: Path) -> None:
     assert (plan.file, [r.id for r in plan.requirements]) == ("plan.toml", [f"SR-{i}" for i in range(1, 6)])
     assert plan.requirements[0].limit == pytest.approx(math.radians(0.5))
     assert plan.requirements[2].label == "sideslip RMSE ≤ 0.5 × zero"
-    assert plan.requirements[4].label == "sideslip in 95 % CI ≥ 0.9"
+    assert plan.requirements[4].label == "sideslip in 95 % CI ≥ 90 %"
     assert not default_plan().file
 
 
@@ -57,6 +57,9 @@ def test_degrees_manoeuvres_and_quantiles() -> None:
     ("table", "problem"),
     [
         ({}, "requirement[0].id: is missing"),
+        ({**WHOLE, "exposure": [{"speed_m_s": [3.0, 10.0], "drives": 1}]}, "multiples of 5"),
+        ({**WHOLE, "exposure": [{"friction": [0.5, 0.4], "minutes": 1.0}]}, "should be [from, to]"),
+        ({**WHOLE, "exposure": [{"car": "golf"}]}, "give drives or minutes"),
         ({**WHOLE, "id": "a b"}, "requirement[0].id"),
         ({**WHOLE, "limit": 0.1}, "give one of limit, limit_deg, limit_deg_s, or baseline"),
         ({"id": "A", "signal": "sideslip_rad"}, "give one of limit"),
@@ -101,7 +104,7 @@ def test_earlier_files_are_converted(tmp_path: Path) -> None:
     assert [r.label for r in plan.requirements] == [
         "sideslip RMSE ≤ 0.5°",
         "sideslip max ≤ 5.73° (linear, worst drive, pd-hef)",
-        "sideslip in 95 % CI ≥ 0.9",
+        "sideslip in 95 % CI ≥ 90 %",
         "sideslip RMSE ≤ 1.05 × run A",
         "sideslip max ≤ 1.1 × run A (worst drive)",
     ]

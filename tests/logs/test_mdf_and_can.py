@@ -210,6 +210,26 @@ def test_raw_can_is_decoded_by_the_dbc_of_the_mapping(suffix: str, kind: str, tm
     _check_can(path, tmp_path, kind)
 
 
+def test_bus_logging_is_decoded_by_several_databases(tmp_path: Path) -> None:
+    folder = tmp_path / "dbc"
+    folder.mkdir()
+    (folder / "motion.dbc").write_text(DBC)
+    other = DBC.replace("BO_ 291 Motion", "BO_ 292 Steering").replace("AccelY", "Angle").replace('"g"', '"deg"')
+    (folder / "steering.dbc").write_text(other)
+    with can.Logger(str(tmp_path / "a.mf4")) as writer:
+        for message in frames():
+            writer.on_message_received(message)
+            if message.arbitration_id == 291:
+                late = {"timestamp": message.timestamp + 1e-3, "data": message.data, "is_extended_id": False}
+                writer.on_message_received(can.Message(arbitration_id=292, channel=1, **late))
+    with closing(open_log(tmp_path / "a.mf4", msgs=folder)) as log:
+        assert {"Motion", "Steering"} <= {t.name for t in log.topics}
+        assert {f.path: f.unit for f in log.fields("Steering")} == {"Angle": "deg", "Speed": "km/h"}
+        read = log.read({"Motion": ["AccelY"], "Steering": ["Angle"]})
+    np.testing.assert_allclose(read["Steering"].fields["Angle"], np.round(AY, 3), atol=1e-12)
+    assert np.median(read["Steering"].log_time_ns - read["Motion"].log_time_ns) == pytest.approx(1e6, abs=2e5)
+
+
 def test_multiplexed_signals_have_a_table_for_each_selector(tmp_path: Path) -> None:
     dbc = (
         DBC.partition("BO_ 291")[0]

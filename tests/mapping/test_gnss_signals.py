@@ -21,9 +21,24 @@ NAV_PVT = ("vel_n", "vel_e", "g_speed", "h_acc", "s_acc", "fix_type", "lat", "lo
         (("vel_n", "vel_e", "g_speed", "c_acc", "s_acc"), {"gnss_velocity_north_m_s": ("vel_n", 1e-2)}),
         (("hor_speed", "trk_gnd"), {"gnss_speed_m_s": ("hor_speed", 1.0)}),
         (("vn", "ve", "cog", "mode", "latitude"), {"gnss_latitude_deg": ("latitude", 57.29577951308232)}),
+        (("n", "e", "d", "h_accuracy", "n_sats", "tow"), {"gnss_velocity_east_m_s": ("e", 1e-3)}),
+        (("lat", "lon", "height", "h_accuracy", "n_sats"), {"gnss_latitude_deg": ("lat", 1.0)}),
+        (("lat", "lon", "h_msl", "h_acc", "v_acc"), {"gnss_longitude_deg": ("lon", 1e-7)}),
+        (("speed_raw", "heading_raw", "True_Head"), {"gnss_speed_m_s": ("speed_raw", 1.0 / 3.6)}),
         (("track", "speed", "err_track", "err_horz"), {"gnss_position_accuracy_m": ("err_horz", 0.5)}),
     ],
-    ids=["NAV-PVT", "NAV-PVT camel case", "NAV-VELNED", "BESTVEL", "PVTGeodetic", "GPSFix"],
+    ids=[
+        "NAV-PVT",
+        "NAV-PVT camel case",
+        "NAV-VELNED",
+        "BESTVEL",
+        "PVTGeodetic",
+        "VelNed",
+        "PosLlh",
+        "NAV-POSLLH",
+        "VBO",
+        "GPSFix",
+    ],
 )
 @pytest.mark.parametrize("base", ["", "receiver.solution."])
 def test_messages_of_receivers_are_recognised_below_any_struct(fields, signals, base):

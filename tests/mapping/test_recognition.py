@@ -345,6 +345,16 @@ def test_a_types_name_promises_nothing(type_name: str, lacks: str, has: dict[str
     assert auto.ambiguities == ()
 
 
+def test_a_reference_instrument_beside_a_receiver_is_ground_truth_and_no_input(shared_dir: Path) -> None:
+    log = open_log(shared_dir / "data" / "drives" / "v40_swd_gnss.mcap")
+    mapping = auto_map(log).mapping
+    log.close()
+    assert {s.topic for s in mapping.truth.values()} == {"/reference/slip"}
+    assert {"vx_m_s", "vy_m_s"} <= set(mapping.truth)
+    assert "/reference/slip" not in {s.topic for s in mapping.signals.values()}
+    assert {"gnss_velocity_east_m_s", "gnss_velocity_north_m_s"} <= set(mapping.signals)
+
+
 @pytest.mark.parametrize(
     ("drive", "reference", "unmapped"),
     [

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import pytest
 from fake_drive_log import FakeLog, FakeTopic
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
 
 from pdhef_logtool.mapping import Mapping, SignalSource, fit_clocks, read_signals
 from pdhef_logtool.mapping.clocks import why_unusable, with_usable_stamps
 from pdhef_logtool.records.signals import IntArray
+from pdhef_logtool.runs.inspection import inspect_drive_log, render_inspection
 from pdhef_logtool.runs.inspection.step_statistics import StepStatistics
 
 MS, S = 1_000_000, 1_000_000_000
@@ -144,6 +150,36 @@ def test_the_stamp_of_a_nested_message_that_is_a_time_is_read(inner: IntArray, o
     mapping = with_usable_stamps(log, Mapping(signals={"ay_m_s2": source}))
     assert mapping.signals["ay_m_s2"].stamp == chosen
     assert bool(mapping.notes) == (chosen == "header.stamp")
+
+
+@given(
+    burst=st.integers(1, 12), spread_us=st.integers(0, 3000), period_ms=st.integers(40, 300), seed=st.integers(0, 99)
+)
+def test_the_rate_of_any_burst_pattern_is_messages_over_time(
+    burst: int, spread_us: int, period_ms: int, seed: int
+) -> None:
+    jitter = np.random.default_rng(seed).integers(0, 1 + 1000 * spread_us, 200 * burst)
+    stamps = np.sort(T0 + np.repeat(np.arange(200) * period_ms * MS, burst) + jitter)
+    steps = StepStatistics()
+    for part in np.array_split(stamps, 7):
+        steps.add(part)
+    assert steps.rate_hz == pytest.approx(burst * 1000.0 / period_ms, rel=0.06)
+
+
+def test_a_delay_of_another_clock_is_named_and_not_shown_as_a_delay() -> None:
+    count = np.arange(300, dtype=np.int64)
+    text = {}
+    for name, offset in (("simulation", T0), ("boot", 3600 * S), ("arrival", 20 * MS)):
+        stamps = T0 + count * 10 * MS - offset
+        fields = {"header.stamp": stamps, "angular_velocity.z": np.sin(count * 0.01)}
+        log = FakeLog({"/imu": FakeTopic("sensor_msgs/msg/Imu", T0 + count * 10 * MS, fields, publish_time_ns=stamps)})
+        out = io.StringIO()
+        render_inspection(inspect_drive_log(log), Console(file=out, width=120, no_color=True))
+        text[name] = out.getvalue()
+    assert "simulation clock" in text["simulation"]
+    assert "other clock" in text["boot"]
+    assert "clock" not in text["arrival"].split("Mapping")[0]
+    assert "e+" not in "".join(text.values()).split("Values")[0]
 
 
 def test_rates_of_bursts_are_those_of_their_messages() -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import importlib.util
+import json
 import sys
 import time
 from collections.abc import Iterator
@@ -15,33 +17,20 @@ sys.path.insert(0, str(Path(__file__).parent))
 from browser import CHROMIUM, WHY_NOT, Browser
 from made_runs import NAMES, drive_tracks, write_run
 from test_drive import hostile_run, plan_of
+from test_fleet_page import run_of
 
 from pdhef_logtool.reports.pages import write_pages
 from pdhef_logtool.results.opened_run import open_run
 
 pytestmark = [pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT), pytest.mark.slow]
+_AXE = importlib.util.find_spec("axe_core_python")
+AXE = None if _AXE is None or _AXE.origin is None else Path(_AXE.origin).parent / "axe.min.js"
 #: Processor time of the main thread.
 FIRST_PICTURE_S, ZOOM_S = 2.0, 0.1
 #: A picture of one point.
 _DOT = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
 )
-#: Elements with text whose contrast to the nearest background is below 4.5 (WCAG 2.1 AA).
-_LOW_CONTRAST = """(() => {
-  const light = (c) => { const [r, g, b] = c.match(/[\\d.]+/g).map((v) => v / 255)
-    .map((v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4));
-    return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
-  const low = [];
-  for (const node of document.querySelectorAll('main *')) {
-    if (![...node.childNodes].some((n) => n.nodeType === 3 && n.textContent.trim()) || !node.offsetWidth) continue;
-    let back = node;
-    while (back && getComputedStyle(back).backgroundColor === 'rgba(0, 0, 0, 0)') back = back.parentElement;
-    const [a, b] = [getComputedStyle(node).color, back ? getComputedStyle(back).backgroundColor : 'rgb(255,255,255)']
-      .map(light).sort((x, y) => y - x);
-    if ((a + 0.05) / (b + 0.05) < 4.5) low.push(node.outerHTML.slice(0, 60));
-  }
-  return low.slice(0, 5);
-})()"""
 _DRAWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
 
 
@@ -207,14 +196,37 @@ def test_the_keyboard_zooms(browser, tmp_path):
         assert browser.value(seen) == text
 
 
-def test_texts_have_contrast_in_the_dark_and_in_the_light(browser, tmp_path):
-    file = page_of(write_run(tmp_path, drive_tracks(3.0), plan=plan_of("PASS", "FAIL", "INCONCLUSIVE")))
-    for scheme, ground in (("dark", "rgb(20, 24, 29)"), ("light", "rgb(255, 255, 255)")):
+def serious(browser: Browser) -> list[str]:
+    """Return what axe-core finds that is serious or critical (WCAG 2.1 AA), a line an element."""
+    browser.value(AXE.read_text(encoding="utf-8") + ";0")
+    found = json.loads(browser.value("axe.run(document).then((r) => JSON.stringify(r.violations))"))
+    grave = [v for v in found if v["impact"] in ("serious", "critical")]
+    return [f"{v['id']}: {node['html'][:80]}: {node['failureSummary']}" for v in grave for node in v["nodes"]]
+
+
+@pytest.mark.skipif(AXE is None, reason="axe-core is not installed (pip install axe-core-python)")
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+@pytest.mark.parametrize("width", [390, 1280])
+def test_axe_finds_nothing_serious(tmp_path, scheme, width):
+    ground = {"dark": "rgb(20, 24, 29)", "light": "rgb(255, 255, 255)"}[scheme]
+    run = open_run(write_run(tmp_path / "made", drive_tracks(3.0), plan=plan_of("PASS", "FAIL", "INCONCLUSIVE")))
+    cells = [
+        {"speed": i % 3, "ay": i // 3, "seconds": 3.0**i, "scored": 9, "sideslip_mse_rad2": 1e-4} for i in range(9)
+    ]
+    space = {"speed_edges_m_s": [0, 5, 10], "ay_edges_m_s2": [0, 1, 2], "cells": cells}
+    drives = {f"d{i}": {"errors": (0.001 * (1 + i), 0.0015), "operating_space": space} for i in range(12)}
+    fleet = open_run(run_of(tmp_path / "fleet", drives, {"bad": "/x/bad.mcap: expected a log, got 3 bytes"}))
+    write_pages(fleet)
+    with Browser(width, 900) as browser:
         browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
-        opened(browser, file)
-        assert browser.value("getComputedStyle(document.body).backgroundColor") == ground
-        assert browser.value(_LOW_CONTRAST) == []
-    browser.call("Emulation.setEmulatedMedia", features=[])
+        for page in (
+            write_pages(run).pages[0].file,
+            fleet.folder / "report.html",
+            fleet.folder / "logs/bad/report.html",
+        ):
+            browser.open(page)
+            assert browser.value("getComputedStyle(document.body).backgroundColor") == ground
+            assert serious(browser) == []
 
 
 @pytest.mark.parametrize("width", [390, 1280])

@@ -7,7 +7,7 @@ import json
 import math
 import re
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 from made_runs import START_NS, drive_tracks, write_run
 
+from pdhef_logtool.evaluation.dead_reckoned import path_drift
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.reports.colours import colour, contrast
 from pdhef_logtool.reports.drive import drive_page, roles_of
@@ -216,12 +217,13 @@ def test_the_path_is_aligned_and_its_drift_is_stated(tmp_path):
     angle, x, y = 0.3, tracks[1].x_m, tracks[1].y_m
     turned = np.cos(angle) * x - np.sin(angle) * y + 5.0, np.sin(angle) * x + np.cos(angle) * y
     tracks[1] = replace(tracks[1], x_m=turned[0], y_m=turned[1])
-    page = drive_page(open_run(write_run(tmp_path, tracks)).logs[0])
+    made = path_drift(tracks[1], tracks[0])
+    page = drive_page(open_run(write_run(tmp_path, tracks, path_drift=asdict(made))).logs[0])
     text = words(page.html.decode())
     assert "the largest remaining distance is 0.0 m" in text
     length = float(np.hypot(np.diff(x), np.diff(y)).sum())
     drift = float(re.search(r"Drift: ([\d.]+) m", text)[1])
-    assert drift == pytest.approx(2.0 * np.sin(angle / 2.0) * np.hypot(x[-1], y[-1]), abs=6.0)
+    assert drift == pytest.approx(2.0 * np.sin(angle / 2.0) * np.hypot(x[-1], y[-1]), abs=0.5)
     assert f"{length / 1000.0:.2f} km" in text
     labels = [c.label for c in page.charts.figures["path"].clouds]
     assert labels[0] == "truth" and all("°" in label for label in labels[1:])

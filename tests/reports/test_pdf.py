@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from pypdf import PdfReader
 
 sys.path.insert(0, str(Path(__file__).parent))
 from browser import CHROMIUM, WHY_NOT
@@ -51,5 +52,9 @@ def test_without_chromium_there_is_one_clear_line(tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT)
 def test_chromium_prints_it(tmp_path):
-    data = write_pdf(open_run(write_run(tmp_path, drive_tracks(3.0), plan=plan_of("PASS")))).read_bytes()
-    assert data.startswith(b"%PDF") and len(re.findall(rb"/Type\s*/Page\b", data)) >= 4
+    target = write_pdf(open_run(write_run(tmp_path, drive_tracks(3.0), plan=plan_of("PASS"))))
+    pages = [" ".join(page.extract_text().split()) for page in PdfReader(target).pages]
+    assert len(pages) >= 4 and "Prepared by" in pages[0] and pages[1].startswith(f"2 / {len(pages)}")
+    for title in ("Requirements", "Inputs and versions"):
+        number = int(re.search(rf"{title} ?p\. ?(\d+)", pages[1])[1])
+        assert title in pages[number - 1] and title not in pages[number - 2].replace(pages[1], "")

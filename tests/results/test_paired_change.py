@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from pdhef_logtool.results.dependence import dependence
+from pdhef_logtool.evaluation.dependence import dependence
 from pdhef_logtool.results.paired_change import holm, log_ratios, paired_change
 
 

@@ -2,25 +2,40 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
 import pytest
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
 from pdhef_logtool.evaluation.requirement_verdicts import RequirementVerdict
-from pdhef_logtool.evaluation.validation_plan import Requirement, ValidationPlan
+from pdhef_logtool.evaluation.validation_plan import ExposureNeed, Requirement, ValidationPlan, load_plan
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.results.opened_run import open_run
+from pdhef_logtool.results.plan_against import plan_verdicts_against
 from pdhef_logtool.results.plan_verdicts import (
     JudgedDrive,
     figures_of_file,
     figures_of_rows,
     plan_verdicts,
 )
+from pdhef_logtool.results.run_report import CarFacts, LogOutcome
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import LogResult, judge, read_validation_plan
+from pdhef_logtool.storage.documents import jsonable
+from tests.results.made_run import entry, write_run
 
 BETA = Requirement("A", "", "sideslip_rad", limit=0.02)
 SIX = tuple("abcdef")
+EARLIER = '[[requirement]]\nid = "A"\nsignal = "sideslip_rad"\nbaseline = "{}"\nmax_ratio = 1.0\n'
 
 
 def row(log: str, metric: str, value: float, n: int = 1000, **changes: str) -> MetricRow:
@@ -76,7 +91,7 @@ def test_the_estimated_reference_counts_only_without_ground_truth() -> None:
 @pytest.mark.parametrize(
     ("requirement", "reason"),
     [
-        (Requirement("A", "", "vx_m_s", limit=1.0), "no ground truth of vx_m_s"),
+        (Requirement("A", "", "vx_m_s", limit=1.0), "no ground truth of v_x"),
         (Requirement("A", "", "sideslip_rad", segment="slalom", limit=1.0), "no scored driving in slalom"),
         (Requirement("A", "", "sideslip_rad", estimator="ekf", limit=1.0), "ekf did not run: add it to --estimators"),
         (Requirement("A", "", "sideslip_rad", baseline="ekf", max_ratio=1.0), "ekf has no such value"),
@@ -101,10 +116,10 @@ def test_run_a_is_the_baseline_of_a_comparison_with_its_own_selected_estimate() 
     requirement = Requirement("A", "", "sideslip_rad", baseline="run", max_ratio=1.05)
     a = figures_of_rows(scored(value=0.02, estimator="physics"))
     partners = {log: JudgedDrive(log, "physics") for log in SIX}
-    verdict = judged(scored(), requirement, against=(a, partners))
+    verdict = judged(scored(), requirement, against={"run": (a, partners)})
     assert (verdict.outcome, verdict.value) == ("PASS", pytest.approx(0.5))
     del partners["a"]
-    assert judged(scored(), requirement, against=(a, partners)).exposure.drives == 5
+    assert judged(scored(), requirement, against={"run": (a, partners)}).exposure.drives == 5
 
 
 def test_blocks_are_read_only_where_fewer_than_five_drives_are_scored() -> None:
@@ -115,8 +130,13 @@ def test_blocks_are_read_only_where_fewer_than_five_drives_are_scored() -> None:
         k = 8
         return [RequirementBlocks(BETA.measured, "pd-hef", 10.0, range(k), [99] * k, [10.0] * k, [9.0] * k, [0.01] * k)]
 
+    def report(log: str) -> dict[str, Any]:
+        return {"requirement_blocks": jsonable(blocks(log))}
+
     def drives(logs: Sequence[str]) -> list[JudgedDrive]:
-        return [JudgedDrive(log, "pd-hef", lambda log=log: blocks(log)) for log in logs]  # type: ignore[misc]
+        return [
+            JudgedDrive(log, "pd-hef", lambda log=log: {"requirement_blocks": jsonable(blocks(log))}) for log in logs
+        ]  # type: ignore[misc]
 
     assert judged(scored(), drives=drives(SIX)).basis == "drives" and read == []
     few = judged(scored("ab"), drives=drives("ab"))
@@ -133,3 +153,84 @@ def test_only_a_users_plan_closes_the_gate() -> None:
     nothing = plan_verdicts(ValidationPlan((BETA,), file="plan.toml"), figures_of_rows([]), [], strict=True)
     assert nothing.closes_gate and not plan_verdicts(nothing.plan, figures_of_rows([]), []).closes_gate
     assert nothing.to_dict()["requirements"][0]["value"] is None
+
+
+def ratio_plan(baseline: str, ratio: float = 1.0) -> ValidationPlan:
+    return ValidationPlan((Requirement("A", "", "sideslip_rad", baseline=baseline, max_ratio=ratio),), file="plan.toml")
+
+
+def made(rng: np.random.Generator, worse: float, shared: float) -> tuple[dict[str, float], dict[str, float]]:
+    """Figures of 100 drives of six days in two runs, the second one worse; a share of the variance is between days."""
+    day = rng.normal(size=6)[np.arange(100) % 6]
+    noise = 0.14 * (math.sqrt(1.0 - shared) * rng.normal(size=100) + math.sqrt(shared) * day)
+    a = 0.01 * np.exp(rng.normal(0.0, 0.5, 100))
+    return tuple({f"d{i:03d}": float(v) for i, v in enumerate(x)} for x in (a, worse * a * np.exp(noise)))  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("shared", [0.0, 0.2])
+def test_a_planted_regression_of_ten_percent_fails_and_equal_runs_seldom_do(shared: float) -> None:
+    rng, failed = np.random.default_rng(11), {1.1: 0, 1.0: 0}
+    for worse in failed:
+        for _ in range(40):
+            a, b = made(rng, worse, shared)
+            figures = [figures_of_rows([row(log, "rmse", v) for log, v in values.items()]) for values in (a, b)]
+            days = [JudgedDrive(log, "pd-hef", factors={"day": int(log[1:]) % 6}) for log in b]
+            against = {"../a/": (figures[0], {d.log: d for d in days})}
+            (verdict,) = plan_verdicts(ratio_plan("../a/"), figures[1], days, against=against).verdicts
+            failed[worse] += verdict.outcome == "FAIL"
+            assert any("6 days" in note for note in verdict.notes)
+    assert failed[1.0] <= 3
+    assert failed[1.1] >= (38 if shared == 0.0 else 15)  # six days that differ are little evidence
+
+
+def test_run_metrics_and_compare_give_the_same_verdict_on_an_earlier_run(tmp_path: Path) -> None:
+    rng, outcomes = np.random.default_rng(5), Counter[tuple[str, float]]()
+    for worse in (1.1,) * 5 + (1.0,) * 5:
+        a, b = made(rng, worse, 0.0)
+        entries = [entry(log, day=f"2026-01-{int(log[1:]) % 6 + 1:02d}") for log in a]
+        runs = [write_run(tmp_path / name, of, entries=entries) for name, of in (("a", a), ("b", b))]
+        (tmp_path / "plan.toml").write_text(EARLIER.format("./a"))
+        plan = load_plan(tmp_path / "plan.toml")
+        of_compare = plan_verdicts_against(plan, *map(open_run, runs), strict=False)
+        results = []
+        for e, (log, value) in zip(entries, b.items(), strict=True):
+            car, known = CarFacts(None, "golf", "0", None), {"signals_sha256": e["signals_sha256"], "day": e["day"]}
+            outcome = LogOutcome(log, f"{log}.mcap", e["sha256"], main="pd-hef", car=car, **known)
+            results.append(LogResult(outcome, None, {}, (row(log, "rmse", value, 99),)))
+        of_run = judge(plan, results, strict=False)
+        assert of_run.verdicts == of_compare.verdicts
+        outcomes[of_run.verdicts[0].outcome, worse] += 1
+    assert outcomes["FAIL", 1.1] == 5 and outcomes["FAIL", 1.0] == 0
+
+
+def test_a_missing_earlier_run_ends_the_command_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "plan.toml").write_text(EARLIER.format("gone/run"))
+    with pytest.raises(OutputError, match="no such folder") as raised:
+        read_validation_plan(RunConfig(plan=tmp_path / "plan.toml"), None)
+    assert raised.value.exit_code == 2 and "gone/run" in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("need", "outcome", "words"),
+    [
+        ({"speed_m_s": [20.0, 30.0], "minutes": 1.0}, "PASS", ""),
+        ({"speed_m_s": [20.0, 30.0], "minutes": 5.0}, "INCONCLUSIVE", "2.0 of 5 minutes at 20 to 30 m/s"),
+        ({"ay_m_s2": [4.0, 13.0], "drives": 1}, "INCONCLUSIVE", "0 of 1 drives at |a_y| 4 to 13 m/s²"),
+        ({"friction": [0.0, 0.5], "drives": 3}, "PASS", ""),
+        (
+            {"friction": [0.5, 1.2], "car": "golf", "drives": 4},
+            "INCONCLUSIVE",
+            "3 of 4 drives at μ 0.5 to 1.2, car golf",
+        ),
+        ({"car": "polo", "minutes": 1.0}, "INCONCLUSIVE", "0.0 of 1 minutes at car polo"),
+    ],
+)
+def test_exposure_in_conditions(need: dict[str, Any], outcome: str, words: str) -> None:
+    def report(friction: float) -> dict[str, Any]:
+        edges = {"speed_edges_m_s": [0.0, 5.0, 10.0, 15.0, 20.0], "ay_edges_m_s2": [0.0, 1.0, 2.0]}
+        cells = [{"speed": s, "ay": a, "seconds": 20.0} for s, a in ((4, 0), (1, 2))]
+        return {"operating_space": {**edges, "cells": cells, "friction_median": friction}}
+
+    drives = [JudgedDrive(x, "pd-hef", partial(report, 0.3 if x < "d" else 0.9), {"car": "golf"}) for x in SIX]
+    verdict = judged(scored(), replace(BETA, exposure=(ExposureNeed(**need),)), drives=drives)
+    assert verdict.outcome == outcome and words in verdict.reason

@@ -113,7 +113,7 @@ def test_what_was_assumed_of_car_friction_and_network() -> None:
 
 def test_a_calibrated_car_is_said_to_be_and_a_refusal_with_its_reason() -> None:
     estimators = [EstimatorFacts("pd-hef", causal=False, algorithm={"physics_sha256": SHA, "options": {}})]
-    told = {"refused": None, "logs": 1, "understeer": {"contradicts": True}}
+    told = {"refused": None, "logs": 1, "parameters": [{}], "understeer": {"contradicts": True}}
     said = texts(vehicle_proven=False, estimators=estimators, calibration=told)
     assert "car golf; calibrated on this log without ground truth, therefore not causal" in said["assumed"]
     assert "the understeer gradient of the drive contradicts the file" in said["assumed"]

@@ -138,29 +138,19 @@ def test_the_report_for_people_is_this() -> None:
     ]
     report = _report(segments=spans)
     assert report_markdown(report).splitlines() == [
-        "# drive", "", "d.mcap (mcap), 6.0 s, sha256 abababababab; vehicle sedan", "",
+        "# drive", "", "d.mcap (mcap), 6.0 s", "",
         "## Warnings", "", "- careful", "",
         "## Losses", "", "- a gap (/imu)", "",
-        "## Ground truth", "", "- vy_m_s: `/ins.v`, 7 samples; moved", "- latency 12.5 ms",
-        "- not independent of the estimators' inputs: vx_m_s", "- smoothed", "",
-        "Friction: vehicle file, 0.85, observable", "",
-        "## sideslip_rad", "", "| estimator | segment | rmse [deg] | coverage |", "| --- | --- | ---: | ---: |",
-        "| ukf | all | 0.573 | 0.9 |", "| smooth (not causal) | all | 0.573 | 0.9 |", "",
-        "## vx_m_s", "", "| estimator | segment | rmse [m/s] |", "| --- | --- | ---: |",
-        "| ukf | all | 0.25 |", "| smooth (not causal) | all | 0.25 |", "",
-        "## yaw_rate_rad_s", "", "| estimator | segment | rmse [deg/s] |", "| --- | --- | ---: |",
-        "| ukf | all | 1.146 |", "| smooth (not causal) | all | 1.146 |", "",
         "## Estimators", "",
         "- **ukf** (causal): a; b; diverged for 1.25 s in 2 intervals, first at 2.00 s",
-        "- **smooth** (not causal)", "",
-        "## Signals", "", "- ay_m_s2: `/imu.y`, 600 samples", "- friction: missing", "",
-        "Versions: numpy 2, python 3",
+        "- **smooth** (not causal)",
     ]  # fmt: skip
     assert diverged_line({**report, "segments": spans[:1]}, "ukf") == "diverged for 1.00 s, first at 5.00 s"
     assert diverged_line(report, "smooth") == ""
-    plain = report_markdown(_report(warnings=[], losses=[], friction={"source": "none", "summary": ""}))
-    assert "Friction: none\n" in plain and "Warnings" not in plain and "Losses" not in plain
-    assert "Friction" not in report_markdown(_report(friction=None))
+    assert "Warnings" not in report_markdown(_report(warnings=[], losses=[]))
+    verdict = {"outcome": "FAIL", "label": "sideslip RMSE ≤ 1°", "reason": "1.2° (95 % CI 1.1° to 1.3°)"}
+    text = report_markdown(_report(plan={"requirements": [verdict]}))
+    assert "- **FAIL** sideslip RMSE ≤ 1°: 1.2° (95 % CI 1.1° to 1.3°)" in text
 
 
 def test_versions_are_those_that_are_installed_and_json_is_the_same_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -53,6 +53,9 @@ def test_a_cache_and_a_full_copy_exclude_each_other(tmp_path: Path) -> None:
     assert "cache" not in RunConfig(cache="x").to_dict()
     with pytest.raises(UsageError, match="leave out --cache"):
         load_config(None, {"cache": "x", "annotate": "full"})
+    with pytest.raises(UsageError, match="reduced logs contain the positions"):
+        load_config(None, {"cache": "x", "no_position": True})
+    assert RunConfig(cache="x", no_position=True).read_options.cache is None
     (tmp_path / "pdhef.toml").write_text('cache = "slim"\n')
     assert load_config(tmp_path / "pdhef.toml", {}).cache == str(tmp_path / "slim")
     (tmp_path / "pdhef.toml").write_text('cache = "s3://cars/slim"\n')

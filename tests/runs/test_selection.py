@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.calibration.calibration import calibrate_online
+from pdhef_logtool.estimators.calibration.driving import DrivingReader
+from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS
 from pdhef_logtool.results.selected_estimate import MainFacts
 from pdhef_logtool.runs import frames, selection
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.selection import choose_main, default_names
+from pdhef_logtool.runs.selection import choose_main, choose_over_time, default_names
+from pdhef_logtool.runs.self_calibrating import log_sensors
 
 EVERY = frozenset(ALIGNED_SIGNALS)
 #: Truth as it is, and the same shuffled: the sideslip of something else at another speed.
@@ -39,7 +46,14 @@ def ran(*names: str) -> list[Estimator]:
 
 
 def d2(**values: float) -> list[MetricRow]:
-    return [MetricRow("drive", n.replace("_", "-"), "vy_m_s", "all", "d2", v, "m/s", 9) for n, v in values.items()]
+    """Return figures of estimators that explain the yaw rate; ``zero`` does not."""
+    rows = []
+    for name, value in values.items():
+        estimator = name.replace("_", "-")
+        rows.append(MetricRow("drive", estimator, "vy_m_s", "all", "d2", value, "m/s", 9))
+        yaw = 0.1 if name == "zero" else 0.01
+        rows.append(MetricRow("drive", estimator, "yaw_rate_rad_s", "all", "yaw_consistency", yaw, "rad/s", 9))
+    return rows
 
 
 def main(names: list[Estimator], rows: list[MetricRow], *, proven: bool = False, named: bool = False) -> MainFacts:
@@ -132,3 +146,58 @@ def test_the_truth_of_a_log_never_chooses(
     assert answers[0]["chosen_by"] == "d2"
     a, b = ((tmp_path / n / "logs/dlc/metrics.parquet").read_bytes() for n in ("right", "shuffled"))
     assert a != b
+
+
+def test_a_choice_on_line_depends_on_nothing_that_follows(sample_logs_dir: Path) -> None:
+    """The sensors go wild after 40 s; what is selected until then stays, and what follows may change."""
+    car, wild_s = Car.of(default_vehicle()), 40.0
+    with read_drive(sample_logs_dir / "road.mcap", car) as drive:
+        signals = drive.whole().signals.rows(0, 6000)
+    after = signals.stamps_ns - signals.stamps_ns[0] > round(wild_s * 1e9)
+    rng = np.random.default_rng(3)
+    spoilt = replace(
+        signals,
+        ay_m_s2=np.where(after, 20.0 * rng.normal(size=after.size), signals.ay_m_s2),
+        yaw_rate_rad_s=np.where(after, -3.0 * signals.yaw_rate_rad_s, signals.yaw_rate_rad_s),
+        steer_rad=np.where(after, 0.3, signals.steer_rad),
+    )
+    chosen, figures = [], []
+    for sensed in (signals, spoilt):
+        reader = DrivingReader(car.vehicle)
+        reader.add(sensed)
+        calibration = calibrate_online(reader.finish(), car.vehicle)
+        estimators = [make_estimator(name, car) for name in ("zero", "open-loop", "phy-ukf", "physics")]
+        tracks = {e.name: run_window(e, sensed)[0] for e in estimators}
+        looked: list[tuple[int, ...]] = []
+
+        def sensors_of(stage: Any, looked: list[tuple[int, ...]] = looked) -> Any:
+            looked.append((stage.since_ns,))
+            return log_sensors(car.vehicle, stage)
+
+        spans = choose_over_time(estimators, calibration, tracks.get, sensed, sensors_of)
+        limit = int(signals.stamps_ns[0]) + round(wild_s * 1e9)
+        chosen.append([span for span in spans if span[0] <= limit])
+        figures.append(sum(since <= limit for (since,) in looked))
+    assert chosen[0] == chosen[1]
+    assert figures[0] == figures[1] > 1
+
+
+def test_a_choice_on_line_can_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first stages contradict ``pd-hef``, the last one does not."""
+    signals = SimpleNamespace(stamps_ns=np.arange(100), rows=lambda first, last: (first, last))
+    bad = {10: 5.0, 20: 5.0, 30: 0.5}
+
+    def rows(_tracks: Any, part: tuple[int, int], *_: Any, **__: Any) -> list[MetricRow]:
+        return [row for row in d2(open_loop=0.5, pd_hef=bad[part[1]]) if row.metric == "d2"]
+
+    of_yaw = [row for row in d2(open_loop=0.5, pd_hef=0.5) if row.metric == "yaw_consistency"]
+    monkeypatch.setattr("pdhef_logtool.evaluation.metrics.lateral_consistency.consistency_rows", rows)
+    monkeypatch.setattr("pdhef_logtool.evaluation.metrics.yaw_consistency.yaw_rows", lambda *_, **__: of_yaw)
+    stages = [SimpleNamespace(since_ns=t, vehicle_file=default_vehicle()) for t in (0, 10, 20, 30)]
+    calibration: Any = SimpleNamespace(**vars(stages[-1]), earlier=tuple(stages[:-1]))
+    causal = [cast(Estimator, SimpleNamespace(name=n, causal=c)) for n, c in (("pd-hef", True), ("open-loop", True))]
+    later = cast(Estimator, SimpleNamespace(name="pd-hef-smoothed", causal=False))
+    spans = choose_over_time(
+        [*causal, later], calibration, lambda _: None, cast(Any, signals), lambda _: cast(Any, None)
+    )
+    assert spans == [(0, "pd-hef"), (10, "open-loop"), (30, "pd-hef")]

@@ -159,7 +159,7 @@ def test_forty_kinds_with_distinct_names_and_pages() -> None:
     own = [*mountings(), *layouts()]
     assert len({r.name for r in own}) == len(own)
     assert len({r.counted_as for r in own}) >= 40
-    assert len(last) == 10
+    assert len(last) == 6
     generic = {"csv", "csv-german", "csv-gps", "mat", "mdf", "parquet"}  # of no vendor, so that no page describes them
     assert all(r.page.startswith("https://") for r in own if r.group != "fault" and r.container not in generic)
     names = {n for channels in ITEMS.values() for n in channels}

@@ -13,7 +13,7 @@ def test_the_bands_of_calibrated_cars_hold_and_are_no_wider_than_they_must() -> 
     """On cars that nothing was chosen on; the interval of normal errors is 3.92 times as wide as their rms."""
     bands = []
     for one in study.simulate(6, 1357, study.DRIVEN[:1]):
-        wrong = study.make_wrong(one.file, *one.factors)
+        wrong = one.file.with_stiffness(*one.factors)
         found = study.calibrate(one.drive.signals, wrong)
         assert not found.refused
         bands.append(study.band_of(one.drive, study.taken(one.drive.signals, wrong, found)))

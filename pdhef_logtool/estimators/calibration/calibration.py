@@ -20,15 +20,18 @@ from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
 from pdhef_logtool.estimators.calibration.joint import (
+    AY_BIAS,
     DERIVATIVE_STEP,
     ERROR_STD,
     FRONT_STIFFNESS,
     REAR_STIFFNESS,
+    STEER_OFFSET,
+    STEER_RATIO,
     Fit,
     JointProblem,
     counted,
     parameters_of,
-    prior_vehicle,
+    prior_vehicles,
     varied_parameters,
 )
 from pdhef_logtool.estimators.calibration.single_track import AY, OF_AY, OF_RATE, YAW_RATE
@@ -52,8 +55,12 @@ SLIDING_RAD, SLIDING_S, SLIDING_SHARE = math.radians(8.0), 10.0, 0.2
 EXPORTED_STD = 0.16
 #: Directions of the posterior that an interval follows, at most.
 VARIED = 5
+#: Parameters that an interval follows before any driving.
+VARIED_BY_PRIOR = (FRONT_STIFFNESS, REAR_STIFFNESS, STEER_RATIO, STEER_OFFSET, AY_BIAS)
 #: Smallest difference of understeer gradients that is reported as a contradiction, rad/(m/s²).
 LEAST_CONTRADICTION = 1.5e-3
+#: 1-sigma of the understeer gradient by the limits of the single-track model, rad/(m/s²) (studies/plus_minus.py).
+UNDERSTEER_STD = 7e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +140,8 @@ class SelfCalibration:
     @property
     def text(self) -> str:
         """Summary in one line."""
+        if not self.parameters and not self.refused:
+            return "not calibrated: all parameters keep their prior"
         if self.refused:
             return f"not calibrated, the vehicle file is used: {self.refused}"
         by = {p.name: p for p in self.parameters}
@@ -207,9 +216,7 @@ def self_calibrate(
     seconds = sum(d.seconds for d in drives)
     if seconds < LEAST_S:
         why = f"{seconds:.0f} s above {vehicle_file.low_speed_blend_m_s:g} m/s, {LEAST_S:g} are needed"
-        return SelfCalibration(
-            vehicle_file, vehicle_file, (), None, why, (math.nan,) * 2, (math.nan,) * 2, seconds, len(drives)
-        )
+        return _without_fit(vehicle_file, vehicle_file, why, seconds, len(drives))
     problem = JointProblem(drives, vehicle_file, taught)
     fit = problem.solve()
     progress(1.0)
@@ -236,6 +243,19 @@ def self_calibrate(
     return replace(calibration, refused=_refusal(calibration, drives, sliding, exported=exported))
 
 
+def _without_fit(
+    vehicle_file: VehicleParameters, vehicle: VehicleParameters, refused: str = "", seconds: float = 0.0, logs: int = 1
+) -> SelfCalibration:
+    none = (math.nan, math.nan)
+    return SelfCalibration(vehicle_file, vehicle, (), None, refused, none, none, seconds, logs)
+
+
+def prior_calibration(vehicle_file: VehicleParameters, taught: Sequence[TaughtParameter] = ()) -> SelfCalibration:
+    """Return the calibration before any driving: prior means, varied by the prior in what moves the sideslip most."""
+    centre, *varied = prior_vehicles(vehicle_file, taught, VARIED_BY_PRIOR)
+    return replace(_without_fit(vehicle_file, centre), varied=tuple(varied))
+
+
 def calibrate_online(
     driving: Driving, vehicle_file: VehicleParameters, *, taught: Sequence[TaughtParameter] = ()
 ) -> SelfCalibration:
@@ -248,10 +268,7 @@ def calibrate_online(
     for first, last in driving.stretches:
         inside[first:last] = STEP_S
     driven, needed = np.cumsum(inside), LEAST_S
-    start = SelfCalibration(
-        vehicle_file, prior_vehicle(vehicle_file, taught), (), None, "", (math.nan,) * 2, (math.nan,) * 2, 0.0, 1
-    )
-    stages = [start]
+    stages = [prior_calibration(vehicle_file, taught)]
     while driven.size and needed < driven[-1]:
         count = int(np.searchsorted(driven, needed)) + 1
         calibration = self_calibrate([driving.until(count)], vehicle_file, taught=taught)
@@ -270,7 +287,7 @@ def _understeer(problem: JointProblem, fit: Fit, vehicle_file: VehicleParameters
     steps = DERIVATIVE_STEP * np.eye(fit.theta.size)
     slope = np.array([gradient(fit.theta + step) - centre for step in steps]) / DERIVATIVE_STEP
     file = vehicle_file.understeer_gradient_rad_per_m_s2(vehicle_file.assumed_friction)
-    return Understeer(file, centre, math.sqrt(float(slope @ fit.covariance @ slope)))
+    return Understeer(file, centre, math.hypot(math.sqrt(float(slope @ fit.covariance @ slope)), UNDERSTEER_STD))
 
 
 def _refusal(calibration: SelfCalibration, drives: Sequence[Driving], sliding: float, *, exported: bool) -> str:

@@ -5,7 +5,7 @@ A log of any length is taken window by window and thinned at once: of ten hours 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,12 +33,14 @@ class Driving:
     columns : float64 [5, N], steering, speed, yaw rate, a_y and friction on the grid, as ``read_with`` reads them.
     stamps_ns : int64 [N], end of each cell of the grid.
     stretches : int64 [k, 2], [first, last) of each stretch without a gap above the vehicle's low-speed limit.
+    has_ay : whether a_y was measured; if not, it is v_x r here, and is not compared.
     """
 
     columns: FloatArray
     stamps_ns: IntArray
     stretches: IntArray
     read_with: VehicleParameters
+    has_ay: bool = True
 
     @property
     def seconds(self) -> float:
@@ -47,12 +49,12 @@ class Driving:
 
     def between(self, first: int, last: int) -> Driving:
         """Return the same grid with the stretches between two cells alone."""
-        return Driving(self.columns, self.stamps_ns, _long(np.clip(self.stretches, first, last)), self.read_with)
+        return replace(self, stretches=_long(np.clip(self.stretches, first, last)))
 
     def until(self, count: int) -> Driving:
         """Return the first cells of the grid."""
-        stretches = np.minimum(self.stretches, count)
-        return Driving(self.columns[:, :count], self.stamps_ns[:count], _long(stretches), self.read_with)
+        stretches = _long(np.minimum(self.stretches, count))
+        return replace(self, columns=self.columns[:, :count], stamps_ns=self.stamps_ns[:count], stretches=stretches)
 
 
 class DrivingReader:
@@ -101,7 +103,10 @@ class DrivingReader:
         columns[FRICTION] = np.where(np.isfinite(columns[FRICTION]), columns[FRICTION], self._vehicle.assumed_friction)
         for row, bridged_s in ((STEER, BRIDGED_S), (YAW_RATE, BRIDGED_S), (AY, BRIDGED_S), (SPEED, SPEED_BRIDGED_S)):
             columns[row] = _bridged(columns[row], round(bridged_s / STEP_S))
-        return Driving(columns, stamps_ns, _stretches(columns, self._vehicle.low_speed_blend_m_s), self._vehicle)
+        if not (has_ay := bool(np.isfinite(columns[AY]).any())):
+            columns[AY] = columns[SPEED] * columns[YAW_RATE]
+        stretches = _stretches(columns, self._vehicle.low_speed_blend_m_s)
+        return Driving(columns, stamps_ns, stretches, self._vehicle, has_ay)
 
     def _take(self, signals: Signals, cell: NDArray[np.int64]) -> None:
         if not len(signals):

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pdhef_logtool.estimators.reference import smoother as s
+from pdhef_logtool.records.geometry import WGS84_A_M
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 
 #: Knots per second.
@@ -35,7 +36,6 @@ LEAST_SIGN_CORRELATION = 0.3
 ANTENNA_Y_STD_M, LENGTH_FACTOR = 0.5, 4.0
 #: White and correlated 1-sigma of a position: with carrier phase, and of a single receiver.
 RTK_M, SINGLE_M, RTK_ACCURACY_M = (0.01, 0.01), (0.3, 2.0), 0.1
-EARTH_RADIUS_M = 6_378_137.0
 #: Half of the time over which accelerations are averaged that gains multiply, s.
 SLOW_S = 0.25
 
@@ -260,8 +260,8 @@ def _add_position(rows: FloatArray, signals: Signals, knot_s: FloatArray) -> Non
     used = np.isfinite(rows[k, s.GNSS_EAST])
     stated = np.nan_to_num(signals.gnss_position_std_m[good], nan=SINGLE_M[1])
     for column, values in (
-        (s.POSITION_EAST, EARTH_RADIUS_M * east),
-        (s.POSITION_NORTH, EARTH_RADIUS_M * north),
+        (s.POSITION_EAST, WGS84_A_M * east),
+        (s.POSITION_NORTH, WGS84_A_M * north),
         (s.POSITION_STD, np.where(stated < RTK_ACCURACY_M, np.maximum(stated, RTK_M[0]), SINGLE_M[0])),
     ):
         rows[k[used], column] = values[used]

@@ -78,20 +78,27 @@ def _times(p, h):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _update(x, p, h, e, r, store, k, m):  # type: ignore[no-untyped-def]
-    """Update with a scalar measurement of residual e; keep what the backward pass needs in slot m of knot k."""
+def correct(x, p, h, e, r):  # type: ignore[no-untyped-def]
+    """Update state and covariance with a scalar measurement of residual e and variance r; return gain and variance."""
     ph = _times(p, h)
     s = _dot(h, ph) + r
     gain = ph / s
+    for i in range(x.shape[0]):
+        x[i] += gain[i] * e
+        for j in range(x.shape[0]):
+            p[i, j] -= ph[i] * ph[j] / s
+    return gain, s
+
+
+@njit(cache=True)
+def _update(x, p, h, e, r, store, k, m):  # type: ignore[no-untyped-def]
+    """Update with a scalar measurement of residual e; keep what the backward pass needs in slot m of knot k."""
     n = x.shape[0]
+    gain, s = correct(x, p, h, e, r)
     store[k, m, :n] = h
     store[k, m, n : 2 * n] = gain
     store[k, m, 2 * n] = e
     store[k, m, 2 * n + 1] = s
-    for i in range(n):
-        x[i] += gain[i] * e
-        for j in range(n):
-            p[i, j] -= ph[i] * ph[j] / s
 
 
 @njit(cache=True)

@@ -1,4 +1,8 @@
-"""Metrics of the size and the mean of errors: one pass over the errors serves all of them."""
+"""Metrics of the size and the mean of errors: one pass over the errors serves all of them.
+
+a_y is the lateral specific force at the CG in the road plane (:data:`~pdhef_logtool.evaluation.units.AY_NOTE`), of
+estimates and of ground truth; a ground truth that lacks it is not scored.
+"""
 
 from __future__ import annotations
 

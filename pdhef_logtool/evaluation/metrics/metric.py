@@ -8,6 +8,7 @@ from typing import Literal, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.evaluation.blocks import HeldRows, SegmentMasks, SegmentSums, packed, row_blocks
 from pdhef_logtool.evaluation.track_errors import scorable
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS, SIGNALS, read_unit
@@ -157,12 +158,18 @@ class SensorErrors:
     ----------
     ay_bias_m_s2, yaw_rate_bias_rad_s : reading minus true value. ay_gain : of a_y, by body roll. lever_m : position of
         the accelerometer ahead of the centre of gravity.
+    vehicle, read_with : with which the log explains its yaw rate, and with which its signals were read; None: unknown.
+    steer_delay_s : of the steering angle. friction : of the road; None: that of the signals.
     """
 
     ay_bias_m_s2: float = 0.0
     yaw_rate_bias_rad_s: float = 0.0
     ay_gain: float = 1.0
     lever_m: float = 0.0
+    vehicle: VehicleParameters | None = None
+    read_with: VehicleParameters | None = None
+    steer_delay_s: float = 0.0
+    friction: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,6 +19,7 @@ MODULES = (
     "innovations",
     "whiteness",
     "lateral_consistency",
+    "yaw_consistency",
     "disagreement",
     "residual_active",
     "reference",

@@ -65,7 +65,7 @@ class AxleCurve:
 def usable_stamps(drive: FitDrive, vehicle: VehicleParameters) -> BoolArray:
     """Return where ground truth and signals can be used for identification, [N]."""
     truth = drive.truth
-    is_complete = truth.valid & np.isfinite(truth.vx_m_s + truth.vy_m_s + truth.yaw_rate_rad_s + truth.ay_m_s2)
+    is_complete = truth.valid & np.isfinite(truth.vx_m_s + truth.vy_m_s + truth.yaw_rate_rad_s)
     moving = truth.vx_m_s > SPEED_FACTOR * vehicle.low_speed_blend_m_s
     tame = np.abs(truth.sideslip_rad) < MAX_SIDESLIP_RAD
     use: BoolArray = is_complete & moving & tame & np.isfinite(drive.signals.steer_rad)
@@ -111,9 +111,11 @@ def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters, *, simi
         truth = drive.truth
         vx, vy, r = smoothed(truth.vx_m_s), smoothed(truth.vy_m_s), smoothed(truth.yaw_rate_rad_s)
         ay, steer = smoothed(truth.ay_m_s2), smoothed(drive.signals.steer_rad)
-        r_dot = np.full(len(stamps), np.nan)
+        r_dot = vy_dot = np.full(len(stamps), np.nan)
         if len(stamps) > 2:
-            r_dot = np.gradient(r, stamps * 1e-9 - stamps[0] * 1e-9)
+            r_dot, vy_dot = (np.gradient(x, stamps * 1e-9 - stamps[0] * 1e-9) for x in (r, vy))
+        if not np.isfinite(ay).any():  # no specific force is known: a flat road
+            ay = vy_dot + vx * r
         total, moment = vehicle.mass_kg * ay, vehicle.yaw_inertia_kg_m2 * r_dot
         front = (lr * total + moment) / (lf + lr) / np.cos(steer)
         rear = (lf * total - moment) / (lf + lr)

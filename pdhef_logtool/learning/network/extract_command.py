@@ -59,7 +59,7 @@ from pdhef_logtool.learning.network.residuals import (
     residual_windows,
 )
 from pdhef_logtool.learning.variation import MAX_VARIATION, vary
-from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, identity_of
+from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
@@ -699,7 +699,7 @@ def _fingerprint(job: _Job, split: str) -> str:
         "seed": job.settings.seed,
         "vehicle": [job.physics[0], job.car.noise_sha256],
         **({} if job.log_input.span_s is None else {"span_s": job.log_input.span_s}),
-        "mapping": None if mapping is None else hashlib.sha256(Path(mapping).read_bytes()).hexdigest(),
+        "mapping": None if mapping is None else hash_log(Path(mapping)),
         "versions": tool_versions(),
     }
     return digest(document)

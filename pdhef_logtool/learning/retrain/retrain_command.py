@@ -162,7 +162,7 @@ class _Retraining:
     def basis(self, *rests_on: Any, role: str = "") -> list[Any]:
         """Return the inputs of a stage: the settings of all, the drives of a split, and others."""
         config = self.settings.config
-        mapping = None if config.mapping is None else digest(config.mapping.read_text(encoding="utf-8"))
+        mapping = None if config.mapping is None else hash_log(config.mapping)
         head = record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=config, seed=self.settings.seed), self.car)
         return [
             head,

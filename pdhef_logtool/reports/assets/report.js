@@ -24,8 +24,9 @@
 
   /** A colour of the data, lighter on a dark page; alpha: translucent. */
   function tint(colour, alpha) {
-    const n = parseInt(colour.slice(1), 16), share = dark ? (n < 0x303030 ? 0.85 : 0.4) : 0;
-    const [r, g, b] = [n >> 16, (n >> 8) & 255, n & 255].map((c) => Math.round(c + share * (255 - c)));
+    const n = parseInt(colour.slice(1), 16), parts = [n >> 16, (n >> 8) & 255, n & 255];
+    const share = dark ? (Math.max(...parts) < 0x30 ? 0.85 : 0.4) : 0;
+    const [r, g, b] = parts.map((c) => Math.round(c + share * (255 - c)));
     return `rgba(${r},${g},${b},${alpha === undefined ? 1 : alpha})`;
   }
 
@@ -548,7 +549,7 @@
       width: widthOf(figure), height: intervals.length * 24 + 56, legend: { show: false },
       scales: { x: { time: false, range: [low, high] }, y: { range: [0, intervals.length] } },
       axes: [axis(unit, { size: 26 }), axis("", {
-        size: 150, splits: () => intervals.map((_, i) => intervals.length - 0.5 - i), values: () => intervals.map((i) => i.label),
+        size: 150, splits: () => intervals.map((_, i) => intervals.length - 0.5 - i), values: () => intervals.map((i) => fitted(i.label)),
         grid: { show: false }, ticks: { show: false },
       })],
       series: [{}, { scale: "y", stroke: "transparent", points: { show: false } }],
@@ -655,6 +656,13 @@
     }
   }
 
+  // Select the text, so that a browser that refuses leaves one key to press.
+  function copy(button) {
+    getSelection().selectAllChildren(document.getElementById(button.dataset.of));
+    const done = document.execCommand("copy");
+    button.parentElement.querySelector(".copied").textContent = done ? "Copied." : "Selected: press Ctrl+C.";
+  }
+
   function start() {
     readColours();
     for (const node of document.querySelectorAll("[data-figure]")) {
@@ -676,6 +684,7 @@
       });
     }
     for (const button of document.querySelectorAll("button.whole")) button.addEventListener("click", () => zoomTo(null));
+    for (const button of document.querySelectorAll("button.copy")) button.addEventListener("click", () => copy(button));
     let waiting = 0;
     addEventListener("resize", () => {
       clearTimeout(waiting);

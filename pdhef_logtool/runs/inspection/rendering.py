@@ -44,7 +44,7 @@ def render_inspection(inspection: Inspection, console: Console) -> None:
         console.print(_statistics_table(inspection))
     if inspection.candidates:
         console.print(_candidates_table(inspection.candidates))
-    for head, style, text in (*_findings(inspection), *_uses(inspection)):
+    for head, style, text in (*findings_of(inspection), *_uses(inspection)):
         line = Table.grid(padding=(0, 1))
         line.add_column(width=9)
         line.add_column(overflow="fold")
@@ -171,7 +171,7 @@ def _statistics_row(report: SignalReport) -> tuple[str, ...]:
     )
 
 
-def _findings(inspection: Inspection) -> list[tuple[str, str, str]]:
+def findings_of(inspection: Inspection) -> list[tuple[str, str, str]]:
     """Return lines of findings: a heading, its style and the text."""
     rows: list[tuple[str, str, str]] = []
     if inspection.missing:

@@ -31,7 +31,6 @@ from pdhef_logtool.mapping import (
     Mapping,
     QualityGate,
     SignalSource,
-    check_mapping,
     clock_key,
     fit_clocks,
     mapping_of,
@@ -42,12 +41,13 @@ from pdhef_logtool.mapping import (
     resolve_mapping,
 )
 from pdhef_logtool.mapping.candidates import Candidate
+from pdhef_logtool.mapping.choosing import choose_mapping
 from pdhef_logtool.mapping.clocks import sources_by_clock, survey_windows
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss
-from pdhef_logtool.runs.inspection.step_statistics import DelayStatistics, StepStatistics, ValueStatistics
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, FloatArray, Loss
+from pdhef_logtool.runs.inspection.step_statistics import DelayStatistics, Outline, StepStatistics, ValueStatistics
 from pdhef_logtool.runs.inspection.uses import uses_of
 from pdhef_logtool.storage.documents import jsonable
 from pdhef_logtool.storage.files import write_bytes
@@ -165,6 +165,7 @@ class Inspection:
     checks : what physics states of signals and ground truth. proposals : corrections of the mapping that are certain.
     lost : every loss and note of reading. sample : what was looked at; None: everything.
     checksummed_share : which share of the bytes that were read a verified checksum covers; None where none was read.
+    lines : extremes in equal parts of the log [C] by section and signal, no part of the JSON.
     refused : by channel why a run computes nothing from it.
     """
 
@@ -186,6 +187,7 @@ class Inspection:
     candidates: tuple[Candidate, ...] = ()
     sample: Sample | None = None
     checksummed_share: float | None = None
+    lines: MappingABC[tuple[str, str], tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     refused: MappingABC[str, str] = field(default_factory=dict)
 
     @property
@@ -285,8 +287,7 @@ def inspect_drive_log(
         auto = recognise(log, prefer_truth=prefer_truth)
         mapping, ambiguities, candidates = auto.mapping, auto.ambiguities, auto.candidates
     else:
-        check_mapping(given, log)
-        mapping = given
+        mapping = choose_mapping(log, given, prefer_truth=prefer_truth, require_signals=False).mapping
     mapping = resolve_mapping(log, mapping)
     head = (log.start_ns, min(log.end_ns, log.start_ns + WINDOW_NS))
     whole = _Look(windows(log.start_ns, log.end_ns, WINDOW_NS, log.recording_span), tuple(t.name for t in log.topics))
@@ -319,6 +320,7 @@ def inspect_drive_log(
         candidates=candidates,
         sample=None if look.sample is None else look.sample(),
         checksummed_share=checksummed_share(log.byte_ledgers),
+        lines={key: (entry.line.low, entry.line.high) for key, entry in gathered.items()},
         refused=looked_at.refused(),
     )
 
@@ -345,7 +347,7 @@ def _read_windows(
                 steps[name].add(columns.log_time_ns)
             delays[name].add(columns.log_time_ns, columns.publish_time_ns)
         losses.append(channels.losses)
-        _gather(channels, gathered)
+        _gather(channels, gathered, log.end_ns - log.start_ns)
     return steps, delays, gathered, merge_losses(losses)
 
 
@@ -385,20 +387,23 @@ def _sample_look(log: DriveLog, index: ColumnarLog, mapping: Mapping, head: tupl
 
 @dataclass(slots=True)
 class _Gathered:
-    steps: StepStatistics
-    values: ValueStatistics
+    line: Outline
+    steps: StepStatistics = field(default_factory=StepStatistics)
+    values: ValueStatistics = field(default_factory=ValueStatistics)
 
 
-def _gather(channels: MappedChannels, gathered: dict[tuple[str, str], _Gathered]) -> None:
+def _gather(channels: MappedChannels, gathered: dict[tuple[str, str], _Gathered], span_ns: int) -> None:
     for section, partial in (("signals", channels.signals), ("truth", channels.truth)):
         for name, channel in partial.items():
-            entry = gathered.setdefault((section, name), _Gathered(StepStatistics(), ValueStatistics()))
+            entry = gathered.setdefault((section, name), _Gathered(Outline(span_ns)))
             stamps = channel.stamps_ns
+            values = channel.values if channel.values.ndim == 1 else np.linalg.norm(channel.values, axis=1)
+            entry.line.add(stamps, values)
             if entry.steps.last_ns is not None:
                 # Stamps at the seam of two windows may be out of order by the jitter of their delays.
                 stamps = stamps[stamps > entry.steps.last_ns]
             entry.steps.add(stamps)
-            entry.values.add(channel.values if channel.values.ndim == 1 else np.linalg.norm(channel.values, axis=1))
+            entry.values.add(values)
 
 
 # ------------------------------------------------------------------------------------------------ reports
@@ -446,7 +451,7 @@ def _signal_report(
     log: DriveLog,
     quality: QualityGate | None,
 ) -> SignalReport:
-    entry = gathered.get((section, source.name), _Gathered(StepStatistics(), ValueStatistics()))
+    entry = gathered.get((section, source.name), _Gathered(Outline(0)))
     gaps = entry.steps.gaps()
     largest = max(gaps, key=lambda g: g[0]) if gaps else None
     has_values = entry.values.count > 0
@@ -503,10 +508,6 @@ def _clock_notes(mapping: Mapping, clocks: dict[str, ClockModel]) -> list[str]:
     return notes
 
 
-def _inverse(seconds: float) -> float:
-    return 1.0 / seconds if math.isfinite(seconds) and seconds > 0.0 else float("nan")
-
-
 # ------------------------------------------------------------------------------------------------ mapping
 
 
@@ -539,8 +540,14 @@ def mapping_comments(inspection: Inspection) -> dict[str, str]:
     return comments
 
 
+def mapping_text(inspection: Inspection) -> str:
+    """Return the inspection's mapping, with the corrections that it proposes, as TOML that is ready to edit."""
+    mapping, _ = apply_proposals(inspection.proposals, inspection.mapping, default_vehicle())
+    return mapping_to_toml(mapping, comments=mapping_comments(inspection), alternatives=inspection.candidates)
+
+
 def write_mapping(inspection: Inspection, path: Path) -> None:
-    """Write the inspection's mapping, with the corrections that it proposes, as a TOML file that is ready to edit.
+    """Write :func:`mapping_text` to a new file.
 
     Raises
     ------
@@ -550,10 +557,7 @@ def write_mapping(inspection: Inspection, path: Path) -> None:
         raise OutputError(
             expected="a new file", got="one that exists", where=str(path), remedy="give another name or remove it"
         )
-    mapping, _ = apply_proposals(inspection.proposals, inspection.mapping, default_vehicle())
-    comments = mapping_comments(inspection)
-    text = mapping_to_toml(mapping, comments=comments, alternatives=inspection.candidates)
-    write_bytes(path, text.encode())
+    write_bytes(path, mapping_text(inspection).encode())
 
 
 def _number(value: float) -> str:

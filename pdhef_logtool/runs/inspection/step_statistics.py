@@ -17,6 +17,8 @@ GAP_PERIODS = 5.0
 MIN_GAP_S = 0.1
 #: Messages whose median step differs from the mean step by more come in bursts.
 BURST = 0.75
+#: Parts of a log whose extremes are kept.
+COLUMNS = 100
 
 
 @dataclass(slots=True)
@@ -82,7 +84,10 @@ class StepStatistics:
         steps = self.steps_s.values
         if not steps.shape[0]:
             return float("nan")
-        limit = max(MIN_GAP_S, GAP_PERIODS * float(steps.mean()))
+        # The step that half of the time is spent in, without the few longest: of bursts, that from one to the next.
+        usual = np.sort(steps)[: max(1, len(steps) - max(1, len(steps) // 100))]
+        half = usual[np.searchsorted(np.cumsum(usual), 0.5 * usual.sum())]
+        limit = max(MIN_GAP_S, GAP_PERIODS * float(half))
         mean, median = float(steps[steps <= limit].mean()), self.median_s
         step = median if BURST * mean <= median <= mean / BURST else mean
         return 1.0 / step if step > 0.0 else float("nan")
@@ -164,6 +169,26 @@ class ValueStatistics:
     def std(self) -> float:
         """Standard deviation; NaN without values."""
         return float(np.sqrt(self.squares / self.count)) if self.count else float("nan")
+
+
+@dataclass(slots=True)
+class Outline:
+    """Smallest and largest value in each of ``COLUMNS`` equal parts of ``span_ns`` from the first stamp on [C]."""
+
+    span_ns: int
+    first_ns: int | None = None
+    low: FloatArray = field(default_factory=lambda: np.full(COLUMNS, np.inf))
+    high: FloatArray = field(default_factory=lambda: np.full(COLUMNS, -np.inf))
+
+    def add(self, stamps_ns: IntArray, values: FloatArray) -> None:
+        """Add a window's values, float64 [N], at their stamps, int64 [N]."""
+        if stamps_ns.shape[0] == 0:
+            return
+        self.first_ns = int(stamps_ns[0]) if self.first_ns is None else self.first_ns
+        column = (stamps_ns - self.first_ns) * (COLUMNS / max(1, self.span_ns))
+        column = np.clip(column, 0, COLUMNS - 1).astype(np.int64)
+        np.fmin.at(self.low, column, values)
+        np.fmax.at(self.high, column, values)
 
 
 def thin(values: FloatArray) -> FloatArray:

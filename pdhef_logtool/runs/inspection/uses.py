@@ -34,9 +34,9 @@ def usable_signals(mapping: Mapping) -> frozenset[str]:
 def possible_uses(mapping: Mapping) -> str:
     """Return what can be done with a log that is mapped so."""
     have = usable_signals(mapping)
-    names = [preset_of(s.name) for s in all_specs() if s.needs <= have and not s.network and not s.needs_noise]
+    names = [preset_of(s.name) for s in all_specs() if not s.lacking(have) and not s.network and not s.needs_noise]
     uses = []
-    if spec_of(_MAIN).needs <= have:
+    if not spec_of(_MAIN).lacking(have):
         against = _scored(mapping)
         uses.append(f"estimate sideslip ({_MAIN} and others){against}")
     elif names and have:
@@ -49,8 +49,9 @@ def possible_uses(mapping: Mapping) -> str:
 
 
 def missing_for_sideslip(mapping: Mapping) -> str:
-    """Return what sideslip still needs; empty where nothing is missing."""
-    lacking = sorted(spec_of(_MAIN).needs - usable_signals(mapping), key=list(_WORDS).index)
+    """Return what sideslip still needs, or would gain most from; empty where nothing is missing."""
+    wanted = spec_of(_MAIN).needs | {"steer_rad"}
+    lacking = sorted(wanted - usable_signals(mapping), key=list(_WORDS).index)
     return ", ".join(_WORDS.get(n, n) for n in lacking)
 
 

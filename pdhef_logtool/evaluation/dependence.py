@@ -47,6 +47,26 @@ class Dependence:
     by: tuple[str, ...] = ()
     levels: tuple[tuple[str, int], ...] = ()
 
+    def text(self, drives: int) -> str:
+        """Return a sentence on the dependence of drives of one day, car or route."""
+        groups = [f"{count} {name}s" for name, count in self.levels if count > 1]
+        if not groups:
+            return "Drives are taken as independent: days, cars and routes are the same in all drives, or not recorded."
+        among = f"{drives} drives of {', '.join(groups)}"
+        if self.design_effect == 1.0:
+            return f"Design effect 1: no dependence between {among}."
+        return (
+            f"Design effect {self.design_effect:.2g} by {' and '.join(self.by)}: {among} have the evidence of "
+            f"{drives / self.design_effect:.0f} independent drives."
+        )
+
+
+def deviate(share: float, freedom: float) -> float:
+    """Return a quantile of Student's t, or of the normal distribution with infinite degrees of freedom."""
+    from scipy.special import ndtri, stdtrit  # scipy.stats takes half a second longer to load
+
+    return float(ndtri(share) if math.isinf(freedom) else stdtrit(freedom, share))
+
 
 def numbered(values: Sequence[object]) -> IntArray:
     """Return an integer for each different value [N]; a drive that states none (None) is a value of its own."""
@@ -133,12 +153,18 @@ def _freedom(part: IntArray, means: int) -> float:
 
 
 def factors_of(entry: Mapping[str, Any], report: Mapping[str, Any] | None) -> dict[str, str | None]:
-    """Return day (UTC), car and route of a drive by its entry in run.json and its report; None where not stated."""
+    """Return day (UTC), car and route of a drive by its entry in run.json, day and route else by its report."""
+    car = (entry.get("car") or {}).get("name")
+    stated = {key: entry.get(key) for key in ("day", "route")}
+    if report is not None and not any(stated.values()):
+        stated = day_and_route((report.get("log") or {}).get("start_ns"), report.get("metadata") or {})
+    return {"car": None if car is None else str(car), **stated}
+
+
+def day_and_route(start_ns: int | None, metadata: Mapping[str, Any]) -> dict[str, str | None]:
+    """Return the day (UTC) on which a log starts, and the route that its metadata name."""
     from datetime import UTC, datetime
 
-    metadata = {str(k).rpartition(".")[2].lower(): str(v) for k, v in ((report or {}).get("metadata") or {}).items()}
-    start_ns = ((report or {}).get("log") or {}).get("start_ns")
+    texts = {str(k).rpartition(".")[2].lower(): str(v) for k, v in metadata.items()}
     day = None if start_ns is None else datetime.fromtimestamp(start_ns * 1e-9, UTC).date().isoformat()
-    car = (entry.get("car") or {}).get("name")
-    route = next((metadata[key] for key in ROUTE_KEYS if key in metadata), None)
-    return {"day": day, "car": None if car is None else str(car), "route": route}
+    return {"day": day, "route": next((texts[key] for key in ROUTE_KEYS if key in texts), None)}

@@ -1,0 +1,370 @@
+"""``physics`` and ``pd-hef`` with GNSS velocity, as late as it arrives (docs/method.md#gnss).
+
+One antenna shows a course and no heading. Hypotheses differ in how certain v_y of the filter is: as it is, good in the
+linear range of the tyres, or poor. For each a Kalman filter estimates [v_y, heading, bias of a_y, bias of the gyro,
+error of the filter's v_y, antenna x, delay of the receiver] from
+
+    v̇_y = a_y − b − (r − b_r) v_x,   ψ̇ = r − b_r,   v_y,filter = v_y − S v_x d,
+
+with d of unit variance and S the uncertainty of the hypothesis, and from the velocity of the antenna across the
+heading. That of a late sample is the present one less what the sensors have integrated since. The likelihood of the
+GNSS samples, forgotten within seconds, weighs the hypotheses, as in :mod:`~.adaptive_physics`: where GNSS does not
+contradict the filter, its estimate stays. Samples between a jump against the sensors and one back are not used.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2
+from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.base import notes_of
+from pdhef_logtool.estimators.corrected import CorrectedPhysics
+from pdhef_logtool.estimators.filter_base import sideslip_std
+from pdhef_logtool.estimators.physics_filter import LIMIT_TIME_S, LINEAR_SHARE, PhysicsFilter
+from pdhef_logtool.estimators.reference.inputs import GNSS_LAG_S
+from pdhef_logtool.estimators.reference.smoother import BIAS_M_S2, BIAS_S, LAW_S, LAW_WHITE, TILT_SHARE, correct
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns, last_stamp_ns, step_durations_s
+from pdhef_logtool.records.tracks import StateTrack
+
+#: Entries of the state of a hypothesis.
+VY, HEADING, AY_BIAS, RATE_BIAS, LAW_ERROR, ANTENNA_X, DELAY, STATES = range(8)
+#: Uncertainty of the filter's v_y over v_x in degrees: constant, per m/s², per m/s³, per square of the share of the
+#: grip beyond the linear range; and the logarithm of the prior weight. Chosen on simulated drives.
+HYPOTHESES = ((0.01, 0.0, 0.0, 0.0, 0.0), (0.06, 0.02, 0.02, 30.0, -5.5), (1.0, 0.3, 0.1, 30.0, -9.0),
+              (10.0, 0.3, 0.1, 30.0, -13.0))  # fmt: skip
+#: 1-sigma of a GNSS velocity at least, m/s; gate in 1-sigmas; speed below which there is no course, m/s.
+GNSS_STD_M_S, GATE_SIGMA, LEAST_SPEED_M_S = 0.1, 4.0, 3.0
+#: Time constant with which the likelihood is forgotten, s; jump of GNSS against the sensors, m/s; time after which a
+#: heading that samples contradict is determined again, s.
+FORGET_S, JUMP_M_S, LOST_S = 5.0, 0.3, 20.0
+#: Height of an antenna over the roll axis and its 1-sigma, m; 1-sigma of antenna x, unknown and known, m.
+ANTENNA_HEIGHT_M, HEIGHT_STD_M, ANTENNA_STD_M, KNOWN_ANTENNA_STD_M = 1.2, 0.5, 0.5, 0.1
+#: 1-sigmas at the start: heading, rad; gyro, rad/s; delay, s.
+HEADING_STD, RATE_STD, DELAY_STD_S = 0.1, 0.002, 0.03
+#: White noise of accelerometer, m/s²/√Hz, and gyro, rad/s/√Hz; walk of the gyro's bias, rad/s/√s; interval to which the
+#: white part of the filter's error belongs, s, and its floor, m/s.
+AY_NOISE, RATE_NOISE, RATE_WALK, KNOT_S, FLOOR_M_S = 0.05, 0.001, 1e-5, 0.05, 0.005
+#: Low passes of a_y: for its size and its derivative, s. GNSS samples that can wait for their arrival.
+SIZE_S, SLOPE_S, QUEUE = 0.05, 0.1, 64
+_LAW = np.array(HYPOTHESES) * np.array([math.pi / 180.0] * 4 + [1.0])
+
+# Entries of what all hypotheses share, and columns of a sample that waits.
+_CLOCK, _RATE, _AY, _VX, _TURNED, _MOVED, _SIZE, _SLOPE = range(8)
+_GRIP, _RUNS, _LEFT, _LAST, _JUMP, _SINCE, _AGREES, _FIRST, _END = range(8, 17)
+_EAST, _NORTH, _AT, _ARRIVAL, _TURNED_THEN, _MOVED_THEN, _RATE_THEN, _AY_THEN, _ROLL_THEN, _STD = range(10)
+
+
+class Aiding(NamedTuple):
+    """Memory between windows: states [H, 7] and covariances, facts of each, what they share, samples that wait.
+
+    ``facts`` [H, 3]: evidence, whether the heading is known, and since when samples are rejected (−1: they are not).
+    """
+
+    x: FloatArray
+    P: FloatArray
+    facts: FloatArray
+    shared: FloatArray
+    waiting: FloatArray
+
+
+@njit(cache=True)
+def _start(memory, antenna, vy, vx):  # type: ignore[no-untyped-def]
+    x, P, facts, shared, _ = memory
+    x[:], P[:], facts[:], shared[:] = 0.0, 0.0, 0.0, 0.0
+    x[:, VY], x[:, ANTENNA_X], facts[:, 2] = vy, antenna[0], -1.0
+    for i in range(x.shape[0]):
+        P[i, VY, VY] = 0.01 + (_LAW[i, 0] * vx) ** 2
+        P[i, AY_BIAS, AY_BIAS], P[i, RATE_BIAS, RATE_BIAS] = BIAS_M_S2**2, RATE_STD**2
+        P[i, LAW_ERROR, LAW_ERROR] = 1.0
+        P[i, ANTENNA_X, ANTENNA_X], P[i, DELAY, DELAY] = antenna[1] ** 2, DELAY_STD_S**2
+
+
+@njit(cache=True)
+def _advance(x, P, dt, vx, ay_slope, kinematic):  # type: ignore[no-untyped-def]
+    """Move one hypothesis by a step in which the sensors integrate to ``kinematic`` (v_y at heading rate r, angle)."""
+    kept, law_kept = math.exp(-dt / BIAS_S), math.exp(-dt / LAW_S)
+    x[VY] += kinematic[0] - dt * (x[AY_BIAS] - x[RATE_BIAS] * vx)
+    x[HEADING] += kinematic[1] - dt * x[RATE_BIAS]
+    x[AY_BIAS] *= kept
+    x[LAW_ERROR] *= law_kept
+    for j in range(STATES):  # F P, then (F P) Fᵀ
+        P[VY, j] += dt * (vx * P[RATE_BIAS, j] - P[AY_BIAS, j])
+        P[HEADING, j] -= dt * P[RATE_BIAS, j]
+        P[AY_BIAS, j] *= kept
+        P[LAW_ERROR, j] *= law_kept
+    for i in range(STATES):
+        P[i, VY] += dt * (vx * P[i, RATE_BIAS] - P[i, AY_BIAS])
+        P[i, HEADING] -= dt * P[i, RATE_BIAS]
+        P[i, AY_BIAS] *= kept
+        P[i, LAW_ERROR] *= law_kept
+    gyro = RATE_NOISE**2 * dt
+    P[VY, VY] += AY_NOISE**2 * dt + gyro * vx * vx
+    P[VY, HEADING] -= gyro * vx
+    P[HEADING, VY] -= gyro * vx
+    P[HEADING, HEADING] += gyro
+    P[AY_BIAS, AY_BIAS] += BIAS_M_S2**2 * (1.0 - kept * kept) + (TILT_SHARE * ay_slope * dt) ** 2
+    P[RATE_BIAS, RATE_BIAS] += RATE_WALK**2 * dt
+    P[LAW_ERROR, LAW_ERROR] += 1.0 - law_kept * law_kept
+
+
+@njit(cache=True)
+def _residual(x, P, facts, sample, shared, h):  # type: ignore[no-untyped-def]
+    """Return residual and variances, the sample's and in all, of a GNSS velocity across the heading; Jacobian in h."""
+    age = shared[_CLOCK] - sample[_AT]
+    turned = shared[_TURNED] - sample[_TURNED_THEN] - age * x[RATE_BIAS]
+    moved = shared[_MOVED] - sample[_MOVED_THEN] - age * (x[AY_BIAS] - x[RATE_BIAS] * shared[_VX])
+    rate = sample[_RATE_THEN] - x[RATE_BIAS]
+    left = x[VY] - moved + x[ANTENNA_X] * rate - x[DELAY] * sample[_AY_THEN] - ANTENNA_HEIGHT_M * sample[_ROLL_THEN]
+    if facts[1] == 0.0:
+        x[HEADING] = math.atan2(sample[_NORTH], sample[_EAST]) - math.atan2(left, shared[_VX]) + turned
+        P[HEADING, :], P[:, HEADING] = 0.0, 0.0
+        P[HEADING, HEADING], facts[1] = HEADING_STD**2, 1.0
+    c, s = math.cos(x[HEADING] - turned), math.sin(x[HEADING] - turned)
+    h[:] = 0.0
+    h[VY], h[HEADING] = 1.0, c * sample[_EAST] + s * sample[_NORTH]
+    h[ANTENNA_X], h[DELAY] = rate, -sample[_AY_THEN]
+    white = sample[_STD] ** 2 + (BIAS_M_S2 * age) ** 2
+    variance = white
+    for i in range(STATES):
+        for j in range(STATES):
+            variance += h[i] * P[i, j] * h[j]
+    return c * sample[_NORTH] - s * sample[_EAST] - left, white, variance
+
+
+@njit(cache=True)
+def _use(x, P, facts, sample, shared, h, doubt):  # type: ignore[no-untyped-def]
+    """Update one hypothesis with a GNSS velocity; return the residual left. ``doubt``: cost of not fitting."""
+    error, white, variance = _residual(x, P, facts, sample, shared, h)
+    square = error * error / variance
+    facts[0] -= 0.5 * (min(square, GATE_SIGMA**2) + math.log(variance))
+    if square <= GATE_SIGMA**2:
+        facts[2] = -1.0
+        correct(x, P, h, error, white)
+        return error * white / variance
+    facts[0] -= doubt
+    facts[2] = shared[_CLOCK] if facts[2] < 0.0 else facts[2]
+    if shared[_CLOCK] - facts[2] > LOST_S:
+        facts[1], facts[2] = 0.0, -1.0
+    return error
+
+
+@njit(cache=True)
+def _has_jumped(error, sample, shared, facts):  # type: ignore[no-untyped-def]
+    """Return whether GNSS is between a jump against the sensors and one back (multipath), for ``LOST_S`` at most."""
+    change = error - shared[_LEFT]
+    limit = JUMP_M_S + 0.02 * abs(sample[_AY_THEN]) + 0.5 * (sample[_AT] - shared[_LAST]) + abs(sample[_ROLL_THEN])
+    limit += 0.3 * abs(sample[_RATE_THEN])  # an error of v_x becomes one of v_y
+    shared[_LAST] = sample[_AT]
+    if shared[_JUMP] == 0.0 and abs(change) > limit:
+        shared[_JUMP], shared[_SINCE] = change, shared[_CLOCK]
+    elif abs(change + shared[_JUMP]) < 0.5 * abs(shared[_JUMP]):
+        shared[_JUMP] = 0.0
+    elif shared[_JUMP] != 0.0 and shared[_CLOCK] - shared[_SINCE] > LOST_S:
+        shared[_JUMP], shared[_LEFT] = 0.0, 0.0
+        facts[:, 1] = 0.0
+        return True
+    shared[_LEFT] = error
+    return shared[_JUMP] != 0.0
+
+
+@njit(cache=True)
+def _queue(columns, k, p_roll, shared, waiting):  # type: ignore[no-untyped-def]
+    """Put the GNSS velocity of step k where it waits for its arrival; the oldest one goes where there is no room."""
+    east, north, std, late = columns[7:]
+    row, last = waiting[int(shared[_END]) % QUEUE], waiting[int(shared[_END] - 1.0) % QUEUE]
+    if shared[_END] > 0.0:  # a course that turns against the gyro is that of exchanged or mirrored axes
+        turn = last[_EAST] * north[k] - last[_NORTH] * east[k]
+        shared[_AGREES] += turn / (math.hypot(east[k], north[k]) ** 2) * (shared[_TURNED] - last[_TURNED_THEN])
+    row[_EAST], row[_NORTH], row[_AT], row[_ARRIVAL] = east[k], north[k], shared[_CLOCK], shared[_CLOCK] + late[k]
+    row[_TURNED_THEN], row[_MOVED_THEN], row[_ROLL_THEN] = shared[_TURNED], shared[_MOVED], p_roll
+    row[_RATE_THEN], row[_AY_THEN] = shared[_RATE], shared[_AY]
+    stated = max(std[k], GNSS_STD_M_S) if std[k] == std[k] else GNSS_STD_M_S
+    row[_STD] = math.sqrt(stated**2 + (GNSS_LAG_S * shared[_AY]) ** 2 + (HEIGHT_STD_M * p_roll) ** 2)
+    shared[_END] += 1.0
+    shared[_FIRST] = max(shared[_FIRST], shared[_END] - QUEUE)
+
+
+@njit(cache=True)
+def _share(columns, k, dt, body, shared):  # type: ignore[no-untyped-def]
+    """Move what the hypotheses share to step k; return what the sensors integrate to, and the slope of a_y."""
+    ay, rate, vx = columns[2:5]
+    roll_gradient, imu_x_m, grip_m_s2 = body
+    new_rate = rate[k] if math.isfinite(rate[k]) else shared[_RATE]
+    new_ay = ay[k] / (1.0 + GRAVITY_M_S2 * roll_gradient) if math.isfinite(ay[k]) else shared[_AY]
+    if dt == 0.0:
+        shared[_RATE], shared[_AY], shared[_SIZE], shared[_SLOPE], shared[_VX] = new_rate, new_ay, new_ay, new_ay, vx[k]
+    r = 0.5 * (shared[_RATE] + new_rate)
+    turned = dt * r
+    moved = dt * (0.5 * (shared[_AY] + new_ay) - r * 0.5 * (shared[_VX] + vx[k]))
+    moved -= imu_x_m * (new_rate - shared[_RATE])
+    before = shared[_SLOPE]
+    shared[_SIZE] += (new_ay - shared[_SIZE]) * (1.0 - math.exp(-dt / SIZE_S))
+    shared[_SLOPE] += (new_ay - shared[_SLOPE]) * (1.0 - math.exp(-dt / SLOPE_S))
+    shared[_GRIP] = max(abs(shared[_SIZE]) / grip_m_s2, shared[_GRIP] * math.exp(-dt / LIMIT_TIME_S))
+    shared[_CLOCK] += dt
+    shared[_TURNED] += turned
+    shared[_MOVED] += moved
+    shared[_RATE], shared[_AY], shared[_VX] = new_rate, new_ay, vx[k]
+    return (moved, turned), (shared[_SLOPE] - before) / dt if dt > 0.0 else 0.0
+
+
+@njit(cache=True)
+def _mixture(x, P, facts, agrees, vy, out, k):  # type: ignore[no-untyped-def]
+    """Write what the hypotheses add to v_y at step k, the weight of the filter, and their part of the variance."""
+    total, mean, variance, most = 0.0, 0.0, 0.0, np.max(facts[:, 0] + _LAW[:, 4])
+    for i in range(x.shape[0]):
+        has_heading = i == 0 or (agrees and facts[i, 1] > 0.0)  # without a heading GNSS states nothing
+        weight = math.exp(facts[i, 0] + _LAW[i, 4] - most) if has_heading else 0.0
+        total += weight
+        if i > 0:
+            mean += weight * (x[i, VY] - vy)
+            variance += weight * (P[i, VY, VY] + (x[i, VY] - vy) ** 2)
+        else:
+            out[k, 1] = weight
+    mean /= total
+    out[k, 0], out[k, 1], out[k, 2] = mean, out[k, 1] / total, max(0.0, variance / total - mean * mean)
+
+
+@njit(cache=True)
+def _aid(columns, body, antenna, memory, out):  # type: ignore[no-untyped-def]
+    """Run over one window; ``memory`` is moved in place. ``out`` [K, 3] as :func:`_mixture` writes it."""
+    dts, ready, _, _, vx, vy, usable, east, north, _, _ = columns
+    x, P, facts, shared, waiting = memory
+    h = np.empty(STATES)
+    for k in range(dts.shape[0]):
+        out[k, 0], out[k, 1], out[k, 2] = 0.0, 1.0, 0.0
+        if not usable[k]:
+            shared[_RUNS] = 0.0
+            continue
+        dt = dts[k]
+        if shared[_RUNS] == 0.0 or not dt <= RESTART_GAP_S:
+            _start(memory, antenna, vy[k], vx[k])
+            dt = 0.0
+        shared[_RUNS] = 1.0
+        kinematic, ay_slope = _share(columns, k, dt, body, shared)
+        beyond = max(0.0, shared[_GRIP] - LINEAR_SHARE) ** 2
+        for i in range(x.shape[0]):
+            if dt == 0.0:
+                continue
+            facts[i, 0] *= math.exp(-dt / FORGET_S)
+            _advance(x[i], P[i], dt, vx[k], ay_slope, kinematic)
+            law = _LAW[i, 0] + _LAW[i, 1] * abs(shared[_SIZE]) + _LAW[i, 2] * abs(ay_slope) + _LAW[i, 3] * beyond
+            error_m_s = law * max(vx[k], 1.0)
+            h[:] = 0.0
+            h[VY], h[LAW_ERROR] = 1.0, -error_m_s
+            white = (LAW_WHITE * error_m_s) ** 2 * KNOT_S / dt + FLOOR_M_S**2
+            correct(x[i], P[i], h, vy[k] - x[i, VY] + error_m_s * x[i, LAW_ERROR], white)
+        if math.hypot(east[k], north[k]) >= LEAST_SPEED_M_S:
+            _queue(columns, k, body[0] * ay_slope, shared, waiting)
+        while shared[_FIRST] < shared[_END]:
+            sample = waiting[int(shared[_FIRST]) % QUEUE]
+            if sample[_ARRIVAL] > shared[_CLOCK] + ready[k]:
+                break
+            shared[_FIRST] += 1.0
+            error, _, _ = _residual(x[-1], P[-1], facts[-1], sample, shared, h)
+            if not _has_jumped(error, sample, shared, facts):
+                for i in range(x.shape[0]):
+                    shared[_LEFT] = _use(x[i], P[i], facts[i], sample, shared, h, min(i, 1))
+        _mixture(x, P, facts, shared[_AGREES] > 0.0, vy[k], out, k)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AidedSteps(StepColumns):
+    """Steps of the filter, and by step what GNSS adds to v_y, the filter's weight and other variance, [K, 3]."""
+
+    steps: Any
+    aid: FloatArray
+
+    @property
+    def valid(self) -> Any:
+        """Whether there is an estimate, [K]."""
+        return self.steps.valid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AidedState:
+    """State of the filter and of the aid, and the last stamp, between windows."""
+
+    filter: Any
+    aiding: Aiding
+    last_stamp_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class GnssAided:
+    """The estimator of this file; ``estimator`` is what GNSS velocity corrects."""
+
+    algorithm = "gnss-aided"
+    version = 1
+    options = ("estimator",)
+
+    estimator: AdaptivePhysics | CorrectedPhysics
+    causal: bool = True
+
+    @property
+    def name(self) -> str:
+        """That of the filter."""
+        return self.estimator.name
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes of the report."""
+        return (*notes_of(self.estimator), "GNSS velocity corrects v_y")
+
+    @property
+    def calibrated_as(self) -> AdaptivePhysics | CorrectedPhysics:
+        """Whose intervals apply where it has none of its own."""
+        return self.estimator
+
+    @property
+    def _physics(self) -> PhysicsFilter:
+        physics = self.estimator.physics
+        return physics.physics if isinstance(physics, AdaptivePhysics) else physics
+
+    def run(self, signals: Signals, state: AidedState | None) -> tuple[AidedSteps, AidedState]:
+        """Process one window (see :class:`~.base.Estimator`)."""
+        before_ns = None if state is None else state.last_stamp_ns
+        steps, after = self.estimator.run(signals, None if state is None else state.filter)
+        stamps_ns, count, h = signals.stamps_ns, len(signals), len(HYPOTHESES)
+        everywhere = np.ones(count, dtype=np.bool_)
+        at_steps = Extrapolation(np.arange(count), everywhere, np.zeros(count), np.asarray(steps.valid))
+        track = self.estimator.predict(steps, at_steps, stamps_ns)
+        corrected = self._physics.corrected(signals)
+        columns = (
+            step_durations_s(stamps_ns, before_ns), (signals.ready_ns - stamps_ns) * 1e-9, corrected.ay_m_s2,
+            corrected.yaw_rate_rad_s, track.vx_m_s, track.vy_m_s, track.valid & np.isfinite(track.vy_m_s),
+            *signals.gnss_velocity_m_s.T, signals.gnss_velocity_std_m_s, np.nan_to_num(signals.gnss_late_s),
+        )  # fmt: skip
+        shapes = ((h, STATES), (h, STATES, STATES), (h, 3), (_END + 1,), (QUEUE, _STD + 1))
+        aiding = Aiding(*(np.zeros(s) for s in shapes) if state is None else (a.copy() for a in state.aiding))
+        out = np.empty((count, 3))
+        vehicle = self._physics.vehicle
+        antenna = vehicle.gnss_antenna_position_m
+        body = (vehicle.roll_gradient_rad_per_m_s2, vehicle.imu_position_m[0], GRAVITY_M_S2 * vehicle.assumed_friction)
+        prior = (0.0, ANTENNA_STD_M) if antenna is None else (antenna[0], KNOWN_ANTENNA_STD_M)
+        _aid(columns, body, prior, aiding, out)
+        return AidedSteps(steps, out), AidedState(after, aiding, last_stamp_ns(stamps_ns, before_ns))
+
+    def predict(self, steps: AidedSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
+        """Extrapolate the filter's steps and add what GNSS adds (see :class:`~.base.ModelPredictor`)."""
+        track = self.estimator.predict(steps.steps, ahead, stamps_ns)
+        change, weight, variance = steps.aid[ahead.step].T
+        change = np.where(track.valid, change, 0.0)
+        vy, covariance = track.vy_m_s + change, track.covariance
+        scale = np.ones((len(track), 3))  # row and column alike, so that correlations stay
+        scale[:, 1] = np.sqrt(weight + variance / np.maximum(covariance[:, 1, 1], 1e-12))
+        covariance = covariance * scale[:, :, None] * scale[:, None, :]
+        return replace(
+            track,
+            vy_m_s=vy,
+            sideslip_rad=np.arctan2(vy, track.vx_m_s),
+            covariance=covariance,
+            sideslip_std_rad=sideslip_std(track.vx_m_s, vy, covariance),
+        )

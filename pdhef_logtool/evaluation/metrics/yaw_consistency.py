@@ -1,0 +1,149 @@
+"""``yaw_consistency``: yaw rate of the car's tyres at the estimated v_y and the measured steering, against the gyro."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.evaluation.blocks import SegmentSums, blocks_with_halo, packed
+from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, OfDrive, SensorErrors
+from pdhef_logtool.evaluation.metrics.sensor_residuals import MAX_STEP_S, carried_speed
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
+
+#: The yaw rate forgets its start within this time.
+SETTLE_S = 2.0
+#: Longest step of its integration: the yaw motion of any car has time constants above 20 ms at 3 m/s and more.
+_STEP_S = 0.004
+
+
+def _rows(drive: EvaluatedDrive) -> list[MetricRow]:
+    return yaw_rows([*drive.tracks.values()], drive.signals, drive.masks, log=drive.log, sensors=drive.sensors)
+
+
+def yaw_rows(
+    tracks: Sequence[StateTrack], signals: Signals, masks: Mapping[str, BoolArray], *, log: str, sensors: SensorErrors
+) -> list[MetricRow]:
+    """Return the figure of estimators at the same stamps as the signals [N], one row per segment."""
+    if sensors.vehicle is None:
+        return []
+    masks = packed(masks, len(signals))
+    sums_by_track = [SegmentSums() for _ in tracks]
+    for first, a, b, end in blocks_with_halo(signals, SETTLE_S, 1):
+        core, inside = slice(a - first, b - first), dict(masks.rows(a, b))
+        part = Signals.rows(signals, first, end)  # in memory
+        for track, sums in zip(tracks, sums_by_track, strict=True):
+            residual = yaw_residual(track.rows(first, end), part, sensors.vehicle, sensors)[core]
+            sums.add(inside, residual, residual**2)
+    return [
+        MetricRow(
+            log, track.name, "yaw_rate_rad_s", segment, "yaw_consistency", float(np.sqrt(squares / n)), "rad/s", n
+        )
+        for track, sums in zip(tracks, sums_by_track, strict=True)
+        for segment, (n, (_, squares)) in sums.totals().items()
+    ]
+
+
+def yaw_residual(track: StateTrack, signals: Signals, vehicle: VehicleParameters, sensors: SensorErrors) -> FloatArray:
+    """Return the modelled minus the measured yaw rate [N]; NaN across gaps, at low speed, and without steering.
+
+    The steering, its delay, the gyro's bias and the tyres are those of the calibrated ``vehicle``.
+    """
+    friction = signals.friction if sensors.friction is None else np.full(len(signals), sensors.friction)
+    was = sensors.read_with or vehicle
+    before, after, t = was.sensors, vehicle.sensors, signals.stamps_ns
+    angle = (signals.steer_rad + was.steer_offset_rad) * (was.steering_ratio / vehicle.steering_ratio)
+    rate = signals.yaw_rate_rad_s * before.yaw_rate_gain + before.yaw_rate_bias_rad_s
+    rate = (rate - after.yaw_rate_bias_rad_s) / after.yaw_rate_gain
+    steer = np.interp(t - round(sensors.steer_delay_s * 1e9), t, angle - vehicle.steer_offset_rad)
+    friction = np.where(np.isfinite(friction), friction, vehicle.assumed_friction)
+    dt = np.diff(t, prepend=t[:1]) * 1e-9
+    dt[dt > MAX_STEP_S] = np.nan
+    vy = np.where(track.valid, track.vy_m_s, np.nan)
+    modelled = np.full(len(t), np.nan)
+    inputs = (dt, carried_speed(signals), vy, steer, friction, rate)
+    _yaw_rates(inputs, _tyres_of(vehicle), modelled)
+    return modelled - rate
+
+
+class _Tyres(NamedTuple):
+    """Axle distances and radius of gyration over them, low-speed limit, relaxation, and the axles' formulas (Eq 2).
+
+    B, C and D / m in m/s² of a formula are those at friction 1; ``keeps`` : the stiffness does not depend on friction.
+    """
+
+    front_m: float
+    rear_m: float
+    per_gyration: float  # m / I_z, 1/m²
+    least_speed_m_s: float
+    relaxation_m: float
+    formulas: tuple[tuple[float, float, float, float], tuple[float, float, float, float]]
+    keeps: tuple[bool, bool]
+
+
+def _tyres_of(vehicle: VehicleParameters) -> _Tyres:
+    (bf, cf, df, ef), (br, cr, dr, er) = vehicle.magic_formula(True, 1.0), vehicle.magic_formula(False, 1.0)
+    mass = vehicle.mass_kg
+    return _Tyres(
+        vehicle.cg_to_front_axle_m,
+        vehicle.cg_to_rear_axle_m,
+        mass / vehicle.yaw_inertia_kg_m2,
+        vehicle.low_speed_blend_m_s,
+        max(vehicle.relaxation_length_m, 0.01),
+        ((bf, cf, df / mass, ef), (br, cr, dr / mass, er)),
+        (vehicle.tyres.front.keeps_stiffness, vehicle.tyres.rear.keeps_stiffness),
+    )
+
+
+@njit(cache=True)
+def _force(slip, formula, keeps, friction):  # type: ignore[no-untyped-def]
+    b, c, peak, e = formula
+    x = b * slip / friction if keeps else b * slip
+    return friction * peak * math.sin(c * math.atan(x - e * (x - math.atan(x))))
+
+
+@njit(cache=True)
+def _yaw_rates(inputs, tyres, out):  # type: ignore[no-untyped-def]
+    """Write the yaw rate [N] that the tyres cause at a given v_y, where all inputs are known.
+
+    ``inputs`` [N] each: step before the sample, v_x, v_y, steering, friction and measured yaw rate, from which the
+    model starts. The yaw moment follows that of the tyres with their relaxation length.
+    """
+    dt, vx, vy, steer, friction, measured = inputs
+    r, r_dot = math.nan, 0.0
+    for k in range(dt.shape[0]):
+        v, mu = vx[k], friction[k]
+        whole = v > tyres.least_speed_m_s and math.isfinite(vy[k] + steer[k]) and dt[k] >= 0.0
+        if not whole or not math.isfinite(r):
+            r, r_dot = measured[k] if whole else math.nan, 0.0
+            continue
+        n = max(1, math.ceil(dt[k] / _STEP_S))
+        kept = math.exp(-dt[k] / n * v / tyres.relaxation_m)
+        for _ in range(n):
+            front = steer[k] - math.atan2(vy[k] + tyres.front_m * r, v)
+            rear = -math.atan2(vy[k] - tyres.rear_m * r, v)
+            moment = tyres.front_m * math.cos(steer[k]) * _force(front, tyres.formulas[0], tyres.keeps[0], mu)
+            moment -= tyres.rear_m * _force(rear, tyres.formulas[1], tyres.keeps[1], mu)
+            r_dot = tyres.per_gyration * moment + (r_dot - tyres.per_gyration * moment) * kept
+            r += dt[k] / n * r_dot
+        out[k] = r
+
+
+METRICS = (
+    Metric(
+        "yaw_consistency",
+        "yaw consistency",
+        "signal `yaw_rate_rad_s`: RMS of the gyro minus the yaw rate that the car's tyres have at the estimated v_y "
+        "and the measured steering, above the low-speed blend; tyres, steering and gyro "
+        "bias as the log calibrated them",
+        OfDrive(_rows),
+        best="lower",
+        unit="rad/s",
+        brief=("yaw_rate_rad_s",),
+    ),
+)

@@ -1,0 +1,129 @@
+"""GNSS velocity in ``physics``: what it gains on a simulated car, that nothing comes early, and what it must ignore."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.causality_check import CausalityCheck
+from pdhef_logtool.estimators.gnss_aided import GnssAided
+from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.presets import Options
+from pdhef_logtool.estimators.table import make_estimator, runnable
+from pdhef_logtool.records.signals import GNSS_COMPONENTS
+from studies import reference as study
+
+AVAILABLE = frozenset({"steer_rad", "speed_m_s", "ay_m_s2", "yaw_rate_rad_s"})
+
+
+@pytest.fixture(scope="module")
+def bare() -> Car:
+    return Car.of(Car.load(study.ROOT / "sample_logs" / "vehicle.toml").vehicle)
+
+
+@pytest.fixture(scope="module")
+def fishhook():
+    drive = study.simulated_drive(study.SIMULATED["fishhook, 70 km/h"])
+    return drive, study.with_gnss(drive, study.RECEIVERS[study.MADE])
+
+
+def _aided(car):
+    estimator = make_estimator("physics", car, Options(gnss=True))
+    assert isinstance(estimator, GnssAided)
+    return estimator
+
+
+def _error_deg(drive, track):
+    beta = np.arctan2(drive.vy_m_s, drive.vx_m_s)
+    used = (drive.vx_m_s > 3.0) & track.valid
+    error = np.degrees(np.angle(np.exp(1j * (track.sideslip_rad - beta))))[used]
+    return float(np.sqrt(np.mean(error**2))), float(
+        np.mean(np.abs(error) < 1.96 * np.degrees(track.sideslip_std_rad[used]))
+    )
+
+
+def test_gnss_corrects_a_limit_manoeuvre_of_a_car_with_wrong_tyres(fishhook, bare):
+    drive, signals = fishhook
+    causality = CausalityCheck()
+    plain, plain_coverage = _error_deg(drive, run_window(make_estimator("physics", bare), signals)[0])
+    aided, coverage = _error_deg(drive, run_window(_aided(bare), signals, causality=causality)[0])
+    assert not causality.failed
+    assert plain > 1.2
+    assert aided < 0.4
+    assert coverage > max(plain_coverage, 0.9)
+
+
+def test_windows_change_no_bit(fishhook, bare):
+    _, signals = fishhook
+    estimator = _aided(bare)
+    whole, _ = estimator.run(signals, None)
+    state, parts = None, None
+    for first, last in ((0, 333), (333, 334), (334, 900), (900, len(signals))):
+        steps, state = estimator.run(signals.rows(first, last), state)
+        parts = steps if parts is None else parts.joined(steps)
+    np.testing.assert_array_equal(parts.aid, whole.aid)
+
+
+@settings(max_examples=8, deadline=None)
+@given(number=st.integers(20, 100), late_s=st.floats(0.0, 0.4))
+def test_a_sample_changes_nothing_before_it_arrives(fishhook, bare, number, late_s):
+    _, signals = fishhook
+    signals = replace(signals, gnss_late_s=np.full(len(signals), late_s))
+    k = np.flatnonzero(np.isfinite(signals.gnss_velocity_m_s[:, 0]))[number]
+    other = signals.gnss_velocity_m_s.copy()
+    other[k] += 0.05
+    estimator = _aided(bare)
+    one, _ = estimator.run(signals, None)
+    two, _ = estimator.run(replace(signals, gnss_velocity_m_s=other), None)
+    differs = np.flatnonzero((one.aid != two.aid).any(axis=1))
+    assert signals.ready_ns[differs[0]] >= signals.stamps_ns[k] + round(late_s * 1e9)
+    assert signals.ready_ns[differs[0]] - signals.stamps_ns[k] < round((late_s + 0.03) * 1e9)
+
+
+def test_without_a_sample_the_estimate_is_that_of_the_filter_bit_for_bit(fishhook, bare):
+    drive, _ = fishhook
+    plain, _ = run_window(make_estimator("physics", bare), drive.signals)
+    aided, _ = run_window(_aided(bare), drive.signals)
+    np.testing.assert_array_equal(aided.vy_m_s, plain.vy_m_s)
+    np.testing.assert_array_equal(aided.covariance, plain.covariance)
+
+
+@pytest.mark.parametrize("fault", ["multipath", "swapped", "outage", "wild", "slow clock"])
+def test_wrong_gnss_costs_nothing_on_a_road(bare, fault):
+    drive = study.simulated_drive(replace(study.SIMULATED["road, 20 s"], duration_s=45.0))
+    signals = study.with_gnss(drive, study.RECEIVERS[study.MADE])
+    velocity = signals.gnss_velocity_m_s.copy()
+    t = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
+    if fault == "multipath":
+        velocity[(t > 20.0) & (t < 25.0)] += 0.35
+    elif fault == "swapped":
+        velocity = velocity[:, ::-1].copy()
+    elif fault == "outage":
+        velocity[t > 15.0] = np.nan
+    elif fault == "wild":
+        wild = np.random.default_rng(1).random(len(t)) < 0.2
+        velocity[wild] += 5.0
+    else:
+        signals = replace(signals, gnss_late_s=np.full(len(t), 3.0))
+    plain, _ = _error_deg(drive, run_window(make_estimator("physics", bare), signals)[0])
+    aided, _ = _error_deg(drive, run_window(_aided(bare), replace(signals, gnss_velocity_m_s=velocity))[0])
+    assert aided < plain + max(0.05 * plain, 0.003)
+
+
+def test_identity_is_another_one_only_where_gnss_acts(bare):
+    plain = resolve(make_estimator("physics", bare))
+    (off,), _ = runnable(("physics",), bare, AVAILABLE | GNSS_COMPONENTS, Options())
+    (without,), _ = runnable(("physics",), bare, AVAILABLE, Options(gnss=True))
+    (aided,), _ = runnable(("physics",), bare, AVAILABLE | GNSS_COMPONENTS, Options(gnss=True))
+    (smoothed,), _ = runnable(("pd-hef-smoothed",), bare, AVAILABLE | GNSS_COMPONENTS, Options(gnss=True))
+    assert resolve(off) == resolve(without) == plain
+    assert resolve(aided).algorithm == "gnss-aided"
+    assert resolve(aided).options["estimator"] == plain.algorithm
+    assert resolve(aided.calibrated_as) == plain
+    assert resolve(smoothed).algorithm != "gnss-aided"

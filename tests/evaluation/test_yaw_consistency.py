@@ -1,0 +1,77 @@
+"""The yaw rate that tyres cause at a v_y: small for the true one, large for others, without vehicle unknown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pdhef_logtool import Car, read_drive
+from pdhef_logtool.drive.reading import WholeDrive
+from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.table import make_estimator
+from pdhef_logtool.evaluation import blocks
+from pdhef_logtool.evaluation.metrics.metric import SensorErrors
+from pdhef_logtool.evaluation.metrics.yaw_consistency import yaw_residual, yaw_rows
+from pdhef_logtool.records.tracks import StateTrack
+
+SALOON = Car.load("saloon")
+SENSORS = SensorErrors(vehicle=SALOON.physics_vehicle, read_with=SALOON.vehicle)
+
+
+@pytest.fixture(scope="module")
+def lane_change(sample_logs_dir: Path) -> WholeDrive:
+    with read_drive(sample_logs_dir / "dlc.mcap", SALOON) as drive:
+        return drive.whole()
+
+
+def figure(tracks: list[StateTrack], drive: WholeDrive, sensors: SensorErrors = SENSORS) -> list[float]:
+    whole = {"all": np.ones(len(drive.signals), np.bool_)}
+    return [row.value for row in yaw_rows(tracks, drive.signals, whole, log="", sensors=sensors)]
+
+
+def test_the_true_sideslip_explains_the_yaw_rate_and_zero_does_not(sample_logs_dir: Path) -> None:
+    with read_drive(sample_logs_dir / "road.mcap", SALOON) as drive:
+        whole = drive.whole()
+    assert whole.truth is not None
+    road = replace(whole, signals=whole.signals.rows(0, 6000), truth=whole.truth.rows(0, 6000))
+    assert road.truth is not None
+    zero = run_window(make_estimator("zero", SALOON), road.signals)[0]
+    true, none = figure([road.truth, zero], road)
+    assert true < 0.1 * float(np.sqrt(np.nanmean(road.signals.yaw_rate_rad_s**2)))
+    assert none > 3.0 * true
+
+
+def test_a_gyro_bias_and_a_steering_delay_that_the_log_calibrated_are_taken_off(lane_change: WholeDrive) -> None:
+    assert lane_change.truth is not None
+    signals, delay = lane_change.signals, 5
+    late = np.concatenate([np.full(delay, signals.steer_rad[0]), signals.steer_rad[:-delay]])
+    spoilt = replace(signals, steer_rad=late, yaw_rate_rad_s=signals.yaw_rate_rad_s + 0.02)
+    biased = SENSORS.vehicle.sensors.model_copy(  # type: ignore[union-attr]
+        update={"yaw_rate_bias_rad_s": SALOON.vehicle.sensors.yaw_rate_bias_rad_s + 0.02}
+    )
+    vehicle = SENSORS.vehicle.model_copy(update={"sensors": biased})  # type: ignore[union-attr]
+    step_s = float(np.median(np.diff(signals.stamps_ns))) * 1e-9
+    known = replace(SENSORS, vehicle=vehicle, steer_delay_s=-delay * step_s)
+    drive = replace(lane_change, signals=spoilt)
+    (clean,), (corrected,) = figure([lane_change.truth], lane_change), figure([lane_change.truth], drive, known)
+    (ignored,) = figure([lane_change.truth], drive)
+    assert corrected < 1.3 * clean < ignored
+
+
+def test_there_is_no_figure_without_vehicle_steering_or_speed(lane_change: WholeDrive) -> None:
+    assert lane_change.truth is not None
+    assert figure([lane_change.truth], lane_change, SensorErrors()) == []
+    nothing = np.full(len(lane_change.signals), np.nan)
+    for name in ("steer_rad", "speed_m_s"):
+        blind = replace(lane_change.signals, **{name: nothing})
+        assert np.isnan(yaw_residual(lane_change.truth, blind, SALOON.vehicle, SENSORS)).all()
+
+
+def test_blocks_hardly_change_the_figure(lane_change: WholeDrive, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert lane_change.truth is not None
+    whole = figure([lane_change.truth], lane_change)
+    monkeypatch.setattr(blocks, "BLOCK_ROWS", 333)
+    assert figure([lane_change.truth], lane_change) == pytest.approx(whole, rel=1e-3)

@@ -1,0 +1,111 @@
+"""A folder of mappings: each log takes the one whose topics, fields and types it contains."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from pdhef_logtool.mapping import load_mapping, mapping_to_toml
+from pdhef_logtool.mapping.choosing import choose_mapping
+from pdhef_logtool.records.errors import MappingError, MappingFileError
+from tests.command_line import called
+from tests.fake_drive_log import FakeLog, FakeTopic
+from tests.runs.test_inspection_page import car, write_log
+
+STAMPS = list(range(0, 10**9, 10**7))
+A = '[signals.yaw_rate_rad_s]\ntopic = "/imu"\nfield = "wz"\n'
+B = '[signals.yaw_rate_rad_s]\ntopic = "/gyro"\nfield = "z"\nscale = 0.01\n'
+WIDE = A + '[signals.speed_m_s]\ntopic = "/speed"\nfield = "v"\n'
+
+
+def log_of(**fields: tuple[str, str]) -> FakeLog:
+    import numpy as np
+
+    stamps = np.array(STAMPS, dtype=np.int64)
+    return FakeLog({f"/{t}": FakeTopic(kind, stamps, {name: stamps * 1e-9}) for t, (name, kind) in fields.items()})
+
+
+def folder_of(tmp_path: Path, **files: str) -> Path:
+    folder = tmp_path / "mappings"
+    folder.mkdir()
+    for name, text in files.items():
+        (folder / f"{name}.toml").write_text(text)
+    return folder
+
+
+def chosen(log: FakeLog, folder: Path) -> str:
+    found = choose_mapping(log, load_mapping(folder), prefer_truth="perfect")
+    assert found.remarks == (f"mapping {found.mapping.file}: it is for this recorder",)
+    return found.mapping.file
+
+
+def test_the_topics_and_fields_of_a_log_choose(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path, a=A, b=B, wide=WIDE)
+    assert chosen(log_of(gyro=("z", "x/Gyro")), folder) == "b.toml"
+    assert chosen(log_of(imu=("wz", "x/Imu")), folder) == "a.toml"
+    # It contains all that another one reads, and more.
+    assert chosen(log_of(imu=("wz", "x/Imu"), speed=("v", "x/Speed")), folder) == "wide.toml"
+
+
+def test_none_and_several_are_one_clear_line(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path, a=A, b=B)
+    with pytest.raises(MappingError) as none:
+        chosen(log_of(imu=("gyro_z", "x/Imu")), folder)
+    assert "a.toml: yaw_rate_rad_s: /imu has no field wz" in str(none.value)
+    assert "b.toml: yaw_rate_rad_s: no topic /gyro" in str(none.value)
+    assert "--write-mapping" in str(none.value)
+    with pytest.raises(MappingError, match=r"2 \(a\.toml, b\.toml\)") as several:
+        chosen(log_of(imu=("wz", "x/Imu"), gyro=("z", "x/Gyro")), folder)
+    assert "[recorder]" in str(several.value)
+    assert "\n" not in str(several.value)
+
+
+def test_types_decide_between_logs_of_equal_topics(tmp_path: Path) -> None:
+    old = '[recorder]\n"/imu" = "x/msg/Imu"\n' + A
+    new = '[recorder]\n"/imu" = "y/Imu"\n' + A + "scale = 0.0174\n"
+    folder = folder_of(tmp_path, old=old, new=new)
+    assert chosen(log_of(imu=("wz", "x/Imu")), folder) == "old.toml"
+    assert chosen(log_of(imu=("wz", "y/msg/Imu")), folder) == "new.toml"
+    with pytest.raises(MappingError, match="/imu is z/Imu, not y/Imu"):
+        chosen(log_of(imu=("wz", "z/Imu")), folder)
+    # One file alone with a rule is refused on another recorder's log; it is written as it was read.
+    mapping = load_mapping(folder / "old.toml")
+    with pytest.raises(MappingError, match=r"a log of the recorder that old\.toml is for, got /imu is y/Imu"):
+        choose_mapping(log_of(imu=("wz", "y/Imu")), mapping, prefer_truth="perfect")
+    (tmp_path / "again.toml").write_text(mapping_to_toml(mapping))
+    assert load_mapping(tmp_path / "again.toml") == mapping
+
+
+def test_wrong_rules_and_empty_folders_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "m.toml").write_text('[recorder]\n"/imu" = 3\n')
+    with pytest.raises(MappingFileError, match="a type by topic"):
+        load_mapping(tmp_path / "m.toml")
+    (tmp_path / "none").mkdir()
+    with pytest.raises(MappingFileError, match="none in the folder"):
+        load_mapping(tmp_path / "none")
+
+
+def test_a_fleet_of_two_recorders_is_run_with_one_folder(tmp_path: Path) -> None:
+    first = write_log(tmp_path / "first.mcap", {"/car": car()})
+    second = write_log(tmp_path / "second.mcap", {"/vehicle": car()})
+    folder = tmp_path / "mappings"
+    folder.mkdir()
+    for log in (first, second):
+        assert called("inspect", log, "--write-mapping", folder / f"{log.stem}.toml").returncode == 0
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    for log in (first, second):
+        shutil.move(log, logs / log.name)
+    result = called(
+        "run", logs, "-o", tmp_path / "out", "--mapping", folder, "-e", "kinematic", "--calibrate", "off",
+        "--annotate", "none", "--cache", tmp_path / "cache",
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    for name in ("first", "second"):
+        report = (tmp_path / "out" / "logs" / name / "report.json").read_text()
+        assert f"mapping {name}.toml: it is for this recorder" in report
+    failed = called("run", logs / "first.mcap", "-o", tmp_path / "other", "--mapping", folder / "second.toml")
+    assert failed.returncode == 1
+    assert "no topic /vehicle" in failed.stderr
