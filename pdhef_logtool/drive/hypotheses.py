@@ -188,8 +188,9 @@ def posterior(relations: Sequence[Relation], hypotheses: Sequence[Hypothesis]) -
         return sum(h.energy for h in chosen) + sum(of_relation(i, f) for i, f in enumerate(factors))
 
     alone = sorted(((of_set(h), i) for i, h in enumerate(useful)))
-    scored = {(): of_set(), **{(i,): energy for energy, i in alone}}
-    pairs = {tuple(sorted((i, j))) for _, i in alone[:BEAM] for j in range(len(useful)) if j != i}
+    scored: dict[tuple[int, ...], float] = {(): of_set()}
+    scored |= {(i,): energy for energy, i in alone}
+    pairs = {(min(i, j), max(i, j)) for _, i in alone[:BEAM] for j in range(len(useful)) if j != i}
     for i, j in pairs:
         a, b = useful[i], useful[j]
         if not a.factors.keys() & b.factors.keys() and "foreign" not in (a.kind, b.kind):
