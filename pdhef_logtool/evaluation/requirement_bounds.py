@@ -26,7 +26,7 @@ _MOST_DEVIATION = 2.0
 #: Resamples times units that are in memory at once.
 _AT_ONCE = 1 << 21
 #: From so many drives on the bootstrap alone covers.
-_LOGNORMAL = 100
+_LOGNORMAL = 300
 
 
 @dataclass(frozen=True, slots=True)
