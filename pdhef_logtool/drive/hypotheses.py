@@ -45,8 +45,9 @@ PRIORS = {"unit": 5.0, "sign": 5.0, "sign and unit": 9.0, "foreign": 5.7, "field
 #: angle counts, and an axis of an IMU is turned more often than the sign of a gyro that is read from the right one.
 _OFTEN_WRONG = ("steering_wheel_rad", "steer_rad", "wheels", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 _SELDOM, _SELDOM_STEP = 1.0, 0.3
-#: Likeliest mistakes that are combined with another one; probability of another unit below which it is ruled out.
-BEAM, RULED_OUT = 12, 0.01
+#: Likeliest mistakes that are combined with another one; probability of another unit below which it is ruled out;
+#: blocks of a drive whose gains are compared.
+BEAM, RULED_OUT, BLOCKS = 12, 0.01, 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,11 +161,6 @@ class Posterior:
     """Sets of mistakes with their probabilities, the likeliest first; the empty set: the mapping is right."""
 
     sets: tuple[tuple[float, tuple[Hypothesis, ...]], ...]
-
-    @property
-    def best(self) -> tuple[float, tuple[Hypothesis, ...]]:
-        """The likeliest set and its probability."""
-        return self.sets[0]
 
     def of(self, name: str) -> list[tuple[float, Hypothesis]]:
         """Return the mistakes of a signal with their probabilities, the likeliest first."""
@@ -289,7 +285,7 @@ def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
     return resolved | (names & {"truth.vy_m_s"} if "truth.vx_m_s" in resolved else set())
 
 
-def block_gains(reference: FloatArray, measured: FloatArray, blocks: int) -> tuple[float, ...]:
+def block_gains(reference: FloatArray, measured: FloatArray, blocks: int = BLOCKS) -> tuple[float, ...]:
     """Return the gains [at most ``blocks``] of blocks of a drive that move; each has its own means: a bank, a bias.
 
     Parameters

@@ -37,7 +37,7 @@ def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int 
 
     ``most``: mistakes at once that are accepted.
     """
-    probability, chosen = measured.posterior(mounting_is_known=mounting_is_known).best
+    probability, chosen = measured.posterior(mounting_is_known=mounting_is_known).sets[0]
     if probability < CERTAIN or len(chosen) > most or not all(h.is_exact for h in chosen):
         return {}
     bad = [r for r in measured.relations if r.tells and not r.accepts()]
@@ -73,7 +73,7 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
     """Return sign and unit checks of a signal by the relations that count; empty without any."""
     if not relations:
         return []
-    mistakes, chosen = probable.of(name), probable.best[1]
+    mistakes, chosen = probable.of(name), probable.sets[0][1]
     wrong = sum(p for p, _ in mistakes)
     if wrong > DOUBTED:
         likely = [h for p, h in mistakes if p > NAMED * wrong]
