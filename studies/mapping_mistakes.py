@@ -201,8 +201,8 @@ def main(arguments: Sequence[str]) -> int:
     """Count the outcomes over logs and print those that are not named."""
     warnings.simplefilter("error", RuntimeWarning)
     if arguments[:1] == ["--sound"]:
-        counts = sound_drives(int(arguments[1]), int(arguments[2]), float(arguments[3]))
-        print(", ".join(f"{n} {what}" for what, n in counts.items()))
+        of_sound = sound_drives(int(arguments[1]), int(arguments[2]), float(arguments[3]))
+        print(", ".join(f"{n} {what}" for what, n in of_sound.items()))
         return 0
     samples = Path(__file__).parents[1] / "sample_logs"
     counts: Counter[str] = Counter()

@@ -36,7 +36,7 @@ DRIVEN: tuple[tuple[str, float, float | None], ...] = (
     ("sine-with-dwell", 80.0, None),
     ("road", 60.0, 60.0),
 )
-CARS, SEED = 20, 99_005
+CARS, SEED = 12, 99_005
 #: Lowest and highest share of values that a ± with 95 % coverage may have.
 ACCEPTED = (0.90, 0.98)
 _PRINTED = re.compile(r"(-?[\d.]+) \+- ([\d.]+)")
@@ -139,7 +139,7 @@ def measured(cars: int, seed: int) -> list[Printed]:
         friction, printed = float(simulated.file.assumed_friction), list[tuple[str, float, float]]()
         for name, file in (("wrong", told), ("right", simulated.file)):
             car = Car.of(file.model_copy(update={"friction": None}))
-            with as_read(raw, car, ReadOptions(friction="estimate", prefer_truth="rtk")) as drive:
+            with as_read(raw, car, ReadOptions(friction="auto", prefer_truth="rtk")) as drive:
                 drive.friction.model_std = MODEL_STD[name == "right"]  # that of a car with evidence
                 printed += [(f"{text}, {name} file", error, sd) for text, error, sd in of_friction(drive, friction)]
                 if name == "wrong":

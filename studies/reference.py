@@ -138,7 +138,7 @@ def recorded_drive(drive: PeerDrive) -> ScoredDrive:
     truth = whole.truth
     heading = np.cumsum(np.nan_to_num(truth.yaw_rate_rad_s) * np.gradient(truth.stamps_ns * 1e-9))
     columns = (truth.vx_m_s, truth.vy_m_s, heading, np.zeros(len(truth)))
-    return ScoredDrive(whole.signals, prior, *columns, car, _estimates(car, whole.signals))
+    return ScoredDrive(whole.signals, prior, *columns, car=car, estimates=_estimates(car, whole.signals))
 
 
 def _estimates(car: Car, signals: Signals) -> tuple[StateTrack, ...]:
@@ -171,11 +171,10 @@ def simulated_drive(spec: DriveSpec, vehicle: VehicleParameters | None = None) -
             prior = prior_of(car.vehicle, calibrate_drive(opened, RunConfig()))
             signals = opened.whole().signals
     t = (signals.stamps_ns - drive.start_ns) * 1e-9
-    columns = (
-        np.interp(t, drive.times_s, drive.truth[name]) for name in ("vx_m_s", "vy_m_s", "yaw_rad", "roll_rate_rad_s")
-    )
+    names = ("vx_m_s", "vy_m_s", "yaw_rad", "roll_rate_rad_s")
+    vx, vy, heading, roll_rate = (np.interp(t, drive.times_s, drive.truth[name]) for name in names)
     bare = Car.of(car.vehicle)
-    return ScoredDrive(signals, prior, *columns, bare, _estimates(bare, signals))
+    return ScoredDrive(signals, prior, vx, vy, heading, roll_rate, bare, _estimates(bare, signals))
 
 
 def with_gnss(drive: ScoredDrive, receiver: Receiver, seed: int = 7) -> Signals:
@@ -341,8 +340,10 @@ def figures(case: Case, drive: ScoredDrive) -> Figures:
     if drive.car is None or not np.isfinite(signals.gnss_velocity_m_s).any() or case.gnss == NONE:
         return scored
 
-    def rmse(gnss: bool) -> float:
-        track, _ = run_window(make_estimator("physics", drive.car, Options(gnss=gnss)), signals)
+    car = drive.car
+
+    def rmse(*, gnss: bool) -> float:
+        track, _ = run_window(make_estimator("physics", car, Options(gnss=gnss)), signals)
         return _rms_deg(drive.error_rad(track, case.least_speed_m_s))
 
     pairs = (0, 0, 0, 0) if found.refused else _pairs(found, drive, case.least_speed_m_s)
@@ -441,9 +442,9 @@ def _row(case: Case, got: Figures) -> list[str]:
 
 def _rankings(done: Sequence[tuple[Case, Figures]]) -> list[list[str]]:
     rows = []
-    for name, is_one in (("recorded", lambda c: bool(c.log)), ("simulated", lambda c: not c.log)):
-        sums = np.sum([f.pairs for c, f in done if is_one(c)], axis=0)
-        claimed, agreed, clear, found = (int(n) for n in sums)
+    for name, recorded in (("recorded", True), ("simulated", False)):
+        sums = zip(*(f.pairs for c, f in done if bool(c.log) == recorded), strict=True)
+        claimed, agreed, clear, found = map(sum, sums)
         agree = "–" if not claimed else f"{100.0 * agreed / claimed:.0f} %"
         share = "–" if not clear else f"{100.0 * found / clear:.0f} %"
         rows.append([name, str(claimed), agree, str(clear), share])

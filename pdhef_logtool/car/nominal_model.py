@@ -126,30 +126,6 @@ def state_derivative(vx, vy, r, steer, ax, friction, p):  # type: ignore[no-unty
 
 
 @njit(cache=True)
-def yaw_rates_at(inputs, relaxation_m, p, out):  # type: ignore[no-untyped-def]
-    """Write the yaw rate [N] that the tyres cause at a given v_y, where all inputs are known and the model is dynamic.
-
-    ``inputs`` [N] each: step before the sample, v_x, v_y, steering, friction and measured yaw rate, from which the
-    model starts. The yaw moment follows that of the tyres with their relaxation length.
-    """
-    dt, vx, vy, steer, friction, measured = inputs
-    r, r_dot = math.nan, 0.0
-    for k in range(dt.shape[0]):
-        whole = vx[k] > p.blend_high_m_s and math.isfinite(vy[k] + steer[k]) and dt[k] >= 0.0
-        if not whole or not math.isfinite(r):
-            r, r_dot = measured[k] if whole else math.nan, 0.0
-            continue
-        n = 2 * substeps(vx[k], dt[k], friction[k], p)
-        h = dt[k] / n
-        kept = math.exp(-h * vx[k] / relaxation_m)
-        for _ in range(n):
-            _, steady = lateral_acceleration_and_yaw_acceleration(vx[k], vy[k], r, steer[k], friction[k], p)
-            r_dot = steady + (r_dot - steady) * kept
-            r += h * r_dot
-        out[k] = r
-
-
-@njit(cache=True)
 def planar_lateral_acceleration(vx, vy, r, steer, friction, p):  # type: ignore[no-untyped-def]
     """Return the lateral acceleration at the centre of gravity in m/s²; v_x r in the kinematic range."""
     w = dynamic_share(vx, p)

@@ -9,9 +9,9 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.columns import columns_on_grid, derivative, halves
+from pdhef_logtool.drive.hypotheses import Posterior, Relation, known_hypotheses, posterior
 from pdhef_logtool.drive.relations import direction_rate, measured_relations
 from pdhef_logtool.drive.truth import TruthTrack, channel_of
-from pdhef_logtool.mapping.hypotheses import Posterior, Relation, known_hypotheses, posterior
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
 
@@ -63,6 +63,11 @@ class Measured:
         """Return the probabilities of the mistakes that mappings make with these signals."""
         groups = self.groups(mounting_is_known=mounting_is_known)
         return posterior(self.relations, known_hypotheses(list(self.columns), groups))
+
+    def agrees(self, name: str, *, mounting_is_known: bool) -> bool:
+        """Return whether a signal is wrong by these relations too, if one of them counts."""
+        mistakes = self.posterior(mounting_is_known=mounting_is_known).of(name)
+        return sum(p for p, _ in mistakes) > 0.5 or not any(r.tells and name in r.powers for r in self.relations)
 
     def groups(self, *, mounting_is_known: bool) -> list[tuple[str, ...]]:
         """Return the signals whose signs or units are wrong together: those of one topic, and of ground truth."""

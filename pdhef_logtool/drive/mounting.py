@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.checks import check_drive
-from pdhef_logtool.drive.checks.by_relations import explained_factors, is_wrong_by
+from pdhef_logtool.drive.checks.by_relations import explained_factors
 from pdhef_logtool.drive.checks.mounting import CORRECTED, MOUNTING
 from pdhef_logtool.drive.checks.running import misread_channels
 from pdhef_logtool.drive.columns import derivative, halves, independent_samples, moving_at
@@ -34,6 +34,7 @@ from pdhef_logtool.drive.frames import (
     placed_rotation,
     rotation_text,
 )
+from pdhef_logtool.drive.hypotheses import units_told
 from pdhef_logtool.drive.measured import Measured, measure
 from pdhef_logtool.drive.other_fields import with_other_fields
 from pdhef_logtool.drive.relations import gentle_at, steering_references, yaw_references
@@ -51,7 +52,6 @@ from pdhef_logtool.drive.truth import (
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, fit_clocks, read_signals
 from pdhef_logtool.mapping.frames import Placement, placement_of
-from pdhef_logtool.mapping.hypotheses import units_told
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import BoolArray, Channel, FloatArray
@@ -292,8 +292,11 @@ def _tilts_of_parts(
         usable = use & part
         if not usable.any():
             return None
-        mean = rotation @ f[usable].mean(axis=0)
-        mean -= np.array([driven[usable].real.mean(), driven[usable].imag.mean(), 0.0])
+        level = rotation @ f[usable].T
+        along = (driven[usable].real, driven[usable].imag)
+        # The body rolls and pitches with what it drives: a tilt is what is left without driving.
+        slopes = [float(np.cov(d, z)[0, 1] / max(float(d.var()), 1e-9)) for d, z in zip(along, level[:2], strict=True)]
+        mean = level.mean(axis=1) - np.array([*(s * d.mean() for s, d in zip(slopes, along, strict=True)), 0.0])
         ups.append(np.asarray(mean / max(float(np.linalg.norm(mean)), 1e-9)))
     return ups[0], ups[1]
 
@@ -599,7 +602,7 @@ def _rescaled(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span
     signals, notes = dict(mapping.signals), list(mapping.notes)
     checks = list(survey.corrected)
     for name, (factor, evidence) in factors.items():
-        if name in signals and all(is_wrong_by(part, name, factor) is not False for part in parts):
+        if name in signals and all(part.agrees(name, mounting_is_known=survey.is_mounted) for part in parts):
             signals[name] = scaled_source(signals[name], factor)
             notes.append(f"{name} is read with {factor:.6g} times its scale: {evidence}")
             checks.append(_corrected(name, signals[name], notes[-1]))

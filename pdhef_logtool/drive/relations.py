@@ -9,11 +9,9 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
-from pdhef_logtool.mapping.hypotheses import MIN_SAMPLES, Relation, block_gains
+from pdhef_logtool.drive.hypotheses import BLOCKS, MIN_SAMPLES, Relation, block_gains
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
-#: Blocks of a drive whose gains are compared.
-BLOCKS = 8
 #: What is left of two columns by regression is small, and a car that slides leaves it related otherwise.
 MIN_PARTIAL_CORRELATION = 0.8
 #: Share of the curvature that a_y must leave: at one speed they are one regressor.
@@ -114,8 +112,7 @@ def compare(
     correlation = float(np.mean(a * b) / (spread_a * spread_b))
     # The ratio of the spreads lies between the two regressions, as the position of the noise is unknown.
     gain = float(np.copysign(spread_b / spread_a, correlation))
-    gains = block_gains(a, b, BLOCKS)
-    return [Relation(text, powers, correlation, gain, expected, samples, both, blocks=gains)]
+    return [Relation(text, powers, correlation, gain, expected, samples, both, blocks=block_gains(a, b))]
 
 
 def compare_at_ease(
@@ -259,9 +256,10 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
         if samples < MIN_SAMPLES:
             continue
         ratios = column[use] / speed[use]
-        ratio = float(np.median(ratios))
-        relation = Relation(f"{name} over {speed_name}", {name: 1, speed_name: -1}, 1.0, ratio, expected, samples)
-        relation = replace(relation, blocks=tuple(float(np.median(b)) for b in np.array_split(ratios, BLOCKS)))
+        relation = Relation(
+            f"{name} over {speed_name}", {name: 1, speed_name: -1}, 1.0, float(np.median(ratios)), expected, samples,
+            blocks=tuple(float(np.median(b)) for b in np.array_split(ratios, BLOCKS)),
+        )  # fmt: skip
         relations.append(replace(relation, signless=name == "truth.position_speed_m_s"))
     return relations
 

@@ -57,8 +57,6 @@ _COLUMNS = {
 }
 _AY_DERIVED = "smoothing derivative of v_y plus v_x times yaw rate plus g sin(roll), without body roll"
 _AY_UNKNOWN = "not scored: needs a mapped a_y, or an attitude with roll and the car's roll gradient"
-#: An attitude whose roll changes by less, in rad, is a heading.
-_ROLLS_RAD = 1e-6
 _SURVEY_NS = 600_000_000_000
 _CHUNK = 16384
 _ANGLES = frozenset({"yaw_rad", "course_rad", "sideslip_rad"})
@@ -502,7 +500,7 @@ def _find_attitude(source: _Source) -> Attitude:
         if score > best_score + 0.05:
             best, best_score = Attitude(frame, body), score
     left_up = source.rotation(best)[:, 2, 1]
-    rolls = np.abs(left_up - median_known(left_up)) > _ROLLS_RAD  # NaN compares False
+    rolls = np.abs(left_up - median_known(left_up)) > 1e-6  # else it is a heading; NaN compares False
     return replace(best, has_roll=source.reference == "ENU" and bool(rolls.any()))
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
-from pdhef_logtool.estimators.base import notes_of
+from pdhef_logtool.estimators.base import notes_of, predict_track
 from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.filter_base import sideslip_std
 from pdhef_logtool.estimators.physics_filter import LIMIT_TIME_S, LINEAR_SHARE, PhysicsFilter
@@ -335,7 +335,7 @@ class GnssAided:
         stamps_ns, count, h = signals.stamps_ns, len(signals), len(HYPOTHESES)
         everywhere = np.ones(count, dtype=np.bool_)
         at_steps = Extrapolation(np.arange(count), everywhere, np.zeros(count), np.asarray(steps.valid))
-        track = self.estimator.predict(steps, at_steps, stamps_ns)
+        track = predict_track(self.estimator, steps, at_steps, stamps_ns)
         corrected = self._physics.corrected(signals)
         columns = (
             step_durations_s(stamps_ns, before_ns), (signals.ready_ns - stamps_ns) * 1e-9, corrected.ay_m_s2,

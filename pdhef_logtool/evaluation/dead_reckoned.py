@@ -48,8 +48,8 @@ def path_drift(estimate: StateTrack, truth: StateTrack) -> PathDrift | None:
     rows = np.unique(np.linspace(0, max(len(truth) - 1, 0), count).astype(np.int64)).tolist()
     poses = [(t.x_m[0], t.y_m[0]) for track in (estimate, truth) for t in (track.rows(i, i + 1) for i in rows)]
     source, target = np.array(poses, dtype=np.float64).reshape(2, -1, 2).transpose(0, 2, 1)
-    known = np.isfinite(source + target).all(axis=0)
-    source, target = source[:, known], target[:, known]
+    finite = np.isfinite(source + target).all(axis=0)
+    source, target = source[:, finite], target[:, finite]
     length = float(np.hypot(*np.diff(target, axis=1)).sum())
     if not length > 0.0:
         return None

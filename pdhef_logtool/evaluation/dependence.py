@@ -157,14 +157,15 @@ def factors_of(entry: Mapping[str, Any], report: Mapping[str, Any] | None) -> di
     car = (entry.get("car") or {}).get("name")
     stated = {key: entry.get(key) for key in ("day", "route")}
     if report is not None and not any(stated.values()):
-        stated = day_and_route((report.get("log") or {}).get("start_ns"), report.get("metadata") or {})
+        of_report = day_and_route((report.get("log") or {}).get("start_ns"), report.get("metadata") or {})
+        stated = dict(zip(("day", "route"), of_report, strict=True))
     return {"car": None if car is None else str(car), **stated}
 
 
-def day_and_route(start_ns: int | None, metadata: Mapping[str, Any]) -> dict[str, str | None]:
+def day_and_route(start_ns: int | None, metadata: Mapping[str, Any]) -> tuple[str | None, str | None]:
     """Return the day (UTC) on which a log starts, and the route that its metadata name."""
     from datetime import UTC, datetime
 
     texts = {str(k).rpartition(".")[2].lower(): str(v) for k, v in metadata.items()}
     day = None if start_ns is None else datetime.fromtimestamp(start_ns * 1e-9, UTC).date().isoformat()
-    return {"day": day, "route": next((texts[key] for key in ROUTE_KEYS if key in texts), None)}
+    return day, next((texts[key] for key in ROUTE_KEYS if key in texts), None)

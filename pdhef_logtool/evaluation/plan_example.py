@@ -31,6 +31,7 @@ limit_deg = 0.5                    # or limit (SI unit), or limit_deg_s for rate
 exposure_minutes = 1.0             # less scored driving is INCONCLUSIVE; also exposure_drives, exposure_km
 # estimator = "pd-hef"             # default: the selected estimate
 # confidence = 0.95                # of the two-sided interval that decides
+# exposure = [{{ speed_m_s = [20.0, 35.0], minutes = 10.0 }}]  # conditions: also ay_m_s2, friction, car; drives
 
 [[requirement]]
 id = "SR-2"
@@ -43,7 +44,7 @@ limit_deg = 1.0
 id = "SR-3"
 title = "Better than zero sideslip"
 signal = "sideslip_rad"
-baseline = "zero"                  # or "physics"; or "run": run A of pdhef compare A B --plan
+baseline = "zero"                  # or "physics"; "run": run A of pdhef compare A B --plan; "../before": an output
 max_ratio = 0.5                    # the error is at most half of the baseline's
 
 [[requirement]]

@@ -25,10 +25,8 @@ _MOST_UNITS = 1000
 _MOST_DEVIATION = 2.0
 #: Resamples times units that are in memory at once.
 _AT_ONCE = 1 << 21
-#: Larger bounds, as a logarithm, mean nothing.
-_MOST_LOG = 50.0
 #: From so many drives on the bootstrap alone covers.
-_LOGNORMAL = 100
+_LOGNORMAL = 300
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +75,7 @@ def pooled(
         # The mean of both: that of lognormal errors alone is wide where few drives differ much.
         scale = math.sqrt(effect.design_effect)
         above_s += 0.5 * max(scale * _lognormal_excess(values, 1.0 if squares else 0.5, tail) - above_s, 0.0)
-    return Bounded(value, value * math.exp(-below_s), value * math.exp(min(above_s, _MOST_LOG)), n, effect)
+    return Bounded(value, value * math.exp(-below_s), value * math.exp(min(above_s, 50.0)), n, effect)
 
 
 def _studentised(
@@ -98,8 +96,8 @@ def _studentised(
     most_deviation = _MOST_DEVIATION * float(stdtrit(len(top) - 1, 1.0 - tail))
     least, most = np.clip(np.quantile(deviations, [tail, 1.0 - tail]), -most_deviation, most_deviation)
     if effect.by:  # few days: their number limits what is known of the spread
-        known = deviate(1.0 - tail, effect.freedom)
-        least, most = min(least, -known), max(most, known)
+        reach = deviate(1.0 - tail, effect.freedom)
+        least, most = min(least, -reach), max(most, reach)
     error *= math.sqrt(effect.design_effect)
     return float(most) * error, -float(least) * error
 

@@ -9,7 +9,7 @@ import contextlib
 import struct
 from array import array
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -74,7 +74,7 @@ class Rosbag1Container(FileContainer):
     def _walk(self) -> None:
         size = self.source.size
         for offset in self._places():
-            record = self._record_at(offset)
+            record = _record_at(self.source.read, offset, size, self.meter.limits.metadata_bytes)
             if record is None:
                 index_at = self._header[0] if self._header else 0
                 padded_to = index_at if offset < index_at <= size else size
@@ -150,24 +150,6 @@ class Rosbag1Container(FileContainer):
         if missing > 0 and not self.lost:
             self.lose("missing-messages", f"the bag's header names {chunks} chunks, {missing} of them are not there")
             self.account.lose(0, len(self.magic))
-
-    def _record_at(self, offset: int) -> tuple[dict[str, bytes], int, int] | None:
-        """Return header fields and data extent of the record at a byte; None if it is cut or no record."""
-        source, size = self.source, self.source.size
-        if offset + 8 > size:
-            return None
-        (header,) = _U32.unpack(source.read(offset, 4))
-        if header == 0 or offset + 8 + header > size or header > self.meter.limits.metadata_bytes:
-            return None
-        text = source.read(offset + 4, header + 4)
-        start = offset + 8 + header
-        (length,) = _U32.unpack_from(text, header)
-        if start + length > size:
-            return None
-        try:
-            return _header_fields(text[:header]), start, start + length
-        except (struct.error, ValueError):
-            return None
 
     def _is_zero(self, start: int, end: int) -> bool:
         return all(
@@ -249,7 +231,7 @@ class Rosbag1Container(FileContainer):
         channels, stamps, offsets, lengths = (array("q") for _ in range(4))
         offset, size = 0, len(content)
         while offset < size:
-            record = _record_in(content, offset, size)
+            record = _record_at(lambda first, count: content[first : first + count], offset, size, size)
             if record is None:
                 raise SpanDamageError("its last record is cut")
             fields, begin, offset = record
@@ -279,19 +261,27 @@ def _op(fields: Mapping[str, bytes]) -> int:
     return op[0] if len(op) == 1 else -1
 
 
-def _record_in(data: bytes, offset: int, size: int) -> tuple[dict[str, bytes], int, int] | None:
-    """Return header fields and data extent of the record at a byte of a chunk; None if it is cut or no record."""
+def _record_at(
+    read: Callable[[int, int], bytes], offset: int, size: int, most: int
+) -> tuple[dict[str, bytes], int, int] | None:
+    """Return header fields and data extent of the record at a byte; None if it is cut or no record.
+
+    Parameters
+    ----------
+    read : returns bytes by offset and count. size : of the file or chunk. most : bytes of a header.
+    """
     if offset + 8 > size:
         return None
-    (header,) = _U32.unpack_from(data, offset)
-    if header == 0 or offset + 8 + header > size:
+    (header,) = _U32.unpack(read(offset, 4))
+    if header == 0 or offset + 8 + header > size or header > most:
         return None
+    text = read(offset + 4, header + 4)
     start = offset + 8 + header
-    (length,) = _U32.unpack_from(data, start - 4)
+    (length,) = _U32.unpack_from(text, header)
     if start + length > size:
         return None
     try:
-        return _header_fields(data[offset + 4 : offset + 4 + header]), start, start + length
+        return _header_fields(text[:header]), start, start + length
     except (struct.error, ValueError):
         return None
 

@@ -40,9 +40,11 @@ MIN_BIN_SAMPLES = 20
 OUTLIER_STAMP_NS = 60_000_000_000
 #: From this share on of stamps that are wrong in one way, all of them are given up and log time serves.
 UNUSABLE_SHARE = 0.1
-#: Messages of one stamp were measured apart, by a clock too coarse for them, when they were recorded apart by at
-#: least this share of what messages are apart; else they came in one packet, or are one message recorded twice.
-COARSE_SPACING = 1.0 / 3.0
+#: Messages of one stamp were measured apart, by a clock too coarse for them, when they were recorded apart by at least
+#: this share of what messages are apart; else they came in one packet, or are one message recorded twice. Steps that
+#: vary by more than a share of the period give way to another stamp whose steps vary by so much less. A clock that is
+#: by so much faster or slower than log time is in another unit.
+COARSE_SPACING, IRREGULAR, REGULAR_SHARE, FASTEST = 1.0 / 3.0, 0.3, 0.3, 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,9 +235,10 @@ def why_missing(usable: int, messages: int) -> str:
 
 
 def with_usable_stamps(log: DriveLog, mapping: Mapping) -> Mapping:
-    """Return the mapping with another stamp of a message, of its outer or inner header, where its own is no time.
+    """Return the mapping with another stamp of a message, of its outer or inner header, where its own is worse.
 
-    The first ten seconds decide. If no stamp of a message is usable, the source keeps its own: :func:`fit_clocks`
+    The first ten seconds decide: gaps, steps back, rate, and how regular the steps are. If no stamp of a message is
+    usable, the source keeps its own: :func:`fit_clocks`
     then takes the recorder's time, and gives the reason.
     """
     notes: dict[tuple[str, str], str] = {}
@@ -248,11 +251,17 @@ def with_usable_stamps(log: DriveLog, mapping: Mapping) -> Mapping:
         others = [path for path in stamp_paths(log.fields(source.topic)) if path != source.stamp]
         if not others or source.stamp_unit != "ros":
             continue
-        why = {path: _why_no_time(log, replace(source, stamp=path)) for path in (source.stamp, *others)}
-        good = [path for path in others if not why[path]]
-        if why[source.stamp] and good:
-            chosen[key] = good[0]
-            notes[key] = f"{source.topic} is read by {good[0]}, not {source.stamp}: {why[source.stamp]}"
+        judged = {p: _judged_stamps(log, replace(source, stamp=p)) for p in (source.stamp, *others)}
+        good = [path for path in others if not judged[path][0]]
+        if not good:
+            continue
+        best = min(good, key=lambda p: judged[p][1])
+        (why, varies), (_, least) = judged[source.stamp], judged[best]
+        if not why and varies > IRREGULAR and least < REGULAR_SHARE * varies:
+            why = f"its steps vary by {varies:.0%} of its period, those of {best} by {least:.0%}"
+        if why:
+            chosen[key] = best
+            notes[key] = f"{source.topic} is read by {best}, not {source.stamp}: {why}"
     if not notes:
         return mapping
 
@@ -263,19 +272,34 @@ def with_usable_stamps(log: DriveLog, mapping: Mapping) -> Mapping:
     return replace(mapping, signals=signals, truth=truth, notes=(*mapping.notes, *notes.values()))
 
 
-def _why_no_time(log: DriveLog, source: SignalSource) -> str:
-    """Return in words why the stamps of a source in the first seconds are no measure of time; empty where they are."""
+def _judged_stamps(log: DriveLog, source: SignalSource) -> tuple[str, float]:
+    """Judge the stamps of a source in the first seconds.
+
+    Returns
+    -------
+    why they are no measure of time, empty where they are, and how much their steps vary, in periods; infinite for
+    stamps that are not on the log's clock.
+    """
     request = {source.read_topic: list(stamp_request(log, source))}
     columns = log.read(request, log.start_ns, min(log.end_ns, log.start_ns + SURVEY_WINDOW_NS)).get(source.read_topic)
     if columns is None or not len(columns):
-        return ""
+        return "", 0.0
     raw, usable = raw_stamps(log, columns, source)
     missing = why_missing(int(np.count_nonzero(usable)), len(columns))
     if missing:
-        return missing
-    if len(columns) >= MIN_BIN_SAMPLES and np.ptp(raw[usable]) == 0:
-        return "its stamps are constant"
-    return why_unusable(raw[usable], columns.log_time_ns[usable])
+        return missing, np.inf
+    if len(columns) < MIN_BIN_SAMPLES:
+        return "", 0.0
+    stamps, log_time = raw[usable], columns.log_time_ns[usable]
+    span_s, log_span_s = float(np.ptp(stamps)) * 1e-9, float(np.ptp(log_time)) * 1e-9
+    if span_s == 0.0:
+        return "its stamps are constant", np.inf
+    if not 1.0 / FASTEST < span_s / max(log_span_s, 1e-9) < FASTEST:
+        return f"its stamps advance by {span_s:.3g} s in {log_span_s:.3g} s", np.inf
+    low, middle, high = np.quantile(np.diff(np.sort(stamps)), [0.1, 0.5, 0.9])
+    delay_ns = float(np.median(log_time - stamps))
+    varies = float(high - low) / max(float(middle), 1.0) if 0.0 <= delay_ns <= MAX_CREDIBLE_DELAY_NS else np.inf
+    return why_unusable(stamps, log_time), varies
 
 
 def why_unusable(stamps_ns: IntArray, log_time_ns: IntArray) -> str:

@@ -339,6 +339,13 @@ def mapping_to_toml(
     if mapping.quality is not None:
         lines += ["", *_comment(notes.get("truth_quality", "Ground truth is used where this condition is met."))]
         lines += ["[truth_quality]", *_gate_lines(mapping.quality)]
+    lines += _missing_lines(mapping, notes, alternatives)
+    return "\n".join(lines) + "\n"
+
+
+def _missing_lines(mapping: Mapping, notes: MappingABC[str, str], alternatives: Sequence[Candidate]) -> list[str]:
+    """Return what the mapping lacks as commented examples."""
+    lines: list[str] = []
     missing = missing_signals(mapping)
     if missing:
         lines += ["", "# Not mapped. To add one, remove the # and name its topic and field:"]
@@ -352,7 +359,7 @@ def mapping_to_toml(
         lines += [line for name in TRUTH_UNITS for line in _alternative_lines("truth", name, alternatives)] or [
             line for name in ("vx_m_s", "vy_m_s") for line in _example("truth", name)
         ]
-    return "\n".join(lines) + "\n"
+    return lines
 
 
 def _header(section: str, name: str, width: int) -> str:

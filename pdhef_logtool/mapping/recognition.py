@@ -235,7 +235,7 @@ def auto_map(
     ]
     by_file = "by --set msgs=car.dbc, or " if log.messages is None else ""  # only tables are decoded as a whole
     draft.notes += [
-        f"{t.name} contains raw CAN frames: describe them {by_file}in a mapping file with [can]"
+        f"{t.name} contains raw CAN frames: describe them {by_file}in a mapping file with [can] dbc"
         for t in topics
         if not any(o.type_name.startswith("can/msg/") and o.name != t.name for o in topics)
         if "can" in _words(f"{t.name} {t.type_name}") and holds_frames(t.name, log.fields(t.name, quiet=True))

@@ -79,7 +79,9 @@ def _numbered(document: bytes, printed: Path) -> bytes:
     from pypdf import PdfReader
 
     reader = PdfReader(printed)
-    pages = {name.lstrip("/"): reader.get_destination_page_number(at) for name, at in reader.named_destinations.items()}
+    pages = {
+        name.lstrip("/"): reader.get_destination_page_number(place) for name, place in reader.named_destinations.items()
+    }
 
     def numbered(match: re.Match[bytes]) -> bytes:
         page = pages.get(match[1].decode())

@@ -31,9 +31,8 @@ _Key = tuple[str, str, str, str, str]
 class JudgedDrive:
     """A drive of a run: its label, and its selected estimate (None: its only recorded estimate).
 
-    ``read_report`` returns its report.json, of which blocks of time are used where too few drives are scored for a
-    bootstrap over drives, and the operating space where the plan asks for exposure in conditions. ``factors``: its day,
-    car and route.
+    ``read_report`` returns its report.json: its blocks of time are used where too few drives are scored for a bootstrap
+    over drives, its operating space where the plan asks for exposure. ``factors``: its day, car and route.
     """
 
     log: str
@@ -158,64 +157,41 @@ def plan_verdicts(
 
 
 def _measured(
-    requirement: Requirement,
-    figures: Figures,
-    drive: JudgedDrive,
-    against: Against | None,
+    requirement: Requirement, figures: Figures, drive: JudgedDrive, against: Against | None
 ) -> tuple[DriveValue | None, DriveValue | None]:
     """Return the metric of a drive against ground truth, and against the estimated reference."""
     name = requirement.estimator or figures.main(drive)
     if name is None:
         return None, None
-    other = _Baseline.of(requirement, figures, drive, against)
     truth = None
     tainted = (drive.log, name, requirement.signal, "all", NOT_INDEPENDENT) in figures.values
     if not tainted:
-        truth = _value(requirement, figures, drive, name, requirement.metric, other)
+        truth = _value(requirement, figures, drive, name, requirement.metric, against)
     if (requirement.signal, requirement.metric) != ("sideslip_rad", "rmse"):
         return truth, None
-    return truth, _value(requirement, figures, drive, name, "reference_rms", other)
+    return truth, _value(requirement, figures, drive, name, "reference_rms", against)
 
 
-@dataclass(frozen=True, slots=True)
-class _Baseline:
-    """Where the baseline of a requirement is: figures, drive and estimator; ``needed``: whether there must be one."""
-
-    needed: bool
-    figures: Figures | None = None
-    drive: JudgedDrive | None = None
-    name: str | None = None
-
-    @classmethod
-    def of(
-        cls,
-        requirement: Requirement,
-        figures: Figures,
-        drive: JudgedDrive,
-        against: Against | None,
-    ) -> _Baseline:
-        if requirement.baseline is None:
-            return cls(False)
-        if requirement.other_run is None:
-            return cls(True, figures, drive, requirement.baseline)
-        partner = None if against is None else against[1].get(drive.log)
-        if against is None or partner is None:
-            return cls(True)
-        return cls(True, against[0], partner, requirement.estimator or against[0].main(partner))
-
-    def value(self, requirement: Requirement, metric: str) -> float | None:
-        if self.figures is None or self.drive is None or self.name is None:
+def _baseline(
+    requirement: Requirement, figures: Figures, drive: JudgedDrive, metric: str, against: Against | None
+) -> float | None:
+    """Return the metric of the baseline: an estimator of the drive, or of the drive in the other run."""
+    other, name = drive, requirement.baseline
+    if requirement.other_run is not None:
+        if against is None or drive.log not in against[1]:
             return None
-        figure = self.figures.of(self.drive.log, self.name, requirement, metric)
-        return None if figure is None else figure[0]
+        figures, other = against[0], against[1][drive.log]
+        name = requirement.estimator or figures.main(other)
+    figure = None if name is None else figures.of(other.log, name, requirement, metric)
+    return None if figure is None else figure[0]
 
 
 def _value(
-    requirement: Requirement, figures: Figures, drive: JudgedDrive, name: str, metric: str, other: _Baseline
+    requirement: Requirement, figures: Figures, drive: JudgedDrive, name: str, metric: str, against: Against | None
 ) -> DriveValue | None:
     figure = figures.of(drive.log, name, requirement, metric)
-    baseline = other.value(requirement, metric)
-    if figure is None or (other.needed and baseline is None):
+    needed, baseline = requirement.baseline is not None, _baseline(requirement, figures, drive, metric, against)
+    if figure is None or (needed and baseline is None):
         return None
     std = figures.of(drive.log, name, requirement, "reference_std") if metric == "reference_rms" else None
     if metric == "reference_rms" and std is None:
@@ -224,7 +200,7 @@ def _value(
     seconds, metres = _exposure(requirement, figures, drive, n)
     return DriveValue(
         drive.log, name, value, n, baseline, seconds, metres,
-        math.nan if std is None else std[0], same=other.needed and value == baseline, factors=drive.factors,
+        math.nan if std is None else std[0], same=needed and value == baseline, factors=drive.factors,
     )  # fmt: skip
 
 

@@ -75,18 +75,9 @@ class Trend:
 
 
 def _to_dict(row: TrendRow) -> dict[str, Any]:
-    return {
-        "run": row.run,
-        "logs": row.logs,
-        "failed": row.failed,
-        "scored": row.scored,
-        "median": row.median,
-        "unit": row.unit,
-        "previous": _change(row.previous, row.p_previous),
-        "first": _change(row.first, row.p_first),
-        "differences": row.differences,
-        "regression": row.regression,
-    }
+    plain = ("run", "logs", "failed", "scored", "median", "unit", "differences", "regression")
+    changes = {"previous": _change(row.previous, row.p_previous), "first": _change(row.first, row.p_first)}
+    return {**{key: getattr(row, key) for key in plain}, **changes}
 
 
 def _change(figure: ComparedFigure | None, p: float) -> dict[str, Any] | None:

@@ -77,8 +77,8 @@ def drive_details(
 
 def _friction(signals: Signals, assumed: float) -> float:
     """Return the median friction of a drive."""
-    known = signals.friction[np.isfinite(signals.friction)]
-    return float(np.median(known)) if known.size else assumed
+    friction = signals.friction[np.isfinite(signals.friction)]
+    return float(np.median(friction)) if friction.size else assumed
 
 
 def _faults(read: _Read, name: str) -> tuple[SensorFault, ...] | None:

@@ -514,6 +514,7 @@ def _car_facts(car: Car) -> CarFacts:
 
 def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
     """Return how a log that was read is recorded in run.json."""
+    day, route = day_and_route(drive.plan.start_ns, drive.log.metadata())
     return LogOutcome(
         log=drive.name,
         file=drive.file,
@@ -522,7 +523,8 @@ def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
         truth_sha256=drive.truth_sha256,
         mapping_sha256=drive.mapping.sha256,
         lost=lost_texts(losses),
-        **day_and_route(drive.plan.start_ns, drive.log.metadata()),
+        day=day,
+        route=route,
     )
 
 

@@ -17,9 +17,10 @@ from studies.pages import DRIVES, number, table
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_of, vehicle_of
 
 #: Parameters of the car; biases, offsets and delays belong to a drive.
+STEERING = "steering ratio"
 OF_CAR = (
     "front cornering stiffness", "rear cornering stiffness", "peak force over the file's", "yaw inertia",
-    "relaxation length", "steering ratio", "roll gain", "lever of a_y",
+    "relaxation length", STEERING, "roll gain", "lever of a_y",
 )  # fmt: skip
 
 
@@ -56,7 +57,9 @@ def pairs_table(documents: Sequence[dict[str, Any]]) -> str:
 
 def _difference(a: dict[str, Any], b: dict[str, Any]) -> tuple[float, bool]:
     """Return the difference over its standard deviation, and whether both drives excite the parameter."""
-    values = [np.log(p["value"]) if p["log"] else p["value"] for p in (a, b)]
+    channel = a["name"] == STEERING  # over the file's, for drives of a car have different steering channels
+    values = [p["value"] / p["prior"] if channel else p["value"] for p in (a, b)]
+    values = [np.log(value) if a["log"] else value for value in values]
     return float((values[0] - values[1]) / np.hypot(a["sd"], b["sd"])), a["excited"] and b["excited"]
 
 

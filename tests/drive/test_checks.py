@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.checks import check_drive
+from pdhef_logtool.drive.hypotheses import units_told
 from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.mounting import truth_latency
 from pdhef_logtool.drive.truth import LatencyEstimate, booked_on_the_late, derive_truth
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import MappedChannels, auto_map, fit_clocks, load_mapping, read_signals
-from pdhef_logtool.mapping.hypotheses import units_told
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import SIGNAL_UNITS, Channel
 from truthsim.drive import simulate_drive, write_drive

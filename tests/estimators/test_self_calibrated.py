@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from reference_car import cut, drive, slalom, with_noise
 
+from pdhef_logtool.car.assumed_values import DEFAULT_CG_SPREAD, FRONT_WEIGHT_SHARE, FRONT_WEIGHT_SHARE_SPREAD
 from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.parts import FilterNoise, IntervalEntry, Intervals
+from pdhef_logtool.car.toml_files import vehicle_of_entries
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.intervals import make_inflation
@@ -203,3 +205,24 @@ def test_intervals_of_other_driving_are_not_taken(signals: Signals) -> None:
     np.testing.assert_array_equal(applied.add(track, signals).sideslip_std_rad, without.sideslip_std_rad)
     assert (without.sideslip_std_rad != track.sideslip_std_rad).any()
     assert applied.notes(estimator.name) == ("intervals: own, parameters and d2",)
+
+
+def test_the_interval_contains_where_the_centre_of_gravity_is_only_assumed(signals: Signals) -> None:
+    """At a yaw rate r the rear axle determines v_y up to the error of its distance times r."""
+    known = with_band()
+    assert known.self_calibrated is not None
+    assumed = replace(known, self_calibrated=replace(known.self_calibrated, cg_std_m=0.3))
+    (narrow,), (wide,) = tracks("physics", known, signals), tracks("physics", assumed, signals)
+    added = wide.sideslip_std_rad**2 - narrow.sideslip_std_rad**2
+    expected = (0.3 * wide.yaw_rate_rad_s / wide.vx_m_s) ** 2
+    fast = wide.valid & (wide.vx_m_s > OWN.low_speed_blend_m_s)
+    np.testing.assert_allclose(added[fast], expected[fast], rtol=1e-6, atol=1e-12)
+    np.testing.assert_array_equal(wide.sideslip_rad, narrow.sideslip_rad)
+
+
+def test_the_centre_of_gravity_is_assumed_without_a_file_or_weight_split() -> None:
+    assert Car.of(default_vehicle()).cg_std_m == pytest.approx(DEFAULT_CG_SPREAD * 1.71)
+    assert Car.of(OWN.model_copy(update={"name": "mine"})).cg_std_m == 0.0
+    given = vehicle_of_entries({"name": "mine", "mass_kg": 1500.0, "wheelbase_m": 2.7}, where="test")
+    car = Car.of(given.vehicle, assumed=given.assumed)
+    assert car.cg_std_m == pytest.approx(FRONT_WEIGHT_SHARE_SPREAD * 2.7 * FRONT_WEIGHT_SHARE)

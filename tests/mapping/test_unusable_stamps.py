@@ -23,6 +23,9 @@ N = 1000
 TRUE = T0 + np.arange(N, dtype=np.int64) * 10 * MS
 LOG = TRUE + 3 * MS + np.random.default_rng(0).integers(0, MS, N)
 
+#: When a driver sent them, not when the sensor measured.
+JITTERY = LOG - MS - np.random.default_rng(1).integers(0, 8, N) * MS // 2
+
 
 def stepped(by_ns: int) -> IntArray:
     return TRUE + np.where(np.arange(N) < N // 2, 0, by_ns)
@@ -134,6 +137,10 @@ def test_zero_stamps_lose_no_topic() -> None:
         (TRUE, np.zeros(N, np.int64), "imu.header.stamp"),
         (TRUE, TRUE + 5, "imu.header.stamp"),
         (np.zeros(N, np.int64), np.zeros(N, np.int64), "imu.header.stamp"),
+        (JITTERY, TRUE, "header.stamp"),
+        (TRUE, JITTERY, "imu.header.stamp"),
+        (JITTERY, TRUE - 3600 * S, "imu.header.stamp"),  # regular, and of another clock
+        (T0 + (TRUE - T0) // 1000, TRUE, "header.stamp"),  # microseconds taken for nanoseconds
     ],
 )
 def test_the_stamp_of_a_nested_message_that_is_a_time_is_read(inner: IntArray, outer: IntArray, chosen: str) -> None:

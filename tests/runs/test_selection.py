@@ -149,10 +149,10 @@ def test_the_truth_of_a_log_never_chooses(
 
 
 def test_a_choice_on_line_depends_on_nothing_that_follows(sample_logs_dir: Path) -> None:
-    """The sensors go wild after 20 s; what is selected until then stays, and what follows may change."""
-    car, wild_s = Car.of(default_vehicle()), 20.0
+    """The sensors go wild after 40 s; what is selected until then stays, and what follows may change."""
+    car, wild_s = Car.of(default_vehicle()), 40.0
     with read_drive(sample_logs_dir / "road.mcap", car) as drive:
-        signals = drive.whole().signals.rows(0, 4000)
+        signals = drive.whole().signals.rows(0, 6000)
     after = signals.stamps_ns - signals.stamps_ns[0] > round(wild_s * 1e9)
     rng = np.random.default_rng(3)
     spoilt = replace(
@@ -166,7 +166,6 @@ def test_a_choice_on_line_depends_on_nothing_that_follows(sample_logs_dir: Path)
         reader = DrivingReader(car.vehicle)
         reader.add(sensed)
         calibration = calibrate_online(reader.finish(), car.vehicle)
-        assert len(calibration.earlier) > 1
         estimators = [make_estimator(name, car) for name in ("zero", "open-loop", "phy-ukf", "physics")]
         tracks = {e.name: run_window(e, sensed)[0] for e in estimators}
         looked: list[tuple[int, ...]] = []

@@ -172,7 +172,14 @@ def test_parameters_are_compared_between_drives_of_one_car():
 
     def of(log: str, factor: float):
         fitted = [
-            {"name": n, "value": factor if n == OF_CAR[0] else 1.0, "sd": 0.1, "log": n == OF_CAR[0], "excited": True}
+            {
+                "name": n,
+                "value": factor if n == OF_CAR[0] else 1.0,
+                "prior": 1.0,
+                "sd": 0.1,
+                "log": n == OF_CAR[0],
+                "excited": True,
+            }
             for n in OF_CAR
         ]
         return {"log": log, "parameters": fitted}

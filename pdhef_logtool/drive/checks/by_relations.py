@@ -1,6 +1,6 @@
 """``SIGNAL.sign``, ``unit``, ``axis``: each signal by relations to others (:mod:`~pdhef_logtool.drive.relations`).
 
-The posterior of all mistakes (:mod:`~pdhef_logtool.mapping.hypotheses`) states which signals fail.
+The posterior of all mistakes (:mod:`~pdhef_logtool.drive.hypotheses`) states which signals fail.
 """
 
 from __future__ import annotations
@@ -10,15 +10,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from pdhef_logtool.drive.checks.kind import CheckKind
+from pdhef_logtool.drive.hypotheses import Hypothesis, Posterior, Relation
 from pdhef_logtool.drive.measured import WHEEL_SPEEDS, Measured
-from pdhef_logtool.mapping.hypotheses import Hypothesis, Posterior, Relation
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import GNSS
 
-#: Probability of a mistake from which on a check fails, and below which it passes; and of one that is undone at once.
-FAILS, DOUBTED, CERTAIN = 0.9, 0.005, 0.99
-#: Mistakes of a signal that are likelier than this beside the likeliest are named.
-NAMED = 0.05
+#: Probability of a mistake from which on a check fails, below which it passes, and from which on it is undone at once;
+#: share of a signal's mistakes from which on one is named.
+FAILS, DOUBTED, CERTAIN, NAMED = 0.85, 0.005, 0.99, 0.05
 _LACKS_WHEELBASE = "needs the wheelbase of a vehicle file, or speeds that only full-size vehicles reach"
 _LACKS_SIDESLIP = "needs sideslip that changes fast"
 #: What a drive lacks that shows the sign of a signal and not its unit.
@@ -38,7 +37,7 @@ def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int 
 
     ``most``: mistakes at once that are accepted.
     """
-    probability, chosen = measured.posterior(mounting_is_known=mounting_is_known).best
+    probability, chosen = measured.posterior(mounting_is_known=mounting_is_known).sets[0]
     if probability < CERTAIN or len(chosen) > most or not all(h.is_exact for h in chosen):
         return {}
     bad = [r for r in measured.relations if r.tells and not r.accepts()]
@@ -50,14 +49,6 @@ def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int 
     return factor_by_name
 
 
-def is_wrong_by(measured: Measured, name: str, factor: float) -> bool | None:
-    """Return whether the relations of a signal that count are plausible after a factor and not before; None: none."""
-    mine = [r for r in measured.relations if name in r.powers and r.tells]
-    if not mine:
-        return None
-    return all(r.accepts(factor ** r.powers[name]) for r in mine) and not all(r.accepts() for r in mine)
-
-
 def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Check, ...]:
     """Judge sign, unit and field of every signal that a relation is about."""
     columns, relations = measured.columns, measured.relations
@@ -65,42 +56,28 @@ def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Che
     names = [n for n in columns if (n in measured.topics and not n.startswith(GNSS)) or n in _JUDGED_TRUTH]
     if "truth.sideslip_rad" in names and "truth.vy_m_s" in names:  # which is v_x times its tangent
         names.remove("truth.vy_m_s")
-    found = measured.posterior(mounting_is_known=mounting_is_known)
+    probable = measured.posterior(mounting_is_known=mounting_is_known)
     checks: list[Check] = []
     for name in names:
         # A wheel that contradicts others does so through the mean of the wheels, which is the speed.
-        through = WHEEL_SPEEDS if found.of(name) and name.startswith("wheel_speed_") else name
+        through = WHEEL_SPEEDS if probable.of(name) and name.startswith("wheel_speed_") else name
         mine = [r for r in relations if name in r.powers or through in r.powers]
         unrelated = [r for r in mine if r.unrelated and not _is_cleared(name, r, relations)]
-        judged = _judged(name, _of(name, [r for r in mine if r.tells]), found, measured)
+        judged = _judged(name, [r for r in mine if r.tells], probable, measured)
         checks += [_unrelated(name, r) for r in unrelated[:1]]
         checks += judged or ([] if unrelated else [_not_excited(name, mine)])
     return tuple(checks)
 
 
-def _of(name: str, relations: list[Relation]) -> list[Relation]:
-    """Return the relations without those of a wheel to the mean of the wheels, if others are left."""
-    others = [r for r in relations if not {name, WHEEL_SPEEDS} >= set(r.powers)]
-    return others if others and any(not r.accepts() for r in others) else relations
-
-
-def _judged(name: str, relations: Sequence[Relation], found: Posterior, measured: Measured) -> list[Check]:
+def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measured: Measured) -> list[Check]:
     """Return sign and unit checks of a signal by the relations that count; empty without any."""
-    mistakes = found.of(name)
-    wrong, chosen = sum(p for p, _ in mistakes), found.best[1]
-    bad = [r for r in relations if not r.accepts()]
     if not relations:
         return []
-    doubtful = bad or relations
+    mistakes, chosen = probable.of(name), probable.sets[0][1]
+    wrong = sum(p for p, _ in mistakes)
     if wrong > DOUBTED:
         likely = [h for p, h in mistakes if p > NAMED * wrong]
-        if math.isnan(likely[0].factors[name]):
-            remedy = "no single mistake explains it: look at the field, unit and sign of " + " and ".join(
-                doubtful[0].powers
-            )
-            checks = [UNIT.failed(doubtful[0].evidence, name, remedy=remedy)]
-        else:
-            checks = _failed(name, likely, doubtful, measured)
+        checks = _failed(name, likely, [r for r in relations if not r.accepts()] or relations, measured)
         return checks if wrong > FAILS else [replace(c, verdict="undecided") for c in checks]
     factors = {r.text: math.prod(h.acts_on(r) for h in chosen) for r in relations}
     usable = [r for r in relations if not math.isnan(factors[r.text])]
@@ -110,10 +87,13 @@ def _judged(name: str, relations: Sequence[Relation], found: Posterior, measured
     if not any(r.accepts(factors[r.text]) for r in usable):
         remedy = "no unit or sign explains it: the car may slide, or a sensor may fail for a while"
         return [UNIT.undecided(usable[0].evidence, name, remedy)]
+    return _passed(name, usable)
+
+
+def _passed(name: str, usable: Sequence[Relation]) -> list[Check]:
     best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
-    lacks = _LACKS_FOR_UNIT.get(name)
-    if lacks and not any(r.decides_unit for r in usable):
-        return [SIGN.passed(best.evidence, name), UNIT.undecided(best.evidence, name, lacks)]
+    if name in _LACKS_FOR_UNIT and not any(r.decides_unit for r in usable):
+        return [SIGN.passed(best.evidence, name), UNIT.undecided(best.evidence, name, _LACKS_FOR_UNIT[name])]
     return [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
 
 
@@ -139,6 +119,10 @@ def _unrelated(name: str, relation: Relation) -> Check:
 def _failed(
     name: str, mistakes: Sequence[Hypothesis], relations: Sequence[Relation], measured: Measured
 ) -> list[Check]:
+    if math.isnan(mistakes[0].factors[name]):
+        look_at = " and ".join(relations[0].powers)
+        remedy = f"no single mistake explains it: look at the field, unit and sign of {look_at}"
+        return [UNIT.failed(relations[0].evidence, name, remedy=remedy)]
     mistakes = [h for h in mistakes if not math.isnan(h.factors[name])]
     wrong = [c for a, c in (("sign", SIGN), ("unit", UNIT)) if any(a in _ASPECTS[h.kind] for h in mistakes)]
     evidence = "; ".join(r.evidence for r in relations[:2])

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind
-from pdhef_logtool.mapping.hypotheses import units_of
+from pdhef_logtool.drive.hypotheses import units_of
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS
 

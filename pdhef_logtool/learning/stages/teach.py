@@ -233,8 +233,8 @@ def _folds(drives: Sequence[OpenedDrive]) -> list[_Fold]:
         return folds
     (drive,) = drives
     cells, stamps = len(drive.driving.stamps_ns), drive.whole.signals.stamps_ns
-    taught = np.cumsum(np.isfinite(drive.slopes))
-    half_way = int(np.searchsorted(taught, taught[-1] // 2))
+    known_cells = np.cumsum(np.isfinite(drive.slopes))
+    half_way = int(np.searchsorted(known_cells, known_cells[-1] // 2))
     middle = int(np.searchsorted(stamps, drive.driving.stamps_ns[half_way]))
     for first, last, part in ((0, half_way, slice(middle, None)), (half_way, cells, slice(0, middle))):
         half = drive.driving.between(first, last)

@@ -49,11 +49,10 @@ def possible_uses(mapping: Mapping) -> str:
 
 
 def missing_for_sideslip(mapping: Mapping) -> str:
-    """Return what sideslip still needs; empty where nothing is missing."""
-    spec, words = spec_of(_MAIN), list(_WORDS)
-    lacking = sorted(spec.lacking(usable_signals(mapping)), key=words.index)
-    any_one = " or ".join(_WORDS[n] for n in lacking if n in spec.one_of)
-    return " and ".join(filter(None, [any_one, *(_WORDS[n] for n in lacking if n not in spec.one_of)]))
+    """Return what sideslip still needs, or would gain most from; empty where nothing is missing."""
+    wanted = spec_of(_MAIN).needs | {"steer_rad"}
+    lacking = sorted(wanted - usable_signals(mapping), key=list(_WORDS).index)
+    return ", ".join(_WORDS.get(n, n) for n in lacking)
 
 
 def uses_of(mapping: Mapping) -> MappingABC[str, str]:

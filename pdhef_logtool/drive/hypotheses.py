@@ -8,8 +8,9 @@ spins, or a bank is wrong in some blocks, a unit in all of them. Probabilities a
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -18,40 +19,35 @@ from pdhef_logtool.mapping.naming import G_M_S2
 from pdhef_logtool.records.signals import FloatArray
 
 DEGREE = float(np.pi / 180.0)
-#: Below this correlation a gain gives no information; above it, it is known to its reciprocal.
-MIN_CORRELATION = 0.6
-#: And it must be so far from chance, by Fisher's z of the independent samples.
-MIN_CHANCE_Z = 3.0
-#: Independent samples below which nothing is stated: 3 s of driving.
-MIN_SAMPLES = 6.0
+#: Below this correlation a gain gives no information, and above it, it is between the two regressions. It must be so
+#: far from chance, by Fisher's z of the independent samples; below so many of them (3 s) nothing is stated.
+MIN_CORRELATION, MIN_CHANCE_Z, MIN_SAMPLES = 0.6, 3.0, 6.0
 #: Two sides that move, and not with one another: another field was mapped.
 UNRELATED_CORRELATION = 0.25
-#: A range of gains that is narrower rules out all units but one; wider ones are lengths of any car.
-DECIDES_UNIT = 13.0
 #: Typical values that recognise one quantity recorded as another.
-TYPICAL_STEERING_RATIO = 16.0
-TYPICAL_WHEEL_RADIUS_M = 0.3
+TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M = 16.0, 0.3
 _TYPICAL = (*(f for t in (TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M) for f in (t, 1.0 / t)),)
 #: Factors between units that mappings confuse for any quantity: degrees, g, km/h.
 _FOREIGN = (1.0 / DEGREE, G_M_S2, 3.6)
-#: Factors that differ by less in the logarithm are one unit: km/h and mph are 0.48 apart.
-SAME_FACTOR = 0.25
+#: Factors that differ by less in the logarithm are one unit (km/h and mph are 0.48 apart), and ranges of gains that are
+#: narrower rule out all units but one: wider ones are lengths of any car.
+SAME_FACTOR, DECIDES_UNIT = 0.25, 13.0
 
 #: 1-sigma of the logarithm of a gain within a range that decides units, beyond its edges, and beyond those of a range
 #: that has room for any car.
 LEAST_WIDTH, EDGE, WIDE_EDGE = 0.05, 0.15, 0.04
-#: Largest energy of one relation: sensors fail and cars slide.
-MOST_ENERGY = 20.0
+#: Largest energy of one relation (sensors fail and cars slide), and its energy with a field that is something else.
+MOST_ENERGY, _ANY_GAIN = 20.0, 2.0
 #: Energies of hypotheses (negative logarithms of their prior odds): mistakes are seldom, two of them more so, units of
 #: another quantity are the slips of templates, and a field that is something else explains any gain.
-PRIORS = {"unit": 5.0, "sign": 5.0, "sign and unit": 9.0, "foreign": 5.7, "field": 14.0}
-_ANY_GAIN = 2.0
+PRIORS = {"unit": 5.0, "sign": 5.0, "sign and unit": 9.0, "foreign": 5.7, "field": 14.0, "open": 0.0}
 #: Of signals that explain a contradiction equally well the first is the likeliest: no standard states how a steering
 #: angle counts, and an axis of an IMU is turned more often than the sign of a gyro that is read from the right one.
 _OFTEN_WRONG = ("steering_wheel_rad", "steer_rad", "wheels", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 _SELDOM, _SELDOM_STEP = 1.0, 0.3
-#: Sets of mistakes that are extended by another one, and the largest set.
-BEAM, MOST_MISTAKES = 12, 2
+#: Likeliest mistakes that are combined with another one; probability of another unit below which it is ruled out;
+#: blocks of a drive whose gains are compared.
+BEAM, RULED_OUT, BLOCKS = 12, 0.01, 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,10 +144,11 @@ class Hypothesis:
     @property
     def energy(self) -> float:
         """The negative logarithm of its prior odds."""
+        if self.kind == "open":
+            return 0.0
         names = {"wheels" if n.startswith("wheel_speed") else n for n in self.factors}
-        ranks = [_OFTEN_WRONG.index(n) if n in _OFTEN_WRONG else len(_OFTEN_WRONG) for n in names]
-        seldom = 0.0 if max(ranks) < 2 else _SELDOM + _SELDOM_STEP * max(ranks)
-        seldom *= 2.0 if self.kind == "foreign" else 1.0
+        rank = max(_OFTEN_WRONG.index(n) if n in _OFTEN_WRONG else len(_OFTEN_WRONG) for n in names)
+        seldom = 0.0 if rank < 2 else (_SELDOM + _SELDOM_STEP * rank) * (2.0 if self.kind == "foreign" else 1.0)
         return PRIORS[self.kind] + seldom + 0.5 * (len(names) - 1) + (0.0 if self.is_exact else 0.5)
 
     def acts_on(self, relation: Relation) -> float:
@@ -165,62 +162,35 @@ class Posterior:
 
     sets: tuple[tuple[float, tuple[Hypothesis, ...]], ...]
 
-    @property
-    def best(self) -> tuple[float, tuple[Hypothesis, ...]]:
-        """The likeliest set and its probability."""
-        return self.sets[0]
-
     def of(self, name: str) -> list[tuple[float, Hypothesis]]:
         """Return the mistakes of a signal with their probabilities, the likeliest first."""
-        shares: dict[int, float] = {}
-        by_id: dict[int, Hypothesis] = {}
-        for probability, chosen in self.sets:
-            for h in chosen:
-                if name in h.factors:
-                    by_id[id(h)] = h
-                    shares[id(h)] = shares.get(id(h), 0.0) + probability
-        return sorted(((p, by_id[i]) for i, p in shares.items()), key=lambda x: -x[0])
-
-
-@dataclass(slots=True)
-class _Energies:
-    """Energies of sets of hypotheses over relations; each relation and factor is computed once."""
-
-    relations: Sequence[Relation]
-    known: dict[tuple[int, float], float] = field(default_factory=dict)
-
-    def of(self, chosen: Sequence[Hypothesis]) -> float:
-        total = sum(h.energy for h in chosen)
-        for i, relation in enumerate(self.relations):
-            factor = math.prod(h.acts_on(relation) for h in chosen)
-            key = (i, factor)
-            if math.isnan(factor):
-                total += _ANY_GAIN
-                continue
-            if key not in self.known:
-                self.known[key] = relation.energy(factor)
-            total += self.known[key]
-        return total
+        mistakes = {id(h): h for _, chosen in self.sets for h in chosen if name in h.factors}
+        shares = [(sum(p for p, chosen in self.sets if any(h is m for h in chosen)), m) for m in mistakes.values()]
+        return sorted(shares, key=lambda x: -x[0])
 
 
 def posterior(relations: Sequence[Relation], hypotheses: Sequence[Hypothesis]) -> Posterior:
-    """Return the probabilities of sets of at most ``MOST_MISTAKES`` hypotheses, given relations that tell."""
+    """Return the probabilities of sets of at most two hypotheses, given the relations that count."""
     telling = [r for r in relations if r.tells]
     touched = {n for r in telling for n in r.powers}
     useful = [h for h in hypotheses if touched & h.factors.keys()]
-    energies = _Energies(telling)
-    scored: dict[tuple[int, ...], float] = {(): energies.of(())}
-    grown: list[tuple[int, ...]] = [()]
-    for size in range(MOST_MISTAKES):
-        for former in grown:
-            used = {n for i in former for n in useful[i].factors}
-            rare = sum(useful[i].kind in ("foreign", "field") for i in former)
-            for i, h in enumerate(useful):
-                key = tuple(sorted((*former, i)))
-                if used & h.factors.keys() or key in scored or (rare and h.kind == "foreign"):
-                    continue
-                scored[key] = energies.of([useful[j] for j in key])
-        grown = sorted((k for k in scored if len(k) == size + 1), key=lambda k: scored[k])[:BEAM]
+
+    @cache
+    def of_relation(i: int, factor: float) -> float:
+        return _ANY_GAIN if math.isnan(factor) else telling[i].energy(factor)
+
+    def of_set(*chosen: Hypothesis) -> float:
+        factors = (math.prod(h.acts_on(r) for h in chosen) for r in telling)
+        return sum(h.energy for h in chosen) + sum(of_relation(i, f) for i, f in enumerate(factors))
+
+    alone = sorted(((of_set(h), i) for i, h in enumerate(useful)))
+    scored: dict[tuple[int, ...], float] = {(): of_set()}
+    scored |= {(i,): energy for energy, i in alone}
+    pairs = {(min(i, j), max(i, j)) for _, i in alone[:BEAM] for j in range(len(useful)) if j != i}
+    for i, j in pairs:
+        a, b = useful[i], useful[j]
+        if not a.factors.keys() & b.factors.keys() and "foreign" not in (a.kind, b.kind):
+            scored[i, j] = of_set(a, b)
     least = min(scored.values())
     weights = {k: math.exp(least - e) for k, e in scored.items() if e < least + 25.0}
     total = sum(weights.values())
@@ -235,37 +205,36 @@ def known_hypotheses(names: Sequence[str], together: Sequence[tuple[str, ...]] =
     ----------
     together : signals of one sensor, whose units or signs are wrong together.
     """
-    out: list[Hypothesis] = []
     groups = [[n for n in group if n in names] for group in together]
     parts = [part for group in groups for size in range(2, len(group) + 1) for part in combinations(group, size)]
     # The mean of the wheels is no signal.
-    for part in (*((n,) for n in names if n != "wheel_speeds"), *dict.fromkeys(parts)):
-        words = _together(part)
-        is_one = len(part) == 1
-        units = units_of(part[0].removeprefix("truth."))
-        for name in part[1:]:
-            shared = {f for f, _ in units_of(name.removeprefix("truth."))}
-            units = [(f, text) for f, text in units if f in shared]
-        out += [
-            Hypothesis(dict.fromkeys(part, f), f"{words}{'' if is_one else ': each'} {t}", "unit") for f, t in units
-        ]
+    alone = [(n,) for n in names if n != "wheel_speeds"]
+    out = [h for part in (*alone, *dict.fromkeys(parts)) for h in _of_part(part)]
+    wheels = [(*g,) for g in groups if g and all(n.startswith("wheel_speed") for n in g)]
+    return out + [Hypothesis(dict.fromkeys(part, math.nan), _together(part), "field") for part in (*alone, *wheels)]
+
+
+def _of_part(part: tuple[str, ...]) -> Iterator[Hypothesis]:
+    """Yield the wrong units and signs that signals have together."""
+    words, is_one = _together(part), len(part) == 1
+    units = units_of(part[0].removeprefix("truth."))
+    for name in part[1:]:
+        shared = {f for f, _ in units_of(name.removeprefix("truth."))}
+        units = [(f, text) for f, text in units if f in shared]
+    for factor, text in units:
+        yield Hypothesis(dict.fromkeys(part, factor), f"{words if is_one else f'{words}: each'} {text}", "unit")
         if is_one:
-            both = "and has the wrong sign"
-            out += [Hypothesis({part[0]: -f}, f"{words} {text} {both}", "sign and unit") for f, text in units]
-        if is_one or (words.startswith("wheel") and list(part) in groups):
-            out.append(Hypothesis(dict.fromkeys(part, math.nan), words, "field"))
-        # A sensor is mounted upside down or backwards, or ground truth has another convention; speeds count ahead.
-        if is_one or not _NEVER_TURNED & set(part):
-            has = "has" if is_one else "have"
-            out.append(Hypothesis(dict.fromkeys(part, -1.0), f"{words} {has} the wrong sign", "sign"))
-        factors = [f for size in _FOREIGN for f in (size, 1.0 / size)]
-        strange = [f for f in factors if all(abs(math.log(f / other)) > SAME_FACTOR for other, _ in units)]
-        verb = "are" if words.endswith("speeds") else "is"
-        out += [
-            Hypothesis(dict.fromkeys(part, f), f"{words} {verb} off by a factor of {1.0 / f:.4g}", "foreign")
-            for f in strange
-        ]
-    return out
+            both = f"{words} {text} and has the wrong sign"
+            yield Hypothesis({part[0]: -factor}, both, "sign and unit")
+    # A sensor is mounted upside down or backwards, or ground truth has another convention; speeds count ahead.
+    if is_one or not _NEVER_TURNED & set(part):
+        has = "has" if is_one else "have"
+        yield Hypothesis(dict.fromkeys(part, -1.0), f"{words} {has} the wrong sign", "sign")
+    verb = "are" if words.endswith("speeds") else "is"
+    for factor in (f for size in _FOREIGN for f in (size, 1.0 / size)):
+        if all(abs(math.log(factor / other)) > SAME_FACTOR for other, _ in units):
+            text = f"{words} {verb} off by a factor of {1.0 / factor:.4g}"
+            yield Hypothesis(dict.fromkeys(part, factor), text, "foreign")
 
 
 _NEVER_TURNED = frozenset({"speed_m_s", "steer_rad", "steering_wheel_rad"})
@@ -299,36 +268,24 @@ def units_of(name: str) -> list[tuple[float, str]]:
 
 
 def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
-    """Return those of the signals of doubtful unit for which relations to others rule out every other unit.
+    """Return those of the signals of doubtful unit for which the relations rule out every other unit.
 
-    A relation between two of them gives no information until one is given; the ground-truth v_y has the unit of its
-    v_x.
+    Each unit is as likely as the others before. The ground-truth v_y has the unit of its v_x.
     """
     # Rim speed in m/s and in rad/s look alike where the radius is not known: wheels are never given.
-    open_, resolved = set(doubted), set[str]()
-    while True:
-        newly_resolved = {
-            n
-            for n in open_
-            if not n.startswith("wheel_speed")
-            and _is_told(n, [r for r in relations if not (set(r.powers) - {n}) & open_])
-        }
-        if "truth.vx_m_s" in newly_resolved | resolved:
-            newly_resolved |= open_ & {"truth.vy_m_s"}
-        if not newly_resolved:
-            return resolved
-        resolved |= newly_resolved
-        open_ -= newly_resolved
+    names = {n for n in doubted if not n.startswith("wheel_speed")}
+    units = [Hypothesis({n: f}, "", "open") for n in sorted(names) for f, _ in units_of(n.removeprefix("truth."))]
+    probable = posterior(relations, units)
+    telling = [r for r in relations if r.tells]
+    resolved = {
+        n
+        for n in names & {n for h in units for n in h.factors} & {n for r in telling for n in r.powers}
+        if sum(p for p, _ in probable.of(n)) < RULED_OUT and all(r.accepts() for r in telling if n in r.powers)
+    }
+    return resolved | (names & {"truth.vy_m_s"} if "truth.vx_m_s" in resolved else set())
 
 
-def _is_told(name: str, relations: Sequence[Relation]) -> bool:
-    mine = [r for r in relations if name in r.powers and r.tells]
-    others = [factor for factor, _ in units_of(name.removeprefix("truth."))]
-    holds = bool(mine) and bool(others) and all(r.accepts() for r in mine)
-    return holds and all(any(not r.accepts(f ** r.powers[name]) for r in mine) for f in others)
-
-
-def block_gains(reference: FloatArray, measured: FloatArray, blocks: int) -> tuple[float, ...]:
+def block_gains(reference: FloatArray, measured: FloatArray, blocks: int = BLOCKS) -> tuple[float, ...]:
     """Return the gains [at most ``blocks``] of blocks of a drive that move; each has its own means: a bank, a bias.
 
     Parameters

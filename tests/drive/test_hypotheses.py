@@ -1,0 +1,69 @@
+"""The posterior of mistakes: constant factors are units, gains that change are the car's, and units are likelier."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.drive.hypotheses import Relation, block_gains, known_hypotheses, posterior
+from pdhef_logtool.drive.mounting import scaled_source
+from pdhef_logtool.drive.windows import plan_drive
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import auto_map
+from pdhef_logtool.runs.inspection import inspect_drive_log
+
+NAMES = ["ay_m_s2", "yaw_rate_rad_s", "speed_m_s"]
+TURN = {"ay_m_s2": 1, "yaw_rate_rad_s": -1, "speed_m_s": -1}
+
+
+def relation(*gains: float, powers: dict[str, int] = TURN, text: str = "a_y") -> Relation:
+    size = math.exp(float(np.mean(np.log(np.abs(gains)))))
+    return Relation(text, powers, 0.99, math.copysign(size, gains[0]), (0.55, 1.8), 200.0, blocks=gains)
+
+
+def probabilities(*relations: Relation) -> dict[str, float]:
+    found = posterior(relations, known_hypotheses(NAMES))
+    assert sum(p for p, _ in found.sets) == pytest.approx(1.0)
+    return {n: sum(p for p, _ in found.of(n)) for n in NAMES}
+
+
+@settings(max_examples=50, deadline=None, derandomize=True)
+@given(gains=st.lists(st.floats(0.7, 1.5), min_size=3, max_size=8))
+def test_plausible_gains_blame_nobody(gains: list[float]) -> None:
+    assert max(probabilities(relation(*gains)).values()) < 0.05
+
+
+def test_a_unit_is_wrong_in_every_block_and_a_slide_in_some() -> None:
+    sound = relation(1.0, 1.05, 0.95, 1.0, powers={"speed_m_s": 1}, text="another speed")
+    degrees = np.pi / 180.0
+    wrong = probabilities(sound, *(relation(*(g * degrees for g in (1.0, 1.1, 0.9, 1.0)), text=t) for t in "ab"))
+    assert wrong["yaw_rate_rad_s"] > 0.85 and wrong["speed_m_s"] < 0.1
+    assert max(probabilities(sound, relation(1.0, 0.6, 0.35, 0.2)).values()) < 0.05
+
+
+def test_gains_of_blocks_are_free_of_a_bank_and_of_blocks_that_rest() -> None:
+    time = np.arange(0.0, 80.0, 0.05)
+    bend = np.where(time < 60.0, np.sin(0.9 * time), 0.0)
+    bank = 3.0 * np.floor(time / 10.0)
+    np.testing.assert_allclose(block_gains(bend, 1.2 * bend + bank, 8), [1.2] * 6)
+    assert block_gains(bend[:400], bend[:400], 2) == ()
+
+
+def test_inspect_and_run_refuse_the_same_channels(sample_logs_dir: Path) -> None:
+    log = open_log(sample_logs_dir / "dlc.mcap")
+    right = auto_map(log).mapping
+    degrees = {"yaw_rate_rad_s": scaled_source(right.truth["yaw_rate_rad_s"], 180.0 / np.pi)}
+    wrong = replace(right, truth={**right.truth, **degrees}, origin="file")
+    inspection = inspect_drive_log(log, wrong)
+    plan = plan_drive(log, wrong, default_vehicle(), log.start_ns, log.end_ns)
+    log.close()
+    assert inspection.refused == plan.refused
+    assert set(plan.refused) == {"truth.yaw_rate_rad_s"}
+    assert "estimate sideslip" in inspection.uses["can"]
