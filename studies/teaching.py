@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import permutations
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -265,7 +266,7 @@ def simulated_pairs(seed: int) -> Iterator[PairResult]:
     for index in range(CARS_PER_SEED):
         of_car = [(simulated, drive) for simulated, drive, _ in driven if simulated.car == index]
         car = Car.of(of_car[0][0].file.with_stiffness(*of_car[0][0].factors))
-        drives: dict[str, list[OpenedDrive]] = {"rtk": [], "ground_truth": []}
+        drives: dict[Literal["rtk", "perfect"], list[OpenedDrive]] = {"rtk": [], "perfect": []}
         with tempfile.TemporaryDirectory() as folder:
             for simulated, drive in of_car:
                 path = Path(folder) / f"{simulated.manoeuvre}.mcap"
@@ -277,7 +278,7 @@ def simulated_pairs(seed: int) -> Iterator[PairResult]:
                     found.append(drive_opened)
         names = [simulated.manoeuvre for simulated, _ in of_car]
         choices = [((a,), b) for a, b in permutations(range(len(names)), 2)]
-        both = (drives["rtk"], drives["ground_truth"])
+        both = (drives["rtk"], drives["perfect"])
         yield from taught_pairs(f"{SIMULATED} {seed}-{index}", car, names, both, choices, LEAST_SPEED_M_S)
 
 
