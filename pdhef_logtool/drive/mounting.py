@@ -532,7 +532,7 @@ def survey_log(
         note = f"{mounting.text}, and is read so: {mounting.evidence}"
         signals = turned_signals(mapping, mounting, triads)
         if by_frames is None:  # what the log itself states is no correction
-            corrected = [_corrected(n, s, note) for n, s in signals.items() if s != mapping.signals[n]]
+            corrected = [_corrected(n, signals[n], note) for n in MOUNTED if signals.get(n) != mapping.signals.get(n)]
         mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
         channels = read_signals(log, mapping, clocks, *span_ns)
         mounting = replace(mounting, named=mounting.rows)
