@@ -63,9 +63,9 @@ class PosteriorBand:
 
 
 def posterior_band(car: Car, *, use_speed: bool = True) -> PosteriorBand | None:
-    """Return the intervals of a car; None where its log has calibrated it, or evidence has left no posterior."""
+    """Return the intervals of estimators on the vehicle file; None where identification has kept no posterior."""
     varied = prior_variations(car.physics_vehicle) if car.fitted_physics is None else car.varied_physics
-    if car.self_calibrated is not None or not varied:
+    if not varied:
         return None
     physics, none = of_car(car, use_speed=use_speed), dict.fromkeys(CURES, False)
     read_with = physics.read_with or physics.vehicle

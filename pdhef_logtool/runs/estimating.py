@@ -23,6 +23,7 @@ from pdhef_logtool.records.geometry import DeadReckoner
 from pdhef_logtool.records.readings import without_impossible_states
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
+from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +103,7 @@ def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
 
     algorithms, fixed_notes, posterior = {}, {}, {}
     band = posterior_band(car, use_speed=all(resolve(e).use_speed for e in estimators))
-    of_log = car.self_calibrated
+    of_log, banded = car.self_calibrated, SELF_CALIBRATED | (set() if car.fitted_physics else {NOMINAL_MODEL})
     calibrated = None if of_log is None else CalibratedBand(of_log, car.vehicle)
     online = None if of_log is None else OnlineBand((*of_log.earlier, of_log), car.vehicle)
     for estimator in estimators:
@@ -116,7 +117,7 @@ def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
             continue
         other = getattr(estimator, "calibrated_as", None)
         algorithms[estimator.name] = [resolve(e) for e in (estimator, other) if e is not None]
-        if band is not None and preset_of(estimator.name) in SELF_CALIBRATED:
+        if band is not None and preset_of(estimator.name) in banded:
             posterior[estimator.name] = band.add
     of_car = car.intervals is not None and car.intervals.physics_sha256 == car.physics_sha256
     return TrackCalibrator(car.intervals, algorithms, fixed_notes, posterior, of_car=of_car)

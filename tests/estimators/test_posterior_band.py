@@ -111,6 +111,8 @@ def test_a_file_that_no_drive_has_shown_to_be_right_has_the_interval_of_its_prio
     assert np.mean(error <= 1.96 * wide.sideslip_std_rad[50:]) > 0.95
     assert np.mean(1.96 * wide.sideslip_std_rad[50:]) < 0.03
     np.testing.assert_array_equal(wide.sideslip_rad, plain.sideslip_rad)
+    ((nominal,), (nominal_wide,)) = banded(wrong, signals, name="phy-ukf")
+    assert np.median(nominal_wide.sideslip_std_rad / nominal.sideslip_std_rad) > 2.0
     found = FittedPhysics(values=VALUES, noise=NOISE)
     assert posterior_band(Car.of(OWN, fitted_physics=found).with_noise(PHYSICS, NOISE)) is None
     assert len({vehicle.model_dump_json() for vehicle in (OWN, *prior_variations(OWN))}) == 6
