@@ -35,10 +35,13 @@ def render_plan(plan_result: PlanVerdicts, console: Console) -> None:
         value, margin = ("-" if x is None else shown(x, unit) for x in (v.value, v.margin))
         made.add_row(Text(v.outcome, STYLES[v.outcome]), v.requirement.id, v.requirement.label, value, margin)
     console.print(made)
+    to_do: dict[str, list[str]] = {}
     for v in plan_result.verdicts:
         if v.outcome != "PASS":
-            to_do = f". Next: {v.next}" if v.next else ""
-            console.print(Padding(f"{v.requirement.id}: {v.reason}{to_do}", (0, 0, 0, 2)))
+            what = v.reason.removeprefix(f"{shown(v.value, v.requirement.unit)}; ") if v.value is not None else v.reason
+            to_do.setdefault(f"{what}. Next: {v.next}" if v.next else what, []).append(v.requirement.id)
+    for what, ids in to_do.items():
+        console.print(Padding(f"{', '.join(ids)}: {what}", (0, 0, 0, 2)))
     notes = dict.fromkeys(note for v in plan_result.verdicts for note in v.notes)
     for note in notes:
         console.print(Padding(f"note: {note}", (0, 0, 0, 2)))

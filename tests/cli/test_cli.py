@@ -396,7 +396,7 @@ def test_log_without_truth_shows_what_there_is_instead(sample_logs_dir: Path, tm
     assert "Consistency" in result.stdout
     assert "from pd-hef °" in result.stdout
     assert "RMSE" not in result.stdout[: result.stdout.index("id  ")].replace("RMSE °", "")
-    assert "no ground truth of vx_m_s" in result.stdout
+    assert "no ground truth of v_x" in result.stdout
 
 
 @pytest.mark.slow

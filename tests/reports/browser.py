@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import fcntl
+import importlib.util
 import json
 import os
 import select
@@ -16,6 +17,8 @@ from pathlib import Path
 
 CHROMIUM = next((p for n in ("chromium", "chromium-browser", "google-chrome") if (p := shutil.which(n))), None)
 WHY_NOT = "there is no Chromium on this machine (apt-get install chromium)"
+_AXE = importlib.util.find_spec("axe_core_python")
+AXE = None if _AXE is None or _AXE.origin is None else Path(_AXE.origin).parent / "axe.min.js"
 _FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync", "--disable-extensions", "--disable-dev-shm-usage",
@@ -185,3 +188,11 @@ class Browser:
         ):
             self.call("Input.dispatchMouseEvent", type=kind, x=box[0] + share * box[2], y=box[1], button="left",
                       buttons=int(kind != "mouseReleased"), clickCount=1)  # fmt: skip
+
+
+def serious(browser: Browser) -> list[str]:
+    """Return what axe-core finds that is serious or critical (WCAG 2.1 AA), a line an element."""
+    browser.value(AXE.read_text(encoding="utf-8") + ";0")
+    found = json.loads(browser.value("axe.run(document).then((r) => JSON.stringify(r.violations))"))
+    grave = [v for v in found if v["impact"] in ("serious", "critical")]
+    return [f"{v['id']}: {node['html'][:80]}: {node['failureSummary']}" for v in grave for node in v["nodes"]]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import base64
-import importlib.util
-import json
 import sys
 import time
 from collections.abc import Iterator
@@ -14,7 +12,7 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
-from browser import CHROMIUM, WHY_NOT, Browser
+from browser import AXE, CHROMIUM, WHY_NOT, Browser, serious
 from made_runs import NAMES, drive_tracks, write_run
 from test_drive import hostile_run, plan_of
 from test_fleet_page import run_of
@@ -23,8 +21,6 @@ from pdhef_logtool.reports.pages import write_pages
 from pdhef_logtool.results.opened_run import open_run
 
 pytestmark = [pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT), pytest.mark.slow]
-_AXE = importlib.util.find_spec("axe_core_python")
-AXE = None if _AXE is None or _AXE.origin is None else Path(_AXE.origin).parent / "axe.min.js"
 #: Processor time of the main thread.
 FIRST_PICTURE_S, ZOOM_S = 2.0, 0.1
 #: A picture of one point.
@@ -194,14 +190,6 @@ def test_the_keyboard_zooms(browser, tmp_path):
     for key, text in (("+", "15.0 to 45.0 s"), ("ArrowRight", "22.5 to 52.5 s"), ("-", "0.0 to 60.0 s (whole drive)")):
         browser.value(f"({press})('{key}')")
         assert browser.value(seen) == text
-
-
-def serious(browser: Browser) -> list[str]:
-    """Return what axe-core finds that is serious or critical (WCAG 2.1 AA), a line an element."""
-    browser.value(AXE.read_text(encoding="utf-8") + ";0")
-    found = json.loads(browser.value("axe.run(document).then((r) => JSON.stringify(r.violations))"))
-    grave = [v for v in found if v["impact"] in ("serious", "critical")]
-    return [f"{v['id']}: {node['html'][:80]}: {node['failureSummary']}" for v in grave for node in v["nodes"]]
 
 
 @pytest.mark.skipif(AXE is None, reason="axe-core is not installed (pip install axe-core-python)")

@@ -72,7 +72,7 @@ def test_a_slippery_road_is_found(slippery: Any) -> None:
     seconds = sum(s["end_ns"] - s["start_ns"] for s in shown) * 1e-9
     assert said["observable_share"] > 0.2
     assert seconds == pytest.approx(said["observable_share"] * report["log"]["duration_s"], rel=0.1)
-    assert 0.0 < said["observable_std"] < 0.12
+    assert 0.5 <= said["observable_std"] < 0.6, "no drive has shown that the tyres of the file are right"
 
 
 def test_the_terminal_and_the_warnings_say_it(slippery: Any) -> None:

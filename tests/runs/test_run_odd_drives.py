@@ -78,7 +78,7 @@ def test_an_estimator_without_a_valid_row_while_the_car_moves(tmp_path: Path, sa
 def test_no_valid_row_of_any_estimator_fails_and_keeps_the_report(
     tmp_path: Path, sample_logs_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipeline, "candidates", lambda _car, _available: ())  # physics has valid rows
+    monkeypatch.setattr(pipeline, "default_names", lambda _car, _available: ())  # physics has valid rows
     result = _run(dict, tmp_path, sample_logs_dir, "phy-ukf")
     assert result.exit_code == 1
     report = json.loads((tmp_path / "out" / "logs" / "odd" / "report.json").read_text())
