@@ -173,7 +173,8 @@ def posterior(relations: Sequence[Relation], hypotheses: Sequence[Hypothesis]) -
     """Return the probabilities of sets of at most two hypotheses, given the relations that count."""
     telling = [r for r in relations if r.tells]
     touched = {n for r in telling for n in r.powers}
-    useful = [h for h in hypotheses if touched & h.factors.keys()]
+    # With a signal that no relation is about, a mistake is another one of the same likelihood.
+    useful = [h for h in hypotheses if h.factors.keys() <= touched]
 
     @cache
     def of_relation(i: int, factor: float) -> float:

@@ -262,7 +262,10 @@ def score_log(
     false_alarms = tuple(
         f"{c['name']} ({c['subject']}): {c.get('evidence', '')}"
         for c in messages.checks
-        if c["verdict"] == "failed" and is_right.get(c["subject"], False) and c["subject"] not in blamed
+        if c["verdict"] == "failed"
+        and is_right.get(c["subject"], False)
+        and c["subject"] not in blamed
+        and not c["name"].endswith(".corrected")  # the correction made it right
     )
     named = bool(re.search(cause, messages.text, re.IGNORECASE)) if cause else None
     return Score(tuple(findings), false_alarms, named, messages)

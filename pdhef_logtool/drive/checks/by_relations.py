@@ -17,7 +17,7 @@ from pdhef_logtool.records.signals import GNSS
 
 #: Probability of a mistake from which on a check fails, below which it passes, and from which on it is undone at once;
 #: share of a signal's mistakes from which on one is named.
-FAILS, DOUBTED, CERTAIN, NAMED = 0.85, 0.005, 0.99, 0.05
+FAILS, DOUBTED, CERTAIN, NAMED = 0.85, 0.005, 0.97, 0.05
 _LACKS_WHEELBASE = "needs the wheelbase of a vehicle file, or speeds that only full-size vehicles reach"
 _LACKS_SIDESLIP = "needs sideslip that changes fast"
 #: What a drive lacks that shows the sign of a signal and not its unit.

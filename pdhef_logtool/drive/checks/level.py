@@ -34,7 +34,7 @@ def _levels(drive: CheckedDrive) -> Iterator[Check]:
         driven, at_ease = _driven(name, columns[name], speed, yaw)
         rest = columns[name] - driven
         finite = np.isfinite(rest)
-        is_known = speed is not None and yaw is not None and bool(np.nanstd(yaw) > 0.0)
+        is_known = speed is not None and yaw is not None and bool((yaw[np.isfinite(yaw)] != 0.0).any())
         if independent_samples(int(np.count_nonzero(finite))) < 6.0:
             rest, finite, is_known = columns[name], np.isfinite(columns[name]), False
         if independent_samples(int(np.count_nonzero(finite))) < 2.0:
