@@ -117,8 +117,7 @@ Sensors have [errors](method.md#sensors); the true friction is given.
 - The training drives are of one family of simulated cars, without trucks, worn dampers or overheated tyres.
 - No training drive is a fishhook; [conditions](conditions.md) contains fishhooks, faults, wrong friction and bank.
 - Below the vehicle's low-speed limit the residual is switched off.
-- It does not act on a real car without validation data ([peers](peers.md)). `pdhef learn` gives a car the residual of its own
-  drives: 0.87 times the error of `physics` on like driving, 0.95 on other ([teaching](teaching.md)).
+- It acts on no real car without validation data ([peers](peers.md)); `pdhef learn` gives one ([teaching](teaching.md)).
 """
 
 
