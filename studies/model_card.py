@@ -117,7 +117,7 @@ Sensors have [errors](method.md#sensors); the true friction is given.
 - The training drives are of one family of simulated cars, without trucks, worn dampers or overheated tyres.
 - No training drive is a fishhook; [conditions](conditions.md) contains fishhooks, faults, wrong friction and bank.
 - Below the vehicle's low-speed limit the residual is switched off.
-- It acts on no real car without validation data ([peers](peers.md)); `pdhef learn` gives one ([teaching](teaching.md)).
+- Acts on no real car without validation data ([peers](peers.md), [teaching](teaching.md)): `pdhef learn`.
 """
 
 
