@@ -260,8 +260,10 @@ SIMULATED = {
     "spin, fishhook at 110 km/h": _simulated("fishhook", 110.0, 0.85, amplitude=1.6, keep_spins=True),
     "banked road": _simulated("banked-road", 80.0, 0.85, duration_s=40.0),
     "stop and go": _simulated("stop-and-go", 50.0, 0.85, duration_s=40.0),
+    "road, 10 s": _simulated("road", 90.0, 0.9, seed=5, duration_s=10.0),
     "road, 20 s": _simulated("road", 90.0, 0.9, seed=5, duration_s=20.0),
     "road, 300 s": _simulated("road", 80.0, 0.85, seed=3, duration_s=300.0),
+    "road, 1200 s": _simulated("road", 80.0, 0.85, seed=4, duration_s=1200.0),
 }
 _RECORDED_TITLES = {
     "revs_250lm_a.mcap": "Ferrari 250 LM, race track", "niki_gti_1khz.mcap": "VW GTI, handling course",

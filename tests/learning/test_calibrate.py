@@ -355,21 +355,20 @@ def test_a_run_uses_it_says_so_and_windows_change_nothing(
         report = result.results[0].report
         assert report is not None
         notes = {e["name"]: "; ".join(e["intervals"]) for e in report["estimators"]}
-        assert ("intervals not calibrated" if name == "plain" else "calibrated on truthsim saloon") in notes["phy-ukf"]
+        expected = "intervals: own, parameters" if name == "plain" else "calibrated on truthsim saloon"
+        assert expected in notes["phy-ukf"]
         assert "calibrated" not in notes["zero"]
         assert "other physics" not in notes["phy-ukf"]
         tables[name] = pl.read_parquet(tmp_path / name / "logs" / "dlc" / "estimates.parquet")
         metrics = pl.read_parquet(tmp_path / name / "metrics.parquet").filter(pl.col("estimator") == "phy-ukf")
         figures[name] = {
-            metric: metrics.filter(pl.col("metric") == metric)["value"].to_list()
-            for metric in ("rmse", "nis", "coverage95", "nees")
+            metric: metrics.filter(pl.col("metric") == metric)["value"].to_list() for metric in ("rmse", "nis", "nees")
         }
     assert tables["whole"].equals(tables["cut"])
-    # Coverage and NEES are those of the calibrated covariance; the filter's own innovations know nothing of it.
+    # NEES is that of the calibrated covariance; the filter's own innovations know nothing of it.
     assert {m: figures["whole"][m] == figures["plain"][m] for m in figures["plain"]} == {
         "rmse": True,
         "nis": True,
-        "coverage95": False,
         "nees": False,
     }
     assert all(figures["plain"].values())
