@@ -135,16 +135,16 @@ def measured(cars: int, seed: int) -> list[Printed]:
     results: list[Printed] = []
     for simulated, raw, noise in simulated_drives(cars, seed, DRIVEN, steer_gain=0.0):
         rng = np.random.default_rng([seed, simulated.car, 1])
-        told = with_prior_errors(simulated.file.with_stiffness(*simulated.factors), noise, rng)
+        wrong_file = with_prior_errors(simulated.file.with_stiffness(*simulated.factors), noise, rng)
         friction, printed = float(simulated.file.assumed_friction), list[tuple[str, float, float]]()
-        for name, file in (("wrong", told), ("right", simulated.file)):
+        for name, file in (("wrong", wrong_file), ("right", simulated.file)):
             car = Car.of(file.model_copy(update={"friction": None}))
             with as_read(raw, car, ReadOptions(friction="auto", prefer_truth="rtk")) as drive:
                 drive.friction.model_std = MODEL_STD[name == "right"]  # that of a car with evidence
                 printed += [(f"{text}, {name} file", error, sd) for text, error, sd in of_friction(drive, friction)]
                 if name == "wrong":
                     printed += [*of_checks(drive, simulated.file, noise)]
-                    printed += [*of_calibration(drive, simulated.file, told, noise, rng)]
+                    printed += [*of_calibration(drive, simulated.file, wrong_file, noise, rng)]
         results += [Printed(name, simulated.manoeuvre, error, sd) for name, error, sd in printed]
     return results
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.evaluation.blocks import SegmentSums, blocks_with_halo, packed
 from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, OfDrive, SensorErrors
@@ -36,7 +36,10 @@ def yaw_rows(
     sums_by_track = [SegmentSums() for _ in tracks]
     for first, a, b, end in blocks_with_halo(signals, SETTLE_S, 1):
         core, inside = slice(a - first, b - first), dict(masks.rows(a, b))
-        part = Signals.rows(signals, first, end)  # in memory
+        window = signals.rows(first, end)
+        part = Signals.rows(
+            window, 0, len(window)
+        )  # of signals on disk each column is read once, and no more than this
         for track, sums in zip(tracks, sums_by_track, strict=True):
             residual = yaw_residual(track.rows(first, end), part, sensors.vehicle, sensors)[core]
             sums.add(inside, residual, residual**2)
@@ -55,20 +58,16 @@ def yaw_residual(track: StateTrack, signals: Signals, vehicle: VehicleParameters
     The steering, its delay, the gyro's bias and the tyres are those of the calibrated ``vehicle``.
     """
     friction = signals.friction if sensors.friction is None else np.full(len(signals), sensors.friction)
-    was = sensors.read_with or vehicle
-    before, after, t = was.sensors, vehicle.sensors, signals.stamps_ns
-    angle = (signals.steer_rad + was.steer_offset_rad) * (was.steering_ratio / vehicle.steering_ratio)
-    rate = signals.yaw_rate_rad_s * before.yaw_rate_gain + before.yaw_rate_bias_rad_s
-    rate = (rate - after.yaw_rate_bias_rad_s) / after.yaw_rate_gain
-    steer = np.interp(t - round(sensors.steer_delay_s * 1e9), t, angle - vehicle.steer_offset_rad)
+    read, t = corrected_anew(signals, sensors.read_with or vehicle, vehicle), signals.stamps_ns
+    steer = np.interp(t - round(sensors.steer_delay_s * 1e9), t, read.steer_rad)
     friction = np.where(np.isfinite(friction), friction, vehicle.assumed_friction)
     dt = np.diff(t, prepend=t[:1]) * 1e-9
     dt[dt > MAX_STEP_S] = np.nan
     vy = np.where(track.valid, track.vy_m_s, np.nan)
     modelled = np.full(len(t), np.nan)
-    inputs = (dt, carried_speed(signals), vy, steer, friction, rate)
+    inputs = (dt, carried_speed(signals), vy, steer, friction, read.yaw_rate_rad_s)
     _yaw_rates(inputs, _tyres_of(vehicle), modelled)
-    return modelled - rate
+    return modelled - read.yaw_rate_rad_s
 
 
 class _Tyres(NamedTuple):
