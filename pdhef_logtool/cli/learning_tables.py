@@ -51,31 +51,15 @@ def render_learning(result: LearnResult, console: Console) -> None:
     console.print(f"car in {result.car}; evidence of each decision in learn.md there", soft_wrap=True)
 
 
-def _identification(figures: Mapping[str, Any], console: Console) -> None:
-    """Print the identified parameters with their uncertainty, and the error of the filter with them."""
-    if calibration := figures.get("self_calibration"):
-        parameters = table("parameter", ">value", ">± 1 sd", ">prior", ">± 1 sd", "unit")
-        for p in calibration["parameters"]:
-            spread = [f"{100.0 * s:.0f} %" if p["log"] else f"{s:.2g}" for s in (p["sd"], p["prior_sd"])]
-            parameters.add_row(p["name"], f"{p['value']:.5g}", spread[0], f"{p['prior']:.4g}", spread[1], p["unit"])
-        console.print(parameters)
-        console.print(f"  {calibration['text']}")
-        return
-    parameters = table("parameter", ">value", ">95 % interval", ">prior", "unit", "")
-    for p in figures["parameters"]:
-        interval = f"{p['low95']:.4g} to {p['high95']:.4g}" if p["excited"] else "-"
-        remark = "filter noise" if p["noise"] else "" if p["excited"] else "not observable, kept"
-        parameters.add_row(p["name"], f"{p['value']:.5g}", interval, f"{p['prior']:.4g}", p["unit"], remark)
+def _calibration(figures: Mapping[str, Any], console: Console) -> None:
+    """Print the calibrated parameters with their uncertainty."""
+    calibration = figures["self_calibration"]
+    parameters = table("parameter", ">value", ">± 1 sd", ">prior", ">± 1 sd", "unit")
+    for p in calibration["parameters"]:
+        spread = [f"{100.0 * s:.0f} %" if p["log"] else f"{s:.2g}" for s in (p["sd"], p["prior_sd"])]
+        parameters.add_row(p["name"], f"{p['value']:.5g}", spread[0], f"{p['prior']:.4g}", spread[1], p["unit"])
     console.print(parameters)
-    console.print()
-    console.print("sideslip RMSE")
-    names = [name for name in figures["sideslip_rmse_deg"][0] if name not in ("part", "seconds")]
-    scores = table("part", ">seconds", *(f">{name}" for name in names))
-    for score in figures["sideslip_rmse_deg"]:
-        scores.add_row(score["part"], f"{score['seconds']:.1f}", *(f"{score[name]:.3f}°" for name in names))
-    console.print(scores)
-    for note in figures["notes"]:
-        console.print(f"  {note}")
+    console.print(f"  {calibration['text']}")
 
 
 def _noise(figures: Mapping[str, Any], console: Console) -> None:
@@ -143,7 +127,7 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
         console.print(f"  {text}")
 
 
-_RENDER = {"teach": _teaching, "identify": _identification, "noise": _noise, "gain": _gain, "intervals": _intervals}
+_RENDER = {"teach": _teaching, "calibrate": _calibration, "noise": _noise, "gain": _gain, "intervals": _intervals}
 
 
 def render_extraction(result: ExtractResult, console: Console) -> None:

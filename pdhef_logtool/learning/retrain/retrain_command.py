@@ -57,7 +57,7 @@ from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log, id
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.errors import EXIT_GATE, EstimatorError, OutputError, PdhefError
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.residual_model.bundle import MANY_CARS, NO_MODEL, open_model
+from pdhef_logtool.residual_model.bundle import NO_MODEL, open_model
 from pdhef_logtool.residual_model.torch_extra import check_torch
 from pdhef_logtool.results.comparing import compare_runs
 from pdhef_logtool.results.gate import Figure, Gate
@@ -96,7 +96,7 @@ class RetrainSettings:
     Attributes
     ----------
     config : car, mapping, slice, sensors, truth channel. seed : of the split assignment, training and bootstraps.
-    init : network to start from, a bundle or ``none``; None = the car's, else that of many cars.
+    init : network to start from, a bundle or ``none``; None = the car's, else a new one.
     epochs : of training; None = the recipe's. gate : limits of the candidate. strict : undecided closes the gate.
     """
 
@@ -154,7 +154,7 @@ class _Retraining:
     def start(self) -> Path:
         """The network to begin with, as a bundle is named."""
         car_network = self.car.residual_network is not None and self.car.network_folder
-        return self.settings.init or car_network or Path(MANY_CARS)
+        return self.settings.init or car_network or Path(NO_MODEL)
 
     def config_for(self, car: Path | None, network: Path | None = None) -> RunConfig:
         return replace(self.settings.config, car=car, network=network, intervals=None, estimators=None)
@@ -405,11 +405,10 @@ def _stages(this: _Retraining) -> dict[str, Any]:
     basis = this.basis(digest(basis), role=INTERVALS)
     intervals = this.do(4, "intervals", basis, lambda folder: _intervals(this, folder))
     rests_on = [digest(basis), this.settings.strict, repr(this.settings.gate)]
-    given_network = None if this.car.residual_network is not None else Path(MANY_CARS)
     source = this.settings.config.car
-    this.do(5, "before", this.basis(role=GATE), lambda folder: _run(this, 5, folder, source, given_network))
+    this.do(5, "before", this.basis(role=GATE), lambda folder: _run(this, 5, folder, source))
     candidate = this.stages.place(4, "intervals") / CAR_FOLDER
-    this.do(6, "after", this.basis(digest(basis), role=GATE), lambda folder: _run(this, 6, folder, candidate, None))
+    this.do(6, "after", this.basis(digest(basis), role=GATE), lambda folder: _run(this, 6, folder, candidate))
     judged = this.do(7, "gate", this.basis(*rests_on, role=GATE), lambda folder: _judge(this, folder, trusted))
     return {
         **record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=this.settings.config), this.car),
@@ -519,8 +518,8 @@ def _intervals(this: _Retraining, folder: Path) -> dict[str, Any]:
     return {"shown": output.text, **output.figures}
 
 
-def _run(this: _Retraining, number: int, folder: Path, car: Path | None, network: Path | None) -> dict[str, Any]:
-    config = replace(this.config_for(car, network), estimators=(HYBRID, *BESIDE), keep="metrics")
+def _run(this: _Retraining, number: int, folder: Path, car: Path | None) -> dict[str, Any]:
+    config = replace(this.config_for(car), estimators=(HYBRID, *BESIDE), keep="metrics")
     logs = [str(i.path) for i in this.drives[GATE]]
     result = run_logs(
         logs,
