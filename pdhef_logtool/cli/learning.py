@@ -196,11 +196,11 @@ def train(
 @options.command(
     commands,
     "pdhef retrain logs/ -o retrained --car mycar --jobs 2",
-    "pdhef retrain logs/ -o retrained --car mycar --plan plan.toml --strict",
+    "pdhef retrain logs/ -o retrained --car mycar --strict",
     "pdhef run new/ -o out --car retrained/accepted/0123456789ab/car",
     panel=panels.LEARN,
     notes="Each drive is assigned to one split: training, validation, residual gain, intervals, or the final "
-    "comparison. If pdhef compare finds the candidate worse than the car on the last split, it is written to "
+    "comparison. If its error on the last split is significantly higher than that of the car, it is written to "
     "rejected/ with the reason, otherwise to accepted/ (docs/retrain.md). Repeating the command processes new drives "
     "only. Exit codes: 0 accepted, 3 accepted with drives left out, 4 rejected.",
     shared="cache sensors friction",
@@ -211,14 +211,7 @@ def retrain(
     logs: options.TruthLogs,
     output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Folder for stages and candidates.")],
     config: RunConfig,
-    plan: Annotated[
-        Path | None,
-        Option(
-            metavar="FILE",
-            help='Validation plan with baseline = "run" as the gate. Default: RMSE of pd-hef at most 2 % higher.',
-        ),
-    ] = None,
-    strict: Annotated[bool, Option("--strict", help="An inconclusive requirement rejects the candidate.")] = False,
+    strict: Annotated[bool, Option("--strict", help="Reject unless the lower error is significant.")] = False,
     init: Annotated[
         Path | None, Option(help="Model bundle to start from, or none. Default: the car's, else a new one.")
     ] = None,
@@ -228,13 +221,10 @@ def retrain(
     as_json: options.JsonFlag = False,
 ) -> None:
     """Train a car's network further; accept it only if it is not worse on held-out drives."""
-    from pdhef_logtool.evaluation.validation_plan import load_plan
-    from pdhef_logtool.learning.retrain.retrain_command import DEFAULT_GATE, RetrainSettings
+    from pdhef_logtool.learning.retrain.retrain_command import RetrainSettings
     from pdhef_logtool.learning.retrain.retrain_command import retrain as train_again
-    from pdhef_logtool.results.gate import gate_of
 
-    asked = DEFAULT_GATE if plan is None else gate_of(load_plan(plan))
-    settings = RetrainSettings(config=config, seed=seed, init=init, epochs=epochs, gate=asked, strict=strict)
+    settings = RetrainSettings(config=config, seed=seed, init=init, epochs=epochs, strict=strict)
     with console.reporter() as reporter:
         result = train_again(logs, output, settings, jobs=jobs, reporter=reporter)
     console.finish(result, learning_tables.render_retraining, as_json)

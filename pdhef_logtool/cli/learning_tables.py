@@ -213,18 +213,10 @@ def render_baselines(result: BaselinesResult, console: Console) -> None:
 
 def render_retraining(result: RetrainResult, console: Console) -> None:
     """Print what the candidate identified on, how it compares on the drives of the gate, and the verdict."""
-    from pdhef_logtool.results.gate import Figure
-
     document = result.document
     _print_cells(document["cells"], None, console)
     console.print(", ".join(f"{role}: {count}" for role, count in document["drives_by_role"].items()) + " drives")
-    shown = table("figure", ">drives", ">median change", ">95 % interval", "verdict", fold=1)
-    for row in document["comparison"]["figures"]:
-        figure = Figure(row["signal"], row["metric"], row["segment"], row["estimator"])
-        median, low, high = ("-" if row[k] is None else f"{100.0 * row[k]:+.1f} %" for k in ("median", "low", "high"))
-        shown.add_row(figure.label, str(row["drives"]), median, f"{low} to {high}", row["verdict"])
-    console.print("the candidate against the car as it is, on the drives of the gate")
-    console.print(shown)
+    console.print(f"the candidate against the car as it is: {document['gate']['text']}")
     if document["judged"] > 1:
         console.print(
             f"{document['judged']} candidates were judged on these drives: the more there are, the less it shows"

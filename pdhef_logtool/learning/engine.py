@@ -25,8 +25,8 @@ from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.estimators.table import spec_of
-from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference
-from pdhef_logtool.evaluation.comparison import BLOCK_S, Compared, Errors, compare
+from pdhef_logtool.evaluation.bootstrap import Interval
+from pdhef_logtool.evaluation.comparison import Compared, Errors, compare
 from pdhef_logtool.learning.drives import (
     CALIBRATE,
     GAIN,
@@ -45,11 +45,10 @@ from pdhef_logtool.learning.drives import (
     open_mapping,
     record_head,
 )
-from pdhef_logtool.learning.evidence.trust import MIN_BLOCKS
 from pdhef_logtool.learning.more_driving import what_more_would_pay
 from pdhef_logtool.learning.page import draw_page, page_markdown
 from pdhef_logtool.learning.resume import Stages, read_own
-from pdhef_logtool.learning.score import score_slices
+from pdhef_logtool.learning.score import paired_test, score_slices
 from pdhef_logtool.learning.split import PARTS, TEST, TRAINED, TRAINING, VALIDATION, DriveTimes, Split, split_drives
 from pdhef_logtool.learning.stages.calibrate import calibrate
 from pdhef_logtool.learning.stages.gain import find_gain
@@ -94,8 +93,6 @@ MUST_CONFIRM = (NOISE,)
 LEAST_S = 50.0
 #: Used where the true speed is above this multiple of the low-speed limit, and where the car does not spin or drift.
 SPEED_FACTOR, MAX_SIDESLIP_RAD = 2.0, math.radians(8.0)
-#: A candidate that gives an estimate at fewer of the stamps counts as worse.
-LEAST_AVAILABILITY = 0.9
 #: The filter that follows the network, the same smoothed, and the baseline that runs on every vehicle file.
 HYBRID, SMOOTHED, BASELINE = "pd-hef", "pd-hef-smoothed", "phy-ukf"
 #: Estimators of the stages noise and intervals where several stages share the drives.
@@ -435,17 +432,17 @@ def _run_stage(call: _Call, number: int, name: str, before: Path, folder: Path) 
     update_car(task.car, folder / CAR, output.change)
     task.reporter.progress("scoring the validation part", 1.0)
     old, new = (_validation_errors(call, car) for car in (before, folder / CAR))
-    (was, now), gains = _compare(old, new)
+    test = paired_test(old, new)
     unsure = name in MUST_GAIN and not _still_sure(old, new)
-    doubtful = name in MUST_CONFIRM and not _confirmed(old, new)
-    kept = not unsure and not doubtful and (gains is True if name in MUST_GAIN else gains is not False)
+    doubtful = name in MUST_CONFIRM and not test.confirmed
+    kept = not unsure and not doubtful and (test.better is True if name in MUST_GAIN else test.better is not False)
     _tidy(folder, keep_car=kept)
     text = output.text + ("; its 95 % intervals contain too few of the errors" if unsure else "")
     return {
         "status": KEPT if kept else UNDONE,
         "text": text + ("; the lower error is not significant" if doubtful else ""),
-        "before": [old.name, was],
-        "after": [new.name, now],
+        "before": [old.name, test.was_deg],
+        "after": [new.name, test.now_deg],
         "figures": output.figures,
     }
 
@@ -479,24 +476,10 @@ def _validation_errors(call: _Call, car_folder: Path) -> Errors:
     return scored.errors[name]
 
 
-def _compare(old: Errors, new: Errors) -> tuple[tuple[float, float], bool | None]:
-    """Return the RMSE of both in degrees where both are known, and whether the new one is better; None: it is alike."""
-    both = np.isfinite(old.error) & np.isfinite(new.error)
-    was, now = (float(np.degrees(np.sqrt(np.mean(e.error[both] ** 2)))) if both.any() else np.nan for e in (old, new))
-    lacks = new.scored < LEAST_AVAILABILITY * old.scored
-    return (round(was, 6), round(now, 6)), None if was == now and not lacks else now < was and not lacks
-
-
 def _still_sure(old: Errors, new: Errors) -> bool:
     """Return whether the new 95 % intervals contain most of the errors, or as many as the old ones."""
     was, now = (float(np.mean(e.inside[np.isfinite(e.error)])) if e.inside is not None else 0.0 for e in (old, new))
     return now >= min(was, LEAST_COVERED)
-
-
-def _confirmed(old: Errors, new: Errors) -> bool:
-    """Return whether the new error is lower by the 95 % bounds of a paired block bootstrap."""
-    difference = block_bootstrap_difference(new.error, old.error, new.stamps_ns, block_s=BLOCK_S)
-    return difference.blocks >= MIN_BLOCKS and difference.high < 0.0
 
 
 # ---- the end ----

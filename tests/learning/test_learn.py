@@ -22,8 +22,9 @@ from pdhef_logtool.car.vehicle import AxleTyre, Tyres
 from pdhef_logtool.evaluation.comparison import Errors
 from pdhef_logtool.learning import engine
 from pdhef_logtool.learning.drives import STAGES, LearnSettings
-from pdhef_logtool.learning.engine import _compare, count_evaluations, learn
+from pdhef_logtool.learning.engine import count_evaluations, learn
 from pdhef_logtool.learning.page import draw_page, page_markdown
+from pdhef_logtool.learning.score import paired_test
 from pdhef_logtool.learning.split import (
     GAP_S,
     NETWORK_TRAINING,
@@ -151,13 +152,14 @@ def _errors(*degrees: float) -> Errors:
 
 def test_what_is_worse_or_says_less_does_not_stay() -> None:
     nan = float("nan")
-    assert _compare(_errors(1.0, 1.0), _errors(0.5, -0.5)) == ((1.0, 0.5), True)
-    assert _compare(_errors(0.5, 0.5), _errors(1.0, nan))[1] is False
-    assert _compare(_errors(1.0, 1.0), _errors(-1.0, 1.0))[1] is None
+    good = paired_test(_errors(1.0, 1.0), _errors(0.5, -0.5))
+    assert (good.was_deg, good.now_deg, good.better) == (1.0, 0.5, True)
+    assert paired_test(_errors(0.5, 0.5), _errors(1.0, nan)).better is False
+    assert paired_test(_errors(1.0, 1.0), _errors(-1.0, 1.0)).better is None
     # Where one of them says nothing, neither counts; an estimate that is missing too often is worse.
-    assert _compare(_errors(nan, *[1.0] * 10), _errors(9.0, *[0.5] * 10))[1] is True
-    assert _compare(_errors(*[1.0] * 10), _errors(nan, nan, *[0.5] * 8))[1] is False
-    assert _compare(_errors(1.0, nan), _errors(nan, 1.0))[1] is False
+    assert paired_test(_errors(nan, *[1.0] * 10), _errors(9.0, *[0.5] * 10)).better is True
+    assert paired_test(_errors(*[1.0] * 10), _errors(nan, nan, *[0.5] * 8)).better is False
+    assert paired_test(_errors(1.0, nan), _errors(nan, 1.0)).better is False
 
 
 def test_noise_must_be_better_beyond_doubt() -> None:
@@ -166,10 +168,17 @@ def test_noise_must_be_better_beyond_doubt() -> None:
 
     rng = np.random.default_rng(0)
     old = rng.normal(0.0, 1.0, 900)
-    assert engine._confirmed(errors(old), errors(0.9 * old))
-    assert not engine._confirmed(errors(old[:700]), errors(0.9 * old[:700]))  # of seven blocks
-    assert not engine._confirmed(errors(old), errors(rng.normal(0.0, 0.99, 900)))
-    assert not engine._confirmed(errors(0.9 * old), errors(old))
+
+    def verdict(before: np.ndarray, after: np.ndarray) -> tuple[bool, bool]:
+        test = paired_test(errors(before), errors(after))
+        return test.confirmed, test.refuted
+
+    assert verdict(old, 0.9 * old) == (True, False)
+    assert verdict(old[:700], 0.9 * old[:700]) == (False, False)  # of seven blocks
+    assert verdict(0.9 * old[:700], old[:700]) == (False, True)
+    assert verdict(old, rng.normal(0.0, 0.99, 900)) == (False, False)
+    assert verdict(0.9 * old, old) == (False, True)
+    assert verdict(old, np.where(np.arange(900) < 300, np.nan, 0.5 * old)) == (False, True)
 
 
 def test_evaluations_of_the_same_driving_are_counted(tmp_path: Path) -> None:
