@@ -121,8 +121,9 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
         drives.add_row(d["name"], cell(d["seconds"], digits=0), *errors, d["calibration"])
     console.print(drives)
     console.print(f"  {figures['evidence']}")
-    if not figures["prior_used"]:
-        console.print("  no prior: with each drive left out, the prior of the others raises the error significantly")
+    console.print(
+        f"  the prior of the tyres lowers the error of other driving with probability {figures['prior_support']:.2f}"
+    )
     for text in figures["more"]:
         console.print(f"  {text}")
 
