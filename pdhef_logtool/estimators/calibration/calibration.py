@@ -210,7 +210,7 @@ def self_calibrate(
     Parameters
     ----------
     taught : prior that drives with ground truth gave. It makes no calibration plausible that is refused without it: the
-        model does not explain the driving, whatever its parameters.
+        model does not explain such driving with any parameters.
     exported : whether it is written to a car, for which the driving must excite both cornering stiffnesses.
     """
     drives = [d for d in drives if len(d.stretches)]

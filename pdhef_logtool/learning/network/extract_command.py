@@ -534,14 +534,14 @@ def _in_service(drive: Drive, job: _Job) -> _Service:
     if taught is None or job.settings.model != PHYSICS_MODEL:
         return _Service(car, lambda signals: signals, "", None)
     calibration = self_calibrate([read_driving(drive)], car.vehicle, taught=car.taught_prior)
-    found = self_calibrated(drive, calibration).self_calibrated
-    if found is None:
+    on_log = self_calibrated(drive, calibration).self_calibrated
+    if on_log is None:
         acts = None if taught.calibrated else taught.residual
         return _Service(car, lambda signals: signals, f"refused: {calibration.refused}", acts)
-    calibrated = replace(car, self_calibrated=found).calibrated_car
+    calibrated = replace(car, self_calibrated=on_log).calibrated_car
 
     def read(signals: Signals) -> Signals:
-        return corrected_anew(of_friction(signals, found), car.vehicle, found.vehicle)
+        return corrected_anew(of_friction(signals, on_log), car.vehicle, on_log.vehicle)
 
     return _Service(calibrated, read, calibration.text, taught.residual if taught.calibrated else None)
 

@@ -411,8 +411,8 @@ def _complete(values: FloatArray) -> BoolArray:
 def _truth_std(window: DriveWindow, state: FloatArray, std_m_s: float) -> FloatArray:
     """Return the 1-sigma of the true sideslip [N] in rad: that of the ground truth's track, else of its v_y."""
     of_noise = std_m_s / np.maximum(np.abs(state[:, 0]), 1.0)
-    own = of_noise if window.truth is None else window.truth.sideslip_std_rad
-    return np.where(np.isfinite(own), own, of_noise)
+    of_track = of_noise if window.truth is None else window.truth.sideslip_std_rad
+    return np.where(np.isfinite(of_track), of_track, of_noise)
 
 
 def _true_state(window: DriveWindow) -> FloatArray:
