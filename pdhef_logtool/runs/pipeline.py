@@ -618,7 +618,7 @@ def _open_sinks(
                 if source is not None and not config.no_position
                 else []
             )
-            sinks.append(LayoutsSink(*layouts, None, colours, shown=first, fixes=fixes))
+            sinks.append(LayoutsSink(*layouts, colours, shown=first, fixes=fixes))
         if config.kept == "full":
             sinks.append(_recording(change, drive, config, car, shown, output, colours))
         yield [WithoutPosition(sink) for sink in sinks] if config.no_position else sinks
