@@ -67,8 +67,8 @@ class ManoeuvreRules:
         3888-2, 52 m on that of ISO 3888-1). severe_m, severe_m_s : below both it is ISO 3888-2.
     offset_m, exit_m, returned, overshoot, sideways, heading_left : of a double lane change: sideways offset; length of
         the exit lane; largest share of the offset that is left on its average, and how much less an overshoot to the
-        other side counts; sideways distance over that of going out and back once; largest share of the peak heading
-        that is left on the exit lane's average.
+        other side counts; sideways distance beside 1.2 times that of going out and back once, as a share of it for each
+        swing above three; largest share of the peak heading that is left on the exit lane's average.
     step_rise_s, held, held_s : 10 to 90 % of a step; share within which the steering is held, and for how long.
     ramp_s, ramp_m_s2, ramp_misfit, ramp_speed : of a ramp: duration, demand at its end, largest RMS deviation from a
         line over its height, largest change of speed.
@@ -109,7 +109,7 @@ class ManoeuvreRules:
     offset_m: tuple[float, float] = (1.0, 10.0)
     returned: float = 0.65
     overshoot: float = 0.8
-    sideways: float = 1.6
+    sideways: float = 0.2
     exit_m: float = 30.0
     heading_left: float = 0.25
     step_rise_s: float = 0.35
@@ -464,6 +464,9 @@ def _name_of_repeated(part: Sequence[_Swing], rules: ManoeuvreRules) -> str:
 def _lane_changes(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
     """Double lane changes: out, back, and as straight at the end as before, within the length of a course."""
     for i in range(len(swings)):
+        before = swings[i - 1] if i and (swings[i].start - swings[i - 1].end) * _STEP_S < rules.swing_gap_s else None
+        if before is not None and before.peak > rules.equal_peaks * swings[i].peak:
+            continue
         for last in range(i + 3, min(i + 7, len(swings)) + 1):
             side_m = _side_lane_m(run, swings[i:last], rules)
             if rules.side_m[0] <= side_m <= rules.side_m[1]:
@@ -494,7 +497,7 @@ def _side_lane_m(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> 
     is_one = (
         rules.offset_m[0] <= peak <= rules.offset_m[1]
         and max(left, -left * rules.overshoot, way[-1]) <= rules.returned * peak
-        and np.abs(np.diff(way)).sum() <= rules.sideways * (2.0 * peak - way[-1])
+        and np.abs(np.diff(way)).sum() <= (1.2 + rules.sideways * (len(swings) - 3)) * (2.0 * peak - way[-1])
         and abs(heading[after].mean()) <= rules.heading_left * np.abs(heading).max()
     )
     return float(speed[: len(way)][way > 0.5 * peak].sum()) * _STEP_S if is_one else 0.0

@@ -87,6 +87,8 @@ if TYPE_CHECKING:
     from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
     from pdhef_logtool.evaluation.metrics import MetricRow
     from pdhef_logtool.evaluation.metrics.metric import SensorErrors
+    from pdhef_logtool.evaluation.operating_space import OperatingSpace
+    from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
     from pdhef_logtool.evaluation.validation_plan import ValidationPlan
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
     from pdhef_logtool.results.selected_estimate import MainFacts
