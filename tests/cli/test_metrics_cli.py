@@ -78,7 +78,7 @@ def test_exposure_of_recorded_estimates_is_that_of_the_drive(annotated: str, tmp
     whole = PLAN.format(limit=10.0).partition('[[requirement]]\nid = "SR-2"')[0]
     table = "exposure = [{{ speed_m_s = [{}], minutes = 0.05 }}]\n"
     plan.write_text(
-        "".join(whole.replace("SR-1", name) + table.format(x) for name, x in (("A", "15, 35"), ("B", "0, 8")))
+        "".join(whole.replace("SR-1", name) + table.format(x) for name, x in (("A", "15, 35"), ("B", "0, 5")))
     )
     document = json.loads(called("metrics", annotated, *ESTIMATE, "--plan", str(plan), "--json").stdout)
     enough, too_little = document["plan"]["requirements"]
