@@ -159,7 +159,9 @@ class _Weighing:
         usable = [f for f in usable if (f.seen.changes or f.fixed) and f.section != "truth"]
         for item in usable:
             # Sensors of the message with ground truth are taken only if no other message has them.
-            item.bonus -= 0.2 if item.topic.name == self.truth_from else 0.0
+            others = (f for f in usable if f.topic.name != self.truth_from)
+            has_other = any(f.meaning.quantity == item.meaning.quantity for f in others)
+            item.bonus -= 0.2 if item.topic.name == self.truth_from and has_other else 0.0
         wheels = any(n.startswith("wheel_speed") for n in have)
         for name, quantity, part in _SENSORS:
             if name not in have and not (wheels and quantity == "speed"):
@@ -439,6 +441,10 @@ class _Weighing:
         if first.role == "sensor" and self.truth.get("yaw_rate_rad_s") is self.taken.get("yaw_rate_rad_s"):
             self.truth.pop("yaw_rate_rad_s", None)  # the only gyro of a table of everything is a sensor
         agrees = self._truth_turns()
+        lateral, true = self._chosen("ay_m_s2"), self.truth.get("vy_m_s")
+        if lateral is not None and true is not None and lateral.sign < 0.0 and _share_axis(lateral, true):
+            true.sign = -1.0
+            true.reasons.append(f"sign turned as that of {lateral.path}: their axis is one")
         # Fields of ground truth are no inputs, except the speed of a navigation system without another speed.
         mine = set(map(id, self.truth.values()))
         for signal in [n for n, f in self.taken.items() if id(f) in mine and n != "speed_m_s"]:
@@ -513,6 +519,12 @@ class _Weighing:
             rivals=tuple(self.rivals),
             checks=(*(c for c in self.fields.checks if self._is_of_ours(c)), *self.checks),
         )
+
+
+def _share_axis(first: Field, second: Field) -> bool:
+    """Return whether two fields of one topic, both without a documented sign, name their axis with the same word."""
+    axes = (set(words_of(f.path)) & {"lat", "lateral", "trans", "y", "right"} for f in (first, second))
+    return first.topic.name == second.topic.name and bool(set.intersection(*axes)) and not (first.fixed or second.fixed)
 
 
 def _truth_of(candidates: Sequence[Field]) -> dict[str, Field]:
