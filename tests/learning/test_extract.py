@@ -287,7 +287,7 @@ def _slow(values: np.ndarray, dt_s: np.ndarray, tau_s: float) -> np.ndarray:
 
 
 def test_a_plain_ridge_is_trained_from_the_file_alone(sample_logs_dir: Path, tmp_path: Path) -> None:
-    """A file with a front axle that is too soft: what a ridge learns of every second block lowers the error of the rest."""
+    """A file with a front axle that is too soft: what a ridge learns of every second block lowers the others' error."""
     text = (sample_logs_dir / "vehicle.toml").read_text()
     (tmp_path / "soft.toml").write_text(text[: text.index("[network]")] + "\n" + text[text.index("[sensors]") :])
     soft = (tmp_path / "soft.toml").read_text().replace("B = 11.146", "B = 7.0")
