@@ -1,8 +1,9 @@
 """``physics`` and ``pd-hef`` with GNSS velocity, as late as it arrives (docs/method.md#gnss).
 
-One antenna shows a course and no heading. Hypotheses differ in how certain v_y of the filter is: as it is, good in the
-linear range of the tyres, or poor. For each a Kalman filter estimates [v_y, heading, bias of a_y, bias of the gyro,
-error of the filter's v_y, antenna x, delay of the receiver, accelerometer x] from
+One antenna shows a course and no heading. Hypotheses differ in how certain v_y of the filter is (as it is, good in the
+linear range of the tyres, poor) and the position of the accelerometer. For each a Kalman filter estimates [v_y,
+heading, bias of a_y, bias of the gyro, error of the filter's v_y, antenna x, delay of the receiver, accelerometer x]
+from
 
     v̇_y = a_y − b − x ṙ − (r − b_r) v_x,   ψ̇ = r − b_r,   v_y,filter = v_y − S v_x d,
 
@@ -37,9 +38,9 @@ from pdhef_logtool.records.tracks import StateTrack
 VY, HEADING, AY_BIAS, RATE_BIAS, LAW_ERROR, ANTENNA_X, DELAY, IMU_X, STATES = range(9)
 #: Uncertainty of the filter's v_y over v_x in degrees: constant, per m/s², per m/s³, per square of the share of the
 #: grip beyond the linear range; the logarithm of the prior weight; and 1-sigma of the accelerometer's position in m.
-#: Chosen on simulated drives. Where the filter fits, a free position would explain what its tyres lack at the limit.
-HYPOTHESES = ((0.01, 0.0, 0.0, 0.0, 0.0, 0.0), (0.06, 0.02, 0.02, 30.0, -5.5, 0.0), (1.0, 0.3, 0.1, 30.0, -9.0, 0.3),
-              (10.0, 0.3, 0.1, 30.0, -13.0, 0.3))  # fmt: skip
+#: Chosen on simulated drives. A position that is free in every hypothesis would explain what the tyres lack.
+HYPOTHESES = ((0.01, 0.0, 0.0, 0.0, 0.0, 0.0), (0.06, 0.02, 0.02, 30.0, -5.5, 0.0), (0.06, 0.02, 0.02, 30.0, -9.0, 1.0),
+              (1.0, 0.3, 0.1, 30.0, -9.0, 0.3), (10.0, 0.3, 0.1, 30.0, -13.0, 0.3))  # fmt: skip
 #: 1-sigma of a GNSS velocity at least, m/s; gate in 1-sigmas; speed below which there is no course, m/s.
 GNSS_STD_M_S, GATE_SIGMA, LEAST_SPEED_M_S = 0.1, 4.0, 3.0
 #: Time constant with which the likelihood is forgotten, s; jump of GNSS against the sensors, m/s; time after which a
@@ -90,7 +91,10 @@ def _start(memory, antenna, imu_x_m, vy, vx):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _advance(x, P, dt, vx, ay_slope, kinematic):  # type: ignore[no-untyped-def]
-    """Move one hypothesis by a step in which the sensors integrate to ``kinematic`` (v_y at heading rate r, angle)."""
+    """Move one hypothesis by a step; ``kinematic``: what the sensors integrate to.
+
+    Of v_y at their place, at constant heading, of the heading, and of the yaw rate.
+    """
     kept, law_kept = math.exp(-dt / BIAS_S), math.exp(-dt / LAW_S)
     x[VY] += kinematic[0] - dt * (x[AY_BIAS] - x[RATE_BIAS] * vx) - kinematic[2] * x[IMU_X]
     x[HEADING] += kinematic[1] - dt * x[RATE_BIAS]
@@ -124,7 +128,14 @@ def _residual(x, P, facts, sample, shared, h):  # type: ignore[no-untyped-def]
     moved = shared[_MOVED] - sample[_MOVED_THEN] - age * (x[AY_BIAS] - x[RATE_BIAS] * shared[_VX])
     rate = sample[_RATE_THEN] - x[RATE_BIAS]
     sped = shared[_RATE] - sample[_RATE_THEN]
-    left = x[VY] - moved + x[IMU_X] * sped + x[ANTENNA_X] * rate - x[DELAY] * sample[_AY_THEN] - ANTENNA_HEIGHT_M * sample[_ROLL_THEN]
+    left = (
+        x[VY]
+        - moved
+        + x[IMU_X] * sped
+        + x[ANTENNA_X] * rate
+        - x[DELAY] * sample[_AY_THEN]
+        - ANTENNA_HEIGHT_M * sample[_ROLL_THEN]
+    )
     if facts[1] == 0.0:
         x[HEADING] = math.atan2(sample[_NORTH], sample[_EAST]) - math.atan2(left, shared[_VX]) + turned
         P[HEADING, :], P[:, HEADING] = 0.0, 0.0
@@ -195,10 +206,9 @@ def _queue(columns, k, p_roll, shared, waiting):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _share(columns, k, dt, body, shared):  # type: ignore[no-untyped-def]
+def _share(columns, k, dt, roll_gradient, grip_m_s2, shared):  # type: ignore[no-untyped-def]
     """Move what the hypotheses share to step k; return what the sensors integrate to, and the slope of a_y."""
     ay, rate, vx = columns[2:5]
-    roll_gradient, _, grip_m_s2 = body
     new_rate = rate[k] if math.isfinite(rate[k]) else shared[_RATE]
     new_ay = ay[k] / (1.0 + GRAVITY_M_S2 * roll_gradient) if math.isfinite(ay[k]) else shared[_AY]
     if dt == 0.0:
@@ -251,7 +261,7 @@ def _aid(columns, body, antenna, memory, out):  # type: ignore[no-untyped-def]
             _start(memory, antenna, body[1], vy[k], vx[k])
             dt = 0.0
         shared[_RUNS] = 1.0
-        kinematic, ay_slope = _share(columns, k, dt, body, shared)
+        kinematic, ay_slope = _share(columns, k, dt, body[0], body[2], shared)
         beyond = max(0.0, shared[_GRIP] - LINEAR_SHARE) ** 2
         for i in range(x.shape[0]):
             if dt == 0.0:
