@@ -36,6 +36,8 @@ SAME_FACTOR, DECIDES_UNIT = 0.25, 13.0
 #: 1-sigma of the logarithm of a gain within a range that decides units, beyond its edges, and beyond those of a range
 #: that has room for any car.
 LEAST_WIDTH, EDGE, WIDE_EDGE = 0.05, 0.15, 0.04
+#: Where a drive is too short for blocks, they would differ by this share of what the relation leaves: the car slides.
+UNKNOWN_APART = 0.5
 #: Largest energy of one relation (sensors fail and cars slide), and its energy with a field that is something else.
 MOST_ENERGY, _ANY_GAIN = 20.0, 2.0
 #: Energies of hypotheses (negative logarithms of their prior odds): mistakes are seldom, two of them more so, units of
@@ -108,7 +110,8 @@ class Relation:
             size = np.log(np.abs(gains))
         room = -math.log(max(abs(self.correlation), 1e-3))  # between the two regressions
         # Blocks that differ show what changes: sliding, a frequency that tyres do not follow; a unit does not change.
-        apart = float(np.std(size)) if np.isfinite(size).all() else 0.0
+        unknown = UNKNOWN_APART * math.sqrt(max(0.0, 1.0 - self.correlation**2))
+        apart = float(np.std(size)) if self.blocks and np.isfinite(size).all() else unknown
         beyond = np.maximum(np.maximum(low - room - size, size - high - room), 0.0)
         energy = 0.5 * (beyond / math.hypot(EDGE if self.decides_unit else WIDE_EDGE, apart)) ** 2
         if self.decides_unit:
@@ -250,7 +253,8 @@ def _together(names: Sequence[str]) -> str:
 def units_of(name: str) -> list[tuple[float, str]]:
     """Return by what a signal is off where its unit is taken for another, and how that is stated."""
     to_radians = [(DEGREE, "is in degrees"), (1.0 / DEGREE, "was converted from degrees twice")]
-    of_speeds = [(1.0 / 3.6, "is in km/h"), (3.6, "was converted from km/h twice"), (0.44704, "is in mph")]
+    of_speeds = [(1.0 / 3.6, "is in km/h"), (3.6, "was converted from km/h twice")]
+    of_speeds += [(0.44704, "is in mph"), (1.0 / 0.44704, "was converted from mph twice")]
     if name in ("yaw_rate_rad_s", "sideslip_rad"):
         return to_radians
     if name == "steer_rad":

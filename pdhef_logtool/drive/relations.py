@@ -13,7 +13,7 @@ from pdhef_logtool.drive.hypotheses import BLOCKS, MIN_SAMPLES, Relation, block_
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
 #: What is left of two columns by regression is small, and a car that slides leaves it related otherwise.
-MIN_PARTIAL_CORRELATION = 0.8
+MIN_PARTIAL_CORRELATION, STEADY_BLOCKS = 0.8, 5
 #: Share of the curvature that a_y must leave: at one speed they are one regressor.
 SEPARABLE = 0.15
 #: One of two sides that moves by more must move the other. Crossfall and grade alone move an accelerometer by less (5 %
@@ -425,4 +425,9 @@ def _partial(
     if np.nanstd(left[0]) < separable * np.std(reference[finite]):
         return []
     relations = compare(text, powers, left[0], left[1], finite, (0.0, np.inf))
-    return [replace(r, least_correlation=MIN_PARTIAL_CORRELATION) for r in relations]
+    return [r if _is_steady(r) else replace(r, least_correlation=MIN_PARTIAL_CORRELATION) for r in relations]
+
+
+def _is_steady(relation: Relation) -> bool:
+    """Return whether so many blocks of the drive agree on the sign that it is no chance."""
+    return len(relation.blocks) >= STEADY_BLOCKS and len(set(np.sign(relation.blocks))) == 1

@@ -10,7 +10,7 @@ import numpy as np
 
 from pdhef_logtool.drive.checks.fitting import SURE, fit
 from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind
-from pdhef_logtool.drive.columns import derivative, earlier, moving_at
+from pdhef_logtool.drive.columns import derivative, earlier, moving_at, running_mean
 from pdhef_logtool.drive.truth import LatencyEstimate
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
@@ -28,6 +28,10 @@ SENSOR_DELAY_S = 0.03
 LEVER_M, MOST_LEVER_M = 0.5, 5.0
 #: Steps to find the delay of a_y, the largest last step, and the largest delay.
 DELAY_STEPS, DELAY_KNOWN_S, MOST_DELAY_S = 4, 0.005, 0.3
+#: Lateral acceleration that changes slower is also a bank of the road.
+SLOW_S = 4.0
+#: A body rolls so much later than it is accelerated, within this share, 1-sigma; the gain shows how far it rolls.
+ROLL_LAG_S, ROLL_LAG_SHARE, MOST_ROLL_GAIN = 0.08, 0.3, 0.2
 _TRUTH = {"truth.vx_m_s", "truth.vy_m_s", "truth.yaw_rate_rad_s"}
 
 
@@ -55,7 +59,7 @@ def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
     """Regress a_y and the gyro on ground truth; NaN for errors that the drive does not excite.
 
     The regressors of a_y are v̇_y + v_x r (gain, with body roll), the yaw acceleration (lever arm), the derivative of
-    v̇_y + v_x r (delay) and a constant (bias).
+    v̇_y + v_x r (delay), a constant (bias), and v̇_y + v_x r again where it changes slowly (bank).
     """
     nothing = (math.nan, math.inf)
     lever = gain = ay_gain = delay = nothing
@@ -68,17 +72,18 @@ def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
         gain = nothing if result is None else (result[0][0], result[1][0])
     if vx is not None and vy is not None and rate is not None and ay is not None:
         lateral = derivative(vy) + vx * rate
-        regressors = [derivative(rate), lateral, derivative(lateral), np.ones_like(rate)]
+        regressors = [derivative(rate), lateral, derivative(lateral), np.ones_like(rate), running_mean(lateral, SLOW_S)]
         late_s = 0.0
         for _ in range(DELAY_STEPS):  # the part of the lever arm is late too: one step is not enough
             result = fit(earlier(ay, late_s), regressors, moving_at(vx))
             if result is None or result[0][1] <= 0.0:
                 break
-            (place, scale, slope, _), (place_error, scale_error, slope_error, _), _ = result
+            (place, scale, slope, *_), (place_error, scale_error, slope_error, *_), _ = result
             step_s = -slope / scale
             late_s += step_s
             is_converged = abs(step_s) < DELAY_KNOWN_S and late_s < MOST_DELAY_S
-            delay = (late_s, slope_error / scale) if is_converged else nothing
+            roll = float(np.clip(scale - 1.0, 0.0, MOST_ROLL_GAIN)) * ROLL_LAG_S
+            delay = (late_s - roll, math.hypot(slope_error / scale, ROLL_LAG_SHARE * roll)) if is_converged else nothing
             if lever == nothing or (is_converged and late_s > SURE * delay[1]):
                 lever, ay_gain = (place, place_error), (scale, scale_error)
     return SensorErrors(*(float(x) for x in (*lever, *gain, *ay_gain, *delay)))
@@ -126,6 +131,8 @@ def _ay_place(drive: CheckedDrive) -> Iterator[Check]:
     )
     if abs(off) > max(MOST_LEVER_M, SURE * error):
         yield AY_PLACE.undecided(evidence)
+    elif abs(off) > LEVER_M and not drive.has_file:
+        yield AY_PLACE.undecided(evidence, lacks="needs a vehicle file that gives imu_position_m")
     elif abs(off) > LEVER_M and abs(off) > SURE * error:
         yield AY_PLACE.failed(evidence, lever=errors.lever_m)
     elif abs(off) + 2.0 * error < 2.0 * LEVER_M:
@@ -215,7 +222,8 @@ def _gyro_delay(drive: CheckedDrive) -> Iterator[Check]:
     if not drive.has_truth or latency is None or not latency.reliable or latency.identical:
         return
     delay = latency.gyro_delay_s
-    evidence = f"{delay * 1e3:.1f} +- {latency.std_error_s * 1e3:.1f} ms late against ground truth"
+    by = (delay - latency.latency_s) * 1e3
+    evidence = f"{by:.1f} +- {latency.std_error_s * 1e3:.1f} ms late against ground truth"
     yield GYRO_DELAY.judged(delay <= SENSOR_DELAY_S, evidence, delay=delay)
 
 

@@ -16,6 +16,8 @@ from pdhef_logtool.records.signals import FloatArray
 
 #: A larger sideslip on straights is an error of ground truth, not of tyres and crossfall.
 SIDESLIP_OFFSET_RAD = math.radians(0.15)
+#: Bias of an accelerometer, 1-sigma: tyres with a lateral force have a sideslip that it shifts.
+AY_BIAS_M_S2 = 0.1
 #: No car drives sideways: so much of its moving time beyond that, the heading and the velocity do not belong together.
 SIDEWAYS_RAD, SIDEWAYS_SHARE = math.radians(20.0), 0.75
 
@@ -47,7 +49,10 @@ def sideslip_offset(columns: Mapping[str, FloatArray]) -> tuple[float, float] | 
     with np.errstate(divide="ignore", invalid="ignore"):
         regressors = [np.ones_like(vx), rate / vx, ay]
     result = fit(np.arctan2(vy, vx), regressors, gentle_at(rate * vx, moving))
-    return None if result is None else (float(result[0][0]), float(result[1][0]))
+    if result is None:
+        return None
+    (offset, _, compliance), (error, *_), _ = result
+    return float(offset), math.hypot(error, compliance * AY_BIAS_M_S2)
 
 
 def is_turned(offset_rad: float, error_rad: float) -> bool:
