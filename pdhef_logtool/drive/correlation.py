@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -188,51 +187,28 @@ def _around(shift: int) -> tuple[int, int, int]:
 def _rough_correlations(a: FloatArray, b: FloatArray, reach: int) -> tuple[FloatArray, FloatArray]:
     """Return :func:`_correlation` at all shifts within ± ``reach`` and how far it may be off; NaN where it is unsure.
 
-    From sums: those of products a library of linear algebra forms ten times as fast as means are taken off.
+    From sums of products at all shifts, by Fourier transforms.
     """
-    of_a, of_b = _Sums(_unit_power(a)), _Sums(_unit_power(b))
-    correlations, error = np.full((2, 2 * reach + 1), np.nan)
-    n = a.shape[0]
-    for k in range(max(-reach, 1 - n), min(reach, n - 1) + 1):
-        x, y = _overlap(n, k)
-        count, sum_a, aa = of_a.sums_beside(of_b, x, y)
-        _, sum_b, bb = of_b.sums_beside(of_a, y, x)
-        ab = float(np.dot(of_a.values[x], of_b.values[y]))
-        if count >= 2:
-            power_a, power_b = aa - sum_a * sum_a / count, bb - sum_b * sum_b / count
-            least = min(power_a, power_b)
-            if least > _LEAST_POWER * count:
-                correlations[reach + k] = (ab - sum_a * sum_b / count) / (power_a * power_b) ** 0.5
-                error[reach + k] = _ROUGH_ERROR * count / least
-    return correlations, error
+    size = 1 << (a.shape[0] + reach).bit_length()
+    spectra = []
+    for values in (_unit_power(a), _unit_power(b)):
+        known = np.isfinite(values)
+        values = np.where(known, values, 0.0)
+        spectra.append(np.fft.rfft([known, values, values * values], size))
 
+    def sums(of_a: int, of_b: int) -> FloatArray:
+        every = np.fft.irfft(np.conj(spectra[0][of_a]) * spectra[1][of_b], size)
+        return np.concatenate([every[size - reach :], every[: reach + 1]])
 
-class _Sums:
-    """Sums of parts of a signal [N]; ``values`` are 0 where it is not known."""
-
-    def __init__(self, values: FloatArray) -> None:
-        is_finite = np.isfinite(values)
-        self._whole = bool(is_finite.all())
-        self.values = values if self._whole else np.where(is_finite, values, 0.0)
-        self._columns = is_finite, self.values, self.values * self.values
-        self._totals = [float(c.sum()) for c in self._columns]
-
-    def sums_beside(self, other: _Sums, mine: slice, others: slice) -> list[float]:
-        """Return count, sum and sum of squares of a part, where the part of the other signal upon it is known."""
-        if other._whole:
-            ends = zip(self._totals, self._columns, strict=True)
-            return [total - float(c[: mine.start].sum()) - float(c[mine.stop :].sum()) for total, c in ends]
-        first, end = (np.clip(other._runs, others.start, others.stop) + mine.start - others.start).T
-        return [float((c[end] - c[first]).sum()) for c in self._running]
-
-    @cached_property
-    def _runs(self) -> IntArray:
-        """From where to where it is known, [R, 2]."""
-        return np.flatnonzero(np.diff(self._columns[0], prepend=False, append=False)).reshape(-1, 2)
-
-    @cached_property
-    def _running(self) -> list[FloatArray]:
-        return [np.concatenate([[0.0], np.cumsum(c)]) for c in self._columns]
+    count = np.rint(sums(0, 0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sum_a, sum_b = sums(1, 0), sums(0, 1)
+        power_a, power_b = sums(2, 0) - sum_a**2 / count, sums(0, 2) - sum_b**2 / count
+        least = np.minimum(power_a, power_b)
+        correlations = (sums(1, 1) - sum_a * sum_b / count) / np.sqrt(power_a * power_b)
+        error = _ROUGH_ERROR * a.shape[0] / least
+        unsure = ~((count >= 2) & (least > _LEAST_POWER * count))
+    return np.where(unsure, np.nan, correlations), np.where(unsure, np.nan, error)
 
 
 def _overlap(n: int, shift: int) -> tuple[slice, slice]:
