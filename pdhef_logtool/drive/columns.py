@@ -12,8 +12,7 @@ GRID_S = 0.05
 #: −3 dB at 1 Hz: noise and vibration go, manoeuvres stay.
 LOW_PASS_HZ = 1.0
 #: Samples are interpolated onto the grid over gaps of at most this length, and of this many of their periods.
-MAX_GAP_S = 0.5
-MAX_GAP_PERIODS = 2.5
+MAX_GAP_S, MAX_GAP_PERIODS = 0.5, 2.5
 #: Values so many times farther out than all but 1 % of a channel, for so short a time, are spikes.
 SPIKE_RANGES, SPIKE_S = 5.0, 0.2
 #: A slower sensor does not resolve manoeuvres.
@@ -23,8 +22,7 @@ MAX_CELLS = 1_500_000
 #: Blocks of the parts of a drive that must agree: longer than a manoeuvre, and at most so many.
 PART_S, MOST_PARTS = 4.0, 12
 #: Moving: faster than this share of the drive's fast speeds, and than a speed that is too low for the relations.
-MOVING_SHARE = 0.25
-MIN_MOVING_M_S = 0.5
+MOVING_SHARE, MIN_MOVING_M_S = 0.25, 0.5
 
 
 def columns_on_grid(channels: Mapping[str, Channel]) -> dict[str, FloatArray]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from pdhef_logtool.drive.columns import student
 from pdhef_logtool.drive.interpolation import Bracket
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import FloatArray, IntArray
 
 #: A step of more than this many median periods is a gap.
 GAP_PERIODS = 3.0
@@ -18,9 +18,8 @@ MIN_STEP_S, MAX_STEP_S = 0.005, 0.05
 #: Far above what rounding does to a rough correlation of signals that vary by all of their power; of such as vary by
 #: less of it than the least share no rough value is given.
 _ROUGH_ERROR, _LEAST_POWER = 1e-10, 1e-4
-#: For the error of a shift: both sides are averaged over so long; blocks of the drive; share of the motion that must
-#: not be noise.
-_ERROR_MEAN_S, _ERROR_BLOCKS, _LEAST_MOTION = 0.2, 10, 0.5
+#: For the error of a shift: both sides are averaged over so long; blocks of the drive.
+_ERROR_MEAN_S, _ERROR_BLOCKS = 0.2, 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,41 +62,22 @@ class EvenGrid:
         self.step_s = step_ns * 1e-9
         brackets = [Bracket(s, grid, round(GAP_PERIODS * p)) for s, p in zip(both, periods, strict=True)]
         self._a, self._b = brackets[0], brackets[-1]
-        self._line: _Line | None = None
 
     def of_a(self, values: FloatArray) -> FloatArray:
         """Return a column [N] of the first signal on the grid, its linear trend removed; NaN in gaps."""
-        return self._without_trend(self._a.linear(values))
+        return _without_trend(self._a.linear(values))
 
     def of_b(self, values: FloatArray) -> FloatArray:
         """Return a column [M] of the second signal as :meth:`of_a` does."""
-        return self._without_trend(self._b.linear(values))
-
-    def _without_trend(self, values: FloatArray) -> FloatArray:
-        finite = np.isfinite(values)
-        if np.count_nonzero(finite) < 2:
-            return values
-        if self._line is None or not np.array_equal(self._line.is_known, finite):
-            self._line = _Line(finite)
-        return self._line.removed_from(values)
+        return _without_trend(self._b.linear(values))
 
 
-class _Line:
-    """Fits a line to values on a grid [N] where the same ones are finite; the bits are those of ``np.polyfit``."""
-
-    def __init__(self, is_known: BoolArray) -> None:
-        n = is_known.shape[0]
-        self.is_known = is_known
-        self._powers = np.vander((np.arange(n) / n)[is_known], 2)
-        self._scale = np.sqrt((self._powers * self._powers).sum(axis=0))
-        self._powers /= self._scale
-
-    def removed_from(self, values: FloatArray) -> FloatArray:
-        finite_values = values if self.is_known.all() else values[self.is_known]
-        precision = finite_values.shape[0] * np.finfo(np.float64).eps
-        slope, offset = np.linalg.lstsq(self._powers, finite_values, precision)[0] / self._scale
-        n = values.shape[0]
-        return np.asarray(values - offset - slope * (np.arange(n) / n), dtype=np.float64)
+def _without_trend(values: FloatArray) -> FloatArray:
+    known, n = np.flatnonzero(np.isfinite(values)), values.shape[0]
+    if known.size < 2:
+        return values
+    slope, offset = np.polyfit(known / n, values[known], 1)
+    return np.asarray(values - offset - slope * (np.arange(n) / n), dtype=np.float64)
 
 
 def on_common_grid(
@@ -154,7 +134,7 @@ def shift_error(grid: CommonGrid, shift_s: float) -> float:
     gain, power = float(np.dot(a, b) / np.dot(a, a)), np.cumsum(moved**2)
     later = -float(np.dot(moved, left) / max(power[-1], 1e-300)) / gain
     noise = float(np.sum(np.gradient(left + later * gain * moved, grid.step_s) ** 2)) / gain**2
-    if not power[-1] - noise > _LEAST_MOTION * power[-1]:
+    if not power[-1] > 2.0 * noise:
         return math.inf
     edges = np.searchsorted(power, np.linspace(0.0, power[-1], _ERROR_BLOCKS + 1)[1:-1])
     blocks = [

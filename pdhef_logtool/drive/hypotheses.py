@@ -36,8 +36,6 @@ SAME_FACTOR, DECIDES_UNIT = 0.25, 13.0
 #: 1-sigma of the logarithm of a gain within a range that decides units, beyond its edges, and beyond those of a range
 #: that has room for any car.
 LEAST_WIDTH, EDGE, WIDE_EDGE = 0.05, 0.15, 0.04
-#: Where a drive is too short for blocks, they would differ by this share of what the relation leaves: the car slides.
-UNKNOWN_APART = 0.5
 #: Largest energy of one relation (sensors fail and cars slide), and its energy with a field that is something else.
 MOST_ENERGY, _ANY_GAIN = 20.0, 2.0
 #: Energies of hypotheses (negative logarithms of their prior odds): mistakes are seldom, two of them more so, units of
@@ -110,7 +108,8 @@ class Relation:
             size = np.log(np.abs(gains))
         room = -math.log(max(abs(self.correlation), 1e-3))  # between the two regressions
         # Blocks that differ show what changes: sliding, a frequency that tyres do not follow; a unit does not change.
-        unknown = UNKNOWN_APART * math.sqrt(max(0.0, 1.0 - self.correlation**2))
+        # A drive without blocks slides for all of it: they would differ by half of what the relation leaves.
+        unknown = 0.5 * math.sqrt(max(0.0, 1.0 - self.correlation**2))
         apart = float(np.std(size)) if self.blocks and np.isfinite(size).all() else unknown
         beyond = np.maximum(np.maximum(low - room - size, size - high - room), 0.0)
         energy = 0.5 * (beyond / math.hypot(EDGE if self.decides_unit else WIDE_EDGE, apart)) ** 2

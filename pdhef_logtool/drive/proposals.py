@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.checks.by_relations import explained_factors
-from pdhef_logtool.drive.checks.fitting import SURE
+from pdhef_logtool.drive.checks.kind import SURE
 from pdhef_logtool.drive.checks.sensor_errors import LEVER_M, MOST_LEVER_M, SensorErrors, ay_delay, sensor_errors
 from pdhef_logtool.drive.checks.truth_sideslip import is_turned, sideslip_offset
 from pdhef_logtool.drive.measured import drive_columns
@@ -29,7 +29,7 @@ from pdhef_logtool.records.signals import Channel
 LEAST_GAIN = 0.01
 LEAST_LEVER_M = 0.3 * LEVER_M
 #: Less is within what the roll of the body does.
-LEAST_AY_DELAY_S, AY_DELAY_SURE = 0.015, 3.0
+LEAST_AY_DELAY_S = 0.015
 #: Beyond, it is no gain but a unit.
 MOST_GAIN = 0.25
 #: Accuracy of places in recorded frames.
@@ -109,7 +109,7 @@ def _delays(survey: Survey) -> dict[str, tuple[float, str]]:
     # The delay of a_y is not observable from another axis.
     is_mounted = survey.mounting is None or survey.mounting.is_as_named
     by_truth = ay_delay(sensor_errors(survey.measured.columns), latency) if is_mounted else None
-    if by_truth is not None and by_truth[0] > max(LEAST_AY_DELAY_S, AY_DELAY_SURE * by_truth[1]):
+    if by_truth is not None and by_truth[0] > max(LEAST_AY_DELAY_S, 3.0 * by_truth[1]):
         delays["ay_m_s2"] = by_truth[0], f"a_y is {by_truth[0] * 1e3:.1f} ms late against ground truth"
     for sensor in survey.late:
         told_by_truth = sensor.names[0] == "yaw_rate_rad_s" and latency is not None and latency.reliable

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pdhef_logtool.drive.checks.fitting import SURE, fit
-from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind
+from pdhef_logtool.drive.checks.fitting import fit
+from pdhef_logtool.drive.checks.kind import SURE, CheckedDrive, CheckKind
 from pdhef_logtool.drive.columns import moving_at
 from pdhef_logtool.drive.relations import gentle_at
 from pdhef_logtool.records.checks import Check
@@ -57,7 +57,7 @@ def sideslip_offset(columns: Mapping[str, FloatArray]) -> tuple[float, float] | 
 
 def is_turned(offset_rad: float, error_rad: float) -> bool:
     """Return whether an offset of the ground-truth sideslip is larger than tyres, crossfall and chance explain."""
-    return abs(offset_rad) > max(SIDESLIP_OFFSET_RAD, SURE * error_rad)
+    return abs(offset_rad) - SURE * error_rad > SIDESLIP_OFFSET_RAD
 
 
 def _offset_check(columns: Mapping[str, FloatArray]) -> Check | None:
@@ -69,11 +69,7 @@ def _offset_check(columns: Mapping[str, FloatArray]) -> Check | None:
         return OFFSET.undecided("too little gentle driving")
     offset, error = result
     evidence = f"{math.degrees(offset):.2f} +- {math.degrees(error):.2f} deg are left where the car goes straight"
-    if is_turned(offset, error):
-        return OFFSET.failed(evidence)
-    if abs(offset) + 2.0 * error < 2.0 * SIDESLIP_OFFSET_RAD:
-        return OFFSET.passed(evidence)
-    return OFFSET.undecided(evidence)
+    return OFFSET.of_figure(offset, error, (-SIDESLIP_OFFSET_RAD, SIDESLIP_OFFSET_RAD), evidence)
 
 
 FRAME = CheckKind(
