@@ -345,8 +345,10 @@ def late_checks(found: MappedChannels, vehicle: VehicleParameters | None = None)
         ({"delay_s": 0.038}, "yaw_rate_rad_s.delay"),
     ],
 )
-def test_place_gain_and_delay_are_told_apart(sample_logs_dir: Path, errors: dict[str, float], name: str) -> None:
-    checks = late_checks(planted(survey(sample_logs_dir / "sweep.mcap"), **errors))
+def test_place_gain_and_delay_are_told_apart(
+    sample_logs_dir: Path, saloon: VehicleParameters, errors: dict[str, float], name: str
+) -> None:
+    checks = late_checks(planted(survey(sample_logs_dir / "sweep.mcap"), **errors), saloon)
     assert verdicts(checks, "failed") == ({name} if name else set())
     assert {"ay_m_s2.place", "yaw_rate_rad_s.gain", "yaw_rate_rad_s.delay"} <= {c.name for c in checks}
 
