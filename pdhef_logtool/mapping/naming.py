@@ -234,16 +234,18 @@ def is_unlabelled(name: str) -> bool:
 _SPELLED_UNITS = tuple(
     (re.compile(pattern), sign)
     for pattern, sign in (
-        (r"^unit", ""), (r"°|^grad(?![a-z])", "deg"), ("²", "2"), (r"degree?s?(?=[^a-z]|$)", "deg"), (r"of_arc|_angle$", ""),
+        (r"^unit", ""), (r"°|^grad(?![a-z])", "deg"), ("²", "2"), (r"degree?s?(?=[^a-z]|$)", "deg"),
+        (r"of_arc|_angle$", ""),
         (r"kilo_?met[a-z]+", "km"), (r"met(?:er|re)s?", "m"), (r"secon[a-z]*", "s"), (r"hours?", "h"),
-        (r"squar[a-z]*", "2"), (r"[a-z_]*gravi[a-z]*", "g"), (r"radians?", "rad"), (r"revolutions?|umdr[a-z]*|rev", "r"),
+        (r"squar[a-z]*", "2"), (r"[a-z_]*gravi[a-z]*", "g"), (r"radians?", "rad"),
+        (r"revolutions?|umdr[a-z]*|rev", "r"),
         (r"minut[a-z]*", "min"), (r"^_*(?:[1ur]|)_?(?:/|per_)_?min$|^_*min\W*1$", "rpm"),
     )
 )  # fmt: skip
 
 
 def _plain_unit(text: str) -> str:
-    """Return a unit of a file as words that names of fields have: ``Unit_DegrePerSecon`` and ``°/s`` as ``deg_per_s``."""
+    """Return a unit of a file as names of fields have it: ``Unit_DegrePerSecon`` becomes ``deg_per_s``."""
     text = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", text.strip("[](){} ")).lower()
     for pattern, sign in _SPELLED_UNITS:
         text = pattern.sub(sign, text)
@@ -347,8 +349,8 @@ _TRAITS = tuple(
                      "@corner wheel angle", ".str angle|ang|whl|wheel|wheels")),
         ("@slips", ("sideslip|beta", "slip angle", "side slip")),
         ("@turns", ("@rate", "yaw vel|velocity|speed", ".yawrate|.wz", ".yr @unit_rate")),
-        ("@speeds", ("speed|speeds|velocity|velocities|vel|spd|kmh|kph|mph|ux|vx", "twist linear", "@v_axis", ".v @unit_speed",
-                    "@bare_v")),
+        ("@speeds", ("speed|speeds|velocity|velocities|vel|spd|kmh|kph|mph|ux|vx", "twist linear", "@v_axis",
+                     ".v @unit_speed", "@bare_v")),
         ("@road", ("road|tire|tyre|tires|tyres|roadwheel|roadwheels|axle|delta|@any_corner",)),
         ("@hand", ("hand|handwheel|swa|pinion", "steering|steer wheel", ".sw|.hw|.h")),
     )
