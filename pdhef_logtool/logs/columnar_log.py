@@ -192,9 +192,9 @@ class ColumnarLog(DriveLog):
         if self._databases is None:
             stored = [(a.name, a.data) for c in self.containers for a in c.attachments() if a.name.endswith(".dbc")]
             records = [record for c in self.containers for record in c.metadata_records()]
-            entries = [(f"{r.name}.{key}", text) for r in records for key, text in r.metadata.items()]
-            texts = [(f"{name.removesuffix('.dbc')}.dbc", text) for name, text in entries]
-            stored += [(name, text.encode()) for name, text in texts if _DBC.search(text)]
+            texts = [(r.name, key, text) for r in records for key, text in r.metadata.items() if _DBC.search(text)]
+            names = [key if key.endswith(".dbc") else f"{name}.{key}.dbc" for name, key, _ in texts]
+            stored += [(name, text.encode()) for name, (_, _, text) in zip(names, texts, strict=True)]
             self._databases = tuple(self._extract(name, data) for name, data in stored)
         return self._databases
 
