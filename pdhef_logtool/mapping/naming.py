@@ -79,7 +79,7 @@ def words_of(name: str) -> tuple[str, ...]:
     words: list[str] = []
     for letter, latin in (("ä", "ae"), ("ö", "oe"), ("ü", "ue"), ("Ä", "Ae"), ("Ö", "Oe"), ("Ü", "Ue")):
         name = name.replace(letter, latin)
-    for part in re.split(r"[^A-Za-z0-9]+", name):
+    for part in re.split(r"[^A-Za-z0-9]+", _SIDES.sub(lambda m: f"_{m[1][0]}{m[2]}", name)):
         if part.lower() in _SYNONYMS:
             words += _SYNONYMS[part.lower()].split()
             continue
@@ -100,7 +100,7 @@ _SYNONYMS = {
     "quergeschwindigkeit": "lateral velocity", "laengsgeschwindigkeit": "longitudinal velocity",
     "geschwindigkeit": "speed", "fahrzeuggeschwindigkeit": "vehicle speed", "raddrehzahl": "wheel speed",
     "radgeschwindigkeit": "wheel speed", "radgeschw": "wheel speed", "strg": "steering", "stwhl": "steering wheel",
-    "strwhl": "steering wheel", "stwhlang": "steering wheel angle", "lgt": "longitudinal",
+    "strwhl": "steering wheel", "winkel": "angle", "stwhlang": "steering wheel angle", "lgt": "longitudinal",
     "inline": "longitudinal", "psidot": "yaw rate", "yawdot": "yaw rate", "psip": "yaw rate", "sog": "ground speed",
     "sas": "steering wheel angle sensor", "lws": "steering wheel angle sensor",
     "avx": "angular velocity x", "avy": "angular velocity y", "avz": "angular velocity z",
@@ -113,7 +113,8 @@ _WHOLE = _set(
     kmh kph mps ms2 mps2 fl fr rl rr lf rf lr vx vy vz ax ay az
     """
 )
-#: A wheel behind letters that stand for its speed.
+#: A wheel as ``FrL``, and behind letters that stand for its speed.
+_SIDES = re.compile(r"(?<=[a-z_])(Fr|Re)([LR])(?![a-z])")
 _CORNER_SPEED = re.compile(r"(?:ws|vw|w|v|n)(?=(?:fl|fr|rl|rr)$)")
 
 
@@ -346,13 +347,13 @@ _TRAITS = tuple(
                           ".a|.g .lat|.long", ".gx|.gy|.gz @unit_acceleration", "=a_x|=a_y|=a_z",
                           ".a @x|@y|@z @unit_acceleration")),
         ("@steers", ("steer|steering|swa|handwheel|roadwheel|roadwheels", "@delta", "road|hand|front wheel angle",
-                     "@corner wheel angle", ".str angle|ang|whl|wheel|wheels")),
+                     "@corner wheel angle", ".str angle|ang|whl|wheel|wheels", ".lw angle")),
         ("@slips", ("sideslip|beta", "slip angle", "side slip")),
         ("@turns", ("@rate", "yaw vel|velocity|speed", ".yawrate|.wz", ".yr @unit_rate")),
         ("@speeds", ("speed|speeds|velocity|velocities|vel|spd|kmh|kph|mph|ux|vx", "twist linear", "@v_axis",
                      ".v @unit_speed", "@bare_v")),
         ("@road", ("road|tire|tyre|tires|tyres|roadwheel|roadwheels|axle|delta|@any_corner",)),
-        ("@hand", ("hand|handwheel|swa|pinion", "steering|steer wheel", ".sw|.hw|.h")),
+        ("@hand", ("hand|handwheel|swa|pinion", "steering|steer wheel", ".sw|.hw|.h|.lw")),
     )
     for text in texts
 )  # fmt: skip
