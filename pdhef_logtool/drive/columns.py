@@ -74,6 +74,13 @@ def independent_samples(count: int) -> float:
     return 2.0 * LOW_PASS_HZ * GRID_S * count
 
 
+def student(blocks: int) -> float:
+    """Return the factor of a standard error from so many blocks, at least two, whose ± 1.96 contains 95 %."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(blocks - 1, 0.975)) / 1.96
+
+
 def _on_grid(channel: Channel, start_ns: int, cells: int) -> FloatArray:
     """Average a channel into the grid's cells and low-pass it; NaN in gaps."""
     nothing = np.full(cells, np.nan)

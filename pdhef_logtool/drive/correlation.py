@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from pdhef_logtool.drive.columns import student
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
@@ -17,6 +19,9 @@ MIN_STEP_S, MAX_STEP_S = 0.005, 0.05
 #: Far above what rounding does to a rough correlation of signals that vary by all of their power; of such as vary by
 #: less of it than the least share no rough value is given.
 _ROUGH_ERROR, _LEAST_POWER = 1e-10, 1e-4
+#: For the error of a shift: both sides are averaged over so long; blocks of the drive; share of the motion that must
+#: not be noise.
+_ERROR_MEAN_S, _ERROR_BLOCKS, _LEAST_MOTION = 0.2, 10, 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,6 +130,41 @@ def find_shift(grid: CommonGrid, max_shift_s: float) -> Shift:
         return Shift(best * grid.step_s, exact[best], False)
     refined = parabolic_peak(*(exact[k] if k in exact else _correlation(grid.a, grid.b, k) for k in _around(best)))
     return Shift((best + refined) * grid.step_s, exact[best], True)
+
+
+def shift_error(grid: CommonGrid, shift_s: float) -> float:
+    """Return the standard error of a shift, s, from blocks of equal motion; infinity where the motion does not show it.
+
+    A gain that drifts or bends, an offset and a trend look like a part of the shift, in a ramp like all of it: they are
+    fitted beside it, and what the shift then differs by is part of its error.
+    """
+    steps = round(shift_s / grid.step_s)
+    half = max(1, round(0.5 * _ERROR_MEAN_S / grid.step_s))
+    kernel = np.full(2 * half + 1, 1.0 / (2 * half + 1))
+    parts = zip((grid.a, grid.b), _overlap(grid.a.shape[0], steps), strict=True)
+    a, b = (np.convolve(values[part], kernel, "valid") for values, part in parts)
+    slope = np.gradient(a, grid.step_s)
+    known = np.isfinite(a) & np.isfinite(b) & np.isfinite(slope)
+    a, b, slope = a[known], b[known], slope[known]
+    if a.size < 4 * _ERROR_BLOCKS or not a.any():
+        return math.inf
+    time = np.linspace(-1.0, 1.0, a.size)
+    others = np.stack([np.ones_like(a), time, a, a * time, a * np.abs(a)], axis=1)
+    both = np.stack([b, slope], axis=1)
+    left, moved = (both - others @ np.linalg.lstsq(others, both, rcond=None)[0]).T
+    gain, power = float(np.dot(a, b) / np.dot(a, a)), np.cumsum(moved**2)
+    later = -float(np.dot(moved, left) / max(power[-1], 1e-300)) / gain
+    noise = float(np.sum(np.gradient(left + later * gain * moved, grid.step_s) ** 2)) / gain**2
+    if not power[-1] - noise > _LEAST_MOTION * power[-1]:
+        return math.inf
+    edges = np.searchsorted(power, np.linspace(0.0, power[-1], _ERROR_BLOCKS + 1)[1:-1])
+    blocks = [
+        float(np.dot(m, n) / np.dot(m, m)) / gain
+        for m, n in zip(np.split(moved, edges), np.split(left, edges), strict=True)
+        if m.any()
+    ]
+    chance = student(len(blocks)) * float(np.std(blocks, ddof=1)) / math.sqrt(len(blocks))
+    return math.hypot(chance, later - (shift_s - steps * grid.step_s))
 
 
 def has_peak_within(grid: CommonGrid, low_s: float, high_s: float, least: float) -> bool:

@@ -286,13 +286,15 @@ def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
     return resolved | (names & {"truth.vy_m_s"} if "truth.vx_m_s" in resolved else set())
 
 
-def block_gains(reference: FloatArray, measured: FloatArray, blocks: int = BLOCKS) -> tuple[float, ...]:
+def block_gains(reference: FloatArray, measured: FloatArray, blocks: int) -> tuple[float, ...]:
     """Return the gains [at most ``blocks``] of blocks of a drive that move; each has its own means: a bank, a bias.
 
     Parameters
     ----------
     reference, measured : float64 [N], known everywhere.
     """
+    if blocks < 3:
+        return ()
     least, gains = 0.3 * float(reference.std()), []
     for a, b in zip(np.array_split(reference, blocks), np.array_split(measured, blocks), strict=True):
         spread_a, spread_b = float(a.std()), float(b.std())

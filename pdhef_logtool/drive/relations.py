@@ -112,7 +112,9 @@ def compare(
     correlation = float(np.mean(a * b) / (spread_a * spread_b))
     # The ratio of the spreads lies between the two regressions, as the position of the noise is unknown.
     gain = float(np.copysign(spread_b / spread_a, correlation))
-    return [Relation(text, powers, correlation, gain, expected, samples, both, blocks=block_gains(a, b))]
+    # A block of fewer samples has a gain by chance.
+    blocks = block_gains(a, b, min(BLOCKS, int(samples / MIN_SAMPLES)))
+    return [Relation(text, powers, correlation, gain, expected, samples, both, blocks=blocks)]
 
 
 def compare_at_ease(

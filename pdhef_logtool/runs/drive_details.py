@@ -14,7 +14,6 @@ from pdhef_logtool.evaluation.blocks import row_blocks
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
 from pdhef_logtool.evaluation.largest_errors import largest_places
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.evaluation.operating_space import operating_space
 from pdhef_logtool.evaluation.reasons import SensorFault, sensor_faults
 from pdhef_logtool.evaluation.segments import moving_mask
 from pdhef_logtool.evaluation.standing import standings
@@ -67,18 +66,10 @@ def drive_details(
         innovations=[] if sample is None else channel_innovations(asked, sample),
         standings=[] if truth is None else standings(main, _rivals(ready, by_name[main], read), read, truth, slow),
         error_budget=no_budget(_LEFT_OUT) if brief else _budget(drive, by_name.get(PHYSICS), read, signals),
-        operating_space=operating_space(signals, truth, answer, slow),
         path_drift=None if truth is None else path_drift(answer, truth),
-        friction_median=_friction(signals, drive.car.vehicle.assumed_friction),
         metadata=_metadata(drive),
         largest_errors=[] if truth is None else _largest_errors(answer, truth, slow),
     )
-
-
-def _friction(signals: Signals, assumed: float) -> float:
-    """Return the median friction of a drive."""
-    friction = signals.friction[np.isfinite(signals.friction)]
-    return float(np.median(friction)) if friction.size else assumed
 
 
 def _faults(read: _Read, name: str) -> tuple[SensorFault, ...] | None:

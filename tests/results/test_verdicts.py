@@ -11,7 +11,7 @@ import pytest
 from run_report import MAIN, TRUTH, errors_deg, report
 
 from pdhef_logtool.evaluation.bootstrap import Interval
-from pdhef_logtool.evaluation.operating_space import Cell
+from pdhef_logtool.evaluation.operating_space import Cell, OperatingSpace
 from pdhef_logtool.evaluation.reasons import Interval as Span
 from pdhef_logtool.evaluation.reasons import SensorFault
 from pdhef_logtool.evaluation.standing import Standing
@@ -35,7 +35,7 @@ def standing(difference: Interval | None, rival: str | None = "physics", own: In
 
 
 def details(*standings: Standing, **changes: Any) -> DriveDetails:
-    empty = DriveDetails([], [], standings, no_budget("the log contains no ground truth"), [], {})
+    empty = DriveDetails([], [], standings, no_budget("the log contains no ground truth"), {})
     return replace(empty, **changes)
 
 
@@ -99,9 +99,8 @@ def test_a_truth_that_never_slips_gives_no_verdict() -> None:
 def test_the_other_details_follow_the_schema_and_an_older_report_does_without() -> None:
     fault = SensorFault("ay_m_s2", "spike", 70, 1.0, (Span(1, 2),))
     channel = ChannelInnovations("physics", "ay_m_s2", "m/s^2", 5, 0.1, 0.2, NAN)
-    cell = Cell(3, 2, 1.5, 0, NAN)
-    found = details(faults=[fault], innovations=[channel], operating_space=[cell], metadata={"vehicle": "a"})
-    document = valid(details=found)
+    found = details(faults=[fault], innovations=[channel], metadata={"vehicle": "a"})
+    document = valid(details=found, space=OperatingSpace([Cell(3, 2, 1.5, 0, NAN)], 0.9))
     assert document["innovations"][0]["autocorrelation"] is None
     assert document["operating_space"]["cells"][0]["sideslip_mse_rad2"] is None
     assert valid(details=details(faults=None))["faults"] is None

@@ -58,17 +58,22 @@ class TaughtProblem(JointProblem):
 
 
 def taught_parameters(
-    drives: Sequence[Driving], slopes: Sequence[FloatArray], vehicle_file: VehicleParameters
+    drives: Sequence[Driving], slopes: Sequence[FloatArray], vehicle_file: VehicleParameters, support: float = 1.0
 ) -> tuple[TaughtParameter, ...]:
-    """Return the prior of a car's calibration from its drives, which were read with ``vehicle_file``."""
+    """Return the prior of a car's calibration from its drives, which were read with ``vehicle_file``.
+
+    Of the correlation between drives the share ``support`` counts: the spread between drives is the least width of the
+    prior, so that the sensors of a later drive can overrule it.
+    """
+    correlation = support * CORRELATION
     problem = TaughtProblem(drives, slopes, vehicle_file)
     fit, level = problem.solve(), float(f"{level_of(drives):.4g}")
     variances = np.minimum(np.diag(fit.covariance), 1.0)
-    stds = np.sqrt(1.0 - CORRELATION**2 * (1.0 - variances))
+    stds = np.sqrt(1.0 - correlation**2 * (1.0 - variances))
     return tuple(
         TaughtParameter(
             name=p.name,
-            value=float(f"{p.value(CORRELATION * float(t)):.9g}"),
+            value=float(f"{p.value(correlation * float(t)):.9g}"),
             std=float(f"{s * p.std:.6g}"),
             ay_m_s2=level,
         )

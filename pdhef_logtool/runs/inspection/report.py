@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_proposals
 from pdhef_logtool.logs.byte_account import checksummed_share
@@ -227,7 +226,7 @@ class Inspection:
             "ambiguities": self.ambiguities,
             "notes": self.notes,
             "checks": self.checks,
-            "proposals": [{"subject": p.subject, "home": p.home, "evidence": p.evidence} for p in self.proposals],
+            "proposals": [{"subject": p.subject, "evidence": p.evidence} for p in self.proposals],
             "lost": self.lost,
             "checksummed_share": self.checksummed_share,
             "candidates": self.candidates,
@@ -556,7 +555,7 @@ def mapping_comments(inspection: Inspection) -> dict[str, str]:
 
 def mapping_text(inspection: Inspection) -> str:
     """Return the inspection's mapping, with the corrections that it proposes, as TOML that is ready to edit."""
-    mapping, _ = apply_proposals(inspection.proposals, inspection.mapping, default_vehicle())
+    mapping = apply_proposals(inspection.proposals, inspection.mapping)
     return mapping_to_toml(mapping, comments=mapping_comments(inspection), alternatives=inspection.candidates)
 
 
