@@ -44,13 +44,11 @@ UNIT_TEXTS = {
 
 #: Several words that are one unit, in the order in which they are looked for.
 _UNIT_PHRASES = (
-    ("m_s_2", "mps2"), ("m_s2", "mps2"), ("m_per_s2", "mps2"), ("m_sec2", "mps2"), ("m_per_sec_2", "mps2"),
-    ("mps_2", "mps2"), ("ms_2", "mps2"), ("m_s_s", "mps2"),
-    ("deg_per_sec", "degps"), ("deg_per_s", "degps"), ("degrees_per_second", "degps"), ("deg_sec", "degps"),
-    ("deg_s", "degps"), ("rad_per_sec", "radps"), ("rad_per_s", "radps"), ("rad_sec", "radps"), ("rad_s", "radps"),
-    ("radians_per_second", "radps"),
-    ("km_per_h", "kmh"), ("km_h", "kmh"), ("k_m_h", "kmh"), ("m_per_sec", "mps"), ("m_per_s", "mps"), ("m_s", "mps"),
-    ("meters_per_second", "mps"), ("metres_per_second", "mps"), ("m_sec", "mps"), ("milli_g", "mg"),
+    ("m_s_2", "mps2"), ("m_s2", "mps2"), ("mps_2", "mps2"), ("ms_2", "mps2"), ("m_s_s", "mps2"),
+    ("degrees_second", "degps"),
+    ("deg_s", "degps"), ("radians_second", "radps"), ("rad_s", "radps"), ("km_h", "kmh"), ("k_m_h", "kmh"),
+    ("m_s", "mps"),
+    ("meters_second", "mps"), ("metres_second", "mps"), ("milli_g", "mg"),
 )  # fmt: skip
 
 
@@ -79,7 +77,7 @@ def words_of(name: str) -> tuple[str, ...]:
     words: list[str] = []
     for letter, latin in (("ä", "ae"), ("ö", "oe"), ("ü", "ue"), ("Ä", "Ae"), ("Ö", "Oe"), ("Ü", "Ue")):
         name = name.replace(letter, latin)
-    for part in re.split(r"[^A-Za-z0-9]+", name):
+    for part in re.split(r"[^A-Za-z0-9]+", _SIDES.sub(lambda m: f"_{m[1][0]}{m[2]}", name)):
         if part.lower() in _SYNONYMS:
             words += _SYNONYMS[part.lower()].split()
             continue
@@ -100,7 +98,7 @@ _SYNONYMS = {
     "quergeschwindigkeit": "lateral velocity", "laengsgeschwindigkeit": "longitudinal velocity",
     "geschwindigkeit": "speed", "fahrzeuggeschwindigkeit": "vehicle speed", "raddrehzahl": "wheel speed",
     "radgeschwindigkeit": "wheel speed", "radgeschw": "wheel speed", "strg": "steering", "stwhl": "steering wheel",
-    "strwhl": "steering wheel", "stwhlang": "steering wheel angle", "lgt": "longitudinal",
+    "strwhl": "steering wheel", "winkel": "angle", "stwhlang": "steering wheel angle", "lgt": "longitudinal",
     "inline": "longitudinal", "psidot": "yaw rate", "yawdot": "yaw rate", "psip": "yaw rate", "sog": "ground speed",
     "sas": "steering wheel angle sensor", "lws": "steering wheel angle sensor",
     "avx": "angular velocity x", "avy": "angular velocity y", "avz": "angular velocity z",
@@ -113,7 +111,8 @@ _WHOLE = _set(
     kmh kph mps ms2 mps2 fl fr rl rr lf rf lr vx vy vz ax ay az
     """
 )
-#: A wheel behind letters that stand for its speed.
+#: A wheel as ``FrL``, and behind letters that stand for its speed.
+_SIDES = re.compile(r"(?<=[a-z_])(Fr|Re)([LR])(?![a-z])")
 _CORNER_SPEED = re.compile(r"(?:ws|vw|w|v|n)(?=(?:fl|fr|rl|rr)$)")
 
 
@@ -234,16 +233,18 @@ def is_unlabelled(name: str) -> bool:
 _SPELLED_UNITS = tuple(
     (re.compile(pattern), sign)
     for pattern, sign in (
-        (r"^unit", ""), (r"°|^grad(?![a-z])", "deg"), ("²", "2"), (r"degree?s?(?=[^a-z]|$)", "deg"), (r"of_arc|_angle$", ""),
+        (r"^unit", ""), (r"°|^grad(?![a-z])", "deg"), ("²", "2"), (r"degree?s?(?=[^a-z]|$)", "deg"),
+        (r"of_arc|_angle$", ""),
         (r"kilo_?met[a-z]+", "km"), (r"met(?:er|re)s?", "m"), (r"secon[a-z]*", "s"), (r"hours?", "h"),
-        (r"squar[a-z]*", "2"), (r"[a-z_]*gravi[a-z]*", "g"), (r"radians?", "rad"), (r"revolutions?|umdr[a-z]*|rev", "r"),
+        (r"squar[a-z]*", "2"), (r"[a-z_]*gravi[a-z]*", "g"), (r"radians?", "rad"),
+        (r"revolutions?|umdr[a-z]*|rev", "r"),
         (r"minut[a-z]*", "min"), (r"^_*(?:[1ur]|)_?(?:/|per_)_?min$|^_*min\W*1$", "rpm"),
     )
 )  # fmt: skip
 
 
 def _plain_unit(text: str) -> str:
-    """Return a unit of a file as words that names of fields have: ``Unit_DegrePerSecon`` and ``°/s`` as ``deg_per_s``."""
+    """Return a unit of a file as names of fields have it: ``Unit_DegrePerSecon`` becomes ``deg_per_s``."""
     text = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", text.strip("[](){} ")).lower()
     for pattern, sign in _SPELLED_UNITS:
         text = pattern.sub(sign, text)
@@ -258,7 +259,7 @@ def unit_of(leaf: str, kind: str) -> tuple[str, float | None]:
     kind : of quantity, a key of ``UNITS``; units of other kinds are ignored (``g`` of a speed).
     """
     words = [w for w in re.split(r"[^a-z0-9]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", leaf).lower()) if w]
-    text = "_".join(words)
+    text = re.sub(r"(?<=_)sec(?=2|_|$)", "s", "_".join(words).replace("_per_", "_"))
     for phrase, unit in _UNIT_PHRASES:
         if unit in UNITS[kind] and re.search(rf"(^|_){phrase}($|_)", text):
             return unit, UNITS[kind][unit]
@@ -284,20 +285,27 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
     index = re.search(r"\[(\d+)\]$", leaf)
     column = None if index is None else int(index[1])
     named = f"{leaf}_{_plain_unit(unit_text)}" if unit_text else leaf
-    if "v" in leaf_words and set(leaf_words) <= _OF_V and unit_text and not unit_of(named, "speed")[0]:
-        return None  # a voltage
-    scopes = [(1.0, leaf_words, leaf), (0.9, (*inner, *leaf_words), path)]
-    if leaf_words == ("yaw",) and {"rate", "velocity", "gyro", "gyroscope"} & set(inner):
-        scopes = scopes[1:]
+    own = _strength_of_leaf(leaf_words, inner, named, has_unit=bool(unit_text))
+    if own is None:
+        return None
+    scopes = [(own, leaf_words, leaf)] if own else []
+    scopes.append((0.9, (*inner, *leaf_words), path))
     if all(w in _BARE or not w.isalpha() for w in leaf_words):  # else a topic's name does not describe each field
         scopes.append((0.7, (*outer, *inner, *leaf_words), f"{topic} {path}"))
     for strength, words, where in scopes:
         quantity = _quantity(words, leaf_words, column, strength, named)
         if quantity is not None:
-            if {"v"} <= set(leaf_words) <= _OF_V and not unit_of(named, "speed")[0]:
-                strength = 0.6
             return _with_unit(quantity, strength, where, inner, (named, *parents[-1:]))
     return None
+
+
+def _strength_of_leaf(
+    leaf_words: tuple[str, ...], inner: tuple[str, ...], named: str, *, has_unit: bool
+) -> float | None:
+    """Return how much a leaf alone gives: less for a v without a unit, 0 for the yaw of a rate, None for a voltage."""
+    if "v" in leaf_words and set(leaf_words) <= _OF_V and not unit_of(named, "speed")[0]:
+        return None if has_unit else 0.6
+    return 0.0 if leaf_words == ("yaw",) and {"rate", "velocity", "gyro", "gyroscope"} & set(inner) else 1.0
 
 
 def _with_unit(
@@ -344,13 +352,13 @@ _TRAITS = tuple(
                           ".a|.g .lat|.long", ".gx|.gy|.gz @unit_acceleration", "=a_x|=a_y|=a_z",
                           ".a @x|@y|@z @unit_acceleration")),
         ("@steers", ("steer|steering|swa|handwheel|roadwheel|roadwheels", "@delta", "road|hand|front wheel angle",
-                     "@corner wheel angle", ".str angle|ang|whl|wheel|wheels")),
+                     "@corner wheel angle", ".str angle|ang|whl|wheel|wheels", ".lw angle")),
         ("@slips", ("sideslip|beta", "slip angle", "side slip")),
         ("@turns", ("@rate", "yaw vel|velocity|speed", ".yawrate|.wz", ".yr @unit_rate")),
-        ("@speeds", ("speed|speeds|velocity|velocities|vel|spd|kmh|kph|mph|ux|vx", "twist linear", "@v_axis", ".v @unit_speed",
-                    "@bare_v")),
+        ("@speeds", ("speed|speeds|velocity|velocities|vel|spd|kmh|kph|mph|ux|vx", "twist linear", "@v_axis",
+                     ".v @unit_speed", "@bare_v")),
         ("@road", ("road|tire|tyre|tires|tyres|roadwheel|roadwheels|axle|delta|@any_corner",)),
-        ("@hand", ("hand|handwheel|swa|pinion", "steering|steer wheel", ".sw|.hw|.h")),
+        ("@hand", ("hand|handwheel|swa|pinion", "steering|steer wheel", ".sw|.hw|.h|.lw")),
     )
     for text in texts
 )  # fmt: skip
