@@ -12,7 +12,7 @@ import numpy as np
 
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.reports.charts import Charts, Cloud, Interval
+from pdhef_logtool.reports.charts import BarsFigure, Charts, Cloud, Interval, IntervalsFigure, PointsFigure
 from pdhef_logtool.reports.colours import INK, PLAIN, colour
 from pdhef_logtool.reports.first_screen import next_steps, plan_head, tested_run
 from pdhef_logtool.reports.page import render
@@ -111,7 +111,7 @@ def _worst(fleet: Fleet, charts: Charts) -> tuple[str, float | None] | None:
             for error, d in ranked[:_WORST]
         ]
         title = f"The {len(bars)} drives with the largest sideslip RMSE"
-        charts.intervals("worst", title, "RMSE in °", bars, zero=0.0)
+        charts.figures["worst"] = IntervalsFigure(title, "RMSE in °", bars, zero=0.0)
     return ranked[0][1].label, ranked[0][0]
 
 
@@ -122,8 +122,7 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
     first = judged[0]
     near = [d for d in judged if d.median.value <= _DRAWN * first.median.value]
     degree = math.degrees(1.0)
-    charts.intervals(
-        "medians",
+    charts.figures["medians"] = IntervalsFigure(
         f"Median RMSE of sideslip over {first.drives} drives, 95 % interval"
         + ("" if len(near) == len(judged) else f" (beyond {_DRAWN:g} times the selected estimate's: table)"),
         "RMSE in °",
@@ -136,15 +135,15 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
         values = first.values * degree
         edges, counts = _histogram(values)
         beyond = ", the last bar and beyond" if values[-1] > edges[-1] else ""
-        charts.bars("spread", f"Drives by RMSE of the selected estimate's sideslip{beyond}", "RMSE in °", edges, counts)
+        title = f"Drives by RMSE of the selected estimate's sideslip{beyond}"
+        charts.figures["spread"] = BarsFigure(title, "RMSE in °", edges.tolist(), counts.tolist())
     rival, drives = _rival(fleet), fleet.scored
     if rival is not None:
         ours, other = (np.array([d.error(name) * degree for d in drives]) for name in (ANSWER, rival))
         both = np.isfinite(ours) & np.isfinite(other) & (ours > 0.0) & (other > 0.0)
         if np.count_nonzero(both) > 2:
             ends = np.array([min(ours[both].min(), other[both].min()), max(ours[both].max(), other[both].max())])
-            charts.points(
-                "against",
+            charts.figures["against"] = PointsFigure(
                 f"A point a drive: the selected estimate has the lower error below the line, {rival} above it",
                 f"RMSE of {rival}, °",
                 "RMSE of the selected estimate, °",
