@@ -20,8 +20,6 @@ from pdhef_logtool.results.breakdown import LEAST_DRIVES
 from pdhef_logtool.results.fleet import ANSWER, JUDGED, Distribution, Fleet, Space, read_fleet
 from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
 
-#: Keys of the figures of the page.
-FIGURES = ("worst", "medians", "spread", "against")
 #: Rows of tables that a run can make as long as it likes, keys that are given, and bars of a histogram at most.
 MOST_ROWS, _MOST_KEYS, _MOST_BARS = 1000, 12, 40
 #: Errors beyond this quantile of the drives are counted in the last bar.
