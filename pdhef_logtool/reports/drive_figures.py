@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.evaluation.dead_reckoned import aligned_path
-from pdhef_logtool.evaluation.largest_errors import largest_places
+from pdhef_logtool.evaluation.largest_errors import ErrorPlace
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
@@ -75,14 +75,10 @@ class Roles:
 
 
 @dataclass(frozen=True, slots=True)
-class Peak:
-    """One of the largest errors: a stamp of the file, in ns and in seconds from the log's start; angles in rad."""
+class Peak(ErrorPlace):
+    """One of the largest errors with its seconds from the log's start, and the segments that it is in."""
 
-    stamp_ns: int
     at_s: float
-    estimate_rad: float
-    other_rad: float
-    error_rad: float
     during: str
 
 
@@ -90,14 +86,12 @@ class Peak:
 class DriveFigures:
     """What is drawn of a drive, and what the page states beside it.
 
-    ``other``: reference of the selected estimate, ground truth or else another estimator; empty where there is none.
     ``scored``: whether any sideslip error is known. ``moves``: whether a sideslip is known at all above the low-speed
     blend. ``absent``: estimators that the report names and the file has not.
     """
 
     charts: Charts
     peaks: Sequence[Peak]
-    other: str
     scored: bool
     moves: bool
     absent: Sequence[str]
@@ -126,7 +120,8 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles, low_speed
         return None
     grid, origin_ns = grid_of(stamps), int(report["log"]["start_ns"])
     answer = tracks.sideslip(roles.main)
-    reference = _reference(tracks, roles, answer)
+    peaks = _peaks(report)
+    reference = _reference(tracks, peaks)
     scored = reference is not None and reference.scored
     dof = _degrees_of_freedom(report)
     series = {}
@@ -136,7 +131,6 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles, low_speed
             error_of = None if name == TRUTH else against
             series[name] = gather(name, tracks, grid, error_of, dof, whole=name in (TRUTH, roles.main))
     charts = Charts(grid, origin_ns)
-    peaks = () if reference is None else _peaks(answer, reference, report["segments"], origin_ns)
     moves = bool(np.isfinite(series[roles.main].sideslip.values).any())
     _add_sideslip(charts, series, roles)
     _add_error(charts, series, roles, peaks, scored=scored)
@@ -148,19 +142,13 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles, low_speed
     _add_planes(charts, [series[n] for n in (TRUTH, roles.main) if n in series])
     _add_worst(charts, answer, reference, peaks, origin_ns)
     absent = [n for n in roles.names if n not in tracks.names]
-    return DriveFigures(
-        charts, peaks, "" if reference is None else reference.track.name, scored, moves, absent, path_text
-    )
+    return DriveFigures(charts, peaks, scored, moves, absent, path_text)
 
 
-def _reference(tracks: Tracks, roles: Roles, answer: SideslipTrack) -> Reference | None:
-    """Return ground truth where it scores the selected sideslip, else the next estimate, None where there is none."""
-    if TRUTH in tracks.names:
-        truth = Reference(tracks.sideslip(TRUTH), True, tracks)
-        if np.isfinite(truth.whole_error(answer)).any():
-            return truth
-    other = next((n for n in roles.names[1:] if n in tracks.names), None)
-    return None if other is None else Reference(tracks.sideslip(other), False, tracks)
+def _reference(tracks: Tracks, peaks: Sequence[Peak]) -> Reference | None:
+    """Return what the largest errors of the report are against; None where it has none."""
+    against = peaks[0].against if peaks else ""
+    return Reference(tracks.sideslip(against), against == TRUTH, tracks) if against in tracks.names else None
 
 
 def _degrees_of_freedom(report: Mapping[str, Any]) -> dict[str, float]:
@@ -170,27 +158,14 @@ def _degrees_of_freedom(report: Mapping[str, Any]) -> dict[str, float]:
     return {m["estimator"]: float(m["value"]) for m in rows}
 
 
-def _peaks(
-    answer: SideslipTrack, reference: Reference, segments: Sequence[Mapping[str, Any]], origin_ns: int
-) -> tuple[Peak, ...]:
-    rows = reference.rows(answer.stamps_ns)
-    if rows is None:
-        return ()
-    error, stamps = reference.whole_error(answer), answer.stamps_ns
+def _peaks(report: Mapping[str, Any]) -> tuple[Peak, ...]:
+    """Return the largest errors of a report; those of an earlier version are against ground truth."""
     peaks = []
-    for row in largest_places(stamps, error):
-        stamp = int(stamps[row])
-        names = [s["name"] for s in segments if s["start_ns"] <= stamp < s["end_ns"]]
-        peaks.append(
-            Peak(
-                stamp,
-                (stamp - origin_ns) * 1e-9,
-                float(answer.sideslip_rad[row]),
-                float(reference.track.sideslip_rad[rows[row]]),
-                float(error[row]),
-                ", ".join(dict.fromkeys(names)),
-            )
-        )
+    for place in report.get("largest_errors") or ():
+        stamp = int(place["stamp_ns"])
+        names = [s["name"] for s in report["segments"] if s["start_ns"] <= stamp < s["end_ns"]]
+        at_s, during = (stamp - int(report["log"]["start_ns"])) * 1e-9, ", ".join(dict.fromkeys(names))
+        peaks.append(Peak(**{"against": TRUTH, **place}, at_s=at_s, during=during))
     return tuple(peaks)
 
 
