@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.breakdown import LEAST_DRIVES
 from pdhef_logtool.results.fleet import ANSWER, JUDGED, Distribution, Fleet, Space, read_fleet
 from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
+from pdhef_logtool.storage.documents import jsonable
 
 #: Rows of tables that a run can make as long as it likes, keys that are given, and bars of a histogram at most.
 MOST_ROWS, _MOST_KEYS, _MOST_BARS = 1000, 12, 40
@@ -44,10 +45,11 @@ class SpaceCell:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FleetPage:
-    """The page of a run: the HTML, and the figures in it."""
+    """The page of a run: the HTML, the figures in it, and the same as JSON-able values."""
 
     html: bytes
     charts: Charts
+    document: dict[str, Any]
 
 
 def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
@@ -68,33 +70,37 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
     shown = [b for b in fleet.breakdowns if by or any(g.effect for g in b.groups)][: None if by else _MOST_KEYS]
     charts = Charts()
     _add_figures(charts, fleet)
-    html = render(
-        "fleet.html",
-        charts,
-        fleet=fleet,
-        pages=pages,
-        plan=plan_head(run.document.get("plan")),
-        tested=tested_run(run.document, sum(d.seconds for d in fleet.drives) / 3600.0),
-        steps=next_steps(run.document.get("plan")),
-        worst=_worst(fleet, charts),
-        verdicts=Counter(d.verdict for d in fleet.scored if d.verdict),
-        paired=_paired(fleet),
-        answer=next((d for d in fleet.distributions if (d.estimator, d.signal) == (ANSWER, JUDGED)), None),
-        rows=_rows(_told(fleet)),
-        mains={ANSWER} if len(mains) > 1 else mains,
-        names=list(dict.fromkeys(d.estimator for d in fleet.distributions if d.estimator != ANSWER)),
-        ranked=any(r.place is not None for r in fleet.ranking),
-        dependence=fleet.dependence.text(len(fleet.scored)),
-        breakdowns=shown,
-        comparisons=sum(b.comparisons for b in fleet.breakdowns),
-        idle_keys=[b.key for b in fleet.breakdowns if b not in shown],
-        space=None if fleet.space is None else _space_rows(fleet.space),
-        held=sorted(fleet.drives, key=lambda d: d.label)[:MOST_ROWS],
-        most_rows=MOST_ROWS,
-        least=LEAST_DRIVES,
-        run=run.document,
-    )
-    return FleetPage(html, charts)
+    texts: dict[str, Any] = {
+        "plan": plan_head(run.document.get("plan")),
+        "tested": tested_run(run.document, sum(d.seconds for d in fleet.drives) / 3600.0),
+        "steps": next_steps(run.document.get("plan")),
+        "worst": _worst(fleet, charts),
+        "verdicts": Counter(d.verdict for d in fleet.scored if d.verdict),
+        "paired": _paired(fleet),
+        "answer": next((d for d in fleet.distributions if (d.estimator, d.signal) == (ANSWER, JUDGED)), None),
+        "rows": _rows(_told(fleet)),
+        "mains": {ANSWER} if len(mains) > 1 else mains,
+        "names": list(dict.fromkeys(d.estimator for d in fleet.distributions if d.estimator != ANSWER)),
+        "ranked": any(r.place is not None for r in fleet.ranking),
+        "dependence": fleet.dependence.text(len(fleet.scored)),
+        "breakdowns": shown,
+        "comparisons": sum(b.comparisons for b in fleet.breakdowns),
+        "idle_keys": [b.key for b in fleet.breakdowns if b not in shown],
+        "space": None if fleet.space is None else _space_rows(fleet.space),
+        "held": sorted(fleet.drives, key=lambda d: d.label)[:MOST_ROWS],
+        "most_rows": MOST_ROWS,
+        "least": LEAST_DRIVES,
+    }
+    html = render("fleet.html", charts, fleet=fleet, pages=pages, run=run.document, **texts)
+    return FleetPage(html, charts, _document(fleet, texts))
+
+
+def _document(fleet: Fleet, texts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the page shows as JSON-able values."""
+    more = {"worst_drives": fleet.worst, "without_truth": fleet.without_truth[:MOST_ROWS]}
+    kept = ("logs", "ranking", "least_to_rank", "dependence", "breakdowns", "failed", "losses")
+    whole = {key: getattr(fleet, key) for key in kept} | {"scored": len(fleet.scored)}
+    return {"format": "pdhef.fleet", "version": 1, **jsonable({**texts, **more, **whole})}
 
 
 def _worst(fleet: Fleet, charts: Charts) -> tuple[str, float | None] | None:

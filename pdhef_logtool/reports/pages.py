@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, OutputError
-from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedLog, OpenedRun
+from pdhef_logtool.results.opened_run import PAGE_FILE, REPORT_FILE, OpenedLog, OpenedRun
+from pdhef_logtool.results.run_report import write_json
 from pdhef_logtool.storage.files import write_bytes
 
 if TYPE_CHECKING:
@@ -108,9 +109,10 @@ def write_drive_page(log: OpenedLog) -> WrittenPage:
 
 def remove_pages(run: OpenedRun) -> None:
     """Remove the pages that an earlier run left in its folders: they are of other estimates."""
-    for folder in (run.folder, *(log.folder for log in run.logs)):
+    pages = [folder / PAGE_FILE for folder in (run.folder, *(log.folder for log in run.logs))]
+    for path in (*pages, run.folder / REPORT_FILE):
         with suppress(OSError):
-            (folder / PAGE_FILE).unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
 
 
 def _write(folder: Path, label: str, make: Callable[[], DrivePage | FleetPage]) -> WrittenPage:
@@ -122,4 +124,6 @@ def _write(folder: Path, label: str, make: Callable[[], DrivePage | FleetPage]) 
         return WrittenPage(label, None, shown)
     path = folder / PAGE_FILE
     write_bytes(path, page.html)
+    if document := getattr(page, "document", None):
+        write_json(folder / REPORT_FILE, document)
     return WrittenPage(label, path, wrong)
