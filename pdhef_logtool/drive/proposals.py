@@ -11,7 +11,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from pdhef_logtool.drive.checks.by_relations import explained_factors
-from pdhef_logtool.drive.checks.kind import SURE
 from pdhef_logtool.drive.checks.sensor_errors import ay_delay, sensor_errors
 from pdhef_logtool.drive.checks.truth_sideslip import is_turned, sideslip_offset
 from pdhef_logtool.drive.mounting import Survey, scaled_source, turned_signals
