@@ -221,13 +221,15 @@ def _steering(
     with np.errstate(divide="ignore", invalid="ignore"):
         curvature = yaw / speed
     gentle = gentle_at(yaw * speed, moving)
+    driven = yaw[gentle & np.isfinite(yaw)]
+    is_turning = driven.size > 0 and bool(driven.std() > MOVES_RAD_S)
     for name, lengths, typical in _lengths(speed, vehicle):
         steer = columns.get(name)
         if steer is None:
             continue
         powers = {name: 1, "yaw_rate_rad_s": -1, speed_name: 1}
         either = [
-            replace(r, typical=typical)
+            replace(r, typical=typical, moves=r.correlation == 0.0 and is_turning)  # a dead sensor
             for use in (moving, gentle)
             for r in compare(f"{name} against yaw_rate_rad_s / speed", powers, curvature, steer, use, lengths)
         ]
