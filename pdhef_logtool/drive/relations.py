@@ -398,13 +398,17 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     text = f"{subject} against curvature, apart from a_y"
     powers = {subject: 1, turning: -1} | ({} if of_vx else {"truth.vx_m_s": 1})
     rolling = _partial(text, powers, curvature, sideslip, [ay, ones], gentle, SEPARABLE)
+    (low, most), lever = REAR_LEVER_M, REAR_LEVER_TYPICAL_M
     return [
         *(replace(r, expected=SIDESLIP_RANGE) for r in kinematic),
         *(replace(r, expected=COMPLIANCE_RAD_PER_M_S2) for r in handling),
+        # Blocks that only agree on the sign leave the size open.
         *(
-            replace(r, expected=REAR_LEVER_M, typical=REAR_LEVER_TYPICAL_M)
+            replace(
+                r, expected=(low, most if abs(r.correlation) > MIN_PARTIAL_CORRELATION else 2 * most), typical=lever
+            )
             for r in rolling
-            if abs(r.gain) > REAR_LEVER_M[0]
+            if abs(r.gain) > low
         ),
     ]
 
