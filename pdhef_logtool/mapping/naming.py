@@ -44,13 +44,11 @@ UNIT_TEXTS = {
 
 #: Several words that are one unit, in the order in which they are looked for.
 _UNIT_PHRASES = (
-    ("m_s_2", "mps2"), ("m_s2", "mps2"), ("m_per_s2", "mps2"), ("m_sec2", "mps2"), ("m_per_sec_2", "mps2"),
-    ("mps_2", "mps2"), ("ms_2", "mps2"), ("m_s_s", "mps2"),
-    ("deg_per_sec", "degps"), ("deg_per_s", "degps"), ("degrees_per_second", "degps"), ("deg_sec", "degps"),
-    ("deg_s", "degps"), ("rad_per_sec", "radps"), ("rad_per_s", "radps"), ("rad_sec", "radps"), ("rad_s", "radps"),
-    ("radians_per_second", "radps"),
-    ("km_per_h", "kmh"), ("km_h", "kmh"), ("k_m_h", "kmh"), ("m_per_sec", "mps"), ("m_per_s", "mps"), ("m_s", "mps"),
-    ("meters_per_second", "mps"), ("metres_per_second", "mps"), ("m_sec", "mps"), ("milli_g", "mg"),
+    ("m_s_2", "mps2"), ("m_s2", "mps2"), ("mps_2", "mps2"), ("ms_2", "mps2"), ("m_s_s", "mps2"),
+    ("degrees_second", "degps"),
+    ("deg_s", "degps"), ("radians_second", "radps"), ("rad_s", "radps"), ("km_h", "kmh"), ("k_m_h", "kmh"),
+    ("m_s", "mps"),
+    ("meters_second", "mps"), ("metres_second", "mps"), ("milli_g", "mg"),
 )  # fmt: skip
 
 
@@ -79,7 +77,7 @@ def words_of(name: str) -> tuple[str, ...]:
     words: list[str] = []
     for letter, latin in (("ä", "ae"), ("ö", "oe"), ("ü", "ue"), ("Ä", "Ae"), ("Ö", "Oe"), ("Ü", "Ue")):
         name = name.replace(letter, latin)
-    for part in re.split(r"[^A-Za-z0-9]+", name):
+    for part in re.split(r"[^A-Za-z0-9]+", _SIDES.sub(lambda m: f"_{m[1][0]}{m[2]}", name)):
         if part.lower() in _SYNONYMS:
             words += _SYNONYMS[part.lower()].split()
             continue
@@ -100,8 +98,10 @@ _SYNONYMS = {
     "quergeschwindigkeit": "lateral velocity", "laengsgeschwindigkeit": "longitudinal velocity",
     "geschwindigkeit": "speed", "fahrzeuggeschwindigkeit": "vehicle speed", "raddrehzahl": "wheel speed",
     "radgeschwindigkeit": "wheel speed", "radgeschw": "wheel speed", "strg": "steering", "stwhl": "steering wheel",
-    "strwhl": "steering wheel", "stwhlang": "steering wheel angle", "lgt": "longitudinal",
-    "inline": "longitudinal", "psidot": "yaw rate", "yawdot": "yaw rate", "sog": "ground speed",
+    "strwhl": "steering wheel", "winkel": "angle", "stwhlang": "steering wheel angle", "lgt": "longitudinal",
+    "inline": "longitudinal", "psidot": "yaw rate", "yawdot": "yaw rate", "psip": "yaw rate", "sog": "ground speed",
+    "sas": "steering wheel angle sensor", "lws": "steering wheel angle sensor",
+    "avx": "angular velocity x", "avy": "angular velocity y", "avz": "angular velocity z",
 }  # fmt: skip
 
 
@@ -111,10 +111,15 @@ _WHOLE = _set(
     kmh kph mps ms2 mps2 fl fr rl rr lf rf lr vx vy vz ax ay az
     """
 )
+#: A wheel as ``FrL``, and behind letters that stand for its speed.
+_SIDES = re.compile(r"(?<=[a-z_])(Fr|Re)([LR])(?![a-z])")
+_CORNER_SPEED = re.compile(r"(?:ws|vw|w|v|n)(?=(?:fl|fr|rl|rr)$)")
 
 
 def _unglued(piece: str) -> list[str]:
     """Return the known words that a piece consists of, or the piece itself."""
+    if letters := _CORNER_SPEED.match(piece):
+        return [letters[0], piece[letters.end() :]]
     if piece in _LEXICON or len(piece) < 5:
         return [piece]
     best: list[list[str] | None] = [[]] + [None] * len(piece)
@@ -160,7 +165,7 @@ _NOT_VALUES = _set(
     jerk threshold rms noise throttle brake pedal accelerator integral sum residual stiffness percent pct
     driver duration period rsrvd reserved mag magnetic magnetometer quaternion orientation calibration
     resolution size width height num number engine motor wind air fan pump gear shaft eng transmission cruise
-    obstacle object lead relative ambient rack mast display max_speed tow ratio
+    obstacle object lead relative ambient rack mast display max_speed tow ratio suspension susp damper shock
     """
 )
 _COMMANDS = _set(
@@ -177,7 +182,8 @@ _CORNERS = {
 #: Front and rear in German databases; too short to be unambiguous except beside a word for wheel.
 _GERMAN = {"vl": "fl", "vr": "fr", "hl": "rl", "hr": "rr"}
 _AXES = {
-    "x": "x", "y": "y", "z": "z", "ax": "x", "ay": "y", "az": "z", "wx": "x", "wy": "y", "wz": "z", "long": "x",
+    "x": "x", "y": "y", "z": "z", "ax": "x", "ay": "y", "az": "z", "wx": "x", "wy": "y", "wz": "z", "gx": "x",
+    "gy": "y", "gz": "z", "long": "x",
     "lng": "x", "longitudinal": "x", "forward": "x", "lat": "y", "lateral": "y", "vert": "z", "vertical": "z",
     "trans": "y", "transverse": "y", "transversal": "y", "down": "z",
 }  # fmt: skip
@@ -191,10 +197,13 @@ _BARE = _set(
 )
 
 
+#: Words that leave a v a speed.
+_OF_V = _set("v x veh vehicle car ego signal sig can esp abs act actual ist ref value mps ms kmh kph m s km h")
 #: Words that leave a delta a steering angle; a delta of anything else is a difference.
 _OF_DELTA = _set(
     """
     delta rad deg degrees radians f front roadwheel roadwheels road wheel wheels steer steering measured actual mean
+    sw hw h
     """
 )
 #: Devices whose quantities have the names of a car's.
@@ -220,6 +229,28 @@ def is_unlabelled(name: str) -> bool:
     return all(len(w) == 1 or w.isdigit() or w in _COUNTING for w in words_of(name))
 
 
+#: Spelled-out parts of units, as far as databases write them (``Unit_DegrePerSecon``), and their signs.
+_SPELLED_UNITS = tuple(
+    (re.compile(pattern), sign)
+    for pattern, sign in (
+        (r"^unit", ""), (r"°|^grad(?![a-z])", "deg"), ("²", "2"), (r"degree?s?(?=[^a-z]|$)", "deg"),
+        (r"of_arc|_angle$", ""),
+        (r"kilo_?met[a-z]+", "km"), (r"met(?:er|re)s?", "m"), (r"secon[a-z]*", "s"), (r"hours?", "h"),
+        (r"squar[a-z]*", "2"), (r"[a-z_]*gravi[a-z]*", "g"), (r"radians?", "rad"),
+        (r"revolutions?|umdr[a-z]*|rev", "r"),
+        (r"minut[a-z]*", "min"), (r"^_*(?:[1ur]|)_?(?:/|per_)_?min$|^_*min\W*1$", "rpm"),
+    )
+)  # fmt: skip
+
+
+def _plain_unit(text: str) -> str:
+    """Return a unit of a file as names of fields have it: ``Unit_DegrePerSecon`` becomes ``deg_per_s``."""
+    text = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", text.strip("[](){} ")).lower()
+    for pattern, sign in _SPELLED_UNITS:
+        text = pattern.sub(sign, text)
+    return re.sub(r"_+", "_", text).strip("_")
+
+
 def unit_of(leaf: str, kind: str) -> tuple[str, float | None]:
     """Return the unit that a name contains, and its factor to SI; ``("", None)`` without one.
 
@@ -228,7 +259,7 @@ def unit_of(leaf: str, kind: str) -> tuple[str, float | None]:
     kind : of quantity, a key of ``UNITS``; units of other kinds are ignored (``g`` of a speed).
     """
     words = [w for w in re.split(r"[^a-z0-9]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", leaf).lower()) if w]
-    text = "_".join(words)
+    text = re.sub(r"(?<=_)sec(?=2|_|$)", "s", "_".join(words).replace("_per_", "_"))
     for phrase, unit in _UNIT_PHRASES:
         if unit in UNITS[kind] and re.search(rf"(^|_){phrase}($|_)", text):
             return unit, UNITS[kind][unit]
@@ -253,15 +284,28 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
         return None
     index = re.search(r"\[(\d+)\]$", leaf)
     column = None if index is None else int(index[1])
-    scopes = [(1.0, leaf_words, leaf), (0.9, (*inner, *leaf_words), path)]
+    named = f"{leaf}_{_plain_unit(unit_text)}" if unit_text else leaf
+    own = _strength_of_leaf(leaf_words, inner, named, has_unit=bool(unit_text))
+    if own is None:
+        return None
+    scopes = [(own, leaf_words, leaf)] if own else []
+    scopes.append((0.9, (*inner, *leaf_words), path))
     if all(w in _BARE or not w.isalpha() for w in leaf_words):  # else a topic's name does not describe each field
         scopes.append((0.7, (*outer, *inner, *leaf_words), f"{topic} {path}"))
     for strength, words, where in scopes:
-        quantity = _quantity(words, leaf_words, column, strength)
+        quantity = _quantity(words, leaf_words, column, strength, named)
         if quantity is not None:
-            named = f"{leaf}_{unit_text.replace('°', 'deg').replace('²', '2')}" if unit_text else leaf
             return _with_unit(quantity, strength, where, inner, (named, *parents[-1:]))
     return None
+
+
+def _strength_of_leaf(
+    leaf_words: tuple[str, ...], inner: tuple[str, ...], named: str, *, has_unit: bool
+) -> float | None:
+    """Return how much a leaf alone gives: less for a v without a unit, 0 for the yaw of a rate, None for a voltage."""
+    if "v" in leaf_words and set(leaf_words) <= _OF_V and not unit_of(named, "speed")[0]:
+        return None if has_unit else 0.6
+    return 0.0 if leaf_words == ("yaw",) and {"rate", "velocity", "gyro", "gyroscope"} & set(inner) else 1.0
 
 
 def _with_unit(
@@ -305,14 +349,16 @@ _TRAITS = tuple(
         ("@rate", ("rate|gyro|gyroscope|omega|gyr", "angular|ang velocity|vel|velocities", ".psi_dot|.yaw_dot|.w_z",
                    "angular speed|twist")),
         ("@accelerates", ("accel|acceleration|accelerometer|accelerations|accels|acc|specific", ".ax|.ay|.az",
-                          ".a|.g .lat|.long")),
+                          ".a|.g .lat|.long", ".gx|.gy|.gz @unit_acceleration", "=a_x|=a_y|=a_z",
+                          ".a @x|@y|@z @unit_acceleration")),
         ("@steers", ("steer|steering|swa|handwheel|roadwheel|roadwheels", "@delta", "road|hand|front wheel angle",
-                     "@corner wheel angle")),
+                     "@corner wheel angle", ".str angle|ang|whl|wheel|wheels", ".lw angle")),
         ("@slips", ("sideslip|beta", "slip angle", "side slip")),
-        ("@turns", ("@rate", "yaw vel|velocity|speed", ".yawrate|.wz")),
-        ("@speeds", ("speed|speeds|velocity|velocities|vel|spd|kmh|kph|mph|ux|vx", "twist linear", "@v_axis")),
+        ("@turns", ("@rate", "yaw vel|velocity|speed", ".yawrate|.wz", ".yr @unit_rate")),
+        ("@speeds", ("speed|speeds|velocity|velocities|vel|spd|kmh|kph|mph|ux|vx", "twist linear", "@v_axis",
+                     ".v @unit_speed", "@bare_v")),
         ("@road", ("road|tire|tyre|tires|tyres|roadwheel|roadwheels|axle|delta|@any_corner",)),
-        ("@hand", ("hand|handwheel|swa|pinion", "steering|steer wheel")),
+        ("@hand", ("hand|handwheel|swa|pinion", "steering|steer wheel", ".sw|.hw|.h|.lw")),
     )
     for text in texts
 )  # fmt: skip
@@ -323,7 +369,8 @@ _QUANTITIES: tuple[tuple[_Rule, _Quantity | None], ...] = tuple(
         (".roll|.pitch !@accelerates", None),
         ("@steers @rate|@accelerates|.velocity|.speed|.vel|.column|.motor", None),
         ("@around @steers velocity|vel !.angle|.ang|.rad|.deg|.position|.pos|.delta", None),
-        ("@steers @road", ("steering", "road", "angle")),
+        ("@steers .sw|.hw", ("steering", "wheel", "angle")),
+        ("@steers @road !.h", ("steering", "road", "angle")),
         ("@steers @hand", ("steering", "wheel", "angle")),
         ("@steers", ("steering", "", "angle")),
         ("@slips @rate", None),
@@ -331,11 +378,12 @@ _QUANTITIES: tuple[tuple[_Rule, _Quantity | None], ...] = tuple(
         ("@accelerates !angular|yaw|pedal @x|@y|@z", ("acceleration", "@axis", "acceleration")),
         ("@accelerates !angular|yaw|pedal", None),
         ("@turns @corner @wheel|.omega", ("wheel rate", "@corner", "wheel rate")),
-        ("@turns yaw|yawrate|turn|wz|psi|@z", ("rate", "z", "rate")),
+        ("@turns yaw|yawrate|yr|turn|wz|psi|@z", ("rate", "z", "rate")),
         ("@turns @x|@y", ("rate", "@axis", "rate")),
         ("=r_radps|=r_rad_s|=r_rads|=r_degps|=r_deg_s|=r_dps", ("rate", "z", "rate")),
         ("@turns", None),
         ("@corner @wheel|@speeds @speeds|@around", ("wheel speed", "@corner", "speed")),
+        ("@corner .ws|.vw @unit_speed|@unit_wheel_rate", ("wheel speed", "@corner", "speed")),
         ("@corner @wheel|@speeds", None),
         ("@place_lat !@speeds", ("latitude", "", "position")),
         ("@place_lon|@place_lng|@place_long !@speeds", ("longitude", "", "position")),
@@ -362,9 +410,9 @@ _PLACE_WORDS = frozenset({"gps", "gnss", "ins", "pos", "position", "abs"})
 
 
 def _quantity(
-    words: tuple[str, ...], leaf_words: tuple[str, ...], index: int | None, strength: float
+    words: tuple[str, ...], leaf_words: tuple[str, ...], index: int | None, strength: float, named: str
 ) -> _Quantity | None:
-    """Return the quantity of the first rule that the words match."""
+    """Return the quantity of the first rule that the words match; ``named`` is the leaf with its unit."""
     axis = next((_AXES[w] for w in (*reversed(leaf_words), *reversed(words)) if w in _AXES), "")
     if not axis and index is not None and index < 3:
         axis = "xyz"[index]
@@ -379,6 +427,8 @@ def _quantity(
         "@delta": "delta" in leaf <= _OF_DELTA,
         "@letters": leaf <= set("xyz"),
         "@v_axis": leaf_words[0] == "v" and leaf_words[1:2] != () and leaf_words[1] in _AXES,
+        "@bare_v": "v" in leaf <= _OF_V,
+        **{f"@unit_{kind.replace(' ', '_')}": bool(unit_of(named, kind)[0]) for kind in UNITS},
         f"@place_{leaf_words[-1]}": set(leaf_words[:-1]) <= _PLACE_WORDS,
     }
     tokens |= {flag for flag, is_set in flags.items() if is_set}

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
-from pdhef_logtool.mapping.can_frames import holds_frames
+from pdhef_logtool.mapping.can_frames import CanSignalLog, decoded_frames, holds_frames
 from pdhef_logtool.mapping.candidates import Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.clocks import with_usable_stamps
@@ -233,13 +233,7 @@ def auto_map(
     draft.notes += [
         f"{t.name} ({_type(t)}) has no messages" for t in log.topics if not t.messages and _is_well_known(t)
     ]
-    by_file = "by --set msgs=car.dbc, or " if log.messages is None else ""  # only tables are decoded as a whole
-    draft.notes += [
-        f"{t.name} contains raw CAN frames: describe them {by_file}in a mapping file with [can] dbc"
-        for t in topics
-        if not any(o.type_name.startswith("can/msg/") and o.name != t.name for o in topics)
-        if "can" in _words(f"{t.name} {t.type_name}") and holds_frames(t.name, log.fields(t.name, quiet=True))
-    ]
+    topics, decoded = _decode(draft, topics)
     _map_imu(draft, topics)
     _map_steering(draft, topics)
     _map_speed(draft, topics)
@@ -258,8 +252,36 @@ def auto_map(
         notes=tuple(draft.notes),
         checks=weighed.checks,
     )
+    candidates = weighed.candidates
+    if decoded is not None:
+        mapping = decoded.as_mapped(mapping)
+        candidates = tuple(replace(c, source=decoded.as_source(c.source)) for c in candidates)
     mapping = with_usable_stamps(log, mapping)
-    return AutoMapping(mapping, tuple(draft.ambiguities), missing_signals(mapping), weighed.candidates)
+    return AutoMapping(mapping, tuple(draft.ambiguities), missing_signals(mapping), candidates)
+
+
+def _decode(draft: _Draft, topics: list[TopicInfo]) -> tuple[list[TopicInfo], CanSignalLog | None]:
+    """Return the topics with messages of DBC files in place of raw CAN frames, and the log that offers these."""
+    log = draft.log
+    frames = [
+        t
+        for t in topics
+        if not any(o.type_name.startswith("can/msg/") and o.name != t.name for o in topics)
+        if "can" in _words(f"{t.name} {t.type_name}") and holds_frames(t.name, log.fields(t.name, quiet=True))
+    ]
+    decoded = decoded_frames(log, frames)
+    if decoded is not None:
+        draft.log = decoded
+        there = {t.name for t in log.topics}
+        topics = [t for t in topics if t not in frames] + [t for t in decoded.topics if t.name not in there]
+        names = ", ".join(path.name for path in log.databases)
+        draft.notes.append(f"the frames of {', '.join(t.name for t in frames)} are decoded by {names}")
+    else:
+        draft.notes += [
+            f"{t.name} contains raw CAN frames: describe them by --set msgs=car.dbc or [can] dbc of a mapping file"
+            for t in frames
+        ]
+    return topics, decoded
 
 
 def _why_unused(log: DriveLog, topic: TopicInfo) -> str:

@@ -27,7 +27,6 @@ _SHORT_S = 10.0
 #: The figures of a page, in the order in which they are.
 OVER_TIME = ("sideslip", "error", "trust", "r_scale", "nis", "speed", "ay", "strip")
 IN_PLANE = ("path", "ay_sideslip", "phase")
-FIGURES = ("worst", *OVER_TIME, *IN_PLANE)
 #: Rows of tables that a log can make as long as it likes.
 _MOST_ROWS = 200
 #: Outcomes of verdicts: a word, and the class of the style.

@@ -84,6 +84,8 @@ def _line(requirement: Mapping[str, Any]) -> RequirementLine:
 
 
 def _exposure(exposure: Mapping[str, Any]) -> str:
+    if not exposure["drives"]:
+        return "nothing"
     parts = [f"{exposure['drives']} {'drive' if exposure['drives'] == 1 else 'drives'}"]
     if exposure["minutes"] is not None:
         parts.append(f"{exposure['minutes']:.1f} min")

@@ -19,7 +19,7 @@ def test_without_the_drives_it_says_so_and_ends_with_0(monkeypatch: pytest.Monke
 
 def pair(untaught: float, hybrid: float) -> PairResult:
     scores = [Score(value, value, 0.6, 0.95) for value in (untaught, untaught, hybrid)]
-    return PairResult("car", "a", "b", *scores, kinematic_deg=1.0, rung="linear")
+    return PairResult("car", "a", "b", *scores, kinematic_deg=1.0, paper_deg=1.0, rung="linear")
 
 
 def test_a_pair_is_worse_beyond_the_larger_of_both_limits() -> None:

@@ -138,7 +138,7 @@ AY_PLACE = CheckKind(
     "ay_m_s2.place",
     compares="the position of the accelerometer, by a_y against ground truth, with the position in the vehicle file",
     fails="they are 0.5 m apart",
-    remedy="imu_position_m = [{lever:.2f}, 0.0, 0.0] in the vehicle file, or pdhef learn --stages identify",
+    remedy="imu_position_m = [{lever:.2f}, 0.0, 0.0] in the vehicle file",
     lacks="needs quick bends to both sides",
     function=_ay_place,
 )
@@ -205,7 +205,7 @@ GYRO_GAIN = CheckKind(
     "yaw_rate_rad_s.gain",
     compares="the gyro with the ground-truth yaw rate",
     fails="its gain is off by 5 %",
-    remedy="sensors.yaw_rate_gain = {gain:.3f} in the vehicle file, or pdhef learn --stages identify",
+    remedy="sensors.yaw_rate_gain = {gain:.3f} in the vehicle file",
     lacks="needs bends to both sides",
     function=_gyro_gain,
 )
@@ -225,7 +225,7 @@ GYRO_DELAY = CheckKind(
     "yaw_rate_rad_s.delay",
     compares="the stamps of the gyro with those of ground truth",
     fails="the gyro is 30 ms late",
-    remedy="latency_s = {delay:.4f} more in the mapping, or pdhef learn --stages identify",
+    remedy="latency_s = {delay:.4f} more in the mapping",
     function=_gyro_delay,
 )
 CHECKS = (AY_PLACE, AY_GAIN, AY_DELAY, GYRO_GAIN, GYRO_DELAY)

@@ -113,7 +113,7 @@ UNDERSTEER = CheckKind(
     "vehicle.understeer",
     compares="the understeer gradient of the drive with that of the vehicle file",
     fails="their signs are opposite, and both are far from neutral",
-    remedy="the car {behaves}: check tyre stiffness and place of the CG, or run pdhef learn --stages identify",
+    remedy="the car {behaves}: check tyre stiffness and place of the CG, or run pdhef learn",
     lacks=_LACKS,
 )
 
