@@ -221,13 +221,15 @@ def _steering(
     with np.errstate(divide="ignore", invalid="ignore"):
         curvature = yaw / speed
     gentle = gentle_at(yaw * speed, moving)
+    driven = yaw[gentle & np.isfinite(yaw)]
+    is_turning = driven.size > 0 and bool(driven.std() > MOVES_RAD_S)
     for name, lengths, typical in _lengths(speed, vehicle):
         steer = columns.get(name)
         if steer is None:
             continue
         powers = {name: 1, "yaw_rate_rad_s": -1, speed_name: 1}
         either = [
-            replace(r, typical=typical)
+            replace(r, typical=typical, moves=r.correlation == 0.0 and is_turning)  # a dead sensor
             for use in (moving, gentle)
             for r in compare(f"{name} against yaw_rate_rad_s / speed", powers, curvature, steer, use, lengths)
         ]
@@ -396,13 +398,17 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     text = f"{subject} against curvature, apart from a_y"
     powers = {subject: 1, turning: -1} | ({} if of_vx else {"truth.vx_m_s": 1})
     rolling = _partial(text, powers, curvature, sideslip, [ay, ones], gentle, SEPARABLE)
+    (low, most), lever = REAR_LEVER_M, REAR_LEVER_TYPICAL_M
     return [
         *(replace(r, expected=SIDESLIP_RANGE) for r in kinematic),
         *(replace(r, expected=COMPLIANCE_RAD_PER_M_S2) for r in handling),
+        # Blocks that only agree on the sign leave the size open.
         *(
-            replace(r, expected=REAR_LEVER_M, typical=REAR_LEVER_TYPICAL_M)
+            replace(
+                r, expected=(low, most if abs(r.correlation) > MIN_PARTIAL_CORRELATION else 2 * most), typical=lever
+            )
             for r in rolling
-            if abs(r.gain) > REAR_LEVER_M[0]
+            if abs(r.gain) > low
         ),
     ]
 

@@ -11,6 +11,7 @@ import numpy as np
 from pdhef_logtool.drive.checks.fitting import fit
 from pdhef_logtool.drive.checks.kind import SURE, CheckedDrive, CheckKind
 from pdhef_logtool.drive.columns import derivative, earlier, moving_at, running_mean
+from pdhef_logtool.drive.relations import GAIN_RANGE
 from pdhef_logtool.drive.truth import LatencyEstimate
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
@@ -122,12 +123,15 @@ def _ay_place(drive: CheckedDrive) -> Iterator[Check]:
     evidence = (
         f"the accelerometer is {errors.lever_m:.2f} +- {error:.2f} m ahead of the CG, the vehicle file gives {place:g}"
     )
+    check = AY_PLACE.of_figure(off, error, (-LEVER_M, LEVER_M), evidence, lever=errors.lever_m)
     if abs(off) > max(MOST_LEVER_M, SURE * error):
-        yield AY_PLACE.undecided(evidence)
-    elif abs(off) > LEVER_M and not drive.has_file:
-        yield AY_PLACE.undecided(evidence, lacks="needs a vehicle file that gives imu_position_m")
-    else:
-        yield AY_PLACE.of_figure(off, error, (-LEVER_M, LEVER_M), evidence, lever=errors.lever_m)
+        no_car = (
+            "no car has its sensor there: lateral velocity or yaw rate of ground truth may be of another point or time"
+        )
+        check = AY_PLACE.undecided(evidence, lacks=no_car)
+    elif check.verdict == "failed" and not drive.has_file:
+        check = AY_PLACE.undecided(evidence, lacks="needs a vehicle file that gives imu_position_m")
+    yield check
 
 
 AY_PLACE = CheckKind(
@@ -135,7 +139,7 @@ AY_PLACE = CheckKind(
     compares="the position of the accelerometer, by a_y against ground truth, with the position in the vehicle file",
     fails="they are 0.5 m apart",
     remedy="imu_position_m = [{lever:.2f}, 0.0, 0.0] in the vehicle file",
-    lacks="no car has its sensor there: lateral velocity or yaw rate of ground truth may be of another point or time",
+    lacks="needs quick bends to both sides",
     function=_ay_place,
 )
 
@@ -149,7 +153,12 @@ def _ay_gain(drive: CheckedDrive) -> Iterator[Check]:
     if not np.nanstd(lateral) > LEAST_LATERAL_M_S2:
         return
     evidence = f"a_y reads {gain:.2f} +- {error:.2f} of the ground-truth lateral acceleration, with roll and bank"
-    yield AY_GAIN.of_figure(gain, error, AY_GAIN_RANGE, evidence, gain=gain)
+    low, high = GAIN_RANGE
+    if not low < gain < high and any(c.name == "ay_m_s2.unit" and c.verdict == "passed" for c in drive.related):
+        lacks = "a_y agrees with yaw rate x speed: the lateral velocity of ground truth may be wrong"
+        yield AY_GAIN.undecided(evidence, lacks=lacks)
+    else:
+        yield AY_GAIN.of_figure(gain, error, AY_GAIN_RANGE, evidence, gain=gain)
 
 
 AY_GAIN = CheckKind(
@@ -165,7 +174,7 @@ AY_GAIN = CheckKind(
 def _ay_delay(drive: CheckedDrive) -> Iterator[Check]:
     errors = errors_of("ay_m_s2", drive)
     delay_and_error = None if errors is None else ay_delay(errors, drive.latency)
-    if delay_and_error is None:
+    if delay_and_error is None or delay_and_error[1] > SENSOR_DELAY_S:
         return
     delay, error = delay_and_error
     evidence = f"a_y is {delay * 1e3:.1f} +- {error * 1e3:.1f} ms late against ground truth"
