@@ -30,7 +30,7 @@ IN_PLANE = ("path", "ay_sideslip", "phase")
 #: Rows of tables that a log can make as long as it likes.
 _MOST_ROWS = 200
 #: Outcomes of verdicts: a word, and the class of the style.
-_OUTCOMES = {
+OUTCOMES = {
     "better": ("better", "good"),
     "same": ("as good", ""),
     "worse": ("worse", "bad"),
@@ -191,7 +191,7 @@ def verdicts_of(report: Mapping[str, Any]) -> list[Verdict]:
     """Return the sentences at the head of a page; without verdicts, the words of the selected estimate."""
     signals: dict[tuple[str, str, str], list[str]] = {}
     for v in _told(report):
-        word, kind = _OUTCOMES.get(str(v.get("outcome")), (str(v.get("outcome")), ""))
+        word, kind = OUTCOMES.get(str(v.get("outcome")), (str(v.get("outcome")), ""))
         text = str(v.get("text", "")).removeprefix(f"{word}: ")
         signals.setdefault((word, text, kind), []).append(LABELS.get(str(v.get("signal")), ""))
     verdicts = [Verdict(", ".join(names), *of) for of, names in signals.items()]
