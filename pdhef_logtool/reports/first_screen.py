@@ -179,7 +179,7 @@ def _upper(edges: Sequence[float], index: int) -> str:
 def _sensors(report: Mapping[str, Any]) -> str:
     names = [str(s["name"]) for s in report["mapping"]["signals"]]
     wheels = [n for n in names if n.startswith("wheel_speed_")]
-    others = [LABELS.get(n, _UNIT.sub("", n).replace("_", " ")) for n in names if n not in wheels]
+    others = [LABELS.get(n, _UNIT.sub("", n).replace("_", " ").replace("ax", "a_x")) for n in names if n not in wheels]
     return ", ".join([*others, *([f"{len(wheels)} wheel speeds"] if wheels else [])])
 
 
