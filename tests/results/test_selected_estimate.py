@@ -68,7 +68,7 @@ def test_a_truth_that_is_an_input_is_no_independent_check() -> None:
 )
 def test_whether_the_band_holds(share: float, said: str) -> None:
     band = texts(metrics=[*errors_deg(pd_hef=0.1), *figures(("pd-hef", "sideslip_rad", "coverage95", share))])["band"]
-    assert band.startswith(f"coverage {share:.0%} {said}")
+    assert band.startswith(f"coverage {100 * share:.0f} % {said}")
     assert band.endswith("(intervals calibrated on x)")
 
 
