@@ -219,7 +219,8 @@ def _clocks(sheet: Sheet, names: Mapping[str, str]) -> list[str]:
     clocks = [n for n in reversed(clocks) if _is_clock(sheet.columns[n])]
     ascending = [(n, name) for n, name in names.items() if not clocks and _ascends(sheet.columns[name])]
     clocks = clocks or [name for n, name in ascending if _TIME_LIKE.search(n)]
-    return clocks or [name for _, name in ascending if sheet.units.get(name, "").lower() in _FACTORS_NS]
+    dates = [name for _, name in ascending if sheet.columns[name].dtype.kind == "M"]  # type: ignore[union-attr]
+    return clocks or dates or [name for _, name in ascending if sheet.units.get(name, "").lower() in _FACTORS_NS]
 
 
 def _is_clock(column: NDArray[Any] | Series) -> bool:

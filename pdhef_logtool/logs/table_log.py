@@ -66,7 +66,7 @@ class Table:
 
 
 def _with_signs(table: Table) -> Table:
-    """Return the table with a column ``<name>_signed`` for each magnitude whose sign is in another column (1: negative)."""
+    """Add a column ``<name>_signed`` for each magnitude whose sign is in another column (1: negative)."""
     names = {f.path: f for f in table.fields}
     signs = {m: path for path in names if (m := _SIGN.sub("", path)) != path and m in names}
     if not signs:

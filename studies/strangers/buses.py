@@ -25,7 +25,8 @@ def _coded(topics: Sequence[Topic]) -> tuple[list[_Frame], dict[str, str]]:
     frames: list[_Frame] = []
     databases: dict[str, str] = {}
     buses = list(dict.fromkeys(t.type_name for t in topics))
-    for number, topic in enumerate(topics, 0x101):
+    for topic in topics:
+        number = 0x101 + databases.get(topic.type_name, "").count("BO_ ")
         text = databases.get(topic.type_name, 'VERSION ""\nNS_ :\nBS_:\nBU_: ECU\n')
         text += f"BO_ {number} {topic.name.strip('/')}: 8 ECU\n"
         columns = []
