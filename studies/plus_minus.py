@@ -63,7 +63,7 @@ def with_prior_errors(file: VehicleParameters, noise: SensorNoise, rng: np.rando
     """Return a vehicle file whose other entries are as wrong as the prior of the calibration expects."""
     inertia, roll, place = rng.normal(size=3)
     reach = 0.4 * file.wheelbase_m
-    gain = max(0.0, file.roll_gradient_rad_per_m_s2 + 0.05 / GRAVITY_M_S2 * roll)
+    gain = max(0.0, file.roll_gradient_rad_per_m_s2 + 0.03 / GRAVITY_M_S2 * roll)
     changed = {
         "yaw_inertia_kg_m2": file.yaw_inertia_kg_m2 * math.exp(0.2 * inertia),
         "roll_gradient_rad_per_m_s2": gain,

@@ -128,7 +128,7 @@ def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
         _around(STEER_OFFSET, "rad", vehicle_file.steer_offset_rad, 0.01, 0.05),
         _factor(STEER_RATIO, "1", vehicle_file.steering_ratio, 0.05, 1.2),
         _around(STEER_DELAY, "s", 0.0, 0.02, 0.1),
-        _around(AY_GAIN, "1", 1.0 + GRAVITY_M_S2 * gradient, 0.02, 0.15),
+        _around(AY_GAIN, "1", 1.0 + GRAVITY_M_S2 * gradient, 0.03, 0.15),
         _around(AY_BIAS, "m/s^2", sensors.ay_bias_m_s2, 0.1, 1.5),
         _around(IMU_X, "m", vehicle_file.imu_position_m[0], reach, 3.0 * reach),
         _around(RATE_BIAS, "rad/s", sensors.yaw_rate_bias_rad_s, 0.005, 0.05),
