@@ -96,7 +96,7 @@ def of_calibration(
 ) -> Iterator[tuple[str, float, float]]:
     """Yield name, error and standard deviation of the calibrated parameters whose true value the car has."""
     signals = drive.whole().signals
-    gain, delay_s = math.exp(0.05 * rng.normal()), 0.02 * rng.normal()
+    gain, delay_s = math.exp(0.08 * rng.normal()), 0.02 * rng.normal()
     time_s = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
     late = gain * np.interp(time_s - delay_s, time_s, signals.steer_rad)
     calibration = calibrate(replace(signals, steer_rad=late), wrong)

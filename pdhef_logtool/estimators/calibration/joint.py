@@ -126,7 +126,7 @@ def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
         _factor(INERTIA, "kg m^2", vehicle_file.yaw_inertia_kg_m2, 0.2, 2.0),
         _factor(RELAXATION, "m", vehicle_file.relaxation_length_m or 0.5, 0.4, 4.0),
         _around(STEER_OFFSET, "rad", vehicle_file.steer_offset_rad, 0.01, 0.05),
-        _factor(STEER_RATIO, "1", vehicle_file.steering_ratio, 0.05, 1.2),
+        _factor(STEER_RATIO, "1", vehicle_file.steering_ratio, 0.08, 1.2),
         _around(STEER_DELAY, "s", 0.0, 0.02, 0.1),
         _around(AY_GAIN, "1", 1.0 + GRAVITY_M_S2 * gradient, 0.03, 0.15),
         _around(AY_BIAS, "m/s^2", sensors.ay_bias_m_s2, 0.1, 1.5),
