@@ -44,7 +44,7 @@ from pdhef_logtool.runs.self_calibrating import calibrate_drive
 from pdhef_logtool.storage.documents import digest
 from pdhef_logtool.storage.files import write_bytes
 from studies.condition_runs import source_digest
-from studies.many_cars import FIT_FRICTION, fit_vehicle
+from studies.drawn_cars import FIT_FRICTION, fit_vehicle
 from studies.pages import DOCS, DRIVES, RESULTS, ROOT, number, options, table, write
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_of, vehicle_of
 from truthsim.batch import DriveSpec
