@@ -13,7 +13,7 @@ GRID_S = 0.05
 LOW_PASS_HZ = 1.0
 #: Samples are interpolated onto the grid over gaps of at most this length, and of this many of their periods.
 MAX_GAP_S, MAX_GAP_PERIODS = 0.5, 2.5
-#: Values so many times farther out than all but 1 % of a channel, for so short a time, are spikes.
+#: Values beyond so many ranges of 99 % of a channel, for so short a time, are spikes.
 SPIKE_RANGES, SPIKE_S = 5.0, 0.2
 #: A slower sensor does not resolve manoeuvres.
 LONGEST_GAP_S = 2.5
@@ -68,10 +68,10 @@ def earlier(column: FloatArray, by_s: float) -> FloatArray:
 def running_mean(column: FloatArray, over_s: float) -> FloatArray:
     """Return the mean of a column of the grid over a time about each cell; NaN beside gaps."""
     half = min(round(0.5 * over_s / GRID_S), column.shape[0] - 1)
-    known = np.flatnonzero(np.isfinite(column))
-    if known.size:  # the ends of what is known go on
+    finite = np.flatnonzero(np.isfinite(column))
+    if finite.size:  # the ends of what is known go on
         column = column.copy()
-        column[: known[0]], column[known[-1] + 1 :] = column[known[0]], column[known[-1]]
+        column[: finite[0]], column[finite[-1] + 1 :] = column[finite[0]], column[finite[-1]]
     return np.convolve(np.pad(column, half, "edge"), np.full(2 * half + 1, 1.0 / (2 * half + 1)), "valid")
 
 
