@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,7 +28,8 @@ MOVING_SHARE, MIN_MOVING_M_S = 0.25, 0.5
 
 def columns_on_grid(channels: Mapping[str, Channel]) -> dict[str, FloatArray]:
     """Return the scalar channels with two samples or more on one even grid of ``GRID_S``; NaN in gaps."""
-    used = {n: without_spikes(c) for n, c in channels.items() if len(c) > 1 and c.values.ndim == 1}
+    sound = {n: without_spikes(c) for n, c in channels.items() if len(c) > 1 and c.values.ndim == 1}
+    used = {n: c for n, c in sound.items() if len(c) > 1}
     if not used:
         return {}
     start = min(int(c.stamps_ns[0]) for c in used.values())
@@ -40,10 +42,15 @@ def columns_on_grid(channels: Mapping[str, Channel]) -> dict[str, FloatArray]:
 
 
 def without_spikes(channel: Channel) -> Channel:
-    """Return a channel without samples far outside its range for a moment: a bus's mark of invalid values."""
-    low, middle, high = np.quantile(channel.values, (0.005, 0.5, 0.995))
-    with np.errstate(over="ignore"):
-        out = np.abs(channel.values - middle) > SPIKE_RANGES * max(high - low, 1e-9)
+    """Return a channel without samples far outside its range for a moment: a bus's mark of invalid values.
+
+    Beyond 1e12 all numbers are one, and below 1e-12: their squares must be finite.
+    """
+    values = np.clip(channel.values, -1e12, 1e12)
+    values[np.abs(values) < 1e-12] = 0.0
+    channel = replace(channel, values=values).take(np.isfinite(values))
+    low, middle, high = np.quantile(channel.values, (0.005, 0.5, 0.995)) if len(channel) else (0.0, 0.0, 0.0)
+    out = np.abs(channel.values - middle) > SPIKE_RANGES * max(high - low, 1e-9)
     if not out.any():
         return channel
     first, end = np.flatnonzero(np.diff(out, prepend=False, append=False)).reshape(-1, 2).T

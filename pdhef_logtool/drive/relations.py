@@ -113,7 +113,7 @@ def compare(
     # The ratio of the spreads lies between the two regressions, as the position of the noise is unknown.
     gain = float(np.copysign(spread_b / spread_a, correlation))
     # A block of fewer samples has a gain by chance.
-    blocks = block_gains(a, b, min(BLOCKS, int(samples / MIN_SAMPLES)))
+    blocks = block_gains(a, b, min(BLOCKS, max(1, int(samples / MIN_SAMPLES))))
     return [Relation(text, powers, correlation, gain, expected, samples, both, blocks=blocks)]
 
 
