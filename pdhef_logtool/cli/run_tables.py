@@ -284,8 +284,9 @@ def _failed_checks(report: _Report, *, undecided: bool = True) -> Iterable[str |
     for check in checks:
         if check["verdict"] == "failed":
             waived = "waived" if check["waived"] else "FAILED"
-            remedy = f" Remedy: {check['remedy']}" if check["remedy"] else ""
-            yield Text.assemble(f"{waived}: ", (check["name"], "bold"), f": {check['evidence']}{remedy}")
+            remedy = f". Remedy: {check['remedy']}" if check["remedy"] else ""
+            evidence = check["evidence"].rstrip(".")
+            yield Text.assemble(f"{waived}: ", (check["name"], "bold"), f": {evidence}{remedy}")
     names = [check["name"] for check in checks if check["verdict"] == "undecided"]
     if names and undecided:
         more = f" and {len(names) - _MOST_UNDECIDED} more" if len(names) > _MOST_UNDECIDED else ""

@@ -39,7 +39,7 @@ VY, HEADING, AY_BIAS, RATE_BIAS, LAW_ERROR, ANTENNA_X, DELAY, IMU_X, STATES = ra
 #: Uncertainty of the filter's v_y over v_x in degrees: constant, per m/s², per m/s³, per square of the share of the
 #: grip beyond the linear range; the logarithm of the prior weight; and 1-sigma of the accelerometer's position in m.
 #: Chosen on simulated drives. A position that is free in every hypothesis would explain what the tyres lack.
-HYPOTHESES = ((0.01, 0.0, 0.0, 0.0, 0.0, 0.0), (0.06, 0.02, 0.02, 30.0, -5.5, 0.0), (0.06, 0.02, 0.02, 30.0, -9.0, 1.0),
+HYPOTHESES = ((0.01, 0.0, 0.0, 0.0, 0.0, 0.0), (0.06, 0.02, 0.02, 30.0, -5.5, 0.0), (0.06, 0.02, 0.02, 30.0, -6.5, 1.0),
               (1.0, 0.3, 0.1, 30.0, -9.0, 0.3), (10.0, 0.3, 0.1, 30.0, -13.0, 0.3))  # fmt: skip
 #: 1-sigma of a GNSS velocity at least, m/s; gate in 1-sigmas; speed below which there is no course, m/s.
 GNSS_STD_M_S, GATE_SIGMA, LEAST_SPEED_M_S = 0.1, 4.0, 3.0

@@ -14,6 +14,7 @@ from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.reports.charts import BarsFigure, Charts, Cloud, Interval, IntervalsFigure, PointsFigure
 from pdhef_logtool.reports.colours import INK, PLAIN, colour
+from pdhef_logtool.reports.drive import OUTCOMES
 from pdhef_logtool.reports.first_screen import next_steps, plan_head, tested_run
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.breakdown import LEAST_DRIVES
@@ -88,6 +89,7 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
         "idle_keys": [b.key for b in fleet.breakdowns if b not in shown],
         "space": None if fleet.space is None else _space_rows(fleet.space),
         "held": sorted(fleet.drives, key=lambda d: d.label)[:MOST_ROWS],
+        "words": {outcome: word for outcome, (word, _) in OUTCOMES.items()},
         "most_rows": MOST_ROWS,
         "least": LEAST_DRIVES,
     }

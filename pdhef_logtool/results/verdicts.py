@@ -116,7 +116,7 @@ def _against(standing: Standing, outcome: Outcome) -> str:
     if outcome == "same":
         return f"{'equal to' if difference.value == 0.0 else 'no relevant difference to'} {beside}"
     share = abs(difference.value) / standing.rival_rmse if standing.rival_rmse else math.inf
-    by = "" if share >= _MANY else "less than 1 % " if share < _FEW else f"{share:.0%} "
+    by = "" if share >= _MANY else "less than 1 % " if share < _FEW else f"{100.0 * share:.0f} % "
     how = f"{by}{'lower' if difference.value < 0.0 else 'higher'} than {beside}"
     if not math.isfinite(difference.low):
         return f"{how}, difference not tested"

@@ -97,7 +97,7 @@ def test_without_truth_the_page_says_why_there_is_no_score_and_shows_disagreemen
     text = words(page)
     assert "The log has no ground truth" in text
     assert "Largest disagreements of pd-hef" in text
-    assert "estimator NIS per degree of freedom pd-hef 1.033" in text  # NIS of 3.1 at 3 degrees of freedom
+    assert "estimator NIS per degree of freedom pd-hef 1.03" in text  # NIS of 3.1 at 3 degrees of freedom
     assert figures(page)["error"]["title"].startswith("Disagreement")
     assert [s["label"] for s in figures(page)["error"]["series"]] == ["physics", "zero"]
 
@@ -149,7 +149,7 @@ def test_tracks_of_one_row_and_of_unknown_values_have_a_page(tmp_path):
     at = np.array([START_NS], dtype=np.int64)
     nothing = make_track("pd-hef", at)
     assert words(page_of(write_run(tmp_path, [nothing])))
-    assert (number(None), number(math.nan), number(0.123456, 10.0)) == ("–", "–", "1.235")
+    assert (number(None), number(math.nan), number(0.123456, 10.0)) == ("–", "–", "1.23")
 
 
 @pytest.mark.parametrize("outcome", ["better", "worse", "same", "undecided", "none"])

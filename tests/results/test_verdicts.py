@@ -53,10 +53,10 @@ def valid(**facts: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("difference", "outcome", "said"),
     [
-        (interval(-0.02, -0.03, -0.01), "better", "17% lower than physics (0.12°): 95 % CI of the difference -0.03°"),
-        (interval(0.02, 0.01, 0.03), "worse", "17% higher than physics (0.12°): 95 % CI of the difference"),
-        (interval(-0.02, -0.05, 0.01), "undecided", "17% lower than physics (0.12°), difference not significant: "),
-        (interval(-0.02), "undecided", "17% lower than physics (0.12°), difference not tested"),
+        (interval(-0.02, -0.03, -0.01), "better", "17 % lower than physics (0.12°): 95 % CI of the difference -0.03°"),
+        (interval(0.02, 0.01, 0.03), "worse", "17 % higher than physics (0.12°): 95 % CI of the difference"),
+        (interval(-0.02, -0.05, 0.01), "undecided", "17 % lower than physics (0.12°), difference not significant: "),
+        (interval(-0.02), "undecided", "17 % lower than physics (0.12°), difference not tested"),
         (interval(0.001, 0.0005, 0.002), "same", "no relevant difference to physics (0.12°)"),
         (interval(0.0, 0.0, 0.0), "same", "equal to physics (0.12°)"),
     ],

@@ -30,7 +30,7 @@ from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters, s
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.drive.windows import DriveWindow
 from pdhef_logtool.estimators.corrected import CorrectedPhysics, CorrectedState
-from pdhef_logtool.estimators.filter_base import U_AX, U_FRICTION, U_STEER, FilterState, HeldInputs
+from pdhef_logtool.estimators.filter_base import U_AX, U_FRICTION, U_STEER, FilterState, HeldInputs, PosteriorSteps
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter
@@ -366,21 +366,11 @@ def residual_windows(
         fresh: BoolArray = whole & ~(np.concatenate([[running], whole[:-1]]) & np.isfinite(filtered.prior[:, 0]))
         numbers = segment + np.cumsum(fresh)
         running, segment = bool(whole[-1]), int(numbers[-1])
-        inputs = filtered.inputs.copy()
-        inputs[~np.isfinite(without_impossible(window.signals).steer_rad), U_STEER] = np.nan
-        state, region = _true_state(window), np.full(len(window.signals), np.nan)
+        region = np.full(len(window.signals), np.nan)
         if taught is not None:
             corrected, taught_state = taught.run(window.signals, taught_state)
             region = np.where(corrected.valid, corrected.gain, np.nan)
-        new = _Steps(
-            stamps_ns=window.signals.stamps_ns,
-            state=state,
-            model=ModelSteps(filtered.x, inputs),
-            features=features,
-            segment=np.maximum(numbers, 0),
-            truth_std_rad=_truth_std(window, state, truth_std_m_s),
-            region=region,
-        )
+        new = _steps_of(window, features, filtered, np.maximum(numbers, 0), truth_std_m_s, region)
         chain = new if waiting is None else waiting.since(len(waiting.stamps_ns) - 1).joined(new)
         increments = np.concatenate([increments, _increments(chain, physics, run, max_step_s)])
         waiting = new if waiting is None else waiting.joined(new)
@@ -391,6 +381,28 @@ def residual_windows(
             waiting, emitted, increments = waiting.since(keep), decided - keep, increments[keep:]
     if waiting is not None and emitted < len(waiting.stamps_ns):
         yield emit(waiting, emitted, len(waiting.stamps_ns))
+
+
+def _steps_of(
+    window: DriveWindow,
+    features: FloatArray,
+    filtered: PosteriorSteps,
+    segment: IntArray,
+    truth_std_m_s: float,
+    region: FloatArray,
+) -> _Steps:  # positional: what a window gives, column by column
+    """Return what the targets of a window are computed from."""
+    inputs, state = filtered.inputs.copy(), _true_state(window)
+    inputs[~np.isfinite(without_impossible(window.signals).steer_rad), U_STEER] = np.nan
+    return _Steps(
+        stamps_ns=window.signals.stamps_ns,
+        state=state,
+        model=ModelSteps(filtered.x, inputs),
+        features=features,
+        segment=segment,
+        truth_std_rad=_truth_std(window, state, truth_std_m_s),
+        region=region,
+    )
 
 
 def _increments(steps: _Steps, physics: PhysicsFilter | PhysicsUkf, run: FloatArray, max_step_s: float) -> FloatArray:
