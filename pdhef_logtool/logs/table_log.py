@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 #: End of the name of a column that is made of a magnitude and its sign, and how the name of a sign differs from it.
 SIGNED = "_signed"
-_SIGN = re.compile(r"(?<=_)(?:VZ|vorzeichen|sign|sgn)_|_(?:VZ|vorzeichen|sign|sgn)$", re.IGNORECASE)
+_SIGN = re.compile(r"(?<![A-Za-z0-9])(?:VZ|vorzeichen|sign|sgn)_|_(?:VZ|vorzeichen|sign|sgn)$", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
