@@ -11,7 +11,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from pdhef_logtool.drive.checks.by_relations import explained_factors
-from pdhef_logtool.drive.checks.fitting import SURE
 from pdhef_logtool.drive.checks.sensor_errors import ay_delay, sensor_errors
 from pdhef_logtool.drive.checks.truth_sideslip import is_turned, sideslip_offset
 from pdhef_logtool.drive.mounting import Survey, scaled_source, turned_signals
@@ -84,7 +83,7 @@ def _delays(survey: Survey) -> dict[str, tuple[float, str]]:
     # The delay of a_y is not observable from another axis.
     is_mounted = survey.mounting is None or survey.mounting.is_as_named
     by_truth = ay_delay(sensor_errors(survey.measured.columns), latency) if is_mounted else None
-    if by_truth is not None and by_truth[0] > max(LEAST_AY_DELAY_S, SURE * by_truth[1]):
+    if by_truth is not None and by_truth[0] > max(LEAST_AY_DELAY_S, 3.0 * by_truth[1]):
         delays["ay_m_s2"] = by_truth[0], f"a_y is {by_truth[0] * 1e3:.1f} ms late against ground truth"
     for sensor in survey.late:
         told_by_truth = sensor.names[0] == "yaw_rate_rad_s" and latency is not None and latency.reliable

@@ -413,6 +413,8 @@ def dependent_signals(
                     f"{truth.source} equals the {role} {signal} ({channel.source}) on {share:.1%} of its samples"
                 )
                 break
+    if "sideslip_rad" not in truth_channels and {"vx_m_s", "vy_m_s"} <= dependent.keys():
+        dependent["sideslip_rad"] = "v_x and v_y are not"
     return dependent
 
 

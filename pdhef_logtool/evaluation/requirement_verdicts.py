@@ -419,7 +419,7 @@ def _decisive(requirement: Requirement, bounded: Bounded, exposure: Exposure, wh
         return f"{far}: more than {_MOST_TIMES:g} times as much driving would be needed"
     more = f"about {math.ceil(times)} times as much driving{where} would decide, if value and spread stay the same"
     if exposure.minutes:
-        more += f" ({exposure.minutes * (times - 1.0):.0f} minutes more)" if exposure.minutes * times > 1.5 else ""
+        more += f" ({exposure.minutes * (times - 1.0):.3g} min more)"
     return more
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.compiled.sources import compiled_digest
 from pdhef_logtool.evaluation.dead_reckoned import PathDrift
+from pdhef_logtool.evaluation.largest_errors import ErrorPlace
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.operating_space import OperatingSpace
@@ -134,23 +135,13 @@ class FrictionFacts:
 
 
 @dataclass(frozen=True, slots=True)
-class LargestError:
-    """A place of a large sideslip error: stamp in ns, angles in rad."""
-
-    stamp_ns: int
-    estimate_rad: float
-    truth_rad: float
-    error_rad: float
-
-
-@dataclass(frozen=True, slots=True)
 class DriveDetails:
     """What a report's page shows and no table contains, of a drive that a run estimated.
 
     ``faults`` of the sensors, None where no estimator detects them. ``innovations`` by channel.
     ``standings`` of the selected estimate, empty without ground truth.
     ``error_budget`` has a reason where there is none.
-    ``metadata`` : what the log states of itself. ``largest_errors`` : of sideslip, the largest first.
+    ``metadata`` : what the log states of itself.
     """
 
     faults: Sequence[SensorFault] | None
@@ -158,7 +149,6 @@ class DriveDetails:
     standings: Sequence[Standing]
     error_budget: Any
     metadata: Mapping[str, str]
-    largest_errors: Sequence[LargestError] = ()
     path_drift: PathDrift | None = None
 
 
@@ -183,6 +173,7 @@ class ReportFacts:
     ``file_bytes``: what became of the bytes of each file; ``samples``: of the samples of each mapped source.
     ``checks``: plausibility of signals, ground truth and vehicle file. ``details``: None where nothing was estimated.
     ``requirements``: None where there is nothing to judge. ``space``: where the drive went.
+    ``largest_errors``: of sideslip, the largest first.
     """
 
     log: LogFacts
@@ -212,6 +203,7 @@ class ReportFacts:
     checks: Sequence[Check] = ()
     requirements: RequirementFacts | None = None
     space: OperatingSpace | None = None
+    largest_errors: Sequence[ErrorPlace] = ()
     details: DriveDetails | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
 
@@ -332,7 +324,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
         document["plan"] = facts.requirements.verdicts.to_dict()
         document["requirement_blocks"] = list(facts.requirements.blocks)
     if facts.space is not None:
-        document["operating_space"] = facts.space
+        document |= {"operating_space": facts.space, "largest_errors": list(facts.largest_errors)}
     document = {key: jsonable(value) for key, value in document.items()}
     return document | _selected(document, facts.main, facts.details)
 
@@ -369,7 +361,6 @@ def _detailed(details: DriveDetails) -> dict[str, Any]:
         "error_budget": details.error_budget,
         "path_drift": details.path_drift,
         "metadata": dict(details.metadata),
-        "largest_errors": details.largest_errors,
     }
     return {key: jsonable(value) for key, value in values.items()}
 

@@ -12,7 +12,6 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.evaluation.blocks import row_blocks
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
-from pdhef_logtool.evaluation.largest_errors import largest_places
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.evaluation.reasons import SensorFault, sensor_faults
 from pdhef_logtool.evaluation.segments import moving_mask
@@ -20,7 +19,7 @@ from pdhef_logtool.evaluation.standing import standings
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.run_report import DriveDetails, LargestError
+from pdhef_logtool.results.run_report import DriveDetails
 from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.runs.drive_sample import sample_drive
 from pdhef_logtool.runs.error_budget import ErrorBudget, error_budget, no_budget
@@ -68,7 +67,6 @@ def drive_details(
         error_budget=no_budget(_LEFT_OUT) if brief else _budget(drive, by_name.get(PHYSICS), read, signals),
         path_drift=None if truth is None else path_drift(answer, truth),
         metadata=_metadata(drive),
-        largest_errors=[] if truth is None else _largest_errors(answer, truth, slow),
     )
 
 
@@ -87,17 +85,6 @@ def _rivals(ready: Sequence[Estimator], main: Estimator, read: _Read) -> list[st
         if other and not _is_same(read(estimator.name), read(main.name)):
             rivals.append(estimator.name)
     return rivals
-
-
-def _largest_errors(estimate: StateTrack, truth: StateTrack, low_speed_m_s: float) -> list[LargestError]:
-    """Return the largest sideslip errors of a track [N], at least a second and a fiftieth of the drive apart."""
-    parts = [(estimate.rows(a, b), truth.rows(a, b)) for a, b in row_blocks(len(truth))]
-    error = np.concatenate([signal_error(e, t, "sideslip_rad", low_speed_m_s) for e, t in parts])
-    stamps, beta = (np.concatenate([getattr(e, key) for e, _ in parts]) for key in ("stamps_ns", "sideslip_rad"))
-    return [
-        LargestError(int(stamps[row]), float(beta[row]), float(beta[row] - error[row]), float(error[row]))
-        for row in largest_places(stamps, error)
-    ]
 
 
 def _is_same(track: StateTrack | None, main: StateTrack | None) -> bool:

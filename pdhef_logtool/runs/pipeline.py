@@ -432,6 +432,7 @@ def _facts(
     losses: Sequence[Loss],
 ) -> ReportFacts:
     """Gather the content of report.json; ``ran``: intervals, and the estimators that failed with their reasons."""
+    from pdhef_logtool.evaluation.largest_errors import largest_errors
     from pdhef_logtool.evaluation.operating_space import operating_space
     from pdhef_logtool.runs.drive_details import drive_details
 
@@ -453,7 +454,10 @@ def _facts(
     estimators += [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in job.skipped]
     digests = {name: a.sha256[:SHOWN_DIGITS] for name, a in algorithms.items()}
     rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows]
-    space = operating_space(signals, store.read(TRUTH), store.read(main.name), job.car.vehicle)
+    truth, selected, vehicle = store.read(TRUTH), store.read(main.name), job.car.vehicle
+    assert selected is not None
+    space = operating_space(signals, truth, selected, vehicle)
+    others = [t for n in (REFERENCE, PHYSICS, *algorithms) if n != main.name and (t := store.read(n)) is not None]
     return replace(
         report_facts(drive, job.car, estimators, rows, scored.events, losses),
         friction=friction_facts(drive.friction),
@@ -461,6 +465,7 @@ def _facts(
         reference=None if job.reference is None else job.reference.document,
         main=main,
         space=space,
+        largest_errors=largest_errors(selected, truth, others, vehicle.low_speed_blend_m_s),
         details=drive_details(drive, job.ready, main.name, store.read, signals, brief=config.kept != "full"),
         requirements=_requirements(job, main.name, scored, store, space, brief=config.kept == "metrics"),
     )

@@ -192,6 +192,7 @@ class _Scoring:
 
     def score(self, drive: Drive, outputs: OutputFolder | None) -> LogResult:
         """Read, compare and, with a folder, write."""
+        from pdhef_logtool.evaluation.largest_errors import largest_errors
         from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
         from pdhef_logtool.evaluation.operating_space import operating_space
 
@@ -215,7 +216,10 @@ class _Scoring:
         truth_track = against.truth_at(scored_ns)
         seen = signals_at(signals, scored_ns)
         events = self._events(truth_track, seen, recorded, manoeuvres)
-        space = operating_space(seen, truth_track, recorded[0].track if len(recorded) == 1 else None, self.car.vehicle)
+        alone, vehicle = recorded[0].track if len(recorded) == 1 else None, self.car.vehicle
+        space = operating_space(seen, truth_track, alone, vehicle)
+        others = [t for t in (against.reference_at(scored_ns),) if t is not None]
+        places = [] if alone is None else largest_errors(alone, truth_track, others, vehicle.low_speed_blend_m_s)
         samples |= drive.samples
         for r in recorded:
             samples |= r.samples
@@ -233,12 +237,13 @@ class _Scoring:
             log=replace(facts.log, topics=topics),
             truth=replace(facts.truth, notes=[*latency, *facts.truth.notes]),
             space=space,
+            largest_errors=places,
             requirements=judged_alone(self.validation, drive, None, rows, blocks, space),
         )
         report = build_report(facts)
         folder = None
         if outputs is not None:
-            tracks = [r.track for r in recorded] + [t for t in (against.reference_at(scored_ns),) if t is not None]
+            tracks = [*(r.track for r in recorded), *others]
             if truth_track is not None:
                 tracks.insert(0, valid_as_a_whole(truth_track, plan.derivation, self.car.vehicle.standstill_m_s))
             with outputs.begin(log_place(drive.name), stale=(PAGE_FILE,)) as change:

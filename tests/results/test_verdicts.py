@@ -53,18 +53,18 @@ def valid(**facts: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("difference", "outcome", "said"),
     [
-        (interval(-0.02, -0.03, -0.01), "better", "17% lower than physics (0.120°): 95 % CI of the difference -0.030"),
-        (interval(0.02, 0.01, 0.03), "worse", "17% higher than physics (0.120°): 95 % CI of the difference"),
-        (interval(-0.02, -0.05, 0.01), "undecided", "17% lower than physics (0.120°), difference not significant: "),
-        (interval(-0.02), "undecided", "17% lower than physics (0.120°), difference not tested"),
-        (interval(0.001, 0.0005, 0.002), "same", "no relevant difference to physics (0.120°)"),
-        (interval(0.0, 0.0, 0.0), "same", "equal to physics (0.120°)"),
+        (interval(-0.02, -0.03, -0.01), "better", "17 % lower than physics (0.12°): 95 % CI of the difference -0.03°"),
+        (interval(0.02, 0.01, 0.03), "worse", "17 % higher than physics (0.12°): 95 % CI of the difference"),
+        (interval(-0.02, -0.05, 0.01), "undecided", "17 % lower than physics (0.12°), difference not significant: "),
+        (interval(-0.02), "undecided", "17 % lower than physics (0.12°), difference not tested"),
+        (interval(0.001, 0.0005, 0.002), "same", "no relevant difference to physics (0.12°)"),
+        (interval(0.0, 0.0, 0.0), "same", "equal to physics (0.12°)"),
     ],
 )  # fmt: skip
 def test_the_sentence_claims_what_the_interval_holds(difference: Interval, outcome: str, said: str) -> None:
     first = verdicts(details(standing(difference)))[0]
     assert (first["signal"], first["outcome"]) == ("sideslip_rad", outcome)
-    assert first["text"].startswith("RMSE of pd-hef: 0.100° (95 % CI 0.090 to 0.110°); " + said)
+    assert first["text"].startswith("RMSE of pd-hef: 0.1° (95 % CI 0.09° to 0.11°); " + said)
 
 
 def test_without_a_rival_or_an_interval_that_is_said() -> None:

@@ -10,8 +10,6 @@ import numpy as np
 from pdhef_logtool.drive.columns import independent_samples, student
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 
-#: A figure of a fit counts from this many standard errors on.
-SURE = 4.0
 #: Blocks of a drive that errors are estimated from; fewer give no information on them.
 LEAST_BLOCKS, MOST_BLOCKS = 4, 10
 

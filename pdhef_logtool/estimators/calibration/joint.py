@@ -131,8 +131,8 @@ def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
         _around(STEER_OFFSET, "rad", vehicle_file.steer_offset_rad, 0.01, 0.05),
         _factor(STEER_RATIO, "1", vehicle_file.steering_ratio, 0.05, 1.2),
         _around(STEER_DELAY, "s", 0.0, 0.02, 0.1),
-        _around(AY_GAIN, "1", 1.0 + GRAVITY_M_S2 * gradient, 0.05, 0.15),
-        _around(AY_BIAS, "m/s^2", sensors.ay_bias_m_s2, 0.2, 1.5),
+        _around(AY_GAIN, "1", 1.0 + GRAVITY_M_S2 * gradient, 0.02, 0.15),
+        _around(AY_BIAS, "m/s^2", sensors.ay_bias_m_s2, 0.1, 1.5),
         _around(IMU_X, "m", vehicle_file.imu_position_m[0], reach, 3.0 * reach),
         _around(RATE_BIAS, "rad/s", sensors.yaw_rate_bias_rad_s, 0.005, 0.05),
     )
@@ -193,13 +193,13 @@ class JointProblem:
             blocks.append(block)
         self._block = np.unique(np.concatenate(blocks), return_inverse=True)[1]
         self._weight = math.sqrt(KEPT_STEPS * STEP_S / CORRELATION_S)
-        self._error_std = np.array(ERROR_STD)
+        self._least_std = self._error_std = np.array(ERROR_STD)
 
     def solve(self) -> Fit:
         """Return the parameters of the lowest cost, and with them the standard deviation of the errors."""
         theta = np.zeros(len(self.parameters))
         for _ in range(SCALES):
-            error_std = np.maximum(ERROR_STD, self.rms(theta))
+            error_std = np.maximum(self._least_std, self._rms(self.errors_of(theta)))
             self._error_std = error_std
             descent, _ = descend(
                 self.errors_of,
@@ -212,7 +212,7 @@ class JointProblem:
                 max_step=MAX_STEP,
             )
             theta = descent.theta
-            if np.allclose(np.maximum(ERROR_STD, self.rms(theta)), error_std, rtol=SAME_SCALE):
+            if np.allclose(np.maximum(self._least_std, self._rms(self.errors_of(theta))), error_std, rtol=SAME_SCALE):
                 break
         return Fit(theta, self._covariance(theta))
 
@@ -222,11 +222,13 @@ class JointProblem:
 
     def rms(self, theta: FloatArray) -> tuple[float, float]:
         """Return the RMS error of yaw rate and a_y."""
-        return self._rms(self.errors_of(theta))
+        rms = self._rms(self.errors_of(theta))
+        return float(rms[OF_RATE]), float(rms[OF_AY])
 
     def rms_of_file(self) -> tuple[float, float]:
         """Return the RMS error of yaw rate and a_y of the vehicle file."""
-        return self._rms(self._errors(track_of(self._file, self._file)))
+        rms = self._rms(self._errors(track_of(self._file, self._file)))
+        return float(rms[OF_RATE]), float(rms[OF_AY])
 
     def sideslip(self, theta: FloatArray) -> FloatArray:
         """Return the model's v_y / v_x of all samples that count [K]."""
@@ -258,11 +260,11 @@ class JointProblem:
             if not d.has_ay:
                 differences[OF_AY] = 0.0
         parts = [e[:, k] for e, k in zip(self._differences, self._kept, strict=True)]
-        return np.asarray(np.concatenate(parts, axis=1) / self._error_std[:, None], dtype=np.float64)
+        return np.asarray(np.concatenate(parts, axis=1) / self._error_std[:2, None], dtype=np.float64)
 
-    def _rms(self, scaled: FloatArray) -> tuple[float, float]:
-        rms = np.sqrt(np.mean(scaled**2, axis=1)) * self._error_std
-        return float(rms[OF_RATE]), float(rms[OF_AY])
+    def _rms(self, scaled: FloatArray) -> FloatArray:
+        """Return the RMS of each channel of errors over ``_error_std``."""
+        return np.asarray(np.sqrt(np.mean(scaled**2, axis=1)) * self._error_std[: len(scaled)], dtype=np.float64)
 
     def _cost(self, scaled: FloatArray, theta: FloatArray) -> float:
         robust = 2.0 * (np.sqrt(1.0 + scaled**2) - 1.0)
