@@ -76,7 +76,8 @@ def _with_signs(table: Table) -> Table:
         magnitude = path.removesuffix(SIGNED)
         if magnitude == path or magnitude not in signs:
             return table.load(path, rows)
-        return np.where(table.load(signs[magnitude], rows) > 0, -1.0, 1.0) * np.abs(table.load(magnitude, rows))
+        negative = table.load(signs[magnitude], rows) > 0
+        return np.where(negative, -1.0, 1.0) * np.abs(np.asarray(table.load(magnitude, rows), np.float64))
 
     more = (replace(names[magnitude], path=f"{magnitude}{SIGNED}") for magnitude in signs)
     return replace(table, fields=(*table.fields, *more), load=load)
