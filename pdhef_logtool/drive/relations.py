@@ -222,7 +222,7 @@ def _steering(
         curvature = yaw / speed
     gentle = gentle_at(yaw * speed, moving)
     driven = yaw[gentle & np.isfinite(yaw)]
-    is_turning = driven.size > 0 and bool(driven.std() > MOVES_RAD_S)
+    is_turning = driven.size > 0 and bool(driven.std() > max(MOVES_RAD_S, abs(driven.mean())))  # to both sides
     for name, lengths, typical in _lengths(speed, vehicle):
         steer = columns.get(name)
         if steer is None:
