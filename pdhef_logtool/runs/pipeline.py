@@ -475,16 +475,20 @@ def _requirements(
     job: _Job, main: str, scored: Evaluation, store: TrackStore, space: OperatingSpace, *, brief: bool
 ) -> RequirementFacts:
     """Return the blocks of the plan's requirements in this drive, and the verdicts on the drive alone."""
-    from pdhef_logtool.evaluation.requirement_blocks import MOST_BLOCKS, ScoredDrive, requirement_blocks
+    from pdhef_logtool.evaluation.requirement_blocks import (
+        MOST_BLOCKS,
+        RequirementBlocks,
+        ScoredDrive,
+        requirement_blocks,
+    )
 
-    drive, truth = job.drive, store.read(TRUTH)
-    reference = None if truth is not None else store.read(REFERENCE)
-    base = reference if truth is None else truth
-    blocks = []
-    if base is not None:
-        slow, dependent = drive.car.vehicle.low_speed_blend_m_s, frozenset(drive.plan.dependent)
-        tracks = ScoredDrive(store.read, base, scored.masks, slow, dependent, estimated=truth is None)
-        blocks = requirement_blocks(job.validation.requirements, main, tracks, _BRIEF_BLOCKS if brief else MOST_BLOCKS)
+    drive, blocks = job.drive, list[RequirementBlocks]()
+    slow, dependent = drive.car.vehicle.low_speed_blend_m_s, frozenset(drive.plan.dependent)
+    for name in (TRUTH, REFERENCE):  # the reference where ground truth scores nothing
+        if (base := store.read(name)) is not None:
+            tracks = ScoredDrive(store.read, base, scored.masks, slow, dependent, estimated=name == REFERENCE)
+            left = [r for r in job.validation.requirements if all(b.of != r.measured for b in blocks)]
+            blocks += requirement_blocks(left, main, tracks, _BRIEF_BLOCKS if brief else MOST_BLOCKS)
     return judged_alone(job.validation, drive, main, scored.rows, blocks, space)
 
 

@@ -326,16 +326,17 @@ class _Scoring:
             figures: list[MetricRow] = []
             if reference is not None:
                 figures += reference_rows([r.track], reference, masks, log=drive.name, low_speed_m_s=slow)
-            base = reference if at_stamps is None else at_stamps
             same = {
                 name: f"the ground truth's {name} equals that of the estimate {r.track.name}"
                 for name in SCORED_SIGNALS
                 if at_stamps is not None and _same_column(getattr(r.track, name), getattr(at_stamps, name))
             }
             dependent |= same
-            if base is not None:
-                tainted = frozenset({**plan.dependent, **same})
-                blocks += self._blocks(r, base, masks, tainted, alone=len(recorded) == 1, estimated=at_stamps is None)
+            tainted, alone = frozenset({**plan.dependent, **same}), len(recorded) == 1
+            for base in (at_stamps, reference):
+                if base is not None:
+                    more = self._blocks(r, base, masks, tainted, alone=alone, estimated=base is reference)
+                    blocks += [b for b in more if all((b.of, b.estimator) != (x.of, x.estimator) for x in blocks)]
             if at_stamps is not None:
                 figures += score_track(
                     r.track,
