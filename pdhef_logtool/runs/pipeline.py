@@ -432,8 +432,8 @@ def _facts(
     losses: Sequence[Loss],
 ) -> ReportFacts:
     """Gather the content of report.json; ``ran``: intervals, and the estimators that failed with their reasons."""
-    from pdhef_logtool.evaluation.largest_errors import largest_errors
     from pdhef_logtool.evaluation.operating_space import operating_space
+    from pdhef_logtool.results.error_places import largest_errors
     from pdhef_logtool.runs.drive_details import drive_details
 
     drive, (store, signals), (intervals, failed) = job.drive, estimates, ran

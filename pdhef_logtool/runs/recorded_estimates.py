@@ -192,9 +192,9 @@ class _Scoring:
 
     def score(self, drive: Drive, outputs: OutputFolder | None) -> LogResult:
         """Read, compare and, with a folder, write."""
-        from pdhef_logtool.evaluation.largest_errors import largest_errors
         from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
         from pdhef_logtool.evaluation.operating_space import operating_space
+        from pdhef_logtool.results.error_places import largest_errors
 
         plan = drive.plan
         self.reporter.progress(drive.name, 0.1)
