@@ -29,11 +29,8 @@ LINEAR_REGRESSION_FILE = "baselines/linear-regression.json"
 PAPER_FOLDER = "baselines/paper-network"
 
 #: Names instead of a folder: the network that comes with the package, and no network.
-SHIPPED, MANY_CARS, NO_MODEL = "default", "many-cars", "none"
-SHIPPED_FOLDERS = {
-    SHIPPED: Path(__file__).parents[1] / "models" / "default" / "network",
-    MANY_CARS: Path(__file__).parents[1] / "models" / "many-cars",
-}
+SHIPPED, NO_MODEL = "default", "none"
+SHIPPED_FOLDERS = {SHIPPED: Path(__file__).parents[1] / "models" / "default" / "network"}
 
 #: Filters that features are made by and whose model a residual is of: the strongest one, and that of the paper, which
 #: the paper's network and the baselines have.

@@ -294,7 +294,7 @@ def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]
         steps.append(
             f"identify and validate the car with this ground truth: pdhef learn LOG {given}"
             if _error(figures, main.name) is not None
-            else f"identify the car from several logs: pdhef learn LOGS {given} --without-truth"
+            else f"calibrate the car with several logs: pdhef learn LOGS {given} --without-truth"
         )
     if vehicle["proven"] and share is not None and share < NEARLY_HOLDS:
         steps.append("recalibrate the intervals with drives like this one: pdhef learn --stages intervals")

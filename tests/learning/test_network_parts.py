@@ -113,6 +113,8 @@ def residual_rows(count: int = 120, **changes: Any) -> ResidualRows:
         "weight": weight,
         "segment": np.zeros(count, dtype=np.int64),
         "truth_velocity": np.stack([np.full(count, 20.0), rng.normal(0.0, 0.3, count)], axis=1),
+        "truth_std_rad": np.full(count, 0.001),
+        "region": np.ones(count),
     }
     return ResidualRows(**{**columns, **changes})
 

@@ -20,9 +20,8 @@ from pdhef_logtool.compiled.cache import njit
 STEER, SPEED, YAW_RATE, AY, FRICTION = range(5)
 #: Rows of the errors.
 OF_RATE, OF_AY = range(2)
-#: Cutoff of the bank of the road; acceleration that sensors explain without one, m/s², and slides as a share of a_y
-#: beyond the linear range, m/s². Chosen on simulated cars: roads with and without bank, and fishhooks.
-BANK_HZ, BANK_FREE, BANK_SHARE, LINEAR_AY = 0.1, 0.3, 0.25, 3.0
+#: Cutoff of the bank of the road; share that slides have in a_y beyond the linear range, m/s².
+BANK_HZ, BANK_SHARE, LINEAR_AY = 0.1, 0.25, 3.0
 #: Gain of the correction of the yaw rate, 1/s; simulated cars with wrong files have the lowest error with it.
 RATE_GAIN = 2.0
 #: An axle starts at most at this share of its peak force.
@@ -111,9 +110,13 @@ def _filter(values, first, last, backwards, passed):  # type: ignore[no-untyped-
 
 @njit(cache=True)
 def disturbance(turn_low, ay_low, speed, p):  # type: ignore[no-untyped-def]
-    """Return the lateral acceleration by the bank of the road: what a_y lacks of v_x r for long, but for its errors."""
+    """Return the lateral acceleration by the bank of the road: what a_y lacks of v_x r for long, but for slides.
+
+    Crossfall is as large as errors of a_y, and superelevation goes with a_y as body roll does: no drive tells them
+    apart, and bias and roll gain keep their priors.
+    """
     lacks = turn_low - speed * p.rate_bias - (ay_low - p.ay_bias) / p.ay_gain
-    return math.copysign(max(0.0, abs(lacks) - BANK_FREE - BANK_SHARE * max(0.0, abs(ay_low) - LINEAR_AY)), lacks)
+    return math.copysign(max(0.0, abs(lacks) - BANK_SHARE * max(0.0, abs(ay_low) - LINEAR_AY)), lacks)
 
 
 @njit(cache=True)

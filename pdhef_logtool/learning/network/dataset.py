@@ -39,7 +39,7 @@ from pdhef_logtool.results.run_report import tool_versions, write_json
 from pdhef_logtool.storage.documents import DIGEST, digest, is_sealed, read_sealed, seal, validated
 
 FORMAT = "pdhef.residual-dataset"
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 MANIFEST = "manifest.json"
 #: Of more vehicles a bundle names the number.
 NAMED_VEHICLES = 4
@@ -96,6 +96,7 @@ def _table(rows: ResidualRows, picked: Picked, schema: pa.Schema) -> pa.Table:
     columns |= {name: rows.targets[:, i] for i, (name, _) in enumerate(TARGETS)}
     columns |= {name: rows.truth_velocity[:, i] for i, name in enumerate(TRUTH)}
     columns |= {"stamp_ns": rows.stamps_ns, "weight": rows.weight, "segment": rows.segment.astype(np.int32)}
+    columns |= {"truth_std_rad": rows.truth_std_rad, "region": rows.region}
     columns |= {"chosen": picked.chosen, "cell": picked.cell, "draw": picked.draw}
     arrays = []
     for f in schema:
