@@ -455,7 +455,6 @@ def _facts(
     digests = {name: a.sha256[:SHOWN_DIGITS] for name, a in algorithms.items()}
     rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows]
     truth, selected, vehicle = store.read(TRUTH), store.read(main.name), job.car.vehicle
-    assert selected is not None
     space = operating_space(signals, truth, selected, vehicle)
     others = [t for n in (REFERENCE, PHYSICS, *algorithms) if n != main.name and (t := store.read(n)) is not None]
     return replace(
@@ -465,7 +464,7 @@ def _facts(
         reference=None if job.reference is None else job.reference.document,
         main=main,
         space=space,
-        largest_errors=largest_errors(selected, truth, others, vehicle.low_speed_blend_m_s),
+        largest_errors=[] if selected is None else largest_errors(selected, truth, others, vehicle.low_speed_blend_m_s),
         details=drive_details(drive, job.ready, main.name, store.read, signals, brief=config.kept != "full"),
         requirements=_requirements(job, main.name, scored, store, space, brief=config.kept == "metrics"),
     )
@@ -475,14 +474,9 @@ def _requirements(
     job: _Job, main: str, scored: Evaluation, store: TrackStore, space: OperatingSpace, *, brief: bool
 ) -> RequirementFacts:
     """Return the blocks of the plan's requirements in this drive, and the verdicts on the drive alone."""
-    from pdhef_logtool.evaluation.requirement_blocks import (
-        MOST_BLOCKS,
-        RequirementBlocks,
-        ScoredDrive,
-        requirement_blocks,
-    )
+    from pdhef_logtool.evaluation.requirement_blocks import MOST_BLOCKS, ScoredDrive, requirement_blocks
 
-    drive, blocks = job.drive, list[RequirementBlocks]()
+    drive, blocks = job.drive, []
     slow, dependent = drive.car.vehicle.low_speed_blend_m_s, frozenset(drive.plan.dependent)
     for name in (TRUTH, REFERENCE):  # the reference where ground truth scores nothing
         if (base := store.read(name)) is not None:

@@ -333,10 +333,9 @@ class _Scoring:
             }
             dependent |= same
             tainted, alone = frozenset({**plan.dependent, **same}), len(recorded) == 1
-            for base in (at_stamps, reference):
-                if base is not None:
-                    more = self._blocks(r, base, masks, tainted, alone=alone, estimated=base is reference)
-                    blocks += [b for b in more if all((b.of, b.estimator) != (x.of, x.estimator) for x in blocks)]
+            for base in (b for b in (at_stamps, reference) if b is not None):
+                more = self._blocks(r, base, masks, tainted, alone=alone, estimated=base is reference)
+                blocks += [b for b in more if all((b.of, b.estimator) != (x.of, x.estimator) for x in blocks)]
             if at_stamps is not None:
                 figures += score_track(
                     r.track,
