@@ -476,7 +476,8 @@ def _requirements(
     """Return the blocks of the plan's requirements in this drive, and the verdicts on the drive alone."""
     from pdhef_logtool.evaluation.requirement_blocks import MOST_BLOCKS, ScoredDrive, requirement_blocks
 
-    drive, blocks = job.drive, []
+    drive = job.drive
+    blocks: list[RequirementBlocks] = []
     slow, dependent = drive.car.vehicle.low_speed_blend_m_s, frozenset(drive.plan.dependent)
     for name in (TRUTH, REFERENCE):  # the reference where ground truth scores nothing
         if (base := store.read(name)) is not None:
