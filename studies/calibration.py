@@ -1,4 +1,4 @@
-"""Calibration of cars with and without ground truth, and their 95 % confidence intervals: ``docs/calibration.md``.
+"""Calibration of cars without ground truth, and their 95 % confidence intervals: ``docs/calibration.md``.
 
 python -m studies.calibration [--out docs]
 """
@@ -10,25 +10,24 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pdhef_logtool.estimators.calibration.calibration import LARGEST_SHARE, VARIED
-from pdhef_logtool.estimators.posterior_band import OWN_SHARE as IDENTIFIED_SHARE
 from pdhef_logtool.estimators.self_calibrated import D2_SHARE
 from pdhef_logtool.runs.selection import FACTOR, SIMPLE
-from studies import identified_bands, plus_minus, self_calibration
+from studies import plus_minus, self_calibration
 from studies.pages import DOCS, DRIVES, options, write
 from studies.self_calibration import outcome_of, say, simulate
 
-#: Seeds and numbers of cars of the two parts.
-SELF_SEED, SELF_CARS, IDENTIFIED_SEED, IDENTIFIED_CARS = 77_002, 50, 88_003, 12
+#: Seed and number of cars.
+SELF_SEED, SELF_CARS = 77_002, 50
 
 PAGE = """# Calibration and confidence intervals
 
-This page shows the accuracy of calibrated and identified cars and the coverage of their confidence intervals.
+This page shows the accuracy of calibrated cars and the coverage of their confidence intervals.
 Command: `python -m studies.calibration`. Sideslip RMSE in degrees. Method: [method.md](method.md).
 
 ## Self-calibration on simulated cars with wrong vehicle files
 
-{cars} saloons, SUVs and hatchbacks with random loads, heights, tyres and sensors (`studies.many_cars`), seed {seed}. No
-setting was chosen on these cars; settings were chosen on 24 others. The stiffness in each vehicle file is wrong by a
+{cars} saloons, SUVs and hatchbacks with random loads, heights, tyres and sensors (`studies.drawn_cars`), seed {seed}.
+No setting was chosen on these cars; settings were chosen on 24 others. The stiffness in each vehicle file is wrong by a
 factor of {low:g} to {high:g} at each axle. Each car is calibrated on the scored drive, without ground truth. Figures
 are medians. The last column contains the median ratio and the 10 % and 90 % quantiles.
 
@@ -66,18 +65,6 @@ self-calibrated car. The speed of the 250 LM, the GTI and the V40 comes from the
 
 {said}
 
-## 95 % confidence intervals of identified cars
-
-{identified_cars} simulated cars, seed {identified_seed}; vehicle files with a stiffness error of up to a factor 1.4 at
-each axle. `physics` of each car is identified on one drive with ground truth, a wide sine sweep or a road of 120 s, and
-evaluated on other drives of the car. The variance of sideslip is the sum of ({identified_own:g} s)² and the effect of
-the {varied} strongest directions of the posterior. The factors were chosen on 8 other cars.
-
-{identified}
-
-The identification assumes an error of at least 0.05° (`FLOOR_RAD`). On driving like that of the identification, where a
-simulated car has lower errors, the intervals are therefore too wide.
-
 ## Coverage of every ± that is printed
 
 {plus_cars} simulated cars of all kinds, seed {plus_seed}, with wrong vehicle files (stiffness, inertia, roll gradient,
@@ -91,7 +78,7 @@ no printed ±.
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Simulate, calibrate, identify, and write the page."""
+    """Simulate, calibrate, and write the page."""
     parser = options("calibration", __doc__)
     parser.add_argument("--out", type=Path, default=DOCS)
     out = parser.parse_args(arguments).out
@@ -102,7 +89,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     published, said = "Not done: needs ../shared beside the repository.", list[str]()
     if DRIVES.is_dir():
         published, said = self_calibration.published_table()
-    judged = identified_bands.judge(IDENTIFIED_CARS, IDENTIFIED_SEED)
     write(
         out / "calibration.md",
         PAGE.format(
@@ -112,7 +98,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             d2=self_calibration.d2_table(outcomes),
             published=published,
             said="\n".join(said),
-            identified=identified_bands.bands_table(judged),
         ),
     )
     plus_minus.fill_page(out / "calibration.md")
@@ -134,9 +119,6 @@ def settings() -> dict[str, object]:
         "looked": self_calibration.LOOKED_AT,
         "plus_cars": plus_minus.CARS,
         "plus_seed": plus_minus.SEED,
-        "identified_cars": IDENTIFIED_CARS,
-        "identified_seed": IDENTIFIED_SEED,
-        "identified_own": IDENTIFIED_SHARE,
     }
 
 

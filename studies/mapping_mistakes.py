@@ -86,11 +86,13 @@ def _source(mapping: Mapping, name: str) -> SignalSource | None:
 
 
 def mistaken(mapping: Mapping, subject: str, kind: str) -> Mapping | None:
-    """Return a mapping file's mapping with a mistake; None where the log lacks the other axis."""
+    """Return a mapping file's mapping with a mistake; None where the log lacks the axis, or nothing changes."""
     signals, truth = dict(mapping.signals), dict(mapping.truth)
     for name in _members(mapping, subject):
         source = _source(mapping, name)
         assert source is not None
+        if kind == "sign" and source.combine == "norm":
+            return None  # the size of a vector
         if kind == AXIS:
             other = _source(mapping, OTHER[subject])
             if other is None:

@@ -38,7 +38,7 @@ from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.selection import FACTOR
 from pdhef_logtool.runs.self_calibrating import log_sensors
 from studies.condition_drives import SIDESLIP, as_logged
-from studies.many_cars import BASE, KINDS, draw_car
+from studies.drawn_cars import BASE, KINDS, draw_car
 from studies.pages import DRIVES, ROOT, number, table
 from truthsim.batch import sensor_noise
 from truthsim.drive import Drive, simulate_drive

@@ -32,6 +32,7 @@ from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.learning.stages.teach import OpenedDrive, Teaching, learn_from, open_drive
 from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.residual_model.bundle import open_model
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator
 from pdhef_logtool.runs.self_calibrating import self_calibrated
@@ -48,6 +49,8 @@ WORSE_SHARE, WORSE_DEG = 0.05, 0.03
 MOST_STAMPS = 20_000
 #: Driving counts as alike where the residual is active on so much of it.
 ALIKE = 0.5
+#: The paper's network, trained in simulation, in the sigma points of the paper's filter.
+PAPER = "pd-hef-paper"
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +116,8 @@ This page shows what a car that was taught on one drive with ground truth is wor
 Sideslip RMSE in degrees; in brackets without the constant of each drive, which may be an offset of the ground truth.
 Each drive calibrates its car on its own sensors, not causal. *untaught* and *taught*: `physics` without and with the
 prior from the teaching drive. *pd-hef*: with the residual as well. *active*: share of the scored stamps at which the
-residual acts. *95 %*: coverage of the confidence intervals of untaught `physics` and of `pd-hef`.
+residual acts. *paper*: `pd-hef-paper`, the ST-ResNet of the simulated saloon in the sigma points, on the vehicle file;
+it is not taught. *95 %*: coverage of the confidence intervals of untaught `physics` and of `pd-hef`.
 
 These are development figures: the settings were chosen on these pairs and on the simulated cars of seed {seed}; one
 variant was also seen on the second seed.
@@ -150,6 +154,7 @@ class PairResult:
     prior: Score
     hybrid: Score
     kinematic_deg: float
+    paper_deg: float
     rung: str
 
     @property
@@ -195,7 +200,7 @@ def score(
     wanted = len(drive.whole.signals) <= most_stamps
     calibration = calibration if wanted else replace(calibration, varied=())
     calibrated = replace(self_calibrated(drive.drive, calibration), taught=taught)
-    estimator = make_estimator(name, calibrated)
+    estimator = make_estimator(name, replace(calibrated, network=car.network))
     track, _ = run_window(estimator, drive.whole.signals)
     track = calibrator(calibrated, [estimator]).add(track, drive.whole.signals)
     assert drive.whole.truth is not None
@@ -249,7 +254,9 @@ def taught_pairs(
     """Yield the results of pairs; ``drives`` : with the ground truth that teaches, and with that which scores."""
     teaching, scored = drives
     untaught = [score(d, car, "physics", None, least, most_stamps) for d in scored]
+    paper = replace(car, network=open_model(None))
     kinematic = [score(d, car, "kinematic", None, least, 0).rmse_deg for d in scored]
+    of_paper = [score(d, paper, PAPER, None, least, 0).rmse_deg for d in scored]
     learned: dict[tuple[int, ...], Taught] = {}
     for teachers, k in choices:
         if teachers not in learned:
@@ -258,7 +265,8 @@ def taught_pairs(
         prior, hybrid = (score(scored[k], car, n, taught, least, most_stamps) for n in ("physics", "pd-hef"))
         taught_on = ", ".join(names[i] for i in teachers) if len(teachers) == 1 else f"{len(teachers)} runs"
         rung = "none" if taught.residual is None else taught.residual.rung
-        yield PairResult(car_name, taught_on, names[k], untaught[k], prior, hybrid, kinematic[k], rung)
+        others = (kinematic[k], of_paper[k])
+        yield PairResult(car_name, taught_on, names[k], untaught[k], prior, hybrid, *others, rung)
 
 
 def simulated_pairs(seed: int) -> Iterator[PairResult]:
@@ -286,6 +294,12 @@ def simulated_pairs(seed: int) -> Iterator[PairResult]:
 def simulated_table(results: Sequence[PairResult]) -> str:
     """Return a table of the simulated pairs by seed and the manoeuvre that teaches."""
     names = [name for name, _, _ in SIMULATED_DRIVES]
+
+    def of_paper(seed: int, scored: str) -> str:
+        of = [r for r in results if r.car.startswith(f"{SIMULATED} {seed}-") and r.scored == scored]
+        ratios = [r.paper_deg / r.untaught.rmse_deg for r in of]
+        return f"{math.exp(float(np.mean(np.log(ratios)))):.2f} ({max(ratios):.2f})" if ratios else "–"
+
     body = []
     for seed, taught in ((s, t) for s in SEEDS for t in names):
         cells = []
@@ -298,6 +312,8 @@ def simulated_table(results: Sequence[PairResult]) -> str:
             mean = math.exp(float(np.mean(np.log(ratios)))) if ratios else math.nan
             cells.append(f"{mean:.2f} ({max(ratios):.2f}; {sum(r.worse for r in pairs)})" if ratios else "–")
         body.append([str(seed), taught, *cells])
+        if taught == names[-1]:
+            body.append([str(seed), "(paper's network)", *(of_paper(seed, scored) for scored in names)])
     return table(["seed", "taught on", *names], body, right_from=2)
 
 
@@ -310,12 +326,25 @@ def pair_table(results: Sequence[PairResult]) -> str:
     body = [
         [
             r.car, r.taught, r.scored, cell(r.untaught), cell(r.prior), cell(r.hybrid),
-            number(r.ratio, 2) + (" worse" if r.worse else ""), r.rung, f"{r.hybrid.active:.0%}",
+            number(r.ratio, 2) + (" worse" if r.worse else ""), number(r.paper_deg, 3), r.rung,
+            f"{r.hybrid.active:.0%}",
             " / ".join("–" if s.covered is None else f"{s.covered:.0%}" for s in (r.untaught, r.hybrid)),
         ]
         for r in results
     ]  # fmt: skip
-    head = ["car", "taught on", "scored on", "untaught", "taught", "pd-hef", "ratio", "residual", "active", "95 %"]
+    head = [
+        "car",
+        "taught on",
+        "scored on",
+        "untaught",
+        "taught",
+        "pd-hef",
+        "ratio",
+        "paper",
+        "residual",
+        "active",
+        "95 %",
+    ]
     return table(head, body, right_from=3)
 
 
@@ -333,6 +362,7 @@ def summary(results: Sequence[PairResult]) -> str:
         ["geometric mean of the ratios, residual active on at least 50 %", mean([r.ratio for r in alike])],
         ["geometric mean of the ratios, residual active on less", mean([r.ratio for r in unlike])],
         ["the same with the prior alone, all pairs", mean([r.prior.rmse_deg / r.untaught.rmse_deg for r in results])],
+        ["the same with the paper's network, all pairs", mean([r.paper_deg / r.untaught.rmse_deg for r in results])],
         ["1:10 cars, pd-hef over kinematic", mean([r.hybrid.rmse_deg / r.kinematic_deg for r in small])],
     ]
     return table(["figure", "value"], lines)

@@ -55,7 +55,7 @@ def test_inspect_log(dlc: Path, mapping: Path, tmp_path: Path, kind: Any) -> Non
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_car_load(sample_logs_dir: Path, kind: Any) -> None:
-    car = pdhef.Car.load(kind(sample_logs_dir / "vehicle.toml"), network=kind("many-cars"), intervals=kind("none"))
+    car = pdhef.Car.load(kind(sample_logs_dir / "vehicle.toml"), network=kind("default"), intervals=kind("none"))
     assert car.network is not None
     assert car.intervals is None
 
@@ -98,7 +98,7 @@ def test_what_learns(name: str, sample_logs_dir: Path, tmp_path: Path) -> None:
     ends = set()
     for number, kind in enumerate([*KINDS, *KINDS]):
         arguments = kind(log) if number < len(KINDS) else [kind(log)]
-        config = pdhef.RunConfig(car=kind("saloon"), network=kind("many-cars"))
+        config = pdhef.RunConfig(car=kind("saloon"), network=kind("none"))
         output = tmp_path / f"{number}" / "out"
         ends.add(_ends(lambda: command(arguments, kind(output), _settings(name, config))))  # noqa: B023
     assert len(ends) == 1

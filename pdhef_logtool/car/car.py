@@ -351,7 +351,7 @@ def _with_parts(car: Car, folder: Path) -> Car:
     if fit is not None and fit.physics_sha256 == physics_sha256(car.datasheet):
         car = car.with_fit(fit)
     elif fit is not None:
-        notes.append(_stale(FIT_FILE, f"{VEHICLE_FILE} has changed since", "identify"))
+        notes.append(_stale(FIT_FILE, f"{VEHICLE_FILE} has changed since", "calibrate"))
     tuned = _part(folder / NOISE_FILE, Noise)
     noise: Mapping[str, FilterNoise] = {} if tuned is None else tuned.filter
     if stale := [n for n, of_filter in noise.items() if not car.owns_noise(n, of_filter)]:

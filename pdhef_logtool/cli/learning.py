@@ -22,7 +22,6 @@ commands = typer.Typer()
     commands,
     "pdhef learn drives/ --car guess.toml -o mycar",
     "pdhef learn logs/ --car guess.toml -o mycar --without-truth",
-    "pdhef learn lap.mcap --car guess.toml -o mycar --end 150 --stages identify",
     "pdhef learn logs/ --car mycar -o mycar --stages noise",
     "pdhef learn lap.mcap --car mycar -o mycar --start 155 --stages gain",
     "pdhef learn logs/ --car mycar -o mycar --stages intervals",
@@ -30,9 +29,9 @@ commands = typer.Typer()
     notes="""The default stage, teach, uses all driving with ground truth, from 20 s on: it learns the prior for the
 calibration of every later drive, and the residual that physics then lacks (taught.json in the car's folder).
 
-Other stages, in the order in which they run: identify (tyres, steering, biases, roll gradient, model structure),
-noise (filter noise by search), gain (residual gain of the network), network (fine-tuning of the network and its
-residual gain), intervals (95 % confidence intervals).
+Other stages, in the order in which they run: calibrate (the car by the sensors of several logs, as
+--without-truth), noise (filter noise by search), gain (residual gain of the network), network (training of the
+network and its residual gain), intervals (95 % confidence intervals).
 
 Several stages share the drives: they are split into training, validation and test; a stage that raises the validation
 error is undone; the test part is scored once (learn.md in the car's folder). An interrupted call continues when it is
@@ -50,7 +49,7 @@ def learn(
     config: RunConfig,
     stages: Annotated[str | None, Option(help="Comma-separated stages. Default: teach.")] = None,
     without_truth: Annotated[
-        bool, Option("--without-truth", help="Identify from the sensors of several logs; ground truth is not read.")
+        bool, Option("--without-truth", help="Stage calibrate: the sensors of several logs; ground truth is not read.")
     ] = False,
     estimators: Annotated[
         str | None,
@@ -72,23 +71,24 @@ def learn(
     fresh: Annotated[bool, Option("--fresh", help="Forget the results of an earlier call with this output.")] = False,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Learn the prior and the residual of a car, or run stages that identify, tune, train and calibrate it."""
-    from pdhef_logtool.learning.drives import IDENTIFY, TEACH, LearnSettings
+    """Learn the prior and the residual of a car, or run stages that tune, train and calibrate it."""
+    from pdhef_logtool.learning.drives import CALIBRATE, TEACH, LearnSettings
     from pdhef_logtool.learning.engine import learn as run_stages
 
     if estimators is not None:
         config = replace(config, estimators=options.split_names(estimators))
-    names = (TEACH,) if stages is None else options.split_names(stages)
+    names = (CALIBRATE if without_truth else TEACH,) if stages is None else options.split_names(stages)
+    if without_truth and names != (CALIBRATE,):
+        raise UsageError(expected=f"stage {CALIBRATE} alone", got=str(stages), where="--without-truth")
     settings = LearnSettings(
         config=config,
-        stages=(IDENTIFY,) if without_truth and stages is None else names,
+        stages=names,
         holdout=holdout,
         trials=trials,
         spread=vary,
         seed=seed,
         split=split,
         any_split=any_split,
-        without_truth=without_truth,
     )
     with console.reporter() as reporter:
         result = run_stages(logs, output, settings, fresh=fresh, reporter=reporter)
@@ -165,7 +165,7 @@ def train(
     *,
     dataset: Annotated[Path, Argument(metavar="DATASET", help="Dataset folder of pdhef extract.")],
     output: Annotated[Path, Option("--output", "-o", help="Folder for the model bundle.")],
-    init: Annotated[Path | None, Option(help="Model bundle to fine-tune, many-cars, or default.")] = None,
+    init: Annotated[Path | None, Option(help="Model bundle to fine-tune, or default.")] = None,
     baselines: Annotated[bool, Option("--baselines", help="Train pure-lstm and linear-regression instead.")] = False,
     paper: Annotated[bool, Option("--paper", help="Use the hyperparameters of Table 1 of the paper.")] = False,
     seed: Annotated[int, Option(help="Seed of initial weights, sample order and dropout.")] = 0,
@@ -196,11 +196,11 @@ def train(
 @options.command(
     commands,
     "pdhef retrain logs/ -o retrained --car mycar --jobs 2",
-    "pdhef retrain logs/ -o retrained --car mycar --plan plan.toml --strict",
+    "pdhef retrain logs/ -o retrained --car mycar --strict",
     "pdhef run new/ -o out --car retrained/accepted/0123456789ab/car",
     panel=panels.LEARN,
     notes="Each drive is assigned to one split: training, validation, residual gain, intervals, or the final "
-    "comparison. If pdhef compare finds the candidate worse than the car on the last split, it is written to "
+    "comparison. If its error on the last split is significantly higher than that of the car, it is written to "
     "rejected/ with the reason, otherwise to accepted/ (docs/retrain.md). Repeating the command processes new drives "
     "only. Exit codes: 0 accepted, 3 accepted with drives left out, 4 rejected.",
     shared="cache sensors friction",
@@ -211,16 +211,9 @@ def retrain(
     logs: options.TruthLogs,
     output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Folder for stages and candidates.")],
     config: RunConfig,
-    plan: Annotated[
-        Path | None,
-        Option(
-            metavar="FILE",
-            help='Validation plan with baseline = "run" as the gate. Default: RMSE of pd-hef at most 2 % higher.',
-        ),
-    ] = None,
-    strict: Annotated[bool, Option("--strict", help="An inconclusive requirement rejects the candidate.")] = False,
+    strict: Annotated[bool, Option("--strict", help="Reject unless the lower error is significant.")] = False,
     init: Annotated[
-        Path | None, Option(help="Model bundle to start from, many-cars, or none. Default: the car's, else many-cars.")
+        Path | None, Option(help="Model bundle to start from, or none. Default: the car's, else a new one.")
     ] = None,
     epochs: Annotated[int | None, Option(help="Number of epochs. Default: 15; 30 without --init.")] = None,
     seed: Annotated[int, Option(help="Seed of the split, of training and of bootstraps.")] = 0,
@@ -228,13 +221,10 @@ def retrain(
     as_json: options.JsonFlag = False,
 ) -> None:
     """Train a car's network further; accept it only if it is not worse on held-out drives."""
-    from pdhef_logtool.evaluation.validation_plan import load_plan
-    from pdhef_logtool.learning.retrain.retrain_command import DEFAULT_GATE, RetrainSettings
+    from pdhef_logtool.learning.retrain.retrain_command import RetrainSettings
     from pdhef_logtool.learning.retrain.retrain_command import retrain as train_again
-    from pdhef_logtool.results.gate import gate_of
 
-    asked = DEFAULT_GATE if plan is None else gate_of(load_plan(plan))
-    settings = RetrainSettings(config=config, seed=seed, init=init, epochs=epochs, gate=asked, strict=strict)
+    settings = RetrainSettings(config=config, seed=seed, init=init, epochs=epochs, strict=strict)
     with console.reporter() as reporter:
         result = train_again(logs, output, settings, jobs=jobs, reporter=reporter)
     console.finish(result, learning_tables.render_retraining, as_json)

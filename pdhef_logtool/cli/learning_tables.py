@@ -51,31 +51,15 @@ def render_learning(result: LearnResult, console: Console) -> None:
     console.print(f"car in {result.car}; evidence of each decision in learn.md there", soft_wrap=True)
 
 
-def _identification(figures: Mapping[str, Any], console: Console) -> None:
-    """Print the identified parameters with their uncertainty, and the error of the filter with them."""
-    if calibration := figures.get("self_calibration"):
-        parameters = table("parameter", ">value", ">± 1 sd", ">prior", ">± 1 sd", "unit")
-        for p in calibration["parameters"]:
-            spread = [f"{100.0 * s:.0f} %" if p["log"] else f"{s:.2g}" for s in (p["sd"], p["prior_sd"])]
-            parameters.add_row(p["name"], f"{p['value']:.5g}", spread[0], f"{p['prior']:.4g}", spread[1], p["unit"])
-        console.print(parameters)
-        console.print(f"  {calibration['text']}")
-        return
-    parameters = table("parameter", ">value", ">95 % interval", ">prior", "unit", "")
-    for p in figures["parameters"]:
-        interval = f"{p['low95']:.4g} to {p['high95']:.4g}" if p["excited"] else "-"
-        remark = "filter noise" if p["noise"] else "" if p["excited"] else "not observable, kept"
-        parameters.add_row(p["name"], f"{p['value']:.5g}", interval, f"{p['prior']:.4g}", p["unit"], remark)
+def _calibration(figures: Mapping[str, Any], console: Console) -> None:
+    """Print the calibrated parameters with their uncertainty."""
+    calibration = figures["self_calibration"]
+    parameters = table("parameter", ">value", ">± 1 sd", ">prior", ">± 1 sd", "unit")
+    for p in calibration["parameters"]:
+        spread = [f"{100.0 * s:.0f} %" if p["log"] else f"{s:.2g}" for s in (p["sd"], p["prior_sd"])]
+        parameters.add_row(p["name"], f"{p['value']:.5g}", spread[0], f"{p['prior']:.4g}", spread[1], p["unit"])
     console.print(parameters)
-    console.print()
-    console.print("sideslip RMSE")
-    names = [name for name in figures["sideslip_rmse_deg"][0] if name not in ("part", "seconds")]
-    scores = table("part", ">seconds", *(f">{name}" for name in names))
-    for score in figures["sideslip_rmse_deg"]:
-        scores.add_row(score["part"], f"{score['seconds']:.1f}", *(f"{score[name]:.3f}°" for name in names))
-    console.print(scores)
-    for note in figures["notes"]:
-        console.print(f"  {note}")
+    console.print(f"  {calibration['text']}")
 
 
 def _noise(figures: Mapping[str, Any], console: Console) -> None:
@@ -137,13 +121,14 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
         drives.add_row(d["name"], cell(d["seconds"], digits=0), *errors, d["calibration"])
     console.print(drives)
     console.print(f"  {figures['evidence']}")
-    if not figures["prior_used"]:
-        console.print("  no prior: with each drive left out, the prior of the others raises the error significantly")
+    console.print(
+        f"  the prior of the tyres lowers the error of other driving with probability {figures['prior_support']:.2f}"
+    )
     for text in figures["more"]:
         console.print(f"  {text}")
 
 
-_RENDER = {"teach": _teaching, "identify": _identification, "noise": _noise, "gain": _gain, "intervals": _intervals}
+_RENDER = {"teach": _teaching, "calibrate": _calibration, "noise": _noise, "gain": _gain, "intervals": _intervals}
 
 
 def render_extraction(result: ExtractResult, console: Console) -> None:
@@ -229,18 +214,10 @@ def render_baselines(result: BaselinesResult, console: Console) -> None:
 
 def render_retraining(result: RetrainResult, console: Console) -> None:
     """Print what the candidate identified on, how it compares on the drives of the gate, and the verdict."""
-    from pdhef_logtool.results.gate import Figure
-
     document = result.document
     _print_cells(document["cells"], None, console)
     console.print(", ".join(f"{role}: {count}" for role, count in document["drives_by_role"].items()) + " drives")
-    shown = table("figure", ">drives", ">median change", ">95 % interval", "verdict", fold=1)
-    for row in document["comparison"]["figures"]:
-        figure = Figure(row["signal"], row["metric"], row["segment"], row["estimator"])
-        median, low, high = ("-" if row[k] is None else f"{100.0 * row[k]:+.1f} %" for k in ("median", "low", "high"))
-        shown.add_row(figure.label, str(row["drives"]), median, f"{low} to {high}", row["verdict"])
-    console.print("the candidate against the car as it is, on the drives of the gate")
-    console.print(shown)
+    console.print(f"the candidate against the car as it is: {document['gate']['text']}")
     if document["judged"] > 1:
         console.print(
             f"{document['judged']} candidates were judged on these drives: the more there are, the less it shows"

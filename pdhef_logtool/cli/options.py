@@ -133,7 +133,7 @@ _OPTIONS: dict[str, Any] = {
     ],
     "network": Annotated[
         _File,
-        Option(help="Network folder, default, many-cars or none. Default: the car's.", rich_help_panel=ESTIMATION),
+        Option(help="Network folder, default or none. Default: the car's.", rich_help_panel=ESTIMATION),
     ],
     "calibrate": Annotated[
         _Text,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 _LEARN = "pdhef learn LOG... --car CAR -o CAR --stages"
 REMOVED = {
-    "identify": f"{_LEARN} identify",
+    "identify": "pdhef learn LOG... --car CAR -o CAR",
     "tune": f"{_LEARN} noise",
     "trust": f"{_LEARN} gain",
     "calibrate": f"{_LEARN} intervals",

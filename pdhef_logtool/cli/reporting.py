@@ -27,7 +27,6 @@ commands = typer.Typer()
     "pdhef report out",
     "pdhef report out --open",
     "pdhef report out --by car --by vehicle_id",
-    "pdhef report out --png --json",
     "pdhef report out --pdf",
     panel=panels.READ,
 )
@@ -38,7 +37,6 @@ def report(
         list[str] | None,
         Option(metavar="KEY", help="Breakdown of the drives: car, folder, or a metadata key. Repeatable."),
     ] = None,
-    png: Annotated[bool, Option("--png", help="Write each figure as a PNG file too, to logs/LOG/figures.")] = False,
     pdf: Annotated[
         bool, Option("--pdf", help="Write report.pdf to sign: cover, verdicts, drives, input hashes. Needs Chromium.")
     ] = False,
@@ -54,7 +52,7 @@ def report(
         raise UsageError(expected="--pdf", got="--positions alone", where="--positions")
     open_run(output)  # before the folder is held, which would make it where it is missing
     with OutputFolder(output, (LOGS,)), console.reporter() as reporter:
-        result = write_pages(open_run(output), reporter.progress, png=png, by=by or ())
+        result = write_pages(open_run(output), reporter.progress, by=by or ())
         if pdf:
             from pdhef_logtool.reports.pdf import write_pdf
 
@@ -85,6 +83,4 @@ def _render(result: WrittenPages, out: Console) -> None:
         out.print(str(result.pdf), soft_wrap=True)
     for page in (*result.pages, result.fleet):
         if page.file is not None:
-            number = f"{len(page.pictures)} picture{'s' if len(page.pictures) > 1 else ''}"
-            pictures = f" and {number} in {page.pictures[0].parent}" if page.pictures else ""
-            out.print(f"{page.file}{pictures}", soft_wrap=True)
+            out.print(str(page.file), soft_wrap=True)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from pdhef_logtool.evaluation.metrics.metric import Metric
-    from pdhef_logtool.results.run_report import LogOutcome
     from pdhef_logtool.results.summary import RunSummary
     from pdhef_logtool.runs.pipeline import RunResult
 
@@ -85,18 +83,20 @@ def render_run(result: RunResult, console: Console) -> None:
     """Print the selected estimate of each log, or of several in one table, and where the outputs are."""
     reports_by_log = [(r, all_printable(r.report)) for r in result.results]
     reports = [report for _, report in reports_by_log if report is not None]
-    alike = None
-    console.print(_head(result, reports))
+    is_joint = len(reports) > 1 and all(report["answer"] for report in reports)
+    assumed = _assumed(reports)
+    console.print(_head(result, reports, assumed))
     console.print()
-    if len(reports) > 1 and all(report["answer"] for report in reports):
-        alike = _Alike.of(reports)
+    if is_joint:
         console.print(_joint_table(reports))
-        console.print(_lines({key: text for key, text in alike.texts.items() if key != "assumed"}))
-        for remark, logs in alike.remarks.items():
-            _print_indented(f"note: {remark} ({', '.join(logs)})", console)
         console.print()
     for log_result, report in reports_by_log:
-        _render_log(log_result.outcome, report, console, alike)
+        if report is None:
+            console.print(Text.assemble((log_result.outcome.log, "bold"), f"  {log_result.outcome.outcome}\n"))
+        elif is_joint:
+            _render_one_of_several(report, assumed, console)
+        else:
+            _render_log(report, console)
     if result.requirements is not None:
         render_plan(result.requirements, console)
     failed = [r for r, report in reports_by_log if report is None]
@@ -108,7 +108,13 @@ def render_run(result: RunResult, console: Console) -> None:
         _print_outputs(result.place, console)
 
 
-def _head(result: RunResult, reports: Sequence[_Report]) -> Table:
+def _assumed(reports: Sequence[_Report]) -> list[str]:
+    """Return what is assumed of all logs, clause by clause."""
+    first, *others = [_clauses(_texts(report), "assumed") for report in reports] or [[]]
+    return [clause for clause in first if all(clause in clauses for clauses in others)]
+
+
+def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str]) -> Table:
     """Return the three lines that come first: result, assumptions, next step."""
     verdicts = None if result.requirements is None else plan_line(result.requirements)
     texts = [_texts(report) for report in reports]
@@ -116,9 +122,7 @@ def _head(result: RunResult, reports: Sequence[_Report]) -> Table:
         said = texts[0].get("result", "nothing was estimated") if texts else "the log failed"
     else:
         said = f"{len(reports)} of {len(result.results)} logs are done"
-    clauses = [_clauses("assumed", t.get("assumed", "")) for t in texts]
-    assumed = [c for c in clauses[0] if c and all(c in others for others in clauses)] if clauses else []
-    steps = list(dict.fromkeys(c for t in texts for c in _clauses("next", t.get("next", "")) if c))
+    steps = list(dict.fromkeys(c for t in texts for c in _clauses(t, "next")))
     given = result.requirements
     if given is not None and given.plan.file:
         ordered = sorted(given.verdicts, key=lambda v: v.outcome != "FAIL")
@@ -200,58 +204,43 @@ def _print_outputs(output: Path | str, console: Console) -> None:
     console.print(f"outputs in {output}{shown}", soft_wrap=True)
 
 
-@dataclass(frozen=True, slots=True)
-class _Alike:
-    """What is stated once of several logs: ``texts`` of all of them, ``remarks`` with the logs that they are on."""
-
-    texts: Mapping[str, str]
-    remarks: Mapping[str, Sequence[str]]
-
-    @classmethod
-    def of(cls, reports: Sequence[_Report]) -> _Alike:
-        first, *others = [{key: _clauses(key, text) for key, text in _texts(report).items()} for report in reports]
-        by_remark: dict[str, list[str]] = {}
-        for report in reports:
-            for remark in report["remarks"]:
-                by_remark.setdefault(remark, []).append(report["log"]["name"])
-        return cls(
-            {
-                key: "; ".join(common)
-                for key, clauses in first.items()
-                if (common := [c for c in clauses if all(c in texts.get(key, ()) for texts in others)])
-            },
-            {remark: logs for remark, logs in by_remark.items() if len(logs) > 1},
-        )
-
-
 def _print_indented(line: str | Text, console: Console) -> None:
     console.print(Padding(line, (0, 0, 0, 2)))
 
 
-def _render_log(outcome: LogOutcome, report: _Report | None, console: Console, alike: _Alike | None) -> None:
-    """Print one log; ``alike`` is what was stated of several, whose joint table has the figures. None: it is alone."""
-    if report is None:
-        console.print(Text.assemble((outcome.log, "bold"), f"  {outcome.outcome}\n"))
-        return
-    answer = report["answer"]
+def _render_one_of_several(report: _Report, assumed: Sequence[str], console: Console) -> None:
+    """Print what the joint table does not show of a log and a user acts on; ``assumed`` is stated of all logs."""
+    texts, main = _texts(report), report["answer"]["main"]
+    is_scored = _figures(report).get((main, "sideslip_rad", "all", "rmse")) is not None
+    rest = [clause for clause in _clauses(texts, "assumed") if clause not in assumed]
+    shown = {} if is_scored or "result" not in texts else {"result": texts["result"]}
+    shown |= {"assumed": "; ".join(rest)} if rest else {}
+    lines = [*_failed_checks(report, undecided=False), *_losses(report, notes=False)]
+    if shown or lines or report["answer"]["named"]:
+        _print_log(report, "", lines, shown, (), console, tabled=report["answer"]["named"])
+
+
+def _render_log(report: _Report, console: Console) -> None:
+    """Print the log of a run of one."""
+    about = f"  {report['log']['kind']}, {report['log']['duration_s']:.1f} s"
     texts = _texts(report)
-    if alike is not None:
-        scored = _figures(report).get((answer["main"], "sideslip_rad", "all", "rmse")) is not None
-        texts = {
-            key: "; ".join(clauses_here)
-            for key, text in texts.items()
-            if not (scored and key in ("result", "band"))
-            and (clauses_here := [c for c in _clauses(key, text) if c not in _clauses(key, alike.texts.get(key, ""))])
-        }
-    else:
-        texts = _below_head(texts)
-    tabled = alike is None or answer["named"]
-    above = list(_failed_checks(report))
-    below = list(_below(report, () if alike is None else alike.remarks, tabled=tabled))
-    if not (tabled or texts or above or below):
-        return
-    about = f"  {report['log']['kind']}, {report['log']['duration_s']:.1f} s" if alike is None else ""
-    console.print(Text.assemble((outcome.log, "bold"), about))
+    later = _clauses(texts, "next")[1:]  # the head has the first one
+    shown = {key: text for key, text in texts.items() if key not in ("result", "assumed", "next")}
+    shown |= {"next": "; ".join(later)} if later else {}
+    _print_log(report, about, [*_failed_checks(report)], shown, [*_below(report)], console, tabled=True)
+
+
+def _print_log(  # positional: what both callers have at hand
+    report: _Report,
+    about: str,
+    above: Sequence[str | Text],
+    texts: Mapping[str, str],
+    below: Sequence[str],
+    console: Console,
+    *,
+    tabled: bool,
+) -> None:
+    console.print(Text.assemble((report["log"]["name"], "bold"), about))
     for line in above:
         _print_indented(line, console)
     if texts:
@@ -276,16 +265,9 @@ def _texts(report: _Report) -> dict[str, str]:
     return {key: texts[key] for key in _TEXTS if texts.get(key)}
 
 
-def _below_head(texts: Mapping[str, str]) -> dict[str, str]:
-    """Return the texts that the three lines above do not have: of the next steps those behind the first."""
-    rest = {key: text for key, text in texts.items() if key not in ("result", "assumed", "next")}
-    later = _clauses("next", texts.get("next", ""))[1:]
-    return {**rest, **({"next": "; ".join(later)} if later else {})}
-
-
-def _clauses(key: str, text: str) -> list[str]:
-    """Return what is given of several logs once, clause by clause where the clauses are independent."""
-    return text.split("; ") if key in ("assumed", "next") else [text]
+def _clauses(texts: Mapping[str, str], key: str) -> list[str]:
+    """Return the clauses of a text, which are independent."""
+    return texts[key].split("; ") if texts.get(key) else []
 
 
 def _lines(texts: Mapping[str, str]) -> Table:
@@ -297,20 +279,21 @@ def _lines(texts: Mapping[str, str]) -> Table:
     return lines
 
 
-def _failed_checks(report: _Report) -> Iterable[str | Text]:
+def _failed_checks(report: _Report, *, undecided: bool = True) -> Iterable[str | Text]:
     checks = report.get("checks") or []
     for check in checks:
         if check["verdict"] == "failed":
             waived = "waived" if check["waived"] else "FAILED"
-            remedy = f" Remedy: {check['remedy']}" if check["remedy"] else ""
-            yield Text.assemble(f"{waived}: ", (check["name"], "bold"), f": {check['evidence']}{remedy}")
-    undecided = [check["name"] for check in checks if check["verdict"] == "undecided"]
-    if undecided:
-        more = f" and {len(undecided) - _MOST_UNDECIDED} more" if len(undecided) > _MOST_UNDECIDED else ""
-        yield f"not decided by this drive: {', '.join(undecided[:_MOST_UNDECIDED])}{more}"
+            remedy = f". Remedy: {check['remedy']}" if check["remedy"] else ""
+            evidence = check["evidence"].rstrip(".")
+            yield Text.assemble(f"{waived}: ", (check["name"], "bold"), f": {evidence}{remedy}")
+    names = [check["name"] for check in checks if check["verdict"] == "undecided"]
+    if names and undecided:
+        more = f" and {len(names) - _MOST_UNDECIDED} more" if len(names) > _MOST_UNDECIDED else ""
+        yield f"not decided by this drive: {', '.join(names[:_MOST_UNDECIDED])}{more}"
 
 
-def _losses(report: _Report) -> Iterable[str]:
+def _losses(report: _Report, *, notes: bool = True) -> Iterable[str]:
     """Yield what of the input was lost, then what else is known of it; what several channels share is once."""
     where: dict[tuple[str, str, str], list[str]] = {}
     for loss in sorted(report["losses"], key=lambda x: x["severity"] != "lost"):
@@ -322,16 +305,18 @@ def _losses(report: _Report) -> Iterable[str]:
             span = f", {(loss['start_ns'] - start) / 1e9:.2f} to {(loss['end_ns'] - start) / 1e9:.2f} s"
         where.setdefault(("lost" if loss["severity"] == "lost" else "note", what, span), []).append(loss["where"])
     for (word, what, span), places in where.items():
+        if word == "note" and not notes:
+            continue
         more = f" and {len(places) - _MOST_PLACES} more" if len(places) > _MOST_PLACES else ""
         yield f"{word}: {what} ({', '.join(places[:_MOST_PLACES])}{more}{span})"
 
 
-def _below(report: _Report, above: Container[str], *, tabled: bool) -> Iterable[str]:
-    """Yield what belongs below the table: its marks, what did not run, what happened, and remarks not yet ``above``."""
+def _below(report: _Report) -> Iterable[str]:
+    """Yield what belongs below the table: its marks, what did not run, what happened, and remarks."""
     shown = _shown(report)
-    if tabled and report["truth"]["not_independent"]:
+    if report["truth"]["not_independent"]:
         yield "† the ground truth is an input or the estimate itself: no independent check"
-    if tabled and any(not e["causal"] for e in shown):
+    if any(not e["causal"] for e in shown):
         yield "* not causal: uses what was measured later"
     skipped: dict[str, list[str]] = {}
     for estimator in report["estimators"]:
@@ -348,7 +333,7 @@ def _below(report: _Report, above: Container[str], *, tabled: bool) -> Iterable[
     for event, names in happened.items():
         yield f"{', '.join(names)}: {event}"
     yield from _losses(report)
-    yield from (f"note: {remark}" for remark in report["remarks"] if remark not in above)
+    yield from (f"note: {remark}" for remark in report["remarks"])
 
 
 def _shown(report: _Report) -> list[Mapping[str, Any]]:

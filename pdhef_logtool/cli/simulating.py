@@ -107,7 +107,7 @@ def _incomplete(missing: str) -> UsageError:
 @options.command(
     commands,
     "pdhef simulate suite --count 200 --seed 1 --jobs 2 -o logs/",
-    "pdhef simulate suite --count 2000 --vehicles randomised -o many_cars/",
+    "pdhef simulate suite --count 2000 --vehicles randomised -o fleet/",
     panel=panels.TOOLS,
     notes="manifest.json contains, for each drive, its split and the command that reproduces it.",
     name="simulate suite",

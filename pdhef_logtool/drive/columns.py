@@ -12,8 +12,9 @@ GRID_S = 0.05
 #: −3 dB at 1 Hz: noise and vibration go, manoeuvres stay.
 LOW_PASS_HZ = 1.0
 #: Samples are interpolated onto the grid over gaps of at most this length, and of this many of their periods.
-MAX_GAP_S = 0.5
-MAX_GAP_PERIODS = 2.5
+MAX_GAP_S, MAX_GAP_PERIODS = 0.5, 2.5
+#: Values so many times farther out than all but 1 % of a channel, for so short a time, are spikes.
+SPIKE_RANGES, SPIKE_S = 5.0, 0.2
 #: A slower sensor does not resolve manoeuvres.
 LONGEST_GAP_S = 2.5
 #: 21 hours about the middle of the drive; it keeps one wrong stamp from making a grid of decades.
@@ -21,13 +22,12 @@ MAX_CELLS = 1_500_000
 #: Blocks of the parts of a drive that must agree: longer than a manoeuvre, and at most so many.
 PART_S, MOST_PARTS = 4.0, 12
 #: Moving: faster than this share of the drive's fast speeds, and than a speed that is too low for the relations.
-MOVING_SHARE = 0.25
-MIN_MOVING_M_S = 0.5
+MOVING_SHARE, MIN_MOVING_M_S = 0.25, 0.5
 
 
 def columns_on_grid(channels: Mapping[str, Channel]) -> dict[str, FloatArray]:
     """Return the scalar channels with two samples or more on one even grid of ``GRID_S``; NaN in gaps."""
-    used = {n: c for n, c in channels.items() if len(c) > 1 and c.values.ndim == 1}
+    used = {n: without_spikes(c) for n, c in channels.items() if len(c) > 1 and c.values.ndim == 1}
     if not used:
         return {}
     start = min(int(c.stamps_ns[0]) for c in used.values())
@@ -37,6 +37,19 @@ def columns_on_grid(channels: Mapping[str, Channel]) -> dict[str, FloatArray]:
     start, end = max(start, middle - reach), min(end, middle + reach)
     cells = int((end - start) * 1e-9 / GRID_S) + 1
     return {name: _on_grid(channel, start, cells) for name, channel in used.items()}
+
+
+def without_spikes(channel: Channel) -> Channel:
+    """Return a channel without samples far outside its range for a moment: a bus's mark of invalid values."""
+    low, middle, high = np.quantile(channel.values, (0.005, 0.5, 0.995))
+    with np.errstate(over="ignore"):
+        out = np.abs(channel.values - middle) > SPIKE_RANGES * max(high - low, 1e-9)
+    if not out.any():
+        return channel
+    first, end = np.flatnonzero(np.diff(out, prepend=False, append=False)).reshape(-1, 2).T
+    short = channel.stamps_ns[end - 1] - channel.stamps_ns[first] < SPIKE_S * 1e9
+    out &= np.repeat(short, end - first)[np.cumsum(out) - 1]
+    return channel.take(~out)
 
 
 def derivative(column: FloatArray) -> FloatArray:
@@ -50,6 +63,16 @@ def earlier(column: FloatArray, by_s: float) -> FloatArray:
     """Return a column of the grid as it would be had it come earlier; NaN where that is not known."""
     cell = np.arange(column.shape[0]) + by_s / GRID_S
     return column if by_s == 0.0 else np.interp(cell, np.arange(column.shape[0]), column, left=np.nan, right=np.nan)
+
+
+def running_mean(column: FloatArray, over_s: float) -> FloatArray:
+    """Return the mean of a column of the grid over a time about each cell; NaN beside gaps."""
+    half = min(round(0.5 * over_s / GRID_S), column.shape[0] - 1)
+    known = np.flatnonzero(np.isfinite(column))
+    if known.size:  # the ends of what is known go on
+        column = column.copy()
+        column[: known[0]], column[known[-1] + 1 :] = column[known[0]], column[known[-1]]
+    return np.convolve(np.pad(column, half, "edge"), np.full(2 * half + 1, 1.0 / (2 * half + 1)), "valid")
 
 
 def moving_at(speed: FloatArray, least_m_s: float = MIN_MOVING_M_S) -> BoolArray:
@@ -72,6 +95,13 @@ def halves(cells: int) -> tuple[BoolArray, BoolArray]:
 def independent_samples(count: int) -> float:
     """Return how many independent samples this many cells contain after the low pass."""
     return 2.0 * LOW_PASS_HZ * GRID_S * count
+
+
+def student(blocks: int) -> float:
+    """Return the factor of a standard error from so many blocks, at least two, whose ± 1.96 contains 95 %."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(blocks - 1, 0.975)) / 1.96
 
 
 def _on_grid(channel: Channel, start_ns: int, cells: int) -> FloatArray:

@@ -108,7 +108,9 @@ class Relation:
             size = np.log(np.abs(gains))
         room = -math.log(max(abs(self.correlation), 1e-3))  # between the two regressions
         # Blocks that differ show what changes: sliding, a frequency that tyres do not follow; a unit does not change.
-        apart = float(np.std(size)) if np.isfinite(size).all() else 0.0
+        # A drive without blocks slides for all of it: they would differ by half of what the relation leaves.
+        unknown = 0.5 * math.sqrt(max(0.0, 1.0 - self.correlation**2))
+        apart = float(np.std(size)) if self.blocks and np.isfinite(size).all() else unknown
         beyond = np.maximum(np.maximum(low - room - size, size - high - room), 0.0)
         energy = 0.5 * (beyond / math.hypot(EDGE if self.decides_unit else WIDE_EDGE, apart)) ** 2
         if self.decides_unit:
@@ -250,7 +252,8 @@ def _together(names: Sequence[str]) -> str:
 def units_of(name: str) -> list[tuple[float, str]]:
     """Return by what a signal is off where its unit is taken for another, and how that is stated."""
     to_radians = [(DEGREE, "is in degrees"), (1.0 / DEGREE, "was converted from degrees twice")]
-    of_speeds = [(1.0 / 3.6, "is in km/h"), (3.6, "was converted from km/h twice"), (0.44704, "is in mph")]
+    of_speeds = [(1.0 / 3.6, "is in km/h"), (3.6, "was converted from km/h twice")]
+    of_speeds += [(0.44704, "is in mph"), (1.0 / 0.44704, "was converted from mph twice")]
     if name in ("yaw_rate_rad_s", "sideslip_rad"):
         return to_radians
     if name == "steer_rad":
@@ -286,13 +289,15 @@ def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
     return resolved | (names & {"truth.vy_m_s"} if "truth.vx_m_s" in resolved else set())
 
 
-def block_gains(reference: FloatArray, measured: FloatArray, blocks: int = BLOCKS) -> tuple[float, ...]:
+def block_gains(reference: FloatArray, measured: FloatArray, blocks: int) -> tuple[float, ...]:
     """Return the gains [at most ``blocks``] of blocks of a drive that move; each has its own means: a bank, a bias.
 
     Parameters
     ----------
     reference, measured : float64 [N], known everywhere.
     """
+    if blocks < 3:
+        return ()
     least, gains = 0.3 * float(reference.std()), []
     for a, b in zip(np.array_split(reference, blocks), np.array_split(measured, blocks), strict=True):
         spread_a, spread_b = float(a.std()), float(b.std())

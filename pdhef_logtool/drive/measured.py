@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
-from pdhef_logtool.drive.columns import columns_on_grid, derivative, halves
+from pdhef_logtool.drive.columns import columns_on_grid, derivative, halves, median_known, moving_at
 from pdhef_logtool.drive.hypotheses import Posterior, Relation, known_hypotheses, posterior
 from pdhef_logtool.drive.relations import direction_rate, measured_relations
 from pdhef_logtool.drive.truth import TruthTrack, channel_of
@@ -17,7 +17,8 @@ from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
 
 #: Name of the column that is the mean of the wheel speeds.
 WHEEL_SPEEDS = "wheel_speeds"
-#: A wheel differs from the others by less in a bend; one that spins or locks counts with this.
+#: A wheel differs from the others by less in a bend. One that spins or locks counts with this; of two that do, or of
+#: four, no wheel shows how fast the car was.
 SPIN_SHARE = 0.2
 
 _TRUTH = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m")
@@ -144,6 +145,11 @@ def _speed_of(columns: dict[str, FloatArray]) -> str | None:
         if wheels:
             middle = np.median(wheels, axis=0)
             most = SPIN_SHARE * np.abs(middle)
-            columns[WHEEL_SPEEDS] = np.asarray(np.mean(np.clip(wheels, middle - most, middle + most), axis=0))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                shares = wheels / np.where(moving_at(middle), middle, np.nan)
+                typical = [[median_known(share)] for share in shares]  # of another unit, a wheel does not spin
+                spin = np.sum(np.abs(shares - typical) > SPIN_SHARE, axis=0) > 1
+            mean = np.mean(np.clip(wheels, middle - most, middle + most), axis=0)
+            columns[WHEEL_SPEEDS] = np.asarray(np.where(spin, np.nan, mean))
             return WHEEL_SPEEDS
     return "truth.vx_m_s" if "truth.vx_m_s" in columns else None

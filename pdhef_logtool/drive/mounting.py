@@ -71,15 +71,13 @@ GAIN_RANGE = (0.5, 2.0)
 MAX_ERROR_DEG = 7.5
 #: A mounting is a multiple of 90 degrees unless it is off by more than this, and than three standard errors. Grade,
 #: crossfall and bias are 0.5 m/s^2 over 20 s, 3 degrees of tilt; sideslip makes 2 degrees of yaw.
-TILT_DEG = 4.0
-YAW_DEG = 4.0
+TURNED_DEG = 4.0
 ASKEW_SAMPLES = 40.0
 #: A part of a drive shows less than all of it; where the parts are too short, all of it must show more.
 PART_CORRELATION = 0.6
 #: Two parts of a drive that differ by more do not agree; beyond the number the regressors are not separable.
 PARTS_AGREE_DEG, PARTS_AGREE_SHARE, WELL_CONDITIONED = 2.5, 0.2, 60.0
-ASKEW_CORRELATION = 0.85
-ASKEW_ERROR_DEG = 1.5
+ASKEW_CORRELATION, ASKEW_ERROR_DEG = 0.85, 1.5
 #: Correlation of the yaw rate with another measurement of it that settles its sign.
 SIGN_CORRELATION = 0.5
 #: And that makes a sensor left-handed: the wheels' difference turns round where a car pushes over its front tyres.
@@ -171,8 +169,7 @@ class _Turn:
     """A rotation for one choice of the vertical, and how well it explains the drive.
 
     ``sign``: correlation of the yaw rate with another measurement of it, 0: none. ``along``: the speed alone shows
-    which way is forward. ``askew_deg``, ``tilts``: of two parts of the drive, what is left of the angle about the
-    vertical beside grade, steady sideslip and unequal gains, and the vertical [3] in the rotation's axes.
+    which way is forward. ``f``, ``driven``, ``rate``, ``use``: the drive that it explains.
     """
 
     rotation: FloatArray
@@ -183,8 +180,10 @@ class _Turn:
     along: bool
     fits: bool
     evidence: str
-    askew_deg: tuple[float, float] | None = None
-    tilts: tuple[FloatArray, FloatArray] | None = None
+    f: FloatArray
+    driven: ComplexArray
+    rate: FloatArray
+    use: BoolArray
 
 
 def _ups(f: FloatArray, w: FloatArray, named: FloatArray) -> list[FloatArray]:
@@ -253,52 +252,7 @@ def _turned(
     )
     fits = correlation >= MIN_CORRELATION and GAIN_RANGE[0] <= gain <= GAIN_RANGE[1] and error <= MAX_ERROR_DEG
     along = _along(rotation[0] @ f[use].T, driven[use].real)
-    askew = _askew_of_parts(f, rotation, driven, rate, use)
-    tilts = _tilts_of_parts(f, rotation, driven, use)
-    return _Turn(rotation, correlation, error, samples, sign, along, fits, evidence, askew, tilts)
-
-
-def _askew_of_parts(
-    f: FloatArray, rotation: FloatArray, driven: ComplexArray, rate: FloatArray, use: BoolArray
-) -> tuple[float, float] | None:
-    """Return for two parts of a drive the angle that a rotation still lacks, degrees; None if one does not show it.
-
-    Steady sideslip turns the acceleration by an angle that grows with lateral acceleration and curvature, roll and
-    pitch change the gains of both axes, and grade and crossfall are slow: each has its regressor, or is a constant.
-    """
-    z = f @ rotation[0] + 1j * (f @ rotation[1])
-    lateral = driven.imag
-    regressors = [driven, driven.conj(), 1j * derivative(rate), lateral**2, rate**2, np.ones_like(driven)]
-    matrix = np.stack([np.asarray(r, np.complex128) for r in regressors], axis=1)
-    angles = []
-    for part in halves(len(use)):
-        usable = use & part & np.isfinite(matrix).all(axis=1) & np.isfinite(z)
-        size = np.linalg.norm(matrix[usable], axis=0)
-        if independent_samples(int(np.count_nonzero(usable))) < ASKEW_SAMPLES / 2.0 or (size <= 1e-9).any():
-            return None
-        scaled = matrix[usable] / size
-        if np.linalg.cond(scaled) > WELL_CONDITIONED:
-            return None
-        angles.append(math.degrees(float(np.angle(np.linalg.lstsq(scaled, z[usable], rcond=None)[0][0]))))
-    return angles[0], angles[1]
-
-
-def _tilts_of_parts(
-    f: FloatArray, rotation: FloatArray, driven: ComplexArray, use: BoolArray
-) -> tuple[FloatArray, FloatArray] | None:
-    """Return the vertical [3] of two parts of a drive in the axes of a rotation."""
-    ups = []
-    for part in halves(len(use)):
-        usable = use & part
-        if not usable.any():
-            return None
-        level = rotation @ f[usable].T
-        along = (driven[usable].real, driven[usable].imag)
-        # The body rolls and pitches with what it drives: a tilt is what is left without driving.
-        slopes = [float(np.cov(d, z)[0, 1] / max(float(d.var()), 1e-9)) for d, z in zip(along, level[:2], strict=True)]
-        mean = level.mean(axis=1) - np.array([*(s * d.mean() for s, d in zip(slopes, along, strict=True)), 0.0])
-        ups.append(np.asarray(mean / max(float(np.linalg.norm(mean)), 1e-9)))
-    return ups[0], ups[1]
+    return _Turn(rotation, correlation, error, samples, sign, along, fits, evidence, f, driven, rate, use)
 
 
 def _along(measured: FloatArray, driven: FloatArray) -> bool:
@@ -332,8 +286,8 @@ def _snapped(turn: _Turn) -> FloatArray:
     is_precise = turn.correlation >= ASKEW_CORRELATION and turn.error_deg <= ASKEW_ERROR_DEG
     if not is_precise or turn.samples < ASKEW_SAMPLES:
         return step
-    is_turned = abs(yaw) > max(YAW_DEG, 3.0 * turn.error_deg) and _parts_turned(turn, yaw)
-    if tilt > TILT_DEG and _parts_tilted(turn):
+    is_turned = abs(yaw) > max(TURNED_DEG, 3.0 * turn.error_deg) and _parts_turned(turn, yaw)
+    if tilt > TURNED_DEG and _parts_tilted(turn):
         return rotation if is_turned else _level_only(rest) @ step
     if not is_turned:
         return step
@@ -342,24 +296,48 @@ def _snapped(turn: _Turn) -> FloatArray:
 
 
 def _parts_turned(turn: _Turn, yaw_deg: float) -> bool:
-    """Return whether two parts of the drive agree that the sensor is turned about the vertical."""
-    if turn.askew_deg is None:
-        return False
-    first, second = (yaw_deg - angle for angle in turn.askew_deg)
-    return min(first * np.sign(yaw_deg), second * np.sign(yaw_deg)) > YAW_DEG and abs(first - second) < max(
+    """Return whether two parts of the drive agree that the sensor is turned about the vertical.
+
+    Steady sideslip turns the acceleration by an angle that grows with lateral acceleration and curvature, roll and
+    pitch change the gains of both axes, and grade and crossfall are slow: each has its regressor, or is a constant.
+    """
+    z, lateral = turn.f @ (turn.rotation[0] + 1j * turn.rotation[1]), turn.driven.imag
+    regressors = [turn.driven, turn.driven.conj(), 1j * derivative(turn.rate), lateral**2, turn.rate**2]
+    matrix = np.stack([*regressors, np.ones_like(z)], axis=1)
+    angles = []
+    for part in halves(len(z)):
+        usable = turn.use & part & np.isfinite(matrix).all(axis=1) & np.isfinite(z)
+        size = np.linalg.norm(matrix[usable], axis=0)
+        if independent_samples(int(np.count_nonzero(usable))) < ASKEW_SAMPLES / 2.0 or (size <= 1e-9).any():
+            return False
+        scaled = matrix[usable] / size
+        if np.linalg.cond(scaled) > WELL_CONDITIONED:
+            return False
+        left = np.linalg.lstsq(scaled, z[usable], rcond=None)[0][0]
+        angles.append((yaw_deg - math.degrees(float(np.angle(left)))) * np.sign(yaw_deg))
+    return min(angles) > TURNED_DEG and abs(angles[0] - angles[1]) < max(
         PARTS_AGREE_DEG, PARTS_AGREE_SHARE * abs(yaw_deg)
     )
 
 
 def _parts_tilted(turn: _Turn) -> bool:
     """Return whether two parts of the drive agree that the sensor is tilted: one of them may be a hill."""
-    if turn.tilts is None:
-        return False
-    step = nearest_step(turn.rotation)
-    first, second = (step @ turn.rotation.T @ up for up in turn.tilts)
-    tilts = [math.degrees(math.acos(float(np.clip(up[2], -1.0, 1.0)))) for up in (first, second)]
-    apart = math.degrees(math.acos(float(np.clip(first @ second, -1.0, 1.0))))
-    return min(tilts) > TILT_DEG and apart < PARTS_AGREE_DEG
+    ups = []
+    for part in halves(len(turn.use)):
+        usable = turn.use & part
+        if not usable.any():
+            return False
+        level, driven = turn.rotation @ turn.f[usable].T, turn.driven[usable]
+        # The body rolls and pitches with what it drives: a tilt is what is left without driving.
+        along = [
+            (d, float(np.cov(d, z)[0, 1] / max(float(d.var()), 1e-9)))
+            for d, z in zip((driven.real, driven.imag), level[:2], strict=True)
+        ]
+        mean = level.mean(axis=1) - np.array([*(slope * d.mean() for d, slope in along), 0.0])
+        ups.append(nearest_step(turn.rotation) @ turn.rotation.T @ (mean / max(float(np.linalg.norm(mean)), 1e-9)))
+    first, second = ups
+    tilts = [math.degrees(math.acos(float(np.clip(x, -1.0, 1.0)))) for x in (first[2], second[2], first @ second)]
+    return min(tilts[:2]) > TURNED_DEG and tilts[2] < PARTS_AGREE_DEG
 
 
 def _level_only(rest: FloatArray) -> FloatArray:

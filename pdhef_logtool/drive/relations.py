@@ -112,7 +112,9 @@ def compare(
     correlation = float(np.mean(a * b) / (spread_a * spread_b))
     # The ratio of the spreads lies between the two regressions, as the position of the noise is unknown.
     gain = float(np.copysign(spread_b / spread_a, correlation))
-    return [Relation(text, powers, correlation, gain, expected, samples, both, blocks=block_gains(a, b))]
+    # A block of fewer samples has a gain by chance.
+    blocks = block_gains(a, b, min(BLOCKS, int(samples / MIN_SAMPLES)))
+    return [Relation(text, powers, correlation, gain, expected, samples, both, blocks=blocks)]
 
 
 def compare_at_ease(
@@ -158,6 +160,10 @@ def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace
         reference = derivative(pace)
         relations += compare(text, powers, reference, forward, straight, GAIN_RANGE, moves=moves, either=False)
     return relations
+
+
+def _best(either: list[Relation]) -> list[Relation]:
+    return sorted(either, key=lambda r: (r.tells and r.accepts(), abs(r.correlation)))[-1:]
 
 
 def gentle_at(lateral_m_s2: FloatArray, moving: BoolArray) -> BoolArray:
@@ -215,18 +221,20 @@ def _steering(
     with np.errstate(divide="ignore", invalid="ignore"):
         curvature = yaw / speed
     gentle = gentle_at(yaw * speed, moving)
+    driven = yaw[gentle & np.isfinite(yaw)]
+    is_turning = driven.size > 0 and bool(driven.std() > max(MOVES_RAD_S, abs(driven.mean())))  # to both sides
     for name, lengths, typical in _lengths(speed, vehicle):
         steer = columns.get(name)
         if steer is None:
             continue
         powers = {name: 1, "yaw_rate_rad_s": -1, speed_name: 1}
         either = [
-            replace(r, typical=typical)
+            replace(r, typical=typical, moves=r.correlation == 0.0 and is_turning)  # a dead sensor
             for use in (moving, gentle)
             for r in compare(f"{name} against yaw_rate_rad_s / speed", powers, curvature, steer, use, lengths)
         ]
         # Sliding front tyres break the relation, and so does noise where there is little of it.
-        relations += sorted(either, key=lambda r: (r.tells and r.accepts(), abs(r.correlation)))[-1:]
+        relations += _best(either)
         if "ay_m_s2" in columns:
             powers = {"ay_m_s2": 1, name: -1, speed_name: -2}
             text = f"ay_m_s2 against {name} x speed^2"
@@ -310,7 +318,7 @@ def _wheel_differences(columns: Mapping[str, FloatArray], speed_name: str, speed
                     f"{text} against {name}", powers, columns[name], factor * difference, (moving, gentle), TRACK_M
                 )
             ]
-            relations += sorted(either, key=lambda r: abs(r.correlation))[-1:]
+            relations += _best(either)
     return relations
 
 
@@ -339,7 +347,7 @@ def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relat
                 for turning in turnings
                 for r in compare_at_ease(text, {name: 1}, turning, columns[name], use, GAIN_RANGE, moves=MOVES_RAD_S)
             ]
-            relations += sorted(either, key=lambda r: (r.tells and r.accepts(), abs(r.correlation)))[-1:]
+            relations += _best(either)
     return relations
 
 
@@ -390,13 +398,17 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     text = f"{subject} against curvature, apart from a_y"
     powers = {subject: 1, turning: -1} | ({} if of_vx else {"truth.vx_m_s": 1})
     rolling = _partial(text, powers, curvature, sideslip, [ay, ones], gentle, SEPARABLE)
+    (low, most), lever = REAR_LEVER_M, REAR_LEVER_TYPICAL_M
     return [
         *(replace(r, expected=SIDESLIP_RANGE) for r in kinematic),
         *(replace(r, expected=COMPLIANCE_RAD_PER_M_S2) for r in handling),
+        # Blocks that only agree on the sign leave the size open.
         *(
-            replace(r, expected=REAR_LEVER_M, typical=REAR_LEVER_TYPICAL_M)
+            replace(
+                r, expected=(low, most if abs(r.correlation) > MIN_PARTIAL_CORRELATION else 2 * most), typical=lever
+            )
             for r in rolling
-            if abs(r.gain) > REAR_LEVER_M[0]
+            if abs(r.gain) > low
         ),
     ]
 
@@ -423,4 +435,9 @@ def _partial(
     if np.nanstd(left[0]) < separable * np.std(reference[finite]):
         return []
     relations = compare(text, powers, left[0], left[1], finite, (0.0, np.inf))
-    return [replace(r, least_correlation=MIN_PARTIAL_CORRELATION) for r in relations]
+    return [r if _is_steady(r) else replace(r, least_correlation=MIN_PARTIAL_CORRELATION) for r in relations]
+
+
+def _is_steady(relation: Relation) -> bool:
+    """Return whether so many blocks of the drive agree on the sign that it is no chance."""
+    return len(relation.blocks) > BLOCKS // 2 and len(set(np.sign(relation.blocks))) == 1

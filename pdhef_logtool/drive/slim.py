@@ -78,7 +78,7 @@ def write_slim(drive: Drive, target: Path) -> ReducedRecord:
     with McapLogWriter(target, profile="ros1" if log.kind == "rosbag1" else "ros2") as writer:
         copy_topics(writer, log, topics)
         for name, path in zip(drive.chosen.dbc_names, () if mapping.can is None else mapping.can.dbc, strict=True):
-            writer.attachment(name, "text/plain", path.read_bytes(), 0, 0)
+            writer.attachment(name, "text/plain", log.definition(path).read_bytes(), 0, 0)
         write_record(writer, record)
     return record
 

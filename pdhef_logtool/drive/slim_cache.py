@@ -101,7 +101,7 @@ class SlimCache:
         if self.mapping is not None:
             if self.mapping.can is not None:
                 mapping["can"]["dbc"] = ""
-            mapping["dbc"] = [hash_log(path) for path in self.mapping.dbc]
+            mapping["dbc"] = [hash_log(path) if path.exists() else path.name for path in self.mapping.dbc]
             vendors = vendors if self.mapping.fill_recognised or self.mapping.recorders else ""
         msgs = "" if self.options.msgs is None else hash_log(self.options.msgs)
         said = (FORMAT, __version__, mapping, vendors, msgs, self.options.prefer_truth, self.options.budget)

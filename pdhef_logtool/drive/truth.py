@@ -24,7 +24,7 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.columns import median_known
-from pdhef_logtool.drive.correlation import GAP_PERIODS, find_shift, on_common_grid
+from pdhef_logtool.drive.correlation import GAP_PERIODS, find_shift, on_common_grid, shift_error
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.mapping.records import VECTOR_COLUMNS
 from pdhef_logtool.records.geometry import (
@@ -351,8 +351,7 @@ def estimate_truth_latency(
     """Estimate the ground-truth latency against the gyro by cross-correlation of detrended yaw rates.
 
     Both are sampled on a common grid, linear trends removed; the correlation coefficient is computed at each shift
-    within ± ``MAX_LATENCY_S`` over the samples that both have, and its peak refined by a parabola. The standard error
-    is that of a shift, σ_residual / (rms(ṙ) √N), with N counted at 10 Hz as if the residual were coloured up to there.
+    within ± ``MAX_LATENCY_S`` over the samples that both have, and its peak refined by a parabola.
     Reliable: correlation of at least 0.8, standard error of at most ``max_error_s``, peak inside the range.
 
     Parameters
@@ -376,10 +375,7 @@ def estimate_truth_latency(
     shift = find_shift(grid, MAX_LATENCY_S)
     if not np.isfinite(shift.correlation):
         return refuse("no yaw motion")
-    motion = float(np.sqrt(np.nanmean(np.gradient(grid.b, grid.step_s) ** 2)))
-    residual = float(np.nanstd(grid.b)) * float(np.sqrt(max(1.0 - shift.correlation**2, 0.0)))
-    count = max(1.0, grid.both * min(grid.step_s * 10.0, 1.0))
-    error = residual / (motion * float(np.sqrt(count))) if motion > 0 else float("inf")
+    error = shift_error(grid, shift.shift_s)
     if not shift.inside:
         return refuse("no peak within the range searched", shift.correlation, error)
     if shift.correlation < 0.8:
@@ -417,6 +413,8 @@ def dependent_signals(
                     f"{truth.source} equals the {role} {signal} ({channel.source}) on {share:.1%} of its samples"
                 )
                 break
+    if "sideslip_rad" not in truth_channels and {"vx_m_s", "vy_m_s"} <= dependent.keys():
+        dependent["sideslip_rad"] = "v_x and v_y are not"
     return dependent
 
 

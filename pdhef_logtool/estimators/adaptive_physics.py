@@ -14,9 +14,8 @@ measurements, forgotten within seconds, the weight of filter i is
     w_i ∝ exp(Λ_i)
 
 which is multiple-model estimation (Magill 1965) for what comes and goes. A cure has a filter where the car's driving
-has shown that it is worth having (:mod:`~pdhef_logtool.learning.car.physics_fit`), and nowhere else: a state more
-always fits something. A car without identified parts has F1 alone. The output is the mixture of all, its covariance
-with their differences.
+has shown that it is worth having, and nowhere else: a state more always fits something. A car without identified parts
+has F1 alone. The output is the mixture of all, its covariance with their differences.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
 """``physics`` and ``pd-hef`` with GNSS velocity, as late as it arrives (docs/method.md#gnss).
 
-One antenna shows a course and no heading. Hypotheses differ in how certain v_y of the filter is: as it is, good in the
-linear range of the tyres, or poor. For each a Kalman filter estimates [v_y, heading, bias of a_y, bias of the gyro,
-error of the filter's v_y, antenna x, delay of the receiver] from
+One antenna shows a course and no heading. Hypotheses differ in how certain v_y of the filter is (as it is, good in the
+linear range of the tyres, poor) and the position of the accelerometer. For each a Kalman filter estimates [v_y,
+heading, bias of a_y, bias of the gyro, error of the filter's v_y, antenna x, delay of the receiver, accelerometer x]
+from
 
-    v̇_y = a_y − b − (r − b_r) v_x,   ψ̇ = r − b_r,   v_y,filter = v_y − S v_x d,
+    v̇_y = a_y − b − x ṙ − (r − b_r) v_x,   ψ̇ = r − b_r,   v_y,filter = v_y − S v_x d,
 
 with d of unit variance and S the uncertainty of the hypothesis, and from the velocity of the antenna across the
 heading. That of a late sample is the present one less what the sensors have integrated since. The likelihood of the
@@ -35,11 +36,12 @@ from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumn
 from pdhef_logtool.records.tracks import StateTrack
 
 #: Entries of the state of a hypothesis.
-VY, HEADING, AY_BIAS, RATE_BIAS, LAW_ERROR, ANTENNA_X, DELAY, STATES = range(8)
+VY, HEADING, AY_BIAS, RATE_BIAS, LAW_ERROR, ANTENNA_X, DELAY, IMU_X, STATES = range(9)
 #: Uncertainty of the filter's v_y over v_x in degrees: constant, per m/s², per m/s³, per square of the share of the
-#: grip beyond the linear range; and the logarithm of the prior weight. Chosen on simulated drives.
-HYPOTHESES = ((0.01, 0.0, 0.0, 0.0, 0.0), (0.06, 0.02, 0.02, 30.0, -5.5), (1.0, 0.3, 0.1, 30.0, -9.0),
-              (10.0, 0.3, 0.1, 30.0, -13.0))  # fmt: skip
+#: grip beyond the linear range; the logarithm of the prior weight; and 1-sigma of the accelerometer's position in m.
+#: Chosen on simulated drives. A position that is free in every hypothesis would explain what the tyres lack.
+HYPOTHESES = ((0.01, 0.0, 0.0, 0.0, 0.0, 0.0), (0.06, 0.02, 0.02, 30.0, -5.5, 0.0), (0.06, 0.02, 0.02, 30.0, -6.5, 1.0),
+              (1.0, 0.3, 0.1, 30.0, -9.0, 0.3), (10.0, 0.3, 0.1, 30.0, -13.0, 0.3))  # fmt: skip
 #: 1-sigma of a GNSS velocity at least, m/s; gate in 1-sigmas; speed below which there is no course, m/s.
 GNSS_STD_M_S, GATE_SIGMA, LEAST_SPEED_M_S = 0.1, 4.0, 3.0
 #: Time constant with which the likelihood is forgotten, s; jump of GNSS against the sensors, m/s; time after which a
@@ -54,7 +56,7 @@ HEADING_STD, RATE_STD, DELAY_STD_S = 0.1, 0.002, 0.03
 AY_NOISE, RATE_NOISE, RATE_WALK, KNOT_S, FLOOR_M_S = 0.05, 0.001, 1e-5, 0.05, 0.005
 #: Low passes of a_y: for its size and its derivative, s. GNSS samples that can wait for their arrival.
 SIZE_S, SLOPE_S, QUEUE = 0.05, 0.1, 64
-_LAW = np.array(HYPOTHESES) * np.array([math.pi / 180.0] * 4 + [1.0])
+_LAW = np.array(HYPOTHESES) * np.array([math.pi / 180.0] * 4 + [1.0, 1.0])
 
 # Entries of what all hypotheses share, and columns of a sample that waits.
 _CLOCK, _RATE, _AY, _VX, _TURNED, _MOVED, _SIZE, _SLOPE = range(8)
@@ -63,7 +65,7 @@ _EAST, _NORTH, _AT, _ARRIVAL, _TURNED_THEN, _MOVED_THEN, _RATE_THEN, _AY_THEN, _
 
 
 class Aiding(NamedTuple):
-    """Memory between windows: states [H, 7] and covariances, facts of each, what they share, samples that wait.
+    """Memory between windows: states [H, 8] and covariances, facts of each, what they share, samples that wait.
 
     ``facts`` [H, 3]: evidence, whether the heading is known, and since when samples are rejected (−1: they are not).
     """
@@ -76,32 +78,36 @@ class Aiding(NamedTuple):
 
 
 @njit(cache=True)
-def _start(memory, antenna, vy, vx):  # type: ignore[no-untyped-def]
+def _start(memory, antenna, imu_x_m, vy, vx):  # type: ignore[no-untyped-def]
     x, P, facts, shared, _ = memory
     x[:], P[:], facts[:], shared[:] = 0.0, 0.0, 0.0, 0.0
-    x[:, VY], x[:, ANTENNA_X], facts[:, 2] = vy, antenna[0], -1.0
+    x[:, VY], x[:, ANTENNA_X], x[:, IMU_X], facts[:, 2] = vy, antenna[0], imu_x_m, -1.0
     for i in range(x.shape[0]):
         P[i, VY, VY] = 0.01 + (_LAW[i, 0] * vx) ** 2
         P[i, AY_BIAS, AY_BIAS], P[i, RATE_BIAS, RATE_BIAS] = BIAS_M_S2**2, RATE_STD**2
         P[i, LAW_ERROR, LAW_ERROR] = 1.0
         P[i, ANTENNA_X, ANTENNA_X], P[i, DELAY, DELAY] = antenna[1] ** 2, DELAY_STD_S**2
+        P[i, IMU_X, IMU_X] = _LAW[i, 5] ** 2
 
 
 @njit(cache=True)
 def _advance(x, P, dt, vx, ay_slope, kinematic):  # type: ignore[no-untyped-def]
-    """Move one hypothesis by a step in which the sensors integrate to ``kinematic`` (v_y at heading rate r, angle)."""
+    """Move one hypothesis by a step; ``kinematic``: what the sensors integrate to.
+
+    Of v_y at their place, at constant heading, of the heading, and of the yaw rate.
+    """
     kept, law_kept = math.exp(-dt / BIAS_S), math.exp(-dt / LAW_S)
-    x[VY] += kinematic[0] - dt * (x[AY_BIAS] - x[RATE_BIAS] * vx)
+    x[VY] += kinematic[0] - dt * (x[AY_BIAS] - x[RATE_BIAS] * vx) - kinematic[2] * x[IMU_X]
     x[HEADING] += kinematic[1] - dt * x[RATE_BIAS]
     x[AY_BIAS] *= kept
     x[LAW_ERROR] *= law_kept
     for j in range(STATES):  # F P, then (F P) Fᵀ
-        P[VY, j] += dt * (vx * P[RATE_BIAS, j] - P[AY_BIAS, j])
+        P[VY, j] += dt * (vx * P[RATE_BIAS, j] - P[AY_BIAS, j]) - kinematic[2] * P[IMU_X, j]
         P[HEADING, j] -= dt * P[RATE_BIAS, j]
         P[AY_BIAS, j] *= kept
         P[LAW_ERROR, j] *= law_kept
     for i in range(STATES):
-        P[i, VY] += dt * (vx * P[i, RATE_BIAS] - P[i, AY_BIAS])
+        P[i, VY] += dt * (vx * P[i, RATE_BIAS] - P[i, AY_BIAS]) - kinematic[2] * P[i, IMU_X]
         P[i, HEADING] -= dt * P[i, RATE_BIAS]
         P[i, AY_BIAS] *= kept
         P[i, LAW_ERROR] *= law_kept
@@ -122,7 +128,15 @@ def _residual(x, P, facts, sample, shared, h):  # type: ignore[no-untyped-def]
     turned = shared[_TURNED] - sample[_TURNED_THEN] - age * x[RATE_BIAS]
     moved = shared[_MOVED] - sample[_MOVED_THEN] - age * (x[AY_BIAS] - x[RATE_BIAS] * shared[_VX])
     rate = sample[_RATE_THEN] - x[RATE_BIAS]
-    left = x[VY] - moved + x[ANTENNA_X] * rate - x[DELAY] * sample[_AY_THEN] - ANTENNA_HEIGHT_M * sample[_ROLL_THEN]
+    sped = shared[_RATE] - sample[_RATE_THEN]
+    left = (
+        x[VY]
+        - moved
+        + x[IMU_X] * sped
+        + x[ANTENNA_X] * rate
+        - x[DELAY] * sample[_AY_THEN]
+        - ANTENNA_HEIGHT_M * sample[_ROLL_THEN]
+    )
     if facts[1] == 0.0:
         x[HEADING] = math.atan2(sample[_NORTH], sample[_EAST]) - math.atan2(left, shared[_VX]) + turned
         P[HEADING, :], P[:, HEADING] = 0.0, 0.0
@@ -130,7 +144,7 @@ def _residual(x, P, facts, sample, shared, h):  # type: ignore[no-untyped-def]
     c, s = math.cos(x[HEADING] - turned), math.sin(x[HEADING] - turned)
     h[:] = 0.0
     h[VY], h[HEADING] = 1.0, c * sample[_EAST] + s * sample[_NORTH]
-    h[ANTENNA_X], h[DELAY] = rate, -sample[_AY_THEN]
+    h[ANTENNA_X], h[DELAY], h[IMU_X] = rate, -sample[_AY_THEN], sped
     white = sample[_STD] ** 2 + (BIAS_M_S2 * age) ** 2
     variance = white
     for i in range(STATES):
@@ -193,10 +207,9 @@ def _queue(columns, k, p_roll, shared, waiting):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _share(columns, k, dt, body, shared):  # type: ignore[no-untyped-def]
+def _share(columns, k, dt, roll_gradient, grip_m_s2, shared):  # type: ignore[no-untyped-def]
     """Move what the hypotheses share to step k; return what the sensors integrate to, and the slope of a_y."""
     ay, rate, vx = columns[2:5]
-    roll_gradient, imu_x_m, grip_m_s2 = body
     new_rate = rate[k] if math.isfinite(rate[k]) else shared[_RATE]
     new_ay = ay[k] / (1.0 + GRAVITY_M_S2 * roll_gradient) if math.isfinite(ay[k]) else shared[_AY]
     if dt == 0.0:
@@ -204,7 +217,7 @@ def _share(columns, k, dt, body, shared):  # type: ignore[no-untyped-def]
     r = 0.5 * (shared[_RATE] + new_rate)
     turned = dt * r
     moved = dt * (0.5 * (shared[_AY] + new_ay) - r * 0.5 * (shared[_VX] + vx[k]))
-    moved -= imu_x_m * (new_rate - shared[_RATE])
+    sped = new_rate - shared[_RATE]
     before = shared[_SLOPE]
     shared[_SIZE] += (new_ay - shared[_SIZE]) * (1.0 - math.exp(-dt / SIZE_S))
     shared[_SLOPE] += (new_ay - shared[_SLOPE]) * (1.0 - math.exp(-dt / SLOPE_S))
@@ -213,7 +226,7 @@ def _share(columns, k, dt, body, shared):  # type: ignore[no-untyped-def]
     shared[_TURNED] += turned
     shared[_MOVED] += moved
     shared[_RATE], shared[_AY], shared[_VX] = new_rate, new_ay, vx[k]
-    return (moved, turned), (shared[_SLOPE] - before) / dt if dt > 0.0 else 0.0
+    return (moved, turned, sped), (shared[_SLOPE] - before) / dt if dt > 0.0 else 0.0
 
 
 @njit(cache=True)
@@ -246,10 +259,10 @@ def _aid(columns, body, antenna, memory, out):  # type: ignore[no-untyped-def]
             continue
         dt = dts[k]
         if shared[_RUNS] == 0.0 or not dt <= RESTART_GAP_S:
-            _start(memory, antenna, vy[k], vx[k])
+            _start(memory, antenna, body[1], vy[k], vx[k])
             dt = 0.0
         shared[_RUNS] = 1.0
-        kinematic, ay_slope = _share(columns, k, dt, body, shared)
+        kinematic, ay_slope = _share(columns, k, dt, body[0], body[2], shared)
         beyond = max(0.0, shared[_GRIP] - LINEAR_SHARE) ** 2
         for i in range(x.shape[0]):
             if dt == 0.0:

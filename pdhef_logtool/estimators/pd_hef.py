@@ -17,6 +17,7 @@ from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_s
 
 #: The preset that takes what the car was taught.
 PRESET = "pd-hef"
+FILTER_ALONE = "taught residual not used: it is fitted to the error of the filter, and a smoother has another"
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
@@ -56,7 +57,8 @@ def build_smoothed(name: str, car: Car, options: Options) -> SmoothedPhysics:
     filtered = _with_network(name, car, options)
     factors = SMOOTHING if car.fitted_physics is None else car.fitted_physics.smoothing
     filtered = replace(filtered, physics=for_smoothing(filtered.physics, factors))
-    return SmoothedPhysics(filtered, name=name, notes=(NOT_CAUSAL, *filtered.notes))
+    taught = () if car.taught is None or car.taught.residual is None else (FILTER_ALONE,)
+    return SmoothedPhysics(filtered, name=name, notes=(NOT_CAUSAL, *taught, *filtered.notes))
 
 
 def _trust(name: str, car: Car, options: Options) -> tuple[float, tuple[str, ...]]:

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pdhef_logtool.car.nominal_model import ModelParameters, dynamic_share, model_parameters
-from pdhef_logtool.car.parts import LIMIT_GAIN, PHYSICS, FilterNoise
+from pdhef_logtool.car.parts import PHYSICS, FilterNoise
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, corrected_anew
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.compiled.vectors import (
@@ -96,6 +96,8 @@ UNKNOWN_STEER_STD, MAX_STEER_STD, UNKNOWN_STEER_WALK = 0.1, 0.2, 0.2
 #: Beyond this share of the grip, the largest of about the last ``LIMIT_TIME_S``, tyre models are least certain
 #: (docs/method.md#limit).
 LINEAR_SHARE, LIMIT_TIME_S = 0.36, 0.5
+#: ``limit_gain`` of a vehicle file that neither ground truth nor calibration has validated, chosen on simulated drives.
+FILE_LIMIT_GAIN = 8.0
 
 #: The column of a block of points that contains the centre.
 _CENTRE = AY_BIAS
@@ -664,9 +666,9 @@ def physics_filter(
 def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:
     """Return ``physics`` of a car, with what was found through it and its noise where the car has them.
 
-    A car without identified parts has none: a static single track with the sensors' noise, and :data:`LIMIT_GAIN` if
-    no drive with ground truth has validated it. What tuned noise leaves out of the process noise is what was found
-    through the filter.
+    A car without identified parts has none: a static single track with the sensors' noise. If no drive with ground
+    truth has validated it, its axle forces lag, for only forces that are states can depart from the tyre model, and do
+    so at the limit. What tuned noise leaves out of the process noise is what was found through the filter.
     """
     vehicle, noise = car.physics_vehicle, car.noise.get(PHYSICS)
     if noise is not None and car.fitted_physics is not None:
@@ -674,5 +676,6 @@ def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:
         noise = noise.model_copy(update={"q_std": (*noise.q_std, *fitted[len(noise.q_std) :])})
     physics = physics_filter(vehicle, noise, use_speed=use_speed)
     if noise is None and not car.has_evidence:
-        physics = replace(physics, limit_gain=LIMIT_GAIN)
+        lagging = vehicle.model_copy(update={"physics": vehicle.physics.model_copy(update={"lag": True})})
+        physics = replace(physics, vehicle=lagging, limit_gain=FILE_LIMIT_GAIN)
     return physics if vehicle == car.vehicle else replace(physics, read_with=car.vehicle)

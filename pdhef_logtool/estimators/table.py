@@ -72,7 +72,7 @@ class Spec:
         if preset_of(self.name) in SELF_CALIBRATED:
             car = car.calibrated_car
         if self.needs_noise and self.name not in car.noise:
-            return f"the car has no noise for {self.name}; pdhef learn --stages identify finds it"
+            return f"the car has no noise for {self.name}; pdhef learn --stages noise finds it"
         if self.network in ("", "optional"):
             return ""
         if car.network is None:

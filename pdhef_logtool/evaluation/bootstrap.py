@@ -22,17 +22,16 @@ class Interval:
 
 
 def block_bootstrap_interval(
-    errors: FloatArray, stamps_ns: IntArray, *, block_s: float = 10.0, n: int = 1000, seed: int = 0, level: float = 0.95
+    errors: FloatArray, stamps_ns: IntArray, *, block_s: float = 10.0, n: int = 1000, seed: int = 0
 ) -> Interval:
-    """Return the RMSE of errors [N] with its interval.
+    """Return the RMSE of errors [N] with its 95 % interval.
 
     Parameters
     ----------
     errors : NaN does not count. stamps_ns : int64 [N]. block_s : at least 10 s (docs/method.md#evaluation). n :
     resamples.
     """
-    sums, counts, _ = block_sums([errors], stamps_ns, block_s)
-    return rmse_interval(sums, counts, n=n, seed=seed, level=level)
+    return _interval(lambda s, c: np.sqrt(s[0] / c), *_block_sums([errors], stamps_ns, block_s), n, seed)
 
 
 def block_bootstrap_difference(
@@ -43,46 +42,28 @@ def block_bootstrap_difference(
     block_s: float = 10.0,
     n: int = 1000,
     seed: int = 0,
-    level: float = 0.95,
 ) -> Interval:
     """Return RMSE(errors) − RMSE(other_errors) with its interval, paired: only stamps where both are known, same draws.
 
     ``errors`` belong to the better estimator when the whole interval lies below 0.
     """
-    sums, counts, _ = block_sums([errors, other_errors], stamps_ns, block_s)
-    return rmse_difference_interval(sums, counts, n=n, seed=seed, level=level)
+    return rmse_difference_interval(*_block_sums([errors, other_errors], stamps_ns, block_s), n=n, seed=seed)
 
 
-def rmse_interval(
-    sums: FloatArray, counts: FloatArray, *, n: int = 1000, seed: int = 0, level: float = 0.95
-) -> Interval:
-    """Return the RMSE of blocks with its interval; ``sums`` of squares [1, K] and ``counts`` [K] of samples."""
-    return _interval(lambda s, c: np.sqrt(s[0] / c), sums, counts, n, seed, level)
-
-
-def rmse_difference_interval(
-    sums: FloatArray, counts: FloatArray, *, n: int = 1000, seed: int = 0, level: float = 0.95
-) -> Interval:
+def rmse_difference_interval(sums: FloatArray, counts: FloatArray, *, n: int = 1000, seed: int = 0) -> Interval:
     """Return the first RMSE less the second with its interval; ``sums`` of squares [2, K], ``counts`` [K]."""
-    return _interval(lambda s, c: np.sqrt(s[0] / c) - np.sqrt(s[1] / c), sums, counts, n, seed, level)
+    return _interval(lambda s, c: np.sqrt(s[0] / c) - np.sqrt(s[1] / c), sums, counts, n, seed)
 
 
-def block_sums(
-    columns: list[FloatArray], stamps_ns: IntArray, block_s: float = 10.0, first_ns: int | None = None
-) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return sums of squares [columns, K], samples [K] and numbers [K] of the blocks that contain any.
-
-    Blocks contain only stamps at which all columns [N] are known, and are counted from ``first_ns``; None: the first of
-    those stamps.
-    """
+def _block_sums(columns: list[FloatArray], stamps_ns: IntArray, block_s: float) -> tuple[FloatArray, FloatArray]:
+    """Return sums of squares [columns, K] and samples [K] of the blocks that contain stamps with all columns [N]."""
     finite = np.isfinite(np.stack(columns)).all(axis=0)
     if not finite.any():
-        return np.zeros((len(columns), 0)), np.zeros(0), np.zeros(0, dtype=np.int64)
-    start_ns = stamps_ns[finite][0] if first_ns is None else first_ns
-    block = (stamps_ns[finite] - start_ns) // round(block_s * 1e9)
-    numbers, index = np.unique(block, return_inverse=True)
+        return np.zeros((len(columns), 0)), np.zeros(0)
+    block = (stamps_ns[finite] - stamps_ns[finite][0]) // round(block_s * 1e9)
+    _, index = np.unique(block, return_inverse=True)
     sums = [np.bincount(index, weights=c[finite] ** 2) for c in columns]
-    return np.stack(sums).astype(np.float64), np.bincount(index).astype(np.float64), numbers
+    return np.stack(sums).astype(np.float64), np.bincount(index).astype(np.float64)
 
 
 def _interval(
@@ -91,7 +72,6 @@ def _interval(
     counts: FloatArray,
     n: int,
     seed: int,
-    level: float,
 ) -> Interval:
     nan = float("nan")
     blocks = int(counts.shape[0])
@@ -102,7 +82,7 @@ def _interval(
         return Interval(value, nan, nan, blocks)
     draws = _draws(blocks, n, seed)
     resampled = statistic(sums @ draws.T, draws @ counts)
-    low, high = np.percentile(resampled, [50.0 * (1.0 - level), 50.0 * (1.0 + level)])
+    low, high = np.percentile(resampled, [2.5, 97.5])
     return Interval(value, float(low), float(high), blocks)
 
 

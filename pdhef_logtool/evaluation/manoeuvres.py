@@ -65,8 +65,10 @@ class ManoeuvreRules:
     slalom_hz, sweep_ratio : highest frequency of a slalom; least growth of the frequency in a sweep.
     side_m : distance over which the path of a double lane change is beyond half its offset (24 m on the course of ISO
         3888-2, 52 m on that of ISO 3888-1). severe_m, severe_m_s : below both it is ISO 3888-2.
-    offset_m, returned, one_sided, heading_left : of a double lane change: sideways offset; largest shares of it left at
-        the end and gone to the other side; largest share of the peak heading that is left at the end.
+    offset_m, exit_m, returned, overshoot, sideways, heading_left : of a double lane change: sideways offset; length of
+        the exit lane; largest share of the offset that is left on its average, and how much less an overshoot to the
+        other side counts; sideways distance beside 1.2 times that of going out and back once, as a share of it for each
+        swing above three; largest share of the peak heading that is left on the exit lane's average.
     step_rise_s, held, held_s : 10 to 90 % of a step; share within which the steering is held, and for how long.
     ramp_s, ramp_m_s2, ramp_misfit, ramp_speed : of a ramp: duration, demand at its end, largest RMS deviation from a
         line over its height, largest change of speed.
@@ -104,10 +106,12 @@ class ManoeuvreRules:
     side_m: tuple[float, float] = (12.0, 80.0)
     severe_m: float = 37.0
     severe_m_s: float = 24.0
-    offset_m: tuple[float, float] = (0.5, 10.0)
-    returned: float = 0.5
-    one_sided: float = 0.5
-    heading_left: float = 0.4
+    offset_m: tuple[float, float] = (1.0, 10.0)
+    returned: float = 0.65
+    overshoot: float = 0.8
+    sideways: float = 0.2
+    exit_m: float = 30.0
+    heading_left: float = 0.25
     step_rise_s: float = 0.35
     held: float = 0.15
     held_s: float = 1.5
@@ -342,7 +346,7 @@ def _manoeuvres_of(run: _Run, rules: ManoeuvreRules) -> list[Manoeuvre]:
     swings = _swings(run, rules)
     spans: list[tuple[str, int, int]] = []
     taken = np.zeros(len(run), dtype=np.bool_)
-    for rule in (_long_repeated, _lane_changes, _repeated, _two_swings, _slowing, _steps, _ramps):
+    for rule in (_lane_changes, _long_repeated, _repeated, _two_swings, _slowing, _steps, _ramps):
         for name, start, end in rule(run, swings, rules):
             a, b = max(start, 0), min(end, len(run))
             if b - a > 1 and not taken[a:b].any():
@@ -460,6 +464,9 @@ def _name_of_repeated(part: Sequence[_Swing], rules: ManoeuvreRules) -> str:
 def _lane_changes(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
     """Double lane changes: out, back, and as straight at the end as before, within the length of a course."""
     for i in range(len(swings)):
+        before = swings[i - 1] if i and (swings[i].start - swings[i - 1].end) * _STEP_S < rules.swing_gap_s else None
+        if before is not None and before.peak > rules.equal_peaks * swings[i].peak:
+            continue
         for last in range(i + 3, min(i + 7, len(swings)) + 1):
             side_m = _side_lane_m(run, swings[i:last], rules)
             if rules.side_m[0] <= side_m <= rules.side_m[1]:
@@ -472,24 +479,28 @@ def _lane_changes(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) ->
 def _side_lane_m(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> float:
     """Return over which distance the path is beyond half its offset; 0 for what is no double lane change.
 
-    The heading returns, and the sideways offset goes out to one side and comes back.
+    The path goes out to one side and back once, and heading and offset return over the length of an exit lane, however
+    the driver steers there.
     """
     sides = [s.sign for s in swings if s.peak >= 0.25 * max(w.peak for w in swings)]
     changes = sum(a != b for a, b in pairwise(sides))
     if changes < 2 or sides[0] != sides[-1] or max(s.peak for s in swings) < rules.strong_m_s2:
         return 0.0
-    here = run.rows(swings[0].start - 10, swings[-1].end + 15)
+    exit_rows = max(round(rules.exit_m / float(run.speed[swings[-1].end - 1]) / _STEP_S), 1)
+    here = run.rows(swings[0].start - 10, swings[-1].end + exit_rows)
     speed = run.speed[here]
     heading = np.cumsum(run.yaw_rate[here]) * _STEP_S
     offset = swings[0].sign * np.cumsum(speed * np.sin(heading)) * _STEP_S
-    peak, end = float(offset.max()), float(offset[-1])
+    after = slice(min(swings[-1].end - here.start, len(offset) - 1), None)
+    way, left = offset[: after.start + 1], float(offset[after].mean())
+    peak = float(way.max())
     is_one = (
         rules.offset_m[0] <= peak <= rules.offset_m[1]
-        and abs(end) <= rules.returned * peak
-        and -offset.min() <= rules.one_sided * peak
-        and abs(heading[-1]) <= rules.heading_left * np.abs(heading).max()
+        and max(left, -left * rules.overshoot, way[-1]) <= rules.returned * peak
+        and np.abs(np.diff(way)).sum() <= (1.2 + rules.sideways * (len(swings) - 3)) * (2.0 * peak - way[-1])
+        and abs(heading[after].mean()) <= rules.heading_left * np.abs(heading).max()
     )
-    return float(speed[offset > 0.5 * peak].sum()) * _STEP_S if is_one else 0.0
+    return float(speed[: len(way)][way > 0.5 * peak].sum()) * _STEP_S if is_one else 0.0
 
 
 def _straight_before(run: _Run, row: int, rules: ManoeuvreRules) -> bool:

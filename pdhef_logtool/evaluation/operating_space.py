@@ -7,10 +7,12 @@ the cells of a fleet add up.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.evaluation.blocks import blocks_with_halo, median_step_ns
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.evaluation.segments import MANOEUVRE_SMOOTHING_HZ, known_of, speed_and_ay
@@ -40,14 +42,24 @@ class Cell:
     sideslip_mse_rad2: float
 
 
+@dataclass(frozen=True, slots=True)
+class OperatingSpace:
+    """The cells that a drive was in, in order, the grid, and the median friction of the drive."""
+
+    cells: Sequence[Cell]
+    friction_median: float
+    speed_edges_m_s: Sequence[float] = SPEED_EDGES_M_S
+    ay_edges_m_s2: Sequence[float] = AY_EDGES_M_S2
+
+
 def operating_space(
-    signals: Signals, truth: StateTrack | None, estimate: StateTrack, low_speed_m_s: float
-) -> tuple[Cell, ...]:
-    """Return the cells that a drive was in, in order.
+    signals: Signals, truth: StateTrack | None, estimate: StateTrack | None, vehicle: VehicleParameters
+) -> OperatingSpace:
+    """Return where a drive went.
 
     Parameters
     ----------
-    signals, truth, estimate : at the same stamps [N]; ground truth None: sensors alone, and no error.
+    signals, truth, estimate : at the same stamps [N]; ground truth or estimate None: no error.
     """
     shape = len(SPEED_EDGES_M_S), len(AY_EDGES_M_S2)
     size = shape[0] * shape[1]
@@ -67,13 +79,14 @@ def operating_space(
         j = np.searchsorted(AY_EDGES_M_S2, ay[core][finite], side="right") - 1
         cell = np.maximum(i, 0) * shape[1] + j
         totals[0] += np.bincount(cell, weights=steps[core][finite], minlength=size)
-        if truth is not None:
-            error = signal_error(estimate.rows(a, b), truth.rows(a, b), "sideslip_rad", low_speed_m_s)[finite]
+        if truth is not None and estimate is not None:
+            slow = vehicle.low_speed_blend_m_s
+            error = signal_error(estimate.rows(a, b), truth.rows(a, b), "sideslip_rad", slow)[finite]
             scored = np.isfinite(error)
             totals[1] += np.bincount(cell[scored], minlength=size)
             totals[2] += np.bincount(cell[scored], weights=error[scored] ** 2, minlength=size)
     seconds, counts, squares = totals
-    return tuple(
+    cells = tuple(
         Cell(
             speed=int(cell_index // shape[1]),
             ay=int(cell_index % shape[1]),
@@ -83,3 +96,5 @@ def operating_space(
         )
         for cell_index in np.flatnonzero(seconds)
     )
+    friction = signals.friction[np.isfinite(signals.friction)]
+    return OperatingSpace(cells, float(np.median(friction)) if friction.size else vehicle.assumed_friction)

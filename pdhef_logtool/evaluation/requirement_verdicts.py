@@ -402,16 +402,24 @@ def _too_few(requirement: Requirement, bounded: Bounded, basis: str, where: str)
 
 
 def _decisive(requirement: Requirement, bounded: Bounded, exposure: Exposure, where: str) -> str:
-    """Return how much driving would decide, if value and spread stay: the interval narrows with its square root."""
-    bound = requirement.bound
-    distance = abs(bound - bounded.value)
-    beyond = bounded.value > bound
-    width = bounded.value - bounded.low if beyond else bounded.high - bounded.value
-    if not math.isfinite(width) or distance <= 0.0 or (times := (width / distance) ** 2) > _MOST_TIMES:
-        return "the value is at the limit: more driving will hardly decide"
+    """Return how much driving would decide, if value and spread stay: the interval narrows with its square root.
+
+    That of a positive value does so in its logarithm, as it was drawn.
+    """
+    near, value, end = (
+        requirement.bound,
+        bounded.value,
+        bounded.low if bounded.value > requirement.bound else bounded.high,
+    )
+    if min(near, bounded.low) > 0.0 and requirement.metric not in AT_LEAST:
+        near, value, end = math.log(near), math.log(value), math.log(end)
+    distance, width = abs(near - value), abs(end - value)
+    if not math.isfinite(width) or (times := (width / distance) ** 2 if distance else math.inf) > _MOST_TIMES:
+        far = "the value is close to the limit for the spread of the drives"
+        return f"{far}: more than {_MOST_TIMES:g} times as much driving would be needed"
     more = f"about {math.ceil(times)} times as much driving{where} would decide, if value and spread stay the same"
     if exposure.minutes:
-        more += f" ({exposure.minutes * (times - 1.0):.0f} minutes more)" if exposure.minutes * times > 1.5 else ""
+        more += f" ({exposure.minutes * (times - 1.0):.3g} min more)"
     return more
 
 

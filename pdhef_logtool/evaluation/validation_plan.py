@@ -161,7 +161,7 @@ def shown(value: float, unit: str) -> str:
     """Return a value with its unit as people read it."""
     text, factor = read_unit(unit)
     if unit == "share":
-        return f"{100.0 * value:.3g} %"
+        return f"{round(100.0 * value, 1):g} %"
     if unit == "1":
         return f"{value:.3g}"
     return f"{value * factor:.3g}{'' if text.startswith('°') else ' '}{text}"

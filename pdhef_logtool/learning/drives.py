@@ -30,7 +30,7 @@ from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.config import RunConfig
 
 #: Stages of ``pdhef learn`` in the order in which they run.
-IDENTIFY, NOISE, GAIN, NETWORK, INTERVALS = STAGES = ("identify", "noise", "gain", "network", "intervals")
+CALIBRATE, NOISE, GAIN, NETWORK, INTERVALS = STAGES = ("calibrate", "noise", "gain", "network", "intervals")
 #: Stage by itself, the default: prior of the calibration and residual of a car, from all drives with ground truth.
 TEACH = "teach"
 #: Splits of a simulated set that results are reported on, and those that a network is trained on and chosen by.
@@ -40,6 +40,8 @@ _SETTINGS = ("car", "mapping", "network", "start", "end", "sensors", "friction",
 #: Drives that are named in an error.
 _NAMED = 3
 MAX_HOLDOUT = 0.5
+#: A stage of former versions, and what does its work.
+REMOVED, INSTEAD = "identify", "pdhef learn without --stages, or --without-truth"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +58,6 @@ class LearnSettings:
     seed : of every random draw.
     split : only drives that their set's manifest assigns to this split.
     any_split : accept drives of the splits that the stages otherwise refuse.
-    without_truth : identify from the sensors of several logs alone.
     """
 
     config: RunConfig
@@ -67,7 +68,6 @@ class LearnSettings:
     seed: int = 0
     split: str | None = None
     any_split: bool = False
-    without_truth: bool = False
 
     def __post_init__(self) -> None:
         """Check the values; raises UsageError."""
@@ -82,16 +82,11 @@ class LearnSettings:
                 ", ".join(self.stages) or "none",
                 "--stages",
             ),
-            (
-                not self.without_truth or self.stages == (IDENTIFY,),
-                f"stage {IDENTIFY} alone",
-                ", ".join(self.stages),
-                "--without-truth",
-            ),
         )
+        remedy = f"{REMOVED} was removed; use: {INSTEAD}" if REMOVED in self.stages else ""
         for holds, expected, got, where in checks:
             if not holds:
-                raise UsageError(expected=expected, got=str(got), where=where)
+                raise UsageError(expected=expected, got=str(got), where=where, remedy=remedy)
 
     @property
     def order(self) -> tuple[str, ...]:
@@ -117,7 +112,7 @@ def open_car(config: RunConfig, warn: Tell) -> Car:
             expected="a car",
             got="none",
             where="--car",
-            remedy=f"pdhef learn LOG... --car vehicle.toml -o CAR --stages {IDENTIFY} makes one",
+            remedy="pdhef learn LOG... --car vehicle.toml -o CAR makes one",
         )
     car = Car.load(config.car, network=config.network, intervals=config.intervals)
     for note in car.notes:
@@ -164,7 +159,7 @@ def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInp
             )
     gain_only = settings.order == (GAIN,)
     refused = [f"{i.stem} ({splits[i.stem]})" for i in inputs if splits[i.stem] in (SEEN if gain_only else HELD_OUT)]
-    if refused and not settings.any_split and not settings.without_truth:
+    if refused and not settings.any_split and settings.order != (CALIBRATE,):
         more = f" and {len(refused) - _NAMED} more" if len(refused) > _NAMED else ""
         raise UsageError(
             expected="drives that no network was trained on" if gain_only else "drives that no result is reported on",
@@ -286,7 +281,7 @@ def no_drive(expected: str, where: str) -> EstimatorError:
         got="none",
         where=where,
         remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference; "
-        "--without-truth identifies a car from the sensors alone",
+        "--without-truth calibrates a car by its sensors alone",
     )
 
 

@@ -21,16 +21,15 @@ import numpy as np
 from pdhef_logtool.car.car import NO_INTERVALS, VEHICLE_FILE, Car
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.car.store import Change, check_output, update_car, vehicle_file
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.estimators.table import spec_of
-from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference
-from pdhef_logtool.evaluation.comparison import BLOCK_S, Compared, Errors, compare
-from pdhef_logtool.learning.car.axle_forces import usable_stamps
-from pdhef_logtool.learning.car.fit_data import load_fit_drive, period_s
+from pdhef_logtool.evaluation.bootstrap import Interval
+from pdhef_logtool.evaluation.comparison import Compared, Errors, compare
 from pdhef_logtool.learning.drives import (
+    CALIBRATE,
     GAIN,
-    IDENTIFY,
     INTERVALS,
     NETWORK,
     NOISE,
@@ -40,19 +39,19 @@ from pdhef_logtool.learning.drives import (
     choose_drives,
     drives_document,
     exit_code,
+    load_drive,
     no_drive,
     open_car,
     open_mapping,
     record_head,
 )
-from pdhef_logtool.learning.evidence.trust import MIN_BLOCKS
-from pdhef_logtool.learning.more_driving import learning_curve, what_more_would_pay
+from pdhef_logtool.learning.more_driving import what_more_would_pay
 from pdhef_logtool.learning.page import draw_page, page_markdown
 from pdhef_logtool.learning.resume import Stages, read_own
-from pdhef_logtool.learning.score import score_slices
+from pdhef_logtool.learning.score import paired_test, score_slices
 from pdhef_logtool.learning.split import PARTS, TEST, TRAINED, TRAINING, VALIDATION, DriveTimes, Split, split_drives
+from pdhef_logtool.learning.stages.calibrate import calibrate
 from pdhef_logtool.learning.stages.gain import find_gain
-from pdhef_logtool.learning.stages.identify import identify
 from pdhef_logtool.learning.stages.intervals import fit_intervals
 from pdhef_logtool.learning.stages.network import train_network
 from pdhef_logtool.learning.stages.noise import tune
@@ -60,10 +59,11 @@ from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.learning.stages.teach import teach
 from pdhef_logtool.logs.discovery import LogInput, Logs, hash_log
 from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.records.errors import EstimatorError, ModelError, UsageError
+from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.residual_model.bundle import MANY_CARS, NO_MODEL
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.residual_model.torch_extra import check_torch
 from pdhef_logtool.results.run_report import json_bytes
 from pdhef_logtool.storage.documents import digest, seal
@@ -78,7 +78,7 @@ CAR, EVALUATIONS_FILE = "car", "evaluations.json"
 KEPT, UNDONE, NOT_DONE = "kept", "undone", "not done"
 RUN: dict[str, Callable[[Task], StageOutput]] = {
     TEACH: teach,
-    IDENTIFY: identify,
+    CALIBRATE: calibrate,
     NOISE: tune,
     GAIN: find_gain,
     NETWORK: train_network,
@@ -87,12 +87,12 @@ RUN: dict[str, Callable[[Task], StageOutput]] = {
 #: Stages that are undone where they change nothing, or where the 95 % intervals then contain less than a share of the
 #: errors and less than before: simpler is better, and a lower error is not worth a meaningless interval.
 MUST_GAIN, LEAST_COVERED = (NOISE, NETWORK), 0.8
-#: Identification has chosen noise through the filter already: another one must be better with significance.
+#: The noise of a calibrated car suits most cars: another one must be better with significance.
 MUST_CONFIRM = (NOISE,)
 #: Usable driving below which nothing is left to fit, to validate and to test.
 LEAST_S = 50.0
-#: A candidate that gives an estimate at fewer of the stamps counts as worse.
-LEAST_AVAILABILITY = 0.9
+#: Used where the true speed is above this multiple of the low-speed limit, and where the car does not spin or drift.
+SPEED_FACTOR, MAX_SIDESLIP_RAD = 2.0, math.radians(8.0)
 #: The filter that follows the network, the same smoothed, and the baseline that runs on every vehicle file.
 HYBRID, SMOOTHED, BASELINE = "pd-hef", "pd-hef-smoothed", "phy-ukf"
 #: Estimators of the stages noise and intervals where several stages share the drives.
@@ -225,17 +225,14 @@ def learn(
 
 
 def _open(settings: LearnSettings, warn: Tell) -> Car:
-    """Return the car to start from: identification starts from the vehicle file and nothing else."""
+    """Return the car to start from: the first stages start from the vehicle file and nothing else."""
     config = settings.config
-    if {TEACH, IDENTIFY} & set(settings.order):
+    if {TEACH, CALIBRATE} & set(settings.order):
         car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
         if config.car is None:
             warn(f"no --car: mass, geometry and priors are those of the default {car.datasheet.name}")
         return car
-    car = open_car(config, warn)
-    if {GAIN, NETWORK} & set(settings.order) and car.network is None and config.network is None:
-        car = Car.load(config.car, network=Path(MANY_CARS), intervals=config.intervals)
-    return car
+    return open_car(config, warn)
 
 
 def _learn_alone(task: Task, output: Path) -> LearnResult:
@@ -296,14 +293,15 @@ def _read(inputs: Sequence[LogInput], task: Task) -> tuple[tuple[DriveRecord, ..
     vehicle = task.car.datasheet
 
     def read(log: LogInput) -> tuple[DriveRecord, DriveTimes | None]:
-        record, drive = load_fit_drive(log, Car.of(vehicle), task.mapping, task.options)
-        if drive is None:
+        record, drive = load_drive(log, Car.of(vehicle), task.mapping, replace(task.options, friction=None))
+        if drive is None or drive.truth is None:
             return record, None
-        use = usable_stamps(drive, vehicle)
-        seconds: FloatArray = (drive.signals.stamps_ns[use] - drive.log_start_ns).astype(np.float64) * 1e-9
+        stamps = drive.signals.stamps_ns
+        use = usable_stamps(drive.signals, drive.truth, vehicle)
+        seconds: FloatArray = (stamps[use] - drive.log_start_ns).astype(np.float64) * 1e-9
         if seconds.size < 2:
             return replace(record, left_out="no driving with ground truth above twice the low-speed limit"), None
-        return record, DriveTimes(log, seconds, period_s(drive))
+        return record, DriveTimes(log, seconds, float(np.median(np.diff(stamps))) * 1e-9)
 
     records, times = task.read(inputs, read, 0.05)
     if not times:
@@ -319,13 +317,22 @@ def _read(inputs: Sequence[LogInput], task: Task) -> tuple[tuple[DriveRecord, ..
     return records, times
 
 
+def usable_stamps(signals: Signals, truth: StateTrack, vehicle: VehicleParameters) -> BoolArray:
+    """Return where ground truth and signals can be learned from, [N]."""
+    is_complete = truth.valid & np.isfinite(truth.vx_m_s + truth.vy_m_s + truth.yaw_rate_rad_s)
+    moving = truth.vx_m_s > SPEED_FACTOR * vehicle.low_speed_blend_m_s
+    tame = np.abs(truth.sideslip_rad) < MAX_SIDESLIP_RAD
+    use: BoolArray = is_complete & moving & tame & np.isfinite(signals.steer_rad)
+    return use
+
+
 def _begin(work: Path, given: Car, settings: LearnSettings, *, fresh: bool) -> Path:
     """Return the folder of the car that everything starts from."""
     start = work / "0-start"
     kept = set() if fresh else {f"{number}-{name}" for number, name in enumerate((*settings.order, "end"), start=1)}
     for folder in [p for p in work.iterdir() if p.is_dir() and p.name not in kept]:
         shutil.rmtree(folder)
-    if given.source is not None and given.source.is_dir() and IDENTIFY not in settings.order:
+    if given.source is not None and given.source.is_dir() and CALIBRATE not in settings.order:
         shutil.copytree(given.source, start, ignore=shutil.ignore_patterns(WORK, "learn.*", f"{LOCK_FILE}*"))
     write_bytes(start / VEHICLE_FILE, vehicle_file(given))
     return start
@@ -391,16 +398,9 @@ def config_of(settings: LearnSettings, car: Path) -> LearnSettings:
 
 
 def _network_of(settings: LearnSettings, car: Car) -> Car:
-    """Return the car with the network to start from: the requested one, else its own, else that of many cars."""
+    """Return the car with the network to start from: the requested one, else its own."""
     assert car.source is not None
-    if settings.config.network is None and IDENTIFY not in settings.order and car.residual_network is not None:
-        return car
-    try:
-        return Car.load(car.source, network=settings.config.network or Path(MANY_CARS))
-    except ModelError:
-        if settings.config.network is None:
-            return car  # a source tree without shipped networks still runs the stages that need none
-        raise
+    return car if settings.config.network is None else Car.load(car.source, network=settings.config.network)
 
 
 def _stage_task(call: _Call, number: int, name: str, before: Path, folder: Path) -> Task:
@@ -408,8 +408,6 @@ def _stage_task(call: _Call, number: int, name: str, before: Path, folder: Path)
     car = Car.load(before)
     if name in (GAIN, NETWORK):
         car = _network_of(call.task.settings, car)
-        if car.network is None:
-            raise EstimatorError(expected="a network", got="none", where=name)
         network = call.task.settings.config.network or (None if car.network_folder is None else car.network_folder)
         settings = replace(settings, config=replace(settings.config, network=network))
     first, span = _share(call, number), _share(call, 2) - _share(call, 1)
@@ -430,23 +428,21 @@ def _run_stage(call: _Call, number: int, name: str, before: Path, folder: Path) 
         output = RUN[name](task)
     except EstimatorError as error:
         _tidy(folder, keep_car=False)
-        if name == IDENTIFY:
-            raise  # without it there is nothing to give
         return {"status": NOT_DONE, "text": str(error), "before": None, "after": None, "figures": {}}
     update_car(task.car, folder / CAR, output.change)
     task.reporter.progress("scoring the validation part", 1.0)
     old, new = (_validation_errors(call, car) for car in (before, folder / CAR))
-    (was, now), gains = _compare(old, new)
+    test = paired_test(old, new)
     unsure = name in MUST_GAIN and not _still_sure(old, new)
-    doubtful = name in MUST_CONFIRM and not _confirmed(old, new)
-    kept = not unsure and not doubtful and (gains is True if name in MUST_GAIN else gains is not False)
+    doubtful = name in MUST_CONFIRM and not test.confirmed
+    kept = not unsure and not doubtful and (test.better is True if name in MUST_GAIN else test.better is not False)
     _tidy(folder, keep_car=kept)
     text = output.text + ("; its 95 % intervals contain too few of the errors" if unsure else "")
     return {
         "status": KEPT if kept else UNDONE,
         "text": text + ("; the lower error is not significant" if doubtful else ""),
-        "before": [old.name, was],
-        "after": [new.name, now],
+        "before": [old.name, test.was_deg],
+        "after": [new.name, test.now_deg],
         "figures": output.figures,
     }
 
@@ -480,24 +476,10 @@ def _validation_errors(call: _Call, car_folder: Path) -> Errors:
     return scored.errors[name]
 
 
-def _compare(old: Errors, new: Errors) -> tuple[tuple[float, float], bool | None]:
-    """Return the RMSE of both in degrees where both are known, and whether the new one is better; None: it is alike."""
-    both = np.isfinite(old.error) & np.isfinite(new.error)
-    was, now = (float(np.degrees(np.sqrt(np.mean(e.error[both] ** 2)))) if both.any() else np.nan for e in (old, new))
-    lacks = new.scored < LEAST_AVAILABILITY * old.scored
-    return (round(was, 6), round(now, 6)), None if was == now and not lacks else now < was and not lacks
-
-
 def _still_sure(old: Errors, new: Errors) -> bool:
     """Return whether the new 95 % intervals contain most of the errors, or as many as the old ones."""
     was, now = (float(np.mean(e.inside[np.isfinite(e.error)])) if e.inside is not None else 0.0 for e in (old, new))
     return now >= min(was, LEAST_COVERED)
-
-
-def _confirmed(old: Errors, new: Errors) -> bool:
-    """Return whether the new error is lower by the 95 % bounds of a paired block bootstrap."""
-    difference = block_bootstrap_difference(new.error, old.error, new.stamps_ns, block_s=BLOCK_S)
-    return difference.blocks >= MIN_BLOCKS and difference.high < 0.0
 
 
 # ---- the end ----
@@ -507,19 +489,14 @@ def _end(call: _Call, start: Path, car: Path, stages: Sequence[StageResult]) -> 
     """Score the test part once, and return what more driving would be worth."""
     task = call.task
     task.reporter.progress("scoring the test part, once", _share(call, len(stages) + 1))
-    curve = None
-    if IDENTIFY in task.settings.order:
-        curve = learning_curve(task.split, car, task.mapping, _slice_options(task), task.reporter.progress)
     spans = [[call.logs[s.path], *(s.span_s or ())] for s in task.split.parts[TEST]]
     count = count_evaluations(call.work / EVALUATIONS_FILE, spans, call.task.reporter.note)
     tables = {part: table_of(task, start, car, part) for part in (VALIDATION, TEST)}
-    figures = {s.name: s.figures for s in stages if s.status == KEPT}
     return {
         "car_name": Car.load(car).vehicle.name,
         "evaluations": count,
         **tables,
-        "curve": curve,
-        "more": what_more_would_pay(task.split, task.settings.order, figures, curve),
+        "more": what_more_would_pay(task.split, task.settings.order),
     }
 
 

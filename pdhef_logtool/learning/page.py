@@ -11,7 +11,7 @@ from pdhef_logtool.records.printable import printable
 _COLOURS = {"kept": "#009E73", "undone": "#D55E00", "not done": "0.6"}
 #: Use of each part of the drives.
 _USES = {
-    "training": "sensors, parameters and noise; parts of the model, by cross-validation",
+    "training": "parameters and noise",
     "network training": "the network; without this part the training part",
     "validation": "decision after each stage; residual gain; intervals",
     "test": "scored once, at the end",
@@ -35,8 +35,6 @@ def page_markdown(document: Mapping[str, Any]) -> str:
         ("stage", "outcome", "before", "after", "evidence"),
         ([s["name"], s["status"], _figure(s["before"]), _figure(s["after"]), s["text"]] for s in document["stages"]),
     )
-    physics = [s for s in document["stages"] if "physics_parameters" in s["figures"]]
-    lines += [line for stage in physics for line in _physics(stage["figures"])]
     lines += ["## Test part, scored once at the end", ""]
     if document["evaluations"] > 1:
         lines += [
@@ -50,25 +48,6 @@ def page_markdown(document: Mapping[str, Any]) -> str:
     lines += [f"- {_text(text)}" for text in document["more"]] or ["- nothing is missing"]
     lines += ["", "Versions: " + ", ".join(f"{k} {v}" for k, v in sorted(document["versions"].items()))]
     return "\n".join(lines) + "\n"
-
-
-def _physics(figures: Mapping[str, Any]) -> list[str]:
-    """Return the tables of the fitted parameters and of the parts of the model that were tried."""
-    rows = []
-    for p in figures["physics_parameters"]:
-        remark = "" if p["excited"] else "not observable"
-        interval = f"{p['low95']:.4g} to {p['high95']:.4g}"
-        rows.append([p["name"], f"{p['value']:.5g}", interval, f"{p['prior']:.4g}", p["unit"], remark])
-    lines = ["## Physics", "", *_table(("parameter", "value", "95 %", "prior", "unit", ""), rows)]
-    tried = figures["physics"].get("tried", ())
-    if tried:
-        lines += ["Parts of the model, each tried on two halves of the training part: one is fitted, the other scored."]
-        cells = (
-            [", ".join(t["parts"]) or "none", *(f"{x:.3f}" for x in t["held_out_deg"]), "taken" if t["taken"] else ""]
-            for t in tried
-        )
-        lines += ["", *_table(("parts", "first half °", "second half °", ""), cells)]
-    return lines
 
 
 def _scores(lines: Iterable[Mapping[str, Any]]) -> list[str]:

@@ -1,4 +1,4 @@
-"""How well a car's estimators do on slices of drives: errors paired by stamp, and the share inside their intervals."""
+"""How well a car's estimators do on slices of drives, and whether a candidate does better, by paired blocks."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.table import Options, runnable
-from pdhef_logtool.evaluation.comparison import Errors, end_to_end
+from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference
+from pdhef_logtool.evaluation.comparison import BLOCK_S, Errors, end_to_end
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.learning.drives import load_drive
+from pdhef_logtool.learning.evidence.trust import MIN_BLOCKS
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
@@ -22,6 +24,8 @@ from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 
 #: What a filter needs from the start of a slice before its error counts.
 SETTLE_S = 3.0
+#: A candidate that gives an estimate at fewer of the stamps counts as worse.
+LEAST_AVAILABILITY = 0.9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,6 +34,45 @@ class Scored:
 
     errors: Mapping[str, Errors]
     skipped: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class PairedTest:
+    """Errors of a candidate against those before, at the stamps that both score.
+
+    Attributes
+    ----------
+    was_deg, now_deg : sideslip RMSE in degrees. difference : of RMSE, the candidate's less the other, rad, by a
+        bootstrap of blocks. better : by the RMSE; None: alike.
+    """
+
+    was_deg: float
+    now_deg: float
+    difference: Interval
+    better: bool | None
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the 95 % bounds of the difference are below 0."""
+        return self.difference.blocks >= MIN_BLOCKS and self.difference.high < 0.0
+
+    @property
+    def refuted(self) -> bool:
+        """Whether they are above 0; too few blocks for bounds, a higher error."""
+        return self.difference.low > 0.0 if self.difference.blocks >= MIN_BLOCKS else self.better is False
+
+
+def paired_test(old: Errors, new: Errors) -> PairedTest:
+    """Compare errors at the same stamps [N]; much fewer of them (:data:`LEAST_AVAILABILITY`) are worse."""
+    both = np.isfinite(old.error) & np.isfinite(new.error)
+    was, now = (float(np.degrees(np.sqrt(np.mean(e.error[both] ** 2)))) if both.any() else np.nan for e in (old, new))
+    lacks = new.scored < LEAST_AVAILABILITY * old.scored
+    difference = block_bootstrap_difference(new.error, old.error, new.stamps_ns, block_s=BLOCK_S)
+    if lacks:
+        difference = Interval(difference.value, np.inf, np.inf, difference.blocks)
+    return PairedTest(
+        round(was, 6), round(now, 6), difference, None if was == now and not lacks else now < was and not lacks
+    )
 
 
 def score_slices(

@@ -8,33 +8,33 @@ from itertools import pairwise
 
 import numpy as np
 
-from pdhef_logtool.learning.car.fit_data import GUARD_S
-from pdhef_logtool.learning.drives import IDENTIFY, NETWORK, NOISE, STAGES
+from pdhef_logtool.learning.drives import CALIBRATE, NETWORK, NOISE, STAGES
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.signals import FloatArray
 
-#: Fit of parameters and noise (and choice of the model's parts, by folds); training of the network; decision after each
-#: stage whether it is kept, residual gain and intervals; scored once at the end.
+#: Between two parts of one drive, half of it on either side of the cut: filter states and slow disturbances must have
+#: forgotten the former.
+GAP_S = 5.0
+#: Parameters and noise; training of the network; decision after each stage whether it is kept, residual gain and
+#: intervals; scored once at the end.
 TRAINING, NETWORK_TRAINING, VALIDATION, TEST = "training", "network training", "validation", "test"
 PARTS = (TRAINING, NETWORK_TRAINING, VALIDATION, TEST)
 #: Shares of the driving that is not held out, without and with a part for the network.
 SHARES = {TRAINING: 0.82, VALIDATION: 0.18}
 SHARES_WITH_NETWORK = {TRAINING: 0.50, NETWORK_TRAINING: 0.32, VALIDATION: 0.18}
 #: Stages that use the training part; the others use the validation part alone.
-TRAINED = {IDENTIFY, NOISE, NETWORK}
+TRAINED = {CALIBRATE, NOISE, NETWORK}
 #: Usable driving from which on the network has a part of its own, that physics was not fitted to, and still leaves
 #: the fit enough to choose the model's parts; with less it learns from the training split.
 OWN_NETWORK_PART_S = 600.0
 #: One drive is cut into rounds of about this much usable driving, each with all parts but the test.
 ROUND_S = 240.0
 #: Least usable driving of validation and test, where there is little; a gap comes off it.
-LEAST_PART_S = 10.0 + GUARD_S
+LEAST_PART_S = 10.0 + GAP_S
 #: Drives shorter than this are cut together, as if they were one.
 LEAST_CUT_S = 100.0
 #: From so many drives on each belongs to one part whole; fewer are cut by time.
 WHOLE_DRIVES = 8
-#: Between two parts of one drive, half of it on either side of the cut.
-GAP_S = GUARD_S
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -76,6 +76,8 @@ def _arrow_column(column: Any) -> Any:
     import polars as pl
     import pyarrow as pa
 
+    if pa.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
     if pa.types.is_timestamp(column.type):
         return column.cast(pa.timestamp("ns")).to_numpy()
     if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
@@ -93,10 +95,13 @@ def open_mat(file: LogFile) -> TableLog:
         hdf5 = head.read(len(_HDF5_MAT)) == _HDF5_MAT
         read = _hdf5_variables if hdf5 else _variables
         arrays: dict[str, dict[str, NDArray[Any]]] = {}
-        for path, array in read(file, losses):
+        units: dict[str, dict[str, str]] = {}
+        for path, array, unit in read(file, losses):
             struct_, _, name = path.rpartition(_SLASH)
-            arrays.setdefault(struct_, {}).update(_vectors(name, array))
-        tables = list(_mat_tables(arrays, str(file.place), losses))
+            vectors = _vectors(name, array)
+            arrays.setdefault(struct_, {}).update(vectors)
+            units.setdefault(struct_, {}).update(dict.fromkeys(vectors, unit))
+        tables = list(_mat_tables(arrays, units, str(file.place), losses))
     if not tables:
         raise LogError(
             expected="a vector of times (t, time, ...) as long as the signals beside it",
@@ -107,14 +112,20 @@ def open_mat(file: LogFile) -> TableLog:
     return TableLog(file, "mat-7.3" if hdf5 else "mat", tables, losses)
 
 
-def _mat_tables(arrays: Mapping[str, Mapping[str, NDArray[Any]]], where: str, losses: list[Loss]) -> Iterator[Table]:
+def _mat_tables(
+    arrays: Mapping[str, Mapping[str, NDArray[Any]]],
+    units: Mapping[str, Mapping[str, str]],
+    where: str,
+    losses: list[Loss],
+) -> Iterator[Table]:
     """Yield the tables of the structs; vectors without a clock of their length are noted."""
     sheets = []
     for struct_, variables in arrays.items():
         lengths = dict.fromkeys(len(v) for v in variables.values() if len(v) > 1)
         for length in sorted(lengths, reverse=True):
             columns = {n: v for n, v in variables.items() if len(v) == length}
-            sheets.append((struct_, length, Sheet(field_name(struct_) if struct_ else "mat", columns, {})))
+            name = field_name(struct_) if struct_ else "mat"
+            sheets.append((struct_, length, Sheet(name, columns, units[struct_])))
     clocks = {}
     for struct_, length, sheet in sheets:
         try:
@@ -129,17 +140,20 @@ def _mat_tables(arrays: Mapping[str, Mapping[str, NDArray[Any]]], where: str, lo
             losses.append(Loss("no-clock", text, where, severity="note"))
             continue
         signals = {n: v for n, v in sheet.columns.items() if (struct_, length) not in clocks or n not in clock[1]}
-        rows += [(Sheet(sheet.name, signals, {}), clock[0])] if signals else []
+        rows += [(Sheet(sheet.name, signals, sheet.units), clock[0])] if signals else []
     for name, (sheet, stamps) in zip(unique(sheet.name for sheet, _ in rows), rows, strict=True):
-        yield from tables_of(Sheet(name, sheet.columns, {}), where, losses, stamps)
+        yield from tables_of(Sheet(name, sheet.columns, sheet.units), where, losses, stamps)
 
 
 def _clock_of(struct_: str, length: int, clocks: Mapping[tuple[str, int], Any]) -> Any:
-    """Return the clock of a struct, or of the nearest struct around it, for vectors of a length."""
+    """Return the clock of a struct, or of the nearest struct around it or beside it, for vectors of a length."""
     while (struct_, length) not in clocks:
         if not struct_:
             return None
         struct_ = struct_.rpartition(_SLASH)[0]
+        beside = [key for key in clocks if struct_ and key[1] == length and key[0].startswith(f"{struct_}{_SLASH}")]
+        if len(beside) == 1:
+            return clocks[beside[0]]
     return clocks[struct_, length]
 
 
@@ -158,8 +172,8 @@ def _vectors(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:
     return {f"{field_name(name)}_{i}": array[:, i] for i in range(array.shape[1])}
 
 
-def _variables(file: LogFile, losses: list[Loss]) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Yield the arrays of a MAT file of version 5 by path, element by element, so that a damaged one is a loss."""
+def _variables(file: LogFile, losses: list[Loss]) -> Iterator[tuple[str, NDArray[Any], str]]:
+    """Yield the arrays of a MAT file of version 5 by path and their units, by element: a damaged one is a loss."""
     from scipy.io import loadmat
 
     data = file.path.read_bytes()
@@ -192,20 +206,29 @@ def _inflated(stored: bytes, limits: ResourceLimits) -> bytes:
     return data
 
 
-def _leaves(path: str, value: Any, depth: int) -> Iterator[tuple[str, NDArray[Any]]]:
+def _leaves(path: str, value: Any, depth: int, unit: str = "") -> Iterator[tuple[str, NDArray[Any], str]]:
     if isinstance(value, np.ndarray) and value.dtype != object:
-        yield path, value
+        yield path, value, unit
     elif isinstance(value, dict) and depth < _DEEPEST:
         for name, inner in value.items():
-            yield from _leaves(f"{path}{_SLASH}{name}", inner, depth + 1)
+            yield from _leaves(f"{path}{_SLASH}{name}", inner, depth + 1, _text_of(value, "unit", "units"))
     elif isinstance(value, list | np.ndarray) and depth < _DEEPEST:
         structs = [v for v in value if isinstance(v, dict)][:_MOST_COLUMNS]
         for number, inner in enumerate(structs):
-            label = inner.get("label") or inner.get("name") or str(number)
-            yield from _leaves(f"{path}{_SLASH}{label}", inner, depth + 1)
+            data = [v for v in inner.values() if isinstance(v, np.ndarray)]
+            label = _text_of(inner, "label", "name") or str(number)
+            named = data[0] if len(data) == 1 else inner
+            yield from _leaves(f"{path}{_SLASH}{label}", named, depth + 1, _text_of(inner, "unit", "units"))
 
 
-def _hdf5_variables(file: LogFile, losses: list[Loss]) -> Iterator[tuple[str, NDArray[Any]]]:
+def _text_of(struct_: Mapping[str, Any], *names: str) -> str:
+    """Return the first text of these names in a struct, or in the description of its data."""
+    info = struct_.get("DataInfo")
+    lower = {n.lower(): v for n, v in {**(info if isinstance(info, dict) else {}), **struct_}.items()}
+    return next((lower[n] for n in names if isinstance(lower.get(n), str)), "")
+
+
+def _hdf5_variables(file: LogFile, losses: list[Loss]) -> Iterator[tuple[str, NDArray[Any], str]]:
     """Yield the arrays of a MAT file of version 7.3 by path; a dataset that cannot be read is a loss."""
     h5py = extra("h5py", "MAT files of version 7.3", file.place)
     datasets: list[tuple[str, Callable[[], NDArray[Any]]]] = []
@@ -218,7 +241,7 @@ def _hdf5_variables(file: LogFile, losses: list[Loss]) -> Iterator[tuple[str, ND
         source.visititems(visit)
         for name, load in datasets:
             try:
-                yield name, np.asarray(load())
+                yield name, np.asarray(load()), ""
             except Exception as error:  # noqa: BLE001  any error of a damaged chunk
                 losses.append(
                     Loss("bad-variable", f"{name} cannot be read: {describe_damage(error)[1]}", str(file.place))

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,10 @@ CAN_TYPE = "can/msg/Frame"
 _MAX_DBC_BYTES = 32 << 20
 #: Bits of a signal that become a number.
 _MOST_BITS = 64
+
+
+#: Multiplexers with the values under which something is sent.
+Selectors: TypeAlias = "tuple[tuple[Signal, tuple[int, ...]], ...]"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,27 +67,34 @@ class Frames:
     def decoded(self, databases: Sequence[Database]) -> Iterator[Table]:
         """Yield a table for each message of the databases that the frames contain, with its signals and units.
 
+        An identifier that several databases define is that of the one with the largest share of its messages on a bus.
         Signals that are sent under some values of a multiplexer only have a table for each of these conditions.
         """
-        for message in (m for database in databases for m in database.messages):
-            rows = np.flatnonzero(self._are(message))
+        owner = self._owners(databases)
+        for message, number in ((m, n) for n, database in enumerate(databases) for m in database.messages):
+            rows = np.flatnonzero(self._are(message) & (owner == number))
             if not rows.size or message.length > self.data.shape[1]:
                 continue
-            by_name = {s.name: s for s in message.signals}
-            groups: dict[tuple[Any, ...], list[Signal]] = {}
-            for signal in message.signals:
-                if signal.length <= _MOST_BITS:
-                    conditions = tuple((s.name, values) for s, values in selectors_of(signal, by_name))
-                    groups.setdefault(conditions, []).append(signal)
-            for conditions, signals in groups.items():
+            for ending, signals, selectors in signal_groups(message):
                 its = rows
-                for name, values in conditions:
-                    selector = by_name[name]
+                for selector, values in selectors:
                     raw = raw_bits(self.data[its], selector.start, selector.length, selector.byte_order)
                     its = its[np.isin(raw, np.asarray(values, np.uint64))]
                 if its.size:
-                    ending = "".join(f"_{name}_{values[0]}" for name, values in conditions)
                     yield self._message(f"{message.name}{ending}", signals, its)
+
+    def _owners(self, databases: Sequence[Database]) -> IntArray:
+        """Return the number of the database that describes each frame [N]; -1 without one."""
+        ids, buses = self.parts["id"], self.parts.get("bus", np.zeros(len(self.stamps_ns)))
+        owner, most = np.full(len(ids), -1), np.zeros(len(ids))
+        for number, database in enumerate(databases):
+            described = np.isin(ids, [m.frame_id for m in database.messages])
+            for bus in np.unique(buses[described]):
+                its = described & (buses == bus)
+                weight = fit_of(database, frozenset(ids[its].tolist()))
+                its &= weight > most
+                owner[its], most[its] = number, weight
+        return owner
 
     def _are(self, message: Message) -> NDArray[np.bool_]:
         ids = self.parts["id"]
@@ -146,6 +157,25 @@ def signal_values(data: NDArray[np.uint8], signal: Signal) -> FloatArray:
     else:
         number = raw
     return np.asarray(number.astype(np.float64) * float(signal.scale) + float(signal.offset), dtype=np.float64)
+
+
+def fit_of(database: Database, sent: frozenset[int]) -> float:
+    """Return how well a database describes the identifiers of a bus: those it defines, times their share of its own."""
+    known = sum(m.frame_id in sent for m in database.messages)
+    return known**2 / max(1, len(database.messages))
+
+
+def signal_groups(message: Message) -> Iterator[tuple[str, list[Signal], Selectors]]:
+    """Yield the signals of a message that are sent together: an ending of their name, they, and their multiplexers."""
+    by_name = {s.name: s for s in message.signals}
+    groups: dict[tuple[tuple[str, tuple[int, ...]], ...], list[Signal]] = {}
+    for signal in message.signals:
+        if signal.length <= _MOST_BITS:
+            conditions = tuple((s.name, values) for s, values in selectors_of(signal, by_name))
+            groups.setdefault(conditions, []).append(signal)
+    for conditions, signals in groups.items():
+        ending = "".join(f"_{name}_{values[0]}" for name, values in conditions)
+        yield ending, signals, tuple((by_name[name], values) for name, values in conditions)
 
 
 def selectors_of(signal: Signal, by_name: Mapping[str, Signal]) -> Iterator[tuple[Signal, tuple[int, ...]]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -40,10 +42,13 @@ from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
+from pdhef_logtool.storage.files import scratch_folder, write_bytes
 
 #: Neighbouring windows share the span at their border: this many loaded spans are kept for the next window, and of a
 #: short log all that fit into this many bytes, as it is surveyed several times before it is read.
 _KEPT_SPANS, _KEPT_BYTES = 2, 8 << 20
+#: A message in the text of a DBC file.
+_DBC = re.compile(r"^BO_ \d+ \w+ *:", re.MULTILINE)
 
 
 class ColumnarLog(DriveLog):
@@ -96,6 +101,8 @@ class ColumnarLog(DriveLog):
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
         self._kept_bytes = 0
         self._recording_span: RecordingSpan | None = None
+        self._databases: tuple[Path, ...] | None = None
+        self._extracted: tempfile.TemporaryDirectory[str] | None = None
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
@@ -176,6 +183,33 @@ class ColumnarLog(DriveLog):
         """The log itself if its index is complete and consistent; else None."""
         sound = all(container.by_index for container in self.containers)
         return self if sound and all(loss.kind == UNVERIFIED for loss in self.lost) else None
+
+    @property
+    def databases(self) -> tuple[Path, ...]:
+        """The DBC files given with the log, otherwise those among its attachments and metadata."""
+        if self.given_databases:
+            return self.given_databases
+        if self._databases is None:
+            stored = [(a.name, a.data) for c in self.containers for a in c.attachments() if a.name.endswith(".dbc")]
+            records = [record for c in self.containers for record in c.metadata_records()]
+            texts = [(r.name, key, text) for r in records for key, text in r.metadata.items() if _DBC.search(text)]
+            names = [key if key.endswith(".dbc") else f"{name}.{key}.dbc" for name, key, _ in texts]
+            stored += [(name, text.encode()) for name, (_, _, text) in zip(names, texts, strict=True)]
+            self._databases = tuple(self._extract(name, data) for name, data in stored)
+        return self._databases
+
+    def definition(self, path: Path) -> Path:
+        """Return a file that defines something of the log; a mere name is that of an attached one."""
+        own = None if path.exists() and len(path.parts) > 1 else {p.name: p for p in self.databases}.get(path.name)
+        return own or path
+
+    def _extract(self, name: str, data: bytes) -> Path:
+        """Write a file that the log contains, to be read until the log is closed."""
+        if self._extracted is None:
+            self._extracted = scratch_folder()
+        path = Path(self._extracted.name) / Path(name).name
+        write_bytes(path, data)
+        return path
 
     def metadata(self) -> dict[str, str]:
         """Return the entries of metadata records by ``key`` and ``record.key``, and rosbag2's ``custom_data``."""
@@ -323,6 +357,8 @@ class ColumnarLog(DriveLog):
         self._kept_bytes = 0
         for container in self.containers:
             container.close()
+        if self._extracted is not None:
+            self._extracted.cleanup()
 
     def load(self, c: int, span: Span, want: frozenset[int] | None = None) -> Block | None:
         """Read a span of the c-th container; None and a recorded loss if it is damaged.

@@ -67,10 +67,12 @@ class DriveLog(ABC):
     ----------
     path : file, folder or object.
     kind : name of the format, for reports: ``mcap``, ``rosbag1``, ``rosbag2-sqlite3``, ``rosbag2-mcap``, ...
+    given_databases : DBC files given with the log.
     """
 
     path: LogPlace
     kind: str
+    given_databases: tuple[Path, ...] = ()
 
     @property
     @abstractmethod
@@ -151,6 +153,15 @@ class DriveLog(ABC):
     def metadata(self) -> dict[str, str]:
         """Return the metadata of the log by ``key`` and ``record.key``."""
         return {}
+
+    @property
+    def databases(self) -> tuple[Path, ...]:
+        """The DBC files of the frames in the log's topics: those given with it, otherwise those in it."""
+        return self.given_databases
+
+    def definition(self, path: Path) -> Path:
+        """Return a file that defines something of the log, where it is."""
+        return path
 
     def unreadable(self, topic: str) -> str:
         """Return why a topic has no readable fields; empty if it has some."""

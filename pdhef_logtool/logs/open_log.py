@@ -71,6 +71,7 @@ def open_log(
     log = _opened(place_of(path) if isinstance(path, str) else path, Meter(limits), wanted)
     if log.messages is not None:
         log.messages.definitions = definitions
+    log.given_databases = databases
     if databases and isinstance(log, TableLog):
         from pdhef_logtool.logs.can_decoding import load_dbc
 

@@ -8,7 +8,6 @@ topic reads no other bytes.
 from __future__ import annotations
 
 import struct
-import tempfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +26,6 @@ from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.records.version import LIBRARY
-from pdhef_logtool.storage.files import scratch_folder, write_bytes
 
 #: Of the record's content; another one is not read.
 FORMAT = 1
@@ -85,7 +83,6 @@ class ReducedLog(ColumnarLog):
         super().__init__(path, record.kind, [container], distro=record.distro)
         self.record = record
         self._recording_span = RecordingSpan(record.intervals, left_out=record.left_out)
-        self._extracted: tempfile.TemporaryDirectory[str] | None = None
 
     @property
     def index(self) -> None:
@@ -121,17 +118,7 @@ class ReducedLog(ColumnarLog):
         attachment = next((a for c in self.containers for a in c.attachments() if a.name == name), None)
         if attachment is None:
             raise LogError(expected=_EXPECTED, got=f"none with its {name}", where=str(self.path), remedy=_REMEDY)
-        if self._extracted is None:
-            self._extracted = scratch_folder()
-        path = Path(self._extracted.name) / Path(name).name
-        write_bytes(path, attachment.data)
-        return path
-
-    def close(self) -> None:
-        """Release the files."""
-        super().close()
-        if self._extracted is not None:
-            self._extracted.cleanup()
+        return self._extract(name, attachment.data)
 
 
 def reduced_record(container: Container) -> ReducedRecord | None:

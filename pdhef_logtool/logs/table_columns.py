@@ -35,7 +35,7 @@ _UNITS = frozenset(
     re.split(
         ",",
         "g,mg,m/s²,m/s^2,m/s2,m/s**2,m/s/s,mps2,m/s,m/sec,mps,km/h,kmh,kph,kmph,mph,kn,kt,kts,knots,deg,°,degree,degrees,"
-        "rad,radians,mrad,deg/s,°/s,dps,deg/sec,degps,rad/s,rad/sec,radps,mdps,rpm,1/min,u/min,min,',s,sec,seconds,ms,us,"
+        "rad,radians,mrad,deg/s,°/s,dps,deg/sec,degps,rad/s,rad/sec,radps,mdps,rpm,1/min,u/min,/min,min-1,grad,grad/s,min,',s,sec,seconds,ms,us,"
         "µs,ns,m,cm,mm,km,%,bar,pa,kpa,n,nm,v,mv,a,°c,degc,c,hz,kg,-,1",
     )
 )
@@ -51,6 +51,9 @@ _WEEK = re.compile(r"(?:gps|gnss)?_?week(?:_?(?:number|no|nr))?")
 _WEEK_TIME = re.compile(
     r"(?:(?:gps|gnss)_)?(?:i?tow|sow|time_of_week|seconds_of_week|week_seconds|seconds|time)(?:_m?s)?"
 )
+#: Columns of a table in long form, with a row for each value.
+_SIGNAL = re.compile(r"(?:signal|channel|variable|parameter|sensor|tag|key|name)(?:_?name)?")
+_VALUE = re.compile(r"(?:physical_|signal_|phys_)?(?:value|val|wert)")
 _DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")
 _FACTORS_NS = {
     "s": 10**9,
@@ -214,7 +217,10 @@ def _clocks(sheet: Sheet, names: Mapping[str, str]) -> list[str]:
     """Return the columns with times, the best first; ``names`` are all columns by their names in lower case."""
     clocks = [name for n, name in names.items() if _TIME.fullmatch(n)]
     clocks = [n for n in reversed(clocks) if _is_clock(sheet.columns[n])]
-    return clocks or [name for n, name in names.items() if _TIME_LIKE.search(n) and _ascends(sheet.columns[name])]
+    ascending = [(n, name) for n, name in names.items() if not clocks and _ascends(sheet.columns[name])]
+    clocks = clocks or [name for n, name in ascending if _TIME_LIKE.search(n)]
+    dates = [name for _, name in ascending if sheet.columns[name].dtype.kind == "M"]  # type: ignore[union-attr]
+    return clocks or dates or [name for _, name in ascending if sheet.units.get(name, "").lower() in _FACTORS_NS]
 
 
 def _is_clock(column: NDArray[Any] | Series) -> bool:
@@ -224,10 +230,10 @@ def _is_clock(column: NDArray[Any] | Series) -> bool:
 
 
 def _ascends(column: NDArray[Any] | Series) -> bool:
-    """Return whether a column contains numbers that never step back."""
-    if not isinstance(column, np.ndarray) or column.dtype.kind not in "iuf":
+    """Return whether a column contains dates, or numbers that never step back."""
+    if not isinstance(column, np.ndarray) or column.dtype.kind not in "iufM":
         return False
-    return len(column) > 1 and bool((np.diff(column.astype(np.float64)) >= 0.0).all())
+    return column.dtype.kind == "M" or (len(column) > 1 and bool((np.diff(column.astype(np.float64)) >= 0.0).all()))
 
 
 def _numbers(column: NDArray[Any] | Series) -> FloatArray:
@@ -244,6 +250,10 @@ def tables_of(sheet: Sheet, where: str, losses: list[Loss], stamps: IntArray | N
     used: frozenset[str] = frozenset()
     if stamps is None:
         stamps, used = stamps_of(sheet, where)
+        if long := list(_of_long_form(sheet, stamps)):
+            for name, (part, its) in zip(unique(part.name for part, _ in long), long, strict=True):
+                yield from tables_of(Sheet(name, part.columns, part.units), where, losses, its)
+            return
     has_time = stamps != NO_TIME
     if not has_time.all():
         losses.append(Loss("bad-stamp", "row without a time", f"{where}, {sheet.name}", count=int((~has_time).sum())))
@@ -267,6 +277,26 @@ def tables_of(sheet: Sheet, where: str, losses: list[Loss], stamps: IntArray | N
     for number, (there, columns) in enumerate(ordered, 1):
         name = sheet.name if number == 1 else f"{sheet.name}_{number}"
         yield Table.of_arrays(name, stamps[order][there], columns, sheet.units, sheet.type_name)
+
+
+def _of_long_form(sheet: Sheet, stamps: IntArray) -> Iterator[tuple[Sheet, IntArray]]:
+    """Yield the signals of a table with a row for each value, those with the same times together; of others nothing."""
+    named = {snake(name): column for name, column in sheet.columns.items()}
+    signal, value = (next((c for n, c in named.items() if p.fullmatch(n)), None) for p in (_SIGNAL, _VALUE))
+    if signal is None or isinstance(signal, np.ndarray) or not isinstance(value, np.ndarray):
+        return
+    names, units = signal.to_numpy(), named.get("unit", named.get("units"))
+    clocks: dict[bytes, tuple[Sheet, IntArray]] = {}
+    for title in signal.unique(maintain_order=True).drop_nulls().to_list():
+        rows = np.flatnonzero(names == title)
+        part, _ = clocks.setdefault(stamps[rows].tobytes(), (Sheet(sheet.name, {}, {}), stamps[rows]))
+        (field,), given = read_head([title])
+        cells = (
+            units[rows[:1].tolist()].to_list() if units is not None and not isinstance(units, np.ndarray) else [None]
+        )
+        part.columns[field] = value[rows]  # type: ignore[index]
+        part.units[field] = cells[0] or given.get(field, "")  # type: ignore[index]
+    yield from clocks.values()
 
 
 def whole_days(date: dt.date) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -22,6 +24,11 @@ if TYPE_CHECKING:
     from cantools.database.can import Database
 
     from pdhef_logtool.logs.can_decoding import Frames
+
+
+#: End of the name of a column that is made of a magnitude and its sign, and how the name of a sign differs from it.
+SIGNED = "_signed"
+_SIGN = re.compile(r"(?<=_)(?:VZ|vorzeichen|sign|sgn)_|_(?:VZ|vorzeichen|sign|sgn)$", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +65,23 @@ class Table:
         return cls(name, stamps_ns, fields, lambda path, rows: columns[path][rows], type_name)
 
 
+def _with_signs(table: Table) -> Table:
+    """Add a column ``<name>_signed`` for each magnitude whose sign is in another column (1: negative)."""
+    names = {f.path: f for f in table.fields}
+    signs = {m: path for path in names if (m := _SIGN.sub("", path)) != path and m in names}
+    if not signs:
+        return table
+
+    def load(path: str, rows: slice) -> NDArray[Any]:
+        magnitude = path.removesuffix(SIGNED)
+        if magnitude == path or magnitude not in signs:
+            return table.load(path, rows)
+        return np.where(table.load(signs[magnitude], rows) > 0, -1.0, 1.0) * np.abs(table.load(magnitude, rows))
+
+    more = (replace(names[magnitude], path=f"{magnitude}{SIGNED}") for magnitude in signs)
+    return replace(table, fields=(*table.fields, *more), load=load)
+
+
 class TableLog(DriveLog):
     """Tables as a log. It has no messages to copy, and one ledger entry: the file was read.
 
@@ -84,8 +108,9 @@ class TableLog(DriveLog):
         self.path, self.kind = file.place, kind
         self._frames = frames
         self._file = file
-        self._tables = {table.name: table for table in sorted(tables, key=lambda table: table.name)}
-        wrong = [t.name for t in tables if self._tables[t.name] is not t or (t.stamps_ns[1:] < t.stamps_ns[:-1]).any()]
+        self._tables = {table.name: _with_signs(table) for table in sorted(tables, key=lambda table: table.name)}
+        names = Counter(table.name for table in tables)
+        wrong = [t.name for t in tables if names[t.name] > 1 or (t.stamps_ns[1:] < t.stamps_ns[:-1]).any()]
         if wrong:
             got = f"others: {', '.join(wrong)}"
             raise LogError(expected="tables of different names with ascending times", got=got, where=str(self.path))
@@ -101,7 +126,7 @@ class TableLog(DriveLog):
         for table in tables:
             number = 1 + sum(name.partition("#")[0] == table.name for name in self._tables)
             name = table.name if number == 1 else f"{table.name}#{number}"
-            self._tables[name] = replace(table, name=name)
+            self._tables[name] = _with_signs(replace(table, name=name))
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:

@@ -2,12 +2,14 @@
 
 A source whose field is ``can:<message>.<signal>`` gets a view of its own: the frames of that message (and, for a
 multiplexed signal, of that selector) with the signal as a column. Everything behind it reads the view like a topic.
+Recognition examines a view of each message (:func:`decoded_frames`), by the DBC files that are given with the log or
+attached to it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_account import ByteLedger
-from pdhef_logtool.logs.can_decoding import load_dbc, raw_bits, selectors_of, signal_values
+from pdhef_logtool.logs.can_decoding import (
+    Selectors,
+    fit_of,
+    load_dbc,
+    raw_bits,
+    selectors_of,
+    signal_groups,
+    signal_values,
+)
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.recording_span import RecordingSpan
@@ -42,6 +52,9 @@ NO_DATA_FLAGS = (1 << 30) | (1 << 29)
 ID_BITS = (1 << 29) - 1
 STANDARD_ID_BITS = (1 << 11) - 1
 
+#: Parts of a log in which identifiers are looked for.
+_PARTS, _PART_NS = 4, 5_000_000_000
+
 SHORT_FRAME = "frame shorter than its message in the DBC dropped"
 
 
@@ -63,7 +76,69 @@ def with_can_signals(log: DriveLog, mapping: SignalMapping) -> DriveLog:
             where="mapping",
             remedy="see docs/formats.md",
         )
-    return CanSignalLog(log, sources, mapping.can)
+    views: dict[str, _CanView] = {}
+    databases = [(path, load_dbc(log.definition(path))) for path in mapping.can.dbc]
+    valid_ids = {t.name for t in log.topics}
+    paths: dict[str, _FramePaths | str] = {}
+    problems: list[str] = []
+    for source in sources:
+        if source.topic not in valid_ids:
+            continue  # check_mapping names it, with the nearest topic.
+        if source.topic not in paths:
+            paths[source.topic] = _frame_paths(source.topic, log.fields(source.topic), mapping.can)
+        view = _make_view(source, paths[source.topic], databases)
+        if isinstance(view, str):
+            problems.append(view)
+        else:
+            views[source.read_topic] = view
+    if problems:
+        raise MappingError(
+            expected="CAN frames, and messages and signals of the DBC",
+            got="; ".join(dict.fromkeys(problems)),
+            where=", ".join(p.name for p in mapping.can.dbc),
+            remedy='write field = "can:<message>.<signal>"; [can] names the fields of a frame',
+        )
+    return CanSignalLog(log, views, mapping.can)
+
+
+def decoded_frames(log: DriveLog, topics: Sequence[TopicInfo]) -> CanSignalLog | None:
+    """Return a log with a view for each message of its DBC files that topics of frames contain; None without one.
+
+    Of several files with one identifier, that named like the topic decides, or that with most of its identifiers.
+    """
+    databases = [(path, load_dbc(path)) for path in log.databases] if topics else []
+    views: dict[str, _CanView] = {}
+    settings = CanSettings(tuple(p if p in log.given_databases else Path(p.name) for p, _ in databases))
+    for topic in topics if databases else ():
+        paths = _frame_paths(topic.name, log.fields(topic.name, quiet=True), settings)
+        if isinstance(paths, str):
+            continue
+        sent = _identifiers(log, topic.name, paths)
+        ranked = sorted(databases, key=lambda d: (not _is_named_like(d[0], topic.name), -fit_of(d[1], sent)))
+        described: set[tuple[int, bool]] = set()
+        for _, database in ranked:
+            for message in (m for m in database.messages if m.frame_id in sent):
+                key = (message.frame_id, message.is_extended_frame)
+                for ending, signals, selectors in signal_groups(message) if key not in described else ():
+                    name = f"{topic.name}.{CAN_PREFIX}{message.name}{ending}"
+                    by_name = {s.name: s for s in signals}
+                    views[name] = _CanView(topic.name, paths, message, by_name, selectors, True)
+            described |= {(m.frame_id, m.is_extended_frame) for m in database.messages}
+    return CanSignalLog(log, views, settings) if views else None
+
+
+def _identifiers(log: DriveLog, topic: str, paths: _FramePaths) -> frozenset[int]:
+    """Return the identifiers of a topic's frames in parts of the log."""
+    sent: set[int] = set()
+    for start in np.linspace(log.start_ns, max(log.start_ns, log.end_ns - _PART_NS), _PARTS).astype(np.int64).tolist():
+        columns = log.read({topic: [paths.identifier]}, start, start + _PART_NS, quiet=True)[topic]
+        numbers = np.asarray(columns.fields[paths.identifier], np.float64)
+        sent |= {int(i) & ID_BITS for i in np.unique(numbers[np.isfinite(numbers)])}
+    return frozenset(sent)
+
+
+def _is_named_like(path: Path, topic: str) -> bool:
+    return path.stem.lower() in topic.lower()
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,13 +160,13 @@ class _FramePaths:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _CanView:
-    """One signal of one topic. ``selectors`` are the multiplexers that have to contain one of their values."""
+    """Signals of one message by field. ``selectors`` are the multiplexers that have to contain one of their values."""
 
-    source: SignalSource
+    topic: str
     paths: _FramePaths
     message: Message
-    signal: Signal
-    selectors: tuple[tuple[Signal, tuple[int, ...]], ...]
+    signals: Mapping[str, Signal]
+    selectors: Selectors
     unflagged_may_be_extended: bool
 
 
@@ -101,41 +176,32 @@ class CanSignalLog(DriveLog):
     ``short_frames`` counts what the last read dropped: :class:`Loss` by topic and message.
     """
 
-    def __init__(self, log: DriveLog, sources: Sequence[SignalSource], settings: CanSettings) -> None:
+    def __init__(self, log: DriveLog, views: Mapping[str, _CanView], settings: CanSettings) -> None:
         self._log = log
         self.path, self.kind = log.path, log.kind
         self._settings = settings
-        self._views: dict[str, _CanView] = {}
+        self._views = views
         self.short_frames: tuple[Loss, ...] = ()
-        databases = [(path, load_dbc(path)) for path in settings.dbc]
-        valid_ids = {t.name for t in log.topics}
-        paths: dict[str, _FramePaths | str] = {}
-        problems: list[str] = []
-        for source in sources:
-            if source.topic not in valid_ids:
-                continue  # check_mapping names it, with the nearest topic.
-            if source.topic not in paths:
-                paths[source.topic] = _frame_paths(source.topic, log.fields(source.topic), settings)
-            view = _make_view(source, paths[source.topic], databases)
-            if isinstance(view, str):
-                problems.append(view)
-            else:
-                self._views[source.read_topic] = view
-        if problems:
-            raise MappingError(
-                expected="CAN frames, and messages and signals of the DBC",
-                got="; ".join(dict.fromkeys(problems)),
-                where=", ".join(p.name for p in settings.dbc),
-                remedy='write field = "can:<message>.<signal>"; [can] names the fields of a frame',
-            )
+
+    def as_mapped(self, mapping: SignalMapping) -> SignalMapping:
+        """Return a mapping that names fields of views, as one of ``can:`` sources with the DBC files."""
+        signals = {name: self.as_source(source) for name, source in mapping.signals.items()}
+        truth = {name: self.as_source(source) for name, source in mapping.truth.items()}
+        used = any(s.can_signal is not None for s in (*signals.values(), *truth.values()))
+        return replace(mapping, signals=signals, truth=truth, can=self._settings if used else None)
+
+    def as_source(self, source: SignalSource) -> SignalSource:
+        """Return a source that names a field of a view as a ``can:`` source."""
+        view = self._views.get(source.topic)
+        if view is None or not isinstance(source.field, str):
+            return source
+        return replace(source, topic=view.topic, field=f"{CAN_PREFIX}{view.message.name}.{source.field}")
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
         """The log's topics, and one for each view."""
         wanted = {t.name: t for t in self._log.topics}
-        views = (
-            TopicInfo(name, v.message.name, "can", wanted[v.source.topic].messages) for name, v in self._views.items()
-        )
+        views = (TopicInfo(name, v.message.name, "can", wanted[v.topic].messages) for name, v in self._views.items())
         return (*wanted.values(), *views)
 
     @property
@@ -153,22 +219,24 @@ class CanSignalLog(DriveLog):
         view = self._views.get(topic)
         if view is None:
             return self._log.fields(topic, quiet=quiet)
-        return (*self._log.fields(view.source.topic, quiet=quiet), *(FieldInfo(p, "number") for p in view.source.paths))
+        fields = self._log.fields(view.topic, quiet=quiet)
+        stamps = (f for f in fields if f.path.partition("[")[0] not in view.paths.all)
+        return (*stamps, *(FieldInfo(path, "number", unit=s.unit or "") for path, s in view.signals.items()))
 
     def unreadable(self, topic: str) -> str:
         """Return why no field of a topic is known."""
         view = self._views.get(topic)
-        return self._log.unreadable(topic if view is None else view.source.topic)
+        return self._log.unreadable(topic if view is None else view.topic)
 
     def borrowed(self, topic: str) -> tuple[Path, ...]:
         """Return the files of an installed ROS that a topic's type is read by."""
         view = self._views.get(topic)
-        return self._log.borrowed(topic if view is None else view.source.topic)
+        return self._log.borrowed(topic if view is None else view.topic)
 
     def first_messages(self, topic: str, most: int) -> list[object]:
         """Return the first messages of a topic whole."""
         view = self._views.get(topic)
-        return self._log.first_messages(topic if view is None else view.source.topic, most)
+        return self._log.first_messages(topic if view is None else view.topic, most)
 
     def read(
         self,
@@ -183,8 +251,8 @@ class CanSignalLog(DriveLog):
         raw: dict[str, list[str]] = {}
         for topic, paths in requests.items():
             view = self._views.get(topic)
-            wanted = paths if view is None else (*view.paths.all, *(p for p in paths if p not in view.source.paths))
-            merged = raw.setdefault(topic if view is None else view.source.topic, [])
+            wanted = paths if view is None else (*view.paths.all, *(p for p in paths if p not in view.signals))
+            merged = raw.setdefault(topic if view is None else view.topic, [])
             merged += [p for p in wanted if p not in merged]
         read = self._log.read(raw, start_ns, end_ns, quiet=quiet, stamps=stamps) if raw or stamps else {}
         short: dict[str, Loss] = {}
@@ -207,13 +275,13 @@ class CanSignalLog(DriveLog):
     def _view_columns(
         self, view: _CanView, read: dict[str, Columns], topic: str, paths: Sequence[str], short: dict[str, Loss]
     ) -> Columns:
-        frames = read[view.source.topic]
+        frames = read[view.topic]
         rows = np.flatnonzero(_is_message(frames, view, self._settings))
         data, available = _payload(frames, view.paths, rows)
         long_enough = available >= view.message.length
         if not long_enough.all():
             times = frames.log_time_ns[rows[~long_enough]]
-            where = f"{view.source.topic}.{CAN_PREFIX}{view.message.name}"
+            where = f"{view.topic}.{CAN_PREFIX}{view.message.name}"
             short[where] = Loss(
                 "undecodable", SHORT_FRAME, where, int(times.min()), int(times.max()) + 1, times.shape[0]
             )
@@ -223,8 +291,10 @@ class CanSignalLog(DriveLog):
                 raw = raw_bits(data, selector.start, selector.length, selector.byte_order)
                 use = use & np.isin(raw, np.asarray(sent_under, np.uint64))
         rows, data = rows[use], data[use]
-        values = signal_values(data, view.signal) if rows.shape[0] else np.empty(0)
-        fields = {p: values if p in view.source.paths else frames.fields[p][rows] for p in paths}
+        given = {p: frames.fields[p][rows] for p in paths if p not in view.signals}
+        signals = {p: view.signals[p] for p in paths if p in view.signals}
+        values = {p: signal_values(data, s) if rows.shape[0] else np.empty(0) for p, s in signals.items()}
+        fields = {**given, **values}
         return Columns(topic, frames.log_time_ns[rows], frames.publish_time_ns[rows], fields)
 
 
@@ -281,6 +351,7 @@ def _make_view(
     if not holders:
         near = _near(message_name, [m.name for _, d in databases for m in d.messages])
         return f"the DBC has no message {message_name}{near}"
+    holders = [h for h in holders if _is_named_like(h[0], source.topic)] or holders
     if len(holders) > 1:
         return f"message {message_name} is in {' and in '.join(p.name for p, _ in holders)}"
     message = holders[0][1]
@@ -293,7 +364,8 @@ def _make_view(
     same_id = [
         m for _, d in databases for m in d.messages if m.frame_id == message.frame_id and not m.is_extended_frame
     ]
-    return _CanView(source, paths, message, signal, tuple(selectors_of(signal, by_name)), not same_id)
+    selectors = tuple(selectors_of(signal, by_name))
+    return _CanView(source.topic, paths, message, dict.fromkeys(source.paths, signal), selectors, not same_id)
 
 
 def holds_frames(topic: str, fields: tuple[FieldInfo, ...]) -> bool:

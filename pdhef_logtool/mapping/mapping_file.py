@@ -418,7 +418,7 @@ def _gate_lines(gate: QualityGate) -> list[str]:
 
 
 def _can_lines(can: CanSettings) -> list[str]:
-    files = tuple(path.absolute().as_posix() for path in can.dbc)
+    files = tuple(path.absolute().as_posix() if path.exists() else path.name for path in can.dbc)
     names = ("id_field", "data_field", "length_field", "extended_field", "bus_field", "data_encoding")
     lines = ["[can]", f"dbc = {_toml(files)}", *_lines(can, {n: n for n in names})]
     if can.bus is not None:

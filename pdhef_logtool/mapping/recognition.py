@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
-from pdhef_logtool.mapping.can_frames import holds_frames
+from pdhef_logtool.mapping.can_frames import CanSignalLog, decoded_frames, holds_frames
 from pdhef_logtool.mapping.candidates import Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.clocks import with_usable_stamps
@@ -18,39 +18,19 @@ from pdhef_logtool.mapping.gnss_signals import RAW_COURSE, gnss_signals, has_hea
 from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, length_of, speed_over_ground
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
-from pdhef_logtool.mapping.naming import is_command
+from pdhef_logtool.mapping.naming import VOCABULARY, is_command
 from pdhef_logtool.mapping.navigation import named_gnss, navigation_truth
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.mapping.weighing import Weighed, weigh
 from pdhef_logtool.records.signals import WHEELS, FloatArray, has_gnss
 
-#: Words of a topic's name that make it a reference to score against; never an input.
-TRUTH_WORDS = frozenset(
-    {"truth", "groundtruth", "gt", "perfect", "mocap", "optitrack", "vicon", "qualisys", "correvit", "reference"}
-)
-#: Words of satellite and inertial navigation: velocities and poses of such topics are ground truth, their IMU is a
-#: sensor.
-NAVIGATION_WORDS = frozenset(
-    {"ins", "gnss", "gps", "rtk", "oxts", "novatel", "applanix", "vbox", "sbg", "span", "navsat", "dgps", "ppk", "adma"}
-)
-#: Words of measured vehicle speed.
-VEHICLE_WORDS = frozenset({"wheel", "wheels", "odom", "odometry", "can", "vehicle", "encoder", "encoders", "speed"})
-COMMAND_WORDS = frozenset({"cmd", "command", "commands", "setpoint", "target", "desired", "control", "plan", "planner"})
-ESTIMATE_WORDS = frozenset(
-    {"filtered", "ekf", "ukf", "estimate", "estimated", "estimator", "localization", "slam", "fused", "kinematic"}
-)
-#: Words of IMUs that sit in another device than the vehicle's own.
-DEVICE_WORDS = frozenset(
-    {"camera", "lidar", "realsense", "zed", "ouster", "livox", "velodyne", "phone", "os1", "radar"}
-)
-
-#: Starts of types that contain no signal of a car, and much else.
-NO_SENSORS = (
-    "sensor_msgs/Image", "sensor_msgs/CompressedImage", "sensor_msgs/PointCloud", "sensor_msgs/LaserScan",
-    "sensor_msgs/CameraInfo", "visualization_msgs/", "tf2_msgs/", "tf/", "rosgraph_msgs/", "rcl_interfaces/",
-    "diagnostic_msgs/", "nav_msgs/Path", "nav_msgs/OccupancyGrid", "foxglove.CompressedImage", "foxglove.PointCloud",
-)  # fmt: skip
+_TOPICS = {name: frozenset(words.split()) for name, words in VOCABULARY["topics"].items()}
+TRUTH_WORDS, NAVIGATION_WORDS = _TOPICS["truth"], _TOPICS["navigation"]
+_FIELDS: dict[str, dict[str, str]] = VOCABULARY["types"]
+#: Where types keep their velocities, and first entries of the covariances whose −1 disowns a quantity (REP 145).
+TWIST_FIELDS, TWIST_COVARIANCES = _FIELDS["twist"], _FIELDS["twist_covariance"]
+NO_SENSORS = tuple(VOCABULARY["topics"]["no_sensors"].split())
 #: Start of the note on a steering angle that is a command.
 FROM_COMMAND = "steer_rad comes from the command"
 PERFECT_PREFIX = "/truth/perfect"
@@ -59,52 +39,11 @@ OWN_PREFIX = "/pdhef/"
 PROBE_NS = 2_000_000_000
 PROBE_AT = (0.0, 0.25, 0.5, 0.75, 1.0)
 
-#: Where a type keeps its velocities; the braces represent ``linear`` or ``angular``.
-TWIST_FIELDS = {
-    "nav_msgs/Odometry": "twist.twist.{}",
-    "geometry_msgs/TwistStamped": "twist.{}",
-    "geometry_msgs/TwistWithCovarianceStamped": "twist.twist.{}",
-    "geometry_msgs/Twist": "{}",
-    "foxglove.Odometry": "{}_velocity",
-}
 #: Types whose velocities are in the body frame by convention.
 BODY_TWIST_TYPES = frozenset({"nav_msgs/Odometry", "foxglove.Odometry"})
-#: First entries of the covariances whose −1 disowns a quantity (REP 145).
-TWIST_COVARIANCES = {
-    "nav_msgs/Odometry": "twist.covariance[0]",
-    "geometry_msgs/TwistWithCovarianceStamped": "twist.covariance[0]",
-}
-POSE_COVARIANCES = {
-    "nav_msgs/Odometry": "pose.covariance[0]",
-    "geometry_msgs/PoseWithCovarianceStamped": "pose.covariance[0]",
-}
-POSE_FIELDS = {
-    "nav_msgs/Odometry": "pose.pose",
-    "geometry_msgs/PoseStamped": "pose",
-    "geometry_msgs/PoseWithCovarianceStamped": "pose.pose",
-    "foxglove.PoseInFrame": "pose",
-    "foxglove.Odometry": "pose",
-}
-STEERING_FIELDS = {
-    "autoware_vehicle_msgs/SteeringReport": "steering_tire_angle",
-    "autoware_auto_vehicle_msgs/SteeringReport": "steering_tire_angle",
-    "ackermann_msgs/AckermannDriveStamped": "drive.steering_angle",
-    "ackermann_msgs/AckermannDrive": "steering_angle",
-}
-SPEED_FIELDS = {
-    "autoware_vehicle_msgs/VelocityReport": "longitudinal_velocity",
-    "autoware_auto_vehicle_msgs/VelocityReport": "longitudinal_velocity",
-}
 WHEEL_SPEED_TYPES = frozenset({"truthsim_msgs/WheelSpeeds"})
 IMU_TYPES = frozenset({"sensor_msgs/Imu"})
 FIX_TYPES = frozenset({"sensor_msgs/NavSatFix", "foxglove.LocationFix"})
-#: Types that contain positions without the information which one is the vehicle's.
-SEVERAL_POSITIONS = {
-    "foxglove.PosesInFrame": "it is a list of poses, and the type does not give which pose is the vehicle's",
-    "foxglove.LocationFixes": "it is a list of fixes, and the type does not give which fix is the vehicle's",
-    "foxglove.FrameTransform": "the type does not give which frame is the vehicle",
-    "foxglove.FrameTransforms": "the type does not give which frame is the vehicle",
-}
 #: What a type must have to be what its name gives; of an IMU any of them, of others all.
 _IMU_PATHS = ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z")
 _TILT_RATE_PATHS = ("angular_velocity.x", "angular_velocity.y")
@@ -233,13 +172,7 @@ def auto_map(
     draft.notes += [
         f"{t.name} ({_type(t)}) has no messages" for t in log.topics if not t.messages and _is_well_known(t)
     ]
-    by_file = "by --set msgs=car.dbc, or " if log.messages is None else ""  # only tables are decoded as a whole
-    draft.notes += [
-        f"{t.name} contains raw CAN frames: describe them {by_file}in a mapping file with [can] dbc"
-        for t in topics
-        if not any(o.type_name.startswith("can/msg/") and o.name != t.name for o in topics)
-        if "can" in _words(f"{t.name} {t.type_name}") and holds_frames(t.name, log.fields(t.name, quiet=True))
-    ]
+    topics, decoded = _decode(draft, topics)
     _map_imu(draft, topics)
     _map_steering(draft, topics)
     _map_speed(draft, topics)
@@ -258,8 +191,36 @@ def auto_map(
         notes=tuple(draft.notes),
         checks=weighed.checks,
     )
+    candidates = weighed.candidates
+    if decoded is not None:
+        mapping = decoded.as_mapped(mapping)
+        candidates = tuple(replace(c, source=decoded.as_source(c.source)) for c in candidates)
     mapping = with_usable_stamps(log, mapping)
-    return AutoMapping(mapping, tuple(draft.ambiguities), missing_signals(mapping), weighed.candidates)
+    return AutoMapping(mapping, tuple(draft.ambiguities), missing_signals(mapping), candidates)
+
+
+def _decode(draft: _Draft, topics: list[TopicInfo]) -> tuple[list[TopicInfo], CanSignalLog | None]:
+    """Return the topics with messages of DBC files in place of raw CAN frames, and the log that offers these."""
+    log = draft.log
+    frames = [
+        t
+        for t in topics
+        if not any(o.type_name.startswith("can/msg/") and o.name != t.name for o in topics)
+        if "can" in _words(f"{t.name} {t.type_name}") and holds_frames(t.name, log.fields(t.name, quiet=True))
+    ]
+    decoded = decoded_frames(log, frames)
+    if decoded is not None:
+        draft.log = decoded
+        there = {t.name for t in log.topics}
+        topics = [t for t in topics if t not in frames] + [t for t in decoded.topics if t.name not in there]
+        names = ", ".join(path.name for path in log.databases)
+        draft.notes.append(f"the frames of {', '.join(t.name for t in frames)} are decoded by {names}")
+    else:
+        draft.notes += [
+            f"{t.name} contains raw CAN frames: describe them by --set msgs=car.dbc or [can] dbc of a mapping file"
+            for t in frames
+        ]
+    return topics, decoded
 
 
 def _why_unused(log: DriveLog, topic: TopicInfo) -> str:
@@ -406,7 +367,7 @@ def _device(topic: str) -> str:
 
 def _is_well_known(topic: TopicInfo) -> bool:
     """Return whether a topic was judged by its type already."""
-    tables = (TWIST_FIELDS, POSE_FIELDS, STEERING_FIELDS, SPEED_FIELDS, SEVERAL_POSITIONS)
+    tables = (TWIST_FIELDS, _FIELDS["pose"], _FIELDS["steering"], _FIELDS["speed"], _FIELDS["several_positions"])
     kind = _type(topic)
     return kind in IMU_TYPES | FIX_TYPES | WHEEL_SPEED_TYPES or any(kind in table for table in tables)
 
@@ -418,9 +379,9 @@ def _role(topic: TopicInfo) -> Role:
         return "command"
     if words & TRUTH_WORDS:
         return "truth"
-    if words & ESTIMATE_WORDS:
+    if words & _TOPICS["estimate"]:
         return "estimate"
-    if words & DEVICE_WORDS:
+    if words & _TOPICS["device"]:
         return "device"
     return "navigation" if (words | _words(topic.type_name)) & NAVIGATION_WORDS else "sensor"
 
@@ -428,22 +389,23 @@ def _role(topic: TopicInfo) -> Role:
 def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
     """Take yaw rate from an odometry and speed from a navigation system where no sensor gives them, with a note."""
     twists = [t for t in topics if _type(t) in TWIST_FIELDS]
-    twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | COMMAND_WORDS | ESTIMATE_WORDS)]
+    twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | _TOPICS["command"] | _TOPICS["estimate"])]
     if "yaw_rate_rad_s" not in draft.signals:
         odometries = [t for t in twists if _type(t) in BODY_TWIST_TYPES and not _is_truth(t)]
-        odometries = [t for t in odometries if _words(t.name) & VEHICLE_WORDS]
+        odometries = [t for t in odometries if _words(t.name) & _TOPICS["vehicle"]]
         odometries = [t for t in odometries if _span(draft.values(t.name, _twist(t, "angular", "z"))) > 0.0]
         chosen = draft.choose("yaw rate", odometries, lambda _: (), "the first of its kind")
         if chosen is not None:
             draft.take(draft.signals, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
             draft.notes.append(f"yaw_rate_rad_s comes from the odometry {chosen.name}, as no IMU gives it")
-    if "speed_m_s" in draft.signals or any(n.startswith("wheel_speed_") for n in draft.signals) or not draft.signals:
+    if not draft.signals or any(n.startswith(("speed_m_s", "wheel_speed_")) for n in draft.signals):
         return
     _speed_of_navigation(draft, topics)
     if "speed_m_s" not in draft.signals:
-        unsaid = [(t, TWIST_FIELDS[_type(t)].format("linear")) for t in twists if not _words(t.name) & VEHICLE_WORDS]
-        other = [t for t in topics if _role(t) in ("sensor", "navigation") and not _is_well_known(t)]
-        vectors = [*unsaid, *((t, "") for t in other if not _type(t).startswith(NO_SENSORS))]
+        unsaid = (t for t in twists if not _words(t.name) & _TOPICS["vehicle"])
+        other = (t for t in topics if _role(t) in ("sensor", "navigation") and not _is_well_known(t))
+        vectors = [(t, TWIST_FIELDS[_type(t)].format("linear")) for t in unsaid]
+        vectors += ((t, "") for t in other if not _type(t).startswith(NO_SENSORS))
         speed = speed_over_ground(draft.log, vectors, draft.signals, draft.truth)
         if speed is not None:
             draft.signals["speed_m_s"], evidence = speed
@@ -494,12 +456,12 @@ def _has_its_fields(log: DriveLog, topic: TopicInfo) -> bool:
     needed: list[str] = []
     if kind in FIX_TYPES:
         needed += ["latitude", "longitude"]
-    needed += [table[kind] for table in (STEERING_FIELDS, SPEED_FIELDS) if kind in table]
+    needed += [table[kind] for table in (_FIELDS["steering"], _FIELDS["speed"]) if kind in table]
     either: list[str] = []
     if kind in TWIST_FIELDS:
         either.append(_twist(topic, "linear", "x"))
-    if kind in POSE_FIELDS:
-        either.append(_join(POSE_FIELDS[kind], "position.x"))
+    if kind in _FIELDS["pose"]:
+        either.append(_join(_FIELDS["pose"][kind], "position.x"))
     if not needed and not either:
         return True
     fields = log.fields(topic.name)
@@ -552,12 +514,12 @@ def _probed_paths(topic: TopicInfo) -> list[str]:
         paths += [*_IMU_PATHS, *_TILT_RATE_PATHS, "linear_acceleration_covariance[0]", "angular_velocity_covariance[0]"]
     if kind in TWIST_FIELDS:
         paths += [*(_twist(topic, "linear", axis) for axis in "xyz"), _twist(topic, "angular", "z")]
-    if kind in POSE_FIELDS:
+    if kind in _FIELDS["pose"]:
         parts = [*(f"position.{a}" for a in "xy"), *(f"orientation.{a}" for a in "xyzw")]
-        paths += [_join(POSE_FIELDS[kind], part) for part in parts]
+        paths += [_join(_FIELDS["pose"][kind], part) for part in parts]
     if kind in FIX_TYPES:
         paths += ["latitude", "longitude", "altitude", "status.status", "heading", "course"]
-    return [*paths, *(table[kind] for table in (TWIST_COVARIANCES, POSE_COVARIANCES) if kind in table)]
+    return [*paths, *(table[kind] for table in (TWIST_COVARIANCES, _FIELDS["pose_covariance"]) if kind in table)]
 
 
 # ------------------------------------------------------------------------------------------------ sensors
@@ -568,7 +530,7 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
     imu = draft.choose(
         "imu",
         imus,
-        lambda t: (bool(_words(t.name) & DEVICE_WORDS),),
+        lambda t: (bool(_words(t.name) & _TOPICS["device"]),),
         "an IMU of the vehicle is preferred to one of a camera or lidar",
     )
     if imu is None:
@@ -590,7 +552,7 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
 
 
 def _map_steering(draft: _Draft, topics: list[TopicInfo]) -> None:
-    candidates = [t for t in topics if _type(t) in STEERING_FIELDS]
+    candidates = [t for t in topics if _type(t) in _FIELDS["steering"]]
     measured = [t for t in candidates if not _is_command(t)]
     chosen = draft.choose("steering", measured or candidates, lambda _: (), "the first of its kind")
     if chosen is None:
@@ -599,40 +561,40 @@ def _map_steering(draft: _Draft, topics: list[TopicInfo]) -> None:
         draft.notes.append(
             f"{FROM_COMMAND} {chosen.name}, not from a measured angle: actuator lag and steering play are missing"
         )
-    draft.take(draft.signals, "steer_rad", chosen.name, STEERING_FIELDS[_type(chosen)])
+    draft.take(draft.signals, "steer_rad", chosen.name, _FIELDS["steering"][_type(chosen)])
 
 
 def _is_command(topic: TopicInfo) -> bool:
-    return _type(topic).startswith("ackermann_msgs/") or bool(_words(topic.name) & COMMAND_WORDS)
+    return _type(topic).startswith("ackermann_msgs/") or bool(_words(topic.name) & _TOPICS["command"])
 
 
 def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
-    reports = [t for t in topics if _type(t) in SPEED_FIELDS]
+    reports = [t for t in topics if _type(t) in _FIELDS["speed"]]
     twists = []
     for topic in topics:
-        if _type(topic) not in TWIST_FIELDS or _is_truth(topic) or _words(topic.name) & COMMAND_WORDS:
+        if _type(topic) not in TWIST_FIELDS or _is_truth(topic) or _words(topic.name) & _TOPICS["command"]:
             continue
-        if _words(topic.name) & ESTIMATE_WORDS:
+        if _words(topic.name) & _TOPICS["estimate"]:
             draft.doubt(
                 "speed",
                 (topic.name,),
                 None,
                 "its name is that of an estimate, which is neither a sensor nor ground truth",
             )
-        elif _words(topic.name) & VEHICLE_WORDS:
+        elif _words(topic.name) & _TOPICS["vehicle"]:
             twists.append(topic)
         else:
             draft.doubt("speed", (topic.name,), None, "its name is neither that of a speed sensor nor of ground truth")
     chosen = draft.choose(
         "speed",
         [*reports, *twists],
-        lambda t: (_type(t) not in SPEED_FIELDS,),
+        lambda t: (_type(t) not in _FIELDS["speed"],),
         "a velocity report is preferred to an odometry or a twist",
     )
     if chosen is None:
         return
     kind = _type(chosen)
-    path = SPEED_FIELDS[kind] if kind in SPEED_FIELDS else _twist(chosen, "linear", "x")
+    path = _FIELDS["speed"][kind] if kind in _FIELDS["speed"] else _twist(chosen, "linear", "x")
     draft.take(draft.signals, "speed_m_s", chosen.name, path)
 
 
@@ -654,7 +616,7 @@ def _truth_group(topic: TopicInfo) -> str:
 
 
 def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
-    types = set(TWIST_FIELDS) | set(POSE_FIELDS) | FIX_TYPES
+    types = set(TWIST_FIELDS) | set(_FIELDS["pose"]) | FIX_TYPES
     candidates = [t for t in topics if _type(t) in types and (_is_truth(t) or _type(t) in FIX_TYPES)]
     groups = {_truth_group(t) for t in candidates}
     if len(groups) > 1:
@@ -663,8 +625,8 @@ def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
         draft.notes.append(f"{prefer} ground truth used; {', '.join(left)} not used")
         candidates = kept
     for topic in topics:
-        if _is_truth(topic) and _type(topic) in SEVERAL_POSITIONS:
-            draft.doubt("ground-truth position", (topic.name,), None, SEVERAL_POSITIONS[_type(topic)])
+        if _is_truth(topic) and _type(topic) in _FIELDS["several_positions"]:
+            draft.doubt("ground-truth position", (topic.name,), None, _FIELDS["several_positions"][_type(topic)])
     velocity = _map_truth_velocity(draft, candidates)
     _map_truth_position(draft, candidates, velocity)
 
@@ -726,10 +688,10 @@ def _has_twist(draft: _Draft, topic: TopicInfo) -> bool:
     if not (draft.is_given(topic.name, forward) and draft.is_given(topic.name, left)):
         return False
     v = np.concatenate([draft.values(topic.name, forward), draft.values(topic.name, left)])
-    if v.shape[0] and (v == 0.0).all() and _type(topic) in POSE_FIELDS:
+    if v.shape[0] and (v == 0.0).all() and _type(topic) in _FIELDS["pose"]:
         # Converters from fixes to odometry leave the twist at zero while the pose moves.
-        x = draft.values(topic.name, _join(POSE_FIELDS[_type(topic)], "position.x"))
-        y = draft.values(topic.name, _join(POSE_FIELDS[_type(topic)], "position.y"))
+        x = draft.values(topic.name, _join(_FIELDS["pose"][_type(topic)], "position.x"))
+        y = draft.values(topic.name, _join(_FIELDS["pose"][_type(topic)], "position.y"))
         return not (_span(x) > 1.0 or _span(y) > 1.0)
     return True
 
@@ -740,9 +702,11 @@ def _span(values: FloatArray) -> float:
 
 
 def _has_pose(draft: _Draft, topic: TopicInfo) -> bool:
-    if _type(topic) not in POSE_FIELDS or draft.is_disowned(topic.name, POSE_COVARIANCES.get(_type(topic), "")):
+    if _type(topic) not in _FIELDS["pose"] or draft.is_disowned(
+        topic.name, _FIELDS["pose_covariance"].get(_type(topic), "")
+    ):
         return False
-    base = POSE_FIELDS[_type(topic)]
+    base = _FIELDS["pose"][_type(topic)]
     if not all(draft.is_given(topic.name, _join(base, f"position.{a}")) for a in "xy"):
         return False
     # A pose that stays at the origin while messages come is a filler.
@@ -770,7 +734,7 @@ def _map_truth_position(draft: _Draft, candidates: list[TopicInfo], velocity: To
     if _type(chosen) in FIX_TYPES:
         _map_fix(draft, chosen, alone=velocity is None)
         return
-    base = POSE_FIELDS[_type(chosen)]
+    base = _FIELDS["pose"][_type(chosen)]
     for name, axis in (("x_m", "x"), ("y_m", "y")):
         draft.take(draft.truth, name, chosen.name, _join(base, f"position.{axis}"))
     paths = tuple(_join(base, f"orientation.{a}") for a in "wxyz")

@@ -157,9 +157,10 @@ class _Weighing:
         """Take the best candidate of each signal that is missing."""
         usable = [f for f in self.fields.candidates if f.role in ("sensor", "navigation", "device")]
         usable = [f for f in usable if (f.seen.changes or f.fixed) and f.section != "truth"]
+        elsewhere = {f.meaning.quantity for f in usable if f.topic.name != self.truth_from}
         for item in usable:
             # Sensors of the message with ground truth are taken only if no other message has them.
-            item.bonus -= 0.2 if item.topic.name == self.truth_from else 0.0
+            item.bonus -= 0.2 * (item.topic.name == self.truth_from and item.meaning.quantity in elsewhere)
         wheels = any(n.startswith("wheel_speed") for n in have)
         for name, quantity, part in _SENSORS:
             if name not in have and not (wheels and quantity == "speed"):
@@ -459,7 +460,11 @@ class _Weighing:
             self._tell(f"truth.{name}", item)
 
     def _truth_turns(self) -> bool:
-        """Give the ground-truth yaw rate the sign of the sensor's; return whether the two are one motion."""
+        """Give the ground truth the signs of the sensors; return whether its yaw rate is the sensor's."""
+        lateral, across = self._chosen("ay_m_s2"), self.truth.get("vy_m_s")
+        if lateral is not None and across is not None and lateral.sign < 0.0 and _share_axis(lateral, across):
+            across.sign = -1.0
+            across.reasons.append(f"sign turned as that of {lateral.path}: their axis is one")
         sensor = self._chosen("yaw_rate_rad_s")
         true = self.truth.get("yaw_rate_rad_s")
         relation = None if sensor is None or true is None else fit(sensor.si, true.si)
@@ -513,6 +518,12 @@ class _Weighing:
             rivals=tuple(self.rivals),
             checks=(*(c for c in self.fields.checks if self._is_of_ours(c)), *self.checks),
         )
+
+
+def _share_axis(first: Field, second: Field) -> bool:
+    """Return whether two fields of one topic, both without a documented sign, name their axis with the same word."""
+    axes = (set(words_of(f.path)) & {"lat", "lateral", "trans", "y", "right"} for f in (first, second))
+    return first.topic.name == second.topic.name and bool(set.intersection(*axes)) and not (first.fixed or second.fixed)
 
 
 def _truth_of(candidates: Sequence[Field]) -> dict[str, Field]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -53,8 +53,7 @@ class Mark:
     value: float
 
 
-@dataclass(frozen=True, slots=True)
-class Span:
+class Span(NamedTuple):
     """Something that lasted, in seconds from the log's start."""
 
     start_s: float
@@ -95,10 +94,23 @@ class Interval:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TimeFigure:
+class Figure:
+    """What all figures have; ``kind`` decides what the page's script draws."""
+
+    kind: ClassVar[str]
+    title: str
+
+    @property
+    def heading(self) -> str:
+        """What is over the figure."""
+        return self.title
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TimeFigure(Figure):
     """Lines over time. ``level``: a value that is drawn across; ``resolution``: what nobody sees, in the unit."""
 
-    title: str
+    kind = "time"
     unit: str
     series: Sequence[Series]
     bands: Sequence[Band] = ()
@@ -114,68 +126,45 @@ class TimeFigure:
         return f"{self.title} [{self.unit}]" if self.unit else self.title
 
 
-@dataclass(frozen=True, slots=True)
-class StripFigure:
+@dataclass(frozen=True, slots=True, eq=False)
+class StripFigure(Figure):
     """Rows of intervals over time."""
 
-    title: str
+    kind = "strip"
     rows: Sequence[Row]
-
-    @property
-    def heading(self) -> str:
-        """What is over the figure."""
-        return self.title
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PointsFigure:
+class PointsFigure(Figure):
     """Points in a plane. ``equal``: one scale on both axes; ``log``: both are logarithmic."""
 
-    title: str
+    kind = "points"
     x_label: str
     y_label: str
     clouds: Sequence[Cloud]
     equal: bool = False
     log: bool = False
 
-    @property
-    def heading(self) -> str:
-        """What is over the figure."""
-        return self.title
 
-
-@dataclass(frozen=True, slots=True)
-class IntervalsFigure:
+@dataclass(frozen=True, slots=True, eq=False)
+class IntervalsFigure(Figure):
     """Figures with their intervals, one below the other; ``zero`` is drawn across."""
 
-    title: str
+    kind = "intervals"
     unit: str
     intervals: Sequence[Interval]
     zero: float | None = None
 
-    @property
-    def heading(self) -> str:
-        """What is over the figure."""
-        return self.title
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BarsFigure:
+class BarsFigure(Figure):
     """A histogram: ``counts`` [B] between ``edges`` [B + 1]."""
 
-    title: str
+    kind = "bars"
     unit: str
-    edges: FloatArray
-    counts: FloatArray
+    edges: Sequence[float]
+    counts: Sequence[float]
     colour: str = "#0072b2"
-
-    @property
-    def heading(self) -> str:
-        """What is over the figure."""
-        return self.title
-
-
-Figure = TimeFigure | StripFigure | PointsFigure | IntervalsFigure | BarsFigure
 
 
 @dataclass(slots=True, eq=False)
@@ -185,30 +174,6 @@ class Charts:
     grid: Grid | None = None
     origin_ns: int = 0
     figures: dict[str, Figure] = field(default_factory=dict)
-
-    def time(self, key: str, title: str, unit: str, series: Sequence[Series], **options: Any) -> None:
-        """Add a :class:`TimeFigure`."""
-        self.figures[key] = TimeFigure(title, unit, series, **options)
-
-    def strip(self, key: str, title: str, rows: Sequence[Row]) -> None:
-        """Add a :class:`StripFigure`."""
-        self.figures[key] = StripFigure(title, [Row(r.label, r.colour, _joined(r.spans)) for r in rows])
-
-    def points(
-        self, key: str, title: str, x_label: str, y_label: str, clouds: Sequence[Cloud], **options: bool
-    ) -> None:
-        """Add a :class:`PointsFigure`."""
-        self.figures[key] = PointsFigure(title, x_label, y_label, clouds, **options)
-
-    def intervals(
-        self, key: str, title: str, unit: str, intervals: Sequence[Interval], zero: float | None = None
-    ) -> None:
-        """Add an :class:`IntervalsFigure`."""
-        self.figures[key] = IntervalsFigure(title, unit, intervals, zero)
-
-    def bars(self, key: str, title: str, unit: str, edges: FloatArray, counts: FloatArray) -> None:
-        """Add a :class:`BarsFigure`."""
-        self.figures[key] = BarsFigure(title, unit, edges, counts)
 
     def text(self, key: str) -> str:
         """Return a figure in words: what it shows, and the range of each of its tracks."""
@@ -225,8 +190,10 @@ class Charts:
         if isinstance(figure, IntervalsFigure):
             parts = [f"{i.label} {i.middle:.3g} ({i.low:.3g} to {i.high:.3g})" for i in figure.intervals]
             return f"{figure.heading} in {figure.unit}: {'; '.join(parts)}."
+        assert isinstance(figure, BarsFigure)
         return (
-            f"{figure.heading} in {figure.unit}: histogram of {figure.counts.sum():.0f} values, {_range(figure.edges)}."
+            f"{figure.heading} in {figure.unit}: histogram of {sum(figure.counts):.0f} values, "
+            f"{_range(np.array(figure.edges))}."
         )
 
     def start_s(self) -> float:
@@ -236,7 +203,10 @@ class Charts:
     def document(self) -> tuple[dict[str, Any], dict[str, str]]:
         """Return what the page's script draws, and the blocks of text that it names, by name."""
         packed = _Blocks()
-        figures = {key: _of_figure(figure, packed) for key, figure in self.figures.items()}
+        figures = {
+            key: {"kind": figure.kind, **packed.entries(figure, getattr(figure, "resolution", 0.0))}
+            for key, figure in self.figures.items()
+        }
         grid = self.grid
         time = None if grid is None else {"start": self.start_s(), "cell": grid.cell_s, "cells": grid.cells}
         return {"time": time, "figures": figures}, packed.texts
@@ -259,94 +229,20 @@ class _Blocks:
             self._known[key] = {"block": name, "low": made.low, "step": made.step, "count": made.count}
         return self._known[key]
 
+    def entries(self, record: Any, resolution: float) -> dict[str, Any]:
+        """Return a record by its fields, as the page's script reads it."""
+        return {f.name: self._plain(getattr(record, f.name), resolution) for f in fields(record)}
 
-def _of_figure(figure: Figure, blocks: _Blocks) -> dict[str, Any]:
-    if isinstance(figure, TimeFigure):
-        return _of_time(figure, blocks)
-    if isinstance(figure, StripFigure):
-        rows = [
-            {
-                "label": _label(r.label),
-                "colour": r.colour,
-                "spans": [[round(s.start_s, 4), round(s.end_s, 4), all_printable(s.text[:200])] for s in r.spans],
-            }
-            for r in figure.rows
-        ]
-        return {"kind": "strip", "title": _label(figure.title), "rows": rows}
-    if isinstance(figure, PointsFigure):
-        clouds = [
-            {
-                "label": _label(c.label),
-                "colour": c.colour,
-                "line": c.line,
-                "x": blocks.add(c.x),
-                "y": blocks.add(c.y),
-                "at": None if c.at_s is None else blocks.add(c.at_s),
-            }
-            for c in figure.clouds
-        ]
-        return {
-            "kind": "points",
-            "title": _label(figure.title),
-            "xLabel": _label(figure.x_label),
-            "yLabel": _label(figure.y_label),
-            "clouds": clouds,
-            "equal": figure.equal,
-            "log": figure.log,
-        }
-    if isinstance(figure, IntervalsFigure):
-        intervals = [
-            {"label": _label(i.label), "colour": i.colour, "of": [_known(v) for v in (i.low, i.middle, i.high)]}
-            for i in figure.intervals
-        ]
-        return {
-            "kind": "intervals",
-            "title": _label(figure.title),
-            "unit": figure.unit,
-            "intervals": intervals,
-            "zero": figure.zero,
-        }
-    return {
-        "kind": "bars",
-        "title": _label(figure.title),
-        "unit": figure.unit,
-        "colour": figure.colour,
-        "edges": [float(v) for v in figure.edges],
-        "counts": [float(v) for v in figure.counts],
-    }
-
-
-def _of_time(figure: TimeFigure, blocks: _Blocks) -> dict[str, Any]:
-    return {
-        "kind": "time",
-        "title": _label(figure.title),
-        "unit": figure.unit,
-        "log": figure.log,
-        "level": figure.level,
-        "height": figure.height,
-        "series": [
-            {
-                "label": _label(s.label),
-                "colour": s.colour,
-                "width": s.width,
-                "dash": list(s.dash),
-                "group": _label(s.group),
-                "data": blocks.add(s.values, figure.resolution),
-            }
-            for s in figure.series
-        ],
-        "bands": [
-            {
-                "label": _label(b.label),
-                "colour": b.colour,
-                "group": _label(b.group),
-                "low": blocks.add(b.low, figure.resolution),
-                "high": blocks.add(b.high, figure.resolution),
-            }
-            for b in figure.bands
-        ],
-        "marks": [{"label": _label(m.label), "at": m.at_s, "value": m.value} for m in figure.marks],
-    }
+    def _plain(self, value: Any, resolution: float) -> Any:
+        if isinstance(value, np.ndarray):
+            return self.add(value, resolution)
+        if isinstance(value, str):
+            return _label(value)
+        if isinstance(value, float):
+            return float(f"{value:.9g}") if np.isfinite(value) else None
+        if isinstance(value, list | tuple):
+            return [self._plain(entry, resolution) for entry in value]
+        return self.entries(value, resolution) if is_dataclass(value) else value
 
 
 def _range(values: FloatArray) -> str:
@@ -359,11 +255,7 @@ def _label(text: str) -> str:
     return all_printable(cut)
 
 
-def _known(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
-def _joined(spans: Sequence[Span]) -> list[Span]:
+def joined(spans: Sequence[Span]) -> list[Span]:
     """Return the spans in order of time, at most :data:`_MOST_SPANS`: the narrowest gaps between them are closed."""
     ordered = sorted(spans, key=lambda s: (s.start_s, s.end_s))
     if len(ordered) <= _MOST_SPANS:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.evaluation.units import read_unit
-from pdhef_logtool.reports.charts import Charts, Cloud, Interval
+from pdhef_logtool.reports.charts import Charts, Cloud, Interval, IntervalsFigure, PointsFigure
 from pdhef_logtool.reports.colours import FAULT, PLAIN
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison, DriveFigure
@@ -74,7 +74,7 @@ def _draw(comparison: Comparison, charts: Charts) -> None:
     ]
     others = [_interval(figure, PLAIN) for figure in comparison.others]
     if asked or others:
-        charts.intervals("changes", "Median change, 95 % interval", "%", [*asked, *others], zero=0.0)
+        charts.figures["changes"] = IntervalsFigure("Median change, 95 % interval", "%", [*asked, *others], zero=0.0)
     figure = comparison.figures[0]
     unit, factor = read_unit(figure.unit)
     a, b = (np.array([getattr(d, side) for d in figure.drives]) * factor for side in "ab")
@@ -83,7 +83,7 @@ def _draw(comparison: Comparison, charts: Charts) -> None:
         ends = np.array([min(a[positive].min(), b[positive].min()), max(a[positive].max(), b[positive].max())])
         clouds = [Cloud("no change", PLAIN, ends, ends, line=True), Cloud("drives", _BLUE, a[positive], b[positive])]
         title = f"{figure.figure.signal} {figure.figure.metric} of each drive: above the line B is worse"
-        charts.points("drives", title, f"A [{unit or '1'}]", f"B [{unit or '1'}]", clouds, log=True)
+        charts.figures["drives"] = PointsFigure(title, f"A [{unit or '1'}]", f"B [{unit or '1'}]", clouds, log=True)
 
 
 def _interval(figure: ComparedFigure, colour: str) -> Interval:

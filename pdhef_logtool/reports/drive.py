@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,11 +27,10 @@ _SHORT_S = 10.0
 #: The figures of a page, in the order in which they are.
 OVER_TIME = ("sideslip", "error", "trust", "r_scale", "nis", "speed", "ay", "strip")
 IN_PLANE = ("path", "ay_sideslip", "phase")
-FIGURES = ("worst", *OVER_TIME, *IN_PLANE)
 #: Rows of tables that a log can make as long as it likes.
 _MOST_ROWS = 200
 #: Outcomes of verdicts: a word, and the class of the style.
-_OUTCOMES = {
+OUTCOMES = {
     "better": ("better", "good"),
     "same": ("as good", ""),
     "worse": ("worse", "bad"),
@@ -126,18 +125,16 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
 
 
 def roles_of(report: Mapping[str, Any]) -> Roles | None:
-    """Return who is drawn how: the selected estimate and the best physics, as the verdict on sideslip has them."""
-    ran = [e for e in report["estimators"] if e["outcome"] == "ran"]
-    names: list[str] = [e["name"] for e in ran]
+    """Return who is drawn how: the selected estimate, and what the verdict on sideslip compares it with, or physics."""
+    names: list[str] = [e["name"] for e in report["estimators"] if e["outcome"] == "ran"]
     if not names:
         return None
     answer = report.get("answer") or {}
     main: str = answer["main"] if answer.get("main") in names else names[0]
     rival_of_verdict = next((str(v.get("rival")) for v in _told(report) if v.get("signal") == "sideslip_rad"), "")
     identical = identical_to(report, main)
-    others = [e for e in ran if e["name"] not in identical]
-    is_other = rival_of_verdict in names and rival_of_verdict not in identical
-    rival = rival_of_verdict if is_other else _best_physics(report, others, main)
+    others = [n for n in names if n not in identical]
+    rival = next((n for n in (rival_of_verdict, _PHYSICS, *others) if n in others and n != main), "")
     return Roles(main, rival, tuple(n for n in names if n not in (main, rival)))
 
 
@@ -159,31 +156,6 @@ def identical_to(report: Mapping[str, Any], main: str) -> list[str]:
     return [*dict.fromkeys([*same, *pairs])]
 
 
-def _best_physics(report: Mapping[str, Any], ran: Sequence[Mapping[str, Any]], main: str) -> str:
-    """Return the estimator on physics alone with the least error, else the first; the first of any where none is.
-
-    Where nothing is scored, ``physics`` itself comes before others.
-    """
-    errors = {m["estimator"]: m["value"] for m in report["metrics"] if _is_whole(m, "sideslip_rad", "rmse")}
-    others = [e for e in ran if e["name"] != main]
-    causal = next(e["causal"] for e in ran if e["name"] == main)
-    physics: list[str] = [e["name"] for e in others if _on_physics(e) and (e["causal"] or not causal)]
-    scored = [n for n in physics if errors.get(n) is not None]
-    if scored:
-        return min(scored, key=lambda n: float(errors[n]))
-    fallback: list[str] = [*(n for n in physics if n == _PHYSICS), *physics, *(e["name"] for e in others), ""]
-    return fallback[0]
-
-
-def _on_physics(estimator: Mapping[str, Any]) -> bool:
-    algorithm = estimator.get("algorithm") or {}
-    return algorithm.get("physics_sha256") is not None and algorithm.get("network_sha256") is None
-
-
-def _is_whole(row: Mapping[str, Any], signal: str, metric: str) -> bool:
-    return (row["signal"], row["segment"], row["metric"]) == (signal, "all", metric)
-
-
 def _told(report: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     return [v for v in report.get("verdicts") or () if isinstance(v, Mapping)]
 
@@ -192,7 +164,7 @@ def verdicts_of(report: Mapping[str, Any]) -> list[Verdict]:
     """Return the sentences at the head of a page; without verdicts, the words of the selected estimate."""
     signals: dict[tuple[str, str, str], list[str]] = {}
     for v in _told(report):
-        word, kind = _OUTCOMES.get(str(v.get("outcome")), (str(v.get("outcome")), ""))
+        word, kind = OUTCOMES.get(str(v.get("outcome")), (str(v.get("outcome")), ""))
         text = str(v.get("text", "")).removeprefix(f"{word}: ")
         signals.setdefault((word, text, kind), []).append(LABELS.get(str(v.get("signal")), ""))
     verdicts = [Verdict(", ".join(names), *of) for of, names in signals.items()]

@@ -10,11 +10,23 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.evaluation.dead_reckoned import aligned_path
-from pdhef_logtool.evaluation.largest_errors import largest_places
+from pdhef_logtool.evaluation.largest_errors import ErrorPlace
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
-from pdhef_logtool.reports.charts import Band, Charts, Cloud, Mark, Row, Series, Span
+from pdhef_logtool.reports.charts import (
+    Band,
+    Charts,
+    Cloud,
+    Mark,
+    PointsFigure,
+    Row,
+    Series,
+    Span,
+    StripFigure,
+    TimeFigure,
+    joined,
+)
 from pdhef_logtool.reports.colours import FAULT, NOTE, PLAIN, colour
 from pdhef_logtool.reports.drive_series import DriveSeries, Points, Reference, SideslipTrack, Tracks, gather
 from pdhef_logtool.reports.encoding import grid_of
@@ -63,14 +75,10 @@ class Roles:
 
 
 @dataclass(frozen=True, slots=True)
-class Peak:
-    """One of the largest errors: a stamp of the file, in ns and in seconds from the log's start; angles in rad."""
+class Peak(ErrorPlace):
+    """One of the largest errors with its seconds from the log's start, and the segments that it is in."""
 
-    stamp_ns: int
     at_s: float
-    estimate_rad: float
-    other_rad: float
-    error_rad: float
     during: str
 
 
@@ -78,14 +86,12 @@ class Peak:
 class DriveFigures:
     """What is drawn of a drive, and what the page states beside it.
 
-    ``other``: reference of the selected estimate, ground truth or else another estimator; empty where there is none.
     ``scored``: whether any sideslip error is known. ``moves``: whether a sideslip is known at all above the low-speed
     blend. ``absent``: estimators that the report names and the file has not.
     """
 
     charts: Charts
     peaks: Sequence[Peak]
-    other: str
     scored: bool
     moves: bool
     absent: Sequence[str]
@@ -114,7 +120,8 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles, low_speed
         return None
     grid, origin_ns = grid_of(stamps), int(report["log"]["start_ns"])
     answer = tracks.sideslip(roles.main)
-    reference = _reference(tracks, roles, answer)
+    peaks = _peaks(report)
+    reference = _reference(tracks, peaks)
     scored = reference is not None and reference.scored
     dof = _degrees_of_freedom(report)
     series = {}
@@ -124,30 +131,24 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles, low_speed
             error_of = None if name == TRUTH else against
             series[name] = gather(name, tracks, grid, error_of, dof, whole=name in (TRUTH, roles.main))
     charts = Charts(grid, origin_ns)
-    peaks = () if reference is None else _peaks(answer, reference, report["segments"], origin_ns)
     moves = bool(np.isfinite(series[roles.main].sideslip.values).any())
     _add_sideslip(charts, series, roles)
     _add_error(charts, series, roles, peaks, scored=scored)
     _add_filter(charts, series, roles)
     _add_motion(charts, series, roles)
-    charts.strip("strip", "Faults, gaps and segments", _rows(report, series, roles, stamps, origin_ns))
+    rows = _rows(report, series, roles, stamps, origin_ns)
+    charts.figures["strip"] = StripFigure("Faults, gaps and segments", rows)
     path_text = _add_path(charts, series, roles, report.get("path_drift")) if TRUTH in series else ""
     _add_planes(charts, [series[n] for n in (TRUTH, roles.main) if n in series])
     _add_worst(charts, answer, reference, peaks, origin_ns)
     absent = [n for n in roles.names if n not in tracks.names]
-    return DriveFigures(
-        charts, peaks, "" if reference is None else reference.track.name, scored, moves, absent, path_text
-    )
+    return DriveFigures(charts, peaks, scored, moves, absent, path_text)
 
 
-def _reference(tracks: Tracks, roles: Roles, answer: SideslipTrack) -> Reference | None:
-    """Return ground truth where it scores the selected sideslip, else the next estimate, None where there is none."""
-    if TRUTH in tracks.names:
-        truth = Reference(tracks.sideslip(TRUTH), True, tracks)
-        if np.isfinite(truth.whole_error(answer)).any():
-            return truth
-    other = next((n for n in roles.names[1:] if n in tracks.names), None)
-    return None if other is None else Reference(tracks.sideslip(other), False, tracks)
+def _reference(tracks: Tracks, peaks: Sequence[Peak]) -> Reference | None:
+    """Return what the largest errors of the report are against; None where it has none."""
+    against = peaks[0].against if peaks else ""
+    return Reference(tracks.sideslip(against), against == TRUTH, tracks) if against in tracks.names else None
 
 
 def _degrees_of_freedom(report: Mapping[str, Any]) -> dict[str, float]:
@@ -157,27 +158,14 @@ def _degrees_of_freedom(report: Mapping[str, Any]) -> dict[str, float]:
     return {m["estimator"]: float(m["value"]) for m in rows}
 
 
-def _peaks(
-    answer: SideslipTrack, reference: Reference, segments: Sequence[Mapping[str, Any]], origin_ns: int
-) -> tuple[Peak, ...]:
-    rows = reference.rows(answer.stamps_ns)
-    if rows is None:
-        return ()
-    error, stamps = reference.whole_error(answer), answer.stamps_ns
+def _peaks(report: Mapping[str, Any]) -> tuple[Peak, ...]:
+    """Return the largest errors of a report; those of an earlier version are against ground truth."""
     peaks = []
-    for row in largest_places(stamps, error):
-        stamp = int(stamps[row])
-        names = [s["name"] for s in segments if s["start_ns"] <= stamp < s["end_ns"]]
-        peaks.append(
-            Peak(
-                stamp,
-                (stamp - origin_ns) * 1e-9,
-                float(answer.sideslip_rad[row]),
-                float(reference.track.sideslip_rad[rows[row]]),
-                float(error[row]),
-                ", ".join(dict.fromkeys(names)),
-            )
-        )
+    for place in report.get("largest_errors") or ():
+        stamp = int(place["stamp_ns"])
+        names = [s["name"] for s in report["segments"] if s["start_ns"] <= stamp < s["end_ns"]]
+        at_s, during = (stamp - int(report["log"]["start_ns"])) * 1e-9, ", ".join(dict.fromkeys(names))
+        peaks.append(Peak(**{"against": TRUTH, **place}, at_s=at_s, during=during))
     return tuple(peaks)
 
 
@@ -203,7 +191,9 @@ def _add_sideslip(charts: Charts, series: Mapping[str, DriveSeries], roles: Role
         if np.isfinite(low).any()
         else []
     )
-    charts.time("sideslip", "Sideslip", "°", lines, bands=bands, level=0.0, resolution=_DEGREES_SEEN, height=260)
+    charts.figures["sideslip"] = TimeFigure(
+        "Sideslip", "°", lines, bands, level=0.0, resolution=_DEGREES_SEEN, height=260
+    )
 
 
 def _add_error(
@@ -216,19 +206,19 @@ def _add_error(
     if scored:
         title = "Absolute error of sideslip, largest of each cell"
     marks = [Mark(str(i + 1), p.at_s, abs(p.error_rad) * DEGREES) for i, p in enumerate(peaks)]
-    charts.time("error", title, "°", lines, marks=marks, level=0.0, resolution=_DEGREES_SEEN)
+    charts.figures["error"] = TimeFigure(title, "°", lines, marks=marks, level=0.0, resolution=_DEGREES_SEEN)
 
 
 def _add_filter(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> None:
     if trust := _lines(series, roles, "trust", roles.names):
-        charts.time("trust", "Residual gain", "", trust, resolution=_SHARE_SEEN, height=120)
+        charts.figures["trust"] = TimeFigure("Residual gain", "", trust, resolution=_SHARE_SEEN, height=120)
     scales = _lines(series, roles, "r_scale", roles.names)
     if any(np.nanmax(s.values) > 1.0 + 1e-9 for s in scales):
         title = "R scale: how much wider than usual the filter takes its sensors' noise"
-        charts.time("r_scale", title, "×", scales, level=1.0, log=True, height=130)
+        charts.figures["r_scale"] = TimeFigure(title, "×", scales, level=1.0, log=True, height=130)
     if nis := _lines(series, roles, "nis", roles.names):
         title = "NIS over its degrees of freedom, mean of a second: 1 where sensors surprise as much as expected"
-        charts.time("nis", title, "", nis, level=1.0, height=130, resolution=_SEEN)
+        charts.figures["nis"] = TimeFigure(title, "", nis, level=1.0, height=130, resolution=_SEEN)
 
 
 def _add_motion(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> None:
@@ -237,7 +227,7 @@ def _add_motion(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles)
         ("ay", "Lateral acceleration, specific force", "m/s²"),
     ):
         if lines := _lines(series, roles, key, (TRUTH, roles.main)):
-            charts.time(key, title, unit, lines, resolution=_SEEN, height=120)
+            charts.figures[key] = TimeFigure(title, unit, lines, resolution=_SEEN, height=120)
 
 
 def _rows(
@@ -269,14 +259,15 @@ def _rows(
         by_name.setdefault(s["name"], []).append(span(s["start_ns"], s["end_ns"], s["text"]))
     for name in sorted(by_name, key=lambda n: (not n.endswith(" diverged"), n)):
         rows.append(Row(name, FAULT if name.endswith(" diverged") else PLAIN, by_name[name]))
-    return [row for row in rows if row.spans] or [Row("nothing", PLAIN, [])]
+    rows = [Row(row.label, row.colour, joined(row.spans)) for row in rows if row.spans]
+    return rows or [Row("nothing", PLAIN, [])]
 
 
 def _add_planes(charts: Charts, series: Sequence[DriveSeries]) -> None:
     for key, title, x_label, y_label in _PLANES:
         clouds = [c for s in series if (c := _cloud(s.name, getattr(s, key), charts.origin_ns)) is not None]
         if clouds:
-            charts.points(key, title, x_label, y_label, clouds)
+            charts.figures[key] = PointsFigure(title, x_label, y_label, clouds)
 
 
 def _cloud(name: str, points: Points, origin_ns: int) -> Cloud | None:
@@ -306,7 +297,7 @@ def _add_worst(
     kind = "error" if reference.scored else "difference"
     title = f"Largest {kind}: {abs(worst.error_rad) * DEGREES:.2f}° at {worst.at_s:.1f} s"
     title += f" during {worst.during}" if worst.during else ""
-    charts.points("worst", title, "s from the log's start", "sideslip in °", clouds)
+    charts.figures["worst"] = PointsFigure(title, "s from the log's start", "sideslip in °", clouds)
 
 
 def _add_path(
@@ -319,12 +310,13 @@ def _add_path(
     common, at_truth, at_own = np.intersect1d(truth[0], estimate[0], return_indices=True)
     clouds = [Cloud(TRUTH, colour(TRUTH), truth[1], truth[2], _seconds(truth[0], charts), line=True)]
     if len(common) < 2:
-        charts.points("path", "Path of the ground truth", "m east", "m north", clouds, equal=True)
+        charts.figures["path"] = PointsFigure("Path of the ground truth", "m east", "m north", clouds, equal=True)
         return ""
     target, source = truth[1:, at_truth], estimate[1:, at_own]
     aligned = aligned_path(source, target)
     clouds += _by_error(aligned, common, series[roles.main], charts)
-    charts.points("path", "Path, aligned with the ground truth", "m east", "m north", clouds, equal=True)
+    title = "Path, aligned with the ground truth"
+    charts.figures["path"] = PointsFigure(title, "m east", "m north", clouds, equal=True)
     if drift is None:
         return ""
     return (

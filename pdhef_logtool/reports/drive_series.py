@@ -24,7 +24,6 @@ _NIS_S = 1.0
 #: What is drawn of every track, and beside it of the ground truth and of the selected estimate.
 _COLUMNS = ("vx_m_s", "vy_m_s", "sideslip_rad", "network_trust", "r_scale", "nis", "valid", "reason")
 _MORE_COLUMNS = ("yaw_rate_rad_s", "ay_m_s2", "x_m", "y_m", "sideslip_std_rad")
-_BLOCK_ROWS = 1 << 15
 #: What errors and gaps of sideslip are given from.
 _OF_SIDESLIP = ("vx_m_s", "vy_m_s", "sideslip_rad", "valid")
 
@@ -73,11 +72,6 @@ class SideslipTrack:
         """Return rows [M] of it as a track."""
         columns = {c: getattr(self, c)[rows] for c in _OF_SIDESLIP}
         return make_track(self.name, self.stamps_ns[rows], **columns)
-
-    def blocks(self) -> Iterator[StateTrack]:
-        """Yield it as a track, block by block."""
-        for start in range(0, len(self.stamps_ns), _BLOCK_ROWS):
-            yield self.at(np.arange(start, min(start + _BLOCK_ROWS, len(self.stamps_ns))))
 
 
 @dataclass(slots=True, eq=False)
@@ -138,10 +132,6 @@ class Reference:
             return signal_error(track, other, "sideslip_rad", self.tracks.low_speed_m_s)
         ours, theirs = (self.tracks.drawn(t).sideslip_rad for t in (track, other))
         return np.asarray(wrap_angle(ours - theirs), dtype=np.float64)
-
-    def whole_error(self, track: SideslipTrack) -> FloatArray:
-        """Return the error of a whole track [N]."""
-        return np.concatenate([self.error(block) for block in track.blocks()])
 
 
 def gather(

@@ -19,6 +19,8 @@ _KINDS = {"PASS": "pass", "FAIL": "fail", "INCONCLUSIVE": "unknown"}
 #: Versions that a first screen names; the appendix has all.
 _VERSIONS = ("pdhef-logtool", "python", "numpy")
 _MOST_NEXT = 4
+#: What follows a value: its interval in brackets.
+_INTERVAL = re.compile(r"^\((.*?)\)")
 _UNIT = re.compile(r"_(rad_s|rad|m_s2|m_s)$")
 
 
@@ -68,6 +70,7 @@ def _line(requirement: Mapping[str, Any]) -> RequirementLine:
     value, margin = requirement["value"], requirement["margin"]
     sign = "≥" if requirement.get("at_least") else "≤"
     of = f" × {requirement['baseline']}" if requirement.get("baseline") else ""
+    text = "" if value is None else shown(value, unit)
     return RequirementLine(
         str(requirement["id"]),
         str(requirement["title"]),
@@ -75,15 +78,17 @@ def _line(requirement: Mapping[str, Any]) -> RequirementLine:
         str(requirement["outcome"]),
         _KINDS.get(str(requirement["outcome"]), "unknown"),
         f"{sign} {shown(requirement['bound'], unit)}{of}",
-        "–" if value is None else f"{shown(value, unit)}{of}",
+        f"{text}{of}" if text else "–",
         "–" if margin is None else f"{'+' if margin >= 0 else '−'}{shown(abs(margin), unit)}",
         _exposure(requirement["exposure"]),
-        str(requirement["reason"]),
+        _INTERVAL.sub(r"\1", str(requirement["reason"]).removeprefix(text).lstrip("; ")),
         str(requirement["next"]),
     )
 
 
 def _exposure(exposure: Mapping[str, Any]) -> str:
+    if not exposure["drives"]:
+        return "nothing"
     parts = [f"{exposure['drives']} {'drive' if exposure['drives'] == 1 else 'drives'}"]
     if exposure["minutes"] is not None:
         parts.append(f"{exposure['minutes']:.1f} min")
@@ -174,7 +179,7 @@ def _upper(edges: Sequence[float], index: int) -> str:
 def _sensors(report: Mapping[str, Any]) -> str:
     names = [str(s["name"]) for s in report["mapping"]["signals"]]
     wheels = [n for n in names if n.startswith("wheel_speed_")]
-    others = [LABELS.get(n, _UNIT.sub("", n).replace("_", " ")) for n in names if n not in wheels]
+    others = [LABELS.get(n, _UNIT.sub("", n).replace("_", " ").replace("ax", "a_x")) for n in names if n not in wheels]
     return ", ".join([*others, *([f"{len(wheels)} wheel speeds"] if wheels else [])])
 
 

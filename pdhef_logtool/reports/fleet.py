@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,16 +12,16 @@ import numpy as np
 
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.reports.charts import Charts, Cloud, Interval
+from pdhef_logtool.reports.charts import BarsFigure, Charts, Cloud, Interval, IntervalsFigure, PointsFigure
 from pdhef_logtool.reports.colours import INK, PLAIN, colour
+from pdhef_logtool.reports.drive import OUTCOMES
 from pdhef_logtool.reports.first_screen import next_steps, plan_head, tested_run
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.breakdown import LEAST_DRIVES
 from pdhef_logtool.results.fleet import ANSWER, JUDGED, Distribution, Fleet, Space, read_fleet
 from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
+from pdhef_logtool.storage.documents import jsonable
 
-#: Keys of the figures of the page.
-FIGURES = ("worst", "medians", "spread", "against")
 #: Rows of tables that a run can make as long as it likes, keys that are given, and bars of a histogram at most.
 MOST_ROWS, _MOST_KEYS, _MOST_BARS = 1000, 12, 40
 #: Errors beyond this quantile of the drives are counted in the last bar.
@@ -46,10 +46,11 @@ class SpaceCell:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FleetPage:
-    """The page of a run: the HTML, and the figures in it."""
+    """The page of a run: the HTML, the figures in it, and the same as JSON-able values."""
 
     html: bytes
     charts: Charts
+    document: dict[str, Any]
 
 
 def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
@@ -70,33 +71,38 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
     shown = [b for b in fleet.breakdowns if by or any(g.effect for g in b.groups)][: None if by else _MOST_KEYS]
     charts = Charts()
     _add_figures(charts, fleet)
-    html = render(
-        "fleet.html",
-        charts,
-        fleet=fleet,
-        pages=pages,
-        plan=plan_head(run.document.get("plan")),
-        tested=tested_run(run.document, sum(d.seconds for d in fleet.drives) / 3600.0),
-        steps=next_steps(run.document.get("plan")),
-        worst=_worst(fleet, charts),
-        verdicts=Counter(d.verdict for d in fleet.scored if d.verdict),
-        paired=_paired(fleet),
-        answer=next((d for d in fleet.distributions if (d.estimator, d.signal) == (ANSWER, JUDGED)), None),
-        rows=_rows(_told(fleet)),
-        mains={ANSWER} if len(mains) > 1 else mains,
-        names=list(dict.fromkeys(d.estimator for d in fleet.distributions if d.estimator != ANSWER)),
-        ranked=any(r.place is not None for r in fleet.ranking),
-        dependence=fleet.dependence.text(len(fleet.scored)),
-        breakdowns=shown,
-        comparisons=sum(b.comparisons for b in fleet.breakdowns),
-        idle_keys=[b.key for b in fleet.breakdowns if b not in shown],
-        space=None if fleet.space is None else _space_rows(fleet.space),
-        held=sorted(fleet.drives, key=lambda d: d.label)[:MOST_ROWS],
-        most_rows=MOST_ROWS,
-        least=LEAST_DRIVES,
-        run=run.document,
-    )
-    return FleetPage(html, charts)
+    texts: dict[str, Any] = {
+        "plan": plan_head(run.document.get("plan")),
+        "tested": tested_run(run.document, sum(d.seconds for d in fleet.drives) / 3600.0),
+        "steps": next_steps(run.document.get("plan")),
+        "worst": _worst(fleet, charts),
+        "verdicts": Counter(d.verdict for d in fleet.scored if d.verdict),
+        "paired": _paired(fleet),
+        "answer": next((d for d in fleet.distributions if (d.estimator, d.signal) == (ANSWER, JUDGED)), None),
+        "rows": _rows(_told(fleet)),
+        "mains": {ANSWER} if len(mains) > 1 else mains,
+        "names": list(dict.fromkeys(d.estimator for d in fleet.distributions if d.estimator != ANSWER)),
+        "ranked": any(r.place is not None for r in fleet.ranking),
+        "dependence": fleet.dependence.text(len(fleet.scored)),
+        "breakdowns": shown,
+        "comparisons": sum(b.comparisons for b in fleet.breakdowns),
+        "idle_keys": [b.key for b in fleet.breakdowns if b not in shown],
+        "space": None if fleet.space is None else _space_rows(fleet.space),
+        "held": sorted(fleet.drives, key=lambda d: d.label)[:MOST_ROWS],
+        "words": {outcome: word for outcome, (word, _) in OUTCOMES.items()},
+        "most_rows": MOST_ROWS,
+        "least": LEAST_DRIVES,
+    }
+    html = render("fleet.html", charts, fleet=fleet, pages=pages, run=run.document, **texts)
+    return FleetPage(html, charts, _document(fleet, texts))
+
+
+def _document(fleet: Fleet, texts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the page shows as JSON-able values."""
+    more = {"worst_drives": fleet.worst, "without_truth": fleet.without_truth[:MOST_ROWS]}
+    kept = ("logs", "ranking", "least_to_rank", "dependence", "breakdowns", "failed", "losses")
+    whole = {key: getattr(fleet, key) for key in kept} | {"scored": len(fleet.scored)}
+    return {"format": "pdhef.fleet", "version": 1, **jsonable({**texts, **more, **whole})}
 
 
 def _worst(fleet: Fleet, charts: Charts) -> tuple[str, float | None] | None:
@@ -111,7 +117,7 @@ def _worst(fleet: Fleet, charts: Charts) -> tuple[str, float | None] | None:
             for error, d in ranked[:_WORST]
         ]
         title = f"The {len(bars)} drives with the largest sideslip RMSE"
-        charts.intervals("worst", title, "RMSE in °", bars, zero=0.0)
+        charts.figures["worst"] = IntervalsFigure(title, "RMSE in °", bars, zero=0.0)
     return ranked[0][1].label, ranked[0][0]
 
 
@@ -122,8 +128,7 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
     first = judged[0]
     near = [d for d in judged if d.median.value <= _DRAWN * first.median.value]
     degree = math.degrees(1.0)
-    charts.intervals(
-        "medians",
+    charts.figures["medians"] = IntervalsFigure(
         f"Median RMSE of sideslip over {first.drives} drives, 95 % interval"
         + ("" if len(near) == len(judged) else f" (beyond {_DRAWN:g} times the selected estimate's: table)"),
         "RMSE in °",
@@ -136,15 +141,15 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
         values = first.values * degree
         edges, counts = _histogram(values)
         beyond = ", the last bar and beyond" if values[-1] > edges[-1] else ""
-        charts.bars("spread", f"Drives by RMSE of the selected estimate's sideslip{beyond}", "RMSE in °", edges, counts)
+        title = f"Drives by RMSE of the selected estimate's sideslip{beyond}"
+        charts.figures["spread"] = BarsFigure(title, "RMSE in °", edges.tolist(), counts.tolist())
     rival, drives = _rival(fleet), fleet.scored
     if rival is not None:
         ours, other = (np.array([d.error(name) * degree for d in drives]) for name in (ANSWER, rival))
         both = np.isfinite(ours) & np.isfinite(other) & (ours > 0.0) & (other > 0.0)
         if np.count_nonzero(both) > 2:
             ends = np.array([min(ours[both].min(), other[both].min()), max(ours[both].max(), other[both].max())])
-            charts.points(
-                "against",
+            charts.figures["against"] = PointsFigure(
                 f"A point a drive: the selected estimate has the lower error below the line, {rival} above it",
                 f"RMSE of {rival}, °",
                 "RMSE of the selected estimate, °",

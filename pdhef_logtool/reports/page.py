@@ -136,8 +136,10 @@ def _printed(value: Any) -> Any:
 
 
 def number(value: float | None, factor: float = 1.0) -> str:
-    """Return a figure with four digits, a dash for none."""
-    return DASH if value is None or not math.isfinite(value) else f"{value * factor:.4g}"
+    """Return a figure with three digits, of large ones all before the point; a dash for none."""
+    if value is None or not math.isfinite(value):
+        return DASH
+    return f"{value * factor:.3g}" if abs(value * factor) < 1000.0 else f"{value * factor:.0f}"
 
 
 def unit(text: str) -> str:

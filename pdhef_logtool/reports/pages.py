@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -10,25 +10,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, OutputError
-from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedLog, OpenedRun
+from pdhef_logtool.results.opened_run import PAGE_FILE, REPORT_FILE, OpenedLog, OpenedRun
+from pdhef_logtool.results.run_report import write_json
 from pdhef_logtool.storage.files import write_bytes
 
 if TYPE_CHECKING:
     from pdhef_logtool.reports.drive import DrivePage
     from pdhef_logtool.reports.fleet import FleetPage
 
-#: Folder of a log's pictures within its outputs.
-PICTURES = "figures"
-
 
 @dataclass(frozen=True, slots=True)
 class WrittenPage:
-    """A page: its log (empty: that of the run), file (None: it could not be made), what is wrong, files of pictures."""
+    """A page: its log (empty: that of the run), file (None: it could not be made), what is wrong."""
 
     log: str
     file: Path | None
     wrong: str = ""
-    pictures: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +64,6 @@ class WrittenPages:
 def _to_dict(page: WrittenPage) -> dict[str, Any]:
     return {
         "page": None if page.file is None else str(page.file),
-        "pictures": [str(f) for f in page.pictures],
         "wrong": page.wrong or None,
     }
 
@@ -76,61 +72,50 @@ def write_pages(
     run: OpenedRun,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
     *,
-    png: bool = False,
     by: Sequence[str] = (),
     logs: Sequence[OpenedLog] | None = None,
 ) -> WrittenPages:
     """Write the page of each log of a run, then that of the run; one that cannot be made never stops the others.
 
-    The caller contains the folder. ``progress`` is given which log, and the share that is done; ``png``: whether each
-    figure is written as a picture too; ``by``: keys that the run's page breaks the drives down by, none: what it finds.
+    The caller contains the folder. ``progress`` is given which log, and the share that is done;
+    ``by``: keys that the run's page breaks the drives down by, none: what it finds.
 
     Raises
     ------
     OutputError
         A page cannot be written.
     """
-    from pdhef_logtool.reports.fleet import FIGURES as FLEET_FIGURES
     from pdhef_logtool.reports.fleet import fleet_page
 
     pages = []
     logs = run.logs if logs is None else logs
     for number, log in enumerate(logs):
         progress(f"{log.label}: page", number / len(logs))
-        pages.append(write_drive_page(log, png=png))
-    fleet = _write(run.folder, "", partial(fleet_page, run, by), FLEET_FIGURES, png=png)
+        pages.append(write_drive_page(log))
+    fleet = _write(run.folder, "", partial(fleet_page, run, by))
     return WrittenPages(run.folder, tuple(pages), fleet)
 
 
-def write_drive_page(log: OpenedLog, *, png: bool = False) -> WrittenPage:
+def write_drive_page(log: OpenedLog) -> WrittenPage:
     """Write the page of a log; raises OutputError."""
-    from pdhef_logtool.reports.drive import FIGURES, drive_page
+    from pdhef_logtool.reports.drive import drive_page
 
     def make() -> DrivePage:
         with log.reading():
             return drive_page(log, f"../../{PAGE_FILE}")
 
-    return _write(log.folder, log.label, make, FIGURES, png=png)
+    return _write(log.folder, log.label, make)
 
 
 def remove_pages(run: OpenedRun) -> None:
     """Remove the pages that an earlier run left in its folders: they are of other estimates."""
-    folders = (run.folder, *(log.folder for log in run.logs))
-    if not any((folder / left).exists() for folder in folders for left in (PAGE_FILE, PICTURES)):
-        return  # what makes pages is not loaded for a run that has none
-
-    from pdhef_logtool.reports.drive import FIGURES
-    from pdhef_logtool.reports.fleet import FIGURES as FLEET_FIGURES
-
-    for folder, keys in zip(folders, (FLEET_FIGURES, *[FIGURES] * len(run.logs)), strict=True):
-        for path in (folder / PAGE_FILE, *_pictures(folder, keys)):
-            with suppress(OSError):
-                path.unlink(missing_ok=True)
+    pages = [folder / PAGE_FILE for folder in (run.folder, *(log.folder for log in run.logs))]
+    for path in (*pages, run.folder / REPORT_FILE):
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
-def _write(
-    folder: Path, label: str, make: Callable[[], DrivePage | FleetPage], keys: Iterable[str], *, png: bool
-) -> WrittenPage:
+def _write(folder: Path, label: str, make: Callable[[], DrivePage | FleetPage]) -> WrittenPage:
     try:
         page = make()
         wrong = getattr(page, "wrong", "")
@@ -139,15 +124,6 @@ def _write(
         return WrittenPage(label, None, shown)
     path = folder / PAGE_FILE
     write_bytes(path, page.html)
-    for old in _pictures(folder, keys):
-        old.unlink(missing_ok=True)
-    if not png:
-        return WrittenPage(label, path, wrong)
-    from pdhef_logtool.reports.pictures import write_pictures
-
-    return WrittenPage(label, path, wrong, write_pictures(page.charts, folder / PICTURES, label))
-
-
-def _pictures(folder: Path, keys: Iterable[str]) -> list[Path]:
-    """Return the pictures that this command wrote into a folder at some time."""
-    return [p for key in keys if (p := folder / PICTURES / f"{key}.png").is_file()]
+    if document := getattr(page, "document", None):
+        write_json(folder / REPORT_FILE, document)
+    return WrittenPage(label, path, wrong)

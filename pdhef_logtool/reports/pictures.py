@@ -1,83 +1,42 @@
-"""The figures of a page as PNG, for slides: drawn from the same records by matplotlib, which needs no browser."""
+"""Figures of a page as PNG for report.pdf, drawn from the same records by matplotlib."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.reports.charts import (
-    BarsFigure,
-    Charts,
-    Figure,
-    IntervalsFigure,
-    PointsFigure,
-    StripFigure,
-    TimeFigure,
-)
+from pdhef_logtool.reports.charts import Charts, Figure, PointsFigure, TimeFigure
 from pdhef_logtool.reports.encoding import Grid
-from pdhef_logtool.storage.files import write_bytes
 
 _Axes: TypeAlias = Any
 #: Inches, at _DPI a slide's width of 1600 points.
 _WIDTH, _HEIGHT, _SQUARE, _DPI = 10.0, 4.2, 6.0, 160
-_ROW = 0.24
 
 
-def write_pictures(charts: Charts, folder: Path, label: str) -> tuple[Path, ...]:
-    """Write ``KEY.png`` of every figure into a folder and return the files; ``label`` names the drive in each.
-
-    Raises
-    ------
-    OutputError
-        A picture cannot be written.
-    """
-    made = []
-    for key, figure in charts.figures.items():
-        path = folder / f"{key}.png"
-        write_bytes(path, picture(figure, charts, label))
-        made.append(path)
-    return tuple(made)
-
-
-def picture(figure: Figure, charts: Charts, label: str = "") -> bytes:
-    """Return one figure as PNG; the same figure gives the same bytes."""
+def picture(figure: Figure, charts: Charts) -> bytes:
+    """Return a figure over time or in a plane as PNG; the same figure gives the same bytes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas
 
-    height = _SQUARE if isinstance(figure, PointsFigure) else _HEIGHT
-    if isinstance(figure, StripFigure):
-        height = 1.1 + _ROW * len(figure.rows)
-    if isinstance(figure, IntervalsFigure):
-        height = 1.1 + 1.4 * _ROW * len(figure.intervals)
-    canvas = Canvas(figsize=(_SQUARE + 1.0 if isinstance(figure, PointsFigure) else _WIDTH, height), dpi=_DPI)
+    size = (_WIDTH, _HEIGHT) if isinstance(figure, TimeFigure) else (_SQUARE + 1.0, _SQUARE)
+    canvas = Canvas(figsize=size, dpi=_DPI)
     FigureCanvasAgg(canvas)
     axes = canvas.add_subplot()
     axes.grid(color="#e3e6ea", linewidth=0.8)
     axes.set_axisbelow(True)
-    _drawing(figure)(figure, axes, charts)
-    title = figure.heading if not label else f"{printable(label, 60)}: {figure.heading}"
-    axes.set_title(title.replace("$", r"\$"), loc="left", fontsize=10, fontweight="bold")
+    if isinstance(figure, TimeFigure):
+        _time(figure, axes, charts)
+    elif isinstance(figure, PointsFigure):
+        _points(figure, axes)
+    axes.set_title(figure.heading.replace("$", r"\$"), loc="left", fontsize=10, fontweight="bold")
     canvas.tight_layout()
     file = io.BytesIO()
     canvas.savefig(file, format="png", metadata={"Software": None})
     return file.getvalue()
-
-
-def _drawing(figure: Figure) -> Callable[[Any, _Axes, Charts], None]:
-    drawings: dict[type, Callable[[Any, _Axes, Charts], None]] = {
-        TimeFigure: _time,
-        StripFigure: _strip,
-        PointsFigure: _points,
-        IntervalsFigure: _intervals,
-        BarsFigure: _bars,
-    }
-    return drawings[type(figure)]
 
 
 def _instants(grid: Grid, start_s: float, values: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -117,18 +76,7 @@ def _time(figure: TimeFigure, axes: _Axes, charts: Charts) -> None:
     _legend(axes)
 
 
-def _strip(figure: StripFigure, axes: _Axes, charts: Charts) -> None:
-    for i, row in enumerate(figure.rows):
-        spans = [(s.start_s, max(s.end_s - s.start_s, 0.0)) for s in row.spans]
-        axes.broken_barh(spans, (i - 0.3, 0.6), facecolor=row.colour, edgecolor=row.colour, linewidth=0.6)
-    axes.set_yticks(range(len(figure.rows)), [_plain(r.label) for r in figure.rows], fontsize=8)
-    axes.set_ylim(len(figure.rows) - 0.5, -0.5)
-    if (grid := charts.grid) is not None:
-        axes.set_xlim(charts.start_s(), charts.start_s() + grid.cells * grid.cell_s)
-    axes.set_xlabel("s from the log's start")
-
-
-def _points(figure: PointsFigure, axes: _Axes, _: Charts) -> None:
+def _points(figure: PointsFigure, axes: _Axes) -> None:
     for cloud in figure.clouds:
         style: dict[str, Any] = {"linewidth": 1.2} if cloud.line else {"linestyle": "", "marker": ".", "markersize": 2}
         axes.plot(cloud.x, cloud.y, color=cloud.colour, label=_plain(cloud.label), **style)
@@ -140,25 +88,6 @@ def _points(figure: PointsFigure, axes: _Axes, _: Charts) -> None:
     axes.set_xlabel(figure.x_label)
     axes.set_ylabel(figure.y_label)
     _legend(axes)
-
-
-def _intervals(figure: IntervalsFigure, axes: _Axes, _: Charts) -> None:
-    for i, interval in enumerate(figure.intervals):
-        axes.plot([interval.low, interval.high], [i, i], color=interval.colour, linewidth=2, marker="|", markersize=8)
-        axes.plot([interval.middle], [i], color=interval.colour, marker="o")
-    if figure.zero is not None:
-        axes.axvline(figure.zero, color="#1a1a1a", linewidth=0.9, linestyle="--")
-    axes.set_yticks(range(len(figure.intervals)), [_plain(i.label) for i in figure.intervals], fontsize=8)
-    axes.set_ylim(len(figure.intervals) - 0.5, -0.5)
-    axes.set_xlabel(figure.unit)
-
-
-def _bars(figure: BarsFigure, axes: _Axes, _: Charts) -> None:
-    axes.bar(
-        figure.edges[:-1], figure.counts, np.diff(figure.edges), align="edge", color=figure.colour, edgecolor="white"
-    )
-    axes.set_xlabel(figure.unit)
-    axes.set_ylabel("number")
 
 
 def _legend(axes: _Axes) -> None:

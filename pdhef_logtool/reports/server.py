@@ -24,7 +24,7 @@ from starlette.routing import Route
 
 from pdhef_logtool.evaluation.units import LABELS, SCORED_SIGNALS, read_unit
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.reports.charts import Charts, Cloud, Series
+from pdhef_logtool.reports.charts import Charts, Cloud, PointsFigure, Series, TimeFigure
 from pdhef_logtool.reports.colours import colour
 from pdhef_logtool.reports.encoding import Envelope, Grid, grid_of
 from pdhef_logtool.reports.page import render
@@ -284,7 +284,7 @@ def _add_distributions(charts: Charts, rows: pl.DataFrame, runs: Sequence[str]) 
             clouds.append(Cloud(f"{run} ({len(values)})", shade, np.quantile(values, share), 100.0 * share, line=True))
     if clouds:
         title = "Share of the drives below an RMSE of sideslip, by run"
-        charts.points("distributions", title, "RMSE of sideslip, °", "share of the drives, %", clouds)
+        charts.figures["distributions"] = PointsFigure(title, "RMSE of sideslip, °", "share of the drives, %", clouds)
 
 
 def _drive(library: Library, log: OpenedLog, signal: str, chosen: Sequence[str]) -> Response:
@@ -348,4 +348,4 @@ def _add_tracks(charts: Charts, signal: str, tracks: Sequence[tuple[str, str, Pa
         series.append(Series(_shown(run, track), colour(track), envelope.values, dash=dash))
     if grid is not None:
         charts.grid, charts.origin_ns = grid, grid.start_ns
-        charts.time("tracks", LABELS[signal].capitalize(), unit, series, height=320)
+        charts.figures["tracks"] = TimeFigure(LABELS[signal].capitalize(), unit, series, height=320)

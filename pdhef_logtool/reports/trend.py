@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from pdhef_logtool.reports.charts import Charts, Interval
+from pdhef_logtool.reports.charts import Charts, Interval, IntervalsFigure
 from pdhef_logtool.reports.colours import FAULT, PLAIN
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.comparison_words import change_text
@@ -21,7 +21,7 @@ def trend_page(trend: Trend) -> bytes:
             intervals.append(Interval(row.run, low, middle, high, FAULT if row.regression else PLAIN))
     if intervals:
         title = f"{trend.figure.label}: median change relative to the first run, 95 % interval"
-        charts.intervals("changes", title, "%", intervals, zero=0.0)
+        charts.figures["changes"] = IntervalsFigure(title, "%", intervals, zero=0.0)
     rows = [
         {
             "row": row,

@@ -29,11 +29,8 @@ LINEAR_REGRESSION_FILE = "baselines/linear-regression.json"
 PAPER_FOLDER = "baselines/paper-network"
 
 #: Names instead of a folder: the network that comes with the package, and no network.
-SHIPPED, MANY_CARS, NO_MODEL = "default", "many-cars", "none"
-SHIPPED_FOLDERS = {
-    SHIPPED: Path(__file__).parents[1] / "models" / "default" / "network",
-    MANY_CARS: Path(__file__).parents[1] / "models" / "many-cars",
-}
+SHIPPED, NO_MODEL = "default", "none"
+SHIPPED_FOLDERS = {SHIPPED: Path(__file__).parents[1] / "models" / "default" / "network"}
 
 #: Filters that features are made by and whose model a residual is of: the strongest one, and that of the paper, which
 #: the paper's network and the baselines have.
@@ -120,7 +117,7 @@ class ModelBundle:
         return shapes
 
     def normalise(self, features: FloatArray) -> FloatArray:
-        """Return the chosen features [N, k] of the full array [N, 28], normalised and limited to ±8."""
+        """Return the chosen features [N, k] of the full array [N, 15], normalised and limited to ±8."""
         n = self.normalisation
         scaled = (features[:, self.columns] - np.array(n.feature_mean)) / np.array(n.feature_std)
         limited: FloatArray = np.clip(scaled, -8.0, 8.0)

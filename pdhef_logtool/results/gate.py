@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.units import LABELS, SIGNALS
-from pdhef_logtool.evaluation.validation_plan import RUN, ValidationPlan
-from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 from pdhef_logtool.storage.documents import unknown
 
 #: Name for the selected estimate of each drive in A.
@@ -53,23 +52,6 @@ class Gate:
 
     figures: tuple[Figure, ...]
     allow_unpaired: bool = False
-
-
-def gate_of(plan: ValidationPlan) -> Gate:
-    """Return the requirements of a plan on the ratio to another run as the figures of a comparison.
-
-    Raises
-    ------
-    UsageError : The plan has no such requirement.
-    """
-    figures = tuple(
-        Figure(r.signal, r.metric, r.segment, r.estimator or MAIN, max(r.bound - 1.0, 0.0))
-        for r in plan.requirements
-        if r.baseline == RUN
-    )
-    if not figures:
-        raise UsageError(expected='a requirement with baseline = "run"', got="none", where=plan.file)
-    return Gate(figures)
 
 
 def figures_of(plan: ValidationPlan) -> tuple[Figure, ...]:

@@ -9,7 +9,7 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.mcap_sink import LOG_TOPIC, MAP_FRAME, topic_of
+from pdhef_logtool.results.mcap_sink import LOG_TOPIC, MAP_FRAME, has_pose, topic_of
 from pdhef_logtool.results.palette import colour_rgb
 from pdhef_logtool.results.run_report import json_bytes
 from pdhef_logtool.results.sink import TRUTH, Event, Sink
@@ -62,9 +62,8 @@ class LayoutsSink(Sink):
     Parameters
     ----------
     foxglove, plotjuggler : where the finished files are.
-    names : of the tracks that are written; None: all.
     colours : 0xRRGGBB by estimator.
-    shown : of the tracks whose lines and intervals are on at first; None: all.
+    shown : tracks whose lines and intervals are on at first.
     fixes : topics of satellite fixes in the log, for a map.
     """
 
@@ -72,37 +71,41 @@ class LayoutsSink(Sink):
         self,
         foxglove: Path,
         plotjuggler: Path,
-        names: Container[str] | None,
         colours: Mapping[str, int],
         *,
-        shown: Collection[str] | None = None,
+        shown: Collection[str],
         fixes: Sequence[str] = (),
     ) -> None:
         self._foxglove, self._plotjuggler = foxglove, plotjuggler
-        self._names, self._colours = names, colours
-        self._shown, self._fixes = shown, fixes
+        self._colours, self._shown, self._fixes = colours, shown, fixes
         self._tracks: dict[str, str] = {}
+        self._on_map: set[str] = set()
 
     def append(self, track: StateTrack) -> None:
         """Take note of a track."""
-        if self._names is None or track.name in self._names:
-            red, green, blue = colour_rgb(track.name, self._colours)
-            self._tracks[track.name] = f"#{red:02x}{green:02x}{blue:02x}"
+        red, green, blue = colour_rgb(track.name, self._colours)
+        self._tracks[track.name] = f"#{red:02x}{green:02x}{blue:02x}"
+        if has_pose(track).any():
+            self._on_map.add(track.name)
 
     def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:  # noqa: ARG002
         """Write both files."""
-        shown = self._tracks if self._shown is None else self._shown
-        write_bytes(self._foxglove, json_bytes(foxglove_layout(self._tracks, shown, self._fixes)))
-        write_bytes(self._plotjuggler, plotjuggler_layout(self._tracks, shown))
+        layout = foxglove_layout(self._tracks, self._shown, self._on_map, self._fixes)
+        write_bytes(self._foxglove, json_bytes(layout))
+        write_bytes(self._plotjuggler, plotjuggler_layout(self._tracks, self._shown))
 
     def abort(self) -> None:
         """Remove nothing: nothing is written before :meth:`finish`."""
 
 
-def foxglove_layout(tracks: Mapping[str, str], shown: Collection[str], fixes: Sequence[str] = ()) -> dict[str, Any]:
+def foxglove_layout(
+    tracks: Mapping[str, str], shown: Collection[str], on_map: Container[str] = (), fixes: Sequence[str] = ()
+) -> dict[str, Any]:
     """Return a layout of Foxglove: plots in degrees, errors, maps, states and the log.
 
-    ``tracks``: colour by name; ``shown``: those that are on at first, with their intervals; ``fixes``: topics.
+    ``tracks``: colour by name; ``shown``: those that are on at first, with their intervals; ``on_map``: those that
+    have poses; ``fixes``: topics. The settings are those of ``foxglove.layouts`` in Foxglove's SDK, under the names
+    of panels that exported layouts have.
     """
     plots = [plot for tab in _TABS.values() for plot in tab if plot.field not in _STATES and _of(plot, tracks)]
     panels: dict[str, Any] = {f"Plot!{plot.field}": _plot_panel(plot, tracks, shown) for plot in plots}
@@ -127,19 +130,19 @@ def foxglove_layout(tracks: Mapping[str, str], shown: Collection[str], fixes: Se
         "minLogLevel": _PANEL_LEVEL,
         "searchTerms": [],
     }
-    panels["3D!way"] = {
-        "foxglovePanelTitle": "Way driven",
-        "followTf": MAP_FRAME,
-        "topics": {
-            topic_of(name, what): {"visible": name in shown, "color": colour}
-            for name, colour in tracks.items()
-            for what in ("path", "odometry")
-        },
-    }
-    beside = ["3D!way", "StateTransitions!states", "RosOut!log"]
+    topics: dict[str, dict[str, Any]] = {}
+    for name, colour in tracks.items():
+        if name in on_map:
+            visible = {"visible": name in shown}
+            topics[topic_of(name, "path")] = visible | {"type": "line", "lineWidth": 0.2, "gradient": [colour, colour]}
+            topics[topic_of(name, "odometry")] = visible | {"type": "arrow", "color": colour}
+    beside = ["StateTransitions!states", "RosOut!log"]
     if fixes:
         panels["map!fixes"] = {"foxglovePanelTitle": "Map", "followTopic": fixes[0], "layer": "map"}
-        beside.insert(1, "map!fixes")
+        beside.insert(0, "map!fixes")
+    if topics:
+        panels["3D!path"] = {"foxglovePanelTitle": "Path driven", "followTf": MAP_FRAME, "topics": topics}
+        beside.insert(0, "3D!path")
     return {
         "configById": panels,
         "globalVariables": {},

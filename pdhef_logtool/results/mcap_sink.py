@@ -83,6 +83,11 @@ def topic_of(estimator: str, what: str) -> str:
     return f"{NAMESPACE}{'_' if token[:1].isdigit() else ''}{token}/{what}"
 
 
+def has_pose(track: StateTrack) -> BoolArray:
+    """Return the stamps [N] of which ``odometry`` and ``path`` can contain the pose."""
+    return track.valid & np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
+
+
 def thinned_step_ns(source_bytes: int, *, rows: int, others: int, span_ns: int) -> int:
     """Return the step of the tracks that are not shown first with which an annotated log is at most twice its source.
 
@@ -111,7 +116,6 @@ class AnnotatedMcapSink(Sink):
     ----------
     path : where the finished file is.
     source : the log to copy in full; None, or a log without messages, for a sidecar that contains our topics alone.
-    names : of the tracks that are written; None: all.
     shown : of the tracks whose pose is written at every stamp; of others every 50 ms. None: all.
     others_step_ns : step of all topics of the others; those that are shown then have 10 poses a second, and the ground
         truth 20 states. None: as above.
@@ -128,7 +132,6 @@ class AnnotatedMcapSink(Sink):
         self,
         path: Path,
         source: DriveLog | None,
-        names: Container[str] | None = None,
         *,
         shown: Container[str] | None = None,
         others_step_ns: int | None = None,
@@ -138,7 +141,7 @@ class AnnotatedMcapSink(Sink):
     ) -> None:
         self._copies_rest = left_out is None
         self._source = None if source is None else source.messages
-        self._names, self._shown, self._others_step_ns = names, shown, others_step_ns
+        self._shown, self._others_step_ns = shown, others_step_ns
         self._min_speed_m_s = min_speed_m_s
         self._last_ns: dict[str, int] = {}
         self._topics: dict[str, str] = {}
@@ -164,8 +167,6 @@ class AnnotatedMcapSink(Sink):
 
     def append(self, track: StateTrack) -> None:
         """Take one track of this window."""
-        if self._names is not None and track.name not in self._names:
-            return
         if track.name in self._window:
             self._write_window()
         if track.name not in self._topics:
@@ -192,15 +193,15 @@ class AnnotatedMcapSink(Sink):
         self._first_ns = min(self._first_ns or int(track.stamps_ns[0]), int(track.stamps_ns[0]))
         if len(track.reason) == len(track):
             self._reasons.setdefault(track.name, ReasonIntervals()).append(track.stamps_ns, track.reason)
-        has_pose = track.valid & np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
-        on_path = on_path[has_pose[on_path]]
+        on_map = has_pose(track)
+        on_path = on_path[on_map[on_path]]
         self._paths.setdefault(track.name, []).append(
             np.stack([track.x_m[on_path], track.y_m[on_path], track.yaw_rad[on_path]], axis=1)
         )
         fields = plotted_fields(track, truth, self._min_speed_m_s)
         return [
             _state_batch(track, stated),
-            _odometry_batch(track, posed[has_pose[posed]]),
+            _odometry_batch(track, posed[on_map[posed]]),
             _plot_batch(track, plotted, fields),
         ]
 

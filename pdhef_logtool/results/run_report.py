@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.compiled.sources import compiled_digest
 from pdhef_logtool.evaluation.dead_reckoned import PathDrift
+from pdhef_logtool.evaluation.largest_errors import ErrorPlace
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.metrics.registry import registered
-from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S, Cell
+from pdhef_logtool.evaluation.operating_space import OperatingSpace
 from pdhef_logtool.evaluation.reasons import ReasonFacts, SensorFault
 from pdhef_logtool.evaluation.standing import Standing
 from pdhef_logtool.logs.byte_account import ByteLedger, checksummed_share
@@ -134,44 +135,21 @@ class FrictionFacts:
 
 
 @dataclass(frozen=True, slots=True)
-class LargestError:
-    """A place of a large sideslip error: stamp in ns, angles in rad."""
-
-    stamp_ns: int
-    estimate_rad: float
-    truth_rad: float
-    error_rad: float
-
-
-@dataclass(frozen=True, slots=True)
 class DriveDetails:
     """What a report's page shows and no table contains, of a drive that a run estimated.
 
     ``faults`` of the sensors, None where no estimator detects them. ``innovations`` by channel.
     ``standings`` of the selected estimate, empty without ground truth.
-    ``error_budget`` has a reason where there is none. ``operating_space``: the cells that the drive was in.
-    ``metadata`` : what the log states of itself. ``largest_errors`` : of sideslip, the largest first.
+    ``error_budget`` has a reason where there is none.
+    ``metadata`` : what the log states of itself.
     """
 
     faults: Sequence[SensorFault] | None
     innovations: Sequence[Any]
     standings: Sequence[Standing]
     error_budget: Any
-    operating_space: Sequence[Cell]
     metadata: Mapping[str, str]
-    largest_errors: Sequence[LargestError] = ()
-    friction_median: float | None = None
     path_drift: PathDrift | None = None
-
-    @property
-    def space(self) -> dict[str, Any]:
-        """The operating space as JSON-able values."""
-        return {
-            "speed_edges_m_s": SPEED_EDGES_M_S,
-            "ay_edges_m_s2": AY_EDGES_M_S2,
-            "cells": self.operating_space,
-            "friction_median": self.friction_median,
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +172,8 @@ class ReportFacts:
     ``reference``: what came of the sideslip reference, None where it was not asked for.
     ``file_bytes``: what became of the bytes of each file; ``samples``: of the samples of each mapped source.
     ``checks``: plausibility of signals, ground truth and vehicle file. ``details``: None where nothing was estimated.
-    ``requirements``: None where there is nothing to judge.
+    ``requirements``: None where there is nothing to judge. ``space``: where the drive went.
+    ``largest_errors``: of sideslip, the largest first.
     """
 
     log: LogFacts
@@ -223,6 +202,8 @@ class ReportFacts:
     main: MainFacts | None = None
     checks: Sequence[Check] = ()
     requirements: RequirementFacts | None = None
+    space: OperatingSpace | None = None
+    largest_errors: Sequence[ErrorPlace] = ()
     details: DriveDetails | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
 
@@ -342,6 +323,8 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
     if facts.requirements is not None:
         document["plan"] = facts.requirements.verdicts.to_dict()
         document["requirement_blocks"] = list(facts.requirements.blocks)
+    if facts.space is not None:
+        document |= {"operating_space": facts.space, "largest_errors": list(facts.largest_errors)}
     document = {key: jsonable(value) for key, value in document.items()}
     return document | _selected(document, facts.main, facts.details)
 
@@ -376,10 +359,8 @@ def _detailed(details: DriveDetails) -> dict[str, Any]:
         "faults": details.faults,
         "innovations": details.innovations,
         "error_budget": details.error_budget,
-        "operating_space": details.space,
         "path_drift": details.path_drift,
         "metadata": dict(details.metadata),
-        "largest_errors": details.largest_errors,
     }
     return {key: jsonable(value) for key, value in values.items()}
 

@@ -131,7 +131,7 @@ def _from_reference(report: Report, main: MainFacts, figures: _Figures) -> str:
         share = report["reference"]["valid_share"]
         return (
             f"RMS difference from the estimated reference {degrees(rms)}, reference ± {degrees(std)}{within}, "
-            f"on {share:.0%} of the log; the log contains no ground truth"
+            f"on {100.0 * share:.0f} % of the log; the log contains no ground truth"
         )
     reference = report.get("reference") or {}
     why = f"; no reference: {reference['refused']}" if reference.get("refused") else ""
@@ -143,14 +143,14 @@ def _against(rmse: float, other: float, text: str) -> str:
     if other == rmse:
         return f"equal to {beside}"
     if abs(rmse - other) <= SAME * other:
-        return f"equal within {SAME:.0%} to {beside}"
+        return f"equal within {100.0 * SAME:.0f} % to {beside}"
     if rmse == 0.0 or other == 0.0:
         return f"{'lower' if rmse < other else 'higher'} than {beside}"
     times = max(rmse, other) / min(rmse, other)
     shown = f"{times:.1f}" if times < _FEW else f"{times:.0f}"
     if rmse > other:
-        return f"{shown} times {beside}" if times > 2.0 else f"{times - 1.0:.0%} higher than {beside}"
-    return f"1/{shown} of {beside}" if times > 2.0 else f"{1.0 - rmse / other:.0%} lower than {beside}"
+        return f"{shown} times {beside}" if times > 2.0 else f"{100.0 * (times - 1.0):.0f} % higher than {beside}"
+    return f"1/{shown} of {beside}" if times > 2.0 else f"{100.0 * (1.0 - rmse / other):.0f} % lower than {beside}"
 
 
 def _truth_of(report: Report, name: str) -> str:
@@ -223,9 +223,9 @@ def _band(report: Report, main: MainFacts, figures: _Figures) -> str:
         return f"coverage unknown without ground truth of sideslip{made}"
     if share >= HOLDS:
         wide = ", wider than necessary" if share > _WIDE else ""
-        return f"coverage {share:.0%} (nominal 95 %){wide}{made}"
+        return f"coverage {100.0 * share:.0f} % (nominal 95 %){wide}{made}"
     verdict = "slightly too narrow" if share >= NEARLY_HOLDS else "too narrow"
-    return f"coverage {share:.0%} (nominal 95 %), {verdict}{made}"
+    return f"coverage {100.0 * share:.0f} % (nominal 95 %), {verdict}{made}"
 
 
 def _assumed(report: Report, main: MainFacts) -> list[str]:
@@ -294,7 +294,7 @@ def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]
         steps.append(
             f"identify and validate the car with this ground truth: pdhef learn LOG {given}"
             if _error(figures, main.name) is not None
-            else f"identify the car from several logs: pdhef learn LOGS {given} --without-truth"
+            else f"calibrate the car with several logs: pdhef learn LOGS {given} --without-truth"
         )
     if vehicle["proven"] and share is not None and share < NEARLY_HOLDS:
         steps.append("recalibrate the intervals with drives like this one: pdhef learn --stages intervals")

@@ -11,8 +11,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeAlias
 
 from pdhef_logtool.evaluation.bootstrap import Interval
-from pdhef_logtool.evaluation.standing import JUDGED_SIGNALS, LEAST_BLOCKS, Standing
-from pdhef_logtool.evaluation.units import SCORED_SIGNALS, read_unit
+from pdhef_logtool.evaluation.requirement_bounds import LEAST_BLOCKS
+from pdhef_logtool.evaluation.standing import JUDGED_SIGNALS, Standing
+from pdhef_logtool.evaluation.units import SCORED_SIGNALS
+from pdhef_logtool.evaluation.validation_plan import shown
 from pdhef_logtool.results.selected_estimate import NO_SIDESLIP_RAD, SAME
 
 #: ``same``: the interval of the difference lies within
@@ -79,6 +81,8 @@ def _without_sideslip(report: Mapping[str, Any]) -> bool:
 
 
 _KEYS = ("estimator", "signal", "segment", "metric")
+#: Relative differences from which on, and below which, no percentage is given.
+_MANY, _FEW = 10.0, 0.005
 
 
 def _outcome(standing: Standing) -> Outcome:
@@ -93,43 +97,29 @@ def _outcome(standing: Standing) -> Outcome:
     return "better" if difference.high < 0.0 else "undecided"
 
 
-def _unit(signal: str) -> tuple[str, float]:
-    """Return the unit that people read as it follows a number, and the factor to it."""
-    unit, factor = read_unit(SCORED_SIGNALS[signal])
-    return unit if unit.startswith("°") else f" {unit}", factor
-
-
 def _error(standing: Standing) -> str:
-    unit, factor = _unit(standing.signal)
-    assert standing.rmse is not None
-    shown = _number(standing.rmse.value * factor)
-    if math.isfinite(standing.rmse.low):
-        low, high = _number(standing.rmse.low * factor), _number(standing.rmse.high * factor)
-        between = f" (95 % CI {low} to {high}{unit})"
+    unit, rmse = SCORED_SIGNALS[standing.signal], standing.rmse
+    assert rmse is not None
+    if math.isfinite(rmse.low):
+        between = f" (95 % CI {shown(rmse.low, unit)} to {shown(rmse.high, unit)})"
     else:
         between = f" (no CI: it needs {LEAST_BLOCKS} blocks of {standing.block_s:g} s)"
-    return f"RMSE of {standing.estimator}: {shown}{unit}{between}"
+    return f"RMSE of {standing.estimator}: {shown(rmse.value, unit)}{between}"
 
 
 def _against(standing: Standing, outcome: Outcome) -> str:
     if outcome == "alone":
         return "no other filter without a network ran for comparison"
-    unit, factor = _unit(standing.signal)
-    assert standing.rival_rmse is not None and standing.difference is not None and standing.rmse is not None
-    beside = f"{standing.rival} ({_number(standing.rival_rmse * factor)}{unit})"
+    unit, difference = SCORED_SIGNALS[standing.signal], standing.difference
+    assert standing.rival_rmse is not None and difference is not None
+    beside = f"{standing.rival} ({shown(standing.rival_rmse, unit)})"
     if outcome == "same":
-        return f"{'equal to' if standing.difference.value == 0.0 else 'no relevant difference to'} {beside}"
-    difference = standing.difference
+        return f"{'equal to' if difference.value == 0.0 else 'no relevant difference to'} {beside}"
     share = abs(difference.value) / standing.rival_rmse if standing.rival_rmse else math.inf
-    by = f"{share:.0%} " if share < 10.0 else ""
+    by = "" if share >= _MANY else "less than 1 % " if share < _FEW else f"{100.0 * share:.0f} % "
     how = f"{by}{'lower' if difference.value < 0.0 else 'higher'} than {beside}"
     if not math.isfinite(difference.low):
         return f"{how}, difference not tested"
-    low, high = (_number(x * factor, sign="+") for x in (difference.low, difference.high))
-    between = f"95 % CI of the difference {low} to {high}{unit}"
+    low, high = (f"{'+' if x > 0.0 else ''}{shown(x, unit)}" for x in (difference.low, difference.high))
+    between = f"95 % CI of the difference {low} to {high}"
     return f"{how}, difference not significant: {between}" if outcome == "undecided" else f"{how}: {between}"
-
-
-def _number(value: float, sign: str = "-") -> str:
-    """Return a figure with as many digits as a person reads; ``sign`` ``+`` shows it always."""
-    return f"{value:{sign}.3f}" if abs(value) < 1.0 else f"{value:{sign}.2f}"

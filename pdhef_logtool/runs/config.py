@@ -82,7 +82,7 @@ class RunConfig:
     msgs : folder, zip file or wheel with .msg files of types that a log does not define; or a DBC file, or a folder of
         them, for raw CAN frames in BLF, ASC and MDF files.
     plan : validation plan (plan.toml); None = the default plan, which decides no exit code.
-    network : network folder, ``default``, ``many-cars`` or ``none``; None = the car's.
+    network : network folder, ``default`` or ``none``; None = the car's.
     intervals : intervals file, ``none``, or ``unsure`` (wide intervals, for a car that may have changed); None = the
         car's.
     calibrate : calibration of a car without validation data, without ground truth: per ``log``, ``online`` on what the

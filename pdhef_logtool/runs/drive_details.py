@@ -12,16 +12,14 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.evaluation.blocks import row_blocks
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
-from pdhef_logtool.evaluation.largest_errors import largest_places
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.evaluation.operating_space import operating_space
 from pdhef_logtool.evaluation.reasons import SensorFault, sensor_faults
 from pdhef_logtool.evaluation.segments import moving_mask
 from pdhef_logtool.evaluation.standing import standings
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.run_report import DriveDetails, LargestError
+from pdhef_logtool.results.run_report import DriveDetails
 from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.runs.drive_sample import sample_drive
 from pdhef_logtool.runs.error_budget import ErrorBudget, error_budget, no_budget
@@ -67,18 +65,9 @@ def drive_details(
         innovations=[] if sample is None else channel_innovations(asked, sample),
         standings=[] if truth is None else standings(main, _rivals(ready, by_name[main], read), read, truth, slow),
         error_budget=no_budget(_LEFT_OUT) if brief else _budget(drive, by_name.get(PHYSICS), read, signals),
-        operating_space=operating_space(signals, truth, answer, slow),
         path_drift=None if truth is None else path_drift(answer, truth),
-        friction_median=_friction(signals, drive.car.vehicle.assumed_friction),
         metadata=_metadata(drive),
-        largest_errors=[] if truth is None else _largest_errors(answer, truth, slow),
     )
-
-
-def _friction(signals: Signals, assumed: float) -> float:
-    """Return the median friction of a drive."""
-    friction = signals.friction[np.isfinite(signals.friction)]
-    return float(np.median(friction)) if friction.size else assumed
 
 
 def _faults(read: _Read, name: str) -> tuple[SensorFault, ...] | None:
@@ -96,17 +85,6 @@ def _rivals(ready: Sequence[Estimator], main: Estimator, read: _Read) -> list[st
         if other and not _is_same(read(estimator.name), read(main.name)):
             rivals.append(estimator.name)
     return rivals
-
-
-def _largest_errors(estimate: StateTrack, truth: StateTrack, low_speed_m_s: float) -> list[LargestError]:
-    """Return the largest sideslip errors of a track [N], at least a second and a fiftieth of the drive apart."""
-    parts = [(estimate.rows(a, b), truth.rows(a, b)) for a, b in row_blocks(len(truth))]
-    error = np.concatenate([signal_error(e, t, "sideslip_rad", low_speed_m_s) for e, t in parts])
-    stamps, beta = (np.concatenate([getattr(e, key) for e, _ in parts]) for key in ("stamps_ns", "sideslip_rad"))
-    return [
-        LargestError(int(stamps[row]), float(beta[row]), float(beta[row] - error[row]), float(error[row]))
-        for row in largest_places(stamps, error)
-    ]
 
 
 def _is_same(track: StateTrack | None, main: StateTrack | None) -> bool:

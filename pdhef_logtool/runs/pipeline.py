@@ -87,9 +87,10 @@ if TYPE_CHECKING:
     from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
     from pdhef_logtool.evaluation.metrics import MetricRow
     from pdhef_logtool.evaluation.metrics.metric import SensorErrors
+    from pdhef_logtool.evaluation.operating_space import OperatingSpace
+    from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
     from pdhef_logtool.evaluation.validation_plan import ValidationPlan
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
-    from pdhef_logtool.results.run_report import DriveDetails
     from pdhef_logtool.results.selected_estimate import MainFacts
     from pdhef_logtool.storage.object_store import Mirror
 
@@ -431,6 +432,8 @@ def _facts(
     losses: Sequence[Loss],
 ) -> ReportFacts:
     """Gather the content of report.json; ``ran``: intervals, and the estimators that failed with their reasons."""
+    from pdhef_logtool.evaluation.largest_errors import largest_errors
+    from pdhef_logtool.evaluation.operating_space import operating_space
     from pdhef_logtool.runs.drive_details import drive_details
 
     drive, (store, signals), (intervals, failed) = job.drive, estimates, ran
@@ -451,24 +454,28 @@ def _facts(
     estimators += [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in job.skipped]
     digests = {name: a.sha256[:SHOWN_DIGITS] for name, a in algorithms.items()}
     rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows]
-    details = drive_details(drive, job.ready, main.name, store.read, signals, brief=config.kept != "full")
+    truth, selected, vehicle = store.read(TRUTH), store.read(main.name), job.car.vehicle
+    assert selected is not None
+    space = operating_space(signals, truth, selected, vehicle)
+    others = [t for n in (REFERENCE, PHYSICS, *algorithms) if n != main.name and (t := store.read(n)) is not None]
     return replace(
         report_facts(drive, job.car, estimators, rows, scored.events, losses),
         friction=friction_facts(drive.friction),
         calibration=None if job.calibration is None else job.calibration.to_dict(),
         reference=None if job.reference is None else job.reference.document,
         main=main,
-        details=details,
-        requirements=_requirements(job, main.name, scored, store, details, brief=config.kept == "metrics"),
+        space=space,
+        largest_errors=largest_errors(selected, truth, others, vehicle.low_speed_blend_m_s),
+        details=drive_details(drive, job.ready, main.name, store.read, signals, brief=config.kept != "full"),
+        requirements=_requirements(job, main.name, scored, store, space, brief=config.kept == "metrics"),
     )
 
 
 def _requirements(
-    job: _Job, main: str, scored: Evaluation, store: TrackStore, details: DriveDetails, *, brief: bool
+    job: _Job, main: str, scored: Evaluation, store: TrackStore, space: OperatingSpace, *, brief: bool
 ) -> RequirementFacts:
     """Return the blocks of the plan's requirements in this drive, and the verdicts on the drive alone."""
     from pdhef_logtool.evaluation.requirement_blocks import MOST_BLOCKS, ScoredDrive, requirement_blocks
-    from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_rows, plan_verdicts
 
     drive, truth = job.drive, store.read(TRUTH)
     reference = None if truth is not None else store.read(REFERENCE)
@@ -478,9 +485,23 @@ def _requirements(
         slow, dependent = drive.car.vehicle.low_speed_blend_m_s, frozenset(drive.plan.dependent)
         tracks = ScoredDrive(store.read, base, scored.masks, slow, dependent, estimated=truth is None)
         blocks = requirement_blocks(job.validation.requirements, main, tracks, _BRIEF_BLOCKS if brief else MOST_BLOCKS)
-    report = {"requirement_blocks": jsonable(blocks), "operating_space": jsonable(details.space)}
-    judged = JudgedDrive(drive.name, main, lambda: report, {"car": job.car.vehicle.name})
-    return RequirementFacts(plan_verdicts(job.validation, figures_of_rows(scored.rows), [judged]), blocks)
+    return judged_alone(job.validation, drive, main, scored.rows, blocks, space)
+
+
+def judged_alone(
+    plan: ValidationPlan,
+    drive: Drive,
+    main: str | None,
+    rows: Sequence[MetricRow],
+    blocks: Sequence[RequirementBlocks],
+    space: OperatingSpace,
+) -> RequirementFacts:
+    """Return the verdicts of a plan on one drive with its figures, blocks of time and operating space."""
+    from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_rows, plan_verdicts
+
+    report = {"requirement_blocks": jsonable(blocks), "operating_space": jsonable(space)}
+    judged = JudgedDrive(drive.name, main, lambda: report, {"car": drive.car.vehicle.name})
+    return RequirementFacts(plan_verdicts(plan, figures_of_rows(rows), [judged]), blocks)
 
 
 def _write_files(
@@ -618,7 +639,7 @@ def _open_sinks(
                 if source is not None and not config.no_position
                 else []
             )
-            sinks.append(LayoutsSink(*layouts, None, colours, shown=first, fixes=fixes))
+            sinks.append(LayoutsSink(*layouts, colours, shown=first, fixes=fixes))
         if config.kept == "full":
             sinks.append(_recording(change, drive, config, car, shown, output, colours))
         yield [WithoutPosition(sink) for sink in sinks] if config.no_position else sinks

@@ -53,7 +53,7 @@ from pdhef_logtool.records.signals import (
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
-from pdhef_logtool.results.run_report import EstimatorFacts, RequirementFacts, build_report, write_json
+from pdhef_logtool.results.run_report import EstimatorFacts, build_report, write_json
 from pdhef_logtool.results.sink import TRUTH, Event
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimate_channels import RecordedEstimate, gap_ns, read_estimate
@@ -64,6 +64,7 @@ from pdhef_logtool.runs.pipeline import (
     check_places,
     files_of,
     judge,
+    judged_alone,
     log_place,
     outcome_of,
     read_validation_plan,
@@ -72,7 +73,6 @@ from pdhef_logtool.runs.pipeline import (
     write_verdicts,
 )
 from pdhef_logtool.runs.scoring import diverged_events, in_time, segment_events
-from pdhef_logtool.storage.documents import jsonable
 from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder
 
 if TYPE_CHECKING:
@@ -192,7 +192,9 @@ class _Scoring:
 
     def score(self, drive: Drive, outputs: OutputFolder | None) -> LogResult:
         """Read, compare and, with a folder, write."""
+        from pdhef_logtool.evaluation.largest_errors import largest_errors
         from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
+        from pdhef_logtool.evaluation.operating_space import operating_space
 
         plan = drive.plan
         self.reporter.progress(drive.name, 0.1)
@@ -212,7 +214,12 @@ class _Scoring:
         rows, dependent, blocks = self._figures(drive, plan, recorded, against, signals, manoeuvres)
         drive.plan = plan = replace(plan, dependent={**dependent, **plan.dependent})
         truth_track = against.truth_at(scored_ns)
-        events = self._events(truth_track, signals_at(signals, scored_ns), recorded, manoeuvres)
+        seen = signals_at(signals, scored_ns)
+        events = self._events(truth_track, seen, recorded, manoeuvres)
+        alone, vehicle = recorded[0].track if len(recorded) == 1 else None, self.car.vehicle
+        space = operating_space(seen, truth_track, alone, vehicle)
+        others = [t for t in (against.reference_at(scored_ns),) if t is not None]
+        places = [] if alone is None else largest_errors(alone, truth_track, others, vehicle.low_speed_blend_m_s)
         samples |= drive.samples
         for r in recorded:
             samples |= r.samples
@@ -229,12 +236,14 @@ class _Scoring:
             facts,
             log=replace(facts.log, topics=topics),
             truth=replace(facts.truth, notes=[*latency, *facts.truth.notes]),
-            requirements=self._requirements(drive.name, rows, blocks),
+            space=space,
+            largest_errors=places,
+            requirements=judged_alone(self.validation, drive, None, rows, blocks, space),
         )
         report = build_report(facts)
         folder = None
         if outputs is not None:
-            tracks = [r.track for r in recorded] + [t for t in (against.reference_at(scored_ns),) if t is not None]
+            tracks = [*(r.track for r in recorded), *others]
             if truth_track is not None:
                 tracks.insert(0, valid_as_a_whole(truth_track, plan.derivation, self.car.vehicle.standstill_m_s))
             with outputs.begin(log_place(drive.name), stale=(PAGE_FILE,)) as change:
@@ -366,13 +375,6 @@ class _Scoring:
         drive = ScoredDrive(lambda n: r.track if n == name else None, truth, masks, slow, tainted, estimated=estimated)
         asked = [q for q in self.validation.requirements if q.estimator in (name, None if alone else name)]
         return requirement_blocks(asked, name if alone else None, drive)
-
-    def _requirements(self, log: str, rows: Sequence[MetricRow], blocks: list[RequirementBlocks]) -> RequirementFacts:
-        """Return the verdicts of the plan on the log."""
-        from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_rows, plan_verdicts
-
-        judged = JudgedDrive(log, None, lambda: {"requirement_blocks": jsonable(blocks)})
-        return RequirementFacts(plan_verdicts(self.validation, figures_of_rows(rows), [judged]), blocks)
 
     def _events(
         self,

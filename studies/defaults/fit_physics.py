@@ -17,10 +17,10 @@ from pdhef_logtool.car.car import FIT_FILE, NO_INTERVALS, SHIPPED_CARS, Car
 from pdhef_logtool.car.parts import Fit, FittedValues, LearntOn, physics_sha256
 from pdhef_logtool.car.store import Change, update_car
 from pdhef_logtool.car.toml_files import part_toml
-from pdhef_logtool.learning.car.fit_data import FitDrive
-from pdhef_logtool.learning.car.physics_fit import find_physics
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from studies.condition_drives import read_drive
+from studies.defaults.axle_forces import FitDrive
+from studies.defaults.physics_fit import find_physics
 from studies.pages import options
 
 SEED, DRIVES = 5000, 24
@@ -41,8 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
     for entry in drawn:
         read = read_drive(given.work / entry["file"], Car.of(car.datasheet))
         assert read.truth is not None
-        start_ns = int(read.signals.stamps_ns[0])
-        drives.append(FitDrive(read.name, read.signals, read.truth, independent_yaw_rate=True, log_start_ns=start_ns))
+        drives.append(FitDrive(read.name, read.signals, read.truth))
         learnt_on.append(LearntOn(name=read.name, sha256=entry["sha256"], end_s=entry["duration_s"]))
 
     def say(text: str, share: float) -> None:

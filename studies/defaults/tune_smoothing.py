@@ -10,13 +10,16 @@ over that of the filter. Writes results/smoothing.json; the result is entered as
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import PHYSICS, FittedPhysics, FittedValues
+from pdhef_logtool.car.vehicle import PhysicsParts
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.latency_compensation import run_window
@@ -24,7 +27,8 @@ from pdhef_logtool.estimators.physics_filter import of_car
 from pdhef_logtool.estimators.smoothed import SmoothedPhysics, for_smoothing
 from pdhef_logtool.storage.files import write_bytes
 from studies.condition_drives import root_mean_square
-from studies.identified_bands import DRIVEN, fit_drives, identified
+from studies.defaults.axle_forces import FitDrive
+from studies.defaults.physics_fit import fit_physics
 from studies.pages import options
 from studies.self_calibration import Simulated, calibrate, simulate, taken
 
@@ -33,6 +37,37 @@ PAIRS = tuple(product((1.0, 0.7, 0.5, 0.35), (1.0, 2.0, 3.0)))
 RESULT = Path(__file__).parent / "results" / "smoothing.json"
 #: Ratio from which on a drive counts as one that smoothing has made worse.
 WORSE = 1.05
+#: Manoeuvre, km/h, seconds (None: its own). The first of each kind is identified on where it is one of ``FIT_ON``.
+DRIVEN = (
+    ("sine-sweep-wide", 90.0, None),
+    ("road", 100.0, 120.0),
+    ("dlc", 100.0, None),
+    ("sine-with-dwell", 80.0, None),
+    ("road", 80.0, 90.0),
+    ("sine-sweep-wide", 70.0, None),
+)
+FIT_ON = ("sine-sweep-wide", "road")
+#: With so little driving the parts are not chosen: those that a bare car cannot do without, and none that adapts.
+PARTS = PhysicsParts(lag=True, load_transfer=True, braking=True, roll=True, biases=True)
+FIT_ITERATIONS = 4
+
+
+def identified(simulated: Simulated) -> Car:
+    """Return the car as it is identified on a drive, from a file with the root of its factors wrong."""
+    file = simulated.file.with_stiffness(*np.sqrt(simulated.factors))
+    drive = simulated.drive
+    assert drive.truth is not None
+    drives = [FitDrive(drive.name, drive.signals, drive.truth)]
+    fitted = fit_physics(drives, file, PARTS, starts=({},), iterations=FIT_ITERATIONS)
+    physics = FittedPhysics(values=FittedValues.of(fitted.vehicle), noise=fitted.noise)
+    return replace(Car.of(file), fitted_physics=physics).with_noise(PHYSICS, fitted.noise)
+
+
+def fit_drives(drives: Sequence[Simulated]) -> list[Simulated]:
+    """Return the drives that a car is identified on."""
+    return [
+        next(d for d in drives if d.manoeuvre == kind) for kind in FIT_ON if any(d.manoeuvre == kind for d in drives)
+    ]
 
 
 def cases(of_car: list[Simulated]) -> Iterator[tuple[str, Car, Simulated]]:

@@ -27,7 +27,9 @@ from studies.strangers.scoring import Score, look, score_log
 
 #: What layouts held out gave when they were run for the first time: those now held out, and those that were before.
 FIRST_RUNS = {
-    "held_out": "held-out layouts of table formats were built last",
+    "held_out": "held-out layouts were built last",
+    "fleets": "layouts of fleets and proving grounds (tables, buses, messages) were held out before",
+    "tables": "layouts of table formats were held out before",
     "sensors": "layouts of sensors and controllers were held out before",
     "vehicles": "layouts of vehicles, simulators and data sets were held out earlier",
 }
@@ -74,6 +76,7 @@ def score_recording(recording: Recording, folder: Path) -> Result:
             allowed=recording.allowed,
             cause=recording.cause,
             at_fault=recording.at_fault,
+            start_ns=min((int(t.arrival_ns[0]) for t in recording.topics if len(t.arrival_ns)), default=None),
         )
     finally:
         shutil.rmtree(path) if path.is_dir() else path.unlink()

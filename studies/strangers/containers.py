@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
 from pdhef_logtool.records.signals import IntArray
-from studies.strangers.tables import writers
+from studies.strangers import buses, tables
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -300,5 +300,6 @@ _WRITERS: dict[str, Callable[[Sequence[Topic], Path], Path]] = {
     "rosbag2": _rosbag2,
     "rosbag2-bare": _rosbag2_bare,
     "rosbag2-mcap": _rosbag2_mcap,
-    **dict(writers()),
+    **dict(tables.writers()),
+    **dict(buses.writers()),
 }

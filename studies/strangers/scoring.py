@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool.drive.reading import ReadOptions, read_drive
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.table_columns import RELATIVE_NS
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import fit_clocks, read_signals
 from pdhef_logtool.mapping.choosing import choose_mapping
@@ -102,10 +103,15 @@ class Score:
 # ------------------------------------------------------------------------------------------------ messages of the tool
 
 
+def _databases(path: Path) -> Path | None:
+    """Return the folder of a log with its DBC files, which a person gives as ``--set msgs=``."""
+    return path if path.is_dir() and any(path.glob("*.dbc")) else None
+
+
 def look(path: Path) -> tuple[SignalMapping | None, Told, dict[str, Channel]]:
     """Let the tool read a log on its own; return its mapping, its messages, and its channels."""
     try:
-        with closing(open_log(path)) as log:
+        with closing(open_log(path, msgs=_databases(path))) as log:
             return _look(log)
     except PdhefError as error:
         return None, Told((), (), str(error)), {}
@@ -141,7 +147,8 @@ def _look(log: DriveLog) -> tuple[SignalMapping | None, Told, dict[str, Channel]
 def _checks_of_a_run(path: Path) -> tuple[list[dict[str, Any]], str]:
     """Return the checks that ``pdhef run`` would show, and why it would not run."""
     try:
-        with read_drive(path, Car.load("saloon"), require_sensors=False) as drive:
+        options = ReadOptions(msgs=_databases(path))
+        with read_drive(path, Car.load("saloon"), options=options, require_sensors=False) as drive:
             return [asdict(check) for check in getattr(drive, "checks", ())], ""
     except PdhefError as error:
         return [], str(error)
@@ -225,6 +232,7 @@ def score_log(
     allowed: Mapping[str, Sequence[Series]] | None = None,
     cause: str = "",
     at_fault: Iterable[str] = (),
+    start_ns: int | None = None,
 ) -> Score:
     """Let the tool map a log and compare the mapping with the right answers.
 
@@ -234,10 +242,15 @@ def score_log(
     allowed : what may be mapped too, and is not missed where it is not.
     cause : pattern that a message must match; empty without a cause.
     at_fault : channels whose checks may fail even where they were mapped rightly.
+    start_ns : what a log whose times count from its start has counted from.
     """
     mapping, messages, channels = look(path)
     sources = {} if mapping is None else _sources(mapping)
     fitting = {**(allowed or {}), **right}
+    first = min((int(c.arrival_ns[0]) for c in channels.values() if len(c)), default=None)
+    if start_ns is not None and first is not None and first < RELATIVE_NS + 10**12:
+        shift = RELATIVE_NS - start_ns
+        fitting = {n: [s.late(shift * 1e-9) for s in series] for n, series in fitting.items()}
     is_right = {
         name: any(agrees(channel, series, floor_of(name), bias_of(name)) for series in fitting.get(name, ()))
         for name, channel in channels.items()

@@ -64,6 +64,70 @@ def _text(clock: Sequence[str], columns: dict[str, Any], titles: Sequence[str], 
     return "\n".join([separator.join(titles), *rows, ""] if titles else [*rows, ""])
 
 
+def _lab(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    """Write a laboratory system's export: what was measured above the names, units in brackets below them."""
+    names = [_split(title) for title in columns]
+    head = ["Measurement:;Test 12;;", "Recorder:;17,5 V;car 3;", "Start:;24.11.2025;14:05:12,125;", ""]
+    head += [";".join(["Time", *(n for n, _ in names)]), ";".join(["[s]", *(f"[{u}]" for _, u in names)])]
+    rows = _text([f"{s / 1e9:.4f}" for s in (stamps - stamps[0]).tolist()], columns, [], ";").replace(".", ",")
+    path.write_text("\n".join([*head, rows]), encoding="utf-8")
+
+
+def _dated(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    """Write day and time of day in two columns."""
+    texts = np.datetime_as_string(stamps.astype("datetime64[ns]"), "ms")
+    clock = [f"{t[8:10]}.{t[5:7]}.{t[:4]},{t[11:]}" for t in texts]
+    path.write_text(_text(clock, columns, ["Date", "Time", *columns], ","))
+
+
+def _bare(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    """Write names without units."""
+    clock = [f"{s / 1e9:.4f}" for s in (stamps - stamps[0]).tolist()]
+    path.write_text(_text(clock, columns, ["Time", *columns], ","))
+
+
+def _long_rows(topics: Sequence[Topic]) -> list[tuple[int, str, float, str]]:
+    """Return a row for each value: time in ns, signal, value, unit."""
+    rows = [
+        (stamp, *_split(title)[:1], value, _split(title)[1])
+        for topic in topics
+        for title, values in topic.fields.items()
+        for stamp, value in zip(topic.arrival_ns.tolist(), values.tolist(), strict=True)
+    ]
+    return sorted(rows)
+
+
+def _long_csv(path: Path, topics: Sequence[Topic]) -> None:
+    rows = [f"{stamp / 1e9:.6f},{name},{value:.9g}" for stamp, name, value, _ in _long_rows(topics)]
+    path.write_text("\n".join(["timestamp,signal,value", *rows, ""]))
+
+
+def _long_parquet(path: Path, topics: Sequence[Topic]) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    stamps, names, values, units = (list(column) for column in zip(*_long_rows(topics), strict=True))
+    clock = pa.array(np.array(stamps, "datetime64[ns]"))
+    table = {"signal_name": pa.array(names).dictionary_encode(), "time": clock, "value": values, "unit": units}
+    pq.write_table(pa.table(table), path)
+
+
+def _nested_parquet(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    rows: list[dict[str, Any]] = [{"event_time": stamp // 1000} for stamp in stamps.tolist()]
+    for title, values in columns.items():
+        *parents, leaf = title.split(".")
+        for row, value in zip(rows, values.tolist(), strict=True):
+            for parent in parents:
+                row = row.setdefault(parent, {})
+            row[leaf] = None if np.isnan(value) else value
+    table = pa.Table.from_pylist(rows)
+    clock = table.column("event_time").cast(pa.timestamp("us", "UTC"))
+    pq.write_table(table.set_column(0, "event_time", clock), path)
+
+
 def _vbo(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
     """Write the columns of one topic: titles with units are those of input modules, and come last."""
     titles = list(columns)
@@ -90,6 +154,52 @@ def _mat(path: Path, topics: Sequence[Topic]) -> None:
     for topic in topics:
         structs[topic.name.strip("/")] = {"time": topic.arrival_ns * 1e-9, **topic.fields}
     savemat(path, structs)
+
+
+def _mat_series(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a struct for each signal, as MATLAB's timeseries become."""
+    from scipy.io import savemat
+
+    signals = ((t, *_split(title), values) for t in topics for title, values in t.fields.items())
+    series = {
+        name: {
+            "Name": name,
+            "Time": (t.arrival_ns - topics[0].arrival_ns[0]) * 1e-9,
+            "Data": v,
+            "DataInfo": {"Units": u},
+        }
+        for t, name, u, v in signals
+    }
+    savemat(path, {"data": series})
+
+
+def _mat_recorder(path: Path, topics: Sequence[Topic]) -> None:
+    """Write one struct with axes X and signals Y, as a real-time recorder exports."""
+    from scipy.io import savemat
+
+    record: dict[str, Any] = {"X": [], "Y": [], "Description": {"General": "recorder"}}
+    for number, topic in enumerate(topics, 1):
+        seconds = (topic.arrival_ns - topics[0].arrival_ns[0]) * 1e-9
+        record["X"].append({"Name": f"t{number}", "Data": seconds, "Unit": "s"})
+        for title, values in topic.fields.items():
+            name, unit = _split(title)
+            record["Y"].append({"Name": name, "Data": values, "Unit": unit, "XIndex": float(number)})
+    savemat(path, {"rec1_001": record})
+
+
+def _mat_hdf5(path: Path, topics: Sequence[Topic]) -> None:
+    """Write version 7.3: each variable is a row vector, which HDF5 stores as a column."""
+    import h5py
+
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for number, topic in enumerate(topics, 1):
+            group = file.create_group(topic.name.strip("/")) if number > 1 else file
+            vectors = {"t": (topic.arrival_ns - topics[0].arrival_ns[0]) * 1e-9, **topic.fields}
+            for name, values in vectors.items():
+                group.create_dataset(name, data=np.asarray(values).reshape(-1, 1)).attrs["MATLAB_class"] = b"double"
+    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM"
+    with path.open("r+b") as raw:
+        raw.write(head)
 
 
 def _parquet(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
@@ -122,11 +232,20 @@ _TABLES: dict[str, tuple[str, Callable[[Path, IntArray, dict[str, Any]], None]]]
     "csv": (".csv", _iso),
     "csv-german": (".csv", _german),
     "csv-gps": (".csv", _gps),
+    "csv-lab": (".csv", _lab),
+    "csv-dated": (".csv", _dated),
+    "csv-bare": (".csv", _bare),
+    "parquet-nested": (".parquet", _nested_parquet),
     "parquet": (".parquet", _parquet),
     "vbo": (".vbo", _vbo),
 }
 _GROUPS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
+    "csv-long": (".csv", _long_csv),
+    "parquet-long": (".parquet", _long_parquet),
     "mat": (".mat", _mat),
+    "mat-series": (".mat", _mat_series),
+    "mat-recorder": (".mat", _mat_recorder),
+    "mat-7.3": (".mat", _mat_hdf5),
     "mdf": (".mf4", _mdf),
 }
 

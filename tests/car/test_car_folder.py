@@ -186,10 +186,10 @@ def test_a_fit_of_biases_leaves_the_other_sensors(folder: Path) -> None:
 
 
 def test_a_cars_network_may_be_its_own_or_named_by_the_cars_folder(folder: Path, tmp_path: Path) -> None:
-    shutil.copytree(SHIPPED_FOLDERS["many-cars"], folder / NETWORK_FOLDER)
-    add_trust(folder, "many-cars")
+    shutil.copytree(SHIPPED_FOLDERS["default"], folder / NETWORK_FOLDER)
+    add_trust(folder)
     text = (folder / NETWORK_FILE).read_text()
-    (folder / NETWORK_FILE).write_text(text.replace('"many-cars"', '"network"'))
+    (folder / NETWORK_FILE).write_text(text.replace('"default"', '"network"'))
     car = Car.load(folder)
     assert (car.network_name, car.network_folder) == ("network", folder / NETWORK_FOLDER)
     assert car.allowed_trust.cap == 0.5
@@ -277,7 +277,7 @@ def test_other_physics_leave_fit_noise_and_trust_out_and_say_so(folder: Path, ol
     assert dict(car.noise) == {}
     assert car.learnt_on == ()
     assert car.notes == (
-        "fit.toml is not used: vehicle.toml has changed since; pdhef learn --stages identify creates it again",
+        "fit.toml is not used: vehicle.toml has changed since; pdhef learn --stages calibrate creates it again",
         "noise of physics is not used: it belongs to other physics; pdhef learn --stages noise creates it again",
         "network.toml allows no residual gain: it was fitted with other physics; "
         "pdhef learn --stages gain creates it again",
@@ -349,7 +349,7 @@ def test_other_noise_takes_the_trust_but_nothing_else(folder: Path) -> None:
 
 def test_evidence_about_another_network_makes_nothing_stale(folder: Path) -> None:
     add_noise(folder)
-    add_trust(folder, "many-cars")
+    write_part(folder / NETWORK_FILE, add_trust(folder).model_copy(update={"network_sha256": "ab" * 32}))
     assert load(folder, "default").notes == ()
     assert "the car's evidence is about network" in load(folder, "default").allowed_trust.reason
 
@@ -378,7 +378,7 @@ def test_trust_changes_no_physics_so_that_intervals_stay_those_of_the_car(folder
 
 def test_a_network_is_no_car(tmp_path: Path) -> None:
     with pytest.raises(VehicleError, match=r"a folder with vehicle\.toml, or such a file, got a network's folder"):
-        Car.load(SHIPPED_FOLDERS["many-cars"])
+        Car.load(SHIPPED_FOLDERS["default"])
     with pytest.raises(VehicleError, match="got another folder"):
         Car.load(tmp_path)
 
@@ -497,14 +497,14 @@ def test_the_same_folder_is_updated_and_every_command_leaves_a_line(folder: Path
 def test_a_network_is_copied_whole_and_replaces_the_one_before(folder: Path) -> None:
     (folder / NETWORK_FOLDER / "baselines").mkdir(parents=True)
     (folder / NETWORK_FOLDER / "baselines" / "old.json").write_text("{}")
-    many = SHIPPED_FOLDERS["many-cars"]
-    change = Change("trust", NETWORK_FILE, {NETWORK_FILE: b"x = 1\n"}, {NETWORK_FOLDER: many})
+    shipped = SHIPPED_FOLDERS["default"]
+    change = Change("trust", NETWORK_FILE, {NETWORK_FILE: b"x = 1\n"}, {NETWORK_FOLDER: shipped})
     update_car(load(folder), folder, change)
-    assert files_of(folder / NETWORK_FOLDER) == files_of(many)
+    assert files_of(folder / NETWORK_FOLDER) == files_of(shipped)
     again = Change("trust", NETWORK_FILE, {NETWORK_FILE: b"x = 2\n"}, {NETWORK_FOLDER: folder / NETWORK_FOLDER})
     (folder / NETWORK_FILE).unlink()
     update_car(load(folder), folder, again)
-    assert files_of(folder / NETWORK_FOLDER) == files_of(many)
+    assert files_of(folder / NETWORK_FOLDER) == files_of(shipped)
 
 
 def _raise(error: BaseException) -> Callable[..., Any]:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.checks import check_drive
+from pdhef_logtool.drive.columns import columns_on_grid
 from pdhef_logtool.drive.hypotheses import units_told
 from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.mounting import truth_latency
@@ -345,8 +346,10 @@ def late_checks(found: MappedChannels, vehicle: VehicleParameters | None = None)
         ({"delay_s": 0.038}, "yaw_rate_rad_s.delay"),
     ],
 )
-def test_place_gain_and_delay_are_told_apart(sample_logs_dir: Path, errors: dict[str, float], name: str) -> None:
-    checks = late_checks(planted(survey(sample_logs_dir / "sweep.mcap"), **errors))
+def test_place_gain_and_delay_are_told_apart(
+    sample_logs_dir: Path, saloon: VehicleParameters, errors: dict[str, float], name: str
+) -> None:
+    checks = late_checks(planted(survey(sample_logs_dir / "sweep.mcap"), **errors), saloon)
     assert verdicts(checks, "failed") == ({name} if name else set())
     assert {"ay_m_s2.place", "yaw_rate_rad_s.gain", "yaw_rate_rad_s.delay"} <= {c.name for c in checks}
 
@@ -437,3 +440,39 @@ def test_a_unit_is_told_where_the_drive_rules_out_all_others() -> None:
     assert told == set(), "a model car's wheel turns like a car's steering wheel"
     wheels = {n: c for n, c in drive(3).items() if n.startswith("wheel_speed_rl") or n == "yaw_rate_rad_s"}
     assert units_told(measure(wheels).relations, {"wheel_speed_rl_m_s"}) == set()
+
+
+def test_a_steering_sensor_that_never_moves_is_no_steering() -> None:
+    channels = drive(1)
+    dead = replace(channels["steer_rad"], values=np.full_like(channels["steer_rad"].values, 0.01))
+    assert failed({**channels, "steer_rad": dead}) == {"steer_rad.axis"}
+
+
+def test_two_spinning_wheels_show_no_speed() -> None:
+    """The derivative of spinning wheels is no acceleration; a wheel in another unit does not spin."""
+    channels = drive(2)
+    wheel = channels.pop("wheel_speed_rl_m_s")
+    del channels["speed_m_s"], channels["wheel_speed_fr_rad_s"]
+
+    def with_front(factor: np.ndarray) -> dict[str, Channel]:
+        wheels = {n: wheel.values * (factor if n.startswith("f") else 1.0) for n in ("fl", "fr", "rl", "rr")}
+        return channels | {f"wheel_speed_{n}_m_s": replace(wheel, values=v) for n, v in wheels.items()}
+
+    spinning = with_front(1.0 + 4.0 * (np.arange(len(wheel)) % 400 < 100))
+    assert failed(spinning) == set()
+    assert 0.5 < np.isfinite(measure(spinning).columns["wheel_speeds"]).mean() < 0.8
+    km_h = with_front(np.full(len(wheel), 3.6))
+    assert np.isfinite(measure(km_h).columns["wheel_speeds"]).mean() > 0.95
+
+
+def test_marks_of_invalid_values_are_no_motion() -> None:
+    """A bus writes its largest value for a moment; a manoeuvre lasts longer."""
+    channels = drive(3)
+    steer = channels["steer_rad"]
+    marked = steer.values.copy()
+    marked[500:503] = marked[900] = 486.0
+    columns = columns_on_grid({"clean": steer, "marked": replace(steer, values=marked)})
+    assert np.nanmax(np.abs(columns["marked"] - columns["clean"])) < 0.1
+    held = steer.values.copy()
+    held[500:800] = 486.0
+    assert np.nanmax(columns_on_grid({"held": replace(steer, values=held)})["held"]) > 400.0

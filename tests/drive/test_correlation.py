@@ -13,6 +13,7 @@ from pdhef_logtool.drive.correlation import (
     find_shift,
     on_common_grid,
     parabolic_peak,
+    shift_error,
 )
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.records.signals import FloatArray
@@ -85,3 +86,28 @@ def test_what_never_moves_has_no_shift() -> None:
     holed = np.where(np.arange(300) % 7 == 0, np.nan, 0.0)
     for still in (np.zeros(300), holed):
         assert repr(find_shift(CommonGrid(0.01, moving, still), 0.3)) == repr(_UNKNOWN)
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+def test_the_error_of_a_shift_is_that_of_its_scatter(coloured: bool) -> None:
+    """Noise is white or as slow as a bend: the spread of shifts over many drives is the error that is stated."""
+    rng, ratios = np.random.default_rng(3), []
+    for _ in range(40):
+        a, noise = (np.convolve(rng.standard_normal(6200), np.hanning(200), "valid") for _ in range(2))
+        noise = noise[:6000] if coloured else 6.0 * rng.standard_normal(6000)
+        b = np.roll(a[:6000], 7) + 0.1 * noise
+        grid = CommonGrid(0.01, a[:6000], b)
+        shift = find_shift(grid, 0.5).shift_s
+        ratios.append((shift - 0.07) / shift_error(grid, shift))
+    assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.3
+
+
+def test_a_ramp_shows_no_shift() -> None:
+    """A gain that bends with the size looks like a delay in a ramp, and only there."""
+    rng, time = np.random.default_rng(4), np.arange(4000) * 0.01
+    for motion, shows in ((0.1 * time, False), (np.sin(1.5 * time), True)):
+        a = motion + 1e-3 * rng.standard_normal(4000)
+        b = 1.5 * motion * (1.0 - 0.05 * np.abs(motion)) + 1e-3 * rng.standard_normal(4000)
+        grid = CommonGrid(0.01, a - np.mean(a), b - np.mean(b))
+        assert (shift_error(grid, find_shift(grid, 0.5).shift_s) < 0.015) == shows
+    assert shift_error(CommonGrid(0.01, np.zeros(4000), np.zeros(4000)), 0.0) == np.inf

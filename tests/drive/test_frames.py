@@ -8,14 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.drive.checks.sensor_errors import SensorErrors
 from pdhef_logtool.drive.mounting import Survey, survey_log
-from pdhef_logtool.drive.proposals import _of_frames
 from pdhef_logtool.logs.drive_log import TopicInfo
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map, fit_clocks
-from pdhef_logtool.mapping.frames import Placement, placement_of
+from pdhef_logtool.mapping.frames import placement_of
 from tests.turned_log import TurnedLog, rotation
 
 SECOND = 1_000_000_000
@@ -124,18 +121,3 @@ def test_frames_that_contradict_gravity_are_not_taken(drives) -> None:
     survey = surveyed(FramedLog(drives["fishhook"], rotation(0, 0, 90), rotation(90, 0, 0)), 2.0)
     assert verdicts(survey) == ["failed"]
     assert survey.mapping.signals["ay_m_s2"].field == "linear_acceleration.y"
-
-
-def placed_at(x: float, y: float) -> Placement:
-    return Placement("imu_link", "base_link", np.eye(3), np.array([x, y, 0.5]))
-
-
-def test_a_place_is_proposed_where_the_drive_tells_the_frames_origin() -> None:
-    car = default_vehicle()
-    errors = SensorErrors(-0.3, 0.05, 1.0, 0.01, 1.0, 0.01, 0.0, 0.01)
-    (found,) = _of_frames(placed_at(car.cg_to_rear_axle_m - 0.3, 0.4), errors, car)
-    assert found.entries["imu_position_m"] == (-0.3, 0.4, car.imu_position_m[2])
-    assert "middle of the rear axle" in found.evidence
-    assert _of_frames(placed_at(3.0, 0.4), errors, car) == []
-    vague = SensorErrors(-0.3, 2.0, 1.0, 0.01, 1.0, 0.01, 0.0, 0.01)
-    assert _of_frames(placed_at(0.5, 0.4), vague, car) == []

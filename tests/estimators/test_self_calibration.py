@@ -102,6 +102,16 @@ def test_a_wrong_steering_gain_is_found() -> None:
     assert abs(math.log(ratio.value / (1.1 * RIGHT.steering_ratio))) < 1.96 * ratio.sd
 
 
+def test_errors_that_no_parameter_explains_leave_the_prior() -> None:
+    signals = with_noise(wide().signals, 10)
+    rng = np.random.default_rng(11)
+    rate, ay = (std * rng.standard_normal(len(signals)) for std in (1.0, 15.0))
+    unexplained = replace(signals, yaw_rate_rad_s=signals.yaw_rate_rad_s + rate, ay_m_s2=signals.ay_m_s2 + ay)
+    for p in found(unexplained, RIGHT).parameters:
+        distance = math.log(p.value / p.prior) if p.log else p.value - p.prior
+        assert abs(distance) < 2.0 * p.prior_sd, p.name
+
+
 def test_slow_driving_calibrates_and_very_slow_driving_is_refused() -> None:
     file = wrong(0.6, 0.6).model_copy(update={"relaxation_length_m": 0.1})  # the forces of this car do not lag
     slow = found(with_noise(drive(sweep(0.08), 60.0, speed=7.0).signals, 9), file)

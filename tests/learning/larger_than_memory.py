@@ -50,6 +50,8 @@ def write_set(folder: Path, drives: int, steps: int = STEPS) -> Path:
             weight=weight,
             segment=np.zeros(steps, dtype=np.int64),
             truth_velocity=features[:, :2],
+            truth_std_rad=np.zeros(steps),
+            region=np.full(steps, np.nan),
         )
         split = "validation" if number % 10 == 9 else "train"
         entry = {

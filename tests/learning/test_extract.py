@@ -19,6 +19,8 @@ import pytest
 from fake_drive_log import FakeLog, FakeTopic
 from residual_car import CAR, Motion, Wave, drive
 
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.taught import Taught
 from pdhef_logtool.car.toml_files import vehicle_toml
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive import reading
@@ -28,6 +30,8 @@ from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.records.errors import LogError, OutputError, UsageError
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.residual_model.ladder import LadderModel, plain
+from pdhef_logtool.residual_model.slow_features import EVEN_COUNT, ODD_COUNT
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.storage.documents import is_sealed, seal
 from pdhef_logtool.storage.outputs import OutputFolder
@@ -234,6 +238,8 @@ def test_rows_are_whole_and_in_order(dataset: ExtractResult) -> None:
         "target_dyaw_rate_rad_s",
         "truth_vx_m_s",
         "truth_vy_m_s",
+        "truth_std_rad",
+        "region",
         "weight",
         "segment",
         "chosen",
@@ -242,9 +248,10 @@ def test_rows_are_whole_and_in_order(dataset: ExtractResult) -> None:
     ]
     assert frame["stamp_ns"].diff().drop_nulls().min() > 0  # type: ignore[operator]
     entry = next(d for d in dataset.manifest["drives"] if d["log"] == "dlc")
-    assert (len(frame), int(frame["weight"].sum())) == (entry["rows"], entry["usable_rows"])
+    assert (len(frame), int((frame["weight"] > 0).sum())) == (entry["rows"], entry["usable_rows"])
     usable = frame.filter(pl.col("weight") > 0)
-    assert usable.null_count().sum_horizontal().item() == 0
+    assert usable.drop("region").null_count().sum_horizontal().item() == 0
+    assert usable["region"].is_null().all() and 0.9 < usable["weight"].min() <= usable["weight"].max() <= 1.0
     assert frame["chosen"].all() and set(frame["cell"].unique()) <= {-1, *(int(n) for n in entry["cells"])}
     assert sum(entry["cells"].values()) == entry["usable_rows"]
     whole = pl.scan_parquet(dataset.output / "**/*.parquet", hive_partitioning=True)
@@ -269,6 +276,66 @@ def test_reading_back_gives_arrays_for_training(dataset: ExtractResult) -> None:
         assert data.vehicle(one).name == next(
             v["name"] for v in data.manifest["vehicles"] if v["sha256"] == one.entry["vehicle_sha256"]
         )
+
+
+def _slow(values: np.ndarray, dt_s: np.ndarray, tau_s: float) -> np.ndarray:
+    """Return a causal first-order low pass of columns [N, c], as METHOD has it for any framework."""
+    out = np.zeros_like(values)
+    for k in range(1, len(values)):
+        out[k] = out[k - 1] + min(dt_s[k] / tau_s, 1.0) * (values[k] - out[k - 1])
+    return out
+
+
+def test_a_plain_ridge_is_trained_from_the_file_alone(sample_logs_dir: Path, tmp_path: Path) -> None:
+    """A file with a front axle that is too soft: what a ridge learns of every second block lowers the others' error."""
+    text = (sample_logs_dir / "vehicle.toml").read_text()
+    (tmp_path / "soft.toml").write_text(text[: text.index("[network]")] + "\n" + text[text.index("[sensors]") :])
+    soft = (tmp_path / "soft.toml").read_text().replace("B = 11.146", "B = 7.0")
+    (tmp_path / "soft.toml").write_text(soft)
+    config = RunConfig(car=tmp_path / "soft.toml", start="60", end="120")
+    extract([str(sample_logs_dir / "road.mcap")], tmp_path / "set", ExtractSettings(config))
+    (file,) = (tmp_path / "set").rglob("part-*.parquet")
+    rows = pl.read_parquet(file, hive_partitioning=False).filter(pl.col("weight") > 0)[::5]
+    column = {name: rows[name].cast(pl.Float64).to_numpy() for name in rows.columns if name != "chosen"}
+    physics = np.arctan2(column["physics_vy_m_s"], column["vx_m_s"])
+    residual = np.arctan2(column["truth_vy_m_s"], column["truth_vx_m_s"]) - physics
+    signals = np.stack([column["steer_rad"], column["yaw_rate_rad_s"], column["ay_m_s2"], physics], axis=1)
+    dt_s = np.diff(column["stamp_ns"], prepend=column["stamp_ns"][0]) * 1e-9
+    z = np.concatenate([_slow(signals, dt_s, tau) for tau in (0.05, 0.3, 1.5)], axis=1)
+    seconds = (column["stamp_ns"] - column["stamp_ns"][0]) * 1e-9
+    taught = (seconds // 4.0) % 2.0 == 0.0
+    z /= z[taught].std(axis=0)
+    weight = (column["weight"] * dt_s)[taught]
+    centred = z[taught] - np.average(z[taught], axis=0, weights=weight)  # a constant is free and not kept
+    normal = centred.T @ (weight[:, None] * centred) + 10.0 * np.eye(z.shape[1])
+    ridge = np.linalg.solve(normal, centred.T @ (weight * residual[taught]))
+    error = (residual - z @ ridge)[~taught]
+    assert error.std() < 0.5 * residual[~taught].std()
+
+
+def test_a_taught_car_is_calibrated_and_each_row_has_the_gain_of_its_region(
+    sample_logs_dir: Path, tmp_path: Path
+) -> None:
+    car = tmp_path / "car"
+    car.mkdir()
+    text = (sample_logs_dir / "vehicle.toml").read_text()
+    (car / "vehicle.toml").write_text(text[: text.index("[network]")] + "\n" + text[text.index("[sensors]") :])
+    ones = np.ones(ODD_COUNT)
+    model = LadderModel(
+        rung="linear", scale=plain(ones), even_mean=plain(np.zeros(EVEN_COUNT)), even_scale=plain(np.ones(EVEN_COUNT)),
+        weights=plain(0.01 * ones), factor=plain(0.01 * ones[:, None]), whitening=plain(0.6 * np.eye(ODD_COUNT)),
+        speed_m_s=(5.0, 60.0), largest_rad=0.1,
+    )  # fmt: skip
+    taught = Taught(physics_sha256=Car.load(car, network="none").physics_sha256, residual=model)
+    (car / "taught.json").write_text(json.dumps(taught.model_dump(mode="json")))
+    config = RunConfig(car=car)
+    result = extract([str(sample_logs_dir / "dlc.mcap")], tmp_path / "set", ExtractSettings(config))
+    (entry,) = result.manifest["drives"]
+    jsonschema.validate(json.loads((tmp_path / "set" / MANIFEST).read_text()), SCHEMA)
+    assert entry["taught_sha256"] == model.sha256 and "stiffness" in entry["calibration"]
+    (file,) = (tmp_path / "set").rglob("part-*.parquet")
+    region = pl.read_parquet(file, hive_partitioning=False)["region"].drop_nulls().to_numpy()
+    assert region.min() == 0.0 and region.max() == 1.0 and ((region > 0.0) & (region < 1.0)).any()
 
 
 def test_damaged_dataset_is_told(dataset: ExtractResult, tmp_path: Path) -> None:

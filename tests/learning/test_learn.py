@@ -6,7 +6,6 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,11 +20,11 @@ from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres
 from pdhef_logtool.evaluation.comparison import Errors
-from pdhef_logtool.learning import engine, more_driving
-from pdhef_logtool.learning.car import identify, physics_fit
+from pdhef_logtool.learning import engine
 from pdhef_logtool.learning.drives import STAGES, LearnSettings
-from pdhef_logtool.learning.engine import _compare, count_evaluations, learn
+from pdhef_logtool.learning.engine import count_evaluations, learn
 from pdhef_logtool.learning.page import draw_page, page_markdown
+from pdhef_logtool.learning.score import paired_test
 from pdhef_logtool.learning.split import (
     GAP_S,
     NETWORK_TRAINING,
@@ -153,13 +152,14 @@ def _errors(*degrees: float) -> Errors:
 
 def test_what_is_worse_or_says_less_does_not_stay() -> None:
     nan = float("nan")
-    assert _compare(_errors(1.0, 1.0), _errors(0.5, -0.5)) == ((1.0, 0.5), True)
-    assert _compare(_errors(0.5, 0.5), _errors(1.0, nan))[1] is False
-    assert _compare(_errors(1.0, 1.0), _errors(-1.0, 1.0))[1] is None
+    good = paired_test(_errors(1.0, 1.0), _errors(0.5, -0.5))
+    assert (good.was_deg, good.now_deg, good.better) == (1.0, 0.5, True)
+    assert paired_test(_errors(0.5, 0.5), _errors(1.0, nan)).better is False
+    assert paired_test(_errors(1.0, 1.0), _errors(-1.0, 1.0)).better is None
     # Where one of them says nothing, neither counts; an estimate that is missing too often is worse.
-    assert _compare(_errors(nan, *[1.0] * 10), _errors(9.0, *[0.5] * 10))[1] is True
-    assert _compare(_errors(*[1.0] * 10), _errors(nan, nan, *[0.5] * 8))[1] is False
-    assert _compare(_errors(1.0, nan), _errors(nan, 1.0))[1] is False
+    assert paired_test(_errors(nan, *[1.0] * 10), _errors(9.0, *[0.5] * 10)).better is True
+    assert paired_test(_errors(*[1.0] * 10), _errors(nan, nan, *[0.5] * 8)).better is False
+    assert paired_test(_errors(1.0, nan), _errors(nan, 1.0)).better is False
 
 
 def test_noise_must_be_better_beyond_doubt() -> None:
@@ -168,10 +168,17 @@ def test_noise_must_be_better_beyond_doubt() -> None:
 
     rng = np.random.default_rng(0)
     old = rng.normal(0.0, 1.0, 900)
-    assert engine._confirmed(errors(old), errors(0.9 * old))
-    assert not engine._confirmed(errors(old[:700]), errors(0.9 * old[:700]))  # of seven blocks
-    assert not engine._confirmed(errors(old), errors(rng.normal(0.0, 0.99, 900)))
-    assert not engine._confirmed(errors(0.9 * old), errors(old))
+
+    def verdict(before: np.ndarray, after: np.ndarray) -> tuple[bool, bool]:
+        test = paired_test(errors(before), errors(after))
+        return test.confirmed, test.refuted
+
+    assert verdict(old, 0.9 * old) == (True, False)
+    assert verdict(old[:700], 0.9 * old[:700]) == (False, False)  # of seven blocks
+    assert verdict(0.9 * old[:700], old[:700]) == (False, True)
+    assert verdict(old, rng.normal(0.0, 0.99, 900)) == (False, False)
+    assert verdict(0.9 * old, old) == (False, True)
+    assert verdict(old, np.where(np.arange(900) < 300, np.nan, 0.5 * old)) == (False, True)
 
 
 def test_evaluations_of_the_same_driving_are_counted(tmp_path: Path) -> None:
@@ -192,20 +199,6 @@ def test_a_gain_is_not_worth_intervals_that_mean_nothing(was: int, now: int, sur
 @pytest.mark.slow
 def test_the_page_holds_any_name_and_what_was_not_known() -> None:
     line = {"name": "pd-hef-smoothed, trained", "causal": False, "share": 1.0, "covered": None}
-    parameter = {
-        "name": "shape",
-        "unit": "1",
-        "value": 1.2,
-        "low95": 1.0,
-        "high95": 1.4,
-        "prior": 1.3,
-        "excited": False,
-    }
-    tried = [
-        {"parts": [], "held_out_deg": [0.2, 0.3], "taken": True},
-        {"parts": ["lag", "roll"], "held_out_deg": [0.1, 0.2], "taken": False},
-    ]
-    found = {"physics_parameters": [parameter], "physics": {"tried": tried}}
     document = {
         "car_name": "a|b\x1b",
         "evaluations": 2,
@@ -218,7 +211,7 @@ def test_the_page_holds_any_name_and_what_was_not_known() -> None:
                 "text": "why",
                 "before": ["a", 0.5],
                 "after": ["b", 0.75],
-                "figures": found,
+                "figures": {},
             },
             {"name": "two", "status": "not done", "text": "why not", "before": None, "after": None, "figures": {}},
         ],
@@ -235,9 +228,6 @@ def test_the_page_holds_any_name_and_what_was_not_known() -> None:
         "x\\|y_0-30s |",
         "| one | undone | a: 0.500 | b: 0.750 | why |",
         "| two | not done | – | – | why not |",
-        "| shape | 1.2 | 1 to 1.4 | 1.3 | 1 | not observable |",
-        "| none | 0.200 | 0.300 | taken |",
-        "| lag, roll | 0.100 | 0.200 |  |",
         "Nothing was held out.",
         "Number of evaluations on the test part, in calls with this output: 2.",
         "| pd-hef-smoothed, trained (not causal) | 0.100 | 100 % | – | -0.020 [-0.030, 0.010] |",
@@ -266,7 +256,7 @@ def _tyres(factor: float) -> Callable[[Task], StageOutput]:
         )
         fit = Fit(physics_sha256=physics_sha256(task.car.datasheet), values=FittedValues(tyres=tyres))
         change = Change("stage", FIT_FILE, {FIT_FILE: part_toml(fit, "made").encode()})
-        return StageOutput(change, (), f"factor {factor}", {"physics_parameters": [], "physics": {}})
+        return StageOutput(change, (), f"factor {factor}", {})
 
     return run
 
@@ -308,7 +298,7 @@ def test_stages_that_raise_the_error_are_undone_and_a_rerun_continues_to_the_sam
 
         return count
 
-    stages = {"identify": _tyres(GOOD), "noise": _too_little, "gain": _tyres(BAD), "network": _tyres(GOOD)}
+    stages = {"calibrate": _tyres(GOOD), "noise": _too_little, "gain": _tyres(BAD), "network": _tyres(GOOD)}
     for name, run in stages.items():
         monkeypatch.setitem(engine.RUN, name, counted(name, run))
     settings = LearnSettings(config=RunConfig(car=guess, start=SLICE.start, end=SLICE.end), stages=FOUR)
@@ -316,7 +306,7 @@ def test_stages_that_raise_the_error_are_undone_and_a_rerun_continues_to_the_sam
     whole = tmp_path / "whole"
     result = learn(logs, whole, settings)
     assert [(s.name, s.status) for s in result.stages] == [
-        ("identify", "kept"),
+        ("calibrate", "kept"),
         ("noise", "not done"),
         ("gain", "undone"),
         ("network", "undone"),
@@ -366,13 +356,13 @@ def test_other_settings_begin_anew_and_so_does_fresh(
         done.append(1)
         return good(task)
 
-    monkeypatch.setitem(engine.RUN, "identify", run)
+    monkeypatch.setitem(engine.RUN, "calibrate", run)
     monkeypatch.setitem(engine.RUN, "noise", _too_little)
     end = {"car_name": "x", "evaluations": 1, "validation": [], "test": [], "more": []}
     monkeypatch.setattr(engine, "_end", lambda *_: end)
     logs = [str(sample_logs_dir / "road.mcap")]
     config = RunConfig(car=guess, start=SLICE.start, end=SLICE.end)
-    settings = LearnSettings(config=config, stages=("noise", "identify"))
+    settings = LearnSettings(config=config, stages=("noise", "calibrate"))
     for count, (holdout, fresh) in enumerate(((0.2, False), (0.3, False), (0.3, True)), start=1):
         learn(logs, tmp_path / "car", replace(settings, holdout=holdout), fresh=fresh)
         assert len(done) == count
@@ -387,8 +377,8 @@ def test_some_stages_start_from_the_parts_that_the_car_has(
 ) -> None:
     logs = [str(sample_logs_dir / "road.mcap")]
     config = RunConfig(car=guess, start=SLICE.start, end=SLICE.end)
-    monkeypatch.setitem(engine.RUN, "identify", _tyres(GOOD))
-    learn(logs, tmp_path / "car", LearnSettings(config=config, stages=("identify",)))
+    monkeypatch.setitem(engine.RUN, "calibrate", _tyres(GOOD))
+    learn(logs, tmp_path / "car", LearnSettings(config=config, stages=("calibrate",)))
     seen: list[Car] = []
 
     def run(task: Task) -> StageOutput:
@@ -410,49 +400,18 @@ def test_some_stages_start_from_the_parts_that_the_car_has(
 
 @pytest.mark.slow
 def test_a_minute_of_driving_gives_a_car_that_says_what_it_could_not_learn(
-    guess: Path, tmp_path: Path, sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch
+    guess: Path, tmp_path: Path, sample_logs_dir: Path
 ) -> None:
-    # What is found does not matter here: two steps from one start.
-    quick = partial(physics_fit.fit_physics, starts=physics_fit.STARTS[:1], iterations=2)
-    for module in (physics_fit, more_driving):
-        monkeypatch.setattr(module, "fit_physics", quick)
-    monkeypatch.setattr(identify, "MAX_ITERATIONS", 2)
     config = RunConfig(car=guess, start="210", end="270")
-    said: list[str] = []
-    result = learn(
-        [str(sample_logs_dir / "road.mcap")],
-        tmp_path / "car",
-        LearnSettings(config=config, stages=STAGES),
-        reporter=Reporter(note=said.append),
-    )
+    settings = LearnSettings(config=config, stages=("calibrate", "network", "intervals"))
+    result = learn([str(sample_logs_dir / "road.mcap")], tmp_path / "car", settings)
     by_name = {s.name: s for s in result.stages}
-    assert tuple(by_name) == STAGES and by_name["identify"].status == "kept"
     assert {by_name[n].status for n in ("network", "intervals")} == {"not done"}
-    figures = {line["name"]: line["rmse_deg"][0] for line in result.document["test"] if "rmse_deg" in line}
-    assert figures["physics, trained"] < figures["phy-ukf, as given"]
     told = "\n".join(result.document["more"])
-    for words in (
-        "none was tried on",
-        "needs 100 s",
-        "the 95 % intervals are not calibrated",
-        "half of the training part",
-    ):
+    for words in ("needs 100 s", "the 95 % intervals are not calibrated"):
         assert words in told
-    assert len(said) == len(STAGES) + 1 and (tmp_path / "car" / "learn.png").is_file()
-    assert Car.load(tmp_path / "car").fitted_physics is not None
 
 
-def test_too_little_driving_and_wrong_options_are_said(guess: Path, tmp_path: Path, sample_logs_dir: Path) -> None:
-    logs = [str(sample_logs_dir / "dlc.mcap")]
-    settings = LearnSettings(config=RunConfig(car=guess), stages=STAGES)
-    with pytest.raises(EstimatorError, match="at least 50 s"):
-        learn(logs, tmp_path / "car", settings)
-    assert not (tmp_path / "car").exists()
-    with pytest.raises(UsageError, match="--holdout"):
-        learn(logs, tmp_path / "car", LearnSettings(config=RunConfig(car=guess), holdout=0.6))
-    with pytest.raises(UsageError, match="a car's folder"):
-        learn(logs, tmp_path / "car.toml", settings)
-    with pytest.raises(UsageError, match="would replace the input"):
-        shutil.copytree(sample_logs_dir, tmp_path / "logs", ignore=lambda *_: {"road.mcap", "faults.mcap"})
-        (tmp_path / "logs" / "vehicle.toml").write_bytes(guess.read_bytes())
-        learn([str(tmp_path / "logs" / "dlc.mcap")], tmp_path / "logs", settings)
+def test_a_removed_stage_is_answered_with_what_does_its_work() -> None:
+    with pytest.raises(UsageError, match=r"identify was removed; use: pdhef learn without --stages"):
+        LearnSettings(config=RunConfig(), stages=("identify", "noise"))

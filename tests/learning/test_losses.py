@@ -34,9 +34,6 @@ def _losses_by_command(
 
     tuned = replace(physics, estimators=("phy-ukf:tuned",))
     commands = {
-        "identify": lambda tell: run_stage(
-            "identify", logs, out / "1", config, holdout=0.0, reporter=Reporter(warn=tell)
-        ),
         "extract": lambda tell: extract(logs, out / "2", ExtractSettings(physics), reporter=Reporter(warn=tell)),
         "noise": lambda tell: run_stage("noise", logs, out / "3", tuned, trials=4, reporter=Reporter(warn=tell)),
         "gain": lambda tell: run_stage("gain", logs, out / "4", config, reporter=Reporter(warn=tell)),

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from pdhef_logtool.car.car import HISTORY_FILE, Car
-from pdhef_logtool.learning.stages import identify
+from pdhef_logtool.learning.stages import calibrate as stage
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
@@ -26,15 +26,15 @@ pytestmark = pytest.mark.slow
 
 #: Files by the command that writes them; the first is the part.
 FILES = {
-    "identify": ("fit.toml",),
+    "calibrate": ("fit.toml",),
     "noise": ("noise.toml", "noise.record.json"),
     "gain": ("network.toml", "network.record.json"),
     "intervals": ("intervals.json",),
 }
 #: Every command follows every other one once.
 ORDER = (
-    *("noise", "gain", "intervals", "identify", "gain", "noise", "identify"),
-    *("intervals", "noise", "intervals", "gain", "identify", "noise"),
+    *("noise", "gain", "intervals", "calibrate", "gain", "noise", "calibrate"),
+    *("intervals", "noise", "intervals", "gain", "calibrate", "noise"),
 )
 
 
@@ -60,7 +60,7 @@ class Commands:
         self._logs = {
             name: [str(sample_logs_dir / f"{log}.mcap") for log in logs.split()]
             for name, logs in {
-                "identify": "road",
+                "calibrate": "dlc sweep",
                 "noise": "dlc",
                 "gain": "dlc",
                 "intervals": "dlc step fishhook sweep road",
@@ -70,8 +70,8 @@ class Commands:
     def __call__(self, name: str) -> None:
         config = RunConfig(car=self.car if self.car.exists() else self.guess)
         logs = self._logs[name]
-        if name == "identify":
-            run_stage(name, logs, self.car, replace(config, end="34"), holdout=0.0)
+        if name == "calibrate":
+            run_stage(name, logs, self.car, config)
         elif name == "noise":
             run_stage(name, logs, self.car, replace(config, estimators=("phy-ukf:tuned", "physics")), trials=4)
         elif name == "gain":
@@ -100,8 +100,8 @@ class Commands:
 
 @pytest.fixture
 def commands(sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Commands:
-    fit: Callable[..., object] = identify.fit_car
-    # Every identification here has the same drives and start: one is enough.
+    fit: Callable[..., object] = stage.self_calibrate
+    # Every calibration here has the same drives and start: one is enough.
     found: list[object] = []
 
     def once(*arguments: object, **named: object) -> object:
@@ -109,7 +109,7 @@ def commands(sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
             found.append(fit(*arguments, **named))
         return found[0]
 
-    monkeypatch.setattr(identify, "fit_car", once)
+    monkeypatch.setattr(stage, "self_calibrate", once)
     return Commands(sample_logs_dir, tmp_path)
 
 
@@ -130,7 +130,7 @@ def test_every_order_gives_parts_that_are_valid_or_said_to_be_stale(commands: Co
     before: dict[str, bytes] = {}
     for number, command in enumerate(ORDER, start=1):
         # What counts is whether the car is identified, and whether it has tuned noise that belongs to it.
-        identified |= command == "identify"
+        identified |= command == "calibrate"
         tuned = made.get("noise") == (identified,)
         basis = (identified, tuned) if command == "gain" else (identified,)
         commands(command)
@@ -149,7 +149,7 @@ def test_every_order_gives_parts_that_are_valid_or_said_to_be_stale(commands: Co
         assert [drive["name"] for drive in history[-1]["drives"]] == commands.drives(command)
         assert all(len(drive["sha256"]) == 64 and drive["end_s"] > 0.0 for drive in history[-1]["drives"])
 
-        if command == "identify" and command in made:  # its input is the person's file and drives alone
+        if command == "calibrate" and command in made:  # its input is the person's file and drives alone
             assert {f: after[f] for f in own} == {f: before[f] for f in own}
         made[command] = basis
         tuned = made.get("noise") == (identified,)
@@ -157,28 +157,29 @@ def test_every_order_gives_parts_that_are_valid_or_said_to_be_stale(commands: Co
         expected |= {"gain"} if made.get("gain", (identified, tuned)) != (identified, tuned) else set()
         car = Car.load(commands.car)
         assert _stale(car.notes) == expected, (number, command)
-        assert car.vehicle.name.endswith("(identified)") == identified
+        assert car.vehicle.name.endswith("(calibrated without ground truth)") == identified
         assert ("physics" in car.noise) == (tuned or identified)
         assert (car.fitted_physics is not None) == identified
         assert ("gain" in made) == car.allowed_trust.reason.startswith(("too little", "the car's evidence was found"))
         assert ("gain" in expected) == ("pdhef learn --stages gain creates it again" in car.allowed_trust.reason)
         before = after
 
-        if number == ORDER.index("identify") + 1:
+        if number == ORDER.index("calibrate") + 1:
             assert expected == {"noise", "gain", "intervals"}
             said, notes = commands.run(commands.car.parent / "out", dlc)
             assert _stale(said) == expected
-            assert "but with other physics" in notes["physics"][0]
+            assert notes["physics"] == ["intervals: own, parameters and sensors"]
         if (ORDER[number - 2], command) == ("intervals", "gain"):
             assert "intervals" not in expected
             said, notes = commands.run(commands.car.parent / "out", dlc)
             assert said == []
             assert notes["physics"] == [
-                "intervals calibrated on truthsim saloon (identified) for friction and vehicle as given"
+                "intervals calibrated on truthsim saloon (calibrated without ground truth) for friction and vehicle "
+                "as given"
             ]
 
 
-# What calibrate writes twice is compared where it is tested; what identify writes, above.
+# What calibrate writes twice is compared where it is tested; what that stage writes, above.
 @pytest.mark.parametrize("command", ["noise", "gain"])
 def test_the_same_command_on_the_same_input_gives_the_same_bytes(commands: Commands, command: str) -> None:
     commands(command)

@@ -18,10 +18,11 @@ from pdhef_logtool.cli.learning_tables import render_learning
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 from pdhef_logtool.estimators.calibration.joint import FRONT_STIFFNESS, PEAK, parameters_of
+from pdhef_logtool.evaluation.bootstrap import Interval
 from pdhef_logtool.learning.car.taught_prior import TYRES, taught_parameters
 from pdhef_logtool.learning.drives import TEACH, LearnSettings
 from pdhef_logtool.learning.engine import LearnResult, learn
-from pdhef_logtool.learning.stages.teach import OpenedDrive, _folds, learn_from, open_drive
+from pdhef_logtool.learning.stages.teach import OpenedDrive, _folds, _support, learn_from, open_drive
 from pdhef_logtool.records.errors import EstimatorError, UsageError, VehicleError
 from pdhef_logtool.runs.config import RunConfig
 
@@ -62,7 +63,7 @@ def test_a_drive_teaches_a_prior_that_later_drives_start_from(
 ) -> None:
     car = Car.load(result.car, network="none")
     assert car.taught is not None and not car.has_evidence and car.notes == ()
-    assert bool(car.taught_prior) is result.figures["prior_used"]
+    assert bool(car.taught_prior) is (result.figures["prior_support"] > 0.0)
     taught = taught_parameters([drive.driving], [drive.slopes], car.vehicle)
     by_name = {p.name: p for p in taught}
     parameters = {p.name: p for p in parameters_of(car.vehicle)}
@@ -114,9 +115,19 @@ def test_an_offset_of_the_ground_truth_changes_neither_prior_nor_residual(drive:
 
 def test_the_prior_of_several_drives_is_tested_with_each_left_out(sample_logs_dir: Path, bare: Path) -> None:
     drives = [opened(sample_logs_dir / "road.mcap", bare, start=a, end=b) for a, b in (("60", "90"), ("95", "125"))]
-    taught = learn_from(drives)
+    taught, car = learn_from(drives), drives[0].drive.car.vehicle
     assert taught.prior_test is not None and taught.prior_test.blocks >= 4
-    assert not (taught.parameters and taught.prior_test.value > 0.0)
+    assert (taught.support > 0.5) == (taught.prior_test.value < 0.0)
+    assert _support(None) == _support(Interval(0.0, 0.0, 0.0, 9)) == 0.0
+    assert _support(Interval(-1.0, -2.96, 0.96, 9)) == pytest.approx(0.841, abs=1e-3)
+    file, weak, full = (
+        {p.name: p for p in taught_parameters([d.driving for d in drives], [d.slopes for d in drives], car, support)}
+        for support in (0.0, 0.5, 1.0)
+    )
+    for p in parameters_of(car):
+        if p.name in TYRES:
+            assert file[p.name].value == pytest.approx(p.mean) and file[p.name].std == pytest.approx(p.std)
+            assert full[p.name].std <= weak[p.name].std <= file[p.name].std
 
 
 def test_a_drive_that_begins_with_a_long_stop_is_halved_by_its_driving(drive: OpenedDrive) -> None:

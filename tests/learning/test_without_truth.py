@@ -29,7 +29,7 @@ def config(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> R
 @pytest.fixture(scope="module")
 def pool(sample_logs_dir: Path, config: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> LearnResult:
     logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "sweep")]
-    return run_stage("identify", logs, tmp_path_factory.mktemp("out") / "car", config, without_truth=True)
+    return run_stage("calibrate", logs, tmp_path_factory.mktemp("out") / "car", config)
 
 
 def test_a_pool_of_logs_mends_the_file(pool: LearnResult, sample_logs_dir: Path) -> None:
@@ -58,7 +58,7 @@ def test_the_car_says_what_it_rests_on_and_that_no_truth_was_looked_at(pool: Lea
 
 def test_one_log_is_no_pool(sample_logs_dir: Path, config: RunConfig, tmp_path: Path) -> None:
     with pytest.raises(EstimatorError, match="need not apply to another"):
-        run_stage("identify", [str(sample_logs_dir / "dlc.mcap")], tmp_path / "car", config, without_truth=True)
+        run_stage("calibrate", [str(sample_logs_dir / "dlc.mcap")], tmp_path / "car", config)
     assert not (tmp_path / "car").exists()
 
 
@@ -67,5 +67,5 @@ def test_logs_that_do_not_know_the_stiffness_are_refused(
 ) -> None:
     logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("no_truth", "faults")]
     with pytest.raises(EstimatorError, match=r"cornering stiffness|are needed"):
-        run_stage("identify", logs, tmp_path / "car", config, without_truth=True)
+        run_stage("calibrate", logs, tmp_path / "car", config)
     assert not (tmp_path / "car").exists()

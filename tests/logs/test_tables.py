@@ -350,3 +350,62 @@ def test_a_search_ignores_general_files_beside_logs(tmp_path: Path) -> None:
     found = {log.path.relative_to(tmp_path).as_posix() for log in find_logs([str(tmp_path)])}  # type: ignore[union-attr]
     assert found == {"one/drive.mcap", "two/a.csv", "two/b.parquet", "two/sub/c.vbo"}
     assert [log.path.name for log in find_logs([str(tmp_path / "one" / "notes.csv")])] == ["notes.csv"]
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_table_in_long_form_has_a_column_for_each_signal(suffix: str, tmp_path: Path) -> None:
+    rows = [(t, "Lat Acc [m/s²]", a) for t, a in zip(TIME_S, AY, strict=True)]
+    rows += [(t, "speed [km/h]", v) for t, v in zip(TIME_S, SPEED, strict=True)]
+    rows += [(t, "gnss", 2.0 * t) for t in TIME_S[::10]]
+    rows.sort()
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".csv":
+        path.write_text("\n".join(["timestamp,signal,value", *(f"{t:.2f},{n},{float(v)!r}" for t, n, v in rows), ""]))
+    else:
+        times, names, values = (list(column) for column in zip(*rows, strict=True))
+        clock = (np.array(times) * 1e9).round().astype("datetime64[ns]")
+        columns = {"signal_name": pa.array(names).dictionary_encode(), "recorded": clock, "value": values}
+        pq.write_table(pa.table(columns), path)
+    with closing(open_log(path)) as log:
+        kind = suffix[1:]
+        units = {(t.name, f.path): f.unit for t in log.topics for f in log.fields(t.name)}
+        assert units == {(kind, "Lat_Acc"): "m/s²", (kind, "speed"): "km/h", (f"{kind}_2", "gnss"): ""}
+        read = log.read({kind: ["Lat_Acc", "speed"], f"{kind}_2": ["gnss"]})
+    np.testing.assert_allclose(read[kind].fields["Lat_Acc"], AY)
+    np.testing.assert_allclose(read[kind].fields["speed"], SPEED)
+    np.testing.assert_allclose(read[f"{kind}_2"].fields["gnss"], 2.0 * TIME_S[::10])
+
+
+def test_a_magnitude_and_its_sign_are_a_signed_column(tmp_path: Path) -> None:
+    signed = np.sin(TIME_S)
+    rows = [f"{t:.2f},{abs(v):.6f},{int(v < 0)},{int(v < 0)}" for t, v in zip(TIME_S, signed, strict=True)]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(["time,ESP_Gierrate [rad/s],ESP_VZ_Gierrate,Other_sign", *rows, ""]))
+    with closing(open_log(path)) as log:
+        units = {f.path: f.unit for f in log.fields("csv")}
+        assert units == {
+            "ESP_Gierrate": "rad/s", "ESP_VZ_Gierrate": "", "Other_sign": "", "ESP_Gierrate_signed": "rad/s",
+        }  # fmt: skip
+        read = log.read({"csv": ["ESP_Gierrate", "ESP_Gierrate_signed"]})["csv"]
+    np.testing.assert_allclose(read.fields["ESP_Gierrate_signed"], signed, atol=1e-6)
+    np.testing.assert_allclose(read.fields["ESP_Gierrate"], np.abs(signed), atol=1e-6)
+    assert inspect_log(path).mapping.signals["yaw_rate_rad_s"].field == "ESP_Gierrate_signed"
+
+
+def test_named_data_of_a_recorder_take_their_name_unit_and_the_clock_beside_them(tmp_path: Path) -> None:
+    def entry(name: str, data: np.ndarray, unit: str) -> dict[str, object]:
+        return {"Name": name, "Data": data, "Unit": unit}
+
+    slow = TIME_S[::2]
+    record = {
+        "X": [entry("axis1", TIME_S, "s"), entry("axis2", slow, "s")],
+        "Y": [entry("a_y", AY, "m/s^2"), entry("v_veh", SPEED[::2], "km/h")],
+    }
+    savemat(tmp_path / "a.mat", {"rec": record})
+    with closing(open_log(tmp_path / "a.mat")) as log:
+        units = {f.path: f.unit for t in log.topics for f in log.fields(t.name)}
+        tables = {f.path: t for t in log.topics for f in log.fields(t.name)}
+        assert units == {"a_y": "m/s^2", "v_veh": "km/h"}
+        read = log.read({tables["v_veh"].name: ["v_veh"]})[tables["v_veh"].name]
+    np.testing.assert_allclose(read.fields["v_veh"], SPEED[::2])
+    np.testing.assert_allclose((read.log_time_ns - RELATIVE_NS) * 1e-9, slow, atol=1e-9)

@@ -585,3 +585,58 @@ def test_a_rate_of_the_steering_is_no_steering_angle() -> None:
     beside = meaning_of("/velocity_and_steering", "a/B", "angle")
     assert beside is not None
     assert beside.quantity == "steering"
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "quantity", "part", "scale"),
+    [
+        ("LWS_Angle", "°", "steering", "wheel", DEG),
+        ("SAS_deg", "", "steering", "wheel", DEG),
+        ("delta_SW", "deg", "steering", "wheel", DEG),
+        ("LWI_Lenkradwinkel", "Unit_DegreOfArc", "steering", "wheel", DEG),
+        ("LW_WINKEL", "Grad", "steering", "wheel", DEG),
+        ("STR_ANG", "deg", "steering", "", DEG),
+        ("GY", "G", "acceleration", "y", G),
+        ("a_x", "Unit_MeterPerSeconSquar", "acceleration", "x", 1.0),
+        ("YR", "deg/s", "rate", "z", DEG),
+        ("psiP_Veh", "rad/s", "rate", "z", 1.0),
+        ("AngularVelocity.Yaw", "", "rate", "z", None),
+        ("ESP_v_Signal", "Unit_KiloMeterPerHour", "speed", "", 1 / 3.6),
+        ("v", "m/s", "speed", "", 1.0),
+        ("WSFL", "km/h", "wheel speed", "fl", 1 / 3.6),
+        ("ESP_wheelSpeedReL", "kph", "wheel speed", "rl", 1 / 3.6),
+        ("Raddrehzahl_VR", "1/min", "wheel rate", "fr", 2.0 * math.pi / 60.0),
+        ("wheel_rl", "U/min", "wheel rate", "rl", 2.0 * math.pi / 60.0),
+        ("pose.yaw", "", "heading", "", None),
+    ],
+)
+def test_abbreviations_and_spelled_out_units(
+    name: str, unit: str, quantity: str, part: str, scale: float | None
+) -> None:
+    meaning = meaning_of("log", "", name, unit)
+    assert meaning is not None
+    assert (meaning.quantity, meaning.part) == (quantity, part)
+    assert meaning.scale == (None if scale is None else pytest.approx(scale))
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [("gx", ""), ("V", "V"), ("YR", ""), ("LWS_Speed", "°/s"), ("FL_Susp_Vel", "mm/s"), ("VW_FL", "bar"), ("str", "")],
+)
+def test_abbreviations_of_other_quantities_are_none(name: str, unit: str) -> None:
+    assert meaning_of("log", "", name, unit) is None
+
+
+def test_a_v_without_a_unit_is_a_speed_if_the_acceleration_follows_it() -> None:
+    fields = {"v": V, "ax": AX, "ay": AY, "yaw_rate": RATE}
+    assert taken(found(state=topic(**fields)))["speed_m_s"] == ("/state.v", 1.0)
+    assert "speed_m_s" not in taken(found(state=topic(**(fields | {"v": np.sin(np.arange(len(V)))}))))
+
+
+def test_the_axis_of_a_lateral_velocity_is_that_of_the_acceleration_beside_it() -> None:
+    fields = {"VelForward": V, "VelLateral": -0.2 * RATE, "AccelLateral": -AY, "AngRateDown": -RATE}
+    fields["AccelDown"] = np.full(len(V), -G)
+    steering = topic(road_wheel_angle_rad=2.7 * RATE / np.maximum(V, 1.0))
+    auto = found(ins=topic(**fields), steering=steering, wheel__speed=topic(speed_mps=V))
+    assert auto.mapping.signals["ay_m_s2"].scale == -1.0
+    assert auto.mapping.truth["vy_m_s"].scale == -1.0

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.evaluation.largest_errors import largest_errors
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.results.parquet_sink import EstimatesSink, write_metrics
 from pdhef_logtool.results.run_report import write_json
@@ -105,6 +107,10 @@ def report_of(tracks: list[StateTrack], label: str = "drive", **changes: Any) ->
         "remarks": [],
         "checks": [],
         "versions": {"python": "3.11"},
+        "largest_errors": [asdict(e) for e in largest_errors(
+            next(t for t in tracks if t.name == names[0]), next((t for t in tracks if t.name == "truth"), None),
+            [t for t in tracks if t.name not in ("truth", names[0])], 3.0,
+        )],
         "answer": {"main": names[0], "why": "for a test", "texts": {"result": "a result"}},
         **changes,
     }  # fmt: skip

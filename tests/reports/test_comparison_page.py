@@ -35,7 +35,7 @@ def test_a_page_says_what_the_terminal_says(tmp_path: Path) -> None:
     assert "Verdict B is worse" in text
     assert "Gate closed drives in B only: new" in text
     assert "configuration: friction auto → 0.3" in text
-    assert "d9 0.573 0.6818 +19.0 %" in text
+    assert "d9 0.573 0.682 +19.0 %" in text
     assert page.count('data-figure="') == 2
 
 

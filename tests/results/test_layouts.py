@@ -1,14 +1,22 @@
 from __future__ import annotations
 
+import dataclasses
 import json
+import re
+import types
+import typing
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
+import numpy as np
 import pytest
+from foxglove import layouts as fl
 from mcap.reader import make_reader
 from rosbags.typesys import get_types_from_msg
 
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.layouts import LayoutsSink, foxglove_layout, plotjuggler_layout
 from pdhef_logtool.results.mcap_sink import AnnotatedMcapSink
 from pdhef_logtool.results.sink import Event
@@ -22,22 +30,27 @@ REPORT = {
 }
 
 
-@pytest.fixture
-def written(tmp_path: Path, circle: Any) -> Path:
-    """Write a sidecar and the layouts of three tracks, of which one is not asked for."""
-    names = {"truth", "pd-hef", "2nd try"}
-    layouts = tmp_path / "foxglove.json", tmp_path / "plotjuggler.xml"
+def write(folder: Path, tracks: Iterable[StateTrack]) -> Path:
+    """Write a sidecar and the layouts of tracks."""
+    layouts = folder / "foxglove.json", folder / "plotjuggler.xml"
     sinks = (
-        AnnotatedMcapSink(tmp_path / "annotated.mcap", None, names),
-        LayoutsSink(*layouts, names, {"pd-hef": 0x123456}, shown={"truth", "pd-hef"}, fixes=["/gnss/fix"]),
+        AnnotatedMcapSink(folder / "annotated.mcap", None),
+        LayoutsSink(*layouts, {"pd-hef": 0x123456}, shown={"truth", "pd-hef"}, fixes=["/gnss/fix"]),
     )
     event = Event("slalom", 1_700_000_000_000_000_123, 1_700_000_001_000_000_123, "")
+    for track in tracks:
+        for sink in sinks:
+            sink.append(track)
     for sink in sinks:
-        for first in (0, 100):
-            for name in ("truth", "pd-hef", "zero", "2nd try"):
-                sink.append(circle(name, first, 100))
         sink.finish(REPORT, [event])
-    return tmp_path
+    return folder
+
+
+@pytest.fixture
+def written(tmp_path: Path, circle: Any) -> Path:
+    """Write a sidecar and the layouts of three tracks."""
+    names = ("truth", "pd-hef", "2nd try")
+    return write(tmp_path, [circle(name, first, 100) for first in (0, 100) for name in names])
 
 
 def fields_by_topic(path: Path) -> dict[str, set[str]]:
@@ -48,8 +61,8 @@ def fields_by_topic(path: Path) -> dict[str, set[str]]:
     for channel in summary.channels.values():
         schema = summary.schemas[channel.schema_id]
         _, fields = get_types_from_msg(schema.data.decode(), schema.name)[schema.name]
-        assert summary.statistics.channel_message_counts[channel.id]
-        topics[channel.topic] = {name for name, _ in fields}
+        if summary.statistics.channel_message_counts.get(channel.id):
+            topics[channel.topic] = {name for name, _ in fields}
     return topics
 
 
@@ -87,6 +100,90 @@ def test_every_path_of_foxglove_is_in_the_log(written: Path) -> None:
     limits = [p["value"].rpartition(".")[2] for p in slip if p["label"] == "pd-hef 95 %"]
     assert limits == ["sideslip_low_deg", "sideslip_high_deg"]
     assert not any("truth" in p["label"] for p in layout["configById"]["Plot!sideslip_error_deg"]["paths"])
+
+
+def conforms(value: Any, kind: Any) -> bool:
+    """Return whether a value of JSON is of a type of ``foxglove.layouts``; objects have no further keys."""
+    if dataclasses.is_dataclass(kind):
+        hints = typing.get_type_hints(kind, vars(fl))
+        names = {re.sub("_(.)", lambda m: m[1].upper(), field.name): field.name for field in dataclasses.fields(kind)}
+        return isinstance(value, dict) and all(
+            name in names and conforms(v, hints[names[name]]) for name, v in value.items()
+        )
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        return any(conforms(value, arg) for arg in args)
+    if origin is typing.Literal:
+        return value in args
+    if origin is list:
+        return isinstance(value, list) and all(conforms(v, args[0]) for v in value)
+    if origin is tuple:
+        return isinstance(value, list) and len(value) == len(args) and all(map(conforms, value, args))
+    if origin is dict:
+        return isinstance(value, dict) and all(conforms(v, args[1]) for v in value.values())
+    return isinstance(value, (int, float) if kind is float else kind) and isinstance(value, bool) == (kind is bool)
+
+
+def test_panels_have_the_settings_that_foxglove_publishes(written: Path) -> None:
+    layout = json.loads((written / "foxglove.json").read_text())
+    published = {
+        "Plot": fl.PlotConfig,
+        "StateTransitions": fl.StateTransitionsConfig,
+        "RosOut": fl.LogConfig,
+        "map": fl.MapConfig,
+        "3D": fl.ThreeDeeConfig,
+    }
+    seen = set()
+    for name, panel in layout["configById"].items():
+        kind = name.partition("!")[0]
+        seen.add(kind)
+        config = {key: value for key, value in panel.items() if key != "foxglovePanelTitle"}
+        assert conforms(config, published[kind]), name
+        assert not conforms({**config, "further": 1}, published[kind])
+        if kind == "3D":
+            by_kind = {
+                "path": fl.BaseRendererPosesTopicSettings,
+                "odometry": fl.BaseRendererPoseTopicSettings,
+            }
+            assert all(conforms(s, by_kind[topic.rpartition("/")[2]]) for topic, s in config["topics"].items())
+    assert seen == set(published)
+    assert not conforms({"paths": [{"value": "/a.b", "lineSize": "1"}]}, fl.PlotConfig)
+
+
+def test_without_poses_there_is_no_path(tmp_path: Path, circle: Any) -> None:
+    none = np.full(100, np.nan)
+    write(tmp_path, [circle("pd-hef", 0, 100).with_pose(none, none, none)])
+    layout = json.loads((tmp_path / "foxglove.json").read_text())
+    assert "3D!path" not in layout["configById"]
+    assert sorted(panels_of(layout["layout"])) == sorted(layout["configById"])
+    assert "/pdhef/pd_hef/path" not in fields_by_topic(tmp_path / "annotated.mcap")
+
+
+#: Elements that PlotJuggler reads: attributes and children of each (MainWindow, TabbedPlotWidget, PlotDocker and
+#: PlotWidget, xmlLoadState; it asks for each attribute by name).
+PLOTJUGGLER = {
+    "root": (set(), {"tabbed_widget", "use_relative_time_offset"}),
+    "use_relative_time_offset": ({"enabled"}, set()),
+    "tabbed_widget": ({"name", "parent"}, {"Tab", "currentTabIndex"}),
+    "currentTabIndex": ({"index"}, set()),
+    "Tab": ({"containers", "tab_name"}, {"Container"}),
+    "Container": (set(), {"DockSplitter"}),
+    "DockSplitter": ({"orientation", "count", "sizes"}, {"DockArea", "DockSplitter"}),
+    "DockArea": ({"name"}, {"plot"}),
+    "plot": ({"mode", "style", "flip_x", "flip_y"}, {"curve"}),
+    "curve": ({"name", "color"}, set()),
+}
+
+
+def test_elements_are_those_that_plotjuggler_reads(written: Path) -> None:
+    root = ET.fromstring((written / "plotjuggler.xml").read_bytes())
+    assert root.tag == "root"
+    for element in root.iter():
+        attributes, children = PLOTJUGGLER[element.tag]
+        assert set(element.attrib) == attributes and {child.tag for child in element} <= children
+    assert {"|", "-"} >= {s.attrib["orientation"] for s in root.iter("DockSplitter")}
+    assert all(p.attrib["mode"] == "TimeSeries" and p.attrib["style"] == "Lines" for p in root.iter("plot"))
+    assert all(re.fullmatch("#[0-9a-f]{6}", c.attrib["color"]) for c in root.iter("curve"))
 
 
 def test_every_curve_of_plotjuggler_is_in_the_log(written: Path) -> None:

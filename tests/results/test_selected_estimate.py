@@ -22,7 +22,7 @@ def texts(main: MainFacts = MAIN, **changes: Any) -> dict[str, str]:
 def test_the_result_says_how_good_against_which_truth_and_against_whom() -> None:
     said = texts(metrics=errors_deg(pd_hef=0.1, physics=0.12, zero=1.0))["result"]
     assert said == (
-        "Sideslip RMSE of pd-hef: 0.100° (ground truth: /ins), 17% lower than physics (0.120°), "
+        "Sideslip RMSE of pd-hef: 0.100° (ground truth: /ins), 17 % lower than physics (0.120°), "
         "1/10 of zero sideslip (1.00°)"
     )
 
@@ -31,8 +31,8 @@ def test_the_result_says_how_good_against_which_truth_and_against_whom() -> None
     ("own", "said"),
     [
         (1.0, "equal to zero sideslip"),
-        (0.99, "equal within 3% to zero sideslip"),
-        (1.5, "50% higher than zero sideslip"),
+        (0.99, "equal within 3 % to zero sideslip"),
+        (1.5, "50 % higher than zero sideslip"),
         (3.0, "3.0 times zero sideslip"),
     ],
 )
@@ -68,7 +68,7 @@ def test_a_truth_that_is_an_input_is_no_independent_check() -> None:
 )
 def test_whether_the_band_holds(share: float, said: str) -> None:
     band = texts(metrics=[*errors_deg(pd_hef=0.1), *figures(("pd-hef", "sideslip_rad", "coverage95", share))])["band"]
-    assert band.startswith(f"coverage {share:.0%} {said}")
+    assert band.startswith(f"coverage {100 * share:.0f} % {said}")
     assert band.endswith("(intervals calibrated on x)")
 
 

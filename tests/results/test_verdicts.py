@@ -11,7 +11,7 @@ import pytest
 from run_report import MAIN, TRUTH, errors_deg, report
 
 from pdhef_logtool.evaluation.bootstrap import Interval
-from pdhef_logtool.evaluation.operating_space import Cell
+from pdhef_logtool.evaluation.operating_space import Cell, OperatingSpace
 from pdhef_logtool.evaluation.reasons import Interval as Span
 from pdhef_logtool.evaluation.reasons import SensorFault
 from pdhef_logtool.evaluation.standing import Standing
@@ -35,7 +35,7 @@ def standing(difference: Interval | None, rival: str | None = "physics", own: In
 
 
 def details(*standings: Standing, **changes: Any) -> DriveDetails:
-    empty = DriveDetails([], [], standings, no_budget("the log contains no ground truth"), [], {})
+    empty = DriveDetails([], [], standings, no_budget("the log contains no ground truth"), {})
     return replace(empty, **changes)
 
 
@@ -53,18 +53,18 @@ def valid(**facts: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("difference", "outcome", "said"),
     [
-        (interval(-0.02, -0.03, -0.01), "better", "17% lower than physics (0.120°): 95 % CI of the difference -0.030"),
-        (interval(0.02, 0.01, 0.03), "worse", "17% higher than physics (0.120°): 95 % CI of the difference"),
-        (interval(-0.02, -0.05, 0.01), "undecided", "17% lower than physics (0.120°), difference not significant: "),
-        (interval(-0.02), "undecided", "17% lower than physics (0.120°), difference not tested"),
-        (interval(0.001, 0.0005, 0.002), "same", "no relevant difference to physics (0.120°)"),
-        (interval(0.0, 0.0, 0.0), "same", "equal to physics (0.120°)"),
+        (interval(-0.02, -0.03, -0.01), "better", "17 % lower than physics (0.12°): 95 % CI of the difference -0.03°"),
+        (interval(0.02, 0.01, 0.03), "worse", "17 % higher than physics (0.12°): 95 % CI of the difference"),
+        (interval(-0.02, -0.05, 0.01), "undecided", "17 % lower than physics (0.12°), difference not significant: "),
+        (interval(-0.02), "undecided", "17 % lower than physics (0.12°), difference not tested"),
+        (interval(0.001, 0.0005, 0.002), "same", "no relevant difference to physics (0.12°)"),
+        (interval(0.0, 0.0, 0.0), "same", "equal to physics (0.12°)"),
     ],
 )  # fmt: skip
 def test_the_sentence_claims_what_the_interval_holds(difference: Interval, outcome: str, said: str) -> None:
     first = verdicts(details(standing(difference)))[0]
     assert (first["signal"], first["outcome"]) == ("sideslip_rad", outcome)
-    assert first["text"].startswith("RMSE of pd-hef: 0.100° (95 % CI 0.090 to 0.110°); " + said)
+    assert first["text"].startswith("RMSE of pd-hef: 0.1° (95 % CI 0.09° to 0.11°); " + said)
 
 
 def test_without_a_rival_or_an_interval_that_is_said() -> None:
@@ -99,9 +99,8 @@ def test_a_truth_that_never_slips_gives_no_verdict() -> None:
 def test_the_other_details_follow_the_schema_and_an_older_report_does_without() -> None:
     fault = SensorFault("ay_m_s2", "spike", 70, 1.0, (Span(1, 2),))
     channel = ChannelInnovations("physics", "ay_m_s2", "m/s^2", 5, 0.1, 0.2, NAN)
-    cell = Cell(3, 2, 1.5, 0, NAN)
-    found = details(faults=[fault], innovations=[channel], operating_space=[cell], metadata={"vehicle": "a"})
-    document = valid(details=found)
+    found = details(faults=[fault], innovations=[channel], metadata={"vehicle": "a"})
+    document = valid(details=found, space=OperatingSpace([Cell(3, 2, 1.5, 0, NAN)], 0.9))
     assert document["innovations"][0]["autocorrelation"] is None
     assert document["operating_space"]["cells"][0]["sideslip_mse_rad2"] is None
     assert valid(details=details(faults=None))["faults"] is None

@@ -23,7 +23,7 @@ from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from studies import conditions
 from studies.condition_drives import bin_masks, read_drive, told
-from studies.many_cars import fit_vehicle
+from studies.drawn_cars import fit_vehicle
 from truthsim.vehicle_choice import choose_vehicle
 
 pytestmark = pytest.mark.slow

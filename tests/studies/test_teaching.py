@@ -19,7 +19,7 @@ def test_without_the_drives_it_says_so_and_ends_with_0(monkeypatch: pytest.Monke
 
 def pair(untaught: float, hybrid: float) -> PairResult:
     scores = [Score(value, value, 0.6, 0.95) for value in (untaught, untaught, hybrid)]
-    return PairResult("car", "a", "b", *scores, kinematic_deg=1.0, rung="linear")
+    return PairResult("car", "a", "b", *scores, kinematic_deg=1.0, paper_deg=1.0, rung="linear")
 
 
 def test_a_pair_is_worse_beyond_the_larger_of_both_limits() -> None:
@@ -29,7 +29,7 @@ def test_a_pair_is_worse_beyond_the_larger_of_both_limits() -> None:
     assert "0.63 (2 pairs)" in text and "worse" in teaching.pair_table([pair(0.2, 0.3)])
 
 
-def test_the_stored_results_have_every_pair_and_two_known_ones_are_worse_than_untaught() -> None:
+def test_the_stored_results_have_every_pair_and_none_is_worse_than_untaught() -> None:
     stored = json.loads(teaching.RESULTS_FILE.read_text(encoding="utf-8"))
     counts = {car.name: len(car.parts) for car in CARS}
     for car in CARS:
@@ -37,13 +37,9 @@ def test_the_stored_results_have_every_pair_and_two_known_ones_are_worse_than_un
         assert sum(r["car"] == car.name for r in stored) == wanted
     simulated = sum(r["car"].startswith(teaching.SIMULATED) for r in stored)
     assert simulated == len(teaching.SEEDS) * teaching.CARS_PER_SEED * 20
-    worse = []
     for r in stored:
         before, after = r["untaught"]["rmse_deg"], r["hybrid"]["rmse_deg"]
-        if after > max(1.05 * before, before + 0.03):
-            worse.append((r["taught"], r["scored"]))
-    known = [("polaris_b", "polaris_a"), ("5 runs", "f1tenth_xray_run24")]  # docs/teaching.md
-    assert worse == known
+        assert after <= max(1.05 * before, before + 0.03), (r["taught"], r["scored"])
 
 
 @pytest.mark.slow

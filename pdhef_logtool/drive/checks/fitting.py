@@ -7,11 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from pdhef_logtool.drive.columns import independent_samples
+from pdhef_logtool.drive.columns import independent_samples, student
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 
-#: A figure of a fit counts from this many standard errors on.
-SURE = 4.0
 #: Blocks of a drive that errors are estimated from; fewer give no information on them.
 LEAST_BLOCKS, MOST_BLOCKS = 4, 10
 
@@ -55,4 +53,4 @@ def _block_errors(a: FloatArray, b: FloatArray, samples: float) -> FloatArray:
     products = [a[i:j].T @ b[i:j] for i, j in pairwise(edges)]
     square, product = sum(squares), sum(products)
     without = [np.linalg.lstsq(square - s, product - p, rcond=None)[0] for s, p in zip(squares, products, strict=True)]
-    return np.asarray(np.std(without, axis=0) * np.sqrt(count - 1.0))
+    return np.asarray(np.std(without, axis=0) * np.sqrt(count - 1.0) * student(count))

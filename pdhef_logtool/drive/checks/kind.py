@@ -16,6 +16,8 @@ from pdhef_logtool.records.signals import FloatArray
 #: Placeholder in a name for each signal that the check judges.
 SIGNAL = "SIGNAL"
 _T = TypeVar("_T")
+#: A figure of a fit counts from this many standard errors on.
+SURE = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +59,16 @@ class CheckKind:
     def judged(self, good: bool, evidence: str, signal: str = "", **fields: object) -> Check:
         """Return that it passed or failed."""
         return self.passed(evidence, signal) if good else self.failed(evidence, signal, **fields)
+
+    def of_figure(
+        self, value: float, error: float, plausible: tuple[float, float], evidence: str, **fields: object
+    ) -> Check:
+        """Judge a figure by its standard error: failed so many errors beyond what is plausible, passed two inside."""
+        low, high = plausible
+        if value + SURE * error < low or value - SURE * error > high:
+            return self.failed(evidence, **fields)
+        is_inside = low <= value - 2.0 * error and value + 2.0 * error <= high
+        return self.passed(evidence) if is_inside else self.undecided(evidence)
 
     def _name(self, signal: str) -> str:
         return self.name.replace(SIGNAL, signal)

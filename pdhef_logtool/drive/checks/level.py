@@ -28,8 +28,9 @@ def _levels(drive: CheckedDrive) -> Iterator[Check]:
     columns, speed, sensors = drive.measured.columns, drive.speed, drive.vehicle.sensors
     driving_is_known = not drive.wrong & {"yaw_rate_rad_s", "ay_m_s2", drive.measured.speed_name}
     yaw = columns.get("yaw_rate_rad_s")
+    failed = {c.name for c in drive.related if c.verdict == "failed"}
     for name in ("ax_m_s2", "ay_m_s2"):
-        if name not in columns:
+        if name not in columns or f"{name}.unit" in failed:
             continue
         driven, at_ease = _driven(name, columns[name], speed, yaw)
         rest = columns[name] - driven

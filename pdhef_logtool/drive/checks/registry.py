@@ -19,9 +19,7 @@ MODULES = (
     "truth_sideslip",
     "sensor_errors",
     "late_sensors",
-    "wheel_radius",
-    "steering",
-    "mass",
+    "vehicle_file",
 )
 
 

@@ -212,7 +212,8 @@ def self_calibrate(
 
     Parameters
     ----------
-    taught : prior that drives with ground truth gave.
+    taught : prior that drives with ground truth gave. It makes no calibration plausible that is refused without it: the
+        model does not explain such driving with any parameters.
     exported : whether it is written to a car, for which the driving must excite both cornering stiffnesses.
     """
     drives = [d for d in drives if len(d.stretches)]
@@ -220,13 +221,15 @@ def self_calibrate(
     if seconds < LEAST_S:
         why = f"{seconds:.0f} s above {vehicle_file.low_speed_blend_m_s:g} m/s, {LEAST_S:g} are needed"
         return _without_fit(vehicle_file, vehicle_file, why, seconds, len(drives))
+    if taught and (untaught := self_calibrate(drives, vehicle_file)).refused:
+        return untaught
     problem = JointProblem(drives, vehicle_file, taught)
     fit = problem.solve()
     progress(1.0)
     std = np.sqrt(np.diag(fit.covariance))
     parameters = tuple(
-        Calibrated(p.name, p.unit, p.value(float(t)), p.mean, float(s) * p.std, untaught.std, p.log)
-        for p, untaught, t, s in zip(problem.parameters, parameters_of(vehicle_file), fit.theta, std, strict=True)
+        Calibrated(p.name, p.unit, p.value(float(t)), p.mean, float(s) * p.std, of_file.std, p.log)
+        for p, of_file, t, s in zip(problem.parameters, parameters_of(vehicle_file), fit.theta, std, strict=True)
     )
     root = np.asarray(np.linalg.cholesky(fit.covariance), dtype=np.float64)
     varied = varied_parameters(fit.theta, root, problem.sideslip, VARIED)

@@ -7,8 +7,9 @@ from the prior mean in prior standard deviations) the cost is
 
     Σ_channels Σ_k (Δt / T) 2 (√(1 + (e_k / σ)²) − 1) + |θ|²
 
-with errors e after a zero-phase low pass, so that T = 1 s of driving counts as one sample. Friction and peak force are
-observable as a product only: friction stays at the file's value, the peak force is fitted.
+with errors e after a zero-phase low pass, so that T = 1 s of driving counts as one sample. σ is the RMS of the errors
+of each channel, at least :data:`ERROR_STD`: where the model explains little, the prior decides. Friction and peak force
+are observable as a product only: friction stays at the file's value, the peak force is fitted.
 
 The covariance of θ has three parts: the curvature of the cost, the spread of the cost's gradient between blocks of the
 drives (sandwich estimator, White 1982), which includes model error that changes within a drive, and the model error
@@ -43,8 +44,10 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray
 
 #: Model and sensors are compared below this frequency.
 CUTOFF_HZ = 4.0
-#: Standard deviation of the errors of yaw rate (rad/s) and a_y (m/s²); larger errors count linearly.
+#: Least standard deviation of the errors of yaw rate (rad/s) and a_y (m/s²); larger errors count linearly.
 ERROR_STD = (0.02, 0.3)
+#: Most repetitions of a fit with the standard deviation of its errors; change of it at which they end.
+SCALES, SAME_SCALE = 8, 0.05
 #: Driving that counts as one independent sample of each channel; start of each stretch that does not count, because the
 #: initial state is a guess.
 CORRELATION_S, SETTLE_S = 1.0, 1.0
@@ -190,21 +193,28 @@ class JointProblem:
             blocks.append(block)
         self._block = np.unique(np.concatenate(blocks), return_inverse=True)[1]
         self._weight = math.sqrt(KEPT_STEPS * STEP_S / CORRELATION_S)
+        self._least_std = self._error_std = np.array(ERROR_STD)
 
     def solve(self) -> Fit:
-        """Return the parameters of the lowest cost."""
-        start = np.zeros(len(self.parameters))
-        descent, _ = descend(
-            self.errors_of,
-            self._cost,
-            self._residuals,
-            start,
-            iterations=ITERATIONS,
-            least_gain=lambda _: LEAST_GAIN,
-            derivative_step=DERIVATIVE_STEP,
-            max_step=MAX_STEP,
-        )
-        return Fit(descent.theta, self._covariance(descent.theta))
+        """Return the parameters of the lowest cost, and with them the standard deviation of the errors."""
+        theta = np.zeros(len(self.parameters))
+        for _ in range(SCALES):
+            error_std = np.maximum(self._least_std, self._rms(self.errors_of(theta)))
+            self._error_std = error_std
+            descent, _ = descend(
+                self.errors_of,
+                self._cost,
+                self._residuals,
+                theta,
+                iterations=ITERATIONS,
+                least_gain=lambda _: LEAST_GAIN,
+                derivative_step=DERIVATIVE_STEP,
+                max_step=MAX_STEP,
+            )
+            theta = descent.theta
+            if np.allclose(np.maximum(self._least_std, self._rms(self.errors_of(theta))), error_std, rtol=SAME_SCALE):
+                break
+        return Fit(theta, self._covariance(theta))
 
     def errors_of(self, theta: FloatArray) -> FloatArray:
         """Return errors over ``ERROR_STD`` [2, K]."""
@@ -212,11 +222,13 @@ class JointProblem:
 
     def rms(self, theta: FloatArray) -> tuple[float, float]:
         """Return the RMS error of yaw rate and a_y."""
-        return _rms(self.errors_of(theta))
+        rms = self._rms(self.errors_of(theta))
+        return float(rms[OF_RATE]), float(rms[OF_AY])
 
     def rms_of_file(self) -> tuple[float, float]:
         """Return the RMS error of yaw rate and a_y of the vehicle file."""
-        return _rms(self._errors(track_of(self._file, self._file)))
+        rms = self._rms(self._errors(track_of(self._file, self._file)))
+        return float(rms[OF_RATE]), float(rms[OF_AY])
 
     def sideslip(self, theta: FloatArray) -> FloatArray:
         """Return the model's v_y / v_x of all samples that count [K]."""
@@ -248,7 +260,11 @@ class JointProblem:
             if not d.has_ay:
                 differences[OF_AY] = 0.0
         parts = [e[:, k] for e, k in zip(self._differences, self._kept, strict=True)]
-        return np.asarray(np.concatenate(parts, axis=1) / np.array(ERROR_STD)[:, None], dtype=np.float64)
+        return np.asarray(np.concatenate(parts, axis=1) / self._error_std[:2, None], dtype=np.float64)
+
+    def _rms(self, scaled: FloatArray) -> FloatArray:
+        """Return the RMS of each channel of errors over ``_error_std``."""
+        return np.asarray(np.sqrt(np.mean(scaled**2, axis=1)) * self._error_std[: len(scaled)], dtype=np.float64)
 
     def _cost(self, scaled: FloatArray, theta: FloatArray) -> float:
         robust = 2.0 * (np.sqrt(1.0 + scaled**2) - 1.0)
@@ -286,11 +302,6 @@ def counted(drive: Driving) -> BoolArray:
     for first, last in drive.stretches:
         inside[first + round(SETTLE_S / STEP_S) : last] = True
     return inside
-
-
-def _rms(scaled: FloatArray) -> tuple[float, float]:
-    rms = np.sqrt(np.mean(scaled**2, axis=1)) * np.array(ERROR_STD)
-    return float(rms[OF_RATE]), float(rms[OF_AY])
 
 
 def _vehicle_with(vehicle_file: VehicleParameters, values: Mapping[str, float], digits: int) -> VehicleParameters:

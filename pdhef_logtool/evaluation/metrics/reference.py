@@ -11,12 +11,11 @@ import numpy as np
 from pdhef_logtool.evaluation.blocks import SegmentMasks, SegmentSums, packed, row_blocks
 from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, OfDrive
 from pdhef_logtool.records.geometry import wrap_angle
-from pdhef_logtool.records.signals import BoolArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 
-#: 1-sigmas by which two estimates differ where even a reference that is not independent ranks them: the rankings agree
-#: with those by ground truth then (docs/reference.md).
-CERTAIN = 3.0
+#: Time within which the error of the reference is taken to be the same, s, and two-sided 95 % of a normal distribution.
+BLOCK_S, NORMAL_95 = 10.0, 1.96
 
 
 def _rows(drive: EvaluatedDrive) -> list[MetricRow]:
@@ -69,21 +68,27 @@ def _against(track: StateTrack, reference: StateTrack, place: _Place) -> Iterato
 def _ranked(a: StateTrack, b: StateTrack, reference: StateTrack, place: _Place) -> Iterator[MetricRow]:
     """Yield by how much the first of two estimates [N] is further off, by segment, where that may be claimed.
 
-    Only stamps count at which the two differ by more than the reference's standard deviation; by ``CERTAIN`` of them
-    where it is not independent: what it shares with an estimator is a part of one.
+    An error of the reference δ changes the difference of the squares Σ (β_a − β_c)² − (β_b − β_c)² by
+    2 Σ (β_a − β_b) δ; δ is its standard deviation, of one sign within ``BLOCK_S`` and independent between.
     """
-    sums = SegmentSums()
+    sums, doubts = SegmentSums(), dict[str, FloatArray]()
+    start_ns, block_ns = reference.stamps_ns[0], round(BLOCK_S * 1e9)
+    blocks = int((reference.stamps_ns[-1] - start_ns) // block_ns) + 1
     for start, end in row_blocks(len(a)):
         first, second, c = (t.rows(start, end) for t in (a, b, reference))
         used = first.valid & second.valid & c.valid & (c.vx_m_s > place.low_speed_m_s)
-        apart = np.abs(wrap_angle(first.sideslip_rad - second.sideslip_rad))
-        used &= apart > np.where(c.independent > 0.0, 1.0, CERTAIN) * c.sideslip_std_rad
         errors = [wrap_angle(t.sideslip_rad - c.sideslip_rad) ** 2 for t in (first, second)]
-        columns = (np.where(used, e, np.nan) for e in (*errors, c.sideslip_std_rad**2))
-        sums.add(place.masks.rows(start, end), *columns)
-    for segment, (n, (of_a, of_b, variance)) in sums.totals().items():
-        further = float(np.sqrt(of_a / n) - np.sqrt(of_b / n))
-        if abs(further) > np.sqrt(variance / n):
+        doubt = 2.0 * np.abs(wrap_angle(first.sideslip_rad - second.sideslip_rad)) * c.sideslip_std_rad
+        used &= np.isfinite(errors[0] + errors[1] + doubt)
+        masks = place.masks.rows(start, end)
+        sums.add(masks, *(np.where(used, e, np.nan) for e in errors))
+        number = (c.stamps_ns - start_ns) // block_ns
+        for segment, mask in masks.items():
+            of_block = np.bincount(number[mask & used], doubt[mask & used], blocks)
+            doubts[segment] = doubts.get(segment, 0.0) + of_block
+    for segment, (n, (of_a, of_b)) in sums.totals().items():
+        if abs(of_a - of_b) > NORMAL_95 * np.linalg.norm(doubts[segment]):
+            further = float(np.sqrt(of_a / n) - np.sqrt(of_b / n))
             yield place.row(f"{a.name}~{b.name}", segment, "reference_further", further, n)
 
 
@@ -114,9 +119,9 @@ METRICS = (
     Metric(
         "reference_further",
         "further from reference",
-        "by how much the first of two estimates `a~b` is further from the sideslip reference, as RMS, than the second, "
-        "at the stamps where the two differ by more than its 1-sigma (3 where it is not independent). Only where this "
-        "exceeds the RMS of that 1-sigma: other pairs are not ranked",
+        "by how much the first of two estimates `a~b` is further from the sideslip reference, as RMS, than the second. "
+        "Only where the difference of their mean squares exceeds 1.96 of its standard deviation, which follows from "
+        "the reference's own, with one error in each 10 s: other pairs are not ranked",
         _FUNCTION,
     ),
 )

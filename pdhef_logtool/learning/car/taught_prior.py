@@ -17,6 +17,7 @@ from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
 from pdhef_logtool.estimators.calibration.joint import (
+    ERROR_STD,
     FRONT_STIFFNESS,
     KEPT_STEPS,
     PEAK,
@@ -29,7 +30,7 @@ from pdhef_logtool.estimators.calibration.joint import (
 from pdhef_logtool.estimators.calibration.single_track import SPEED
 from pdhef_logtool.records.signals import FloatArray, IntArray
 
-#: Error of the sideslip of a single track, rad; larger errors count linearly.
+#: Least error of the sideslip of a single track, rad; larger errors count linearly.
 SIDESLIP_STD_RAD = math.radians(0.3)
 #: What ground truth teaches.
 TYRES = (FRONT_STIFFNESS, REAR_STIFFNESS, PEAK, RELAXATION)
@@ -47,6 +48,7 @@ class TaughtProblem(JointProblem):
         self, drives: Sequence[Driving], slopes: Sequence[FloatArray], vehicle_file: VehicleParameters
     ) -> None:
         super().__init__(drives, vehicle_file)
+        self._least_std = self._error_std = np.array([*ERROR_STD, SIDESLIP_STD_RAD])
         self._slopes = [slope[kept] for slope, kept in zip(slopes, self._kept, strict=True)]
 
     def errors_of(self, theta: FloatArray) -> FloatArray:
@@ -54,21 +56,26 @@ class TaughtProblem(JointProblem):
         errors = super().errors_of(theta)
         of_drives = zip(self._drives, self._out, self._kept, self._slopes, strict=True)
         rows = [_without_slow(out[2, k] / d.columns[SPEED, k] - slope) for d, out, k, slope in of_drives]
-        return np.concatenate([errors, np.concatenate(rows)[None] / SIDESLIP_STD_RAD])
+        return np.concatenate([errors, np.concatenate(rows)[None] / self._error_std[2]])
 
 
 def taught_parameters(
-    drives: Sequence[Driving], slopes: Sequence[FloatArray], vehicle_file: VehicleParameters
+    drives: Sequence[Driving], slopes: Sequence[FloatArray], vehicle_file: VehicleParameters, support: float = 1.0
 ) -> tuple[TaughtParameter, ...]:
-    """Return the prior of a car's calibration from its drives, which were read with ``vehicle_file``."""
+    """Return the prior of a car's calibration from its drives, which were read with ``vehicle_file``.
+
+    Of the correlation between drives the share ``support`` counts: the spread between drives is the least width of the
+    prior, so that the sensors of a later drive can overrule it.
+    """
+    correlation = support * CORRELATION
     problem = TaughtProblem(drives, slopes, vehicle_file)
     fit, level = problem.solve(), float(f"{level_of(drives):.4g}")
     variances = np.minimum(np.diag(fit.covariance), 1.0)
-    stds = np.sqrt(1.0 - CORRELATION**2 * (1.0 - variances))
+    stds = np.sqrt(1.0 - correlation**2 * (1.0 - variances))
     return tuple(
         TaughtParameter(
             name=p.name,
-            value=float(f"{p.value(CORRELATION * float(t)):.9g}"),
+            value=float(f"{p.value(correlation * float(t)):.9g}"),
             std=float(f"{s * p.std:.6g}"),
             ay_m_s2=level,
         )

@@ -39,7 +39,7 @@ from pdhef_logtool.results.run_report import tool_versions, write_json
 from pdhef_logtool.storage.documents import DIGEST, digest, is_sealed, read_sealed, seal, validated
 
 FORMAT = "pdhef.residual-dataset"
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 MANIFEST = "manifest.json"
 #: Of more vehicles a bundle names the number.
 NAMED_VEHICLES = 4
@@ -96,6 +96,7 @@ def _table(rows: ResidualRows, picked: Picked, schema: pa.Schema) -> pa.Table:
     columns |= {name: rows.targets[:, i] for i, (name, _) in enumerate(TARGETS)}
     columns |= {name: rows.truth_velocity[:, i] for i, name in enumerate(TRUTH)}
     columns |= {"stamp_ns": rows.stamps_ns, "weight": rows.weight, "segment": rows.segment.astype(np.int32)}
+    columns |= {"truth_std_rad": rows.truth_std_rad, "region": rows.region}
     columns |= {"chosen": picked.chosen, "cell": picked.cell, "draw": picked.draw}
     arrays = []
     for f in schema:
@@ -113,6 +114,8 @@ def read_entry(path: Path) -> dict[str, Any] | None:
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             entry = json.loads(file.metadata.metadata[_ENTRY])
+            if file.schema_arrow.names != arrow_schema(_SCHEMA).names:  # no checksum covers the names
+                return None
             for _ in file.iter_batches():
                 pass
     except (OSError, KeyError, TypeError, ValueError, RecursionError, pa.ArrowException):
@@ -262,7 +265,7 @@ class DriveArrays:
 
     Attributes
     ----------
-    stamps_ns : int64 [N]. features : float32 [N, 28], finite.
+    stamps_ns : int64 [N]. features : float32 [N, 15], finite.
     targets : float32 [N, 2], increments to the next stamp in m/s and rad/s; 0 where ``weight`` is 0.
     step_s : float64 [N], time that a target covers: target / step is the residual rate; the period at the last row.
     weight : float32 [N]. segment : int64 [N]; recurrent state starts again where it changes.

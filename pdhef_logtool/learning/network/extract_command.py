@@ -16,15 +16,19 @@ import numpy as np
 
 from pdhef_logtool.car.car import NO_INTERVALS, VEHICLE_FILE, Car
 from pdhef_logtool.car.parts import physics_sha256
-from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
 from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.correlation import GAP_PERIODS as TRUTH_GAP_PERIODS
 from pdhef_logtool.drive.reading import Drive, Tell, friction_of, no_samples
 from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.drive.windows import DrivePlan, DriveWindow
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.calibration.calibration import self_calibrate
+from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter
+from pdhef_logtool.estimators.self_calibrated import of_friction
 from pdhef_logtool.estimators.table import FEATURES, FILTERS
 from pdhef_logtool.learning.drives import (
     DriveRecord,
@@ -64,10 +68,12 @@ from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.records.signals import Loss, Signals
 from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, NOMINAL_MODEL, PHYSICS_MODEL
+from pdhef_logtool.residual_model.ladder import LadderModel
 from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.self_calibrating import read_driving, self_calibrated
 from pdhef_logtool.storage.documents import digest
 from pdhef_logtool.storage.files import writing
 from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_path
@@ -469,14 +475,15 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         drive.plan = plan = _strict_truth(drive.plan)
         _check_plan(plan, job)
         smoothing = _choose_smoothing(plan, settings)
-        physics = filter_of(job.car, settings.model, use_speed=drive.options.use_speed)
+        service = _in_service(drive, job)
+        physics = filter_of(service.car, settings.model, use_speed=drive.options.use_speed)
         varied = vary(physics.vehicle, settings.vary, f"{settings.seed}:{source}")
         physics = replace(physics, vehicle=varied.vehicle)
         drive.friction = friction_of(plan, varied.vehicle, drive.options, varied.friction_factor)
         condition = None if settings.where is None else condition_of(settings.where)
         writer = DriveWriter(target, Picking(condition, f"{settings.seed}:{source}"))
         try:
-            counts = _counted(drive, physics, smoothing, writer, progress)
+            counts = _counted(drive, physics, smoothing, service, writer, progress)
             if not counts.rows:
                 raise no_samples(job.log_input.path)
             friction = drive.friction
@@ -491,6 +498,9 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
                 "car": job.physics[1].name,
                 "vehicle_sha256": job.physics[0],
                 "settings_sha256": fingerprint,
+                "mapping_sha256": drive.mapping.sha256,
+                "calibration": service.calibration,
+                "taught_sha256": None if service.model is None else service.model.sha256,
                 "period_s": plan.alignment.grid_period_s,
                 **counts.to_dict(),
                 "truth": _truth_facts(plan, smoothing),
@@ -506,6 +516,34 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             drive.tell("not one usable target: no ground truth above the low-speed limit")
         record = record_of(drive, split=split)
     return DriveResult(replace(record, seconds=entry["duration_s"]), entry)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Service:
+    """The car as a run has it on a drive; how it reads the signals; its calibration; the taught residual that acts."""
+
+    car: Car
+    read: Callable[[Signals], Signals]
+    calibration: str
+    model: LadderModel | None
+
+
+def _in_service(drive: Drive, job: _Job) -> _Service:
+    """Return how a drive uses the car: one that was taught is calibrated on each drive."""
+    car, taught = job.car, job.car.taught
+    if taught is None or job.settings.model != PHYSICS_MODEL:
+        return _Service(car, lambda signals: signals, "", None)
+    calibration = self_calibrate([read_driving(drive)], car.vehicle, taught=car.taught_prior)
+    on_log = self_calibrated(drive, calibration).self_calibrated
+    if on_log is None:
+        acts = None if taught.calibrated else taught.residual
+        return _Service(car, lambda signals: signals, f"refused: {calibration.refused}", acts)
+    calibrated = replace(car, self_calibrated=on_log).calibrated_car
+
+    def read(signals: Signals) -> Signals:
+        return corrected_anew(of_friction(signals, on_log), car.vehicle, on_log.vehicle)
+
+    return _Service(calibrated, read, calibration.text, taught.residual if taught.calibrated else None)
 
 
 def _kept(job: _Job, target: Path, source: str, split: str, fingerprint: str) -> DriveResult | None:
@@ -526,6 +564,7 @@ def _counted(
     drive: Drive,
     physics: PhysicsFilter | PhysicsUkf,
     smoothing: _Smoothing,
+    service: _Service,
     writer: DriveWriter,
     progress: Callable[[float], None],
 ) -> _Counts:
@@ -533,12 +572,23 @@ def _counted(
 
     def windows() -> Iterator[DriveWindow]:
         for window in drive.windows():
-            yield window
+            yield replace(window, signals=service.read(window.signals))
             progress(window.share_done)
 
     counts, period_s = _Counts(), drive.plan.alignment.grid_period_s
     half_window = round(smoothing.half_s / period_s)
-    for rows in residual_windows(windows(), physics, period_s=period_s, half_window=half_window):
+    taught = None
+    if service.model is not None and isinstance(physics, PhysicsFilter):
+        taught = CorrectedPhysics(AdaptivePhysics(physics), service.model)
+    noise = smoothing.noise[0] * period_s / math.sqrt(2.0)  # of v_y itself
+    for rows in residual_windows(
+        windows(),
+        physics,
+        period_s=period_s,
+        half_window=half_window,
+        truth_std_m_s=noise if math.isfinite(noise) else 0.0,
+        taught=taught,
+    ):
         counts.add(rows, writer.append(rows))
     return counts
 
@@ -698,6 +748,7 @@ def _fingerprint(job: _Job, split: str) -> str:
         "split": split,
         "seed": job.settings.seed,
         "vehicle": [job.physics[0], job.car.noise_sha256],
+        "taught": None if job.car.taught is None else digest(job.car.taught.model_dump(mode="json")),
         **({} if job.log_input.span_s is None else {"span_s": job.log_input.span_s}),
         "mapping": None if mapping is None else hash_log(Path(mapping)),
         "versions": tool_versions(),

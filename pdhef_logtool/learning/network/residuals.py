@@ -29,7 +29,8 @@ import numpy as np
 from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters, state_derivative
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.drive.windows import DriveWindow
-from pdhef_logtool.estimators.filter_base import U_AX, U_FRICTION, U_STEER, FilterState, HeldInputs
+from pdhef_logtool.estimators.corrected import CorrectedPhysics, CorrectedState
+from pdhef_logtool.estimators.filter_base import U_AX, U_FRICTION, U_STEER, FilterState, HeldInputs, PosteriorSteps
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter
@@ -58,6 +59,8 @@ SMOOTHING_HALF_S = 0.15
 #: Noise of ground truth in a one-step difference, of v̇_y in m/s² and ṙ in rad/s², up to which nothing is smoothed:
 #: well below what a training target varies by (0.2 and more).
 NEGLIGIBLE_NOISE = (0.05, 0.05)
+#: Sideslip error of a single track, at which ground truth of the same uncertainty has half the weight, rad.
+MODEL_STD_RAD = math.radians(0.3)
 
 _CHUNK = 16384
 #: Third differences of white noise have 20 times its variance.
@@ -72,12 +75,15 @@ class ResidualRows:
 
     Attributes
     ----------
-    stamps_ns : int64 [N]. features : [N, 28] at the stamp, NaN where the parallel filter has no state.
+    stamps_ns : int64 [N]. features : [N, 15] at the stamp, NaN where the parallel filter has no state.
     targets : [N, 2], increments of v_y in m/s and of r in rad/s from this stamp to the next; NaN where unknown.
     step_s : [N], time to the next stamp; NaN at the last row.
-    weight : [N], 1 where target and features can be used and the next row carries on from this one, else 0.
+    weight : [N], 0 unless target and features can be used and the next row carries on from this one; 1 with exact
+        ground truth, 1/2 where its sideslip is as uncertain as that of a single track (:data:`MODEL_STD_RAD`).
     segment : int64 [N], a new number wherever the parallel filter starts again: sequences must not cross it.
     truth_velocity : [N, 2], true v_x and v_y at the stamp, for networks that learn them; NaN where unknown.
+    truth_std_rad : [N], 1-sigma of the true sideslip. region : [N], gain of the region of validity of the car's taught
+        residual; NaN without one.
     """
 
     stamps_ns: IntArray
@@ -87,6 +93,8 @@ class ResidualRows:
     weight: FloatArray
     segment: IntArray
     truth_velocity: FloatArray
+    truth_std_rad: FloatArray
+    region: FloatArray
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -293,6 +301,8 @@ class _Steps(StepColumns):
     model: ModelSteps
     features: FloatArray
     segment: IntArray
+    truth_std_rad: FloatArray
+    region: FloatArray
 
 
 def residual_windows(
@@ -301,6 +311,8 @@ def residual_windows(
     *,
     period_s: float,
     half_window: int = 0,
+    truth_std_m_s: float = 0.0,
+    taught: CorrectedPhysics | None = None,
 ) -> Iterator[ResidualRows]:
     """Turn the windows of a drive into residual rows; how the drive is cut into windows changes no bit of them.
 
@@ -309,6 +321,7 @@ def residual_windows(
     windows : signals and ground truth at the same stamps, less biases of the vehicle file; targets need ground truth.
     physics : the parallel filter as it shall run in service; its model is what the residual is of.
     period_s : of the IMU. half_window : steps on each side that a target is smoothed over.
+    truth_std_m_s : 1-sigma of the true v_y where ground truth has none of its own. taught : the car's taught residual.
 
     Yields
     ------
@@ -316,6 +329,7 @@ def residual_windows(
     bounded by one window.
     """
     carry: FilterState | None = None
+    taught_state: CorrectedState | None = None
     waiting: _Steps | None = None
     increments, run = np.empty((0, 2)), np.zeros(_RUN)
     emitted = 0  # rows at the head of ``waiting`` that are there for smoothing only
@@ -337,9 +351,11 @@ def residual_windows(
             features=steps.features[part],
             targets=targets[part],
             step_s=step_s[part],
-            weight=usable[part].astype(np.float64),
+            weight=np.where(usable[part], 1.0 / (1.0 + (steps.truth_std_rad[part] / MODEL_STD_RAD) ** 2), 0.0),
             segment=steps.segment[part],
             truth_velocity=steps.state[part, :2],
+            truth_std_rad=steps.truth_std_rad[part],
+            region=steps.region[part],
         )
 
     for window in windows:
@@ -350,15 +366,11 @@ def residual_windows(
         fresh: BoolArray = whole & ~(np.concatenate([[running], whole[:-1]]) & np.isfinite(filtered.prior[:, 0]))
         numbers = segment + np.cumsum(fresh)
         running, segment = bool(whole[-1]), int(numbers[-1])
-        inputs = filtered.inputs.copy()
-        inputs[~np.isfinite(without_impossible(window.signals).steer_rad), U_STEER] = np.nan
-        new = _Steps(
-            stamps_ns=window.signals.stamps_ns,
-            state=_true_state(window),
-            model=ModelSteps(filtered.x, inputs),
-            features=features,
-            segment=np.maximum(numbers, 0),
-        )
+        region = np.full(len(window.signals), np.nan)
+        if taught is not None:
+            corrected, taught_state = taught.run(window.signals, taught_state)
+            region = np.where(corrected.valid, corrected.gain, np.nan)
+        new = _steps_of(window, features, filtered, np.maximum(numbers, 0), truth_std_m_s, region)
         chain = new if waiting is None else waiting.since(len(waiting.stamps_ns) - 1).joined(new)
         increments = np.concatenate([increments, _increments(chain, physics, run, max_step_s)])
         waiting = new if waiting is None else waiting.joined(new)
@@ -369,6 +381,28 @@ def residual_windows(
             waiting, emitted, increments = waiting.since(keep), decided - keep, increments[keep:]
     if waiting is not None and emitted < len(waiting.stamps_ns):
         yield emit(waiting, emitted, len(waiting.stamps_ns))
+
+
+def _steps_of(
+    window: DriveWindow,
+    features: FloatArray,
+    filtered: PosteriorSteps,
+    segment: IntArray,
+    truth_std_m_s: float,
+    region: FloatArray,
+) -> _Steps:  # positional: what a window gives, column by column
+    """Return what the targets of a window are computed from."""
+    inputs, state = filtered.inputs.copy(), _true_state(window)
+    inputs[~np.isfinite(without_impossible(window.signals).steer_rad), U_STEER] = np.nan
+    return _Steps(
+        stamps_ns=window.signals.stamps_ns,
+        state=state,
+        model=ModelSteps(filtered.x, inputs),
+        features=features,
+        segment=segment,
+        truth_std_rad=_truth_std(window, state, truth_std_m_s),
+        region=region,
+    )
 
 
 def _increments(steps: _Steps, physics: PhysicsFilter | PhysicsUkf, run: FloatArray, max_step_s: float) -> FloatArray:
@@ -384,6 +418,13 @@ def _increments(steps: _Steps, physics: PhysicsFilter | PhysicsUkf, run: FloatAr
 
 def _complete(values: FloatArray) -> BoolArray:
     return np.asarray(np.isfinite(values).all(axis=1), dtype=np.bool_)
+
+
+def _truth_std(window: DriveWindow, state: FloatArray, std_m_s: float) -> FloatArray:
+    """Return the 1-sigma of the true sideslip [N] in rad: that of the ground truth's track, else of its v_y."""
+    of_noise = std_m_s / np.maximum(np.abs(state[:, 0]), 1.0)
+    of_track = of_noise if window.truth is None else window.truth.sideslip_std_rad
+    return np.where(np.isfinite(of_track), of_track, of_noise)
 
 
 def _true_state(window: DriveWindow) -> FloatArray:

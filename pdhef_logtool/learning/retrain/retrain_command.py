@@ -48,6 +48,7 @@ from pdhef_logtool.learning.retrain.assignment import (
     Candidate,
     deal,
 )
+from pdhef_logtool.learning.score import paired_test, score_slices
 from pdhef_logtool.learning.split import Split
 from pdhef_logtool.learning.stages.gain import find_gain
 from pdhef_logtool.learning.stages.intervals import fit_intervals
@@ -57,14 +58,11 @@ from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log, id
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.errors import EXIT_GATE, EstimatorError, OutputError, PdhefError
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.residual_model.bundle import MANY_CARS, NO_MODEL, open_model
+from pdhef_logtool.residual_model.bundle import NO_MODEL, open_model
 from pdhef_logtool.residual_model.torch_extra import check_torch
-from pdhef_logtool.results.comparing import compare_runs
-from pdhef_logtool.results.gate import Figure, Gate
-from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES, open_run
+from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES
 from pdhef_logtool.results.run_report import json_bytes
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.fleet import Schedule, run_logs
 from pdhef_logtool.storage.documents import digest, read_sealed, seal
 from pdhef_logtool.storage.files import write_bytes, writing
 from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder, check_no_input
@@ -74,15 +72,10 @@ FORMAT, FORMAT_VERSION = "pdhef-retrain", 1
 #: In the output: stages, candidates that may take the car's place, and those that may not.
 WORK, ACCEPTED, REJECTED = "work", "accepted", "rejected"
 #: In the folder of a candidate, and in work/.
-RECORD_FILE, PAGE_FILE, CAR_FOLDER, ROLES_FILE, SEEN_FILE = (
-    "retrain.json", "change.html", "car", "roles.json", "seen.json",
-)  # fmt: skip
-#: The estimator that follows the network; what runs beside it, and whose intervals are fitted.
-HYBRID, BESIDE = "pd-hef", ("physics", "zero")
+RECORD_FILE, CAR_FOLDER, ROLES_FILE, SEEN_FILE = "retrain.json", "car", "roles.json", "seen.json"
+#: The estimator that follows the network, and those whose intervals are fitted.
+HYBRID = "pd-hef"
 CALIBRATED = (HYBRID, "pd-hef-smoothed", "physics")
-#: Without a plan: the error of the hybrid filter over the whole drive may grow by so much.
-DEFAULT_LIMIT = 0.02
-DEFAULT_GATE = Gate((Figure(estimator=HYBRID, limit=DEFAULT_LIMIT),))
 #: Digits of a network's hash that name its folder.
 _NAME = 12
 
@@ -96,15 +89,14 @@ class RetrainSettings:
     Attributes
     ----------
     config : car, mapping, slice, sensors, truth channel. seed : of the split assignment, training and bootstraps.
-    init : network to start from, a bundle or ``none``; None = the car's, else that of many cars.
-    epochs : of training; None = the recipe's. gate : limits of the candidate. strict : undecided closes the gate.
+    init : network to start from, a bundle or ``none``; None = the car's, else a new one.
+    epochs : of training; None = the recipe's. strict : reject unless the lower error is confirmed.
     """
 
     config: RunConfig
     seed: int = 0
     init: Path | None = None
     epochs: int | None = None
-    gate: Gate = DEFAULT_GATE
     strict: bool = False
 
     def __post_init__(self) -> None:
@@ -154,7 +146,7 @@ class _Retraining:
     def start(self) -> Path:
         """The network to begin with, as a bundle is named."""
         car_network = self.car.residual_network is not None and self.car.network_folder
-        return self.settings.init or car_network or Path(MANY_CARS)
+        return self.settings.init or car_network or Path(NO_MODEL)
 
     def config_for(self, car: Path | None, network: Path | None = None) -> RunConfig:
         return replace(self.settings.config, car=car, network=network, intervals=None, estimators=None)
@@ -173,10 +165,10 @@ class _Retraining:
         ]
 
     def do(self, number: int, name: str, basis: list[Any], work: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
-        return self.stages.do(number, name, basis, number / 8.0, work)
+        return self.stages.do(number, name, basis, number / 6.0, work)
 
     def step(self, number: int, text: str, share: float) -> None:
-        self.stages.reporter.progress(text, (number + share) / 8.0)
+        self.stages.reporter.progress(text, (number + share) / 6.0)
 
 
 def retrain(
@@ -299,7 +291,7 @@ def _look(  # positional: what reading takes, where it is remembered, and how it
     new = [_Log(i, car, mapping, config) for i in inputs if hashes[i.stem] not in log_entries]
 
     def tell(number: int, text: str, share: float) -> None:
-        reporter.progress(f"reading {text}", (number + share) / len(new) / 8.0)
+        reporter.progress(f"reading {text}", (number + share) / len(new) / 6.0)
 
     records = dict[str, DriveRecord]()
     preload = ("pdhef_logtool.drive.reading", *FILTERS)
@@ -404,13 +396,8 @@ def _stages(this: _Retraining) -> dict[str, Any]:
     trusted = this.do(3, "trust", basis, lambda folder: _trust(this, folder, network))
     basis = this.basis(digest(basis), role=INTERVALS)
     intervals = this.do(4, "intervals", basis, lambda folder: _intervals(this, folder))
-    rests_on = [digest(basis), this.settings.strict, repr(this.settings.gate)]
-    given_network = None if this.car.residual_network is not None else Path(MANY_CARS)
-    source = this.settings.config.car
-    this.do(5, "before", this.basis(role=GATE), lambda folder: _run(this, 5, folder, source, given_network))
-    candidate = this.stages.place(4, "intervals") / CAR_FOLDER
-    this.do(6, "after", this.basis(digest(basis), role=GATE), lambda folder: _run(this, 6, folder, candidate, None))
-    judged = this.do(7, "gate", this.basis(*rests_on, role=GATE), lambda folder: _judge(this, folder, trusted))
+    rests_on = [digest(basis), this.settings.strict]
+    judged = this.do(5, "gate", this.basis(*rests_on, role=GATE), lambda _: _judge(this, trusted))
     return {
         **record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=this.settings.config), this.car),
         "accepted": judged["accepted"],
@@ -422,7 +409,7 @@ def _stages(this: _Retraining) -> dict[str, Any]:
         "training": model,
         "trust": trusted,
         "intervals": intervals,
-        "comparison": judged["comparison"],
+        "gate": judged["gate"],
     }
 
 
@@ -519,36 +506,41 @@ def _intervals(this: _Retraining, folder: Path) -> dict[str, Any]:
     return {"shown": output.text, **output.figures}
 
 
-def _run(this: _Retraining, number: int, folder: Path, car: Path | None, network: Path | None) -> dict[str, Any]:
-    config = replace(this.config_for(car, network), estimators=(HYBRID, *BESIDE), keep="metrics")
-    logs = [str(i.path) for i in this.drives[GATE]]
-    result = run_logs(
-        logs,
-        folder / "run",
-        config,
-        schedule=Schedule(jobs=this.jobs),
-        report=False,
-        reporter=Reporter(lambda text, share: this.step(number, text, share)),
-    )
-    return {"shown": f"{len(logs)} drives of the gate", "exit_code": result.exit_code}
+def _car(folder: Path | None) -> Car:
+    return Car.load(folder)
 
 
-def _judge(this: _Retraining, folder: Path, trusted: Mapping[str, Any]) -> dict[str, Any]:
-    """Compare both runs; the candidate is rejected where the gate closes, or where it may not be followed at all."""
-    a, b = (open_run(this.stages.place(n, name) / "run") for n, name in ((5, "before"), (6, "after")))
-    comparison = compare_runs(a, b, this.settings.gate, strict=this.settings.strict)
-    reasons = list(comparison.failures)
+def _judge(this: _Retraining, trusted: Mapping[str, Any]) -> dict[str, Any]:
+    """Compare car and candidate on the drives of the gate, as ``learn`` judges a stage."""
+    candidate = this.stages.place(4, "intervals") / CAR_FOLDER
+    settings, errors = this.settings, []
+    for number, folder in enumerate((settings.config.car, candidate)):
+        this.step(5, "scoring the drives of the gate", 0.5 * number)
+        options = this.config_for(folder).read_options
+        scored = score_slices(_car(folder), (HYBRID,), this.drives[GATE], open_mapping(settings.config), options)
+        if HYBRID not in scored.errors:
+            raise EstimatorError(expected=f"an estimate of {HYBRID}", got=scored.skipped[HYBRID], where="retrain")
+        errors.append(scored.errors[HYBRID])
+    test = paired_test(*errors)
+    bounds = [math.degrees(x) for x in (test.difference.value, test.difference.low, test.difference.high)]
+    interval = f"difference 95 %: {bounds[1]:.4f} to {bounds[2]:.4f}"
+    shown = f"{HYBRID} {test.now_deg:.4f}° against {test.was_deg:.4f}° ({interval}, {test.difference.blocks} blocks)"
+    reasons = [f"worse: {shown}"] if test.refuted else []
+    if settings.strict and not test.confirmed and not test.refuted:
+        reasons.append(f"not confirmed: {shown}")
     if not trusted["cap"]:
         reasons.append(f"{trusted['shown']} (on drives that it has not seen)")
-    from pdhef_logtool.reports.comparison import comparison_page
-
-    write_bytes(folder / PAGE_FILE, comparison_page(comparison))
-    shown = f"rejected: {'; '.join(reasons)}" if reasons else f"accepted: {comparison.verdict}"
-    return {"shown": shown, "accepted": not reasons, "reasons": reasons, "comparison": comparison.to_dict()}
+    figures = {"text": shown, "before_deg": test.was_deg, "after_deg": test.now_deg, "blocks": test.difference.blocks}
+    return {
+        "shown": f"rejected: {'; '.join(reasons)}" if reasons else f"accepted: {shown}",
+        "accepted": not reasons,
+        "reasons": reasons,
+        "gate": {**figures, "difference_deg": [x if math.isfinite(x) else None for x in bounds]},
+    }
 
 
 def _publish(this: _Retraining, output: Path, name: str, document: Mapping[str, Any]) -> Path:
-    """Put the candidate where its verdict belongs, with its record and the page; return its folder."""
+    """Put the candidate where its verdict belongs, with its record; return its folder."""
     right, wrong = (ACCEPTED, REJECTED) if document["accepted"] else (REJECTED, ACCEPTED)
     folder, data = output / right / name, json_bytes(dict(document))
     with suppress(OSError):
@@ -556,7 +548,6 @@ def _publish(this: _Retraining, output: Path, name: str, document: Mapping[str, 
             return folder
     with writing(folder), FolderTransaction(folder, keep=False) as transaction:
         shutil.copytree(this.stages.place(4, "intervals") / CAR_FOLDER, transaction.file(CAR_FOLDER))
-        shutil.copyfile(this.stages.place(7, "gate") / PAGE_FILE, transaction.file(PAGE_FILE))
         write_bytes(transaction.file(RECORD_FILE), data)
     with writing(folder):
         shutil.rmtree(output / wrong / name, ignore_errors=True)

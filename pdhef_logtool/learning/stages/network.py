@@ -1,4 +1,4 @@
-"""Stage ``network``: the network fine-tuned on drives with ground truth, stopped by others, and its residual gain."""
+"""Stage ``network``: the network trained on drives with ground truth, stopped by others, and its residual gain."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pdhef_logtool.learning.stages.gain import find_gain
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.logs.discovery import Logs
 from pdhef_logtool.records.errors import EstimatorError
-from pdhef_logtool.residual_model.bundle import ModelBundle
+from pdhef_logtool.residual_model.bundle import NO_MODEL, ModelBundle
 from pdhef_logtool.runs.config import RunConfig
 
 #: Fine-tuning of a trained network; a network from random weights is a small one, for a minute or two of driving.
@@ -25,10 +25,16 @@ LEAST_TRAINING_S, TRAIN_SHARE = 100.0, 0.8
 
 
 def train_network(task: Task) -> StageOutput:
-    """Fine-tune the network of the car and find its residual gain; raises EstimatorError on too little driving."""
+    """Train the network of the car, or a new small one, and find its residual gain.
+
+    Raises
+    ------
+    EstimatorError
+        There is too little driving, or no network is wanted.
+    """
     part, init = task.split.network_part(), task.car.network
-    if init is None:
-        raise EstimatorError(expected="a network", got="none", where="network")
+    if str(task.settings.config.network) == NO_MODEL:
+        raise EstimatorError(expected="a network", got=NO_MODEL, where="network")
     seconds = task.split.seconds(part)
     learns, stops = divided(task.split.usable(part), TRAIN_SHARE)
     if seconds < LEAST_TRAINING_S or not stops:

@@ -41,7 +41,6 @@ from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.steps import release
 from pdhef_logtool.residual_model.ladder import NONE
 from pdhef_logtool.residual_model.ladder_fit import (
-    STANDARD_ERRORS,
     LadderFit,
     TaughtDrive,
     corrected_rmse_deg,
@@ -74,12 +73,13 @@ class OpenedDrive:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Teaching:
-    """What drives taught: prior, residual, whether its drives calibrated their car, evidence, what to drive next."""
+    """What drives taught: prior, its support, residual, whether its drives calibrated their car, what to drive next."""
 
     parameters: tuple[TaughtParameter, ...]
     ladder: LadderFit
     calibrated: bool
     prior_test: Interval | None
+    support: float
     drives: tuple[dict[str, Any], ...]
     more: tuple[str, ...]
 
@@ -154,10 +154,11 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
     """Return what drives of one car teach, which were read with its vehicle file."""
     vehicle = drives[0].drive.car.vehicle
     progress("fitting the prior", 0.3)
-    parameters = taught_parameters([d.driving for d in drives], [d.slopes for d in drives], vehicle)
     test = _prior_test(drives, progress)
-    if test is None or not test.value + STANDARD_ERRORS * (test.high - test.value) / NORMAL_95 < 0.0:
-        parameters = ()  # no lower error on driving that it has not seen
+    support = _support(test)
+    parameters: tuple[TaughtParameter, ...] = ()
+    if support > 0.0:
+        parameters = taught_parameters([d.driving for d in drives], [d.slopes for d in drives], vehicle, support)
     calibrations = [_calibration(d, parameters) for d in drives]
     progress("fitting the residual", 0.8)
     lacks = [lacking_of(d, c) for d, c in zip(drives, calibrations, strict=True)]
@@ -185,7 +186,7 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
                 "corrected_without_constant_deg": after_free,
             }
         )
-    return Teaching(parameters, ladder, calibrated, test, tuple(lines), _more(drives, ladder))
+    return Teaching(parameters, ladder, calibrated, test, support, tuple(lines), _more(drives, ladder))
 
 
 def _calibration(drive: OpenedDrive, parameters: Sequence[TaughtParameter]) -> SelfCalibration:
@@ -264,6 +265,13 @@ def _prior_test(drives: Sequence[OpenedDrive], progress: Any) -> Interval | None
     return block_bootstrap_difference(with_prior, without, end_to_end(stamps), block_s=TEST_BLOCK_S)
 
 
+def _support(test: Interval | None) -> float:
+    """Return the probability that the prior lowers the error on other driving, by its test; 0 without evidence."""
+    if test is None or not test.high > test.value:
+        return 0.0
+    return 0.5 * math.erfc(test.value * NORMAL_95 / (test.high - test.value) / math.sqrt(2.0))
+
+
 def _more(drives: Sequence[OpenedDrive], ladder: LadderFit) -> tuple[str, ...]:
     """Return what to drive next, in sentences."""
     texts = []
@@ -296,7 +304,7 @@ def figures_of(taught: Teaching) -> dict[str, Any]:
         "blocks": ladder.blocks,
         "rungs": [asdict(t) for t in ladder.trials],
         "calibrated": taught.calibrated,
-        "prior_used": bool(taught.parameters),
+        "prior_support": round(taught.support, 3),
         "prior_against_untaught_deg": [None if math.isnan(x) else math.degrees(x) for x in bounds],
         "parameters": [p.model_dump() for p in taught.parameters],
         "drives": list(taught.drives),

@@ -277,7 +277,7 @@
       bands.push({ series: [at + 1, at], fill: () => tint(band.colour, 0.2) });
     }
     for (const line of spec.series) {
-      figure.items.push({ item: line, at: columns.length, parts: [line.data] });
+      figure.items.push({ item: line, at: columns.length, parts: [line.values] });
       columns.push(nothing);
       series.push({ scale: "y", show: false, stroke: () => tint(line.colour), width: line.width, dash: line.dash, points: { show: false } });
     }
@@ -338,7 +338,7 @@
     pen.textAlign = "center";
     pen.textBaseline = "middle";
     for (let i = marks.length - 1; i >= 0; i--) {
-      const x = u.valToPos(marks[i].at, "x", true);
+      const x = u.valToPos(marks[i].at_s, "x", true);
       if (x < left || x > left + width) continue;
       const y = Math.max(top + 8 * r, Math.min(top + height - 8 * r, u.valToPos(marks[i].value, "y", true)));
       pen.beginPath();
@@ -471,7 +471,7 @@
     const spec = figure.data;
     const clouds = [];
     for (const cloud of spec.clouds) {
-      clouds.push({ cloud, x: decode(cloud.x), y: decode(cloud.y), at: cloud.at ? decode(cloud.at) : null });
+      clouds.push({ cloud, x: decode(cloud.x), y: decode(cloud.y), at: cloud.at_s ? decode(cloud.at_s) : null });
     }
     figure.follows = clouds.some((c) => c.at);
     const [left, right] = extent(clouds.map((c) => c.x), spec.log), [low, high] = extent(clouds.map((c) => c.y), spec.log);
@@ -488,7 +488,7 @@
     figure.chart = new uPlot({
       width: widthOf(figure), height: height(), legend: { show: false },
       scales: { x: scale(0), y: scale(1) },
-      axes: [axis(spec.xLabel, { size: 26 }), axis(spec.yLabel, { size: 46 })],
+      axes: [axis(spec.x_label, { size: 26 }), axis(spec.y_label, { size: 46 })],
       series: [{}, { scale: "y", stroke: "transparent", points: { show: false } }],
       cursor: { show: false },
       hooks: { draw: [(u) => clouds.forEach((c) => paint(u, c))] },
@@ -543,7 +543,7 @@
 
   function drawIntervals(figure) {
     const { intervals, unit, zero } = figure.data;
-    const known = intervals.flatMap((i) => i.of).concat(zero === null || zero === undefined ? [] : [zero]);
+    const known = intervals.flatMap((i) => [i.low, i.middle, i.high]).concat(zero === null || zero === undefined ? [] : [zero]);
     const [low, high] = extent([known], false);
     figure.chart = new uPlot({
       width: widthOf(figure), height: intervals.length * 24 + 56, legend: { show: false },
@@ -574,7 +574,7 @@
     }
     intervals.forEach((one, i) => {
       const y = top + ((i + 0.5) * height) / intervals.length;
-      const [a, m, b] = one.of.map((v) => (v === null ? null : u.valToPos(v, "x", true)));
+      const [a, m, b] = [one.low, one.middle, one.high].map((v) => (v === null ? null : u.valToPos(v, "x", true)));
       pen.strokeStyle = pen.fillStyle = tint(one.colour);
       pen.lineWidth = 2 * r;
       if (a !== null && b !== null) {

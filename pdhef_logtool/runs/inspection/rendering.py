@@ -109,12 +109,13 @@ def _delay_text(delay_s: float) -> str:
 def _sources_table(inspection: Inspection) -> Table:
     rows = "recognised types and candidates" if any(c.taken for c in inspection.candidates) else "recognised types"
     origin = rows if inspection.mapping.origin == "auto" else "mapping file"
-    table = empty_table(f"Mapping ({origin})", "signal", "topic", "field", words=3)
+    table = empty_table(f"Mapping ({origin})", "signal", "topic", "field", "stamp", words=4)
+    stamps = {clock.topic: clock.stamp for clock in inspection.clocks}
     for section in (inspection.signals, inspection.truth):
         for report in section.values():
-            table.add_row(report.name, Text(report.topic), Text(_short(report.field)))
+            table.add_row(report.name, Text(report.topic), Text(_short(report.field)), stamps.get(report.topic, ""))
         if section is inspection.signals and inspection.truth:
-            table.add_row(Text("truth", "bold"), "", "")
+            table.add_row(Text("truth", "bold"), "", "", "")
     return table
 
 

@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_proposals
 from pdhef_logtool.logs.byte_account import checksummed_share
@@ -44,6 +43,7 @@ from pdhef_logtool.mapping.candidates import Candidate
 from pdhef_logtool.mapping.choosing import choose_mapping
 from pdhef_logtool.mapping.clocks import sources_by_clock, survey_windows
 from pdhef_logtool.mapping.mapping_file import missing_signals
+from pdhef_logtool.mapping.records import RECORDER_STAMPS
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, FloatArray, Loss
@@ -94,7 +94,7 @@ class TopicReport:
 
 @dataclass(frozen=True, slots=True)
 class ClockReport:
-    """The stamps that mapped signals use, against log time; ``reason``: why log time serves instead of theirs."""
+    """The stamps that mapped signals use, against log time; ``reason``: evidence for them, or for log time instead."""
 
     topic: str
     stamp: str
@@ -226,7 +226,7 @@ class Inspection:
             "ambiguities": self.ambiguities,
             "notes": self.notes,
             "checks": self.checks,
-            "proposals": [{"subject": p.subject, "home": p.home, "evidence": p.evidence} for p in self.proposals],
+            "proposals": [{"subject": p.subject, "evidence": p.evidence} for p in self.proposals],
             "lost": self.lost,
             "checksummed_share": self.checksummed_share,
             "candidates": self.candidates,
@@ -492,8 +492,21 @@ def _clock_report(source: SignalSource, clock: ClockModel) -> ClockReport:
         drift_ppm=clock.drift * 1e6,
         residual_s=clock.residual_s,
         delay_known=clock.delay_known,
-        reason=f"{source.stamp}: {clock.unusable}" if clock.unusable else "",
+        reason=_why_stamp(source, clock),
     )
+
+
+def _why_stamp(source: SignalSource, clock: ClockModel) -> str:
+    """Return the evidence for the stamps in use."""
+    if clock.unusable:
+        return f"{source.stamp}: {clock.unusable}"
+    if source.stamp in RECORDER_STAMPS or not clock.samples:
+        return "" if clock.samples else "no message in the parts that were examined"
+    steps = f"steps of {_number(clock.median_period_s * 1e3)} ms"
+    if source.clock == "device":
+        return f"{steps} on a clock of its own, fitted to log time"
+    delays = f"{_number(clock.median_delay_s * 1e3)} to {_number(clock.p95_delay_s * 1e3)} ms before log time"
+    return f"{steps}, {delays}" if clock.delay_known else f"{steps}; all topics are off from log time as one"
 
 
 def _clock_notes(mapping: Mapping, clocks: dict[str, ClockModel]) -> list[str]:
@@ -542,7 +555,7 @@ def mapping_comments(inspection: Inspection) -> dict[str, str]:
 
 def mapping_text(inspection: Inspection) -> str:
     """Return the inspection's mapping, with the corrections that it proposes, as TOML that is ready to edit."""
-    mapping, _ = apply_proposals(inspection.proposals, inspection.mapping, default_vehicle())
+    mapping = apply_proposals(inspection.proposals, inspection.mapping)
     return mapping_to_toml(mapping, comments=mapping_comments(inspection), alternatives=inspection.candidates)
 
 

@@ -15,10 +15,10 @@ from pdhef_logtool.car.parts import FittedPhysics
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.calibration.calibration import VARIED
 from pdhef_logtool.estimators.physics_filter import PHYSICS_Q_STD
-from pdhef_logtool.learning.car import physics_fit
-from pdhef_logtool.learning.car.axle_forces import axle_samples
-from pdhef_logtool.learning.car.fit_data import FitDrive, part_of
-from pdhef_logtool.learning.car.physics_fit import (
+from pdhef_logtool.records.tracks import make_track
+from studies.defaults import physics_fit
+from studies.defaults.axle_forces import FitDrive, axle_samples, part_of
+from studies.defaults.physics_fit import (
     GUARD_S,
     STARTS,
     build_car,
@@ -31,7 +31,6 @@ from pdhef_logtool.learning.car.physics_fit import (
     usable_seconds,
     varied_vehicles,
 )
-from pdhef_logtool.records.tracks import make_track
 
 STATIC = PhysicsParts()
 #: Slope of the true tyres at no slip, N/rad at friction 0.85.
@@ -51,7 +50,7 @@ def fit_drive(made: Drive, seed: int, **changes) -> FitDrive:
     columns = {"vx_m_s": made.vx, "vy_m_s": made.vy, "yaw_rate_rad_s": made.r, "ay_m_s2": made.ay}
     truth = make_track("truth", signals.stamps_ns, valid=np.ones(half.sum(), dtype=bool),
                        **{name: column[half] for name, column in columns.items()})  # fmt: skip
-    return replace(FitDrive(f"made {seed}", signals, truth, True, int(signals.stamps_ns[0])), **changes)
+    return replace(FitDrive(f"made {seed}", signals, truth), **changes)
 
 
 @cache
@@ -151,7 +150,7 @@ def test_of_two_starts_of_the_noise_the_better_end_counts(static: FitDrive) -> N
 
 
 def test_errors_count_where_truth_is_usable_and_the_filter_has_settled(static: FitDrive) -> None:
-    priors = make_priors(guess(), STATIC, axle_samples([static], guess()), 24.0, steering_wheel=False)
+    priors = make_priors(guess(), STATIC, axle_samples([static], guess()), 24.0)
     vehicle, noise = build_car(guess(), STATIC, priors, np.zeros(len(priors)))
     (whole,) = drive_errors([static], guess(), vehicle, noise)
     assert whole.error.size == math.ceil(len(static.signals) / 2)  # 50 Hz: every other one, 25 a second
@@ -180,18 +179,16 @@ OF_PARTS = {
 @pytest.mark.parametrize("names", [(), *((name,) for name in PhysicsParts.model_fields)], ids="+".join)
 def test_only_parameters_that_the_parts_use_are_fitted(names: tuple[str, ...]) -> None:
     nothing = axle_samples([part_of(static_drive(1, 2.0), 0, 100)], guess())
-    priors = make_priors(guess(), parts(*names), nothing, 0.0, steering_wheel=False)
+    priors = make_priors(guess(), parts(*names), nothing, 0.0)
     fitted = {p.name for p in priors if not p.tuning}
     assert fitted == {*CORE}.union(*(OF_PARTS.get(name, ()) for name in names))
-    by_wheel = make_priors(guess(), parts(*names), nothing, 0.0, steering_wheel=True)
-    assert {p.name for p in by_wheel} - {p.name for p in priors} == {"steering ratio"}
 
 
 def test_the_car_at_theta_has_its_values_and_keeps_the_rest() -> None:
     start = guess(1.1, 0.9, roll_gradient_rad_per_m_s2=0.008)
     has = parts("lag", "roll", "load_transfer")
     none = axle_samples([part_of(static_drive(1, 2.0), 0, 100)], start)
-    priors = make_priors(start, has, none, 0.0, steering_wheel=True)
+    priors = make_priors(start, has, none, 0.0)
     theta = np.linspace(-1.0, 1.0, len(priors))
     vehicle, noise = build_car(start, has, priors, theta)
     v = {p.name: max(p.value(t), -math.inf if p.low is None else p.low) for p, t in zip(priors, theta, strict=True)}
@@ -204,7 +201,7 @@ def test_the_car_at_theta_has_its_values_and_keeps_the_rest() -> None:
         assert slope == pytest.approx(v[f"{axle} cornering stiffness"])
     for name, entry in (
         ("yaw inertia", "yaw_inertia_kg_m2"), ("steering offset", "steer_offset_rad"),
-        ("steering ratio", "steering_ratio"), ("roll gradient", "roll_gradient_rad_per_m_s2"),
+        ("roll gradient", "roll_gradient_rad_per_m_s2"),
         ("relaxation length", "relaxation_length_m"), ("load sensitivity", "load_sensitivity"),
         ("roll frequency", "roll_frequency_rad_s"), ("roll damping", "roll_damping"),
         ("CG over roll axis", "cg_over_roll_axis_m"),

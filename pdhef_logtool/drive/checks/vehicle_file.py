@@ -1,14 +1,46 @@
-"""``vehicle.steering``, ``vehicle.understeer``: whether the car steers as its file has it; one fit serves both."""
+"""``vehicle.*``: whether wheels, steering and tyres of the car are as its file has them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
-from pdhef_logtool.drive.checks.fitting import SURE, fit
-from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2
+from pdhef_logtool.drive.checks.fitting import fit
+from pdhef_logtool.drive.checks.kind import SURE, CheckedDrive, CheckKind
 from pdhef_logtool.drive.columns import moving_at
 from pdhef_logtool.drive.relations import gentle_at
 from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.signals import WHEELS
+
+#: Effective radius over the file's: tyres wear by 3 %, sizes of one car differ by 5 %.
+RADIUS_RANGE = (0.85, 1.18)
+
+
+def _radius(drive: CheckedDrive) -> Iterator[Check]:
+    columns, speed, vehicle = drive.measured.columns, drive.speed, drive.vehicle
+    if not drive.has_file or speed is None or "speed_m_s" not in columns:
+        return
+    moving = moving_at(speed)
+    wheels = [columns[n] for w in WHEELS if (n := f"wheel_speed_{w}_rad_s") in columns]
+    turning = [(w, moving & np.isfinite(w) & (w != 0.0)) for w in wheels]
+    ratios = [float(np.median(speed[k] / w[k])) for w, k in turning if k.any()]
+    if not ratios:
+        return
+    radius = float(np.median(ratios))
+    low, high = (f * vehicle.wheel_radius_m for f in RADIUS_RANGE)
+    evidence = f"the speed over the wheels' is {radius:.3f} m, the file's radius {vehicle.wheel_radius_m:g} m"
+    yield RADIUS.judged(low <= radius <= high, evidence, radius=radius)
+
+
+RADIUS = CheckKind(
+    "vehicle.wheel_radius",
+    compares="the speed over that of the wheels with the radius in the vehicle file",
+    fails="it is below 0.85 or above 1.18 of it",
+    remedy="set wheel_radius_m = {radius:.3f}",
+    function=_radius,
+)
 
 #: Understeer gradients that have opposite signs and are this far from neutral; rad per m/s^2. Cars have 0.002 to 0.006.
 NEUTRAL_RAD_PER_M_S2 = 0.0006
@@ -20,7 +52,7 @@ UNEXPLAINED_STEERING = 0.5
 SPEED_SPREAD = 1.4
 
 
-def _checks(drive: CheckedDrive) -> list[Check]:
+def _steering(drive: CheckedDrive) -> list[Check]:
     """Judge wheelbase with steering ratio, and under- or oversteer, by delta = s L r / v + K v r + offset."""
     columns, speed, vehicle = drive.measured.columns, drive.speed, drive.vehicle
     rate, steer = columns.get("yaw_rate_rad_s"), columns.get("steer_rad")
@@ -37,26 +69,21 @@ def _checks(drive: CheckedDrive) -> list[Check]:
     # At one speed curvature and lateral acceleration are one regressor.
     if result is None or np.quantile(speeds, 0.9) < SPEED_SPREAD * np.quantile(speeds, 0.1):
         lacks = "needs bends to both sides at low and at high speed"
-        return [kind.undecided("too little driving in bends", lacks=lacks) for kind in CHECKS]
+        return [kind.undecided("too little driving in bends", lacks=lacks) for kind in (STEERING, UNDERSTEER)]
     (share, gradient, _), (share_error, error, _), left = result
     if share <= 0.0 or left > UNEXPLAINED_STEERING * float(np.std(steer[gentle & np.isfinite(steer)])):
         lacks = "needs bends that the car does not slide through"
         evidence = "curvature and lateral acceleration do not explain the steering"
-        return [kind.undecided(evidence, lacks=lacks) for kind in CHECKS]
+        return [kind.undecided(evidence, lacks=lacks) for kind in (STEERING, UNDERSTEER)]
     file = vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction)
     return [_steering_check(share, share_error), _understeer_check(gradient, error, file)]
 
 
 def _steering_check(share: float, error: float) -> Check:
-    low, high = STEERING_RANGE
     evidence = (
         f"slow bends take {share:.2f} +- {error:.2f} of the steering that wheelbase and ratio of the file ask for"
     )
-    if share + SURE * error < low or share - SURE * error > high:
-        return STEERING.failed(evidence, share=share)
-    if share - 2.0 * error < low or share + 2.0 * error > high:
-        return STEERING.undecided(evidence)
-    return STEERING.passed(evidence)
+    return STEERING.of_figure(share, error, STEERING_RANGE, evidence, share=share)
 
 
 def _understeer_check(gradient: float, error: float, file: float) -> Check:
@@ -80,13 +107,41 @@ STEERING = CheckKind(
     fails="less than 0.75 or more than 1.33 of what the file gives is used",
     remedy="steering_ratio is off by {share:.2f}, or the wheelbase",
     lacks=_LACKS,
-    function=_checks,
+    function=_steering,
 )
 UNDERSTEER = CheckKind(
     "vehicle.understeer",
     compares="the understeer gradient of the drive with that of the vehicle file",
     fails="their signs are opposite, and both are far from neutral",
-    remedy="the car {behaves}: check tyre stiffness and place of the CG, or run pdhef learn --stages identify",
+    remedy="the car {behaves}: check tyre stiffness and place of the CG, or run pdhef learn",
     lacks=_LACKS,
 )
-CHECKS = (STEERING, UNDERSTEER)
+
+#: Lateral acceleration driven over what the file's tyres carry at friction 1: summer tyres reach 1.15 of it.
+MAX_GRIP_USE = 1.25
+
+
+def _mass(drive: CheckedDrive) -> Iterator[Check]:
+    columns, speed, vehicle = drive.measured.columns, drive.speed, drive.vehicle
+    rate, ay = columns.get("yaw_rate_rad_s"), columns.get("ay_m_s2")
+    if not drive.has_file or speed is None or rate is None or ay is None:
+        return
+    # Roll makes a_y too large, and a car that begins to spin its yaw rate.
+    lateral = np.minimum(np.abs(ay), np.abs(rate * speed))
+    finite = lateral[np.isfinite(lateral)]
+    friction = max(1.0, vehicle.assumed_friction)
+    carried = [vehicle.magic_formula(front, friction)[2] / vehicle.axle_load_n(front) for front in (True, False)]
+    most = GRAVITY_M_S2 * min(carried)
+    seen = float(np.quantile(finite, 0.99)) if finite.size else 0.0
+    evidence = f"{seen:.1f} m/s^2 were driven, the file's tyres carry its mass up to {most:.1f} m/s^2"
+    yield MASS.judged(seen <= MAX_GRIP_USE * most, evidence)
+
+
+MASS = CheckKind(
+    "vehicle.mass",
+    compares="the lateral acceleration that was driven with what the file's tyres carry of its mass",
+    fails="it is above 1.25 of that at friction 1",
+    remedy="mass_kg is too large, or friction and the tyres' peak are too small",
+    function=_mass,
+)
+CHECKS = (RADIUS, STEERING, UNDERSTEER, MASS)

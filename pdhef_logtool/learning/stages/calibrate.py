@@ -1,4 +1,4 @@
-"""Stage ``identify`` without ground truth: several logs calibrate their car by the sensors alone.
+"""Stage ``calibrate``: several logs calibrate their car by the sensors alone (``fit.toml``).
 
 See docs/method.md#self-calibration. One log's calibration serves that log, and on another it can be absurd: only the
 result of several logs is written.
@@ -16,7 +16,7 @@ from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import Driving
-from pdhef_logtool.learning.drives import IDENTIFY, DriveRecord, record_of
+from pdhef_logtool.learning.drives import CALIBRATE, DriveRecord, record_of
 from pdhef_logtool.learning.split import TRAINING
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.logs.discovery import LogInput
@@ -27,7 +27,7 @@ from pdhef_logtool.runs.self_calibrating import lacking, read_driving
 LEAST_LOGS = 2
 
 
-def identify_without_truth(task: Task) -> StageOutput:
+def calibrate(task: Task) -> StageOutput:
     """Calibrate a car on its logs without looking at a ground truth.
 
     Raises
@@ -60,9 +60,10 @@ def identify_without_truth(task: Task) -> StageOutput:
     if calibration.refused:
         raise _refused(calibration.refused, "logs with bends and lane changes that calibrate the car")
     part = fit_part(calibration, [r.learnt_on for r in records if not r.left_out])
-    head = f"Written by pdhef learn --stages identify --without-truth: no ground truth was used.\n{calibration.text}."
+    head = f"Written by pdhef learn --without-truth: no ground truth was used.\n{calibration.text}."
     files = {FIT_FILE: part_toml(part, head).encode()}
-    change = Change(f"learn --stages {IDENTIFY}", FIT_FILE, files, settings=task.settings.to_dict(), drives=part.drives)
+    settings = task.settings.to_dict()
+    change = Change(f"learn --stages {CALIBRATE}", FIT_FILE, files, settings=settings, drives=part.drives)
     return StageOutput(change, records, calibration.text, {"self_calibration": calibration.to_dict()})
 
 

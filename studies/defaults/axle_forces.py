@@ -7,26 +7,22 @@ true velocity (Eq 3, 4). The fit is least squares with the priors of docs/method
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.car.vehicle import VehicleParameters, correct_signals
 from pdhef_logtool.estimators.filter_base import PosteriorSteps
 from pdhef_logtool.evaluation.smoothing import smooth
-from pdhef_logtool.learning.car.fit_data import FitDrive, period_s
+from pdhef_logtool.learning.engine import usable_stamps
 from pdhef_logtool.records.geometry import wrap_angle
-from pdhef_logtool.records.signals import BoolArray, FloatArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 
 #: Error samples that fits use; more only cost time.
 FIT_RATE_HZ = 20.0
 #: Forces are smoothed without phase; accelerometers on real cars show the road above this.
 SMOOTHING_HZ = 2.0
-#: Used where the true speed is above this multiple of the low-speed limit.
-SPEED_FACTOR = 2.0
-#: Sideslip beyond this is a spin or a drift, where a static single-track tyre explains nothing
-#: (docs/method.md#identification).
-MAX_SIDESLIP_RAD = float(np.deg2rad(8.0))
 #: 1-sigma of the priors on log stiffness, log peak force, shape (docs/method.md#identification).
 STIFFNESS_LOG_STD = 0.25
 PEAK_LOG_STD = 0.10
@@ -36,6 +32,15 @@ SHAPE = 1.35
 PEAK_OVER_SEEN = 1.1
 #: Friction demand scatters about the curve by this share of its own size and floor.
 FORCE_STD_N_PER_KG = 0.35
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FitDrive:
+    """A drive, or a part of it: signals [N] without any correction of a vehicle file, and ground truth [N]."""
+
+    name: str
+    signals: Signals
+    truth: StateTrack
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,19 +67,30 @@ class AxleCurve:
         return self.peak_n * np.sin(self.shape * np.arctan(b * slip_rad))
 
 
-def usable_stamps(drive: FitDrive, vehicle: VehicleParameters) -> BoolArray:
-    """Return where ground truth and signals can be used for identification, [N]."""
-    truth = drive.truth
-    is_complete = truth.valid & np.isfinite(truth.vx_m_s + truth.vy_m_s + truth.yaw_rate_rad_s)
-    moving = truth.vx_m_s > SPEED_FACTOR * vehicle.low_speed_blend_m_s
-    tame = np.abs(truth.sideslip_rad) < MAX_SIDESLIP_RAD
-    use: BoolArray = is_complete & moving & tame & np.isfinite(drive.signals.steer_rad)
-    return use
+def period_s(drive: FitDrive) -> float:
+    """Return the usual time from one stamp to the next."""
+    stamps = drive.signals.stamps_ns
+    return float(np.median(np.diff(stamps))) * 1e-9 if stamps.size > 1 else 0.01
+
+
+def signals_of(drive: FitDrive, start: VehicleParameters, vehicle: VehicleParameters) -> Signals:
+    """Return a drive's signals as a vehicle file reads them; they were loaded with the starting file's ratio."""
+    ratio = start.steering_ratio / vehicle.steering_ratio
+    return correct_signals(replace(drive.signals, steer_rad=drive.signals.steer_rad * ratio), vehicle)
+
+
+def part_of(drive: FitDrive, a: int, b: int) -> FitDrive:
+    """Return the stamps [a, b) of a drive."""
+    columns = {}
+    for f in fields(StateTrack):
+        value = getattr(drive.truth, f.name)
+        columns[f.name] = value if f.name == "name" or value.shape[0] != len(drive.truth) else value[a:b]
+    return replace(drive, signals=drive.signals.rows(a, b), truth=StateTrack(**columns))
 
 
 def usable_seconds(drive: FitDrive, vehicle: VehicleParameters) -> float:
     """Return how long a drive can be used for identification."""
-    return float(np.count_nonzero(usable_stamps(drive, vehicle))) * period_s(drive)
+    return float(np.count_nonzero(usable_stamps(drive.signals, drive.truth, vehicle))) * period_s(drive)
 
 
 def sampled_errors(
@@ -88,7 +104,7 @@ def sampled_errors(
     pick = slice(None, None, every)
     error = wrap_angle(np.arctan2(steps.x[pick, 1], steps.x[pick, 0]) - drive.truth.sideslip_rad[pick])
     stamps = drive.signals.stamps_ns
-    use = usable_stamps(drive, vehicle)[pick] & steps.valid[pick] & np.isfinite(error)
+    use = usable_stamps(drive.signals, drive.truth, vehicle)[pick] & steps.valid[pick] & np.isfinite(error)
     use &= (stamps[pick] - stamps[0]) * 1e-9 > settle_s
     return np.where(use, error, 0.0), use, every * period_s(drive)
 
@@ -102,7 +118,7 @@ def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters, *, simi
     columns: list[tuple[FloatArray, ...]] = []
     lf, lr = vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
     for drive in drives:
-        use = usable_stamps(drive, vehicle)
+        use = usable_stamps(drive.signals, drive.truth, vehicle)
         stamps = drive.signals.stamps_ns
 
         def smoothed(values: FloatArray, use: BoolArray = use, stamps: FloatArray = stamps) -> FloatArray:  # type: ignore[assignment]

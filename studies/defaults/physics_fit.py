@@ -24,27 +24,30 @@ import numpy as np
 
 from pdhef_logtool.car.descent import descend
 from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, TriedParts
-from pdhef_logtool.car.prior import Prior
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
 from pdhef_logtool.estimators.calibration.calibration import VARIED
 from pdhef_logtool.estimators.calibration.joint import varied_parameters
 from pdhef_logtool.estimators.filter_base import PosteriorSteps
 from pdhef_logtool.estimators.physics_filter import PHYSICS_Q_STD, physics_filter
-from pdhef_logtool.learning.car.axle_forces import (
+from pdhef_logtool.learning.engine import usable_stamps
+from pdhef_logtool.records.signals import FloatArray
+from studies.defaults.axle_forces import (
     PEAK_LOG_STD,
     SHAPE,
     SHAPE_STD,
     STIFFNESS_LOG_STD,
     AxleCurve,
     AxleSamples,
+    FitDrive,
     axle_samples,
     fit_axle,
+    part_of,
+    period_s,
     sampled_errors,
+    signals_of,
     usable_seconds,
-    usable_stamps,
 )
-from pdhef_logtool.learning.car.fit_data import FitDrive, part_of, period_s, signals_of
-from pdhef_logtool.records.signals import FloatArray
+from studies.defaults.prior import Prior
 
 #: Errors stay alike for this long, s; what the filter needs before its error counts, s.
 CORRELATION_S, SETTLE_S = 1.0, 2.0
@@ -65,7 +68,7 @@ STARTS: tuple[Theta, ...] = ({}, {"r a_y": 1.5, "q v_y": 1.4, "q yaw rate": 2.3}
 
 
 def make_priors(
-    start: VehicleParameters, parts: PhysicsParts, samples: AxleSamples, usable_s: float, *, steering_wheel: bool
+    start: VehicleParameters, parts: PhysicsParts, samples: AxleSamples, usable_s: float
 ) -> tuple[Prior, ...]:
     """Return the priors of docs/method.md#identification about a vehicle file."""
     mu = start.assumed_friction
@@ -97,8 +100,6 @@ def make_priors(
         Prior("a_y bias", "m/s^2", start.sensors.ay_bias_m_s2, 0.10),
         Prior("yaw rate bias", "rad/s", start.sensors.yaw_rate_bias_rad_s, 0.002),
     ]
-    if steering_wheel:
-        priors.append(Prior("steering ratio", "1", start.steering_ratio, 0.05, log=True))
     if parts.lag:
         priors.append(Prior("relaxation length", "m", start.relaxation_length_m or 0.5, 0.4, log=True))
     if parts.load_transfer:
@@ -155,7 +156,6 @@ def build_car(
         "physics": parts,
     }
     for name, entry in (
-        ("steering ratio", "steering_ratio"),
         ("relaxation length", "relaxation_length_m"),
         ("load sensitivity", "load_sensitivity"),
         ("roll frequency", "roll_frequency_rad_s"),
@@ -230,7 +230,6 @@ def fit_physics(
     start: VehicleParameters,
     parts: PhysicsParts,
     *,
-    steering_wheel: bool = False,
     starts: Sequence[Theta] = STARTS,
     iterations: int = MAX_ITERATIONS,
 ) -> PhysicsFit:
@@ -242,7 +241,7 @@ def fit_physics(
     """
     usable_s = sum(usable_seconds(d, start) for d in drives)
     samples = axle_samples(drives, start, similar=True)
-    priors = make_priors(start, parts, samples, usable_s, steering_wheel=steering_wheel)
+    priors = make_priors(start, parts, samples, usable_s)
 
     def errors(theta: FloatArray) -> list[DriveError]:
         return drive_errors(drives, start, *build_car(start, parts, priors, theta))
@@ -348,7 +347,7 @@ def make_folds(drives: Sequence[FitDrive], start: VehicleParameters) -> list[Fol
         halves = (usable[::2], usable[1::2])
     else:
         for drive in usable:
-            usable_index = np.flatnonzero(usable_stamps(drive, start))
+            usable_index = np.flatnonzero(usable_stamps(drive.signals, drive.truth, start))
             middle, guard = int(usable_index[usable_index.size // 2]), round(GUARD_S / period_s(drive))
             halves[0].append(part_of(drive, 0, max(middle - guard, 0)))
             halves[1].append(part_of(drive, min(middle + guard, len(drive.signals)), len(drive.signals)))
@@ -361,7 +360,6 @@ def choose_parts(
     folds: Sequence[Fold],
     start: VehicleParameters,
     *,
-    steering_wheel: bool = False,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
 ) -> tuple[PhysicsParts, tuple[TriedParts, ...]]:
     """Choose the parts by driving that their fits have not seen: each stays only with evidence.
@@ -377,7 +375,7 @@ def choose_parts(
         scores: list[float] = []
         ends: list[Sequence[Theta]] = []
         for (fit, held_out), starts in zip(folds, theta, strict=True):
-            result = fit_physics(fit, start, parts, steering_wheel=steering_wheel, starts=starts, iterations=iterations)
+            result = fit_physics(fit, start, parts, starts=starts, iterations=iterations)
             errors = drive_errors(held_out, start, result.vehicle, result.noise)
             logs = sum(e.seconds * math.log(e.rms**2 + FLOOR_RAD**2) for e in errors)
             scores.append(0.5 * logs / sum(e.seconds for e in errors))
@@ -411,7 +409,6 @@ def find_physics(
     drives: Sequence[FitDrive],
     start: VehicleParameters,
     *,
-    steering_wheel: bool = False,
     parts: PhysicsParts | None = None,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
 ) -> tuple[PhysicsFit, FittedPhysics]:
@@ -426,11 +423,9 @@ def find_physics(
         folds = make_folds(drives, start)
         parts = PhysicsParts()
         if folds:
-            parts, tried = choose_parts(
-                folds, start, steering_wheel=steering_wheel, progress=lambda text, share: progress(text, 0.7 * share)
-            )
+            parts, tried = choose_parts(folds, start, progress=lambda text, share: progress(text, 0.7 * share))
     progress("fitting the physics filter's sideslip to the ground truth", 0.7)
-    result = fit_physics(drives, start, parts, steering_wheel=steering_wheel)
+    result = fit_physics(drives, start, parts)
     varied = tuple(FittedValues.between(result.vehicle, v) for v in varied_vehicles(drives, start, result))
     values = FittedValues.of(result.vehicle)
     return result, FittedPhysics(values=values, noise=result.noise, varied=varied, tried=tried)

@@ -1,0 +1,133 @@
+"""Random simulated cars, each with sensors and a vehicle file of its own.
+
+Saloons, SUVs and hatchbacks of all loads, heights, tyres and wear, with sensors of all qualities. The file of a car is
+fitted to a ramp steer (``fit_vehicle``), as after a measurement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters
+from pdhef_logtool.records.errors import SimulationError
+from studies.defaults.fit_nominal_tyres import (
+    LINEAR_A_Y_M_S2,
+    axle_curves,
+    axle_loads_n,
+    fit_axle,
+    ramp,
+    roll_gradient_rad_per_m_s2,
+)
+from truthsim.linear_theory import understeer_gradient_rad_per_m_s2
+from truthsim.sensors import SensorNoise
+from truthsim.vehicle import GRAVITY_M_S2, Vehicle
+from truthsim.vehicle_choice import choose_vehicle
+
+BASE = Path("sample_logs/vehicle.toml")
+KINDS = ("sedan", "suv")
+#: Share of the cars that get the tyres of the other kind.
+OTHER_TYRES_SHARE = 0.3
+#: Ranges of the uniform draws, on top of what ``truthsim.randomisation`` draws.
+RANGES = {"mass": (0.85, 1.15), "cg": (-0.10, 0.12), "height": (0.9, 1.1), "stiffness": (0.8, 1.25)}
+#: Factors on the usual 1-sigma of sensors, uniform in the logarithm.
+SENSOR_FACTORS = {
+    "acceleration_m_s2": (0.5, 2.0),
+    "yaw_rate_rad_s": (0.4, 1.6),
+    "steer_rad": (0.5, 2.0),
+    "wheel_speed_m_s": (0.5, 2.0),
+    "acceleration_bias_m_s2": (0.3, 1.5),
+    "yaw_rate_bias_rad_s": (0.2, 1.5),
+    "steer_bias_rad": (0.5, 2.0),
+    # Noise of accelerometers that is not white: vibration of the body, temperature.
+    "acceleration_walk_m_s2": (1.0, 5.0),
+    "walk_time_s": (0.005, 1.0),
+}
+DELAY_S = (0.0, 0.040)
+STEER_GAIN = 0.01
+#: Free play of the steering at the road wheels: up to 2.5 degrees at a steering wheel of ratio 15.
+STEER_PLAY_RAD = (0.0, 0.003)
+#: Where the IMU may be from where the car's file has it, forward and to the left; the same of the INS, and its heading.
+LEVER_M, TRUTH_LEVER_M, TRUTH_HEADING_RAD = 0.15, 0.1, np.radians(0.3)
+#: Less understeer than this no maker sells: 0.5 degrees per g.
+LEAST_UNDERSTEER = np.radians(0.5) / GRAVITY_M_S2
+#: A ramp steer at this friction shows the axles' curves.
+FIT_FRICTION = 0.85
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnCar:
+    """One car: its name as ``--vehicle`` takes it, its file, and the sensors that it has."""
+
+    text: str
+    vehicle: VehicleParameters
+    sensors: tuple[tuple[str, float], ...]
+
+
+def draw_car(rng: np.random.Generator, base: VehicleParameters, kinds: tuple[str, ...] = KINDS) -> DrawnCar:
+    """Draw a car that understeers and can be driven through a ramp steer, with its vehicle file."""
+    while True:
+        kind = str(rng.choice(kinds))
+        words = [f"{kind}~{rng.integers(2**31)}"]
+        words += [f"{name}={rng.uniform(*limits):.3f}" for name, limits in RANGES.items()]
+        if rng.uniform() < OTHER_TYRES_SHARE:
+            words.append(f"tyres={KINDS[1 - KINDS.index(kind)] if kind in KINDS else KINDS[0]}")
+        text = ",".join(words)
+        car = choose_vehicle(text)
+        if understeer_gradient_rad_per_m_s2(car, FIT_FRICTION) < LEAST_UNDERSTEER:
+            continue
+        try:
+            fitted = fit_vehicle(car, FIT_FRICTION, base)
+        except (SimulationError, ValueError):
+            continue  # rolls over or spins in the ramp
+        entries = {"name": text, "wheel_radius_m": car.wheel_radius_m, "steering_ratio": car.steering_ratio}
+        return DrawnCar(text, fitted.model_copy(update=entries), _sensors(rng))
+
+
+def _sensors(rng: np.random.Generator) -> tuple[tuple[str, float], ...]:
+    usual = SensorNoise()._asdict()
+    values = {
+        name: usual[name] * float(np.exp(rng.uniform(np.log(low), np.log(high))))
+        for name, (low, high) in SENSOR_FACTORS.items()
+    }
+    values["can_delay_s"] = float(rng.uniform(*DELAY_S))
+    values["steer_gain"] = STEER_GAIN
+    values["steer_play_rad"] = float(rng.uniform(*STEER_PLAY_RAD))
+    values["rtk_heading_offset_rad"] = float(rng.uniform(-TRUTH_HEADING_RAD, TRUTH_HEADING_RAD))
+    for reach, names in ((LEVER_M, ("imu_x_m", "imu_y_m")), (TRUTH_LEVER_M, ("rtk_x_m", "rtk_y_m"))):
+        values |= {name: float(rng.uniform(-reach, reach)) for name in names}
+    return tuple((name, round(value, 6)) for name, value in sorted(values.items()))
+
+
+def fit_vehicle(car: Vehicle, friction: float, vehicle: VehicleParameters) -> VehicleParameters:
+    """Return the vehicle file with mass, geometry, axle tyres and roll gradient of a simulated car on a road.
+
+    Raises
+    ------
+    SimulationError
+        The car cannot be driven through the ramp.
+    """
+    motion = ramp(friction, car)
+    if not np.isfinite(motion.column("ay_m_s2")).all():
+        raise SimulationError(expected="a finite ramp steer", got="NaN or infinity", where="fit of a vehicle file")
+    tyres, loads_n = {}, axle_loads_n(car)
+    for axle, (alpha, force) in axle_curves(motion, car).items():
+        # Beyond the peak the car slides in ever other ways; the curve is fitted up to it.
+        whole = slice(0, int(np.argmax(force)) + 1)
+        fit = fit_axle(alpha[whole] / friction, force[whole] / friction, loads_n[axle])
+        tyres[axle] = AxleTyre(B=fit.B, C=fit.C, D_n=fit.D_n, E=fit.E, reference_friction=1.0)
+    linear_m_s2 = min(LINEAR_A_Y_M_S2, 0.5 * friction * GRAVITY_M_S2)
+    return vehicle.model_copy(
+        update={
+            "mass_kg": car.mass_kg,
+            "yaw_inertia_kg_m2": car.yaw_inertia_kg_m2,
+            "cg_to_front_axle_m": car.cg_to_front_axle_m,
+            "cg_to_rear_axle_m": car.cg_to_rear_axle_m,
+            "track_m": car.track_m,
+            "cg_height_m": car.cg_height_m,
+            "roll_gradient_rad_per_m_s2": roll_gradient_rad_per_m_s2(motion, linear_m_s2),
+            "tyres": Tyres(front=tyres["front"], rear=tyres["rear"]),
+        }
+    )
