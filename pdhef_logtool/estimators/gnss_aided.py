@@ -27,6 +27,7 @@ from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import notes_of, predict_track
 from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.filter_base import sideslip_std
+from pdhef_logtool.estimators.intervals import scaled_covariance
 from pdhef_logtool.estimators.physics_filter import LIMIT_TIME_S, LINEAR_SHARE, PhysicsFilter
 from pdhef_logtool.estimators.reference.inputs import GNSS_LAG_S
 from pdhef_logtool.estimators.reference.smoother import BIAS_M_S2, BIAS_S, LAW_S, LAW_WHITE, TILT_SHARE, correct
@@ -371,9 +372,8 @@ class GnssAided:
         change, weight, variance = steps.aid[ahead.step].T
         change = np.where(track.valid, change, 0.0)
         vy, covariance = track.vy_m_s + change, track.covariance
-        scale = np.ones((len(track), 3))  # row and column alike, so that correlations stay
-        scale[:, 1] = np.sqrt(weight + variance / np.maximum(covariance[:, 1, 1], 1e-12))
-        covariance = covariance * scale[:, :, None] * scale[:, None, :]
+        of_vy = np.sqrt(weight + variance / np.maximum(covariance[:, 1, 1], 1e-12))
+        covariance = scaled_covariance(covariance, of_vy)
         return replace(
             track,
             vy_m_s=vy,

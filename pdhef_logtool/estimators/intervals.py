@@ -173,11 +173,16 @@ def inflated(track: StateTrack, terms: FloatArray, inflation: Inflation) -> Stat
     if covariance.shape[0]:
         rate_std = track.yaw_rate_std_rad_s
         rate = combined(yaw_rate_terms(terms, rate_std), _ordered(inflation.yaw_rate, YAW_RATE_TERMS))
-        scale = np.ones((len(track), 3))
-        scale[:, 1] = inflation.vy_factor * _ratio(sideslip, sideslip_std)
-        scale[:, 2] = _ratio(rate, rate_std)
-        covariance = covariance * scale[:, :, None] * scale[:, None, :]
+        of_vy = inflation.vy_factor * _ratio(sideslip, sideslip_std)
+        covariance = scaled_covariance(covariance, of_vy, _ratio(rate, rate_std))
     return replace(track, sideslip_std_rad=sideslip, covariance=covariance)
+
+
+def scaled_covariance(covariance: FloatArray, of_vy: FloatArray, of_rate: FloatArray | float = 1.0) -> FloatArray:
+    """Return covariances [N, 3, 3] with factors [N] on the 1-sigma of v_y and yaw rate; correlations stay."""
+    scale = np.ones(covariance.shape[:2])
+    scale[:, 1], scale[:, 2] = of_vy, of_rate
+    return covariance * scale[:, :, None] * scale[:, None, :]
 
 
 def combined(terms: FloatArray, coefficients: tuple[float, ...]) -> FloatArray:

@@ -12,7 +12,6 @@ includes what its model leaves of a_y.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,7 +19,7 @@ import numpy as np
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.adaptive_physics import CURES
-from pdhef_logtool.estimators.calibration.joint import FILE_STIFFNESS_STD, IMU_X, PEAK, STEER_OFFSET, parameters_of
+from pdhef_logtool.estimators.calibration.joint import prior_variations
 from pdhef_logtool.estimators.error_features import TERMS, FeatureState, error_terms
 from pdhef_logtool.estimators.latency_compensation import WindowState, run_window
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter, of_car
@@ -75,20 +74,3 @@ def posterior_band(car: Car, *, use_speed: bool = True) -> PosteriorBand | None:
         return replace(physics, vehicle=bare, read_with=read_with)
 
     return PosteriorBand(tuple(on(v) for v in (physics.vehicle, *varied)))
-
-
-def prior_variations(vehicle: VehicleParameters) -> tuple[VehicleParameters, ...]:
-    """Return a vehicle file with one error of 1-sigma each, in the parameters that move the sideslip most.
-
-    Stiffness of each axle, friction in place of peak force, steering offset, position of the accelerometer: the
-    priors of the joint calibration.
-    """
-    prior = {p.name: p.std for p in parameters_of(vehicle)}
-    stiffer, (x, y, z) = math.exp(FILE_STIFFNESS_STD), vehicle.imu_position_m
-    return (
-        vehicle.with_stiffness(stiffer, 1.0),
-        vehicle.with_stiffness(1.0, stiffer),
-        vehicle.model_copy(update={"friction": math.exp(-prior[PEAK]) * vehicle.assumed_friction}),
-        vehicle.model_copy(update={"steer_offset_rad": vehicle.steer_offset_rad + prior[STEER_OFFSET]}),
-        vehicle.model_copy(update={"imu_position_m": (x + prior[IMU_X], y, z)}),
-    )

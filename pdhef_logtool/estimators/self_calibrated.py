@@ -26,7 +26,7 @@ import numpy as np
 from pdhef_logtool.car.car import WithoutTruth
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
 from pdhef_logtool.estimators.base import Estimator, look_ahead_of, notes_of, predict_track, run_steps
-from pdhef_logtool.estimators.intervals import MAX_SIDESLIP_STD_RAD
+from pdhef_logtool.estimators.intervals import MAX_SIDESLIP_STD_RAD, scaled_covariance
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import Extrapolation
@@ -156,9 +156,7 @@ def widened(
     std = np.minimum(np.sqrt((own_share * track.sideslip_std_rad) ** 2 + added), MAX_SIDESLIP_STD_RAD)
     covariance = track.covariance
     if covariance.shape[0]:
-        scale = np.ones((len(track), 3))  # row and column alike, so that correlations stay
-        vy_variance = covariance[:, 1, 1]
-        positive = vy_variance > 0.0
-        scale[positive, 1] = np.sqrt(own_share**2 + (added * speed**2)[positive] / vy_variance[positive])
-        covariance = covariance * scale[:, :, None] * scale[:, None, :]
+        variance = covariance[:, 1, 1]
+        more = np.divide(added * speed**2, variance, out=np.full(len(track), 1.0 - own_share**2), where=variance > 0.0)
+        covariance = scaled_covariance(covariance, np.sqrt(own_share**2 + more))
     return replace(track, sideslip_std_rad=std, covariance=covariance)

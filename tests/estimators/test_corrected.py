@@ -12,7 +12,7 @@ from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.taught import Taught, TaughtParameter
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.calibration.joint import parameters_of, prior_vehicles, with_taught
+from pdhef_logtool.estimators.calibration.joint import parameters_of, prior_vehicle, with_taught
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.latency_compensation import run_window
@@ -164,6 +164,6 @@ def test_a_taught_prior_moves_mean_and_width_of_the_calibration() -> None:
     assert unlike.mean == pytest.approx(first.mean) and unlike.std == first.std
     assert first.mean < near.mean < alike.mean and first.std > near.std > alike.std
     assert (alike.mean, alike.std) == pytest.approx((moved[0].mean, moved[0].std))
-    vehicles = (*prior_vehicles(SEDAN), *prior_vehicles(SEDAN, taught))
+    vehicles = (prior_vehicle(SEDAN), prior_vehicle(SEDAN, taught))
     before, after = (v.cornering_stiffness_n_per_rad(True, v.assumed_friction) for v in vehicles)
     assert after == pytest.approx(1.1 * before, rel=1e-4)

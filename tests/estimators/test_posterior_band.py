@@ -23,11 +23,12 @@ from pdhef_logtool.car.parts import (
 from pdhef_logtool.car.toml_files import part_toml, vehicle_toml
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.calibration.joint import prior_variations
 from pdhef_logtool.estimators.error_features import TERMS, error_terms
 from pdhef_logtool.estimators.intervals import POSTERIOR_NOTE, make_inflation
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_filter import physics_filter
-from pdhef_logtool.estimators.posterior_band import OWN_SHARE, posterior_band, prior_variations
+from pdhef_logtool.estimators.posterior_band import OWN_SHARE, posterior_band
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -115,7 +116,7 @@ def test_a_file_that_no_drive_has_shown_to_be_right_has_the_interval_of_its_prio
     assert np.median(nominal_wide.sideslip_std_rad / nominal.sideslip_std_rad) > 2.0
     found = FittedPhysics(values=VALUES, noise=NOISE)
     assert posterior_band(Car.of(OWN, fitted_physics=found).with_noise(PHYSICS, NOISE)) is None
-    assert len({vehicle.model_dump_json() for vehicle in (OWN, *prior_variations(OWN))}) == 6
+    assert len({vehicle.model_dump_json() for vehicle in (OWN, *prior_variations(OWN))}) == 7
 
 
 def test_only_what_runs_on_physics_has_it_and_it_is_told(signals: Signals) -> None:

@@ -20,19 +20,18 @@ from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
 from pdhef_logtool.estimators.calibration.joint import (
-    AY_BIAS,
     DERIVATIVE_STEP,
     ERROR_STD,
     FRONT_STIFFNESS,
     REAR_STIFFNESS,
-    STEER_OFFSET,
-    STEER_RATIO,
     Fit,
     JointProblem,
     counted,
     parameters_of,
-    prior_vehicles,
+    prior_variations,
+    prior_vehicle,
     varied_parameters,
+    with_taught,
 )
 from pdhef_logtool.estimators.calibration.single_track import AY, OF_AY, OF_RATE, YAW_RATE
 from pdhef_logtool.records.signals import FloatArray
@@ -55,8 +54,6 @@ SLIDING_RAD, SLIDING_S, SLIDING_SHARE = math.radians(8.0), 10.0, 0.2
 EXPORTED_STD = 0.16
 #: Directions of the posterior that an interval follows, at most.
 VARIED = 5
-#: Parameters that an interval follows before any driving.
-VARIED_BY_PRIOR = (FRONT_STIFFNESS, REAR_STIFFNESS, STEER_RATIO, STEER_OFFSET, AY_BIAS)
 #: Smallest difference of understeer gradients that is reported as a contradiction, rad/(m/s²).
 LEAST_CONTRADICTION = 1.5e-3
 #: 1-sigma of the understeer gradient by the limits of the single-track model, rad/(m/s²) (studies/plus_minus.py).
@@ -261,8 +258,8 @@ def _without_fit(
 
 def prior_calibration(vehicle_file: VehicleParameters, taught: Sequence[TaughtParameter] = ()) -> SelfCalibration:
     """Return the calibration before any driving: prior means, varied by the prior in what moves the sideslip most."""
-    centre, *varied = prior_vehicles(vehicle_file, taught, VARIED_BY_PRIOR)
-    return replace(_without_fit(vehicle_file, centre), varied=tuple(varied))
+    centre, priors = prior_vehicle(vehicle_file, taught), with_taught(parameters_of(vehicle_file), taught)
+    return replace(_without_fit(vehicle_file, centre), varied=prior_variations(centre, priors))
 
 
 def calibrate_online(

@@ -332,14 +332,31 @@ def _vehicle_with(vehicle_file: VehicleParameters, values: Mapping[str, float], 
     )
 
 
-def prior_vehicles(
-    vehicle_file: VehicleParameters, taught: Sequence[TaughtParameter] = (), varied: Sequence[str] = ()
-) -> list[VehicleParameters]:
-    """Return the vehicle file with every parameter at its prior mean, then with each of ``varied`` 1-sigma away."""
+def prior_vehicle(vehicle_file: VehicleParameters, taught: Sequence[TaughtParameter] = ()) -> VehicleParameters:
+    """Return the vehicle file with every parameter at its prior mean."""
     parameters = with_taught(parameters_of(vehicle_file), taught)
-    names = ("", *varied)
-    values = ({p.name: p.value(1.0 if p.name == name else 0.0) for p in parameters} for name in names)
-    return [_vehicle_with(vehicle_file, of_one, 6) for of_one in values]
+    return _vehicle_with(vehicle_file, {p.name: p.value(0.0) for p in parameters}, 6)
+
+
+def prior_variations(
+    vehicle: VehicleParameters, priors: Sequence[Parameter] | None = None
+) -> tuple[VehicleParameters, ...]:
+    """Return a vehicle with one error of a prior's 1-sigma each, in the parameters that move the sideslip most.
+
+    Stiffness of each axle, friction in place of peak force, steering ratio and offset, position of the accelerometer.
+    Without ``priors`` the vehicle is a file.
+    """
+    std, (x, y, z) = {p.name: p.std for p in priors or parameters_of(vehicle)}, vehicle.imu_position_m
+    if priors is None:
+        std |= dict.fromkeys((FRONT_STIFFNESS, REAR_STIFFNESS), FILE_STIFFNESS_STD)
+    return (
+        vehicle.with_stiffness(math.exp(std[FRONT_STIFFNESS]), 1.0),
+        vehicle.with_stiffness(1.0, math.exp(std[REAR_STIFFNESS])),
+        vehicle.model_copy(update={"friction": math.exp(-std[PEAK]) * vehicle.assumed_friction}),
+        vehicle.model_copy(update={"steering_ratio": math.exp(std[STEER_RATIO]) * vehicle.steering_ratio}),
+        vehicle.model_copy(update={"steer_offset_rad": vehicle.steer_offset_rad + std[STEER_OFFSET]}),
+        vehicle.model_copy(update={"imu_position_m": (x + std[IMU_X], y, z)}),
+    )
 
 
 def track_of(
