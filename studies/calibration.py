@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pdhef_logtool.estimators.calibration.calibration import LARGEST_SHARE, VARIED
-from pdhef_logtool.estimators.self_calibrated import D2_SHARE, POSTERIOR_SHARE
+from pdhef_logtool.estimators.self_calibrated import D2_SHARE
 from pdhef_logtool.runs.selection import FACTOR, SIMPLE
 from studies import plus_minus, self_calibration
 from studies.pages import DOCS, DRIVES, options, write
@@ -39,9 +39,9 @@ slides, or, if it is written to a car, if the driving does not excite both corne
 ## 95 % confidence intervals of self-calibrated cars
 
 Intervals of `physics`, calibrated from the wrong and from the right file. The variance of sideslip is the sum of
-s², where s is the standard deviation of the filter, the effect of the {varied} strongest directions of the posterior at
-{posterior:g} standard deviations, and ({share:g} d)², where d is the part of the v̇_y residual that correlates with v_y,
-v_x r and a_y. For normal errors, an interval with 95 % coverage is 3.92 times as wide as the RMSE.
+[χ² (s² + 0.15²)](method.md#intervals), the effect of the {varied} strongest directions of the posterior, and
+({share:g} d)², where d is the part of the v̇_y residual that correlates with v_y, v_x r and a_y. For normal errors, an
+interval with 95 % coverage is 3.92 times as wide as the RMSE.
 
 {bands}
 
@@ -112,7 +112,6 @@ def settings() -> dict[str, object]:
         "low": self_calibration.WRONG[0],
         "high": self_calibration.WRONG[1],
         "largest": f"{100 * LARGEST_SHARE:.0f} %",
-        "posterior": POSTERIOR_SHARE,
         "varied": VARIED,
         "share": D2_SHARE,
         "factor": FACTOR,

@@ -63,7 +63,7 @@ def with_prior_errors(file: VehicleParameters, noise: SensorNoise, rng: np.rando
     """Return a vehicle file whose other entries are as wrong as the prior of the calibration expects."""
     inertia, roll, place = rng.normal(size=3)
     reach = 0.4 * file.wheelbase_m
-    gain = max(0.0, file.roll_gradient_rad_per_m_s2 + 0.05 / GRAVITY_M_S2 * roll)
+    gain = max(0.0, file.roll_gradient_rad_per_m_s2 + 0.03 / GRAVITY_M_S2 * roll)
     changed = {
         "yaw_inertia_kg_m2": file.yaw_inertia_kg_m2 * math.exp(0.2 * inertia),
         "roll_gradient_rad_per_m_s2": gain,
@@ -96,7 +96,7 @@ def of_calibration(
 ) -> Iterator[tuple[str, float, float]]:
     """Yield name, error and standard deviation of the calibrated parameters whose true value the car has."""
     signals = drive.whole().signals
-    gain, delay_s = math.exp(0.05 * rng.normal()), 0.02 * rng.normal()
+    gain, delay_s = math.exp(0.08 * rng.normal()), 0.02 * rng.normal()
     time_s = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
     late = gain * np.interp(time_s - delay_s, time_s, signals.steer_rad)
     calibration = calibrate(replace(signals, steer_rad=late), wrong)

@@ -126,7 +126,9 @@ def taken(signals: Signals, file: VehicleParameters, calibration: SelfCalibratio
     """Return a car as a run of a log has it after a calibration, which may have been refused."""
     if calibration.refused:
         return Car.of(file)
-    calibrated = WithoutTruth(calibration.vehicle, calibration.noise, told_friction=True, note="")
+    calibrated = WithoutTruth(
+        calibration.vehicle, calibration.noise, told_friction=True, note="", error_scale=calibration.error_scale
+    )
     car = replace(Car.of(file), self_calibrated=calibrated)
     track, _ = run_window(make_estimator("physics", car), signals)
     low, sensors = file.low_speed_blend_m_s, log_sensors(file, calibration)

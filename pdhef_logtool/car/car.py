@@ -81,6 +81,7 @@ class WithoutTruth:
     ``physics`` on the log, the part that correlates with the driving, NaN if unknown. ``earlier`` : what applied
     before, in time order, where the log calibrates its car as it goes on; each applies from its ``since_ns``.
     ``causal`` : whether it depends on nothing that follows ``since_ns``. ``cg_std_m`` : as :attr:`Car.cg_std_m`.
+    ``error_scale`` : what the model leaves of the sensors, over what the calibration assumes.
     """
 
     vehicle: VehicleParameters
@@ -93,6 +94,7 @@ class WithoutTruth:
     earlier: tuple[WithoutTruth, ...] = ()
     causal: bool = False
     cg_std_m: float = 0.0
+    error_scale: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,7 +26,7 @@ from pdhef_logtool.estimators.filter_base import (
 )
 from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter, of_car
-from pdhef_logtool.estimators.physics_model import FRONT, REAR, Layout, PhysicsParameters, sensed_ay
+from pdhef_logtool.estimators.physics_model import FRONT, REAR, sensed_ay
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.bundle import PHYSICS_MODEL
@@ -35,8 +35,8 @@ from pdhef_logtool.residual_model.features import make_features
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
 
-#: Entries of the features that the states of ``physics`` beyond the motion, and its parameters, give.
-_BODY, _PARAMETERS = 4, 6
+#: Entries of the features that the states of ``physics`` beyond the motion give.
+_BODY = 4
 
 
 @njit(cache=True)
@@ -56,22 +56,6 @@ def _physics_ay(x, inputs, layout, p, f, out):  # type: ignore[no-untyped-def]
         out[k] = math.nan
         if math.isfinite(x[k, 0]):
             out[k] = sensed_ay(x[k], inputs[k, U_STEER], layout, p, f, row)
-
-
-def car_features(vehicle: VehicleParameters, friction: FloatArray) -> FloatArray:
-    """Return what shows cars apart, [K, 7], at the friction [K] of each step (see features.FEATURES)."""
-    m, front, rear = vehicle.mass_kg, vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
-    columns = [
-        np.full_like(friction, front),
-        np.full_like(friction, rear),
-        np.full_like(friction, vehicle.yaw_inertia_kg_m2 / (m * front * rear)),
-    ]
-    for axle in (True, False):
-        keeps = (vehicle.tyres.front if axle else vehicle.tyres.rear).keeps_stiffness
-        at_one = vehicle.cornering_stiffness_n_per_rad(axle, 1.0) / m
-        columns.append(np.full_like(friction, at_one) if keeps else at_one * friction)
-    columns += [np.full_like(friction, vehicle.magic_formula(axle, 1.0)[2] / m) for axle in (True, False)]
-    return np.stack(columns, axis=1)
 
 
 def parallel_filter(vehicle: VehicleParameters, *, use_speed: bool = True, slip_gate: bool = True) -> PhysicsUkf:
@@ -108,14 +92,14 @@ def run_features(
 
     Returns
     -------
-    features : [K, 28], NaN without steering, or where the filter has no state or one that goes backwards against the
+    features : [K, 15], NaN without steering, or where the filter has no state or one that goes backwards against the
         speed sensor.
     steps, state : of the filter.
     """
     steps, after = physics.run(signals, state, extra_r=extra_r)
     seen = signals if seen is None else seen
     friction, predicted = steps.inputs[:, U_FRICTION], np.empty(len(signals))
-    body, parameters = np.zeros((len(signals), _BODY)), np.zeros((len(signals), _PARAMETERS))
+    body = np.zeros((len(signals), _BODY))
     if isinstance(physics, PhysicsFilter):
         seen = physics.corrected(seen)
         layout, p, f = physics.parameters
@@ -123,20 +107,13 @@ def run_features(
         if layout.roll >= 0:
             body[:, :2] = steps.x[:, layout.roll : layout.roll + 2]
         body[:, 2:] = steps.x[:, [FRONT, REAR]]
-        parameters[:] = _part_parameters(layout, f)
     else:
         _nominal_ay(steps.x, steps.inputs, model_parameters(physics.vehicle), predicted)
     usable = without_impossible(seen)
     features = make_features(
         steps.inputs[:, U_STEER], usable.ay_m_s2, usable.yaw_rate_rad_s, steps.x, steps.prior, predicted,
-        friction, usable.ax_m_s2, body, np.concatenate([car_features(physics.vehicle, friction), parameters], axis=1),
+        friction, usable.ax_m_s2, body,
     )  # fmt: skip
     steers = steps.inputs[:, U_STEER_KNOWN] > 0.0
     features[~(steps.valid & steers & rolls_forward(steps.x[:, VX], steps.inputs[:, U_SPEED]))] = np.nan
     return features, steps, after
-
-
-def _part_parameters(layout: Layout, f: PhysicsParameters) -> list[float]:
-    """Return the last features: the parameters of the parts that the filter has, 0 for those that it has not."""
-    of_roll = [f.roll_frequency_rad_s, f.roll_damping, f.swing_m] if layout.roll >= 0 else [0.0, 0.0, 0.0]
-    return [f.relaxation_length_m, f.load_sensitivity, f.roll_gradient, *of_roll]

@@ -5,14 +5,13 @@ What a whole log states of its car is known only at its end: none of them is cau
 Their variance of sideslip is their own, what the parameters leave open, and what the sensors contradict
 (docs/method.md#intervals):
 
-    s² = s_own² + s_car² + (Σ_i (2 (v_y,i − v_y))² + (lateral kinematic consistency / 2)² + (s_l r)²) / v_x²,
+    s² = χ² (s_own² + s_car²) + (Σ_i (v_y,i − v_y)² + (0.7 lateral kinematic consistency)² + (s_l r)²) / v_x²,
 
 where v_y,i is that of the physics filter on the vehicle one posterior 1-sigma away in direction i, and d² that of
-the whole log as far as it goes with the driving. The posterior is doubled, for the directions are only the five that
-move the sideslip most. s_car is what no parameter of a single track explains: nearly constant within a drive, it
-differs between drives and cars. s_l is that of the distance from the rear axle to the centre of gravity where no file
-gives it: the rear axle determines its own lateral velocity. That of v_y is the same sum as a velocity.
-Estimates themselves do not change.
+the whole log as far as it goes with the driving. s_car is what no parameter of a single track explains: nearly constant
+within a drive, it differs between drives and cars, as does the RMS error χ that the fit leaves over the assumed one
+(Birge 1932). s_l is that of the distance from the rear axle to the centre of gravity where no file gives it: the rear
+axle determines its own lateral velocity. That of v_y is the same sum as a velocity. Estimates themselves do not change.
 """
 
 from __future__ import annotations
@@ -40,10 +39,8 @@ if TYPE_CHECKING:
 SELF_CALIBRATED = frozenset({"physics", "pd-hef", "pd-hef-smoothed"})
 #: The open-loop model on the calibrated vehicle.
 OPEN_LOOP = "open-loop:calibrated"
-#: Factors of the posterior and of lateral kinematic consistency above.
-POSTERIOR_SHARE, D2_SHARE = 2.0, 0.5
-#: s_car above. Most likely on the real drives of the other cars: 0.05 to 0.10 degrees with one car left out.
-CAR_STD_RAD = math.radians(0.1)
+#: Factor of lateral kinematic consistency, and s_car above; on seven simulated cars and the real drives of four.
+D2_SHARE, CAR_STD_RAD = 0.7, math.radians(0.15)
 
 
 @dataclass(slots=True)
@@ -64,11 +61,10 @@ class CalibratedBand:
             runs = [run_window(f, given, b) for f, b in zip(self._filters, before, strict=True)]
             self._window, self._vy = signals, [t.vy_m_s for t, _ in runs]
             self._states = tuple(state for _, state in runs)
-        d2 = calibration.driven_d2_m_s
-        contradicted = np.hypot(CAR_STD_RAD * track.vx_m_s, D2_SHARE * d2 if math.isfinite(d2) else 0.0)
+        d2, scale = calibration.driven_d2_m_s, calibration.error_scale
+        contradicted = np.hypot(scale * CAR_STD_RAD * track.vx_m_s, D2_SHARE * d2 if math.isfinite(d2) else 0.0)
         contradicted = np.hypot(contradicted, calibration.cg_std_m * track.yaw_rate_rad_s)
-        away = [self._vy[0] + POSTERIOR_SHARE * (vy - self._vy[0]) for vy in self._vy] if self._vy else []
-        return widened(track, away, contradicted, calibration.vehicle.low_speed_blend_m_s, own_share=1.0)
+        return widened(track, self._vy, contradicted, calibration.vehicle.low_speed_blend_m_s, own_share=scale)
 
     @property
     def _filters(self) -> tuple[PhysicsFilter, ...]:

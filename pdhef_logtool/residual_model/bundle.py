@@ -117,7 +117,7 @@ class ModelBundle:
         return shapes
 
     def normalise(self, features: FloatArray) -> FloatArray:
-        """Return the chosen features [N, k] of the full array [N, 28], normalised and limited to ±8."""
+        """Return the chosen features [N, k] of the full array [N, 15], normalised and limited to ±8."""
         n = self.normalisation
         scaled = (features[:, self.columns] - np.array(n.feature_mean)) / np.array(n.feature_std)
         limited: FloatArray = np.clip(scaled, -8.0, 8.0)

@@ -10,8 +10,7 @@ import numpy as np
 
 from pdhef_logtool.records.signals import FloatArray
 
-#: Name and order of the features. The paper's six come first; a network for one car uses all but the last thirteen,
-#: which distinguish cars.
+#: Name and order of the features. The paper's six come first.
 FEATURES = (
     "vx_m_s",  # posterior of the physics filter
     "ay_m_s2",  # measured
@@ -28,24 +27,10 @@ FEATURES = (
     "roll_rate_rad_s",
     "front_force_per_mass",  # of the axle, m/s²
     "rear_force_per_mass",
-    "cg_to_front_axle_m",
-    "cg_to_rear_axle_m",
-    "inertia_ratio",  # I_z / (m l_f l_r)
-    "front_stiffness_per_mass",  # m/s² per rad, at that friction
-    "rear_stiffness_per_mass",
-    "front_peak_per_mass",  # m/s², at friction 1
-    "rear_peak_per_mass",
-    "relaxation_length_m",  # this and what follows are 0 where the physics filter has no such part
-    "load_sensitivity",
-    "roll_gradient_rad_per_m_s2",
-    "roll_frequency_rad_s",
-    "roll_damping",
-    "cg_over_roll_axis_m",
 )
 PAPER_FEATURES = FEATURES[:6]
 #: Those of networks that were trained on what the nominal model misses.
 NOMINAL_FEATURES = FEATURES[:10]
-ONE_CAR_FEATURES = FEATURES[:15]
 #: Features that change sign where left and right are mirrored.
 ODD_FEATURES = frozenset(
     {
@@ -80,9 +65,8 @@ def make_features(
     friction: FloatArray,
     ax_m_s2: FloatArray,
     body: FloatArray,
-    car: FloatArray,
 ) -> FloatArray:
-    """Return the features [K, 28] at each step; always finite where the filter's state is.
+    """Return the features [K, 15] at each step; always finite where the filter's state is.
 
     A missing measurement is replaced by what the physics filter predicts for it, so that to the network a dropped
     channel is like one that agrees with physics.
@@ -93,7 +77,7 @@ def make_features(
     posterior, prior : states of the physics filter, [K, ≥3] over v_x, v_y, r; the prior is NaN where it starts.
     predicted_ay_m_s2 : [K], the filter's a_y at the posterior.
     friction : [K]. ax_m_s2 : [K], NaN where missing.
-    body : [K, 4], roll, roll rate and the axles' forces. car : [K, 13], the last features.
+    body : [K, 4], roll, roll rate and the axles' forces.
     """
     prior = np.where(np.isfinite(prior), prior, posterior)
     vx = posterior[:, _VX]
@@ -117,4 +101,4 @@ def make_features(
         ],
         axis=1,
     )
-    return np.concatenate([columns, body, car], axis=1)
+    return np.concatenate([columns, body], axis=1)

@@ -43,7 +43,7 @@ class NetworkService:
 
         Parameters
         ----------
-        features : [N, 28] as from :func:`~.features.make_features`; rows with NaN give 0 and end the sequence.
+        features : [N, 15] as from :func:`~.features.make_features`; rows with NaN give 0 and end the sequence.
         starts : [N], where a sequence begins again.
         """
         out = np.zeros((features.shape[0], OUTPUT_COUNT[self.bundle.target]))

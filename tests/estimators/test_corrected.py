@@ -16,6 +16,7 @@ from pdhef_logtool.estimators.calibration.joint import parameters_of, prior_vehi
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.pd_hef import FILTER_ALONE
 from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
 from pdhef_logtool.estimators.table import make_estimator
@@ -69,6 +70,11 @@ def test_a_residual_of_zero_is_physics_bit_for_bit(signals: Signals) -> None:
     assert np.array_equal(hybrid.sideslip_rad, physics.sideslip_rad, equal_nan=True)
     assert np.allclose(hybrid.vy_m_s, physics.vy_m_s, atol=1e-12, equal_nan=True)
     assert np.nanmax(hybrid.network_trust) == 1.0
+
+
+def test_a_smoother_takes_the_prior_and_says_why_not_the_residual() -> None:
+    assert FILTER_ALONE in make_estimator("pd-hef-smoothed", taught_car(model())).notes
+    assert FILTER_ALONE not in make_estimator("pd-hef-smoothed", taught_car(None)).notes
 
 
 def test_the_residual_is_added_and_widens_the_interval(signals: Signals) -> None:

@@ -30,7 +30,7 @@ from pdhef_logtool.residual_model.bundle import (
     ModelBundle,
     Normalisation,
 )
-from pdhef_logtool.residual_model.features import ONE_CAR_FEATURES
+from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 
@@ -42,12 +42,12 @@ NAMES = ("pd-hef", "pd-hef-paper", "pure-lstm", "linear-regression")
 
 def make_network(target: str, outputs: int) -> ModelBundle:
     torch.manual_seed(1)
-    size = len(ONE_CAR_FEATURES)
+    size = len(FEATURES)
     network = ResidualNetwork(Architecture(size, 8, 1, (4,), outputs=outputs))
     weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
     normalisation = Normalisation((0.0,) * size, (5.0,) * size, (1.0,) * outputs)
     model = PHYSICS_MODEL if target == RESIDUAL else NOMINAL_MODEL
-    return ModelBundle(ONE_CAR_FEATURES, 8, 1, (4,), 0.01, normalisation, weights, target=target, model=model)
+    return ModelBundle(FEATURES, 8, 1, (4,), 0.01, normalisation, weights, target=target, model=model)
 
 
 #: β = 0.9 v_y,phy / 22 m/s − 0.001 a_y, at 22 m/s.

@@ -24,7 +24,8 @@ from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import concatenate
 from pdhef_logtool.runs.estimating import calibrator
 
-RIGHT = default_vehicle()
+#: The body does not roll; 0 would be a missing entry.
+RIGHT = default_vehicle().model_copy(update={"roll_gradient_rad_per_m_s2": 1e-6})
 
 
 def wrong() -> VehicleParameters:

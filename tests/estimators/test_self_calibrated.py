@@ -21,7 +21,6 @@ from pdhef_logtool.estimators.physics_filter import PhysicsFilter, physics_filte
 from pdhef_logtool.estimators.self_calibrated import (
     D2_SHARE,
     OPEN_LOOP,
-    POSTERIOR_SHARE,
     SELF_CALIBRATED,
     SelfCalibrated,
 )
@@ -178,7 +177,7 @@ def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
     read = [corrected_anew(signals, OWN, v) for v in (FOUND, *found.varied)]
     filters = [physics_filter(v, NOISE) for v in (FOUND, *found.varied)]
     middle, *others = (run_window(f, s)[0].vy_m_s for f, s in zip(filters, read, strict=True))
-    away = sum((POSTERIOR_SHARE * (vy - middle)) ** 2 for vy in others)
+    away = sum((vy - middle) ** 2 for vy in others)
     expected = plain.vy_std_m_s**2 + away
     fast = plain.vx_m_s > OWN.low_speed_blend_m_s
     np.testing.assert_allclose(alone.vy_std_m_s[fast] ** 2, expected[fast], rtol=1e-9)

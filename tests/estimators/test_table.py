@@ -51,7 +51,7 @@ from pdhef_logtool.residual_model.bundle import (
     ModelBundle,
     Normalisation,
 )
-from pdhef_logtool.residual_model.features import ONE_CAR_FEATURES, PAPER_FEATURES
+from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.runs.estimating import calibrator
@@ -66,7 +66,7 @@ LINES = tuple(s for s in all_specs() if s.name != OPEN_LOOP)
 every_spec = pytest.mark.parametrize("spec", LINES, ids=lambda spec: spec.name)
 
 
-def make_network(target: str = RESIDUAL, names: tuple[str, ...] = ONE_CAR_FEATURES, seed: int = 1) -> ModelBundle:
+def make_network(target: str = RESIDUAL, names: tuple[str, ...] = FEATURES, seed: int = 1) -> ModelBundle:
     torch.manual_seed(seed)
     outputs = 2 if target == RESIDUAL else 1
     network = ResidualNetwork(Architecture(len(names), 8, 1, (4,), outputs=outputs))

@@ -72,7 +72,9 @@ def test_a_training_holds_one_drive_and_its_pieces_of_two_batches(
     monkeypatch.setattr(train_command, "FeatureSequence", sequence)
     data = read_dataset(write_set(tmp_path / "set", 20, steps=100))
     training, validation = (
-        SplitSequences(tuple(d for d in data.drives if d.split == split), "residual", odd=False)
+        SplitSequences(
+            tuple(d for d in data.drives if d.split == split), "residual", odd=False, vehicle_of=data.vehicle
+        )
         for split in ("train", "validation")
     )
     recipe = replace(SMALL, epochs=1)

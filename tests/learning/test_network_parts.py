@@ -661,10 +661,9 @@ def arrays(count: int = 200, **changes: Any) -> DriveArrays:
 
 def dataset(**drives: tuple[str, DriveArrays]) -> Any:
     held = tuple(SimpleNamespace(name=n, split=s, load=lambda a=a: a) for n, (s, a) in drives.items())
-    slow = SimpleNamespace(low_speed_blend_m_s=3.0)
     about: dict[str, Any] = {"model": "physics", "physics_sha256": "e" * 64, "vehicle_name": "a car"}
     about["identified_share"] = 0.5
-    return SimpleNamespace(drives=held, sha256="d" * 64, vehicle=lambda _drive: slow, **about)
+    return SimpleNamespace(drives=held, sha256="d" * 64, vehicle=lambda _drive: CAR, **about)
 
 
 def test_runs_end_at_new_segments_and_short_or_worthless_ones_are_left_out() -> None:

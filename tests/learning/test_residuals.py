@@ -303,4 +303,4 @@ def test_an_offset_of_the_steering_angle_is_no_residual() -> None:
     )
     mean = (arrays.targets / arrays.step_s[:, None]).mean(axis=0)
     assert np.abs(mean).min() > 0.05
-    assert np.abs(mean - steering_offset(arrays)).max() < 0.2 * np.abs(mean).max()
+    assert np.abs(mean - steering_offset(arrays, oracle.as_vehicle())).max() < 0.2 * np.abs(mean).max()

@@ -20,7 +20,7 @@ from pdhef_logtool.residual_model.bundle import (
     ModelBundle,
     load_bundle,
 )
-from pdhef_logtool.residual_model.features import FEATURES, ONE_CAR_FEATURES
+from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel, load_linear_model
 from pdhef_logtool.residual_model.low_pass import low_pass
 from pdhef_logtool.residual_model.service import NetworkService
@@ -105,7 +105,7 @@ def velocity_network(tmp_path_factory: pytest.TempPathFactory) -> ModelBundle:
 
 def test_a_network_learns_a_velocity(velocity_network):
     assert velocity_network.target == LATERAL_VELOCITY
-    assert velocity_network.feature_names == ONE_CAR_FEATURES
+    assert velocity_network.feature_names == FEATURES
     test = velocity_sequences(200, 1)[0]
     vy, _ = NetworkService(velocity_network).run(test.features, np.zeros(len(test.weight), dtype=np.bool_), None)
     assert vy.shape == (600, 1)

@@ -52,12 +52,12 @@ def test_features_by_hand() -> None:
     posterior = np.array([[20.0, 0.4, 0.1, 0.0]])
     prior = np.array([[19.0, 0.2, 0.08, 0.0]])
     measured = (np.array([0.02]), np.array([1.5]), np.array([0.11]))
-    body, car = np.arange(1.0, 5.0)[None], np.arange(1.0, 14.0)[None]
-    given = (np.array([1.4]), np.array([0.8]), np.array([-0.5]), body, car)
+    body = np.arange(1.0, 5.0)[None]
+    given = (np.array([1.4]), np.array([0.8]), np.array([-0.5]), body)
     features = make_features(*measured, posterior, prior, *given)
     beta = np.arctan2(0.4, 20.0) - np.arctan2(0.2, 19.0)
     used = 1.5 / (0.8 * 9.80665)
-    expected = [20.0, 1.5, 0.02, 0.11, 0.03, beta, 0.4, 0.1, 0.8, -0.5, used, *body[0], *car[0]]
+    expected = [20.0, 1.5, 0.02, 0.11, 0.03, beta, 0.4, 0.1, 0.8, -0.5, used, *body[0]]
     np.testing.assert_allclose(features, [expected], rtol=1e-12)
     assert len(FEATURES) == len(expected)
 
@@ -103,7 +103,6 @@ def test_missing_measurements_look_like_agreement_with_physics() -> None:
         np.array([0.8]),
         nan,
         np.zeros((1, 4)),
-        np.zeros((1, 13)),
     )
     np.testing.assert_array_equal(features[:, :10], [[20.0, 1.4, 0.02, 0.1, 0.0, 0.0, 0.4, 0.1, 0.8, 0.0]])
 

@@ -11,13 +11,13 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.table import all_names, make_estimator
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS, model_folder, open_model
-from pdhef_logtool.residual_model.features import ONE_CAR_FEATURES
+from pdhef_logtool.residual_model.features import FEATURES
 
 
 def test_models_are_found_by_name() -> None:
     default = open_model(None)
     assert default is not None
-    assert default.feature_names == ONE_CAR_FEATURES
+    assert default.feature_names == FEATURES
     assert None not in (default.pure_lstm, default.linear_regression, default.paper_network)
     assert open_model(Path("none")) is None
     assert model_folder(Path("elsewhere")) == Path("elsewhere")

@@ -138,6 +138,12 @@ class SelfCalibration:
         return FilterNoise(q_std=Q_STD, r_std={"ay_m_s2": ay_std}, limit_gain=LIMIT_GAIN)
 
     @property
+    def error_scale(self) -> float:
+        """What the model leaves of the sensors over ``ERROR_STD``, RMS of both; 1 without a fit."""
+        scale = float(np.sqrt(np.mean((np.array(self.rms) / np.array(ERROR_STD)) ** 2)))
+        return scale if math.isfinite(scale) else 1.0
+
+    @property
     def text(self) -> str:
         """Summary in one line."""
         if not self.parameters and not self.refused:

@@ -96,7 +96,7 @@ def cells() -> list[Cell]:
 
 
 def cell_of(features: FloatArray) -> NDArray[np.int16]:
-    """Return the cell of each row of features [N, 28]; :data:`NO_CELL` where they are not known."""
+    """Return the cell of each row of features [N, 15]; :data:`NO_CELL` where they are not known."""
     speed, ay, friction = (features[:, FEATURES.index(n)] for n in ("vx_m_s", "ay_m_s2", "friction"))
     is_finite = np.isfinite(speed) & np.isfinite(ay) & np.isfinite(friction)
     number = np.zeros(len(features), dtype=np.int16)

@@ -114,6 +114,8 @@ def read_entry(path: Path) -> dict[str, Any] | None:
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             entry = json.loads(file.metadata.metadata[_ENTRY])
+            if file.schema_arrow.names != arrow_schema(_SCHEMA).names:  # no checksum covers the names
+                return None
             for _ in file.iter_batches():
                 pass
     except (OSError, KeyError, TypeError, ValueError, RecursionError, pa.ArrowException):
@@ -263,7 +265,7 @@ class DriveArrays:
 
     Attributes
     ----------
-    stamps_ns : int64 [N]. features : float32 [N, 28], finite.
+    stamps_ns : int64 [N]. features : float32 [N, 15], finite.
     targets : float32 [N, 2], increments to the next stamp in m/s and rad/s; 0 where ``weight`` is 0.
     step_s : float64 [N], time that a target covers: target / step is the residual rate; the period at the last row.
     weight : float32 [N]. segment : int64 [N]; recurrent state starts again where it changes.

@@ -26,7 +26,7 @@ import numpy as np
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import OUTPUT_COUNT, RESIDUAL, ModelBundle, Normalisation
-from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES, ONE_CAR_FEATURES, PAPER_FEATURES
+from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork, State
 from pdhef_logtool.storage.documents import is_sealed, seal
 from pdhef_logtool.storage.files import write_bytes, writing
@@ -51,7 +51,7 @@ _SHAPE = ("feature_names", "hidden", "layers", "head", "odd")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureSequence:
-    """One gap-free run of one drive: features [N, 28], target [N, m], weight [N].
+    """One gap-free run of one drive: features [N, 15], target [N, m], weight [N].
 
     The target is residual rates in m/s² and rad/s² (m = 2), or v_y in m/s (m = 1).
     """
@@ -70,7 +70,7 @@ class Recipe:
     time, in training and in service.
     """
 
-    feature_names: tuple[str, ...] = ONE_CAR_FEATURES
+    feature_names: tuple[str, ...] = FEATURES
     hidden: int = 64
     layers: int = 2
     head: tuple[int, ...] = (64, 32)

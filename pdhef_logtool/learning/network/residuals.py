@@ -75,7 +75,7 @@ class ResidualRows:
 
     Attributes
     ----------
-    stamps_ns : int64 [N]. features : [N, 28] at the stamp, NaN where the parallel filter has no state.
+    stamps_ns : int64 [N]. features : [N, 15] at the stamp, NaN where the parallel filter has no state.
     targets : [N, 2], increments of v_y in m/s and of r in rad/s from this stamp to the next; NaN where unknown.
     step_s : [N], time to the next stamp; NaN at the last row.
     weight : [N], 0 unless target and features can be used and the next row carries on from this one; 1 with exact

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.learning.network.dataset import SPLITS, Dataset, DatasetDrive, DriveArrays, read_dataset
 from pdhef_logtool.learning.network.fit import CHECKPOINT, PAPER_RECIPE, Epoch, FeatureSequence, Recipe, train
 from pdhef_logtool.learning.plots import new_figure, png_bytes
@@ -144,7 +145,7 @@ def train_on(
 ) -> TrainResult:
     """Train one network by a recipe, whose target states what it learns; the rest as :func:`run_training`."""
     splits = {
-        name: SplitSequences(tuple(d for d in data.drives if d.split == name), recipe.target, recipe.odd)
+        name: SplitSequences(tuple(d for d in data.drives if d.split == name), recipe.target, recipe.odd, data.vehicle)
         for name in SPLITS
     }
 
@@ -220,17 +221,18 @@ def _near(chosen: BoolArray) -> BoolArray:
     return np.asarray(following - index <= LEAD_STEPS, dtype=np.bool_)
 
 
-def steering_offset(rows: DriveArrays) -> FloatArray:
+def steering_offset(rows: DriveArrays, vehicle: VehicleParameters) -> FloatArray:
     """Return the residual rates [2] that an offset of the steering angle makes in a drive: no network can predict it.
 
     The offset is constant over the drive, fitted to calm driving, and shrunk where there is little of it.
     """
-    column = {name: rows.features[:, i].astype(np.float64) for i, name in enumerate(FEATURES)}
-    calm = (rows.weight > 0.0) & (column["utilisation"] < CALM_UTILISATION)
+    friction, used = (rows.features[:, FEATURES.index(n)].astype(np.float64) for n in ("friction", "utilisation"))
+    calm = (rows.weight > 0.0) & (used < CALM_UTILISATION)
     if not calm.any():
         return np.zeros(2)
-    force = float(column["front_stiffness_per_mass"][calm].mean())
-    turn = force / float((column["inertia_ratio"] * column["cg_to_rear_axle_m"])[calm].mean())
+    grip = 1.0 if vehicle.tyres.front.keeps_stiffness else float(friction[calm].mean())
+    force = grip * vehicle.cornering_stiffness_n_per_rad(True, 1.0) / vehicle.mass_kg
+    turn = force * vehicle.mass_kg * vehicle.cg_to_front_axle_m / vehicle.yaw_inertia_kg_m2
     by_angle = np.array([force, turn])
     mean = (rows.targets[calm] / rows.step_s[calm, None]).mean(axis=0)
     seconds = float(rows.step_s[calm].sum())
@@ -246,19 +248,23 @@ class SplitSequences:
     drives: tuple[DatasetDrive, ...]
     target: str
     odd: bool
+    vehicle_of: Callable[[DatasetDrive], VehicleParameters]
 
     def __iter__(self) -> Iterator[FeatureSequence]:
         """Yield them in the order of the drives; one drive is held at a time."""
-        yield from _sequences(self.drives, self.target, odd=self.odd)
+        yield from _sequences(self.drives, self.target, vehicle_of=self.vehicle_of if self.odd else None)
 
 
 def _sequences(
-    drives: Iterable[DatasetDrive], target: str = RESIDUAL, *, odd: bool = False
+    drives: Iterable[DatasetDrive],
+    target: str = RESIDUAL,
+    *,
+    vehicle_of: Callable[[DatasetDrive], VehicleParameters] | None = None,
 ) -> Iterable[FeatureSequence]:
     """Yield the gap-free runs of the drives: residual increments as rates by the true step, or the true v_y."""
     for drive in drives:
         rows = drive.load()
-        offset = steering_offset(rows) if odd else np.zeros(2)
+        offset = np.zeros(2) if vehicle_of is None else steering_offset(rows, vehicle_of(drive))
         for part in gap_free_runs(rows):
             weight = weights_of(rows, part)
             features = np.asarray(rows.features[part], dtype=np.float64)

@@ -156,7 +156,7 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
     progress("fitting the prior", 0.3)
     test = _prior_test(drives, progress)
     support = _support(test)
-    parameters = ()
+    parameters: tuple[TaughtParameter, ...] = ()
     if support > 0.0:
         parameters = taught_parameters([d.driving for d in drives], [d.slopes for d in drives], vehicle, support)
     calibrations = [_calibration(d, parameters) for d in drives]
