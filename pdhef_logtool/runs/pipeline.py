@@ -476,15 +476,14 @@ def _requirements(
     """Return the blocks of the plan's requirements in this drive, and the verdicts on the drive alone."""
     from pdhef_logtool.evaluation.requirement_blocks import MOST_BLOCKS, ScoredDrive, requirement_blocks
 
-    drive = job.drive
     blocks: list[RequirementBlocks] = []
-    slow, dependent = drive.car.vehicle.low_speed_blend_m_s, frozenset(drive.plan.dependent)
+    slow, dependent = job.car.vehicle.low_speed_blend_m_s, frozenset(job.drive.plan.dependent)
     for name in (TRUTH, REFERENCE):  # the reference where ground truth scores nothing
         if (base := store.read(name)) is not None:
             tracks = ScoredDrive(store.read, base, scored.masks, slow, dependent, estimated=name == REFERENCE)
             left = [r for r in job.validation.requirements if all(b.of != r.measured for b in blocks)]
             blocks += requirement_blocks(left, main, tracks, _BRIEF_BLOCKS if brief else MOST_BLOCKS)
-    return judged_alone(job.validation, drive, main, scored.rows, blocks, space)
+    return judged_alone(job.validation, job.drive, main, scored.rows, blocks, space)
 
 
 def judged_alone(
