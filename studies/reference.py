@@ -455,7 +455,8 @@ The V40's ground truth is documented as 0.32 m behind the CG. With it at the ant
 {faults}
 
 ## GNSS in the causal filter
-`physics` without calibration, and with the GNSS velocity, which arrives {late:.0f} ms late. In {worse} of {all} rows it is worse with GNSS by more than 5 % and 0.003°.
+`physics` without calibration, and with the GNSS velocity, which arrives {late:.0f} ms late. In {worse} of {all} rows it
+is worse with GNSS by more than 5 % and 0.003°.
 
 {causal}
 
