@@ -112,8 +112,8 @@ def _filter(values, first, last, backwards, passed):  # type: ignore[no-untyped-
 def disturbance(turn_low, ay_low, speed, p):  # type: ignore[no-untyped-def]
     """Return the lateral acceleration by the bank of the road: what a_y lacks of v_x r for long, but for slides.
 
-    Crossfall is as large as errors of a_y, and superelevation goes with a_y as body roll does: no drive tells them
-    apart, and bias and roll gain keep their priors.
+    Crossfall is as large as errors of a_y, and superelevation goes with a_y as body roll does: no drive
+    distinguishes them, and bias and roll gain keep their priors.
     """
     lacks = turn_low - speed * p.rate_bias - (ay_low - p.ay_bias) / p.ay_gain
     return math.copysign(max(0.0, abs(lacks) - BANK_SHARE * max(0.0, abs(ay_low) - LINEAR_AY)), lacks)
