@@ -119,19 +119,29 @@ def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str])
     verdicts = None if result.requirements is None else plan_line(result.requirements)
     texts = [_texts(report) for report in reports]
     if len(result.results) == 1:
-        said = texts[0].get("result", "nothing was estimated") if texts else "the log failed"
+        said = (texts[0].get("result") or _recorded(reports[0])) if texts else "the log failed"
     else:
         said = f"{len(reports)} of {len(result.results)} logs are done"
     steps = list(dict.fromkeys(c for t in texts for c in _clauses(t, "next")))
     given = result.requirements
-    if given is not None and given.plan.file:
+    if given is not None:
         ordered = sorted(given.verdicts, key=lambda v: v.outcome != "FAIL")
-        steps = [*dict.fromkeys(f"{v.requirement.id}: {v.next}" for v in ordered if v.next), *steps]
+        asked = [*dict.fromkeys(f"{v.requirement.id}: {v.next}" for v in ordered if v.next)]
+        steps = [*asked, *steps] if given.plan.file else [*steps, *asked]
     return _three_lines(
         said if verdicts is None else Text.assemble(verdicts, f"; {said}"),
-        "; ".join(assumed) or "differs by log, see below",
+        "; ".join(assumed) or ("differs by log, see below" if len(reports) > 1 else "nothing beside the log"),
         steps[0] if steps else "nothing is needed; pdhef view OUTPUT shows the drive",
     )
+
+
+def _recorded(report: _Report) -> str:
+    """Return the sideslip error of recorded estimates in words."""
+    figures, names = _figures(report), [e["name"] for e in report["estimators"] if e["outcome"] == "ran"]
+    errors = [(n, e) for n in names if (e := figures.get((n, "sideslip_rad", "all", "rmse"))) is not None]
+    if not errors:
+        return f"sideslip of {', '.join(names)} is not scored" if names else "nothing was estimated"
+    return f"sideslip RMSE of {', '.join(f'{name}: {degrees(error)}' for name, error in errors)}"
 
 
 def _three_lines(result: str | Text, assumed: str, following: str) -> Table:

@@ -1,8 +1,10 @@
-"""Channels on one even grid, low-passed: what relations between signals are looked at on."""
+"""Channels on one even grid, low-passed, and regressions on it with errors that count independent samples."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -13,7 +15,7 @@ GRID_S = 0.05
 LOW_PASS_HZ = 1.0
 #: Samples are interpolated onto the grid over gaps of at most this length, and of this many of their periods.
 MAX_GAP_S, MAX_GAP_PERIODS = 0.5, 2.5
-#: Values so many times farther out than all but 1 % of a channel, for so short a time, are spikes.
+#: Values beyond so many ranges of 99 % of a channel, for so short a time, are spikes.
 SPIKE_RANGES, SPIKE_S = 5.0, 0.2
 #: A slower sensor does not resolve manoeuvres.
 LONGEST_GAP_S = 2.5
@@ -23,11 +25,14 @@ MAX_CELLS = 1_500_000
 PART_S, MOST_PARTS = 4.0, 12
 #: Moving: faster than this share of the drive's fast speeds, and than a speed that is too low for the relations.
 MOVING_SHARE, MIN_MOVING_M_S = 0.25, 0.5
+#: Blocks of a drive that errors are estimated from; fewer give no information on them.
+LEAST_BLOCKS, MOST_BLOCKS = 4, 10
 
 
 def columns_on_grid(channels: Mapping[str, Channel]) -> dict[str, FloatArray]:
     """Return the scalar channels with two samples or more on one even grid of ``GRID_S``; NaN in gaps."""
-    used = {n: without_spikes(c) for n, c in channels.items() if len(c) > 1 and c.values.ndim == 1}
+    sound = {n: without_spikes(c) for n, c in channels.items() if len(c) > 1 and c.values.ndim == 1}
+    used = {n: c for n, c in sound.items() if len(c) > 1}
     if not used:
         return {}
     start = min(int(c.stamps_ns[0]) for c in used.values())
@@ -40,10 +45,15 @@ def columns_on_grid(channels: Mapping[str, Channel]) -> dict[str, FloatArray]:
 
 
 def without_spikes(channel: Channel) -> Channel:
-    """Return a channel without samples far outside its range for a moment: a bus's mark of invalid values."""
-    low, middle, high = np.quantile(channel.values, (0.005, 0.5, 0.995))
-    with np.errstate(over="ignore"):
-        out = np.abs(channel.values - middle) > SPIKE_RANGES * max(high - low, 1e-9)
+    """Return a channel without samples far outside its range for a moment: a bus's mark of invalid values.
+
+    Beyond 1e12 all numbers are one, and below 1e-12: their squares must be finite.
+    """
+    values = np.clip(channel.values, -1e12, 1e12)
+    values[np.abs(values) < 1e-12] = 0.0
+    channel = replace(channel, values=values).take(np.isfinite(values))
+    low, middle, high = np.quantile(channel.values, (0.005, 0.5, 0.995)) if len(channel) else (0.0, 0.0, 0.0)
+    out = np.abs(channel.values - middle) > SPIKE_RANGES * max(high - low, 1e-9)
     if not out.any():
         return channel
     first, end = np.flatnonzero(np.diff(out, prepend=False, append=False)).reshape(-1, 2).T
@@ -68,10 +78,10 @@ def earlier(column: FloatArray, by_s: float) -> FloatArray:
 def running_mean(column: FloatArray, over_s: float) -> FloatArray:
     """Return the mean of a column of the grid over a time about each cell; NaN beside gaps."""
     half = min(round(0.5 * over_s / GRID_S), column.shape[0] - 1)
-    known = np.flatnonzero(np.isfinite(column))
-    if known.size:  # the ends of what is known go on
+    finite = np.flatnonzero(np.isfinite(column))
+    if finite.size:  # the ends of what is known go on
         column = column.copy()
-        column[: known[0]], column[known[-1] + 1 :] = column[known[0]], column[known[-1]]
+        column[: finite[0]], column[finite[-1] + 1 :] = column[finite[0]], column[finite[-1]]
     return np.convolve(np.pad(column, half, "edge"), np.full(2 * half + 1, 1.0 / (2 * half + 1)), "valid")
 
 
@@ -147,3 +157,45 @@ def median_known(column: FloatArray) -> float:
     """Return the median of what is known of a column [N], 0 where nothing is."""
     finite = column[np.isfinite(column)]
     return float(np.median(finite)) if finite.size else 0.0
+
+
+def fit(
+    measured: FloatArray, regressors: Sequence[FloatArray], use: BoolArray
+) -> tuple[FloatArray, FloatArray, float] | None:
+    """Regress a column on others where ``use`` and all are known.
+
+    Returns
+    -------
+    coefficients, standard errors with the independent samples counted, and the residual's 1-sigma; None where there
+    are too few, or where the regressors do not vary apart from one another.
+    """
+    matrix = np.stack(regressors, axis=1)
+    usable = use & np.isfinite(measured) & np.isfinite(matrix).all(axis=1)
+    samples = independent_samples(int(np.count_nonzero(usable)))
+    if samples < 4.0 * len(regressors):
+        return None
+    a, b = matrix[usable], measured[usable]
+    scale = np.linalg.norm(a, axis=0)
+    if (scale <= 1e-12).any() or np.linalg.cond(a / scale) > 1e4:
+        return None
+    coefficients = np.linalg.lstsq(a / scale, b, rcond=None)[0] / scale
+    spread = float(np.sqrt(np.mean((b - a @ coefficients) ** 2) * samples / (samples - len(regressors))))
+    covariance = np.linalg.inv(a.T @ a / a.shape[0]) * spread**2 / samples
+    errors = np.maximum(np.sqrt(np.diag(covariance)), _block_errors(a / scale, b, samples) / scale)
+    return coefficients, errors, spread
+
+
+def _block_errors(a: FloatArray, b: FloatArray, samples: float) -> FloatArray:
+    """Return the jackknife's standard errors of a regression over blocks of the drive; 0 with too few samples.
+
+    What is left is not noise: grade, crossfall, roll and sliding last as long as a bend does.
+    """
+    count = min(MOST_BLOCKS, int(samples // (2.0 * a.shape[1])))
+    if count < LEAST_BLOCKS:
+        return np.zeros(a.shape[1])
+    edges = np.linspace(0, a.shape[0], count + 1).astype(int)
+    squares = [a[i:j].T @ a[i:j] for i, j in pairwise(edges)]
+    products = [a[i:j].T @ b[i:j] for i, j in pairwise(edges)]
+    square, product = sum(squares), sum(products)
+    without = [np.linalg.lstsq(square - s, product - p, rcond=None)[0] for s, p in zip(squares, products, strict=True)]
+    return np.asarray(np.std(without, axis=0) * np.sqrt(count - 1.0) * student(count))

@@ -73,10 +73,10 @@ class EvenGrid:
 
 
 def _without_trend(values: FloatArray) -> FloatArray:
-    known, n = np.flatnonzero(np.isfinite(values)), values.shape[0]
-    if known.size < 2:
+    finite, n = np.flatnonzero(np.isfinite(values)), values.shape[0]
+    if finite.size < 2:
         return values
-    slope, offset = np.polyfit(known / n, values[known], 1)
+    slope, offset = np.polyfit(finite / n, values[finite], 1)
     return np.asarray(values - offset - slope * (np.arange(n) / n), dtype=np.float64)
 
 
@@ -123,8 +123,8 @@ def shift_error(grid: CommonGrid, shift_s: float) -> float:
     parts = zip((grid.a, grid.b), _overlap(grid.a.shape[0], steps), strict=True)
     a, b = (np.convolve(values[part], kernel, "valid") for values, part in parts)
     slope = np.gradient(a, grid.step_s)
-    known = np.isfinite(a) & np.isfinite(b) & np.isfinite(slope)
-    a, b, slope = a[known], b[known], slope[known]
+    finite = np.isfinite(a) & np.isfinite(b) & np.isfinite(slope)
+    a, b, slope = a[finite], b[finite], slope[finite]
     if a.size < 4 * _ERROR_BLOCKS or not a.any():
         return math.inf
     time = np.linspace(-1.0, 1.0, a.size)
@@ -172,9 +172,9 @@ def _rough_correlations(a: FloatArray, b: FloatArray, reach: int) -> tuple[Float
     size = 1 << (a.shape[0] + reach).bit_length()
     spectra = []
     for values in (_unit_power(a), _unit_power(b)):
-        known = np.isfinite(values)
-        values = np.where(known, values, 0.0)
-        spectra.append(np.fft.rfft([known, values, values * values], size))
+        finite = np.isfinite(values)
+        values = np.where(finite, values, 0.0)
+        spectra.append(np.fft.rfft([finite, values, values * values], size))
 
     def sums(of_a: int, of_b: int) -> FloatArray:
         every = np.fft.irfft(np.conj(spectra[0][of_a]) * spectra[1][of_b], size)

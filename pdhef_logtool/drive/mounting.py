@@ -315,9 +315,8 @@ def _parts_turned(turn: _Turn, yaw_deg: float) -> bool:
             return False
         left = np.linalg.lstsq(scaled, z[usable], rcond=None)[0][0]
         angles.append((yaw_deg - math.degrees(float(np.angle(left)))) * np.sign(yaw_deg))
-    return min(angles) > TURNED_DEG and abs(angles[0] - angles[1]) < max(
-        PARTS_AGREE_DEG, PARTS_AGREE_SHARE * abs(yaw_deg)
-    )
+    apart_deg = max(PARTS_AGREE_DEG, PARTS_AGREE_SHARE * abs(yaw_deg))
+    return bool(min(angles) > TURNED_DEG and abs(angles[0] - angles[1]) < apart_deg)
 
 
 def _parts_tilted(turn: _Turn) -> bool:

@@ -11,8 +11,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from pdhef_logtool.drive.checks.by_relations import explained_factors
+from pdhef_logtool.drive.checks.kind import SURE
 from pdhef_logtool.drive.checks.sensor_errors import ay_delay, sensor_errors
-from pdhef_logtool.drive.checks.truth_sideslip import is_turned, sideslip_offset
+from pdhef_logtool.drive.checks.truth_sideslip import SIDESLIP_OFFSET_RAD, sideslip_offset
 from pdhef_logtool.drive.mounting import Survey, scaled_source, turned_signals
 from pdhef_logtool.drive.truth import LATE_GYRO_S
 from pdhef_logtool.mapping.records import Mapping, SignalSource
@@ -95,9 +96,11 @@ def _delays(survey: Survey) -> dict[str, tuple[float, str]]:
 def _of_a_turned_truth(survey: Survey) -> list[Proposal]:
     """Return corrected sources of ground truth whose sideslip has a constant offset, if a mapping can correct it."""
     offset_and_error = sideslip_offset(survey.measured.columns)
-    if offset_and_error is None or survey.truth is None or not is_turned(*offset_and_error):
+    if offset_and_error is None or survey.truth is None:
         return []
     offset, error = offset_and_error
+    if abs(offset) - SURE * error <= SIDESLIP_OFFSET_RAD:
+        return []
     truth = survey.mapping.truth
     evidence = f"sideslip is {math.degrees(offset):.2f} +- {math.degrees(error):.2f} deg where the car goes straight"
     vx, vy = truth.get("vx_m_s"), truth.get("vy_m_s")

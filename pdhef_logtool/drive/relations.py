@@ -9,7 +9,7 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
-from pdhef_logtool.drive.hypotheses import BLOCKS, MIN_SAMPLES, Relation, block_gains
+from pdhef_logtool.drive.hypotheses import BLOCKS, MIN_CORRELATION, MIN_SAMPLES, Relation, block_gains
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
 #: What is left of two columns by regression is small, and a car that slides leaves it related otherwise.
@@ -113,7 +113,7 @@ def compare(
     # The ratio of the spreads lies between the two regressions, as the position of the noise is unknown.
     gain = float(np.copysign(spread_b / spread_a, correlation))
     # A block of fewer samples has a gain by chance.
-    blocks = block_gains(a, b, min(BLOCKS, int(samples / MIN_SAMPLES)))
+    blocks = block_gains(a, b, min(BLOCKS, max(1, int(samples / MIN_SAMPLES))))
     return [Relation(text, powers, correlation, gain, expected, samples, both, blocks=blocks)]
 
 
@@ -435,9 +435,7 @@ def _partial(
     if np.nanstd(left[0]) < separable * np.std(reference[finite]):
         return []
     relations = compare(text, powers, left[0], left[1], finite, (0.0, np.inf))
-    return [r if _is_steady(r) else replace(r, least_correlation=MIN_PARTIAL_CORRELATION) for r in relations]
-
-
-def _is_steady(relation: Relation) -> bool:
-    """Return whether so many blocks of the drive agree on the sign that it is no chance."""
-    return len(relation.blocks) > BLOCKS // 2 and len(set(np.sign(relation.blocks))) == 1
+    # That so many blocks of the drive agree on the sign is no chance.
+    is_steady = [len(r.blocks) > BLOCKS // 2 and len(set(np.sign(r.blocks))) == 1 for r in relations]
+    least = [MIN_CORRELATION if steady else MIN_PARTIAL_CORRELATION for steady in is_steady]
+    return [replace(r, least_correlation=n) for r, n in zip(relations, least, strict=True)]

@@ -8,10 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference, block_bootstrap_interval
+from pdhef_logtool.evaluation.requirement_blocks import BLOCK_S
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
-
-#: Errors are correlated over seconds (docs/method.md#evaluation).
-BLOCK_S = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -86,15 +86,11 @@ def operating_space(
             totals[1] += np.bincount(cell[scored], minlength=size)
             totals[2] += np.bincount(cell[scored], weights=error[scored] ** 2, minlength=size)
     seconds, counts, squares = totals
-    cells = tuple(
-        Cell(
-            speed=int(cell_index // shape[1]),
-            ay=int(cell_index % shape[1]),
-            seconds=float(seconds[cell_index]),
-            scored=int(counts[cell_index]),
-            sideslip_mse_rad2=float(squares[cell_index] / counts[cell_index]) if counts[cell_index] else float("nan"),
-        )
-        for cell_index in np.flatnonzero(seconds)
-    )
+    with np.errstate(invalid="ignore"):
+        errors = squares / counts
+    cells = [
+        Cell(*divmod(int(i), shape[1]), float(seconds[i]), int(counts[i]), float(errors[i]))
+        for i in np.flatnonzero(seconds)
+    ]
     friction = signals.friction[np.isfinite(signals.friction)]
     return OperatingSpace(cells, float(np.median(friction)) if friction.size else vehicle.assumed_friction)

@@ -21,7 +21,6 @@ from pdhef_logtool.records.tracks import StateTrack
 
 #: What a drive is judged by, in the order in which it is given.
 JUDGED_SIGNALS = ("sideslip_rad", "vy_m_s", "yaw_rate_rad_s", "vx_m_s")
-_LEVEL = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +66,8 @@ def standings(
                 if best is None or theirs < best[0]:
                     best = theirs, rival, rmse_difference_interval(squares, counts)
         rival_rmse, chosen, difference = best or (None, None, None)
-        rmse = None if alone is None else _rmse(alone)
         bounded = None if difference is None else _with_bounds(difference)
-        block_s = BLOCK_S if alone is None else alone.block_s
+        rmse, block_s = (None, BLOCK_S) if alone is None else (_rmse(alone), alone.block_s)
         results.append(Standing(signal, name, rmse, chosen, rival_rmse, bounded, block_s))
     return results
 
@@ -80,7 +78,7 @@ def _blocks(signal: str, name: str, rival: str | None, drive: ScoredDrive) -> Re
 
 def _rmse(blocks: RequirementBlocks) -> Interval:
     counts, values = np.array(blocks.n, dtype=np.float64), np.array(blocks.value)
-    of = pooled(counts, values, None, squares=True, positive=True, level=_LEVEL)
+    of = pooled(counts, values, None, squares=True, positive=True, level=0.95)
     return _with_bounds(Interval(of.value, of.low, of.high, of.units))
 
 

@@ -12,8 +12,9 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.table import Options, runnable
 from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference
-from pdhef_logtool.evaluation.comparison import BLOCK_S, Errors, end_to_end
+from pdhef_logtool.evaluation.comparison import Errors, end_to_end
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
+from pdhef_logtool.evaluation.requirement_blocks import BLOCK_S
 from pdhef_logtool.learning.drives import load_drive
 from pdhef_logtool.learning.evidence.trust import MIN_BLOCKS
 from pdhef_logtool.logs.discovery import LogInput

@@ -161,8 +161,8 @@ def signal_values(data: NDArray[np.uint8], signal: Signal) -> FloatArray:
 
 def fit_of(database: Database, sent: frozenset[int]) -> float:
     """Return how well a database describes the identifiers of a bus: those it defines, times their share of its own."""
-    known = sum(m.frame_id in sent for m in database.messages)
-    return known**2 / max(1, len(database.messages))
+    defined = sum(m.frame_id in sent for m in database.messages)
+    return defined**2 / max(1, len(database.messages))
 
 
 def signal_groups(message: Message) -> Iterator[tuple[str, list[Signal], Selectors]]:

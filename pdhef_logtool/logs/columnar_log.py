@@ -200,8 +200,8 @@ class ColumnarLog(DriveLog):
 
     def definition(self, path: Path) -> Path:
         """Return a file that defines something of the log; a mere name is that of an attached one."""
-        own = None if path.exists() and len(path.parts) > 1 else {p.name: p for p in self.databases}.get(path.name)
-        return own or path
+        attached = {} if path.exists() and len(path.parts) > 1 else {p.name: p for p in self.databases}
+        return attached.get(path.name, path)
 
     def _extract(self, name: str, data: bytes) -> Path:
         """Write a file that the log contains, to be read until the log is closed."""

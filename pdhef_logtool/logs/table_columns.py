@@ -285,17 +285,20 @@ def _of_long_form(sheet: Sheet, stamps: IntArray) -> Iterator[tuple[Sheet, IntAr
     signal, value = (next((c for n, c in named.items() if p.fullmatch(n)), None) for p in (_SIGNAL, _VALUE))
     if signal is None or isinstance(signal, np.ndarray) or not isinstance(value, np.ndarray):
         return
-    names, units = signal.to_numpy(), named.get("unit", named.get("units"))
+    import polars as pl
+
+    rows_of = pl.DataFrame({"signal": signal}).with_row_index().drop_nulls().group_by("signal", maintain_order=True)
+    grouped, units = rows_of.agg("index"), named.get("unit", named.get("units"))
+    if grouped.height**2 > 100 * len(signal):  # texts of another kind
+        return
     clocks: dict[bytes, tuple[Sheet, IntArray]] = {}
-    for title in signal.unique(maintain_order=True).drop_nulls().to_list():
-        rows = np.flatnonzero(names == title)
+    for title, numbers in zip(grouped["signal"], grouped["index"], strict=True):
+        rows = numbers.to_numpy()
         part, _ = clocks.setdefault(stamps[rows].tobytes(), (Sheet(sheet.name, {}, {}), stamps[rows]))
         (field,), given = read_head([title])
-        cells = (
-            units[rows[:1].tolist()].to_list() if units is not None and not isinstance(units, np.ndarray) else [None]
-        )
+        cell = None if units is None or isinstance(units, np.ndarray) else units[int(rows[0])]
         part.columns[field] = value[rows]  # type: ignore[index]
-        part.units[field] = cells[0] or given.get(field, "")  # type: ignore[index]
+        part.units[field] = cell or given.get(field, "")  # type: ignore[index]
     yield from clocks.values()
 
 

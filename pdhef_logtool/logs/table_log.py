@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 #: End of the name of a column that is made of a magnitude and its sign, and how the name of a sign differs from it.
 SIGNED = "_signed"
-_SIGN = re.compile(r"(?<=_)(?:VZ|vorzeichen|sign|sgn)_|_(?:VZ|vorzeichen|sign|sgn)$", re.IGNORECASE)
+_SIGN = re.compile(r"(?<![A-Za-z0-9])(?:VZ|vorzeichen|sign|sgn)_|_(?:VZ|vorzeichen|sign|sgn)$", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +76,8 @@ def _with_signs(table: Table) -> Table:
         magnitude = path.removesuffix(SIGNED)
         if magnitude == path or magnitude not in signs:
             return table.load(path, rows)
-        return np.where(table.load(signs[magnitude], rows) > 0, -1.0, 1.0) * np.abs(table.load(magnitude, rows))
+        negative = table.load(signs[magnitude], rows) > 0
+        return np.where(negative, -1.0, 1.0) * np.abs(np.asarray(table.load(magnitude, rows), np.float64))
 
     more = (replace(names[magnitude], path=f"{magnitude}{SIGNED}") for magnitude in signs)
     return replace(table, fields=(*table.fields, *more), load=load)

@@ -16,7 +16,7 @@ from typing import TypeAlias
 #: Gravity by which accelerations in g are written.
 G_M_S2 = 9.80665
 
-#: What the code looks names up in: words, units and rules, with their comments.
+#: Words, units and rules that names are compared with.
 VOCABULARY = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 #: Factors to SI by kind of quantity and word of a unit.
 UNITS: dict[str, dict[str, float]] = VOCABULARY["units"]
@@ -50,7 +50,7 @@ def words_of(name: str) -> tuple[str, ...]:
     return tuple(words)
 
 
-#: A wheel as ``FrL``, and behind letters that stand for its speed.
+#: A wheel as ``FrL``, and behind letters for a speed.
 _SIDES = re.compile(r"(?<=[a-z_])(Fr|Re)([LR])(?![a-z])")
 _CORNER_SPEED = re.compile(r"(?:ws|vw|w|v|n)(?=(?:fl|fr|rl|rr)$)")
 
@@ -146,14 +146,13 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
     index = re.search(r"\[(\d+)\]$", leaf)
     column = None if index is None else int(index[1])
     named = f"{leaf}_{_plain_unit(unit_text)}" if unit_text else leaf
-    own = _strength_of_leaf(leaf_words, inner, named, has_unit=bool(unit_text))
-    if own is None:
+    of_leaf = _strength_of_leaf(leaf_words, inner, named, has_unit=bool(unit_text))
+    if of_leaf is None:
         return None
-    scopes = [(own, leaf_words, leaf)] if own else []
+    scopes = [(of_leaf, leaf_words, leaf)] if of_leaf else []
     scopes.append((0.9, (*inner, *leaf_words), path))
-    if all(
-        w in _WORDS["bare"] or not w.isalpha() for w in leaf_words
-    ):  # else a topic's name does not describe each field
+    # A topic's name describes each field only where the leaf identifies no quantity.
+    if all(w in _WORDS["bare"] or not w.isalpha() for w in leaf_words):
         scopes.append((0.7, (*outer, *inner, *leaf_words), f"{topic} {path}"))
     for strength, words, where in scopes:
         quantity = _quantity(words, leaf_words, column, strength, named)

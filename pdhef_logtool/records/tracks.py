@@ -153,7 +153,8 @@ class StateTrack:
         if not slow.any():
             return self
         beta, std = (np.where(slow, np.nan, c) for c in (self.sideslip_rad, self.sideslip_std_rad))
-        return replace(self, sideslip_rad=beta, sideslip_std_rad=std)
+        columns = {f.name: getattr(self, f.name) for f in fields(self)}
+        return StateTrack(**(columns | {"sideslip_rad": beta, "sideslip_std_rad": std}))
 
     @property
     def something_known(self) -> BoolArray:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.evaluation.dead_reckoned import aligned_path
-from pdhef_logtool.evaluation.largest_errors import ErrorPlace
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
@@ -30,6 +29,7 @@ from pdhef_logtool.reports.charts import (
 from pdhef_logtool.reports.colours import FAULT, NOTE, PLAIN, colour
 from pdhef_logtool.reports.drive_series import DriveSeries, Points, Reference, SideslipTrack, Tracks, gather
 from pdhef_logtool.reports.encoding import grid_of
+from pdhef_logtool.results.error_places import ErrorPlace
 from pdhef_logtool.results.sink import TRUTH
 
 #: What nobody sees on a page, in degrees, as a share, and in m/s or m/s².

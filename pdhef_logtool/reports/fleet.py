@@ -77,7 +77,6 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
         "steps": next_steps(run.document.get("plan")),
         "worst": _worst(fleet, charts),
         "verdicts": Counter(d.verdict for d in fleet.scored if d.verdict),
-        "paired": _paired(fleet),
         "answer": next((d for d in fleet.distributions if (d.estimator, d.signal) == (ANSWER, JUDGED)), None),
         "rows": _rows(_told(fleet)),
         "mains": {ANSWER} if len(mains) > 1 else mains,
@@ -189,23 +188,6 @@ def _histogram(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     edges = np.linspace(0.0, most, bars + 1)
     counts, _ = np.histogram(np.minimum(values, most), edges)
     return edges, counts.astype(np.float64)
-
-
-def _paired(fleet: Fleet) -> str:
-    """Return how the selected estimate is against the rival over drives, in words; empty without one."""
-    rival = _rival(fleet)
-    rank = next((r for r in fleet.ranking if r.estimator == rival), None)
-    if rank is None or rank.against_answer is None or len(fleet.scored) < 2:
-        return ""
-    change = rank.against_answer
-    side = "above" if change.value >= 0.0 else "below"
-    how = f"In the median of drives the error of {rival} is {abs(change.value):.1%} {side} the selected estimate's"
-    if not math.isfinite(change.low):
-        return f"{how}; inconclusive with so few drives."
-    bounds = f"{how} (95 % between {change.low:+.1%} and {change.high:+.1%})"
-    if change.low > 0.0:
-        return f"{bounds}: the selected estimate is better."
-    return f"{bounds}: {'the selected estimate is worse.' if change.high < 0.0 else 'no significant difference.'}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -84,7 +84,7 @@ def topic_of(estimator: str, what: str) -> str:
 
 
 def has_pose(track: StateTrack) -> BoolArray:
-    """Return the stamps [N] of which ``odometry`` and ``path`` can contain the pose."""
+    """Return whether each stamp [N] has a pose, which ``odometry`` and ``path`` need."""
     return track.valid & np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
 
 

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.compiled.sources import compiled_digest
 from pdhef_logtool.evaluation.dead_reckoned import PathDrift
-from pdhef_logtool.evaluation.largest_errors import ErrorPlace
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.operating_space import OperatingSpace
@@ -26,6 +25,7 @@ from pdhef_logtool.logs.byte_account import ByteLedger, checksummed_share
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.results.error_places import ErrorPlace
 from pdhef_logtool.results.selected_estimate import MainFacts, answer_of
 from pdhef_logtool.results.sink import Event
 from pdhef_logtool.results.verdicts import verdicts_of

@@ -81,8 +81,6 @@ def _without_sideslip(report: Mapping[str, Any]) -> bool:
 
 
 _KEYS = ("estimator", "signal", "segment", "metric")
-#: Relative differences from which on, and below which, no percentage is given.
-_MANY, _FEW = 10.0, 0.005
 
 
 def _outcome(standing: Standing) -> Outcome:
@@ -116,7 +114,7 @@ def _against(standing: Standing, outcome: Outcome) -> str:
     if outcome == "same":
         return f"{'equal to' if difference.value == 0.0 else 'no relevant difference to'} {beside}"
     share = abs(difference.value) / standing.rival_rmse if standing.rival_rmse else math.inf
-    by = "" if share >= _MANY else "less than 1 % " if share < _FEW else f"{100.0 * share:.0f} % "
+    by = "" if share >= 10.0 else "less than 1 % " if share < 0.005 else f"{100.0 * share:.0f} % "
     how = f"{by}{'lower' if difference.value < 0.0 else 'higher'} than {beside}"
     if not math.isfinite(difference.low):
         return f"{how}, difference not tested"

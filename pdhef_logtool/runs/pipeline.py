@@ -432,8 +432,8 @@ def _facts(
     losses: Sequence[Loss],
 ) -> ReportFacts:
     """Gather the content of report.json; ``ran``: intervals, and the estimators that failed with their reasons."""
-    from pdhef_logtool.evaluation.largest_errors import largest_errors
     from pdhef_logtool.evaluation.operating_space import operating_space
+    from pdhef_logtool.results.error_places import largest_errors
     from pdhef_logtool.runs.drive_details import drive_details
 
     drive, (store, signals), (intervals, failed) = job.drive, estimates, ran
@@ -455,7 +455,6 @@ def _facts(
     digests = {name: a.sha256[:SHOWN_DIGITS] for name, a in algorithms.items()}
     rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows]
     truth, selected, vehicle = store.read(TRUTH), store.read(main.name), job.car.vehicle
-    assert selected is not None
     space = operating_space(signals, truth, selected, vehicle)
     others = [t for n in (REFERENCE, PHYSICS, *algorithms) if n != main.name and (t := store.read(n)) is not None]
     return replace(
@@ -465,7 +464,7 @@ def _facts(
         reference=None if job.reference is None else job.reference.document,
         main=main,
         space=space,
-        largest_errors=largest_errors(selected, truth, others, vehicle.low_speed_blend_m_s),
+        largest_errors=[] if selected is None else largest_errors(selected, truth, others, vehicle.low_speed_blend_m_s),
         details=drive_details(drive, job.ready, main.name, store.read, signals, brief=config.kept != "full"),
         requirements=_requirements(job, main.name, scored, store, space, brief=config.kept == "metrics"),
     )
@@ -477,15 +476,14 @@ def _requirements(
     """Return the blocks of the plan's requirements in this drive, and the verdicts on the drive alone."""
     from pdhef_logtool.evaluation.requirement_blocks import MOST_BLOCKS, ScoredDrive, requirement_blocks
 
-    drive, truth = job.drive, store.read(TRUTH)
-    reference = None if truth is not None else store.read(REFERENCE)
-    base = reference if truth is None else truth
-    blocks = []
-    if base is not None:
-        slow, dependent = drive.car.vehicle.low_speed_blend_m_s, frozenset(drive.plan.dependent)
-        tracks = ScoredDrive(store.read, base, scored.masks, slow, dependent, estimated=truth is None)
-        blocks = requirement_blocks(job.validation.requirements, main, tracks, _BRIEF_BLOCKS if brief else MOST_BLOCKS)
-    return judged_alone(job.validation, drive, main, scored.rows, blocks, space)
+    blocks: list[RequirementBlocks] = []
+    slow, dependent = job.car.vehicle.low_speed_blend_m_s, frozenset(job.drive.plan.dependent)
+    for name in (TRUTH, REFERENCE):  # the reference where ground truth scores nothing
+        if (base := store.read(name)) is not None:
+            tracks = ScoredDrive(store.read, base, scored.masks, slow, dependent, estimated=name == REFERENCE)
+            left = [r for r in job.validation.requirements if all(b.of != r.measured for b in blocks)]
+            blocks += requirement_blocks(left, main, tracks, _BRIEF_BLOCKS if brief else MOST_BLOCKS)
+    return judged_alone(job.validation, job.drive, main, scored.rows, blocks, space)
 
 
 def judged_alone(

@@ -192,9 +192,9 @@ class _Scoring:
 
     def score(self, drive: Drive, outputs: OutputFolder | None) -> LogResult:
         """Read, compare and, with a folder, write."""
-        from pdhef_logtool.evaluation.largest_errors import largest_errors
         from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
         from pdhef_logtool.evaluation.operating_space import operating_space
+        from pdhef_logtool.results.error_places import largest_errors
 
         plan = drive.plan
         self.reporter.progress(drive.name, 0.1)
@@ -326,16 +326,16 @@ class _Scoring:
             figures: list[MetricRow] = []
             if reference is not None:
                 figures += reference_rows([r.track], reference, masks, log=drive.name, low_speed_m_s=slow)
-            base = reference if at_stamps is None else at_stamps
             same = {
                 name: f"the ground truth's {name} equals that of the estimate {r.track.name}"
                 for name in SCORED_SIGNALS
                 if at_stamps is not None and _same_column(getattr(r.track, name), getattr(at_stamps, name))
             }
             dependent |= same
-            if base is not None:
-                tainted = frozenset({**plan.dependent, **same})
-                blocks += self._blocks(r, base, masks, tainted, alone=len(recorded) == 1, estimated=at_stamps is None)
+            tainted, alone = frozenset({**plan.dependent, **same}), len(recorded) == 1
+            for base in (b for b in (at_stamps, reference) if b is not None):
+                more = self._blocks(r, base, masks, tainted, alone=alone, estimated=base is reference)
+                blocks += [b for b in more if all((b.of, b.estimator) != (x.of, x.estimator) for x in blocks)]
             if at_stamps is not None:
                 figures += score_track(
                     r.track,

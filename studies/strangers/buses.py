@@ -5,6 +5,7 @@ A topic is a message, its type the bus. Every field takes 16 bits, from the firs
 
 from __future__ import annotations
 
+import datetime as dt
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -62,20 +63,10 @@ def _mdf(frames: Sequence[_Frame], path: Path) -> None:
     import asammdf
     from asammdf.blocks.source_utils import Source
 
-    kind = np.dtype(
-        [
-            ("CAN_DataFrame.BusChannel", "<u1"),
-            ("CAN_DataFrame.ID", "<u4"),
-            ("CAN_DataFrame.IDE", "<u1"),
-            ("CAN_DataFrame.DLC", "<u1"),
-            ("CAN_DataFrame.DataLength", "<u1"),
-            ("CAN_DataFrame.DataBytes", "(8,)u1"),
-        ]
-    )
+    parts = ("BusChannel", "<u1"), ("ID", "<u4"), ("IDE", "<u1"), ("DLC", "<u1"), ("DataLength", "<u1")
+    kind = np.dtype([(f"CAN_DataFrame.{name}", code) for name, code in (*parts, ("DataBytes", "(8,)u1"))])
     start = frames[0][0] // 10**9
     with asammdf.MDF(version="4.10") as file:
-        import datetime as dt
-
         file.start_time = dt.datetime.fromtimestamp(start, tz=dt.UTC)
         rows = np.array([(bus + 1, i, 0, 8, 8, tuple(data)) for _, bus, i, data in frames], kind)
         clock = np.array([(t - start * 10**9) * 1e-9 for t, *_ in frames])

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.drive.reading import ReadOptions, read_drive
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.table_columns import RELATIVE_NS

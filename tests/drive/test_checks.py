@@ -476,3 +476,19 @@ def test_marks_of_invalid_values_are_no_motion() -> None:
     held = steer.values.copy()
     held[500:800] = 486.0
     assert np.nanmax(columns_on_grid({"held": replace(steer, values=held)})["held"]) > 400.0
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", ["speed_m_s", "yaw_rate_rad_s", "wheel_speed_rl_m_s"])
+def test_no_number_warns(name: str) -> None:
+    """Garbage of any size, runs of NaN, and nothing at all; readers drop what is infinite."""
+    channels = drive(5)
+    values, i = channels[name].values, np.arange(len(channels[name]))
+    for wrong in (
+        1e200 * values,
+        1e-200 * values,
+        np.where(i // 200 % 2 == 0, np.nan, values),
+        np.nan * values,
+    ):
+        checks = check_drive({**channels, name: replace(channels[name], values=wrong)})
+        assert not any("nan" in c.remedy or "inf" in c.remedy for c in checks)

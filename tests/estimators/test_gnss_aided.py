@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.causality_check import CausalityCheck
-from pdhef_logtool.estimators.gnss_aided import GnssAided
+from pdhef_logtool.estimators.gnss_aided import IMU_X, GnssAided
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.table import make_estimator, runnable
@@ -56,13 +56,24 @@ def _error_deg(drive, track):
 
 def test_gnss_corrects_a_limit_manoeuvre_of_a_car_with_wrong_tyres(fishhook, bare):
     drive, signals = fishhook
+    wrong = Car.of(bare.vehicle.model_copy(update={"friction": 0.6}))
     causality = CausalityCheck()
-    plain, plain_coverage = _error_deg(drive, run_window(make_estimator("physics", bare), signals)[0])
-    aided, coverage = _error_deg(drive, run_window(_aided(bare), signals, causality=causality)[0])
+    plain, plain_coverage = _error_deg(drive, run_window(make_estimator("physics", wrong), signals)[0])
+    aided, coverage = _error_deg(drive, run_window(_aided(wrong), signals, causality=causality)[0])
     assert not causality.failed
-    assert plain > 1.2
-    assert aided < 0.4
+    assert plain > 0.8
+    assert aided < 0.6 * plain
     assert coverage > max(plain_coverage, 0.9)
+
+
+@pytest.mark.parametrize("manoeuvre", ["fishhook, 70 km/h", "double lane change, 100 km/h"])
+def test_an_accelerometer_that_is_not_where_the_file_has_it_costs_nothing(bare, manoeuvre):
+    drive = study.simulated_drive(replace(study.SIMULATED[manoeuvre], sensors=study.REAR_IMU))
+    signals = study.with_gnss(drive, study.RECEIVERS[study.MADE])
+    plain, _ = _error_deg(drive, run_window(make_estimator("physics", bare), signals)[0])
+    aided, _ = _error_deg(drive, run_window(_aided(bare), signals)[0])
+    assert aided < plain
+    assert _aided(bare).run(signals, None)[1].aiding.x[2, IMU_X] < -0.5
 
 
 def test_windows_change_no_bit(fishhook, bare):

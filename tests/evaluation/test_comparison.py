@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pdhef_logtool.evaluation.comparison import BLOCK_S, Errors, compare, end_to_end
+from pdhef_logtool.evaluation.comparison import Errors, compare, end_to_end
+from pdhef_logtool.evaluation.requirement_blocks import BLOCK_S
 
 
 def test_slices_end_to_end_share_no_block() -> None:

@@ -409,3 +409,10 @@ def test_named_data_of_a_recorder_take_their_name_unit_and_the_clock_beside_them
         read = log.read({tables["v_veh"].name: ["v_veh"]})[tables["v_veh"].name]
     np.testing.assert_allclose(read.fields["v_veh"], SPEED[::2])
     np.testing.assert_allclose((read.log_time_ns - RELATIVE_NS) * 1e-9, slow, atol=1e-9)
+
+
+def test_texts_that_name_no_signals_make_no_columns(tmp_path: Path) -> None:
+    rows = [f"{t:.2f},entry {i},{v:.3f}" for i, (t, v) in enumerate(zip(TIME_S, SPEED, strict=True))]
+    (tmp_path / "a.csv").write_text("\n".join(["time,name,value", *rows, ""]))
+    with closing(open_log(tmp_path / "a.csv")) as log:
+        assert [f.path for t in log.topics for f in log.fields(t.name)] == ["value"]

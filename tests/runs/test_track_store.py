@@ -109,3 +109,11 @@ def test_minus_zero_is_another_value(tmp_path):
         for sign in (1.0, -1.0):
             store.append(make_track("ukf", STAMPS, vx_m_s=np.zeros(10) * sign))
         assert np.signbit(store.read("ukf").vx_m_s).tolist() == [False] * 10 + [True] * 10
+
+
+def test_a_stored_track_loses_its_sideslip_below_a_speed(tmp_path, held):
+    track = make_track("ukf", STAMPS, vx_m_s=STAMPS * 1.0, vy_m_s=np.zeros(10), sideslip_rad=np.full(10, 0.1))
+    with TrackStore(tmp_path / "tracks") as store:
+        store.append(track)
+        found = store.read("ukf").without_sideslip_below(4.0)
+        np.testing.assert_array_equal(np.isfinite(found.sideslip_rad), STAMPS >= 4)

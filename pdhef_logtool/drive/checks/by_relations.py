@@ -64,7 +64,9 @@ def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Che
         mine = [r for r in relations if name in r.powers or through in r.powers]
         unrelated = [r for r in mine if r.unrelated and not _is_cleared(name, r, relations)]
         judged = _judged(name, [r for r in mine if r.tells], probable, measured)
-        checks += [_unrelated(name, r) for r in unrelated[:1]]
+        for r in unrelated[:1]:
+            evidence = f"{r.text}: one moves and the other does not with it, correlation {r.correlation:.2f}"
+            checks.append(AXIS.failed(evidence, name, signal_name=name))
         checks += judged or ([] if unrelated else [_not_excited(name, mine)])
     return tuple(checks)
 
@@ -109,11 +111,6 @@ def _is_cleared(name: str, unrelated: Relation, relations: Sequence[Relation]) -
     paces = {"speed_m_s", WHEEL_SPEEDS, "truth.vx_m_s"}
     others = [n for n in unrelated.powers if n != name and n not in paces]
     return name in paces or (shown(name) and not all(shown(n) for n in others))
-
-
-def _unrelated(name: str, relation: Relation) -> Check:
-    evidence = f"{relation.text}: one moves and the other does not with it, correlation {relation.correlation:.2f}"
-    return AXIS.failed(evidence, name, signal_name=name)
 
 
 def _failed(

@@ -66,7 +66,7 @@ class CheckKind:
         """Judge a figure by its standard error: failed so many errors beyond what is plausible, passed two inside."""
         low, high = plausible
         if value + SURE * error < low or value - SURE * error > high:
-            return self.failed(evidence, **fields)
+            return self.failed(evidence, "", **fields)
         is_inside = low <= value - 2.0 * error and value + 2.0 * error <= high
         return self.passed(evidence) if is_inside else self.undecided(evidence)
 

@@ -8,9 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
-from pdhef_logtool.drive.checks.fitting import fit
 from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind
-from pdhef_logtool.drive.columns import derivative, independent_samples, median_known
+from pdhef_logtool.drive.columns import derivative, fit, independent_samples, median_known
 from pdhef_logtool.drive.relations import gentle_at
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import BoolArray, FloatArray

@@ -1,9 +1,19 @@
-"""``SIGNAL.mounting``, ``corrected``: the axes of the IMU and what is read otherwise, judged by the survey of a log."""
+"""``SIGNAL.fault``, ``mounting``, ``corrected``: sensors that fail, the axes of the IMU, and what is read otherwise."""
 
 from __future__ import annotations
 
 from pdhef_logtool.drive.checks.kind import CheckKind
+from pdhef_logtool.records.checks import Check
 
+#: A sensor whose silent samples held so much of the drive's motion is itself a failed check.
+FAULTY_SHARE = 0.5
+
+FAULT = CheckKind(
+    "SIGNAL.fault",
+    compares="samples that are stuck or dead with what the car does meanwhile",
+    fails="more than half of what the drive does falls into them; other signals are judged without those samples",
+    remedy="look at the sensor, its cable and its power",
+)
 MOUNTING = CheckKind(
     "SIGNAL.mounting",
     compares="the axis that the mapping reads with the axis that the drive shows",
@@ -16,4 +26,10 @@ CORRECTED = CheckKind(
     fails="the drive contradicts them with certainty: the run reads what it shows",
     remedy="confirm it in a mapping file: field = {field}, scale = {scale}",
 )
-CHECKS = (MOUNTING, CORRECTED)
+CHECKS = (FAULT, MOUNTING, CORRECTED)
+
+
+def fault_check(name: str, share: float) -> Check:
+    """Return the check of a signal whose faulty samples take a share of the drive's motion."""
+    evidence = f"{share:.0%} of what the car did fell into samples of it that are stuck or dead"
+    return FAULT.failed(evidence, name) if share > FAULTY_SHARE else FAULT.passed(evidence, name)

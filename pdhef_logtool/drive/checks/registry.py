@@ -11,7 +11,6 @@ from pdhef_logtool.drive.checks.kind import CheckKind
 
 #: Files of this package that export ``CHECKS``. A new check: a file, and its name here.
 MODULES = (
-    "fault",
     "mounting",
     "by_relations",
     "magnitude",

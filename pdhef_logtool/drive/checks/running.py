@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.checks.by_relations import relation_checks
-from pdhef_logtool.drive.checks.fault import fault_check
 from pdhef_logtool.drive.checks.kind import CheckedDrive
+from pdhef_logtool.drive.checks.mounting import fault_check
 from pdhef_logtool.drive.checks.registry import registered
 from pdhef_logtool.drive.delays import LateSensor
 from pdhef_logtool.drive.faulty_samples import without_faulty_samples

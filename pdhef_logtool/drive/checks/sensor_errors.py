@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.drive.checks.fitting import fit
 from pdhef_logtool.drive.checks.kind import SURE, CheckedDrive, CheckKind
-from pdhef_logtool.drive.columns import derivative, earlier, moving_at, running_mean
+from pdhef_logtool.drive.columns import derivative, earlier, fit, moving_at, running_mean
 from pdhef_logtool.drive.relations import GAIN_RANGE
 from pdhef_logtool.drive.truth import LatencyEstimate
 from pdhef_logtool.records.checks import Check

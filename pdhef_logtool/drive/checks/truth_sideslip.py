@@ -7,9 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pdhef_logtool.drive.checks.fitting import fit
-from pdhef_logtool.drive.checks.kind import SURE, CheckedDrive, CheckKind
-from pdhef_logtool.drive.columns import moving_at
+from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind
+from pdhef_logtool.drive.columns import fit, moving_at
 from pdhef_logtool.drive.relations import gentle_at
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
@@ -53,11 +52,6 @@ def sideslip_offset(columns: Mapping[str, FloatArray]) -> tuple[float, float] | 
         return None
     (offset, _, compliance), (error, *_), _ = result
     return float(offset), math.hypot(error, compliance * AY_BIAS_M_S2)
-
-
-def is_turned(offset_rad: float, error_rad: float) -> bool:
-    """Return whether an offset of the ground-truth sideslip is larger than tyres, crossfall and chance explain."""
-    return abs(offset_rad) - SURE * error_rad > SIDESLIP_OFFSET_RAD
 
 
 def _offset_check(columns: Mapping[str, FloatArray]) -> Check | None:

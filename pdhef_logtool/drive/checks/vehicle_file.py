@@ -7,9 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
-from pdhef_logtool.drive.checks.fitting import fit
 from pdhef_logtool.drive.checks.kind import SURE, CheckedDrive, CheckKind
-from pdhef_logtool.drive.columns import moving_at
+from pdhef_logtool.drive.columns import fit, moving_at
 from pdhef_logtool.drive.relations import gentle_at
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS
@@ -76,14 +75,11 @@ def _steering(drive: CheckedDrive) -> list[Check]:
         evidence = "curvature and lateral acceleration do not explain the steering"
         return [kind.undecided(evidence, lacks=lacks) for kind in (STEERING, UNDERSTEER)]
     file = vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction)
-    return [_steering_check(share, share_error), _understeer_check(gradient, error, file)]
-
-
-def _steering_check(share: float, error: float) -> Check:
     evidence = (
-        f"slow bends take {share:.2f} +- {error:.2f} of the steering that wheelbase and ratio of the file ask for"
+        f"slow bends take {share:.2f} +- {share_error:.2f} of the steering that wheelbase and ratio of the file ask for"
     )
-    return STEERING.of_figure(share, error, STEERING_RANGE, evidence, share=share)
+    steering = STEERING.of_figure(share, share_error, STEERING_RANGE, evidence, share=share)
+    return [steering, _understeer_check(gradient, error, file)]
 
 
 def _understeer_check(gradient: float, error: float, file: float) -> Check:

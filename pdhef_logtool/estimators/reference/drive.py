@@ -241,7 +241,7 @@ def _smooth(
     if velocity is not None:
         guess = np.tile(mean, (len(rows), 1))
         guess[:, [s.VX, s.VY, s.HEADING]] = velocity
-    states, covariance, last, moved, _ = s.smooth(
+    states, covariance, last, moved = s.smooth(
         1.0 / RATE_HZ, rows, prior.rear_m, mean, std**2, noise, guess, MAX_ITERATIONS, TOLERANCE_M_S
     )
     return _Smoothed(states, covariance, last, moved)
@@ -253,13 +253,7 @@ def _parameters(smoothed: _Smoothed, prior: ReferencePrior, *, tilts: bool) -> t
     value, sigma = smoothed.states[-1], np.sqrt(np.maximum(smoothed.last_variance, 0.0))
     return tuple(
         ReferenceParameter(
-            name,
-            unit,
-            float(value[i]),
-            float(sigma[i]),
-            float(mean[i]),
-            float(std[i]),
-            float(FAR_STD_OF.get(i, FAR_STD) * std[i]),
+            name, unit, *map(float, (value[i], sigma[i], mean[i], std[i], FAR_STD_OF.get(i, FAR_STD) * std[i]))
         )
         for i, name, unit in _PARAMETERS
         if i < n

@@ -217,14 +217,9 @@ def _speed(t: FloatArray, speed: FloatArray, knot_s: FloatArray) -> FloatArray:
     if not good.any():
         return np.full(len(knot_s), np.nan)
     times = t[good]
-    i = (
-        np.clip(np.searchsorted(times, knot_s), 1, max(len(times) - 1, 1))
-        if len(times) > 1
-        else np.zeros(len(knot_s), int)
-    )
-    near = np.minimum(
-        np.abs(times[np.minimum(i, len(times) - 1)] - knot_s), np.abs(times[np.maximum(i - 1, 0)] - knot_s)
-    )
+    after = np.searchsorted(times, knot_s)
+    to_next, to_last = times[np.minimum(after, len(times) - 1)] - knot_s, times[np.maximum(after - 1, 0)] - knot_s
+    near = np.minimum(np.abs(to_next), np.abs(to_last))
     return np.where(near < 1.2 / RATE_HZ, np.interp(knot_s, times, speed[good]), np.nan)
 
 

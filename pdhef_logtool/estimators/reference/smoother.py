@@ -428,7 +428,6 @@ def smooth(step_s, rows, rear_m, start, start_variance, noise, guess, iterations
     smoothed = guess.copy() if guessed else np.empty((knots, n))
     moved = np.inf
     dense_row, decay = structure(n, step_s)
-    done = 0
     for iteration in range(iterations):
         x = start.copy()
         trusted = iteration > 1 or guess.shape[0] > 0
@@ -446,7 +445,6 @@ def smooth(step_s, rows, rear_m, start, start_variance, noise, guess, iterations
             filtered[k] = x
             variance[k] = p
         pull = np.zeros(n)
-        information = np.zeros((n, n))
         total = 0.0
         for k in range(knots - 1, -1, -1):
             before = smoothed[k, VY] if guessed else filtered[k, VY]
@@ -463,7 +461,6 @@ def smooth(step_s, rows, rear_m, start, start_variance, noise, guess, iterations
                 _pull_vector(pull, dense[k], dense_row, decay)
         guessed = True
         moved = math.sqrt(total / knots)
-        done = iteration
         if iteration > 2 and moved < tolerance_m_s:
             break
     covariance = np.empty((knots, 3))
@@ -488,7 +485,7 @@ def smooth(step_s, rows, rear_m, start, start_variance, noise, guess, iterations
         if k:
             _pull_back(scratch, information, dense[k], dense_row, decay)
             information, scratch = scratch, information
-    return smoothed, covariance, last, moved, done
+    return smoothed, covariance, last, moved
 
 
 @njit(cache=True)

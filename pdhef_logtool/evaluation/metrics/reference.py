@@ -84,8 +84,8 @@ def _ranked(a: StateTrack, b: StateTrack, reference: StateTrack, place: _Place) 
         sums.add(masks, *(np.where(used, e, np.nan) for e in errors))
         number = (c.stamps_ns - start_ns) // block_ns
         for segment, mask in masks.items():
-            of_block = np.bincount(number[mask & used], doubt[mask & used], blocks)
-            doubts[segment] = doubts.get(segment, 0.0) + of_block
+            of_blocks = doubts.setdefault(segment, np.zeros(blocks))
+            of_blocks += np.bincount(number[mask & used], doubt[mask & used], blocks)
     for segment, (n, (of_a, of_b)) in sums.totals().items():
         if abs(of_a - of_b) > NORMAL_95 * np.linalg.norm(doubts[segment]):
             further = float(np.sqrt(of_a / n) - np.sqrt(of_b / n))
