@@ -44,10 +44,7 @@ def render_comparison(comparison: Comparison, console: Console) -> None:
         for line in comparison.differences:
             _line(line, console)
     if comparison.changed:
-        console.print(
-            f"\n{comparison.changed} of {sum(comparison.pairs.values())} drives "
-            "have a figure that is not the same bit for bit"
-        )
+        console.print(f"\n{comparison.changed} of {sum(comparison.pairs.values())} drives have a changed figure")
     if comparison.figures and not comparison.equal:
         _print_figures(comparison, console)
     if any(f.drives for f in comparison.figures) and not comparison.equal:
@@ -69,7 +66,7 @@ def _line(text: str, console: Console) -> None:
 
 
 def _print_figures(comparison: Comparison, console: Console) -> None:
-    made = table("\nfigure", ">\ndrives", ">median\nchange", ">95 %\ninterval", ">\nmay be", "\nverdict", fold=1)
+    made = table("\nfigure", ">\ndrives", ">median\nchange", ">95 %\ninterval", ">\nlimit", "\nverdict", fold=1)
     for row in comparison.figures:
         limit = row.figure.limit
         may_be = "-" if limit is None else percent(limit)
@@ -94,7 +91,7 @@ def _print_drives(figure: ComparedFigure, console: Console) -> None:
             made.add_row(f"… {len(changed) - len(shown)} more …", "", "", "")
         name = drive.drive if drive.drive == drive.drive_b else f"{drive.drive} ({drive.drive_b} in B)"
         change = "-" if drive.change is None else percent(drive.change)
-        made.add_row(name, f"{drive.a * factor:.4g}", f"{drive.b * factor:.4g}", change)
+        made.add_row(name, f"{drive.a * factor:.3g}", f"{drive.b * factor:.3g}", change)
     console.print(f"\nDrives by {figure.figure.label}, worst first", style="bold")
     console.print(made)
 
@@ -107,7 +104,7 @@ def _print_signals(comparison: Comparison, console: Console) -> None:
             row.drive, row.track, row.signal, f"{row.first_s:.2f}", f"{row.stamps}/{row.of}", largest_text(row)
         )
     console.print(
-        f"\nWhere the tracks part ({comparison.followed} of {comparison.changed} changed drives looked at)",
+        f"\nFirst difference of the tracks ({comparison.followed} of {comparison.changed} changed drives)",
         style="bold",
     )
     console.print(made)
@@ -116,7 +113,7 @@ def _print_signals(comparison: Comparison, console: Console) -> None:
 
 
 def _print_others(others: Sequence[ComparedFigure], console: Console) -> None:
-    made = table("beside it, no gate", ">drives", ">median", ">p (Holm)", "", fold=1)
+    made = table("other figures", ">drives", ">median", ">p (Holm)", "", fold=1)
     for figure in others:
         p = 1.0 if figure.corrected_p is None else figure.corrected_p
         made.add_row(

@@ -68,7 +68,7 @@ def table(*heads: str, fold: int = 0) -> Table:
 
 def cell(value: float | None, factor: float = 1.0, digits: int = 2) -> str:
     """Return a number for a table, a dash where there is none."""
-    return "-" if value is None else f"{value * factor:.{digits}f}"
+    return "-" if value is None else f"{round(value * factor, digits) + 0.0:.{digits}f}"  # no -0
 
 
 def set_verbosity(*, quiet: bool = False, verbose: bool = False) -> None:

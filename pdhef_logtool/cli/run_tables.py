@@ -300,7 +300,7 @@ def _failed_checks(report: _Report, *, undecided: bool = True) -> Iterable[str |
     names = [check["name"] for check in checks if check["verdict"] == "undecided"]
     if names and undecided:
         more = f" and {len(names) - _MOST_UNDECIDED} more" if len(names) > _MOST_UNDECIDED else ""
-        yield f"not decided by this drive: {', '.join(names[:_MOST_UNDECIDED])}{more}"
+        yield f"Not observable in this drive: {', '.join(names[:_MOST_UNDECIDED])}{more}"
 
 
 def _losses(report: _Report, *, notes: bool = True) -> Iterable[str]:

@@ -38,7 +38,7 @@ def trend(
     html: Annotated[Path | None, Option(help="HTML file for the trend.")] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Show a figure over several runs, one row per run, and mark regressions."""
+    """Compare the sideslip error of several runs, one row per run, and mark regressions."""
     from pdhef_logtool.cli.comparing import figure_asked
     from pdhef_logtool.results.opened_run import open_run
     from pdhef_logtool.results.trend import trend_of

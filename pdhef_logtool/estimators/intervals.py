@@ -99,7 +99,7 @@ class TrackCalibrator:
                 *([other] if other else []),
             )
         made = self.intervals
-        of = f"wrong by {made.spread:g}" if made.spread > 0.0 else "as given"
+        of = f"with a spread of {100.0 * made.spread:g} %" if made.spread > 0.0 else "as given"
         then, now = matched[0].algorithm, matched[1]
         others = [
             what

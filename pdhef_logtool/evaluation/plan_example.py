@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ EXAMPLE = f"""\
 # Each requirement gets PASS, FAIL or INCONCLUSIVE by the confidence interval of its value over drives
 # (below five drives: over blocks of 10 s within them). Exit code 4: a requirement failed.
 # signal: {", ".join(SIGNALS)}
-# segment: {", ".join(SEGMENTS)}
+{textwrap.fill(", ".join(SEGMENTS), 108, initial_indent="# segment: ", subsequent_indent="#   ")}
 title = "Sideslip of the sedan"
 
 [[requirement]]

@@ -310,7 +310,8 @@ def _decide(
     """Return outcome, reason and next step."""
     where = "" if requirement.segment == "all" else f" of {requirement.segment}"
     if not exposure.drives or not math.isfinite(bounded.value):
-        return "INCONCLUSIVE", missing or "no drive has this metric", _what_to_record(requirement)
+        reason, _, remedy = missing.partition("; ")
+        return "INCONCLUSIVE", reason or "no drive has this metric", remedy or _what_to_record(requirement)
     if lacking:
         return "INCONCLUSIVE", f"too little driving: {'; '.join(w for w, _ in lacking)}", _more(lacking, where)
     if _without_bounds(requirement, bounded):
@@ -380,10 +381,10 @@ def _more(lacking: Sequence[tuple[str, str]], where: str) -> str:
 
 
 def _what_to_record(requirement: Requirement) -> str:
-    where = "" if requirement.segment == "all" else f" with {requirement.segment}"
+    segment = "" if requirement.segment == "all" else f"{requirement.segment} and "
     if requirement.other_run is not None:
         return "compare with another run: pdhef compare A B --plan PLAN"
-    return f"record drives{where} with ground truth"
+    return f"record drives with {segment}ground truth"
 
 
 def _too_few(requirement: Requirement, bounded: Bounded, basis: str, where: str) -> tuple[str, str]:

@@ -217,7 +217,7 @@ def _add_filter(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles)
         title = "R scale: how much wider than usual the filter takes its sensors' noise"
         charts.figures["r_scale"] = TimeFigure(title, "×", scales, level=1.0, log=True, height=130)
     if nis := _lines(series, roles, "nis", roles.names):
-        title = "NIS over its degrees of freedom, mean of a second: 1 where sensors surprise as much as expected"
+        title = "NIS per degree of freedom, mean over 1 s (expected value 1)"
         charts.figures["nis"] = TimeFigure(title, "", nis, level=1.0, height=130, resolution=_SEEN)
 
 

@@ -28,7 +28,7 @@ MOST_ROWS, _MOST_KEYS, _MOST_BARS = 1000, 12, 40
 _MOST_SHARE = 0.98
 _LEVELS = 8
 #: Drives of the figure of the first screen, and characters of their names in it.
-_WORST, _LABEL = 10, 22
+_WORST, _LABEL = 10, 20
 #: Estimators with a median error beyond this many times the selected estimate's are left to the table.
 _DRAWN = 5.0
 #: The table of the operating space shows at least this far, so that what a car can do and nobody did is seen.
@@ -74,7 +74,7 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
     texts: dict[str, Any] = {
         "plan": plan_head(run.document.get("plan")),
         "tested": tested_run(run.document, sum(d.seconds for d in fleet.drives) / 3600.0),
-        "steps": next_steps(run.document.get("plan")),
+        "steps": next_steps(run.document.get("plan"), "repair the failed logs: causes below" if fleet.failed else ""),
         "worst": _worst(fleet, charts),
         "verdicts": Counter(d.verdict for d in fleet.scored if d.verdict),
         "answer": next((d for d in fleet.distributions if (d.estimator, d.signal) == (ANSWER, JUDGED)), None),
@@ -112,7 +112,13 @@ def _worst(fleet: Fleet, charts: Charts) -> tuple[str, float | None] | None:
     if len(ranked) > 1:
         degree = math.degrees(1.0)
         bars = [
-            Interval(d.label[-_LABEL:], math.nan, (error or 0.0) * degree, math.nan, colour(d.main or ""))
+            Interval(
+                f"…{d.label[1 - _LABEL :]}" if len(d.label) > _LABEL else d.label,
+                math.nan,
+                (error or 0.0) * degree,
+                math.nan,
+                colour(d.main or ""),
+            )
             for error, d in ranked[:_WORST]
         ]
         title = f"The {len(bars)} drives with the largest sideslip RMSE"
@@ -139,7 +145,7 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
     if first.drives > 2:
         values = first.values * degree
         edges, counts = _histogram(values)
-        beyond = ", the last bar and beyond" if values[-1] > edges[-1] else ""
+        beyond = " (last bar: and above)" if values[-1] > edges[-1] else ""
         title = f"Drives by RMSE of the selected estimate's sideslip{beyond}"
         charts.figures["spread"] = BarsFigure(title, "RMSE in °", edges.tolist(), counts.tolist())
     rival, drives = _rival(fleet), fleet.scored
@@ -149,7 +155,7 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
         if np.count_nonzero(both) > 2:
             ends = np.array([min(ours[both].min(), other[both].min()), max(ours[both].max(), other[both].max())])
             charts.figures["against"] = PointsFigure(
-                f"A point a drive: the selected estimate has the lower error below the line, {rival} above it",
+                f"One point per drive; below the line the selected estimate has the lower error, above it {rival}",
                 f"RMSE of {rival}, °",
                 "RMSE of the selected estimate, °",
                 [

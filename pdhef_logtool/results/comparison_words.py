@@ -11,7 +11,7 @@ from pdhef_logtool.results.paired_change import LEAST_CLUSTERS
 from pdhef_logtool.results.sink import TRUTH
 
 _COLUMN_UNITS = {"rad": "rad", "rad_s": "rad/s", "m_s": "m/s", "m_s2": "m/s^2"}
-_BY = {"signals": "what their signals held", "content": "their files", "name": "their names alone"}
+_BY = {"signals": "the content of their signals", "content": "the hashes of their files", "name": "their names alone"}
 
 
 def paired_text(comparison: Comparison) -> str:
@@ -35,9 +35,11 @@ def verdict_text(comparison: Comparison) -> str:
         "inconclusive": "inconclusive with these drives",
         "no figure": "no drive has the figure on both sides (is there ground truth?)",
     }[comparison.verdict]
+    if comparison.verdict == "no figure":
+        return f"{text}: {', '.join(f.figure.label for f in comparison.figures if f.verdict == 'no figure')}"
     detectable = [f.detectable for f in comparison.figures if f.verdict == "inconclusive"]
     if any(math.isfinite(d) for d in detectable):
-        text += f"; a worsening of {percent(max(d for d in detectable if math.isfinite(d)))} would have shown"
+        text += f"; an increase of {percent(max(d for d in detectable if math.isfinite(d)))} would have been detected"
     elif detectable:
         text += (
             f": too few independent drives (at least {LEAST_CLUSTERS} drives or clusters; a design effect reduces "
@@ -48,17 +50,18 @@ def verdict_text(comparison: Comparison) -> str:
 
 def notes_of(comparison: Comparison) -> list[str]:
     """Return what must be known of the figures that were asked for, a line each."""
-    notes = []
+    asked = [f for f in comparison.figures if f.drives and not comparison.equal]
+    texts = {f.figure.label: dependence_text(f, comparison.cluster) for f in asked}
+    alike = len(set(texts.values())) == 1
+    notes = [*dict.fromkeys(text if alike else f"{label}: {text}" for label, text in texts.items())]
     for figure in comparison.figures:
-        if figure.drives and not comparison.equal:
-            notes.append(f"{figure.figure.label}: {dependence_text(figure, comparison.cluster)}")
         notes += [f"{figure.figure.label}: {note}" for note in figure.notes]
         if figure.neither and figure.drives:
             notes.append(f"{figure.figure.label}: {figure.neither} drives have it on neither side")
         if math.isfinite(figure.detectable):
             least = percent(figure.detectable)
             notes.append(
-                f"{figure.figure.label}: the smallest worsening that so many drives show in 4 of 5 cases: {least}"
+                f"{figure.figure.label}: smallest increase that these drives detect with a probability of 80 %: {least}"
             )
     return notes
 

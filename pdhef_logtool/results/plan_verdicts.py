@@ -275,18 +275,18 @@ def _why_missing(
 
 
 def _why_unscored(requirement: Requirement, figures: Figures, names: Mapping[str, str]) -> str:
-    """Return why no drive has the metric of the estimators ``names`` by log."""
+    """Return why no drive has the metric of the estimators ``names`` by log, with a remedy after a semicolon."""
     scored = [log for log, name in names.items() if figures.of(log, name, requirement, requirement.metric)]
     tainted = [log for log in scored if (log, names[log], requirement.signal, "all", NOT_INDEPENDENT) in figures.values]
     if scored and len(tainted) == len(scored):
         return "the ground truth is an input of the estimator: not an independent check"
     if scored and requirement.baseline != requirement.other_run:
-        return f"{requirement.baseline} has no such value: add it to --estimators"
+        return f"{requirement.baseline} has no such value; add it to the estimators of pdhef run"
     if requirement.segment != "all" and any(
         (log, name, requirement.signal, "all", requirement.metric) in figures.values for log, name in names.items()
     ):
         return f"no scored driving in {requirement.segment}"
     if requirement.estimator is not None and not any(requirement.estimator in n for n in figures.names.values()):
-        return f"{requirement.estimator} did not run: add it to --estimators"
+        return f"{requirement.estimator} did not run; add it to the estimators of pdhef run"
     above = " above the low-speed limit" if requirement.signal == "sideslip_rad" else ""
-    return f"no ground truth of {LABELS[requirement.signal]}{above}"
+    return f"no ground truth of {LABELS[requirement.signal]}{above}; record drives with ground truth{above}"

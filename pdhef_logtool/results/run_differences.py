@@ -105,7 +105,7 @@ def _entries(what: str, before: object, other: object) -> Iterator[str]:
 def _value(entries: Mapping[str, Any], key: str) -> str:
     value = entries.get(key)
     if value is None:
-        return "none" if key in entries else "absent"
+        return "not set" if key in entries else "absent"
     return ",".join(map(str, value)) or "none" if isinstance(value, list) else str(value)
 
 

@@ -156,7 +156,7 @@ def _median(run: OpenedRun, figure: Figure) -> tuple[int, float, str]:
 def shown_median(row: TrendRow) -> str:
     """Return the median in the unit that people read, a dash for none."""
     unit, factor = read_unit(row.unit)
-    return f"{row.median * factor:.4g} {unit}".strip() if math.isfinite(row.median) else "-"
+    return f"{row.median * factor:.3g} {unit}".strip() if math.isfinite(row.median) else "-"
 
 
 def mark(row: TrendRow) -> str:

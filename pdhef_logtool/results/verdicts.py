@@ -67,7 +67,8 @@ def _why_none(report: Mapping[str, Any], main: str, signal: str, standing: Stand
         quantities = {q["name"] for q in truth["quantities"]}
         if signal not in quantities:
             return "the ground truth does not contain it"
-        return f"its ground truth and {main} are never valid at the same time"
+        above = " above the low-speed limit" if signal == "sideslip_rad" else ""
+        return f"its ground truth and {main} are never valid at the same time{above}"
     if signal in ("sideslip_rad", "vy_m_s") and _without_sideslip(report):
         return "the sideslip of the ground truth is 0 throughout: it is probably not measured"
     return ""

@@ -41,7 +41,7 @@ def test_a_regression_is_told_with_its_drives_and_where_they_part(runs: tuple[st
     assert code == 4
     assert all(len(line) <= 80 for line in text.splitlines()[1:])
     assert "configuration: friction auto → 0.3" in text
-    assert re.search(r"drive_9 +0\.573 +0\.6818 +\+19\.0 %", text)
+    assert re.search(r"drive_9 +0\.573 +0\.682 +\+19\.0 %", text)
     assert "0.573 °" in text  # the largest difference of the tracks
     assert "Verdict: B is worse" in text
     assert "gate closed: sideslip_rad rmse (all): worse" in text

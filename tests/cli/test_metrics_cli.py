@@ -69,7 +69,7 @@ def test_json_is_one_document(annotated: str, tmp_path: Path) -> None:
     assert document["exit_code"] == result.returncode == 0
     assert document["output"] is None
     assert [v["outcome"] for v in document["plan"]["requirements"]] == ["PASS", "INCONCLUSIVE"]
-    assert document["plan"]["requirements"][1]["reason"] == "pd-hef did not run: add it to --estimators"
+    assert document["plan"]["requirements"][1]["next"] == "add it to the estimators of pdhef run"
     assert document["logs"][0]["report"]["estimators"][0]["name"] == "phy-ukf"
 
 

@@ -111,7 +111,7 @@ def test_failed_checks_stand_above_the_table_and_undecided_ones_are_named() -> N
     document["checks"] = [{**CHECK, "name": name, "verdict": verdict} for name, verdict in checks]
     text = shown(document)
     assert text.index("FAILED: steer_rad.sign: its gain is -1. Remedy: scale = -1") < text.index("estimator")
-    assert "not decided by this drive: ay_m_s2.unit" in text
+    assert "Not observable in this drive: ay_m_s2.unit" in text
     assert "speed_m_s.unit" not in text
     document["checks"][0]["waived"] = True
     assert "waived: steer_rad.sign" in shown(document)

@@ -273,7 +273,7 @@ def test_the_notes_say_for_what_intervals_were_made() -> None:
 
     made = "intervals calibrated on car for friction and vehicle"
     assert notes(_intervals()) == f"{made} as given"
-    assert notes(_intervals(spread=0.2)) == f"{made} wrong by 0.2"
+    assert notes(_intervals(spread=0.2)) == f"{made} with a spread of 20 %"
     for changes, said in (
         ({"physics_sha256": "cd" * 32}, "physics"),
         ({"noise": {"q_std": [0.1, 0.1, 0.2]}}, "filter noise"),

@@ -230,11 +230,14 @@
   }
 
   function timeAxis(label) {
-    return axis(label, { size: 24, values: (u, splits, i, space, step) => splits.map((s) => {
-      let digits = 0;
-      while (digits < 4 && Math.abs(step * 10 ** digits - Math.round(step * 10 ** digits)) > 1e-6) digits++;
-      return s.toFixed(digits);
-    }) });
+    return axis(label, { size: 24, values: byStep });
+  }
+
+  /** Write the values of an axis with as many digits as its step has: two ticks never read the same. */
+  function byStep(u, splits, i, space, step) {
+    let digits = 0;
+    while (digits < 6 && Math.abs(step * 10 ** digits - Math.round(step * 10 ** digits)) > 1e-6) digits++;
+    return splits.map((s) => (s === null ? null : s.toFixed(digits)));
   }
 
   /** The axis at the left, as wide in every figure, so that their times stand below one another. */
@@ -488,7 +491,7 @@
     figure.chart = new uPlot({
       width: widthOf(figure), height: height(), legend: { show: false },
       scales: { x: scale(0), y: scale(1) },
-      axes: [axis(spec.x_label, { size: 26 }), axis(spec.y_label, { size: 46 })],
+      axes: [axis(spec.x_label, { size: 26, space: spec.log ? 24 : 50 }), axis(spec.y_label, { size: 46 })],
       series: [{}, { scale: "y", stroke: "transparent", points: { show: false } }],
       cursor: { show: false },
       hooks: { draw: [(u) => clouds.forEach((c) => paint(u, c))] },
@@ -548,7 +551,7 @@
     figure.chart = new uPlot({
       width: widthOf(figure), height: intervals.length * 24 + 56, legend: { show: false },
       scales: { x: { time: false, range: [low, high] }, y: { range: [0, intervals.length] } },
-      axes: [axis(unit, { size: 26 }), axis("", {
+      axes: [axis(unit, { size: 26, values: byStep }), axis("", {
         size: 150, splits: () => intervals.map((_, i) => intervals.length - 0.5 - i), values: () => intervals.map((i) => fitted(i.label)),
         grid: { show: false }, ticks: { show: false },
       })],
