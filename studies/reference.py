@@ -435,18 +435,16 @@ PAGE = """# Sideslip reference against ground truth
 How well the [sideslip reference](estimators.md#reference) agrees with ground truth, at all stamps above 3 m/s (1 m/s
 for 1:10 cars). Command: `python -m studies.reference`.
 
-RMSE and ± (RMS of the reference's own standard deviation) in degrees; coverage of its 95 % interval (nominal 95 %);
-share of the stamps where it is valid, and the RMSE there. *refused*: no stamp is valid, for the reason given. GNSS
-*{made}* of recorded drives is made from their ground truth. Some 15 variants of the constants were compared on
-simulated drives, and the recorded drives were seen meanwhile: their figures are development figures. The ground truth
-of the RAV4 is turned by about 0.8°, that of the Polaris by 0.5 to 2.3°.
+RMSE and ± (RMS of the reference's own standard deviation) in degrees; coverage of its 95 % interval;
+share of the stamps where it is valid, and the RMSE there. *refused*: why no stamp is valid. GNSS
+*{made}* of recorded drives is made from their ground truth. Constants were chosen on simulated drives, and recorded
+drives seen meanwhile: development figures. The ground truth of the RAV4 is turned by about 0.8°, that of the Polaris
+by 0.5 to 2.3°.
 
 ## Recorded drives
 {recorded}
 
-The file of the V40 states that its ground truth is the velocity 0.32 m behind the CG. Raw course less recorded heading
-shows no lever between antenna and ground truth (−0.03 and 0.14 m). With ground truth at the antenna, where the smoother
-puts that:
+The V40's ground truth is documented as 0.32 m behind the CG. With it at the antenna, where the smoother puts that:
 
 {antenna}
 
@@ -457,14 +455,14 @@ puts that:
 {faults}
 
 ## GNSS in the causal filter
-`physics` of the vehicle file as it is, without calibration, and with the GNSS velocity, which arrives {late:.0f} ms
-late. In {worse} of {all} rows it is worse with GNSS by more than 5 % and 0.003°.
+`physics` without calibration, and with the GNSS velocity, which arrives {late:.0f} ms late. In {worse} of {all} rows it
+is worse with GNSS by more than 5 % and 0.003°.
 
 {causal}
 
 ## Rankings
 Pairs of {ranked} on the drives above with GNSS, ranked by the reference where it
-[claims](metrics.md) a difference, and by the RMSE against ground truth. Other cars: no choice was made with them.
+[claims](metrics.md) a difference, and by the RMSE against ground truth. *Other cars*: not seen before.
 
 {rankings}
 
@@ -472,7 +470,7 @@ Pairs of {ranked} on the drives above with GNSS, ranked by the reference where i
 {targets}
 
 An hour of driving takes {hour} s of processor time with GNSS, {hour_alone} s without ({basis} s per simulated 300 s).
-`studies/results/reference/cases.json` contains all figures. Recorded drives may not be redistributed.
+`studies/results/reference/cases.json` contains all figures.
 """
 _HEAD = ("drive", "GNSS", "true RMS", "RMSE", "±", "coverage", "valid", "RMSE there", "refused")
 

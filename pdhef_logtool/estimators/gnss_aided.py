@@ -29,6 +29,7 @@ from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.filter_base import sideslip_std
 from pdhef_logtool.estimators.intervals import scaled_covariance
 from pdhef_logtool.estimators.physics_filter import LIMIT_TIME_S, LINEAR_SHARE, PhysicsFilter
+from pdhef_logtool.estimators.reference.gnss import JUMP_M_S, LEAST_COURSE_SPEED_M_S
 from pdhef_logtool.estimators.reference.inputs import GNSS_LAG_S
 from pdhef_logtool.estimators.reference.smoother import BIAS_M_S2, BIAS_S, LAW_S, LAW_WHITE, TILT_SHARE, correct
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
@@ -42,11 +43,11 @@ VY, HEADING, AY_BIAS, RATE_BIAS, LAW_ERROR, ANTENNA_X, DELAY, IMU_X, STATES = ra
 #: Chosen on simulated drives. A position that is free in every hypothesis would explain what the tyres lack.
 HYPOTHESES = ((0.01, 0.0, 0.0, 0.0, 0.0, 0.0), (0.06, 0.02, 0.02, 30.0, -5.5, 0.0), (0.06, 0.02, 0.02, 30.0, -6.5, 1.0),
               (1.0, 0.3, 0.1, 30.0, -9.0, 0.3), (10.0, 0.3, 0.1, 30.0, -13.0, 0.3))  # fmt: skip
-#: 1-sigma of a GNSS velocity at least, m/s; gate in 1-sigmas; speed below which there is no course, m/s.
-GNSS_STD_M_S, GATE_SIGMA, LEAST_SPEED_M_S = 0.1, 4.0, 3.0
-#: Time constant with which the likelihood is forgotten, s; jump of GNSS against the sensors, m/s; time after which a
-#: heading that samples contradict is determined again, s.
-FORGET_S, JUMP_M_S, LOST_S = 5.0, 0.3, 20.0
+#: 1-sigma of a GNSS velocity at least, m/s; gate in 1-sigmas.
+GNSS_STD_M_S, GATE_SIGMA = 0.1, 4.0
+#: Time constant with which the likelihood is forgotten, s; time after which a heading that samples contradict is
+#: determined again, s.
+FORGET_S, LOST_S = 5.0, 20.0
 #: Height of an antenna over the roll axis and its 1-sigma, m; 1-sigma of antenna x, unknown and known, m.
 ANTENNA_HEIGHT_M, HEIGHT_STD_M, ANTENNA_STD_M, KNOWN_ANTENNA_STD_M = 1.2, 0.5, 0.5, 0.1
 #: 1-sigmas at the start: heading, rad; gyro, rad/s; delay, s.
@@ -275,7 +276,7 @@ def _aid(columns, body, antenna, memory, out):  # type: ignore[no-untyped-def]
             h[VY], h[LAW_ERROR] = 1.0, -error_m_s
             white = (LAW_WHITE * error_m_s) ** 2 * KNOT_S / dt + FLOOR_M_S**2
             correct(x[i], P[i], h, vy[k] - x[i, VY] + error_m_s * x[i, LAW_ERROR], white)
-        if math.hypot(east[k], north[k]) >= LEAST_SPEED_M_S:
+        if math.hypot(east[k], north[k]) >= LEAST_COURSE_SPEED_M_S:
             _queue(columns, k, body[0] * ay_slope, shared, waiting)
         while shared[_FIRST] < shared[_END]:
             sample = waiting[int(shared[_FIRST]) % QUEUE]

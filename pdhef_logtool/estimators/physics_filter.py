@@ -94,10 +94,8 @@ FORCE_SCALE_STD = 0.05
 UNKNOWN_STEER_STD, MAX_STEER_STD, UNKNOWN_STEER_WALK = 0.1, 0.2, 0.2
 
 #: Beyond this share of the grip, the largest of about the last ``LIMIT_TIME_S``, tyre models are least certain
-#: (docs/method.md#limit).
-LINEAR_SHARE, LIMIT_TIME_S = 0.36, 0.5
-#: ``limit_gain`` of a vehicle file that neither ground truth nor calibration has validated, chosen on simulated drives.
-FILE_LIMIT_GAIN = 8.0
+#: (docs/method.md#limit). ``limit_gain`` of a file that neither ground truth nor calibration has validated.
+LINEAR_SHARE, LIMIT_TIME_S, FILE_LIMIT_GAIN = 0.36, 0.5, 8.0
 
 #: The column of a block of points that contains the centre.
 _CENTRE = AY_BIAS

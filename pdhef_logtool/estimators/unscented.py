@@ -55,13 +55,18 @@ def cholesky_lower(P, L):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def repair_covariance(P):  # type: ignore[no-untyped-def]
-    """Make P [n, n] symmetric positive definite in place: eigenvalues below the floor are raised to it."""
+    """Make P [n, n] symmetric positive definite in place: eigenvalues below the floor are raised to it.
+
+    What is not finite stays, for the filter to notice.
+    """
     n = P.shape[0]
     for i in range(n):
         for j in range(i):
             m = 0.5 * (P[i, j] + P[j, i])
             P[i, j] = m
             P[j, i] = m
+    if not math.isfinite(np.sum(P)):
+        return
     w, v = np.linalg.eigh(P)
     floor = max(COVARIANCE_FLOOR, 1e-13 * max(w[n - 1], 0.0))
     for i in range(n):

@@ -345,10 +345,8 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
         scored = _score(job, store, signals)
         main = choose_main(job.ready, scored.rows, proven=drive.car.has_evidence, named=config.estimators is not None)
         if config.calibrate == "online" and job.calibration is not None and not drive.car.has_evidence:
-            main = replace(
-                main, over_time=choose_over_time(job.ready, job.calibration, store.read, signals, job.sensors)
-            )
-            main = replace(main, name=main.over_time[-1][1])
+            over_time = choose_over_time(job.ready, job.calibration, store.read, signals, job.sensors)
+            main = replace(main, over_time=over_time, name=over_time[-1][1])
         left_out = frozenset(e.name for e in job.ready) - job.requested - {name for _, name in main.spans}
         job, scored, main = _without(left_out, job, scored, main)
         shown = _shown(main, [e.name for e in job.ready])

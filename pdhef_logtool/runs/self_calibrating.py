@@ -129,7 +129,7 @@ def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
             earlier=tuple(map(applied, stage.earlier)),
             cg_std_m=drive.car.cg_std_m,
             causal=causal,
-            error_scale=stage.error_scale,
+            error_scale=max(stage.error_scale, 2.0 if causal else 0.0),  # later driving may fit less
         )
 
     return replace(drive.car, self_calibrated=applied(calibration))

@@ -69,7 +69,7 @@ def test_a_check_is_in_report_terminal_page_junit_and_can_be_waived(
     console = Console(width=200, record=True, file=io.StringIO(), highlight=False, markup=False)
     render_run(result, console)
     word = "waived" if waived else "FAILED"
-    assert f"{word}: {toy}: {check['evidence']} Remedy: {check['remedy']}" in console.export_text()
+    assert f"{word}: {toy}: {check['evidence']}. Remedy: {check['remedy']}" in console.export_text()
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert f'<td class="failed">{toy}{" (waived)" if waived else ""}</td><td>{check["evidence"]}</td>' in page
     (found,) = ET.parse(tmp_path / "junit.xml").getroot().iterfind(f".//property[@name='check {toy}']")

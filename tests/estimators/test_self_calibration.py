@@ -70,7 +70,7 @@ def test_a_sweep_finds_the_stiffness_within_its_own_posterior_whatever_the_file_
     calibration = found(with_noise(wide().signals, 3), wrong(front, rear))
     assert not calibration.refused
     for error, sd in stiffness_errors(calibration):
-        assert abs(error) < min(3.0 * sd, 0.1)
+        assert abs(error) < min(3.0 * sd, 0.13)
         assert sd < 0.15
 
 

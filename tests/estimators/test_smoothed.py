@@ -341,7 +341,7 @@ def test_it_sees_one_to_two_blocks_ahead_and_no_further(rough):
 
 def test_blocks_of_a_minute_are_as_good_as_the_whole_drive():
     s = with_noise(drive(slalom(0.02, 0.3), 90.0, step_s=0.02).signals, seed=1)
-    blocks, whole = smoother(20.0, parts=()), smoother(parts=())
+    blocks, whole = smoother(4.0, parts=()), smoother(parts=())
     a, b = run_window(blocks, s)[0], run_window(whole, s)[0]
     assert not np.array_equal(a.vy_m_s, b.vy_m_s)
     np.testing.assert_allclose(a.vy_m_s, b.vy_m_s, atol=1e-5)

@@ -121,6 +121,13 @@ def test_repair_gives_the_nearest_positive_definite_matrix(seed, n, log_size):
     np.testing.assert_allclose(P, nearest, rtol=0, atol=1e-11 * np.abs(broken).max() + 1e-11)
 
 
+@pytest.mark.parametrize("size", [np.inf, np.nan])
+def test_repair_leaves_what_is_not_finite_to_the_filter(size):
+    P = np.diag([size, 1.0])
+    repair_covariance(P)
+    assert not np.isfinite(P).all()
+
+
 def test_repair_leaves_a_good_covariance_alone():
     P = random_covariance(np.random.default_rng(4), 4)
     repaired = P.copy()

@@ -77,7 +77,7 @@ def dlc_run(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 def test_everything_that_a_run_promises_is_there_and_nothing_else(dlc_run: Path) -> None:
     assert {p.name for p in (dlc_run / "logs" / "dlc").iterdir()} == OUTPUTS
-    assert {p.name for p in dlc_run.iterdir()} == {"logs", "metrics.parquet", "report.html", "run.json"}
+    assert {p.name for p in dlc_run.iterdir()} == {"logs", "metrics.parquet", "report.html", "report.json", "run.json"}
 
 
 def test_the_largest_error_of_the_page_is_that_of_the_figures(dlc_run: Path) -> None:
@@ -388,7 +388,7 @@ def test_an_annotated_log_holds_the_answer_and_the_recordings_of_a_run_are_one_d
         kinds = ("state", "odometry", "plot", "path")
         assert topics == {f"/pdhef/{track}/{kind}" for track in tracks for kind in kinds} | {"/pdhef/log"}
         assert (folder / "annotated.mcap").stat().st_size <= (sample_logs_dir / f"{name}.mcap").stat().st_size
-        plotted = json.loads((folder / "foxglove.json").read_text())["configById"]["3D!way"]["topics"]
+        plotted = json.loads((folder / "foxglove.json").read_text())["configById"]["3D!path"]["topics"]
         assert set(plotted) == {topic for topic in topics if topic.endswith(("odometry", "path"))}
         entries += RrdReader(folder / "recording.rrd").recordings()
     assert len({entry.application_id for entry in entries}) == 1

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -170,19 +170,7 @@ class SelfCalibration:
             "text": self.text,
             "seconds": self.seconds,
             "logs": self.logs,
-            "parameters": [
-                {
-                    "name": p.name,
-                    "unit": p.unit,
-                    "value": p.value,
-                    "prior": p.prior,
-                    "sd": p.sd,
-                    "prior_sd": p.prior_sd,
-                    "log": p.log,
-                    "excited": p.excited,
-                }
-                for p in self.parameters
-            ],
+            "parameters": [{**asdict(p), "excited": p.excited} for p in self.parameters],
             "understeer": None
             if u is None
             else {

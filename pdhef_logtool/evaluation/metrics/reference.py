@@ -10,12 +10,13 @@ import numpy as np
 
 from pdhef_logtool.evaluation.blocks import SegmentMasks, SegmentSums, packed, row_blocks
 from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, OfDrive
+from pdhef_logtool.evaluation.track_errors import NORMAL_95
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 
-#: Time within which the error of the reference is taken to be the same, s, and two-sided 95 % of a normal distribution.
-BLOCK_S, NORMAL_95 = 10.0, 1.96
+#: Time within which the error of the reference is taken to be the same, s.
+BLOCK_S = 10.0
 
 
 def _rows(drive: EvaluatedDrive) -> list[MetricRow]:
