@@ -393,7 +393,7 @@
   }
 
   function fitted(label) {
-    return label.length > 20 ? label.slice(0, 19) + "…" : label;
+    return label.length > 20 ? label.slice(0, 9) + "…" + label.slice(-10) : label;
   }
 
   function drawSpans(u, rows) {
