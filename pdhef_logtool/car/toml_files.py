@@ -53,7 +53,7 @@ def read_vehicle_file(path: Path) -> VehicleFile:
     VehicleError
         The file is missing or no TOML, or has wrong, unknown or missing entries; the message names all of them.
     """
-    return vehicle_of_entries(read_toml(path, "a vehicle TOML file", VehicleError), where=str(path))
+    return vehicle_of_entries(read_toml(path, "a vehicle TOML, car folder or 'saloon'", VehicleError), where=str(path))
 
 
 def with_sensors(vehicle: VehicleParameters, profile: Path | str) -> VehicleParameters:

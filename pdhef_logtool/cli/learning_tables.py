@@ -27,7 +27,7 @@ def render_learning(result: LearnResult, console: Console) -> None:
     if not result.document:
         (stage,) = result.stages
         _RENDER[stage.name](stage.figures, console)
-        console.print(f"{len(result.drives)} drives; car in {result.car}", soft_wrap=True)
+        console.print(f"{len(result.drives)} drives; next: pdhef run LOG --car {result.car} -o OUT", soft_wrap=True)
         return
     stages = table("stage", "outcome", ">validation RMSE °\nbefore", ">\nafter", "of")
     for s in result.stages:
@@ -112,7 +112,7 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
         against = [
             cell(t[key] if t["against"] else None, digits=4) for key in ("difference_deg2", "standard_error_deg2")
         ]
-        rungs.add_row(t["rung"], cell(t["rmse_deg"], digits=3), *against, "taken" if t["taken"] else "not taken")
+        rungs.add_row(t["rung"], cell(t["rmse_deg"], digits=3), *against, "accepted" if t["taken"] else "rejected")
     console.print(rungs)
     console.print()
     drives = table("drive", ">seconds", ">physics °", ">with residual °", "calibration", fold=4)
@@ -122,7 +122,7 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
     console.print(drives)
     console.print(f"  {figures['evidence']}")
     console.print(
-        f"  the prior of the tyres lowers the error of other driving with probability {figures['prior_support']:.2f}"
+        f"  probability that the tyre prior lowers other drives' errors: {figures['prior_support']:.2f} (0: unused)"
     )
     for text in figures["more"]:
         console.print(f"  {text}")

@@ -153,7 +153,7 @@ def metrics(  # positional: one an option of the command line
         str | None, Option(help="Name of the estimator in the results, or the one of [estimates] to score.")
     ] = None,
     output: Annotated[
-        Path | None, Option("--output", "-o", help="Output folder for tables and report. Default: print only.")
+        Path | None, Option("--output", "-o", help="Output folder; pdhef report writes its pages. Default: print only.")
     ] = None,
     junit: options.JunitFile = None,
     strict: options.Strict = False,

@@ -9,7 +9,7 @@ Their variance of sideslip is their own, what the parameters leave open, and wha
 
 where v_y,i is that of the physics filter on the vehicle one posterior 1-sigma away in direction i, and d² that of
 the whole log as far as it goes with the driving. s_car is what no parameter of a single track explains: nearly constant
-within a drive, it differs between drives and cars, as does the RMS error χ that the fit leaves over the assumed one
+within a drive, it differs between drives and cars, as does the RMS error χ ≥ 1 that the fit leaves over the assumed one
 (Birge 1932). s_l is that of the distance from the rear axle to the centre of gravity where no file gives it: the rear
 axle determines its own lateral velocity. That of v_y is the same sum as a velocity. Estimates themselves do not change.
 """

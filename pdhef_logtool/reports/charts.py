@@ -251,7 +251,8 @@ def _range(values: FloatArray) -> str:
 
 
 def _label(text: str) -> str:
-    cut = text if len(text) <= _LABEL_SIGNS else f"{text[: _LABEL_SIGNS - 1]}…"
+    half = _LABEL_SIGNS // 2
+    cut = text if len(text) <= _LABEL_SIGNS else f"{text[: half - 1]}…{text[-half:]}"
     return all_printable(cut)
 
 

@@ -181,10 +181,7 @@ def _notices(report: Mapping[str, Any], figures: DriveFigures | None, low_speed:
     if duration < _SHORT_S:
         said.append(f"The log is only {duration:.1f} s long: too short to judge an estimator by.")
     if figures is not None and not figures.moves:
-        said.append(
-            "The car is never fast enough for a sideslip: below the low-speed blend of the car "
-            f"({_LOW_SPEED_M_S if low_speed is None else low_speed:g} m/s) it has no direction. None is drawn."
-        )
+        said.append("The car is never fast enough for a sideslip: none is drawn.")
     if not report["truth"]["available"]:
         said.append(
             "The log has no ground truth: no error is known, and no estimate can be called good or bad. Shown instead: "

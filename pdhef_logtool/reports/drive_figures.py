@@ -214,7 +214,7 @@ def _add_filter(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles)
         charts.figures["trust"] = TimeFigure("Residual gain", "", trust, resolution=_SHARE_SEEN, height=120)
     scales = _lines(series, roles, "r_scale", roles.names)
     if any(np.nanmax(s.values) > 1.0 + 1e-9 for s in scales):
-        title = "R scale: how much wider than usual the filter takes its sensors' noise"
+        title = "R scale: factor on the measurement noise (nominal 1)"
         charts.figures["r_scale"] = TimeFigure(title, "×", scales, level=1.0, log=True, height=130)
     if nis := _lines(series, roles, "nis", roles.names):
         title = "NIS per degree of freedom, mean over 1 s (expected value 1)"

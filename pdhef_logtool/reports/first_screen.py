@@ -121,9 +121,10 @@ def tested_drive(report: Mapping[str, Any], outcome: str = "") -> list[tuple[str
     state = "validated on drives with ground truth" if vehicle.get("proven") else "parameters not validated"
     if not vehicle.get("file"):
         state = "no car given: default sedan"
+    ran = ", ".join(e["name"] for e in report["estimators"] if e["outcome"] == "ran")
     facts = [
         ("Car", f"{vehicle['name']}{file}; {state}"),
-        ("Estimate", f"{answer['main']} ({answer['why']})" if answer.get("main") else "none"),
+        ("Estimate", f"{answer['main']} ({answer['why']})" if answer.get("main") else ran or "none"),
         ("Outcome", outcome if outcome != "ok" else ""),
         (
             "Drive",

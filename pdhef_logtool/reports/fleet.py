@@ -27,8 +27,8 @@ MOST_ROWS, _MOST_KEYS, _MOST_BARS = 1000, 12, 40
 #: Errors beyond this quantile of the drives are counted in the last bar.
 _MOST_SHARE = 0.98
 _LEVELS = 8
-#: Drives of the figure of the first screen, and characters of their names in it.
-_WORST, _LABEL = 10, 20
+#: Drives of the figure of the first screen.
+_WORST = 10
 #: Estimators with a median error beyond this many times the selected estimate's are left to the table.
 _DRAWN = 5.0
 #: The table of the operating space shows at least this far, so that what a car can do and nobody did is seen.
@@ -112,13 +112,7 @@ def _worst(fleet: Fleet, charts: Charts) -> tuple[str, float | None] | None:
     if len(ranked) > 1:
         degree = math.degrees(1.0)
         bars = [
-            Interval(
-                f"…{d.label[1 - _LABEL :]}" if len(d.label) > _LABEL else d.label,
-                math.nan,
-                (error or 0.0) * degree,
-                math.nan,
-                colour(d.main or ""),
-            )
+            Interval(d.label, math.nan, (error or 0.0) * degree, math.nan, colour(d.main or ""))
             for error, d in ranked[:_WORST]
         ]
         title = f"The {len(bars)} drives with the largest sideslip RMSE"

@@ -60,9 +60,7 @@ def notes_of(comparison: Comparison) -> list[str]:
             notes.append(f"{figure.figure.label}: {figure.neither} drives have it on neither side")
         if math.isfinite(figure.detectable):
             least = percent(figure.detectable)
-            notes.append(
-                f"{figure.figure.label}: smallest increase that these drives detect with a probability of 80 %: {least}"
-            )
+            notes.append(f"{figure.figure.label}: smallest increase that these drives detect with 80 % power: {least}")
     return notes
 
 

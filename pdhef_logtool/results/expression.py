@@ -181,7 +181,7 @@ class _Parser:
             )
         if not self._text.isascii():
             raise self._error(
-                "a column, a number or a sign", next(k for k, c in enumerate(self._text) if not c.isascii())
+                "a column, a number or an operator", next(k for k, c in enumerate(self._text) if not c.isascii())
             )
         duration = _DURATION.search(self._text)
         end = len(self._text) if duration is None else duration.start()
@@ -296,7 +296,7 @@ class _Parser:
         return UsageError(
             expected=expected,
             got=got,
-            where=f"--where, sign {position + 1} (here: {before[-30:]}»{after[:30]})",
+            where=f"--where, character {position + 1} (here: {before[-30:]}»{after[:30]})",
             remedy=f"{self._guide} has the columns and what joins them",
         )
 

@@ -297,8 +297,7 @@ def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]
             else f"calibrate the car with several logs: pdhef learn LOGS {given} --without-truth"
         )
     if vehicle["proven"] and share is not None and share < NEARLY_HOLDS:
-        to_do = "pdhef learn LOGS --car CAR -o mycar --stages intervals"
-        steps.append(f"recalibrate the intervals with drives like this one: {to_do}")
+        steps.append("recalibrate the intervals: pdhef learn LOGS --car CAR -o mycar --stages intervals")
     friction = report["friction"]
     if friction is not None and friction["estimated"] and (friction["observable_share"] or 0.0) < _FRICTION_SHOWN:
         steps.append("give the friction if it is known: --friction 0.8")

@@ -51,7 +51,7 @@ def test_names_that_are_markup_stay_texts_and_a_run_without_truth_has_a_page(tmp
     b = write_run(tmp_path / "b", {HOSTILE: 0.1, "d": float("nan")}, entries=entries)
     page = _page(a, b)
     assert "<img" not in page
-    assert "no drive has the figure on both sides" in _text(page)
+    assert "no drive has the figure on both sides (is there ground truth?): sideslip_rad rmse (all)" in _text(page)
     assert "No drive has the figure on both sides." in _text(page)
 
 

@@ -80,6 +80,11 @@ def test_sideslip_below_the_low_speed_blend_is_a_gap(tmp_path):
         assert np.isfinite(line.values[: int(0.38 * cells)]).all()
 
 
+def test_recorded_estimates_are_named_as_what_was_tested(tmp_path):
+    tracks = drive_tracks(names=("esc",))
+    assert "Estimate esc Drive" in words(page_of(write_run(tmp_path, tracks, answer=None)))
+
+
 def test_a_drive_of_three_seconds_says_that_it_is_short(tmp_path):
     assert "only 3.0 s long" in words(page_of(write_run(tmp_path, drive_tracks(3.0))))
 

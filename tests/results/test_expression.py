@@ -65,7 +65,7 @@ def test_tracks_units_and_errors_are_columns() -> None:
         ("-" * 100 + "1 > 2", 41, "at most 40", "-"),
         ("(" * 1000 + "1", 0, "expected", "("),
         ("not " * 400 + "valid", 0, "at most 40", "not"),
-        ("speed_m_s > 2 ü", 15, "a column, a number or a sign", "ü"),
+        ("speed_m_s > 2 ü", 15, "a column, a number or an operator", "ü"),
         ("speed_m_s > 1j", 13, "a column, a number", "1j"),
         ("speed_m_s > True", 13, "a column, a number", "True"),
         ("speed_m_s > 2 " * 300, 0, "at most 2000 signs", "4200 signs"),
@@ -76,7 +76,7 @@ def test_an_error_points_at_its_place(text: str, sign: int, expected: str, got: 
         parse_condition(text)
     assert expected in str(error.value)
     assert f"got {got}" in str(error.value)
-    assert not sign or f"--where, sign {sign} (here:" in str(error.value)
+    assert not sign or f"--where, character {sign} (here:" in str(error.value)
 
 
 WORDS = ["speed_m_s", "valid", "truth.vx_km_h", "abs(", "(", ")", "and", "or", "not", "for", "0.5", "s", "<", "-", "*"]

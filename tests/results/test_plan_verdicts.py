@@ -104,6 +104,17 @@ def test_the_reason_for_no_value_is_given(requirement: Requirement, reason: str)
     assert reason in verdict.reason and verdict.next
 
 
+def test_what_is_missing_has_the_remedy_that_helps() -> None:
+    """A standstill asks for speed, a baseline that did not run for an estimator, and no ground truth for a record."""
+    needs = {"limit": 1.0}, {"baseline": "ekf", "max_ratio": 1.0}
+    slow = judged(
+        [row(log, "rmse", 0.01, signal="vx_m_s") for log in SIX], Requirement("A", "", "sideslip_rad", **needs[0])
+    )
+    assert slow.next == "record drives with ground truth above the low-speed limit"
+    alone = judged(scored(), Requirement("A", "", "sideslip_rad", **needs[1]))
+    assert (alone.reason, alone.next) == ("ekf has no such value", "add it to the estimators of pdhef run")
+
+
 def test_a_recorded_estimate_is_judged_where_it_is_the_only_one() -> None:
     recorded = scored(estimator="esc")
     drives = [JudgedDrive(log, None) for log in SIX]

@@ -136,9 +136,8 @@ class SelfCalibration:
 
     @property
     def error_scale(self) -> float:
-        """What the model leaves of the sensors over ``ERROR_STD``, RMS of both; 1 without a fit."""
-        scale = float(np.sqrt(np.mean((np.array(self.rms) / np.array(ERROR_STD)) ** 2)))
-        return scale if math.isfinite(scale) else 1.0
+        """RMS of what the model leaves of the sensors over ``ERROR_STD``, at least 1: a good fit proves no more."""
+        return float(np.fmax(1.0, np.sqrt(np.mean((np.array(self.rms) / np.array(ERROR_STD)) ** 2))))
 
     @property
     def text(self) -> str:

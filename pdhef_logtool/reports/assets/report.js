@@ -393,7 +393,7 @@
   }
 
   function fitted(label) {
-    return label.length > 20 ? label.slice(0, 19) + "…" : label;
+    return label.length > 20 ? label.slice(0, 9) + "…" + label.slice(-10) : label;
   }
 
   function drawSpans(u, rows) {
@@ -487,11 +487,17 @@
       const cx = (left + right) / 2, cy = (low + high) / 2;
       return [[cx - (scale * wide) / 2, cx + (scale * wide) / 2], [cy - (scale * tall) / 2, cy + (scale * tall) / 2]];
     };
+    // uPlot's own filter leaves a horizontal logarithmic axis of less than a decade without a number.
+    const decades = (u, splits) => {
+      const wide = (widthOf(figure) - 66) / Math.log10(right / left);
+      const digits = wide > 250 ? "12357" : wide > 120 ? "125" : "1";
+      return splits.map((v) => (v !== null && digits.includes(v.toExponential()[0]) ? v : null));
+    };
     const scale = (k) => (spec.log ? { time: false, distr: 3, range: () => ranges()[k] } : { time: false, range: () => ranges()[k] });
     figure.chart = new uPlot({
       width: widthOf(figure), height: height(), legend: { show: false },
       scales: { x: scale(0), y: scale(1) },
-      axes: [axis(spec.x_label, { size: 26, space: spec.log ? 24 : 50 }), axis(spec.y_label, { size: 46 })],
+      axes: [axis(spec.x_label, { size: 26, ...(spec.log ? { filter: decades } : {}) }), axis(spec.y_label, { size: 46 })],
       series: [{}, { scale: "y", stroke: "transparent", points: { show: false } }],
       cursor: { show: false },
       hooks: { draw: [(u) => clouds.forEach((c) => paint(u, c))] },
