@@ -174,7 +174,8 @@ def _rough_correlations(a: FloatArray, b: FloatArray, reach: int) -> tuple[Float
     for values in (_unit_power(a), _unit_power(b)):
         finite = np.isfinite(values)
         values = np.where(finite, values, 0.0)
-        spectra.append(np.fft.rfft([finite, values, values * values], size))
+        with np.errstate(over="ignore", invalid="ignore"):
+            spectra.append(np.fft.rfft([finite, values, values * values], size))
 
     def sums(of_a: int, of_b: int) -> FloatArray:
         every = np.fft.irfft(np.conj(spectra[0][of_a]) * spectra[1][of_b], size)
