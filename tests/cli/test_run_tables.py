@@ -149,6 +149,14 @@ def test_what_is_assumed_of_all_logs_is_said_once_and_the_rest_with_each() -> No
     assert text.index("car golf") < text.index("friction given (option, 0.9)") < text.index("friction estimated (seen)")
 
 
+def test_estimators_that_were_skipped_are_named_with_the_reason_once() -> None:
+    drive = named("drive")
+    skipped = {"outcome": "skipped", "reason": "needs a gyro"}
+    drive["estimators"] += [{**drive["estimators"][0], "name": name, **skipped} for name in ("one", "two")]
+    (line,) = (line for line in shown(drive).splitlines() if "skipped" in line)
+    assert line.strip() == "one, two skipped: needs a gyro"
+
+
 def test_named_estimators_keep_their_table_a_log() -> None:
     text = shown(*(report(replace(MAIN, named=True), metrics=GOOD) for _ in range(2)))
     assert len(rows(text, "estimator")) == 2
