@@ -151,6 +151,13 @@ def test_the_shipped_car_is_found_by_name_and_none_is_the_default_sedan() -> Non
     assert default.allowed_trust.cap == 0.0
 
 
+def test_a_car_without_network_has_no_residual_network_and_one_for_physics_is_it() -> None:
+    assert Car.of(default_vehicle()).residual_network is None
+    saloon = Car.load("saloon")
+    assert saloon.network is not None
+    assert saloon.residual_network is saloon.network
+
+
 def test_parts_come_one_by_one(folder: Path) -> None:
     own = load(folder).vehicle
     fit = add_fit(folder)
