@@ -27,7 +27,7 @@ from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, signal_error
-from pdhef_logtool.evaluation.metrics.lateral_consistency import consistency_rows, driven_consistency, driving_products
+from pdhef_logtool.evaluation.metrics.lateral_consistency import consistency_rows
 from pdhef_logtool.records.errors import PdhefError, SimulationError
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -36,7 +36,7 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.selection import FACTOR
-from pdhef_logtool.runs.self_calibrating import log_sensors
+from pdhef_logtool.runs.self_calibrating import driven_d2, log_sensors
 from studies.condition_drives import SIDESLIP, as_logged
 from studies.drawn_cars import BASE, KINDS, draw_car
 from studies.pages import DRIVES, ROOT, number, table
@@ -130,9 +130,7 @@ def taken(signals: Signals, file: VehicleParameters, calibration: SelfCalibratio
         calibration.vehicle, calibration.noise, told_friction=True, note="", error_scale=calibration.error_scale
     )
     car = replace(Car.of(file), self_calibrated=calibrated)
-    track, _ = run_window(make_estimator("physics", car), signals)
-    low, sensors = file.low_speed_blend_m_s, log_sensors(file, calibration)
-    driven = driven_consistency(*driving_products(track, signals, low_speed_m_s=low, sensors=sensors))
+    driven = driven_d2([signals], car, calibration)
     return replace(car, self_calibrated=replace(calibrated, varied=calibration.varied, driven_d2_m_s=driven))
 
 

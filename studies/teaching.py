@@ -26,17 +26,16 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.taught import Taught
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
+from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
-from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency, driving_products
 from pdhef_logtool.learning.stages.teach import OpenedDrive, Teaching, learn_from, open_drive
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.residual_model.bundle import open_model
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator
-from pdhef_logtool.runs.self_calibrating import log_sensors, self_calibrated
+from pdhef_logtool.runs.self_calibrating import driven_d2, self_calibrated
 from pdhef_logtool.storage.files import write_bytes
 from studies.pages import DOCS, DRIVES, RESULTS, number, options, table, write
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_of, vehicle_of
@@ -199,8 +198,11 @@ def score(
     prior = () if taught is None else taught.parameters
     calibration = self_calibrate([drive.driving], car.vehicle, taught=prior)
     wanted = len(drive.whole.signals) <= most_stamps
-    calibration = _with_consistency(drive, calibration) if wanted else replace(calibration, varied=())
-    calibrated = replace(self_calibrated(drive.drive, calibration), taught=taught)
+    bare = replace(calibration, varied=())
+    if wanted:
+        d2_m_s = driven_d2([drive.whole.signals], self_calibrated(drive.drive, bare), calibration)
+        calibration = replace(calibration, driven_d2_m_s=d2_m_s)
+    calibrated = replace(self_calibrated(drive.drive, calibration if wanted else bare), taught=taught)
     estimator = make_estimator(name, replace(calibrated, network=car.network))
     track, _ = run_window(estimator, drive.whole.signals)
     track = calibrator(calibrated, [estimator]).add(track, drive.whole.signals)
@@ -214,15 +216,6 @@ def score(
         float(np.mean(track.network_trust[kept] > 0.0)),
         float(np.mean(np.abs(error[kept]) <= NORMAL_95 * track.sideslip_std_rad[kept])) if wanted else None,
     )
-
-
-def _with_consistency(drive: OpenedDrive, calibration: SelfCalibration) -> SelfCalibration:
-    """Return the calibration as a run has it, with the part of ``d2`` that correlates with the driving."""
-    vehicle, alone = drive.drive.car.vehicle, self_calibrated(drive.drive, replace(calibration, varied=()))
-    track, _ = run_window(make_estimator("physics", alone), drive.whole.signals)
-    sensors, slow = log_sensors(vehicle, calibration), vehicle.low_speed_blend_m_s
-    products = driving_products(track, drive.whole.signals, low_speed_m_s=slow, sensors=sensors)
-    return replace(calibration, driven_d2_m_s=driven_consistency(*products))
 
 
 def taught_of(teaching: Teaching, car: Car) -> Taught:

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from pdhef_logtool.drive.checks.by_relations import explained_factors
-from pdhef_logtool.drive.checks.kind import SURE
+from pdhef_logtool.drive.checks.kind import is_beyond
 from pdhef_logtool.drive.checks.sensor_errors import ay_delay, sensor_errors
 from pdhef_logtool.drive.checks.truth_sideslip import SIDESLIP_OFFSET_RAD, sideslip_offset
 from pdhef_logtool.drive.mounting import Survey, scaled_source, turned_signals
@@ -99,7 +99,7 @@ def _of_a_turned_truth(survey: Survey) -> list[Proposal]:
     if offset_and_error is None or survey.truth is None:
         return []
     offset, error = offset_and_error
-    if abs(offset) - SURE * error <= SIDESLIP_OFFSET_RAD:
+    if not is_beyond(offset, error, (-SIDESLIP_OFFSET_RAD, SIDESLIP_OFFSET_RAD)):
         return []
     truth = survey.mapping.truth
     evidence = f"sideslip is {math.degrees(offset):.2f} +- {math.degrees(error):.2f} deg where the car goes straight"

@@ -407,11 +407,8 @@ def _decisive(requirement: Requirement, bounded: Bounded, exposure: Exposure, wh
 
     That of a positive value does so in its logarithm, as it was drawn.
     """
-    near, value, end = (
-        requirement.bound,
-        bounded.value,
-        bounded.low if bounded.value > requirement.bound else bounded.high,
-    )
+    near, value = requirement.bound, bounded.value
+    end = bounded.low if value > near else bounded.high
     if min(near, bounded.low) > 0.0 and requirement.metric not in AT_LEAST:
         near, value, end = math.log(near), math.log(value), math.log(end)
     distance, width = abs(near - value), abs(end - value)

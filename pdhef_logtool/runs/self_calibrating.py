@@ -5,7 +5,7 @@ See docs/method.md#self-calibration.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,6 @@ from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.reading import Drive
-from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.logs.discovery import LogInput
@@ -86,22 +85,25 @@ def checked(drive: Drive, calibration: SelfCalibration | None) -> SelfCalibratio
     if calibration is None or calibration.refused or calibration.earlier:
         return calibration
     alone = self_calibrated(drive, replace(calibration, varied=()))  # lateral kinematic consistency needs no interval
-    sensors = log_sensors(drive.car.vehicle, calibration)
-    return replace(calibration, driven_d2_m_s=_driven_d2_of(drive, make_estimator("physics", alone), sensors))
+    # Windows of a fixed length, so that the length of the run's windows does not change it.
+    windows = drive.windows(fill_friction=_told(drive), window_s=_WINDOW_S)
+    signals = (_without_log_friction(drive, window.signals) for window in windows)
+    return replace(calibration, driven_d2_m_s=driven_d2(signals, alone, calibration))
 
 
-def _driven_d2_of(drive: Drive, estimator: Estimator, sensors: SensorErrors) -> float:
-    """Return the part of ``d2`` of an estimator over a drive that correlates with the driving, in m/s; NaN if unknown.
+def driven_d2(windows: Iterable[Signals], car: Car, calibration: SelfCalibration) -> float:
+    """Return the part of ``d2`` of ``physics`` that correlates with the driving, in m/s; NaN if unknown.
 
-    The windows have a fixed length, so that the length of the run's windows does not change it.
+    ``windows`` : of a drive, read with the vehicle of the car, which has the calibration.
     """
     from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency, driving_products
 
-    slow, carry = drive.car.vehicle.low_speed_blend_m_s, None
+    estimator, sensors = make_estimator("physics", car), log_sensors(car.vehicle, calibration)
+    slow, carry = car.vehicle.low_speed_blend_m_s, None
     products, seconds = np.zeros((4, 4)), 0.0
-    for window in drive.windows(fill_friction=_told(drive), window_s=_WINDOW_S):
-        track, carry = run_window(estimator, _without_log_friction(drive, window.signals), carry, None)
-        more, lasted = driving_products(track, window.signals, low_speed_m_s=slow, sensors=sensors)
+    for signals in windows:
+        track, carry = run_window(estimator, signals, carry, None)
+        more, lasted = driving_products(track, signals, low_speed_m_s=slow, sensors=sensors)
         products += more
         seconds += lasted
     return driven_consistency(products, seconds)

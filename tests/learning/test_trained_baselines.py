@@ -42,7 +42,8 @@ def smoothed(values: np.ndarray, dt: float, corner_hz: float) -> np.ndarray:
 
 def make_features(seed: int, steps: int = 600) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    features = np.cumsum(rng.normal(size=(steps, len(FEATURES))), axis=0) * 0.1
+    walks = rng.normal(size=(steps, 28))  # more than features: another number of them draws the same
+    features = np.cumsum(walks[:, : len(FEATURES)], axis=0) * 0.1
     features[:, FEATURES.index("friction")] = 0.85  # one road: says nothing
     return features
 
@@ -111,7 +112,7 @@ def test_a_network_learns_a_velocity(velocity_network):
     vy = np.stack([NetworkService(velocity_network).run(t.features, whole, None)[0] for t in tests])
     assert vy.shape == (8, 600, 1)
     target = np.stack([t.target for t in tests])
-    assert np.sqrt(np.mean((vy - target) ** 2)) < 0.4 * np.sqrt(np.mean(target**2))
+    assert np.sqrt(np.mean((vy - target) ** 2)) < 0.3 * np.sqrt(np.mean(target**2))
 
 
 def save_model(folder: Path, velocity_network: ModelBundle) -> None:

@@ -20,6 +20,12 @@ _T = TypeVar("_T")
 SURE = 4.0
 
 
+def is_beyond(value: float, error: float, plausible: tuple[float, float]) -> bool:
+    """Return whether a figure is so many standard errors outside of what is plausible."""
+    low, high = plausible
+    return value + SURE * error < low or value - SURE * error > high
+
+
 @dataclass(frozen=True, slots=True)
 class CheckKind:
     """One check, as its file registers it.
@@ -65,7 +71,7 @@ class CheckKind:
     ) -> Check:
         """Judge a figure by its standard error: failed so many errors beyond what is plausible, passed two inside."""
         low, high = plausible
-        if value + SURE * error < low or value - SURE * error > high:
+        if is_beyond(value, error, plausible):
             return self.failed(evidence, "", **fields)
         is_inside = low <= value - 2.0 * error and value + 2.0 * error <= high
         return self.passed(evidence) if is_inside else self.undecided(evidence)
