@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.records.signals import Signals, join_signals
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
     from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
     from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference
     from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
@@ -48,9 +49,7 @@ def reference_of(drive: Drive, calibration: SelfCalibration | None, config: RunC
     if missing:
         return DriveReference(None, _document([], f"the log has no {', '.join(missing)}"))
     speed = drive.mapping.signals.get("speed_m_s")
-    prior = replace(
-        prior_of(drive.car.vehicle, calibration), speed_over_ground=speed is not None and speed.combine == "norm"
-    )
+    prior = replace(prior_of(drive.car, calibration), speed_over_ground=speed is not None and speed.combine == "norm")
     spans = list(_spans(drive, prior, use_gnss=config.gnss != "off"))
     used = [span for span in spans if not span.refused]
     refused = "" if used else next((span.refused for span in spans), "the log has no samples")
@@ -61,11 +60,15 @@ def reference_of(drive: Drive, calibration: SelfCalibration | None, config: RunC
     return DriveReference(estimator, _document(spans, refused))
 
 
-def prior_of(vehicle: VehicleParameters, calibration: SelfCalibration | None) -> ReferencePrior:
-    """Return what is known of a car before its drive: the geometry of its file, sensors as the log calibrated them."""
-    from pdhef_logtool.estimators.calibration.joint import AY_BIAS, AY_GAIN, IMU_X, RATE_BIAS
+def prior_of(car: Car, calibration: SelfCalibration | None) -> ReferencePrior:
+    """Return what is known of a car before its drive: the geometry of its file, sensors as the log calibrated them.
+
+    Without calibration or ground truth nothing has shown that the accelerometer is where no file states another place.
+    """
+    from pdhef_logtool.estimators.calibration.joint import AY_BIAS, AY_GAIN, IMU_X, IMU_X_REACH, RATE_BIAS
     from pdhef_logtool.estimators.reference.drive import ReferencePrior
 
+    vehicle = car.vehicle
     wheelbase = vehicle.cg_to_front_axle_m + vehicle.cg_to_rear_axle_m
     gain = 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2
     prior: dict[str, Any] = {
@@ -86,6 +89,8 @@ def prior_of(vehicle: VehicleParameters, calibration: SelfCalibration | None) ->
         }
         if not calibration.refused:
             prior["friction"] = calibration.vehicle.assumed_friction
+    elif not car.has_evidence and vehicle.imu_position_m[0] == 0.0:
+        prior["unknown_imu_x_m"] = IMU_X_REACH * wheelbase
     antenna = vehicle.gnss_antenna_position_m
     if antenna is not None:
         prior["antenna_m"] = antenna[:2]

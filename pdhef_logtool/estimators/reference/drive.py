@@ -40,7 +40,9 @@ class ReferencePrior:
 
     ``rear_m``, ``wheelbase_m``: geometry. ``friction``: of the road, for the end of the linear range. ``imu_x_m``,
     ``ay_gain``, ``ay_bias_m_s2``, ``yaw_rate_bias_rad_s``: errors of the sensors as the log was read, with 1-sigmas of
-    the first two. ``antenna_m``: position x, y of the antenna from the CG, NaN if unknown.
+    the first two. ``unknown_imu_x_m``: 1-sigma of a position that the drive does not show; it counts in the intervals
+    alone, for a free one explains what the law lacks. ``antenna_m``: position x, y of the antenna from the CG, NaN if
+    unknown.
     ``speed_over_ground``: the speed is the length of a velocity over ground, not that of wheels.
     """
 
@@ -49,6 +51,7 @@ class ReferencePrior:
     friction: float = LINEAR_FRICTION
     imu_x_m: float = 0.0
     imu_x_std_m: float = 0.1
+    unknown_imu_x_m: float = 0.0
     ay_gain: float = 1.05
     ay_gain_std: float = 0.04
     ay_bias_m_s2: float = 0.0
@@ -177,13 +180,13 @@ def refer(signals: Signals, prior: ReferencePrior, *, use_gnss: bool = True) -> 
     rows[:, s.GNSS_OFFSET] -= scanned_delay(rows)
     with_gnss = use_gnss and gnss_follows_imu(rows)
     noise = sensor_noise(signals, rows)
-    alone = best = _smooth(rows, prior, noise, s.WITHOUT_GNSS)
-    if with_gnss:
-        rows = without_jumps(rows)
-        aided = with_gnss_speed(rows)
-        has_position = np.isfinite(rows[:, s.POSITION_EAST]).any()
-        guess = first_guess(rows, alone.states)
-        best = _smooth(aided, prior, noise, s.WITH_POSITION if has_position else s.WITH_GNSS, guess)
+    rows = without_jumps(rows) if with_gnss else rows
+    alone, best = _with_and_without_gnss(rows, prior, noise, with_gnss=with_gnss)
+    if prior.unknown_imu_x_m > 0.0:
+        moved = replace(prior, imu_x_m=prior.imu_x_m + prior.unknown_imu_x_m)
+        _, elsewhere = _with_and_without_gnss(rows, moved, noise, with_gnss=with_gnss)
+        vx, vy = (elsewhere.states - best.states)[:, [s.VX, s.VY]].T
+        best = replace(best, covariance=best.covariance + np.stack([vx * vx, vx * vy, vy * vy], axis=1))
     gnss_share = np.clip(1.0 - best.covariance[:, 2] / np.maximum(alone.covariance[:, 2], 1e-12), 0.0, 1.0)
     vx, vy = best.states[:, s.VX], best.states[:, s.VY]
     law_m_s = np.where(rows[:, s.LAW_STD] > 0.0, rows[:, s.LAW_STD] * np.hypot(vx, vy), np.inf)
@@ -220,6 +223,17 @@ class _Smoothed:
     covariance: FloatArray
     last_variance: FloatArray
     moved_m_s: float
+
+
+def _with_and_without_gnss(
+    rows: FloatArray, prior: ReferencePrior, noise: FloatArray, *, with_gnss: bool
+) -> tuple[_Smoothed, _Smoothed]:
+    """Return what is smoothed without GNSS, and with it where it is used."""
+    alone = _smooth(rows, prior, noise, s.WITHOUT_GNSS)
+    if not with_gnss:
+        return alone, alone
+    n = s.WITH_POSITION if np.isfinite(rows[:, s.POSITION_EAST]).any() else s.WITH_GNSS
+    return alone, _smooth(with_gnss_speed(rows), prior, noise, n, first_guess(rows, alone.states))
 
 
 def _smooth(
@@ -266,5 +280,6 @@ def _refusal(smoothed: _Smoothed, parameters: tuple[ReferenceParameter, ...]) ->
     far = [p for p in parameters if abs(p.value - p.prior) > p.limit]
     if far:
         p = far[0]
-        return f"{p.name} {p.value:.3g} {p.unit} is implausible (expected {p.prior:.3g} ± {p.limit:.2g})"
+        value = f"{p.name} {p.value:.3g} {p.unit}".removesuffix(" 1")  # a number without a unit
+        return f"{value} is implausible (expected {p.prior:.3g} ± {p.limit:.2g})"
     return ""
