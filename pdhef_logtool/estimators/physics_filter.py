@@ -96,7 +96,7 @@ UNKNOWN_STEER_STD, MAX_STEER_STD, UNKNOWN_STEER_WALK = 0.1, 0.2, 0.2
 #: Beyond this share of the grip, the largest of about the last ``LIMIT_TIME_S``, tyre models are least certain
 #: (docs/method.md#limit). ``limit_lag_m`` of a file that neither ground truth nor calibration has validated, in
 #: wheelbases: chosen on simulated cars with right and wrong files. More helps single manoeuvres and harms laps.
-LINEAR_SHARE, LIMIT_TIME_S, FILE_LIMIT_LAG = 0.36, 0.5, 1.1
+LINEAR_SHARE, LIMIT_TIME_S, FILE_LAG = 0.36, 0.5, 1.1
 
 #: The column of a block of points that contains the centre.
 _CENTRE = AY_BIAS
@@ -670,9 +670,8 @@ def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:
     """Return ``physics`` of a car, with what was found through it and its noise where the car has them.
 
     A car without identified parts has none: a static single track with the sensors' noise. If no drive with ground
-    truth has validated it, its axle forces may depart from the tyre model, and do so the longer the nearer it is to
-    the limit: only forces that lag can. What tuned noise leaves out of the process noise is what was found through the
-    filter.
+    truth has validated it, its axle forces may depart from the tyre model, for longer the more grip the car uses: only
+    forces that lag can. What tuned noise leaves out of the process noise is what was found through the filter.
     """
     vehicle, noise = car.physics_vehicle, car.noise.get(PHYSICS)
     if noise is not None and car.fitted_physics is not None:
@@ -681,6 +680,5 @@ def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:
     physics = physics_filter(vehicle, noise, use_speed=use_speed)
     if noise is None and not car.has_evidence:
         lagging = vehicle.model_copy(update={"physics": vehicle.physics.model_copy(update={"lag": True})})
-        lag_m = FILE_LIMIT_LAG * vehicle.wheelbase_m
-        physics = replace(physics, vehicle=lagging, limit_gain=LIMIT_GAIN, limit_lag_m=lag_m)
+        physics = replace(physics, vehicle=lagging, limit_gain=LIMIT_GAIN, limit_lag_m=FILE_LAG * vehicle.wheelbase_m)
     return physics if vehicle == car.vehicle else replace(physics, read_with=car.vehicle)

@@ -69,12 +69,10 @@ def prior_of(car: Car, calibration: SelfCalibration | None) -> ReferencePrior:
     from pdhef_logtool.estimators.reference.drive import ReferencePrior
 
     vehicle = car.vehicle
-    wheelbase = vehicle.cg_to_front_axle_m + vehicle.cg_to_rear_axle_m
-    gain = 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2
     prior: dict[str, Any] = {
         "imu_x_m": vehicle.imu_position_m[0],
         "imu_x_std_m": _FILE_STD_M,
-        "ay_gain": gain,
+        "ay_gain": 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2,
         "friction": vehicle.assumed_friction,
     }
     if calibration is not None and calibration.parameters:
@@ -90,11 +88,11 @@ def prior_of(car: Car, calibration: SelfCalibration | None) -> ReferencePrior:
         if not calibration.refused:
             prior["friction"] = calibration.vehicle.assumed_friction
     elif not car.has_evidence and vehicle.imu_position_m[0] == 0.0:
-        prior["unknown_imu_x_m"] = IMU_X_REACH * wheelbase
+        prior["unknown_imu_x_m"] = IMU_X_REACH * vehicle.wheelbase_m
     antenna = vehicle.gnss_antenna_position_m
     if antenna is not None:
         prior["antenna_m"] = antenna[:2]
-    return ReferencePrior(vehicle.cg_to_rear_axle_m, wheelbase, **prior)
+    return ReferencePrior(vehicle.cg_to_rear_axle_m, vehicle.wheelbase_m, **prior)
 
 
 def _spans(drive: Drive, prior: ReferencePrior, *, use_gnss: bool) -> Iterator[SideslipReference]:
@@ -126,7 +124,6 @@ def _document(spans: Sequence[SideslipReference], refused: str) -> dict[str, Any
     longest = max(spans, key=lambda span: len(span.stamps_ns), default=None)
     knots = sum(len(span.stamps_ns) for span in spans)
     valid = sum(int(span.valid.sum()) for span in spans)
-    parameters = () if longest is None else longest.parameters
     return {
         "refused": refused or None,
         "gnss": any(span.with_gnss for span in spans),
@@ -135,6 +132,6 @@ def _document(spans: Sequence[SideslipReference], refused: str) -> dict[str, Any
         "spans": len(spans),
         "parameters": [
             {"name": p.name, "unit": p.unit, "value": p.value, "std": p.std, "prior": p.prior, "limit": p.limit}
-            for p in parameters
+            for p in (longest.parameters if longest else ())
         ],
     }
