@@ -17,7 +17,7 @@ from typing import Any, NoReturn, TypeVar
 
 from pdhef_logtool.logs.byte_source import ChangedError, SourceError
 from pdhef_logtool.logs.remote_place import RemotePlace
-from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.extras import required
 
 T = TypeVar("T")
 
@@ -154,7 +154,7 @@ class HttpObject(RemoteObject):
     """An object of a web server, whose redirects are checked. Proxies and ``netrc`` are the environment's."""
 
     def __init__(self, place: RemotePlace) -> None:
-        aiohttp = _imported("aiohttp", "http", place)
+        aiohttp = required("aiohttp", "http", f"reads {place.scheme}://", place)
         import fsspec
 
         timeout = aiohttp.ClientTimeout(total=None, sock_connect=PATIENCE.connect_s, sock_read=PATIENCE.silence_s)
@@ -342,7 +342,7 @@ async def try_in_turn(
 
 def s3_system(place: RemotePlace) -> Any:
     """Return fsspec's file system for S3, which asks once: how often a request is made again is decided here."""
-    _imported("s3fs", "s3", place)
+    required("s3fs", "s3", "reads s3://", place)
     import fsspec
 
     client = {
@@ -351,20 +351,6 @@ def s3_system(place: RemotePlace) -> Any:
         "retries": {"total_max_attempts": 1},
     }
     return fsspec.filesystem("s3", config_kwargs=client, use_listings_cache=False)
-
-
-def _imported(module: str, extra: str, place: RemotePlace) -> Any:
-    from importlib import import_module
-
-    try:
-        return import_module(module)
-    except ImportError:
-        raise UsageError(
-            expected=f"the package {module}, which reads {place.scheme}://",
-            got="an installation without it",
-            where=str(place),
-            remedy=f"pip install 'pdhef-logtool[{extra}]'",
-        ) from None
 
 
 def _conditions(pinned: ObjectState | None) -> dict[str, str]:
