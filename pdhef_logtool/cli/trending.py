@@ -64,12 +64,21 @@ def _render(result: Trend, out: Console) -> None:
     from pdhef_logtool.results.comparison_words import change_text
     from pdhef_logtool.results.trend import mark, shown_median
 
-    count = len(result.regressions)
+    count, what = len(result.regressions), f"of {result.figure.short} in {len(result.rows)} runs"
+    pairs = [
+        (result.rows[number - 1 if "previous" in row.regression else 0].run, row.run)
+        for number, row in enumerate(result.rows)
+        if row.regression
+    ]
+    accepted = f", increases up to {100.0 * result.figure.limit:g} % are accepted" if result.figure.limit else ""
     out.print(
-        f"{count} of {len(result.rows)} runs with a regression of {result.figure.label}"
-        if count
-        else f"No significant regression of {result.figure.label} in {len(result.rows)} runs"
+        console.three_lines(
+            f"{count or 'no'} significant regression{'s' * (count > 1)} {what}",
+            f"the order is that of time; sign test over common drives, Holm's correction{accepted}",
+            "pdhef compare {} {}".format(*pairs[0]) if pairs else "nothing is needed",
+        )
     )
+    out.print()
     table = console.table(
         "run", ">logs", ">failed", ">scored", ">median", ">change to the previous run", ">to the first run", "", fold=1
     )

@@ -86,7 +86,8 @@ def test_the_command_prints_rows_json_and_a_page(tmp_path: Path, capsys: pytest.
     write_run(tmp_path / "r3", dict.fromkeys(DRIVES, 0.01), entries=[*map(entry, DRIVES), failed])
     pdhef("trend", *folders, "--html", tmp_path / "t.html")
     out = capsys.readouterr().out
-    assert out.startswith("1 of 3 runs with a regression of sideslip_rad rmse (all)")
+    assert out.startswith("Result   1 significant regression of sideslip RMSE in 3 runs")
+    assert f"\nNext     pdhef compare {folders[1]} {folders[2]}" in out
     assert "regression against the previous and the first run" in out and "versions: numpy 2.1 → 2.2" in out
     page = (tmp_path / "t.html").read_text()
     assert page.count("<tr><td>") == 3 and 'data-figure="changes"' in page
