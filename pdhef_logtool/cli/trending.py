@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from typer import Argument, Option
+from typer import Argument
 
 from pdhef_logtool.cli import console, options, panels
 from pdhef_logtool.records.errors import UsageError
@@ -22,7 +21,7 @@ commands = typer.Typer()
 @options.command(
     commands,
     "pdhef trend week1 week2 week3",
-    "pdhef trend runs/* --max-regression 5% --html trend.html",
+    "pdhef trend runs/* --max-regression 5%",
     "pdhef trend week1 week2 week3 --estimator physics --json",
     panel=panels.READ,
     notes="Runs are compared drive by drive with the run before and with the first run. Marks are corrected for their "
@@ -35,27 +34,17 @@ def trend(
     estimator: options.ComparedEstimator = None,
     metric: options.ComparedMetric = None,
     cluster: options.Cluster = None,
-    html: Annotated[Path | None, Option(help="HTML file for the trend.")] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Compare the sideslip error of several runs, one row per run, and mark regressions."""
     from pdhef_logtool.cli.comparing import figure_asked
     from pdhef_logtool.results.opened_run import open_run
     from pdhef_logtool.results.trend import trend_of
-    from pdhef_logtool.storage.object_store import is_url
-    from pdhef_logtool.storage.outputs import check_no_input
 
     if len(runs) < 2:
         raise UsageError(expected="two runs or more", got=str(len(runs)), where="RUN")
-    check_no_input([Path(x) for x in runs if not is_url(x)], [] if html is None else [html])
     figure = figure_asked(max_regression, estimator, metric)
-    result = trend_of([open_run(run) for run in runs], figure, cluster)
-    if html is not None:
-        from pdhef_logtool.reports.trend import trend_page
-        from pdhef_logtool.storage.files import write_bytes
-
-        write_bytes(html, trend_page(result))
-    console.finish(result, _render, as_json)
+    console.finish(trend_of([open_run(run) for run in runs], figure, cluster), _render, as_json)
 
 
 def _render(result: Trend, out: Console) -> None:
