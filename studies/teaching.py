@@ -185,7 +185,7 @@ def opened(part: TeachPart, car: Car) -> OpenedDrive:
         mapping = Mapping({**others, "steer_rad": angle}, mapping.truth)
     config = RunConfig(start=part.start, end=part.end)
     with read_drive(DRIVES / part.log, car, mapping, config.read_options) as drive:
-        record, found = open_drive(drive)
+        record, found = open_drive(drive, config)
     if found is None:
         raise SystemExit(f"{part.name}: {record.left_out}")
     return found
@@ -196,7 +196,7 @@ def score(
 ) -> Score:
     """Calibrate a car on a drive and score an estimator, with its intervals up to ``most_stamps``."""
     prior = () if taught is None else taught.parameters
-    calibration = self_calibrate([drive.driving], car.vehicle, taught=prior)
+    calibration = self_calibrate([drive.taught.driving], car.vehicle, taught=prior)
     wanted = len(drive.whole.signals) <= most_stamps
     bare = replace(calibration, varied=())
     if wanted:
@@ -206,8 +206,7 @@ def score(
     estimator = make_estimator(name, replace(calibrated, network=car.network))
     track, _ = run_window(estimator, drive.whole.signals)
     track = calibrator(calibrated, [estimator]).add(track, drive.whole.signals)
-    assert drive.whole.truth is not None
-    error = signal_error(track, drive.whole.truth, "sideslip_rad", least_speed_m_s)
+    error = signal_error(track, drive.truth, "sideslip_rad", least_speed_m_s)
     kept = np.isfinite(error)
     degrees = np.degrees(error[kept])
     return Score(
@@ -285,7 +284,7 @@ def simulated_pairs(seed: int) -> Iterator[PairResult]:
                 write_drive(drive, path)
                 for source, found in drives.items():
                     with read_drive(path, car, options=ReadOptions(friction=None, prefer_truth=source)) as read:
-                        drive_opened = open_drive(read)[1]
+                        drive_opened = open_drive(read, RunConfig())[1]
                     assert drive_opened is not None
                     found.append(drive_opened)
         names = [simulated.manoeuvre for simulated, _ in of_car]
