@@ -310,6 +310,7 @@ def figures_of(taught: Teaching) -> dict[str, Any]:
         "blocks": ladder.blocks,
         "rungs": [asdict(t) for t in ladder.trials],
         "calibrated": taught.calibrated,
+        "truth": taught.truth,
         "prior_support": round(taught.support, 3),
         "prior_against_untaught_deg": [None if math.isnan(x) else math.degrees(x) for x in bounds],
         "parameters": [p.model_dump() for p in taught.parameters],
