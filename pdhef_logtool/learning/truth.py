@@ -29,10 +29,7 @@ def weight_of(std_rad: FloatArray) -> FloatArray:
 
 
 def teaching_reference(drive: Drive, config: RunConfig) -> tuple[TruthAt | None, str]:
-    """Return the reference that teaches in place of ground truth, None where the log has it; and why there is neither.
-
-    Stamps at which it is not independent of the estimators' sensors are not valid.
-    """
+    """Return the reference that teaches, None where a log has ground truth; and why there is neither."""
     lacks = no_true_sideslip(drive.plan)
     if not lacks or config.reference != "on" or lacking(drive):
         return None, lacks
@@ -40,9 +37,9 @@ def teaching_reference(drive: Drive, config: RunConfig) -> tuple[TruthAt | None,
     if reference is None or reference.estimator is None:
         return None, f"{lacks}, and no sideslip reference: {'' if reference is None else reference.document['refused']}"
     at = reference.estimator.at
+    return lambda stamps_ns: independent(at(stamps_ns)), ""
 
-    def independent(stamps_ns: IntArray) -> StateTrack:
-        track = at(stamps_ns)
-        return replace(track, valid=track.valid & (track.independent > 0.0))
 
-    return independent, ""
+def independent(reference: StateTrack) -> StateTrack:
+    """Return a reference without the stamps at which it is not independent of the estimators' sensors."""
+    return replace(reference, valid=reference.valid & (reference.independent > 0.0))

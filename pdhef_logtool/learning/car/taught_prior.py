@@ -79,8 +79,8 @@ def taught_parameters(
     """
     correlation = support * CORRELATION
     problem = TaughtProblem(drives, vehicle_file)
-    fit, level = problem.solve(), float(f"{level_of([d.driving for d in drives]):.4g}")
-    variances = np.minimum(np.diag(fit.covariance), 1.0)
+    theta, level = problem.solve(), float(f"{level_of([d.driving for d in drives]):.4g}")
+    variances = np.minimum(np.diag(problem.covariance(theta)), 1.0)
     stds = np.sqrt(1.0 - correlation**2 * (1.0 - variances))
     return tuple(
         TaughtParameter(
@@ -89,7 +89,7 @@ def taught_parameters(
             std=float(f"{s * p.std:.6g}"),
             ay_m_s2=level,
         )
-        for p, t, s in zip(parameters_of(vehicle_file), fit.theta, stds, strict=True)
+        for p, t, s in zip(parameters_of(vehicle_file), theta, stds, strict=True)
         if p.name in TYRES
     )
 

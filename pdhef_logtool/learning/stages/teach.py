@@ -78,6 +78,11 @@ class OpenedDrive:
         assert self.whole.truth is not None
         return self.whole.truth
 
+    @property
+    def seconds(self) -> float:
+        """Driving with it."""
+        return float(np.count_nonzero(np.isfinite(self.taught.slopes))) * STEP_S
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Teaching:
@@ -120,7 +125,7 @@ def teach(task: Task) -> StageOutput:
     records, drives = task.read(task.split.parts[TRAINING], read, 0.3)
     if not drives:
         raise no_drive("a true sideslip and the signals of a calibration", TEACH)
-    seconds = math.fsum(float(np.sum(np.isfinite(d.taught.slopes))) * STEP_S for d in drives)
+    seconds = math.fsum(d.seconds for d in drives)
     if seconds < LEAST_S:
         expected = f"at least {LEAST_S:g} s of driving with ground truth above {car.vehicle.low_speed_blend_m_s:g} m/s"
         raise EstimatorError(expected=expected, got=f"{seconds:.1f} s", where=TEACH, remedy="give more drives")
