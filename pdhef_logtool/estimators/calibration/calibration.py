@@ -227,7 +227,7 @@ def self_calibrate(
         _understeer(problem, fit, vehicle_file),
         "",
         problem.rms(fit.theta),
-        problem.rms_of_file(),
+        problem.rms(None),
         seconds,
         len(drives),
         tuple(problem.vehicle(theta, digits=6) for theta in varied),

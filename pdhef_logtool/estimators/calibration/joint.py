@@ -13,7 +13,8 @@ are observable as a product only: friction stays at the file's value, the peak f
 
 The covariance of θ has three parts: the curvature of the cost, the spread of the cost's gradient between blocks of the
 drives (sandwich estimator, White 1982), which includes model error that changes within a drive, and the model error
-that all of a drive has in common, estimated on simulated cars (:data:`SHARED_SHARES`).
+that all of a drive has in common, estimated on simulated cars (:data:`SHARED_SHARES`). That of a pool is for the
+parameters of one of its drives: what these differ in is added (random effects by moments, DerSimonian and Laird 1986).
 """
 
 from __future__ import annotations
@@ -186,12 +187,9 @@ class JointProblem:
             slow_parts(columns, d.stretches, low_pass(BANK_HZ, STEP_S))
         self._out = [np.full((3, d.columns.shape[1]), np.nan) for d in drives]
         self._differences = [np.full((2, d.columns.shape[1]), np.nan) for d in drives]
-        blocks, first = [], 0
-        for kept in self._kept:
-            block = (kept * STEP_S // BLOCK_S).astype(np.int64) + first
-            first = int(block[-1]) + 1 if block.size else first
-            blocks.append(block)
-        self._block = np.unique(np.concatenate(blocks), return_inverse=True)[1]
+        blocks = [np.unique(kept * STEP_S // BLOCK_S, return_inverse=True)[1] for kept in self._kept]
+        self._first_block = np.cumsum([0, *(int(b.max()) + 1 for b in blocks)])
+        self._block = np.concatenate([b + first for b, first in zip(blocks, self._first_block[:-1], strict=True)])
         self._weight = math.sqrt(KEPT_STEPS * STEP_S / CORRELATION_S)
         self._least_std = self._error_std = np.array(ERROR_STD)
 
@@ -220,14 +218,9 @@ class JointProblem:
         """Return errors over ``ERROR_STD`` [2, K]."""
         return self._errors(self._track(theta))
 
-    def rms(self, theta: FloatArray) -> tuple[float, float]:
-        """Return the RMS error of yaw rate and a_y."""
-        rms = self._rms(self.errors_of(theta))
-        return float(rms[OF_RATE]), float(rms[OF_AY])
-
-    def rms_of_file(self) -> tuple[float, float]:
-        """Return the RMS error of yaw rate and a_y of the vehicle file."""
-        rms = self._rms(self._errors(track_of(self._file, self._file)))
+    def rms(self, theta: FloatArray | None) -> tuple[float, float]:
+        """Return the RMS error of yaw rate and a_y; without θ that of the vehicle file."""
+        rms = self._rms(self._errors(track_of(self._file, self._file)) if theta is None else self.errors_of(theta))
         return float(rms[OF_RATE]), float(rms[OF_AY])
 
     def sideslip(self, theta: FloatArray) -> FloatArray:
@@ -284,16 +277,25 @@ class JointProblem:
             moved[i] += DERIVATIVE_STEP
             jacobian[:, i] = (self._residuals(self.errors_of(moved), centre) - residuals) / DERIVATIVE_STEP
         inverse = np.asarray(np.linalg.inv(jacobian.T @ jacobian + np.eye(theta.size)), dtype=np.float64)
-        gradients = np.zeros((int(self._block.max()) + 1, theta.size))
+        gradients = np.zeros((int(self._first_block[-1]), theta.size))
         np.add.at(gradients, np.tile(self._block, len(centre)), jacobian * residuals[:, None])
         return inverse, gradients
 
     def _covariance(self, theta: FloatArray) -> FloatArray:
         inverse, gradients = self._curvature(theta)
-        blocks = len(gradients)
-        spread = gradients.T @ gradients * (blocks / max(blocks - 1, 1))
+        of_drives = np.add.reduceat(gradients, self._first_block[:-1])
+        spread = _spread(gradients)
+        # What drives of a pool differ in beyond the spread of their blocks; its parameters are used for one drive.
+        more, axes = np.linalg.eigh(_spread(of_drives) - spread)
+        spread += len(of_drives) * (axes * np.maximum(more, 0.0)) @ axes.T
         shared = np.diag([SHARED_SHARES.get(p.name, SHARED_SHARE) ** 2 for p in self.parameters])
         return np.asarray(inverse + inverse @ spread @ inverse + shared, dtype=np.float64)
+
+
+def _spread(gradients: FloatArray) -> FloatArray:
+    """Return the covariance [n, n] of a sum of independent gradients [k, n]; 0 of a single one."""
+    count = len(gradients)
+    return np.asarray(gradients.T @ gradients * (count / (count - 1) if count > 1 else 0.0), dtype=np.float64)
 
 
 def counted(drive: Driving) -> BoolArray:
