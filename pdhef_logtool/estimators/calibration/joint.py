@@ -71,8 +71,8 @@ FRONT_STIFFNESS, REAR_STIFFNESS = "front cornering stiffness", "rear cornering s
 PEAK, INERTIA, RELAXATION = "peak force over the file's", "yaw inertia", "relaxation length"
 STEER_OFFSET, STEER_RATIO, STEER_DELAY = "steering offset", "steering ratio", "steering delay"
 AY_GAIN, AY_BIAS, IMU_X, RATE_BIAS = "roll gain", "a_y bias", "lever of a_y", "yaw rate bias"
-#: Model error that all of a drive has in common, as a share of each prior's standard deviation: with it at least 95 % of
-#: the parameters of simulated cars are within 1.96 standard deviations. The lag of tyres and body moves the delay.
+#: Model error that all of a drive has in common, as a share of each prior's standard deviation: with it at least 95 %
+#: of the parameters of simulated cars are within 1.96 standard deviations. The lag of tyres and body moves the delay.
 SHARED_SHARE, SHARED_SHARES = 0.2, {STEER_DELAY: 0.4}
 
 
