@@ -233,10 +233,9 @@ def remove_unnamed(folder: Path, manifest: Mapping[str, Any]) -> None:
                     parent.rmdir()
 
 
-def vehicle_entry(sha256: str, vehicle: VehicleParameters, *, identified: bool) -> dict[str, Any]:
-    """Return what the manifest states of a vehicle; ``identified``: whether driving gave its values."""
-    parameters = vehicle.model_dump(mode="json")
-    return {"name": vehicle.name, "sha256": sha256, "parameters": parameters, "identified": identified}
+def vehicle_entry(sha256: str, vehicle: VehicleParameters) -> dict[str, Any]:
+    """Return what the manifest states of a vehicle."""
+    return {"name": vehicle.name, "sha256": sha256, "parameters": vehicle.model_dump(mode="json")}
 
 
 def _sha256(path: Path) -> str:
@@ -363,12 +362,6 @@ class Dataset:
         """Names of the vehicles whose models the residuals were taken against."""
         names = sorted({str(v["name"]) for v in self.manifest["vehicles"]})
         return ", ".join(names) if len(names) <= NAMED_VEHICLES else f"{len(names)} vehicles"
-
-    @property
-    def identified_share(self) -> float | None:
-        """Share of the vehicles whose values identification found; None where the manifest is of before it was kept."""
-        shares = [v.get("identified") for v in self.manifest["vehicles"]]
-        return None if None in shares else sum(shares) / len(shares)
 
     def vehicle(self, drive: DatasetDrive) -> VehicleParameters:
         """Return the vehicle whose model a drive's residuals were taken against."""
