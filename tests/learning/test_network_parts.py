@@ -268,8 +268,10 @@ def test_a_plan_needs_three_true_states_and_the_filters_signals() -> None:
     job: Any = SimpleNamespace(log_input=LogInput(Path("a.mcap"), "a"))
     extract_command._check_plan(plan, job)
     for changes in ({"truth": None}, {"derivation": {"vx_m_s": "x", "ay_m_s2": "x"}}):
+        without = SimpleNamespace(**{**plan.__dict__, **changes})
         with pytest.raises(EstimatorError, match="ground truth from which"):
-            extract_command._check_plan(SimpleNamespace(**{**plan.__dict__, **changes}), job)
+            extract_command._check_plan(without, job)
+        extract_command._check_plan(without, job, estimated=True)
     plan.alignment.available = available - {"ay_m_s2"}
     with pytest.raises(EstimatorError, match="no ay_m_s2"):
         extract_command._check_plan(plan, job)

@@ -142,10 +142,10 @@ class ExtractSettings:
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON-able values; files by name only."""
         config = self.config.to_dict()
-        used = ("car", "mapping", "start", "end", "sensors", "prefer_truth", "reference", "gnss")
+        used = ("car", "mapping", "start", "end", "sensors", "prefer_truth")
         return {
             **{k: config[k] for k in used},
-            **({} if config["friction"] == "auto" else {"friction": config["friction"]}),
+            **{k: config[k] for k in ("friction", "reference", "gnss") if config[k] != "auto"},
             "truth_smoothing": self.truth_smoothing,
             "split": self.split,
             "model": self.model,
@@ -637,7 +637,7 @@ def _strict_truth(plan: DrivePlan) -> DrivePlan:
     return replace(plan, truth=replace(plan.truth, max_gap_s=gaps))
 
 
-def _check_plan(plan: DrivePlan, job: _Job, *, estimated: bool) -> None:
+def _check_plan(plan: DrivePlan, job: _Job, *, estimated: bool = False) -> None:
     where = str(job.log_input.path)
     needed = {"vx_m_s", "vy_m_s", "yaw_rate_rad_s"}
     if not estimated and (plan.truth is None or not needed <= plan.derivation.keys()):
@@ -681,7 +681,7 @@ def _choose_smoothing(plan: DrivePlan, settings: ExtractSettings) -> _Smoothing:
     return _Smoothing(SMOOTHING_HALF_S, f"{said}: not within {limits}", noise)
 
 
-def _truth_facts(plan: DrivePlan, smoothing: _Smoothing, *, estimated: bool) -> dict[str, Any]:
+def _truth_facts(plan: DrivePlan, smoothing: _Smoothing, *, estimated: bool = False) -> dict[str, Any]:
     topics = {s.topic for s in plan.mapping.truth.values()}
     perfect = bool(topics) and all(t.startswith(PERFECT_PREFIX) for t in topics)
     return {
