@@ -34,7 +34,7 @@ from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.learning.car.taught_prior import taught_driving
-from pdhef_logtool.learning.stages.teach import LEAST_S, OpenedDrive, Teaching, learn_from, open_drive
+from pdhef_logtool.learning.stages.teach import LEAST_S, OpenedDrive, learn_from, open_drive
 from pdhef_logtool.learning.truth import independent
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.signals import Signals
@@ -89,31 +89,23 @@ class TeachCar:
 _F1TENTH = sorted(p.log for p in PEER_DRIVES if p.car == "1:10 F1TENTH")
 CARS = (
     TeachCar("250 LM", (TeachPart("revs_250lm_a.mcap", None, "150"), TeachPart("revs_250lm_a.mcap", "150"))),
-    TeachCar(
-        "GTI",
-        (
-            TeachPart("gti_pole_aa.mcap"),
-            TeachPart("gti_low_speed.mcap"),
-            TeachPart("niki_gti_1khz.mcap", None, "50"),
-            TeachPart("stanford_wet_1.mcap", steering_gain=1.0 / 13.9),
-        ),
-    ),
+    TeachCar("GTI", (
+        TeachPart("gti_pole_aa.mcap"), TeachPart("gti_low_speed.mcap"), TeachPart("niki_gti_1khz.mcap", None, "50"),
+        TeachPart("stanford_wet_1.mcap", steering_gain=1.0 / 13.9),
+    )),
     TeachCar("V40", (TeachPart("v40_slalom.mcap"), TeachPart("v40_swd_gnss.mcap"))),
     TeachCar("TT-S", (TeachPart("tts_kk.mcap", None, "62"), TeachPart("tts_kk.mcap", "62"))),
     TeachCar("Polaris", (TeachPart("polaris_a.mcap"), TeachPart("polaris_b.mcap"))),
     TeachCar("1:10 DART", (TeachPart("dart_circles_fast.mcap"), TeachPart("dart_steer_rate.mcap"))),
     TeachCar("1:10 F1TENTH", tuple(map(TeachPart, _F1TENTH)), taught_on=5),
-)
+)  # fmt: skip
 SIMULATED = "simulated"
 #: Manoeuvre, km/h, seconds of the drives of a simulated car; seeds of the cars, and cars of each seed. The settings
 #: were chosen on the first seed.
 SIMULATED_DRIVES = (
-    ("road", 90.0, 120.0),
-    ("sine-sweep", 90.0, 30.0),
-    ("dlc", 80.0, 26.0),
-    ("fishhook", 70.0, 24.0),
+    ("road", 90.0, 120.0), ("sine-sweep", 90.0, 30.0), ("dlc", 80.0, 26.0), ("fishhook", 70.0, 24.0),
     ("sine-with-dwell", 80.0, 24.0),
-)
+)  # fmt: skip
 SEEDS, CARS_PER_SEED, LEAST_SPEED_M_S = (29, 31), 4, 3.0
 
 PAGE = """# Teaching on recorded drives
@@ -264,21 +256,9 @@ def score(
     )
 
 
-def taught_of(teaching: Teaching, car: Car) -> Taught:
-    """Return the part of a car that drives taught."""
-    return Taught(
-        physics_sha256=car.physics_sha256,
-        parameters=teaching.parameters,
-        residual=teaching.ladder.model,
-        calibrated=teaching.calibrated,
-        evidence=teaching.evidence,
-    )
-
-
 def pairs_of(car: TeachCar) -> Iterator[PairResult]:
     """Yield the results of a car's pairs."""
-    vehicle = vehicle_of(peer_of(car.parts[0]))
-    of_file = Car.of(vehicle)
+    of_file = Car.of(vehicle_of(peer_of(car.parts[0])))
     drives = [opened(part, of_file) for part in car.parts]
     numbers = range(len(drives))
     if car.taught_on > 1:
@@ -291,31 +271,23 @@ def pairs_of(car: TeachCar) -> Iterator[PairResult]:
 
 
 def taught_pairs(
-    car_name: str,
-    car: Car,
-    names: Sequence[str],
-    drives: tuple[Sequence[OpenedDrive], Sequence[OpenedDrive], Sequence[OpenedDrive]],
-    choices: Sequence[tuple[tuple[int, ...], int]],
-    least: float,
-    most_stamps: int = 0,
-) -> Iterator[PairResult]:
+    car_name: str, car: Car, names: Sequence[str], drives: tuple[Sequence[OpenedDrive], ...],
+    choices: Sequence[tuple[tuple[int, ...], int]], least: float, most_stamps: int = 0,
+) -> Iterator[PairResult]:  # fmt: skip
     """Yield the results of pairs; ``drives`` : with ground truth and reference that teach, and with what scores."""
     *teaching, scored = drives
     untaught = [score(d, car, "physics", None, least, most_stamps) for d in scored]
     paper = replace(car, network=open_model(None))
     kinematic = [score(d, car, "kinematic", None, least, 0).rmse_deg for d in scored]
     of_paper = [score(d, paper, PAPER, None, least, 0).rmse_deg for d in scored]
-    learned: dict[tuple[int, ...], list[Taught | None]] = {}
+    learned: dict[tuple[int, ...], tuple[Taught, Taught | None]] = {}
     for teachers, k in choices:
         if teachers not in learned:
-            by_truth = [[of_truth[i] for i in teachers] for of_truth in teaching]
-            enough = [sum(d.seconds for d in of_truth) >= LEAST_S for of_truth in by_truth]
-            learned[teachers] = [
-                taught_of(learn_from(d), car) if e else None for d, e in zip(by_truth, enough, strict=True)
-            ]
-        taught, by_reference = learned[teachers]
-        assert taught is not None
-        reference = None if by_reference is None else score(scored[k], car, "pd-hef", by_reference, least, 0)
+            by_truth, referred = ([d[i] for i in teachers] for d in teaching)
+            enough = sum(d.seconds for d in referred) >= LEAST_S
+            learned[teachers] = learn_from(by_truth).part(car), learn_from(referred).part(car) if enough else None
+        taught, of_reference = learned[teachers]
+        reference = None if of_reference is None else score(scored[k], car, "pd-hef", of_reference, least, 0)
         prior, hybrid = (score(scored[k], car, n, taught, least, most_stamps) for n in ("physics", "pd-hef"))
         taught_on = ", ".join(names[i] for i in teachers) if len(teachers) == 1 else f"{len(teachers)} runs"
         rung = "none" if taught.residual is None else taught.residual.rung
@@ -349,25 +321,18 @@ def simulated_table(results: Sequence[PairResult]) -> str:
     """Return a table of the simulated pairs by seed and the manoeuvre that teaches."""
     names = [name for name, _, _ in SIMULATED_DRIVES]
 
-    def of_paper(seed: int, scored: str) -> str:
-        of = [r for r in results if r.car.startswith(f"{SIMULATED} {seed}-") and r.scored == scored]
-        ratios = [r.paper_deg / r.untaught.rmse_deg for r in of]
-        return f"{geometric_mean(ratios)} ({max(ratios):.2f})" if ratios else "–"
+    def cell(ratios: Sequence[float], more: str = "") -> str:
+        return f"{geometric_mean(ratios)} ({max(ratios):.2f}{more})" if ratios else "–"
 
     body = []
-    for seed, taught in ((s, t) for s in SEEDS for t in names):
-        cells = []
-        for scored in names:
-            pairs = [
-                r for r in results
-                if r.car.startswith(f"{SIMULATED} {seed}-") and (r.taught, r.scored) == (taught, scored)
-            ]  # fmt: skip
-            ratios = [r.ratio for r in pairs]
-            worse = sum(r.worse for r in pairs)
-            cells.append(f"{geometric_mean(ratios)} ({max(ratios):.2f}; {worse})" if ratios else "–")
-        body.append([str(seed), taught, *cells])
-        if taught == names[-1]:
-            body.append([str(seed), "(paper's network)", *(of_paper(seed, scored) for scored in names)])
+    for seed in SEEDS:
+        of = {s: [r for r in results if r.car.startswith(f"{SIMULATED} {seed}-") and r.scored == s] for s in names}
+        for taught in names:
+            pairs = [[r for r in of[s] if r.taught == taught] for s in names]
+            cells = [cell([r.ratio for r in p], f"; {sum(r.worse for r in p)}") for p in pairs]
+            body.append([str(seed), taught, *cells])
+        of_paper = [cell([r.paper_deg / r.untaught.rmse_deg for r in of[s]]) for s in names]
+        body.append([str(seed), "(paper's network)", *of_paper])
     return table(["seed", "taught on", *names], body, right_from=2)
 
 

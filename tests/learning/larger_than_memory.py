@@ -62,7 +62,7 @@ def write_set(folder: Path, drives: int, steps: int = STEPS) -> Path:
         writer.append(rows)
         writer.finish(entry)
         entries.append(entry)
-    vehicle = vehicle_entry("f" * 64, Car.load(None).datasheet, identified=False)
+    vehicle = vehicle_entry("f" * 64, Car.load(None).datasheet)
     write_manifest(folder, entries, [], settings={"model": "physics"}, seed=0, vehicles={"f" * 64: vehicle})
     return folder
 

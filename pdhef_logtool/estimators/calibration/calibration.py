@@ -211,7 +211,8 @@ def self_calibrate(
     theta = problem.solve()
     refused = _refusal(problem, theta, drives)
     if taught and not refused:
-        theta = problem.solve(problem.teach(taught, theta))
+        problem.teach(taught)
+        theta = problem.solve()
         refused = _refusal(problem, theta, drives)
     covariance = problem.covariance(theta)
     progress(1.0)

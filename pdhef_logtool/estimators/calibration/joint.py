@@ -96,10 +96,6 @@ class Parameter:
         free = self.mean * math.exp(self.std * theta) if self.log else self.mean + self.std * theta
         return min(max(free, self.low), self.high)
 
-    def theta(self, value: float) -> float:
-        """Return the normalised distance of a value from the prior mean."""
-        return (math.log(value / self.mean) if self.log else value - self.mean) / self.std
-
 
 def _factor(name: str, unit: str, mean: float, std: float, most: float) -> Parameter:
     """Return a parameter with a logarithmic prior, between 1 / ``most`` and ``most`` times its mean."""
@@ -157,8 +153,9 @@ def with_taught(
     def moved(p: Parameter, t: TaughtParameter) -> Parameter:
         levels = sorted((t.ay_m_s2, level_m_s2))
         share = float(np.interp(levels[0] / levels[1], LIKE, (0.0, 1.0))) if levels[0] > 0.0 else 1.0
+        distance = (math.log(t.value / p.mean) if p.log else t.value - p.mean) / p.std
         variance = p.std**2 - share**2 * max(p.std**2 - t.std**2, 0.0)
-        return replace(p, mean=p.value(share * p.theta(t.value)), std=math.sqrt(variance))
+        return replace(p, mean=p.value(share * distance), std=math.sqrt(variance))
 
     return tuple(moved(p, by_name[p.name]) if p.name in by_name else p for p in parameters)
 
@@ -200,22 +197,20 @@ class JointProblem:
         self._weight = math.sqrt(KEPT_STEPS * STEP_S / CORRELATION_S)
         self._least_std = self._error_std = np.array(ERROR_STD)
 
-    def teach(self, taught: Sequence[TaughtParameter], theta: FloatArray) -> FloatArray:
-        """Take the prior that drives with ground truth gave; return the parameters at θ as distances from it."""
-        values = self.values(theta)
+    def teach(self, taught: Sequence[TaughtParameter]) -> None:
+        """Take the prior that drives with ground truth gave."""
         self.parameters = with_taught(self.parameters, taught, level_of(self._drives))
-        return np.array([p.theta(values[p.name]) for p in self.parameters])
 
-    def solve(self, theta: FloatArray | None = None) -> FloatArray:
-        """Return the parameters of the lowest cost, from ``theta`` on, with the standard deviation of their errors.
+    def solve(self) -> FloatArray:
+        """Return the parameters of the lowest cost, with the standard deviation of their errors.
 
-        Without ``theta`` there are two starts: from a dry road, a descent does not find the minimum of one on which the
-        tyres saturate.
+        From a dry road, a descent does not find the minimum of one on which the tyres saturate, nor from the fit without
+        a taught prior that with it: there are two starts, and both are of the prior.
         """
-        if theta is None:
-            slippery = [math.log(p.low / p.mean) / p.std if p.name == PEAK else 0.0 for p in self.parameters]
-            descents = [self._descend(start) for start in (np.zeros(len(slippery)), np.array(slippery))]
-            theta = min(descents, key=lambda found: self._cost(self.errors_of(found), found))
+        self._error_std = self._least_std
+        slippery = [math.log(p.low / p.mean) / p.std if p.name == PEAK else 0.0 for p in self.parameters]
+        descents = [self._descend(start) for start in (np.zeros(len(slippery)), np.array(slippery))]
+        theta = min(descents, key=lambda found: self._cost(self.errors_of(found), found))
         for _ in range(SCALES):
             error_std = np.maximum(self._least_std, self._rms(self.errors_of(theta)))
             self._error_std = error_std
