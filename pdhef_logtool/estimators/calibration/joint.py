@@ -67,8 +67,9 @@ PARTS = ("lag", "roll", "bank")
 USUAL_STIFFNESS, USUAL_STIFFNESS_STD, FILE_STIFFNESS_STD = (13.5, 18.0), 0.35, 0.5
 #: Ratio of the levels of a_y of two drives up to which one teaches the other nothing, and from which on all.
 LIKE = (0.3, 0.5)
-#: Usual share of gravity in a_y by body roll, rad/(m/s²), where the file has none (3 degrees per g).
-USUAL_ROLL_GRADIENT = 0.005
+#: Usual share of gravity in a_y by body roll, rad/(m/s²), where the file has none (3 degrees per g), and 1-sigma of the
+#: accelerometer's position, wheelbases.
+USUAL_ROLL_GRADIENT, IMU_X_REACH = 0.005, 0.4
 
 FRONT_STIFFNESS, REAR_STIFFNESS = "front cornering stiffness", "rear cornering stiffness"
 PEAK, INERTIA, RELAXATION = "peak force over the file's", "yaw inertia", "relaxation length"
@@ -124,7 +125,7 @@ def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
     """
     sensors = vehicle_file.sensors
     gradient = vehicle_file.roll_gradient_rad_per_m_s2 or USUAL_ROLL_GRADIENT
-    reach = 0.4 * vehicle_file.wheelbase_m
+    reach = IMU_X_REACH * vehicle_file.wheelbase_m
     return (
         _stiffness(vehicle_file, FRONT_STIFFNESS, front=True),
         _stiffness(vehicle_file, REAR_STIFFNESS, front=False),
