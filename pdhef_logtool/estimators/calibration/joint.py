@@ -205,8 +205,8 @@ class JointProblem:
     def solve(self) -> FloatArray:
         """Return the parameters of the lowest cost, with the standard deviation of their errors.
 
-        From a dry road, a descent does not find the minimum of one on which the tyres saturate, nor from the fit without
-        a taught prior that with it: there are two starts, and both are of the prior.
+        From a dry road, a descent does not find the minimum of one on which the tyres saturate: there are two starts.
+        Both are of the prior, for from the fit without a taught one, the taught fit often remains in its minimum.
         """
         self._error_std = self._least_std
         slippery = [math.log(p.low / p.mean) / p.std if p.name == PEAK else 0.0 for p in self.parameters]
