@@ -36,8 +36,8 @@ from pdhef_logtool.compiled import sources
 from pdhef_logtool.records import processes
 from pdhef_logtool.records.printable import printable
 
-#: How long the first run compiles on two processors, in seconds; a rough figure for the user.
-COMPILING_S = 25
+#: How long the first run compiles, in seconds; a rough figure for the user.
+COMPILING_S = 40
 
 
 def _without_blas() -> None:
@@ -292,19 +292,8 @@ def _stamp(file: str) -> bytes:
     return b"" if path in sources.compiled_sources() else hashlib.sha256(path.read_bytes()).digest()
 
 
-def is_kept(name: str) -> bool:
-    """Return whether there is machine code of a function, ``module.function``, for some arguments."""
-    return any(any(folder.glob(f"{name}-*.nbi")) for folder in (_installed(), kept_in()) if folder is not None)
-
-
 #: Whether the note that compiling begins was printed.
 announced = False
-
-
-def be_silent() -> None:
-    """Print no note about compiling in this process and its forks, as another process prints it."""
-    global announced
-    announced = True
 
 
 def announce() -> None:
