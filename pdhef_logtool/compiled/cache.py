@@ -151,15 +151,12 @@ def kept_in() -> Path | None:
 
 
 def _remove_stale(places: Iterable[Path]) -> None:
-    """Remove, as far as it can be written, the code of other sources, and what versions without a digest kept."""
+    """Remove, as far as it can be written, the code of other sources."""
     digest = sources.compiled_digest().partition("-")[0]
     with contextlib.suppress(OSError):
         for folder in [f for place in places if place.is_dir() for f in place.iterdir()]:
             if re.fullmatch("[0-9a-f]{16}-[0-9a-f]{8}", folder.name) and not folder.name.startswith(digest):
                 shutil.rmtree(folder, ignore_errors=True)
-        for package in sources.PACKAGES:
-            for file in (sources.ROOT / package).rglob("__pycache__/*.nb[ic]"):
-                file.unlink(missing_ok=True)
 
 
 def _private_folder() -> Path | None:
