@@ -30,12 +30,12 @@ def compile_(as_json: options.JsonFlag = False) -> None:
     from truthsim.drive import simulate_drive, write_drive
 
     began_s = time.perf_counter()
-    known = RunConfig(car=Path("saloon"), estimators=(ALL_ESTIMATORS,), keep="metrics", reference="on")
-    unknown = RunConfig(friction="estimate", keep="metrics")
+    saloon = RunConfig(car=Path("saloon"), estimators=(ALL_ESTIMATORS,), keep="metrics", reference="on")
+    sedan = RunConfig(friction="estimate", keep="metrics")
     with TemporaryDirectory() as folder:
         log = Path(folder) / "drive.mcap"
         write_drive(simulate_drive("banked-road"), log)
-        for config in (known, unknown):
+        for config in (saloon, sedan):
             run_logs([str(log)], Path(folder) / "out", config, report=False)
     facts = {"seconds": round(time.perf_counter() - began_s, 1), "compiled": compiled_digest()}
     if as_json:
