@@ -28,8 +28,8 @@ def render_events(events: FoundEvents, console: Console) -> None:
         made = table("drive", ">from, s", ">to, s", ">for, s", ">peak", fold=1)
         for event in events.events[:_MOST_EVENTS]:
             peak = "-" if event.peak is None else f"{event.peak:.4g}"
-            seconds = f"{event.end_s - event.start_s:.2f}"
-            made.add_row(event.drive, f"{event.start_s:.2f}", f"{event.end_s:.2f}", seconds, peak)
+            lasts = f"{event.end_s - event.start_s:.2f}"
+            made.add_row(event.drive, f"{event.start_s:.2f}", f"{event.end_s:.2f}", lasts, peak)
         console.print(made)
         if (more := len(events.events) - _MOST_EVENTS) > 0:
             console.print(f"  and {more} more: --json, --parquet")
