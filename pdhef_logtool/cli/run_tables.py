@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pdhef_logtool.cli.console import cell, table, three_lines
-from pdhef_logtool.cli.plan_tables import outcomes_text, plan_line, render_plan
+from pdhef_logtool.cli.plan_tables import joined, outcomes_text, plan_line, render_plan
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.units import LABELS, read_unit
@@ -133,7 +133,7 @@ def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str])
     steps += dict.fromkeys(c for t in texts for c in _clauses(t, "next"))
     steps = next_steps(None if given is None else given.to_dict(), steps)
     return three_lines(
-        said if given is None else Text.assemble(plan_line(given), f"; {said}"),
+        said if given is None else joined(plan_line(given), said, given.plan.file),
         "; ".join(assumed) or ("differs by log, see below" if len(reports) > 1 else "nothing beside the log"),
         steps[0] if steps else f"nothing is needed; pdhef view {result.place or 'OUT'} shows the drive",
     )
@@ -166,7 +166,7 @@ def _fleet_head(summary: RunSummary) -> Table:
     said = f"{rmse} of {summary.scored} drives"
     steps = next_steps(plan, ["read the failures below"] if summary.failed else ())
     return three_lines(
-        Text.assemble(outcomes_text(counts, plan.get("file") or ""), f"; {said}") if counts else said,
+        joined(outcomes_text(counts, plan.get("file") or ""), said, plan.get("file")) if counts else said,
         "differs by drive, see report.json",
         steps[0] if steps else f"open {Path(summary.output) / PAGE_FILE}",
     )

@@ -312,7 +312,7 @@ def _decide(
     missing: str,
 ) -> tuple[Outcome, str, str]:
     """Return outcome, reason and next step."""
-    where = "" if requirement.segment == "all" else f" of {requirement.segment}"
+    where = "" if requirement.segment == "all" else f" ({requirement.segment})"
     if not exposure.drives or not math.isfinite(bounded.value):
         reason, _, remedy = missing.partition("; ")
         return "INCONCLUSIVE", reason or "no drive has this metric", remedy or _what_to_record(requirement)
@@ -455,6 +455,15 @@ def gates(verdicts: Sequence[RequirementVerdict], *, strict: bool) -> bool:
 def of_documents(verdicts: Sequence[Mapping[str, Any]], outcome: Outcome) -> list[Mapping[str, Any]]:
     """Return the verdicts of a document with an outcome."""
     return [v for v in verdicts if v["outcome"] == outcome]
+
+
+def joint_notes(notes: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return the notes of requirements by their id, each once, with the ids where it is not of all."""
+    ids: dict[str, list[str]] = {}
+    for name, of_requirement in notes.items():
+        for note in of_requirement:
+            ids.setdefault(note.rstrip("."), []).append(name)
+    return [note if len(names) == len(notes) else f"{', '.join(names)}: {note}" for note, names in ids.items()]
 
 
 def next_steps(plan: Mapping[str, Any] | None, more: Sequence[str] = ()) -> list[str]:

@@ -12,8 +12,6 @@ from pdhef_logtool.results.paired_change import LEAST_CLUSTERS
 from pdhef_logtool.results.sink import TRUTH
 
 _COLUMN_UNITS = {"rad": "rad", "rad_s": "rad/s", "m_s": "m/s", "m_s2": "m/s^2"}
-#: Figures that a verdict names.
-_MOST_NAMED = 3
 _BY = {"signals": "the content of their signals", "content": "the hashes of their files", "name": "their names alone"}
 
 
@@ -41,7 +39,7 @@ def verdict_text(comparison: Comparison) -> str:
     decisive = [f for f in comparison.figures if f.verdict == comparison.verdict]
     if comparison.verdict == "no figure":
         return f"{text}: {', '.join(f.figure.label for f in decisive)}"
-    changes = [f"{f.figure.short} {change_text(f)} of {f.change.drives} drives" for f in decisive[:_MOST_NAMED]]
+    changes = [f"{f.figure.short} {change_text(f)} of {f.change.drives} drives" for f in decisive]
     return f"{text}: {', '.join(changes)}" if changes and comparison.verdict != "equal" else text
 
 
