@@ -59,12 +59,14 @@ def _render(result: Trend, out: Console) -> None:
         for number, row in enumerate(result.rows)
         if row.regression
     ]
+    higher = any(c and c.change.median > 0.0 for row in result.rows for c in (row.previous, row.first))
+    otherwise = "more common drives would show whether an increase is real" if higher else "nothing is needed"
     accepted = f", increases up to {100.0 * result.figure.limit:g} % are accepted" if result.figure.limit else ""
     out.print(
         console.three_lines(
             f"{count or 'no'} significant regression{'s' * (count > 1)} {what}",
             f"the order is that of time; sign test over common drives, Holm's correction{accepted}",
-            "pdhef compare {} {}".format(*pairs[0]) if pairs else "nothing is needed",
+            "pdhef compare {} {}".format(*pairs[0]) if pairs else otherwise,
         )
     )
     out.print()

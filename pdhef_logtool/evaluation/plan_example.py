@@ -20,7 +20,7 @@ EXAMPLE = f"""\
 # Each requirement gets PASS, FAIL or INCONCLUSIVE by the confidence interval of its value over drives
 # (below five drives: over blocks of 10 s within them). Exit code 4: a requirement failed.
 # signal: {", ".join(SIGNALS)}
-{textwrap.fill(", ".join(SEGMENTS), 110, initial_indent="# segment: ", break_on_hyphens=False, subsequent_indent="#   ")}
+{textwrap.fill(", ".join(SEGMENTS), 110, initial_indent="# segment: ", subsequent_indent="# ", break_on_hyphens=False)}
 title = "Sideslip of the sedan"
 
 [[requirement]]
