@@ -48,8 +48,6 @@ def trend(
 
 
 def _render(result: Trend, out: Console) -> None:
-    from rich.padding import Padding
-
     from pdhef_logtool.results.comparison_words import change_text
     from pdhef_logtool.results.trend import mark, shown_median
 
@@ -84,4 +82,4 @@ def _render(result: Trend, out: Console) -> None:
     for row in result.regressions:
         out.print(f"\n{row.run}: {mark(row)}", style="bold")
         for line in row.differences or ("nothing else differs from the run before",):
-            out.print(Padding(line, (0, 0, 0, 2), expand=False))
+            console.print_indented(line, out)

@@ -10,7 +10,7 @@ from typing import Any
 
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.segments import SEGMENTS
-from pdhef_logtool.evaluation.units import SIGNALS, typed_unit
+from pdhef_logtool.evaluation.units import SIGNALS, share_of, typed_unit
 from pdhef_logtool.evaluation.validation_plan import AT_LEAST, MEANS, SQUARES, WORST_DRIVE, comparable, plan_from_dict
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.storage.documents import read_toml
@@ -139,11 +139,8 @@ def _figure(table: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
     if problem:
         return entries, problem
     share = table.get("max_regression", 0.0)
-    text = str(share).strip()
-    try:
-        value = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
-    except ValueError:
-        return entries, f"max_regression {text!r} is no share"
+    if (value := share_of(str(share))) is None:
+        return entries, f"max_regression {share!r} is no share"
     return _checked({**entries, "baseline": RUN, "max_ratio": round(1.0 + value, 9)})
 
 
