@@ -73,8 +73,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
     else:
         try:
             path = log.file(ESTIMATES_FILE)
-            slow = report["vehicle"]["low_speed_blend_m_s"]
-            figures = None if path is None else drive_figures(path, report, roles, slow)
+            figures = None if path is None else drive_figures(path, report, roles)
         except OutputError as error:
             wrong = f"the figures cannot be drawn: {error}"
             why_none = f"{wrong[0].upper()}{wrong[1:]}"
