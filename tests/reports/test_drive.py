@@ -282,7 +282,7 @@ def hostile_run(folder: Path) -> Path:
         versions=dict.fromkeys(HOSTILE, all_of_it),
         verdicts=[{"signal": h, "outcome": h, "text": h, "rival": h} for h in HOSTILE],
         metadata=dict(zip(HOSTILE, HOSTILE, strict=True)),
-        vehicle={"name": all_of_it, "file": all_of_it, "sha256": "0", "proven": False},
+        vehicle={"name": all_of_it, "file": all_of_it, "sha256": "0", "proven": False, "low_speed_blend_m_s": 3.0},
     )
 
 
