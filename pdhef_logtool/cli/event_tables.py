@@ -17,9 +17,9 @@ _MOST_EVENTS, _MOST_NAMED = 50, 5
 
 def render_events(events: FoundEvents, console: Console) -> None:
     """Print the events, and what was not searched."""
-    seconds = sum(e.end_s - e.start_s for e in events.events)
+    total_s = sum(e.end_s - e.start_s for e in events.events)
     drives, count = len({e.drive for e in events.events}), len(events.events)
-    summary = f"{count} event{'s' * (count != 1)} in {drives} of {events.searched} drives, {seconds:.2f} s in all"
+    summary = f"{count} event{'s' * (count != 1)} in {drives} of {events.searched} drives, {total_s:.2f} s in all"
     left_out = f"; {len(events.left_out)} drives are not searched, see below" if events.left_out else ""
     following = "nothing is needed" if not count or events.clips else "--clip writes one MCAP file per event"
     console.print(three_lines(summary, f"{events.where} of {events.of}{left_out}", following))
