@@ -522,11 +522,7 @@ def survey_log(
     if not rescale:
         return survey
     if mapping.origin == "auto":
-        settled = _with_settled_signs(survey)
-        if settled == mapping:
-            return _rescaled(survey, log, clocks, span_ns)
-        again = survey_log(log, settled, clocks, span_ns, vehicle)
-        return replace(again, corrected=(*survey.corrected, *again.corrected))
+        return _decided(survey, log, clocks, span_ns)
 
     def checks_of(other: Mapping) -> tuple[Check, ...]:
         return survey_log(log, other, fit_clocks(log, other, *span_ns), span_ns, vehicle, rescale=False).checks
@@ -564,56 +560,41 @@ def _by_frames(
     return placed, check if alone.is_as_named else frames_alone(placed, believed), alone
 
 
-def _with_settled_signs(survey: Survey) -> Mapping:
-    """Return the mapping with the signs that nothing documents as all of the drive shows them, and two parts of it."""
-    mapping, known = survey.mapping, survey.is_mounted
-    groups, sections = mapping.open_signs, {"truth.": dict(mapping.truth), "": dict(mapping.signals)}
-    probable = survey.measured.posterior(mounting_is_known=known, open_signs=groups)
-    turned = [g for g in groups if probable.turned(g[0]) >= CERTAIN]
-    notes, parts = list(mapping.notes), list(survey.measured.parts(survey.vehicle)) if turned else []
-    for group in turned:
-        if all(part.agrees(group[0], mounting_is_known=known, open_signs=groups) for part in parts):
-            notes.append(f"{' and '.join(group)}: read as positive to the right, which nothing documents but the drive")
-            for name in group:
-                prefix = "truth." if name.startswith("truth.") else ""
-                section = sections[prefix]
-                section[name.removeprefix(prefix)] = scaled_source(section[name.removeprefix(prefix)], -1.0)
-    if len(notes) == len(mapping.notes):
-        return mapping
-    return replace(mapping, signals=sections[""], truth=sections["truth."], notes=tuple(notes), open_signs=())
+def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:
+    """Return the survey with the signs that nothing documents, or one wrong unit or sign, as the drive shows them.
 
-
-def _rescaled(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:
-    """Return the survey with the one unit or sign corrected that alone contradicts everything else, with a note.
-
-    No part of the drive may contradict it, by itself.
-
-    Ground truth takes no part in it: it is only checked.
+    It must be certain, and no part of the drive may contradict it by itself. Ground truth takes no part where something
+    documented is corrected, which is a failed check.
     """
-    mapping = survey.mapping
-    factors = explained_factors(survey.measured.without_truth(), mounting_is_known=survey.is_mounted, most=1)
-    if factors:
-        sound, shares = without_faulty_samples(survey.channels.signals, survey.vehicle)
+    mapping, known, measured = survey.mapping, survey.is_mounted, survey.measured
+    groups = mapping.open_signs
+    probable = measured.posterior(mounting_is_known=known, open_signs=groups)
+    turned = [n for g in groups if probable.turned(g[0]) >= CERTAIN for n in g]
+    factors = dict.fromkeys(turned, (-1.0, "nothing documents its sign, and the drive shows it"))
+    if not turned:
+        groups, measured = (), measured.without_truth()
+        factors = explained_factors(measured, mounting_is_known=known, most=1)
+        sound, shares = without_faulty_samples(survey.channels.signals, survey.vehicle) if factors else ({}, {})
         if shares:
-            factors = explained_factors(
-                measure(sound, vehicle=survey.vehicle), mounting_is_known=survey.is_mounted, most=1
-            )
-    parts = [part.without_truth() for part in survey.measured.parts(survey.vehicle)] if factors else []
-    signals, notes = dict(mapping.signals), list(mapping.notes)
+            factors = explained_factors(measure(sound, vehicle=survey.vehicle), mounting_is_known=known, most=1)
+    parts = list(measured.parts(survey.vehicle)) if factors else []
+    sections, notes = {"truth.": dict(mapping.truth), "": dict(mapping.signals)}, list(mapping.notes)
     checks = list(survey.corrected)
     for name, (factor, evidence) in factors.items():
-        if name in signals and all(part.agrees(name, mounting_is_known=survey.is_mounted) for part in parts):
-            signals[name] = scaled_source(signals[name], factor)
+        section = sections[name[:6] if name.startswith("truth.") else ""]
+        source = section.get(name.removeprefix("truth."))
+        if source is not None and all(p.agrees(name, mounting_is_known=known, open_signs=groups) for p in parts):
+            section[source.name] = scaled_source(source, factor)
             notes.append(f"{name} is read with {factor:.6g} times its scale: {evidence}")
-            checks.append(_corrected(name, signals[name], notes[-1]))
-    if signals == mapping.signals:
+            checks += [] if turned else [_corrected(name, section[source.name], notes[-1])]
+    if len(notes) == len(mapping.notes):
         return survey
-    scaled = replace(mapping, signals=signals, notes=tuple(notes))
-    corrected = survey_log(log, scaled, clocks, span_ns, survey.vehicle, rescale=False)
+    scaled = replace(mapping, signals=sections[""], truth=sections["truth."], notes=tuple(notes), open_signs=())
+    again = survey_log(log, scaled, clocks, span_ns, survey.vehicle, rescale=bool(turned))
     # A failing sensor resembles a wrong unit of another one; after a right correction nothing contradicts any more.
-    failed = [check.name for check in corrected.checks if check.verdict == "failed"]
-    is_bad = any(n.endswith((".sign", ".unit", ".axis", ".fault")) for n in failed)
-    return survey if is_bad else replace(corrected, corrected=tuple(checks))
+    failed = [check.name for check in again.checks if check.verdict == "failed"]
+    is_bad = not turned and any(n.endswith((".sign", ".unit", ".axis", ".fault")) for n in failed)
+    return survey if is_bad else replace(again, corrected=(*checks, *again.corrected))
 
 
 def _corrected(name: str, source: SignalSource, note: str) -> Check:
