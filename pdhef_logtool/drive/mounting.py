@@ -51,7 +51,8 @@ from pdhef_logtool.drive.truth import (
 )
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, fit_clocks, read_signals
-from pdhef_logtool.mapping.frames import Placement, placement_of
+from pdhef_logtool.mapping.frames import placement_of
+from pdhef_logtool.mapping.mapping_file import entries_of
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import BoolArray, Channel, FloatArray
@@ -369,7 +370,6 @@ class Survey:
     latency: LatencyEstimate | None
     triads: tuple[Triad | None, Triad | None] = (None, None)
     mounting: Mounting | None = None
-    placed: Placement | None = None
     framed: Check | None = None
     corrected: tuple[Check, ...] = ()
     reread: Callable[[tuple[Check, ...]], tuple[Check, ...]] | None = None
@@ -459,7 +459,7 @@ class Survey:
         resolved = units_told(self.measured.relations, doubted)
         for check in self.mapping.checks:
             signal = check.name.removesuffix(".candidate")
-            if check.name in ("imu.mounting", "mapping.sign") and self.mounting is not None and self.mounting.confident:
+            if check.name == "imu.mounting" and self.mounting is not None and self.mounting.confident:
                 continue
             # A doubt about a unit stays unless the drive rules out all others: a gain that passes is wider than some.
             if f"{signal}.sign" not in passed or (signal in doubted and signal not in resolved):
@@ -499,7 +499,7 @@ def survey_log(
     blind = mounting is not None and mounting.confident
     if not blind and truth is not None:
         mounting = find_mounting(measured, triads, mapping)
-    placed, framed, by_frames = _by_frames(log, mapping, channels, triads, mounting)
+    framed, by_frames = _by_frames(log, mapping, channels, triads, mounting)
     mounting = by_frames or mounting
     channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
     measured = measured.without(extra)
@@ -516,7 +516,7 @@ def survey_log(
         measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     latency = truth_latency(channels, truth)
     survey = Survey(
-        mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, placed, framed,
+        mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, framed,
         tuple(corrected),
     )  # fmt: skip
     if not rescale:
@@ -536,17 +536,12 @@ def _by_frames(
     channels: MappedChannels,
     triads: tuple[Triad | None, Triad | None],
     by_drive: Mounting | None,
-) -> tuple[Placement | None, Check | None, Mounting | None]:
-    """Return where recorded frames put the IMU, the check of it, and the mounting where they alone state it.
-
-    Parameters
-    ----------
-    found : what the drive shows.
-    """
+) -> tuple[Check | None, Mounting | None]:
+    """Return the check of recorded frames, and the mounting where they alone state it."""
     accelerations, rates = triads
     placed = None if accelerations is None else placement_of(log, accelerations.source.topic)
     if placed is None or accelerations is None or rates is None:
-        return placed, None, None
+        return None, None
     components = [channels.signals.get(n) for n in ACCELERATIONS]
     force = np.array([np.nanmean(c.values) if c is not None and len(c) else np.nan for c in components])
     sure = by_drive if by_drive is not None and by_drive.confident else None
@@ -554,10 +549,10 @@ def _by_frames(
     check = frames_check(placed, shown, evidence, force)
     believed = "" if sure is not None else gravity_agrees(placed, force)
     if not believed:
-        return placed, check, None
+        return check, None
     rotation, named = placed_rotation(placed), _named_rows(mapping, accelerations, rates)
     alone = Mounting(rotation, named, f"{believed}; the drive does not show the rest", confident=False)
-    return placed, check if alone.is_as_named else frames_alone(placed, believed), alone
+    return check if alone.is_as_named else frames_alone(placed, believed), alone
 
 
 def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:
@@ -598,7 +593,7 @@ def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_
 
 
 def _corrected(name: str, source: SignalSource, note: str) -> Check:
-    return CORRECTED.failed(note, name, field=_shown(source.field), scale=_shown(source.scale))
+    return CORRECTED.failed(note, name, entries=entries_of(source, "field", "scale"))
 
 
 def scaled_source(source: SignalSource, factor: float) -> SignalSource:
@@ -656,12 +651,7 @@ def mounting_checks(mapping: Mapping, mounting: Mounting, triads: tuple[Triad | 
             if mounting.confident:
                 checks.append(MOUNTING.passed(mounting.evidence, name))
             continue
-        source = turned[name]
         evidence = f"{mounting.text}: {mounting.evidence}"
-        check = MOUNTING.failed(evidence, name, field=_shown(source.field), scale=_shown(source.scale))
+        check = MOUNTING.failed(evidence, name, entries=entries_of(turned[name], "field", "scale"))
         checks.append(check if mounting.confident else replace(check, verdict="undecided"))
     return checks
-
-
-def _shown(value: object) -> str:
-    return repr(list(value)).replace("'", '"') if isinstance(value, tuple) else repr(value).replace("'", '"')
