@@ -561,24 +561,24 @@ def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_
     It must be certain, and no part of the drive may contradict it by itself. Ground truth takes no part where something
     documented is corrected, which is a failed check.
     """
-    mapping, known, measured = survey.mapping, survey.is_mounted, survey.measured
+    mapping, is_mounted, measured = survey.mapping, survey.is_mounted, survey.measured
     groups = mapping.open_signs
-    probable = measured.posterior(mounting_is_known=known, open_signs=groups)
+    probable = measured.posterior(mounting_is_known=is_mounted, open_signs=groups)
     turned = [n for g in groups if probable.turned(g[0]) >= CERTAIN for n in g]
     factors = dict.fromkeys(turned, (-1.0, "nothing documents its sign, and the drive shows it"))
     if not turned:
         groups, measured = (), measured.without_truth()
-        factors = explained_factors(measured, mounting_is_known=known, most=1)
+        factors = explained_factors(measured, mounting_is_known=is_mounted, most=1)
         sound, shares = without_faulty_samples(survey.channels.signals, survey.vehicle) if factors else ({}, {})
         if shares:
-            factors = explained_factors(measure(sound, vehicle=survey.vehicle), mounting_is_known=known, most=1)
+            factors = explained_factors(measure(sound, vehicle=survey.vehicle), mounting_is_known=is_mounted, most=1)
     parts = list(measured.parts(survey.vehicle)) if factors else []
     sections, notes = {"truth.": dict(mapping.truth), "": dict(mapping.signals)}, list(mapping.notes)
     checks = list(survey.corrected)
     for name, (factor, evidence) in factors.items():
         section = sections[name[:6] if name.startswith("truth.") else ""]
         source = section.get(name.removeprefix("truth."))
-        if source is not None and all(p.agrees(name, mounting_is_known=known, open_signs=groups) for p in parts):
+        if source is not None and all(p.agrees(name, mounting_is_known=is_mounted, open_signs=groups) for p in parts):
             section[source.name] = scaled_source(source, factor)
             notes.append(f"{name} is read with {factor:.6g} times its scale: {evidence}")
             checks += [] if turned else [_corrected(name, section[source.name], notes[-1])]
