@@ -131,7 +131,7 @@ def recorded_drive(drive: PeerDrive) -> ScoredDrive:
     """Read a recorded drive as ``pdhef run`` does; a receiver's velocity is mapped where the log has one."""
     mapping = mapping_of(drive)
     if drive.log.startswith("v40_"):
-        mapping = _with_receiver(mapping)
+        mapping = with_receiver(mapping)
     car = Car.of(vehicle_of(drive))
     with read_drive(DRIVES / drive.log, car, mapping, ReadOptions()) as opened:
         prior = prior_of(car.vehicle, calibrate_drive(opened, RunConfig()))
@@ -147,7 +147,8 @@ def _estimates(car: Car, signals: Signals) -> tuple[StateTrack, ...]:
     return tuple(run_window(make_estimator(name, car), signals)[0] for name in RANKED)
 
 
-def _with_receiver(mapping: Mapping) -> Mapping:
+def with_receiver(mapping: Mapping) -> Mapping:
+    """Return the mapping of a V40's drive with its receiver, in place of the speed, and roll and pitch rate."""
     rates = {
         name: SignalSource(name, "/imu/data", f"angular_velocity.{axis}", "header.stamp")
         for name, axis in (("roll_rate_rad_s", "x"), ("pitch_rate_rad_s", "y"))

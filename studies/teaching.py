@@ -3,7 +3,8 @@
     python -m studies.teaching [--cars GTI,...] [--out docs] [--stored]
 
 Each drive calibrates its car on its own sensors, without ground truth. Columns: ``physics`` of the untaught car, of the
-taught car, and ``pd-hef`` of the taught car with its residual. The drives are in ``../shared`` and may not be
+taught car, and ``pd-hef`` of the taught car with its residual, also of a car that the sideslip reference taught, where
+it is independent, in place of ground truth. The drives are in ``../shared`` and may not be
 redistributed. Without them, the command ends with 0 and writes nothing. Simulated cars have a file with a stiffness
 error of a factor 0.5 to 2 at each axle; a drive with a simulated RTK teaches, and the exact sideslip scores.
 """
@@ -28,17 +29,24 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.reference.drive import refer
+from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
-from pdhef_logtool.learning.stages.teach import OpenedDrive, Teaching, learn_from, open_drive
+from pdhef_logtool.learning.car.taught_prior import taught_driving
+from pdhef_logtool.learning.stages.teach import LEAST_S, OpenedDrive, Teaching, learn_from, open_drive
+from pdhef_logtool.learning.truth import independent
 from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.residual_model.bundle import open_model
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator
+from pdhef_logtool.runs.referencing import prior_of
 from pdhef_logtool.runs.self_calibrating import driven_d2, self_calibrated
 from pdhef_logtool.storage.files import write_bytes
 from studies.pages import DOCS, DRIVES, RESULTS, number, options, table, write
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_of, vehicle_of
+from studies.reference import MADE, RECEIVERS, ScoredDrive, with_gnss, with_receiver
 from studies.self_calibration import simulated_drives
 from truthsim.drive import write_drive
 
@@ -118,6 +126,7 @@ Each drive calibrates its car on its own sensors, not causal. *untaught* and *ta
 prior from the teaching drive. *pd-hef*: with the residual as well. *active*: share of the scored stamps at which the
 residual acts. *paper*: `pd-hef-paper`, the ST-ResNet of the simulated saloon in the sigma points, on the vehicle file;
 it is not taught. *95 %*: coverage of the confidence intervals of untaught `physics` and of `pd-hef`.
+*reference*: the ratio if the [sideslip reference](reference.md) teaches (below).
 
 These are development figures: the settings were chosen on these pairs and on the simulated cars of seed {seed}; one
 variant was also seen on the second seed.
@@ -130,6 +139,15 @@ Simulated cars with wrong files, each taught on the drive of a row: geometric me
 worse by more than max(5 %, 0.03°)).
 
 {simulated}
+
+## Taught by the reference
+With `--set reference=on`, `learn` takes the [sideslip reference](reference.md) of drives without ground truth, weighted
+by its standard deviation, where GNSS makes it independent of the other sensors. Pairs with at least {least_s:.0f} s of
+that: geometric mean of the ratio to untaught, its largest value, and pairs worse by more than max(5 %, 0.03°). GNSS of
+the V40 is recorded, that of all others is made from ground truth (Doppler 10 Hz). The default is off: no recorded
+receiver has proven it.
+
+{reference}
 """
 
 
@@ -156,17 +174,27 @@ class PairResult:
     kinematic_deg: float
     paper_deg: float
     rung: str
+    reference: Score | None = None
 
     @property
     def worse(self) -> bool:
         """Whether teaching costs more than it may."""
+        return self.is_worse(self.hybrid)
+
+    def is_worse(self, taught: Score) -> bool:
+        """Whether this teaching costs more than it may."""
         limit = max((1.0 + WORSE_SHARE) * self.untaught.rmse_deg, self.untaught.rmse_deg + WORSE_DEG)
-        return self.hybrid.rmse_deg > limit
+        return taught.rmse_deg > limit
 
     @property
     def ratio(self) -> float:
         """RMSE of ``pd-hef`` of the taught car over that of untaught ``physics``."""
         return self.hybrid.rmse_deg / self.untaught.rmse_deg
+
+    @property
+    def reference_ratio(self) -> float:
+        """The same of a car that the reference taught, NaN if none was."""
+        return math.nan if self.reference is None else self.reference.rmse_deg / self.untaught.rmse_deg
 
 
 def peer_of(part: TeachPart) -> PeerDrive:
@@ -185,10 +213,29 @@ def opened(part: TeachPart, car: Car) -> OpenedDrive:
         mapping = Mapping({**others, "steer_rad": angle}, mapping.truth)
     config = RunConfig(start=part.start, end=part.end)
     with read_drive(DRIVES / part.log, car, mapping, config.read_options) as drive:
-        record, found = open_drive(drive)
+        record, found = open_drive(drive, config)
     if found is None:
         raise SystemExit(f"{part.name}: {record.left_out}")
     return found
+
+
+def by_reference(drive: OpenedDrive, received: Signals | None = None) -> OpenedDrive:
+    """Return a drive that the reference teaches, of signals with a receiver, else with GNSS made from ground truth."""
+    truth, vehicle = drive.truth, drive.drive.car.vehicle
+    prior = prior_of(vehicle, self_calibrate([drive.taught.driving], vehicle))
+    heading = np.cumsum(np.nan_to_num(truth.yaw_rate_rad_s) * np.gradient(truth.stamps_ns * 1e-9))
+    made = ScoredDrive(drive.whole.signals, prior, truth.vx_m_s, truth.vy_m_s, heading, np.zeros(len(truth)))
+    span = refer(with_gnss(made, RECEIVERS[MADE]) if received is None else received, prior)
+    track = independent(ReferenceEstimator(() if span.refused else (span,)).at(truth.stamps_ns))
+    return replace(drive, whole=replace(drive.whole, truth=track), taught=taught_driving(drive.taught.driving, track))
+
+
+def received(part: TeachPart, car: Car) -> Signals | None:
+    """Return the signals of a part with those of its receiver, None if it has none."""
+    if not part.log.startswith("v40_"):
+        return None
+    with read_drive(DRIVES / part.log, car, with_receiver(mapping_of(peer_of(part))), ReadOptions()) as drive:
+        return drive.whole().signals
 
 
 def score(
@@ -196,7 +243,7 @@ def score(
 ) -> Score:
     """Calibrate a car on a drive and score an estimator, with its intervals up to ``most_stamps``."""
     prior = () if taught is None else taught.parameters
-    calibration = self_calibrate([drive.driving], car.vehicle, taught=prior)
+    calibration = self_calibrate([drive.taught.driving], car.vehicle, taught=prior)
     wanted = len(drive.whole.signals) <= most_stamps
     bare = replace(calibration, varied=())
     if wanted:
@@ -206,8 +253,7 @@ def score(
     estimator = make_estimator(name, replace(calibrated, network=car.network))
     track, _ = run_window(estimator, drive.whole.signals)
     track = calibrator(calibrated, [estimator]).add(track, drive.whole.signals)
-    assert drive.whole.truth is not None
-    error = signal_error(track, drive.whole.truth, "sideslip_rad", least_speed_m_s)
+    error = signal_error(track, drive.truth, "sideslip_rad", least_speed_m_s)
     kept = np.isfinite(error)
     degrees = np.degrees(error[kept])
     return Score(
@@ -239,37 +285,42 @@ def pairs_of(car: TeachCar) -> Iterator[PairResult]:
         choices = [(tuple(numbers[: car.taught_on]), k) for k in numbers[car.taught_on :]]
     else:
         choices = [((a,), b) for a, b in permutations(numbers, 2)]
-    names = [part.name for part in car.parts]
-    yield from taught_pairs(
-        car.name, of_file, names, (drives, drives), choices, peer_of(car.parts[0]).least_speed_m_s, MOST_STAMPS
-    )
+    names, least = [part.name for part in car.parts], peer_of(car.parts[0]).least_speed_m_s
+    references = [by_reference(d, received(part, of_file)) for d, part in zip(drives, car.parts, strict=True)]
+    yield from taught_pairs(car.name, of_file, names, (drives, references, drives), choices, least, MOST_STAMPS)
 
 
 def taught_pairs(
     car_name: str,
     car: Car,
     names: Sequence[str],
-    drives: tuple[Sequence[OpenedDrive], Sequence[OpenedDrive]],
+    drives: tuple[Sequence[OpenedDrive], Sequence[OpenedDrive], Sequence[OpenedDrive]],
     choices: Sequence[tuple[tuple[int, ...], int]],
     least: float,
     most_stamps: int = 0,
 ) -> Iterator[PairResult]:
-    """Yield the results of pairs; ``drives`` : with the ground truth that teaches, and with that which scores."""
-    teaching, scored = drives
+    """Yield the results of pairs; ``drives`` : with ground truth and reference that teach, and with what scores."""
+    *teaching, scored = drives
     untaught = [score(d, car, "physics", None, least, most_stamps) for d in scored]
     paper = replace(car, network=open_model(None))
     kinematic = [score(d, car, "kinematic", None, least, 0).rmse_deg for d in scored]
     of_paper = [score(d, paper, PAPER, None, least, 0).rmse_deg for d in scored]
-    learned: dict[tuple[int, ...], Taught] = {}
+    learned: dict[tuple[int, ...], list[Taught | None]] = {}
     for teachers, k in choices:
         if teachers not in learned:
-            learned[teachers] = taught_of(learn_from([teaching[i] for i in teachers]), car)
-        taught = learned[teachers]
+            by_truth = [[of_truth[i] for i in teachers] for of_truth in teaching]
+            enough = [sum(d.seconds for d in of_truth) >= LEAST_S for of_truth in by_truth]
+            learned[teachers] = [
+                taught_of(learn_from(d), car) if e else None for d, e in zip(by_truth, enough, strict=True)
+            ]
+        taught, by_reference = learned[teachers]
+        assert taught is not None
+        reference = None if by_reference is None else score(scored[k], car, "pd-hef", by_reference, least, 0)
         prior, hybrid = (score(scored[k], car, n, taught, least, most_stamps) for n in ("physics", "pd-hef"))
         taught_on = ", ".join(names[i] for i in teachers) if len(teachers) == 1 else f"{len(teachers)} runs"
         rung = "none" if taught.residual is None else taught.residual.rung
-        others = (kinematic[k], of_paper[k])
-        yield PairResult(car_name, taught_on, names[k], untaught[k], prior, hybrid, *others, rung)
+        others = (kinematic[k], of_paper[k], rung, reference)
+        yield PairResult(car_name, taught_on, names[k], untaught[k], prior, hybrid, *others)
 
 
 def simulated_pairs(seed: int) -> Iterator[PairResult]:
@@ -285,13 +336,13 @@ def simulated_pairs(seed: int) -> Iterator[PairResult]:
                 write_drive(drive, path)
                 for source, found in drives.items():
                     with read_drive(path, car, options=ReadOptions(friction=None, prefer_truth=source)) as read:
-                        drive_opened = open_drive(read)[1]
+                        drive_opened = open_drive(read, RunConfig())[1]
                     assert drive_opened is not None
                     found.append(drive_opened)
         names = [simulated.manoeuvre for simulated, _ in of_car]
         choices = [((a,), b) for a, b in permutations(range(len(names)), 2)]
-        both = (drives["rtk"], drives["perfect"])
-        yield from taught_pairs(f"{SIMULATED} {seed}-{index}", car, names, both, choices, LEAST_SPEED_M_S)
+        all_drives = (drives["rtk"], [by_reference(d) for d in drives["perfect"]], drives["perfect"])
+        yield from taught_pairs(f"{SIMULATED} {seed}-{index}", car, names, all_drives, choices, LEAST_SPEED_M_S)
 
 
 def simulated_table(results: Sequence[PairResult]) -> str:
@@ -301,7 +352,7 @@ def simulated_table(results: Sequence[PairResult]) -> str:
     def of_paper(seed: int, scored: str) -> str:
         of = [r for r in results if r.car.startswith(f"{SIMULATED} {seed}-") and r.scored == scored]
         ratios = [r.paper_deg / r.untaught.rmse_deg for r in of]
-        return f"{math.exp(float(np.mean(np.log(ratios)))):.2f} ({max(ratios):.2f})" if ratios else "–"
+        return f"{geometric_mean(ratios)} ({max(ratios):.2f})" if ratios else "–"
 
     body = []
     for seed, taught in ((s, t) for s in SEEDS for t in names):
@@ -312,8 +363,8 @@ def simulated_table(results: Sequence[PairResult]) -> str:
                 if r.car.startswith(f"{SIMULATED} {seed}-") and (r.taught, r.scored) == (taught, scored)
             ]  # fmt: skip
             ratios = [r.ratio for r in pairs]
-            mean = math.exp(float(np.mean(np.log(ratios)))) if ratios else math.nan
-            cells.append(f"{mean:.2f} ({max(ratios):.2f}; {sum(r.worse for r in pairs)})" if ratios else "–")
+            worse = sum(r.worse for r in pairs)
+            cells.append(f"{geometric_mean(ratios)} ({max(ratios):.2f}; {worse})" if ratios else "–")
         body.append([str(seed), taught, *cells])
         if taught == names[-1]:
             body.append([str(seed), "(paper's network)", *(of_paper(seed, scored) for scored in names)])
@@ -329,33 +380,22 @@ def pair_table(results: Sequence[PairResult]) -> str:
     body = [
         [
             r.car, r.taught, r.scored, cell(r.untaught), cell(r.prior), cell(r.hybrid),
-            number(r.ratio, 2) + (" worse" if r.worse else ""), number(r.paper_deg, 3), r.rung,
+            number(r.ratio, 2) + (" worse" if r.worse else ""), number(r.reference_ratio, 2), number(r.paper_deg, 3),
+            r.rung,
             f"{r.hybrid.active:.0%}",
             " / ".join("–" if s.covered is None else f"{s.covered:.0%}" for s in (r.untaught, r.hybrid)),
         ]
         for r in results
     ]  # fmt: skip
-    head = [
-        "car",
-        "taught on",
-        "scored on",
-        "untaught",
-        "taught",
-        "pd-hef",
-        "ratio",
-        "paper",
-        "residual",
-        "active",
-        "95 %",
-    ]
-    return table(head, body, right_from=3)
+    head = "car, taught on, scored on, untaught, taught, pd-hef, ratio, reference, paper, residual, active, 95 %"
+    return table(head.split(", "), body, right_from=3)
 
 
 def summary(results: Sequence[PairResult]) -> str:
     """Return the figures that the targets are about."""
 
     def mean(ratios: Sequence[float]) -> str:
-        return f"{math.exp(float(np.mean(np.log(ratios)))):.2f} ({len(ratios)} pairs)" if ratios else "–"
+        return f"{geometric_mean(ratios)} ({len(ratios)} pairs)" if ratios else "–"
 
     alike = [r for r in results if r.hybrid.active >= ALIKE]
     unlike = [r for r in results if r.hybrid.active < ALIKE]
@@ -369,6 +409,24 @@ def summary(results: Sequence[PairResult]) -> str:
         ["1:10 cars, pd-hef over kinematic", mean([r.hybrid.rmse_deg / r.kinematic_deg for r in small])],
     ]
     return table(["figure", "value"], lines)
+
+
+def geometric_mean(ratios: Sequence[float]) -> str:
+    """Return the geometric mean of ratios, a dash without any."""
+    return f"{math.exp(float(np.mean(np.log(ratios)))):.2f}" if ratios else "–"
+
+
+def reference_table(results: Sequence[PairResult]) -> str:
+    """Return what teaching by the reference is worth where it is possible, beside that by ground truth."""
+    body = []
+    for name in ("recorded", *(f"{SIMULATED} {seed}" for seed in SEEDS)):
+        of = [r for r in results if r.car.startswith(name) or (name == "recorded" and not r.car.startswith(SIMULATED))]
+        pairs = [(r, r.reference) for r in of if r.reference is not None]
+        means = [geometric_mean([r.ratio for r, _ in pairs]), geometric_mean([r.reference_ratio for r, _ in pairs])]
+        largest = number(max((r.reference_ratio for r, _ in pairs), default=math.nan), 2)
+        body.append([name, f"{len(pairs)} of {len(of)}", *means, largest, str(sum(r.is_worse(s) for r, s in pairs))])
+    head = ["drives", "pairs", "by ground truth", "by the reference", "largest", "worse"]
+    return table(head, body, right_from=1)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -403,9 +461,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def stored_results(file: Path) -> list[PairResult]:
     """Return the results of a stored run."""
-    scores = ("untaught", "prior", "hybrid")
+    scores = ("untaught", "prior", "hybrid", "reference")
     documents = json.loads(file.read_text(encoding="utf-8"))
-    return [PairResult(**{**d, **{name: Score(**d[name]) for name in scores}}) for d in documents]
+    return [PairResult(**{**d, **{name: Score(**d[name]) for name in scores if d.get(name)}}) for d in documents]
 
 
 def write_page(folder: Path, results: Sequence[PairResult]) -> None:
@@ -413,7 +471,8 @@ def write_page(folder: Path, results: Sequence[PairResult]) -> None:
     command = "Command: `python -m studies.teaching`."
     recorded = [r for r in results if not r.car.startswith(SIMULATED)]
     parts = {"pairs": pair_table(recorded), "summary": summary(recorded), "simulated": simulated_table(results)}
-    write(folder / "teaching.md", PAGE.format(command=command, seed=SEEDS[0], **parts))
+    parts |= {"reference": reference_table(results)}
+    write(folder / "teaching.md", PAGE.format(command=command, seed=SEEDS[0], least_s=LEAST_S, **parts))
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from pdhef_logtool.car.parts import (
     noise_sha256,
     physics_sha256,
 )
-from pdhef_logtool.car.taught import Taught, TaughtParameter
+from pdhef_logtool.car.taught import GROUND_TRUTH, Taught, TaughtParameter
 from pdhef_logtool.car.toml_files import VehicleFile, read_vehicle_file, with_sensors
 from pdhef_logtool.car.vehicle import DEFAULT_VEHICLE_NAME, Record, VehicleParameters, default_vehicle
 from pdhef_logtool.records.errors import UsageError, VehicleError
@@ -343,8 +343,11 @@ def _with_parts(car: Car, folder: Path) -> Car:
     taught = _part(folder / TAUGHT_FILE, Taught)
     if taught is not None and taught.physics_sha256 == physics_sha256(car.datasheet):
         others = [name for name in (FIT_FILE, NOISE_FILE, NETWORK_FILE) if (folder / name).is_file()]
-        idle = (f"{', '.join(others)}: not used, {TAUGHT_FILE} takes their place",) if others else ()
-        return replace(car, taught=taught, notes=idle)
+        if others:
+            notes.append(f"{', '.join(others)}: not used, {TAUGHT_FILE} takes their place")
+        if taught.truth != GROUND_TRUTH:
+            notes.append(f"{TAUGHT_FILE}: taught by {taught.truth}")
+        return replace(car, taught=taught, notes=tuple(notes))
     if taught is not None:
         notes.append(_stale(TAUGHT_FILE, f"{VEHICLE_FILE} has changed since", "teach"))
     fit = _part(folder / FIT_FILE, Fit)

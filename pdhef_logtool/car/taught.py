@@ -10,6 +10,9 @@ from pdhef_logtool.car.parts import LearntOn, Sha256
 from pdhef_logtool.car.vehicle import Positive, Record
 from pdhef_logtool.residual_model.ladder import LadderModel
 
+#: What teaches.
+GROUND_TRUTH, ESTIMATED = "ground truth", "estimated reference"
+
 
 class TaughtParameter(Record):
     """Prior of a parameter of the calibration: mean and standard deviation, of its logarithm where that is fitted.
@@ -32,6 +35,7 @@ class Taught(Record):
     parameters : prior of the calibration of every later drive. residual : of the sideslip after it; None: none is
         worth its uncertainty.
     calibrated : whether the drives of ``residual`` calibrated their car; else it is one of the vehicle file.
+    truth : what taught, :data:`GROUND_TRUTH`, :data:`ESTIMATED`, or both.
     figures : evidence and what to drive next.
     """
 
@@ -41,6 +45,7 @@ class Taught(Record):
     parameters: Annotated[tuple[TaughtParameter, ...], Field(strict=False)] = ()
     residual: LadderModel | None = None
     calibrated: bool = True
+    truth: str = GROUND_TRUTH
     evidence: str = ""
     drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
     figures: dict[str, Any] = Field(default_factory=dict)

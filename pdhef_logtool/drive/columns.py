@@ -75,16 +75,6 @@ def earlier(column: FloatArray, by_s: float) -> FloatArray:
     return column if by_s == 0.0 else np.interp(cell, np.arange(column.shape[0]), column, left=np.nan, right=np.nan)
 
 
-def running_mean(column: FloatArray, over_s: float) -> FloatArray:
-    """Return the mean of a column of the grid over a time about each cell; NaN beside gaps."""
-    half = min(round(0.5 * over_s / GRID_S), column.shape[0] - 1)
-    finite = np.flatnonzero(np.isfinite(column))
-    if finite.size:  # the ends of what is known go on
-        column = column.copy()
-        column[: finite[0]], column[finite[-1] + 1 :] = column[finite[0]], column[finite[-1]]
-    return np.convolve(np.pad(column, half, "edge"), np.full(2 * half + 1, 1.0 / (2 * half + 1)), "valid")
-
-
 def moving_at(speed: FloatArray, least_m_s: float = MIN_MOVING_M_S) -> BoolArray:
     """Return where the car drives: by the drive's own fast speeds, so that a 1:10 car counts as a car does."""
     finite = np.abs(speed[np.isfinite(speed)])

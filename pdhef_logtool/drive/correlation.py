@@ -9,6 +9,7 @@ import numpy as np
 
 from pdhef_logtool.drive.columns import student
 from pdhef_logtool.drive.interpolation import Bracket
+from pdhef_logtool.records.running_mean import running_mean
 from pdhef_logtool.records.signals import FloatArray, IntArray
 
 #: A step of more than this many median periods is a gap.
@@ -118,13 +119,11 @@ def shift_error(grid: CommonGrid, shift_s: float) -> float:
     fitted beside it, and what the shift then differs by is part of its error.
     """
     steps = round(shift_s / grid.step_s)
-    half = max(1, round(0.5 * _ERROR_MEAN_S / grid.step_s))
-    kernel = np.full(2 * half + 1, 1.0 / (2 * half + 1))
     parts = zip((grid.a, grid.b), _overlap(grid.a.shape[0], steps), strict=True)
-    a, b = (np.convolve(values[part], kernel, "valid") for values, part in parts)
-    slope = np.gradient(a, grid.step_s)
-    finite = np.isfinite(a) & np.isfinite(b) & np.isfinite(slope)
-    a, b, slope = a[finite], b[finite], slope[finite]
+    pair = np.stack([values[part] for values, part in parts], axis=1)
+    mean = running_mean(pair, max(1, round(0.5 * _ERROR_MEAN_S / grid.step_s)))
+    both = np.isfinite(pair).all(axis=1)
+    a, b, slope = (c[both] for c in (*mean.T, np.gradient(mean[:, 0], grid.step_s)))
     if a.size < 4 * _ERROR_BLOCKS or not a.any():
         return math.inf
     time = np.linspace(-1.0, 1.0, a.size)

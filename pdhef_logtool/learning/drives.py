@@ -36,7 +36,10 @@ TEACH = "teach"
 #: Splits of a simulated set that results are reported on, and those that a network is trained on and chosen by.
 HELD_OUT, SEEN = ("test", "extrapolation"), ("train", "validation")
 #: Entries of the configuration that decide what is learned.
-_SETTINGS = ("car", "mapping", "network", "start", "end", "sensors", "friction", "prefer_truth", "estimators")
+_SETTINGS = (
+    "car", "mapping", "network", "start", "end", "sensors", "friction", "prefer_truth", "reference", "gnss",
+    "estimators",
+)  # fmt: skip
 #: Drives that are named in an error.
 _NAMED = 3
 MAX_HOLDOUT = 0.5

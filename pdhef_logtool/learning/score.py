@@ -17,6 +17,7 @@ from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.evaluation.requirement_blocks import BLOCK_S
 from pdhef_logtool.learning.drives import load_drive
 from pdhef_logtool.learning.evidence.trust import MIN_BLOCKS
+from pdhef_logtool.learning.noise.search import MIN_AVAILABILITY
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
@@ -25,8 +26,6 @@ from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 
 #: What a filter needs from the start of a slice before its error counts.
 SETTLE_S = 3.0
-#: A candidate that gives an estimate at fewer of the stamps counts as worse.
-LEAST_AVAILABILITY = 0.9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,10 +63,10 @@ class PairedTest:
 
 
 def paired_test(old: Errors, new: Errors) -> PairedTest:
-    """Compare errors at the same stamps [N]; much fewer of them (:data:`LEAST_AVAILABILITY`) are worse."""
+    """Compare errors at the same stamps [N]; much fewer of them (:data:`MIN_AVAILABILITY`) are worse."""
     both = np.isfinite(old.error) & np.isfinite(new.error)
     was, now = (float(np.degrees(np.sqrt(np.mean(e.error[both] ** 2)))) if both.any() else np.nan for e in (old, new))
-    lacks = new.scored < LEAST_AVAILABILITY * old.scored
+    lacks = new.scored < MIN_AVAILABILITY * old.scored
     difference = block_bootstrap_difference(new.error, old.error, new.stamps_ns, block_s=BLOCK_S)
     if lacks:
         difference = Interval(difference.value, np.inf, np.inf, difference.blocks)

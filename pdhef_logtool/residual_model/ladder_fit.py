@@ -7,11 +7,12 @@ of a sensor. With sums over blocks instead of samples, all fits of the cross-val
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from pdhef_logtool.records.running_mean import running_mean
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.residual_model.ladder import (
     LINEAR,
@@ -47,12 +48,16 @@ QUANTILE = 0.98
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TaughtDrive:
-    """A drive with ground truth: features of its steps [K], the sideslip that ``physics`` lacks, NaN where unknown."""
+    """A drive with ground truth: features of its steps [K], the sideslip that ``physics`` lacks, NaN where unknown.
+
+    ``weight`` : of this sideslip, by the uncertainty of the ground truth.
+    """
 
     name: str
     stamps_ns: IntArray
     features: SlowFeatures
     lacking_rad: FloatArray
+    weight: FloatArray | float = 1.0
 
     @property
     def usable(self) -> BoolArray:
@@ -94,105 +99,67 @@ class LadderFit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Sums:
-    """Sums over samples of a drive's block, each in seconds: of 1, features, error, and their products."""
+class _Sample:
+    """What a fit uses of a drive [K]: odd and even features, error, its weight in s; duration of a row."""
 
-    seconds: float
-    phi: FloatArray
-    error: float
-    phi_phi: FloatArray
-    phi_error: FloatArray
-    error_error: float
+    odd: FloatArray
+    even: FloatArray
+    error: FloatArray
+    weight_s: FloatArray
+    step_s: float
 
-    @classmethod
-    def of(cls, phi: FloatArray, error: FloatArray, step_s: float) -> _Sums:
-        return cls(
-            len(error) * step_s, phi.sum(axis=0) * step_s, float(error.sum()) * step_s,
-            phi.T @ phi * step_s, phi.T @ error * step_s, float(error @ error) * step_s,
-        )  # fmt: skip
-
-    def __add__(self, other: _Sums) -> _Sums:
-        return _Sums(
-            self.seconds + other.seconds, self.phi + other.phi, self.error + other.error,
-            self.phi_phi + other.phi_phi, self.phi_error + other.phi_error, self.error_error + other.error_error,
-        )  # fmt: skip
-
-    def centred(self) -> tuple[FloatArray, FloatArray]:
-        """Return ΣφφT and Σφe without the means: what a free constant leaves of them."""
-        mean = self.phi / self.seconds
-        return self.phi_phi - np.outer(mean, self.phi), self.phi_error - mean * self.error
-
-    def squares(self, weights: FloatArray, constant: float) -> float:
-        """Return the sum of squares of error − φ·w − c."""
-        w, c = weights, constant
-        fitted = w @ self.phi_phi @ w + 2.0 * c * (w @ self.phi) + c * c * self.seconds
-        return float(self.error_error - 2.0 * (w @ self.phi_error + c * self.error) + fitted)
+    @property
+    def seconds(self) -> float:
+        return len(self.error) * self.step_s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    """Sums of the blocks of all drives, and the drive of each block; ``whole`` also has the ends of the blocks."""
+    """Products of 1, features and error, summed over each block [B, c + 2, c + 2], in s; the drive of each block [B].
 
-    blocks: tuple[_Sums, ...]
-    drives: tuple[int, ...]
-    whole: tuple[_Sums, ...]
+    ``whole``: sums over drives, which also have the ends of the blocks.
+    """
+
+    blocks: FloatArray
+    drives: IntArray
+    whole: FloatArray
 
     def only(self, columns: int) -> _Problem:
         """Return the problem with the first features alone."""
-
-        def cut(s: _Sums) -> _Sums:
-            return _Sums(
-                s.seconds, s.phi[:columns], s.error, s.phi_phi[:columns, :columns], s.phi_error[:columns], s.error_error
-            )
-
-        return _Problem(tuple(map(cut, self.blocks)), self.drives, tuple(map(cut, self.whole)))
-
-    def kept(self, without: Sequence[int]) -> dict[int, _Sums]:
-        """Return the sums by drive without some blocks."""
-        drives: dict[int, _Sums] = {}
-        for k, (block, drive) in enumerate(zip(self.blocks, self.drives, strict=True)):
-            if k not in without:
-                drives[drive] = drives[drive] + block if drive in drives else block
-        return drives
+        kept = [*range(columns + 1), -1]
+        return _Problem(self.blocks[:, kept][:, :, kept], self.drives, self.whole[:, kept][:, :, kept])
 
     def block_error(self, block: int, without: Sequence[int], ridge: float | None) -> float:
         """Return the sum of squares of a block after a fit without some blocks; ``ridge`` None fits constants alone."""
-        drives = self.kept(without)
-        size = self.blocks[0].phi.size
-        weights = np.zeros(size) if ridge is None else _solve(list(drives.values()), ridge)
-        trained = drives.get(self.drives[block])
-        constant = 0.0 if trained is None else (trained.error - float(weights @ trained.phi)) / trained.seconds
-        return self.blocks[block].squares(weights, constant)
+        used = ~np.isin(np.arange(len(self.drives)), without)
+        sums = {d: self.blocks[used & (self.drives == d)].sum(axis=0) for d in np.unique(self.drives)}
+        weights = np.zeros(self.blocks.shape[1] - 2)
+        if ridge is not None:
+            weights = _solve([s for s in sums.values() if s[0, 0] > 0.0], ridge)
+        first = sums[self.drives[block]][0]
+        constant = (first[-1] - weights @ first[1:-1]) / first[0] if first[0] > 0.0 else 0.0
+        left = np.concatenate([[-constant], -weights, [1.0]])
+        return float(left @ self.blocks[block] @ left)
 
 
-def _solve(drives: Sequence[_Sums], ridge: float) -> FloatArray:
+def _centred(sums: FloatArray) -> FloatArray:
+    """Return the products of features and error without their means: what a free constant leaves of them."""
+    return np.asarray((sums - np.outer(sums[0], sums[0]) / sums[0, 0])[1:, 1:])
+
+
+def _solve(drives: Sequence[FloatArray], ridge: float) -> FloatArray:
     """Return the weights of a ridge regression with a free constant for each drive."""
-    size = drives[0].phi.size
-    normal, right = ridge * np.eye(size), np.zeros(size)
-    for drive in drives:
-        phi_phi, phi_error = drive.centred()
-        normal += phi_phi
-        right += phi_error
-    return np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
-
-
-def _expanded(
-    features: tuple[FloatArray, FloatArray], odd_directions: FloatArray, even_directions: FloatArray, phases: FloatArray
-) -> FloatArray:
-    """Return the odd features [N, 16] of a drive, then its random ones."""
-    odd, even = features
-    out = np.empty((len(odd), ODD_COUNT + len(phases)))
-    expand(odd, even, odd_directions, even_directions, phases, out)
-    return out
+    normal = np.sum([_centred(d) for d in drives], axis=0)
+    return np.asarray(np.linalg.solve(normal[:-1, :-1] + ridge * np.eye(len(normal) - 1), normal[:-1, -1]))
 
 
 def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR, RANDOM), seed: int = 0) -> LadderFit:
     """Choose a rung and fit it; the result does not depend on a constant that is added to a drive's error."""
-    samples = [s for s in map(_thinned, drives) if len(s[0]) * s[3] >= LEAST_BLOCK_S]
-    seconds = math.fsum(len(s[0]) * s[3] for s in samples)
+    samples = [s for s in map(_thinned, drives) if s.seconds >= LEAST_BLOCK_S]
+    seconds = math.fsum(s.seconds for s in samples)
     if not samples or seconds < 2.0 * LEAST_BLOCK_S:
         return LadderFit(None, math.inf, (), seconds, 0)
-    odd, even = (np.concatenate([s[i] for s in samples]) for i in (0, 1))
+    odd, even = np.concatenate([s.odd for s in samples]), np.concatenate([s.even for s in samples])
     scale = np.maximum(np.sqrt(np.mean(odd**2, axis=0)), 1e-9)
     even_mean, even_scale = even.mean(axis=0), np.maximum(even.std(axis=0), 1e-3)
     count = RANDOM_FEATURES if RANDOM in rungs and seconds >= RANDOM_LEAST_S else 0
@@ -200,14 +167,9 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
     odd_directions = rng.normal(size=(count, ODD_COUNT)) * FREQUENCY
     even_directions = rng.normal(size=(count, EVEN_COUNT)) * FREQUENCY
     phases = rng.uniform(0.0, 2.0 * math.pi, count)
-    z, e, errors = [], [], []
-    for sample_odd, sample_even, error, step_s in samples:
-        z.append(np.ascontiguousarray(sample_odd / scale))
-        e.append(np.ascontiguousarray((sample_even - even_mean) / even_scale))
-        errors.append((error, step_s))
-    phi = [_expanded(of, odd_directions, even_directions, phases) for of in zip(z, e, strict=True)]
-    fast = [without_slow(np.column_stack([p, error]), round(SLOW_S / step)) for p, (error, step) in _zip(phi, errors)]
-    problem = _problem([f[:, :-1] for f in fast], [(f[:, -1], step) for f, (_, step) in _zip(fast, errors)], seconds)
+    z, phi = odd / scale, np.empty((len(odd), ODD_COUNT + count))
+    expand(z, (even - even_mean) / even_scale, odd_directions, even_directions, phases, phi)
+    problem = _problem(samples, np.split(phi, np.cumsum([len(s.error) for s in samples])[:-1]), seconds)
     linear = problem.only(ODD_COUNT)
     trials, chosen = _climb({LINEAR: linear} | ({RANDOM: problem} if count else {}))
     if chosen == NONE:
@@ -216,9 +178,9 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
     ridge = _best_ridge(taken, ())
     weights = _solve(taken.whole, ridge)
     random = 0 if chosen == LINEAR else count
-    used = np.concatenate(phi)[:, : ODD_COUNT + random]
+    used = phi[:, : ODD_COUNT + random]
     rmse_rad = math.radians(next(t.rmse_deg for t in trials if t.rung == chosen))
-    normal = ridge * np.eye(used.shape[1]) + sum(drive.centred()[0] for drive in taken.whole)
+    normal = ridge * np.eye(used.shape[1]) + sum(_centred(drive)[:-1, :-1] for drive in taken.whole)
     speed = np.quantile(even[:, SPEED_COLUMN], [1.0 - QUANTILE, QUANTILE])
     model = LadderModel(
         rung=chosen,  # type: ignore[arg-type]
@@ -230,52 +192,44 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
         phases=plain(phases[:random]),
         weights=plain(weights),
         factor=plain(_factor(normal, used, rmse_rad)),
-        whitening=plain(_whitening(np.concatenate(z))),
+        whitening=plain(_whitening(z)),
         speed_m_s=plain(np.maximum(speed, 0.1)),
         largest_rad=plain(np.quantile(np.abs(used @ weights), 0.999)),
     )
     return LadderFit(model, ridge, trials, seconds, len(problem.blocks))
 
 
-def _zip(
-    columns: Sequence[FloatArray], errors: Sequence[tuple[FloatArray, float]]
-) -> Iterator[tuple[FloatArray, tuple[FloatArray, float]]]:
-    return zip(columns, errors, strict=True)
-
-
-def without_slow(columns: FloatArray, count: int) -> FloatArray:
-    """Return columns [K, c] less their mean over ``count`` rows about each."""
-    rows, half = np.arange(len(columns)), count // 2
-    sums = np.concatenate([np.zeros((1, columns.shape[1])), np.cumsum(columns, axis=0)])
-    first, last = np.maximum(rows - half, 0), np.minimum(rows + half + 1, len(columns))
-    return np.asarray(columns - (sums[last] - sums[first]) / (last - first)[:, None], dtype=np.float64)
-
-
-def _thinned(drive: TaughtDrive) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Return odd and even features, the error, and the duration of a sample, at most so many a second."""
+def _thinned(drive: TaughtDrive) -> _Sample:
+    """Return what a fit uses of a drive, at most so many rows a second."""
     step_s = float(np.median(np.diff(drive.stamps_ns))) * 1e-9 if len(drive.stamps_ns) > 1 else 1.0
     every = max(1, round(1.0 / (FIT_RATE_HZ * step_s)))
     rows = np.flatnonzero(drive.usable)[::every]
-    return drive.features.odd[rows], drive.features.even[rows], drive.lacking_rad[rows], step_s * every
+    weight_s = step_s * every * np.broadcast_to(drive.weight, drive.lacking_rad.shape)[rows]
+    columns = drive.features.odd[rows], drive.features.even[rows], drive.lacking_rad[rows]
+    return _Sample(*columns, weight_s, step_s * every)
 
 
-def _problem(phi: Sequence[FloatArray], errors: Sequence[tuple[FloatArray, float]], seconds: float) -> _Problem:
+def _problem(samples: Sequence[_Sample], phi: Sequence[FloatArray], seconds: float) -> _Problem:
     length_s = max(seconds / MOST_BLOCKS, LEAST_BLOCK_S)
     blocks, drives, whole = [], [], []
-    for number, (rows, (error, step_s)) in enumerate(zip(phi, errors, strict=True)):
-        count = max(1, round(len(error) * step_s / length_s))
-        whole.append(_Sums.of(rows, error, step_s))
-        for part in np.array_split(np.arange(len(error)), count):
-            inner = part[: max(1, len(part) - round(FORGET_S / step_s))]
-            blocks.append(_Sums.of(rows[inner], error[inner], step_s))
+    for number, (sample, features) in enumerate(zip(samples, phi, strict=True)):
+        table = np.column_stack([features, sample.error])
+        table -= running_mean(table, round(SLOW_S / sample.step_s) // 2, sample.weight_s)
+        table = np.column_stack([np.ones(len(table)), table])
+        weighted = sample.weight_s[:, None] * table
+        count = max(1, round(sample.seconds / length_s))
+        whole.append(weighted.T @ table)
+        for part in np.array_split(np.arange(len(table)), count):
+            inner = part[: max(1, len(part) - round(FORGET_S / sample.step_s))]
+            blocks.append(weighted[inner].T @ table[inner])
             drives.append(number)
-    return _Problem(tuple(blocks), tuple(drives), tuple(whole))
+    return _Problem(np.array(blocks), np.array(drives), np.array(whole))
 
 
 def _climb(problems: dict[str, _Problem]) -> tuple[tuple[RungTrial, ...], str]:
     """Try the rungs in order; return what was tried, and the last one that was taken."""
     some = next(iter(problems.values()))
-    count, seconds = len(some.blocks), np.array([b.seconds for b in some.blocks])
+    count, seconds = len(some.blocks), some.blocks[:, 0, 0]
     errors = {NONE: np.array([some.block_error(k, (k,), None) for k in range(count)])}
     trials = [RungTrial(NONE, _rmse_deg(errors[NONE], seconds), "", 0.0, 0.0, True)]
     chosen = NONE

@@ -41,7 +41,7 @@ def bare(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 def opened(log: Path, bare: Path, **span: str) -> OpenedDrive:
     with read_drive(log, Car.load(bare, network="none"), None, RunConfig(**span).read_options) as drive:
-        found = open_drive(drive)[1]
+        found = open_drive(drive, RunConfig(**span))[1]
     assert found is not None
     return found
 
@@ -64,7 +64,7 @@ def test_a_drive_teaches_a_prior_that_later_drives_start_from(
     car = Car.load(result.car, network="none")
     assert car.taught is not None and not car.has_evidence and car.notes == ()
     assert bool(car.taught_prior) is (result.figures["prior_support"] > 0.0)
-    taught = taught_parameters([drive.driving], [drive.slopes], car.vehicle)
+    taught = taught_parameters([drive.taught], car.vehicle)
     by_name = {p.name: p for p in taught}
     parameters = {p.name: p for p in parameters_of(car.vehicle)}
     assert by_name.keys() == set(TYRES)
@@ -72,15 +72,15 @@ def test_a_drive_teaches_a_prior_that_later_drives_start_from(
     right = Car.load(sample_logs_dir / "vehicle.toml").vehicle
     true = right.cornering_stiffness_n_per_rad(True, right.assumed_friction)
     assert abs(np.log(by_name[FRONT_STIFFNESS].value / true)) < 0.2
-    prior = {p.name: p.prior for p in self_calibrate([drive.driving], car.vehicle, taught=taught).parameters}
+    prior = {p.name: p.prior for p in self_calibrate([drive.taught.driving], car.vehicle, taught=taught).parameters}
     assert [prior[name] for name in TYRES] == pytest.approx([by_name[name].value for name in TYRES])
 
 
 def test_what_a_drive_does_not_excite_keeps_its_prior(drive: OpenedDrive) -> None:
     vehicle = drive.drive.car.vehicle
-    first = drive.driving.stretches[0][0]
-    short = drive.driving.between(first, first + 100)
-    taught = {p.name: p for p in taught_parameters([short], [drive.slopes], vehicle)}
+    first = drive.taught.driving.stretches[0][0]
+    short = replace(drive.taught, driving=drive.taught.driving.between(first, first + 100))
+    taught = {p.name: p for p in taught_parameters([short], vehicle)}
     parameters = {p.name: p for p in parameters_of(vehicle)}
     assert taught[PEAK].std > 0.97 * parameters[PEAK].std
     assert taught[PEAK].value == pytest.approx(parameters[PEAK].mean, rel=0.02)
@@ -101,11 +101,10 @@ def test_the_figures_say_which_rung_and_what_to_drive_next(result: LearnResult) 
 
 
 def test_an_offset_of_the_ground_truth_changes_neither_prior_nor_residual(drive: OpenedDrive) -> None:
-    truth = drive.whole.truth
-    assert truth is not None
-    offset = 0.01
+    truth, offset = drive.truth, 0.01
     moved = replace(truth, sideslip_rad=truth.sideslip_rad + offset, vy_m_s=truth.vy_m_s + offset * truth.vx_m_s)
-    shifted = replace(drive, whole=replace(drive.whole, truth=moved), slopes=drive.slopes + offset)
+    taught = replace(drive.taught, slopes=drive.taught.slopes + offset)
+    shifted = replace(drive, whole=replace(drive.whole, truth=moved), taught=taught)
     first, second = (learn_from([d]) for d in (drive, shifted))
     assert [p.value for p in second.parameters] == pytest.approx([p.value for p in first.parameters], rel=1e-6)
     assert second.ladder.rung == first.ladder.rung
@@ -121,8 +120,7 @@ def test_the_prior_of_several_drives_is_tested_with_each_left_out(sample_logs_di
     assert _support(None) == _support(Interval(0.0, 0.0, 0.0, 9)) == 0.0
     assert _support(Interval(-1.0, -2.96, 0.96, 9)) == pytest.approx(0.841, abs=1e-3)
     file, weak, full = (
-        {p.name: p for p in taught_parameters([d.driving for d in drives], [d.slopes for d in drives], car, support)}
-        for support in (0.0, 0.5, 1.0)
+        {p.name: p for p in taught_parameters([d.taught for d in drives], car, support)} for support in (0.0, 0.5, 1.0)
     )
     for p in parameters_of(car):
         if p.name in TYRES:
@@ -131,11 +129,11 @@ def test_the_prior_of_several_drives_is_tested_with_each_left_out(sample_logs_di
 
 
 def test_a_drive_that_begins_with_a_long_stop_is_halved_by_its_driving(drive: OpenedDrive) -> None:
-    cells = len(drive.driving.stamps_ns)
-    moving = np.array([[cells // 2, cells]])
-    slopes = np.where(np.arange(cells) < cells // 2, np.nan, drive.slopes)
-    late = replace(drive, driving=replace(drive.driving, stretches=moving), slopes=slopes)
-    first, second = (fold.driving[0].seconds for fold in _folds([late]))
+    cells = len(drive.taught.slopes)
+    moving = replace(drive.taught.driving, stretches=np.array([[cells // 2, cells]]))
+    slopes = np.where(np.arange(cells) < cells // 2, np.nan, drive.taught.slopes)
+    late = replace(drive, taught=replace(drive.taught, driving=moving, slopes=slopes))
+    first, second = (fold.taught[0].driving.seconds for fold in _folds([late]))
     assert first == pytest.approx(second, abs=2.0) and first > 8.0
 
 

@@ -15,8 +15,8 @@ from pdhef_logtool.residual_model.ladder import LARGEST, LadderModel
 from pdhef_logtool.residual_model.ladder_fit import (
     LadderFit,
     TaughtDrive,
+    _Problem,
     _solve,
-    _Sums,
     corrected_rmse_deg,
     fit_ladder,
 )
@@ -187,22 +187,30 @@ def test_windows_do_not_change_a_bit(cut: int) -> None:
     assert np.array_equal(joined, model.evaluate(whole).residual_rad)
 
 
-def test_the_sums_of_blocks_give_the_ridge_regression_of_the_samples() -> None:
+def test_the_sums_of_blocks_give_the_weighted_ridge_regression_of_the_samples() -> None:
     rng = np.random.default_rng(4)
-    phi, error, step_s, ridge = rng.normal(size=(300, 5)) + 0.4, rng.normal(size=300) + 2.0, 0.04, 3.0
-    blocks = [_Sums.of(phi[rows], error[rows], step_s) for rows in np.array_split(np.arange(300), 7)]
-    total = blocks[0]
-    for block in blocks[1:]:
-        total = total + block
-    weights = _solve([total], ridge)
-    # Least squares with λ as five more samples, and a column of ones for the constant.
-    columns = np.concatenate([np.concatenate([phi, np.ones((300, 1))], axis=1) * np.sqrt(step_s), np.zeros((5, 6))])
-    columns[300:, :5] = np.sqrt(ridge) * np.eye(5)
-    right = np.concatenate([error * np.sqrt(step_s), np.zeros(5)])
-    expected = np.linalg.lstsq(columns, right, rcond=None)[0]
-    assert np.allclose(weights, expected[:5])
-    squares = np.sum((error - phi @ expected[:5] - expected[5]) ** 2) * step_s
-    assert total.squares(weights, float(expected[5])) == pytest.approx(squares)
+    phi, error, ridge = rng.normal(size=(300, 5)) + 0.4, rng.normal(size=300) + 2.0, 3.0
+    root = np.sqrt(0.04 * rng.uniform(0.1, 1.0, 300))
+    table = root[:, None] * np.column_stack([np.ones(300), phi, error])
+    blocks = np.array([table[rows].T @ table[rows] for rows in np.array_split(np.arange(300), 6)])
+    problem = _Problem(blocks, np.zeros(6, dtype=np.int64), blocks.sum(axis=0)[None])
+    # Least squares without the last block, with λ as five more samples.
+    seen = 250
+    columns = np.concatenate([table[:seen, :6], np.eye(6)[1:] * np.sqrt(ridge)])
+    expected = np.linalg.lstsq(columns, np.concatenate([table[:seen, 6], np.zeros(5)]), rcond=None)[0]
+    assert np.allclose(_solve(blocks[:5].sum(axis=0)[None], ridge), expected[1:])
+    squares = np.sum((table[seen:, 6] - table[seen:, :6] @ expected) ** 2)
+    assert problem.block_error(5, (5,), ridge) == pytest.approx(squares)
+    assert problem.only(5).block_error(5, (5,), ridge) == pytest.approx(squares)
+
+
+def test_a_sideslip_without_weight_teaches_nothing() -> None:
+    drive = taught(300.0, 1, linear)
+    weight = np.where(np.arange(len(drive.stamps_ns)) % 500 < 100, 0.0, 0.5)
+    wrong = replace(drive, weight=weight, lacking_rad=np.where(weight > 0.0, drive.lacking_rad, 1.0))
+    first, second = (fit_ladder([d], rungs=("linear",)).model for d in (replace(drive, weight=weight), wrong))
+    assert first is not None and second is not None
+    assert np.allclose(first.weights, second.weights, rtol=1e-6, atol=1e-9)
 
 
 def test_the_interval_contains_most_of_what_a_strong_ridge_leaves() -> None:

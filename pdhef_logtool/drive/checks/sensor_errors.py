@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.drive.checks.kind import SURE, CheckedDrive, CheckKind
-from pdhef_logtool.drive.columns import derivative, earlier, fit, moving_at, running_mean
+from pdhef_logtool.drive.columns import GRID_S, derivative, earlier, fit, moving_at
 from pdhef_logtool.drive.relations import GAIN_RANGE
 from pdhef_logtool.drive.truth import LatencyEstimate
 from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.running_mean import running_mean
 from pdhef_logtool.records.signals import FloatArray
 
 #: Plausible gain of an accelerometer in lateral acceleration: roll adds 10 %, banked bends take 25 %.
@@ -71,7 +72,8 @@ def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
         gain = nothing if result is None else (result[0][0], result[1][0])
     if vx is not None and vy is not None and rate is not None and ay is not None:
         lateral = derivative(vy) + vx * rate
-        regressors = [derivative(rate), lateral, derivative(lateral), np.ones_like(rate), running_mean(lateral, SLOW_S)]
+        slow = running_mean(lateral, round(0.5 * SLOW_S / GRID_S))
+        regressors = [derivative(rate), lateral, derivative(lateral), np.ones_like(rate), slow]
         late_s = 0.0
         for _ in range(DELAY_STEPS):  # the part of the lever arm is late too: one step is not enough
             result = fit(earlier(ay, late_s), regressors, moving_at(vx))

@@ -24,7 +24,6 @@ from pdhef_logtool.estimators.calibration.joint import (
     ERROR_STD,
     FRONT_STIFFNESS,
     REAR_STIFFNESS,
-    Fit,
     JointProblem,
     counted,
     parameters_of,
@@ -208,32 +207,36 @@ def self_calibrate(
     if seconds < LEAST_S:
         why = f"{seconds:.0f} s above {vehicle_file.low_speed_blend_m_s:g} m/s, {LEAST_S:g} are needed"
         return _without_fit(vehicle_file, vehicle_file, why, seconds, len(drives))
-    if taught and (untaught := self_calibrate(drives, vehicle_file)).refused:
-        return untaught
-    problem = JointProblem(drives, vehicle_file, taught)
-    fit = problem.solve()
+    problem = JointProblem(drives, vehicle_file)
+    theta = problem.solve()
+    refused = _refusal(problem, theta, drives)
+    if taught and not refused:
+        theta = problem.solve(problem.teach(taught, theta))
+        refused = _refusal(problem, theta, drives)
+    covariance = problem.covariance(theta)
     progress(1.0)
-    std = np.sqrt(np.diag(fit.covariance))
+    std = np.sqrt(np.diag(covariance))
     parameters = tuple(
         Calibrated(p.name, p.unit, p.value(float(t)), p.mean, float(s) * p.std, of_file.std, p.log)
-        for p, of_file, t, s in zip(problem.parameters, parameters_of(vehicle_file), fit.theta, std, strict=True)
+        for p, of_file, t, s in zip(problem.parameters, parameters_of(vehicle_file), theta, std, strict=True)
     )
-    root = np.asarray(np.linalg.cholesky(fit.covariance), dtype=np.float64)
-    varied = varied_parameters(fit.theta, root, problem.sideslip, VARIED)
-    calibration = SelfCalibration(
+    idle = [p.name for p in parameters if p.name in (FRONT_STIFFNESS, REAR_STIFFNESS) and p.sd > EXPORTED_STD]
+    if exported and idle and not refused:
+        refused = f"the driving does not excite the {' and the '.join(idle)}"
+    root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+    varied = varied_parameters(theta, root, problem.sideslip, VARIED)
+    return SelfCalibration(
         vehicle_file,
-        problem.vehicle(fit.theta, digits=6),
+        problem.vehicle(theta, digits=6),
         parameters,
-        _understeer(problem, fit, vehicle_file),
-        "",
-        problem.rms(fit.theta),
+        _understeer(problem, theta, covariance, vehicle_file),
+        refused,
+        problem.rms(theta),
         problem.rms_of_file(),
         seconds,
         len(drives),
-        tuple(problem.vehicle(theta, digits=6) for theta in varied),
+        tuple(problem.vehicle(to, digits=6) for to in varied),
     )
-    sliding = float(np.mean(np.abs(problem.rear_slip(fit.theta)) > SLIDING_RAD))
-    return replace(calibration, refused=_refusal(calibration, drives, sliding, exported=exported))
 
 
 def _without_fit(
@@ -271,32 +274,29 @@ def calibrate_online(
     return replace(stages[-1], earlier=tuple(stages[:-1]))
 
 
-def _understeer(problem: JointProblem, fit: Fit, vehicle_file: VehicleParameters) -> Understeer:
-    def gradient(theta: FloatArray) -> float:
-        vehicle = problem.vehicle(theta)
+def _understeer(
+    problem: JointProblem, theta: FloatArray, covariance: FloatArray, vehicle_file: VehicleParameters
+) -> Understeer:
+    def gradient(at: FloatArray) -> float:
+        vehicle = problem.vehicle(at)
         return vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction)
 
-    centre = gradient(fit.theta)
-    steps = DERIVATIVE_STEP * np.eye(fit.theta.size)
-    slope = np.array([gradient(fit.theta + step) - centre for step in steps]) / DERIVATIVE_STEP
+    centre = gradient(theta)
+    steps = DERIVATIVE_STEP * np.eye(theta.size)
+    slope = np.array([gradient(theta + step) - centre for step in steps]) / DERIVATIVE_STEP
     file = vehicle_file.understeer_gradient_rad_per_m_s2(vehicle_file.assumed_friction)
-    return Understeer(file, centre, math.hypot(math.sqrt(float(slope @ fit.covariance @ slope)), UNDERSTEER_STD))
+    return Understeer(file, centre, math.hypot(math.sqrt(float(slope @ covariance @ slope)), UNDERSTEER_STD))
 
 
-def _refusal(calibration: SelfCalibration, drives: Sequence[Driving], sliding: float, *, exported: bool) -> str:
-    """Return why a fit is not used: it explains too little, the car slides, or the stiffness remains open.
-
-    ``sliding`` : share of the driving in which the rear axle slides.
-    """
+def _refusal(problem: JointProblem, theta: FloatArray, drives: Sequence[Driving]) -> str:
+    """Return why a fit is not used: it explains too little, or the car slides."""
+    rms = problem.rms(theta)
     for name, column, row in (("yaw rate", YAW_RATE, OF_RATE), ("lateral acceleration", AY, OF_AY)):
         measured = np.concatenate([d.columns[column][counted(d)] for d in drives])
-        share = calibration.rms[row] / max(float(np.sqrt(np.mean(measured**2))), 1e-9)
-        if share > LARGEST_SHARE and calibration.rms[row] > LARGEST_ERROR * ERROR_STD[row]:
+        share = rms[row] / max(float(np.sqrt(np.mean(measured**2))), 1e-9)
+        if share > LARGEST_SHARE and rms[row] > LARGEST_ERROR * ERROR_STD[row]:
             return f"the model leaves {share:.0%} of the {name}, at most {LARGEST_SHARE:.0%} is plausible"
-    if sliding > SLIDING_SHARE and sliding * calibration.seconds > SLIDING_S:
+    sliding = float(np.mean(np.abs(problem.rear_slip(theta)) > SLIDING_RAD))
+    if sliding > SLIDING_SHARE and sliding * sum(d.seconds for d in drives) > SLIDING_S:
         return f"the rear axle slides in {sliding:.0%} of the driving"
-    stiffness = [p for p in calibration.parameters if p.name in (FRONT_STIFFNESS, REAR_STIFFNESS)]
-    idle = [p.name for p in stiffness if p.sd > EXPORTED_STD]
-    if exported and idle:
-        return f"the driving does not excite the {' and the '.join(idle)}"
     return ""

@@ -93,6 +93,10 @@ class Parameter:
         free = self.mean * math.exp(self.std * theta) if self.log else self.mean + self.std * theta
         return min(max(free, self.low), self.high)
 
+    def theta(self, value: float) -> float:
+        """Return the normalised distance of a value from the prior mean."""
+        return (math.log(value / self.mean) if self.log else value - self.mean) / self.std
+
 
 def _factor(name: str, unit: str, mean: float, std: float, most: float) -> Parameter:
     """Return a parameter with a logarithmic prior, between 1 / ``most`` and ``most`` times its mean."""
@@ -150,9 +154,8 @@ def with_taught(
     def moved(p: Parameter, t: TaughtParameter) -> Parameter:
         levels = sorted((t.ay_m_s2, level_m_s2))
         share = float(np.interp(levels[0] / levels[1], LIKE, (0.0, 1.0))) if levels[0] > 0.0 else 1.0
-        distance = (math.log(t.value / p.mean) if p.log else t.value - p.mean) / p.std
         variance = p.std**2 - share**2 * max(p.std**2 - t.std**2, 0.0)
-        return replace(p, mean=p.value(share * distance), std=math.sqrt(variance))
+        return replace(p, mean=p.value(share * p.theta(t.value)), std=math.sqrt(variance))
 
     return tuple(moved(p, by_name[p.name]) if p.name in by_name else p for p in parameters)
 
@@ -163,21 +166,11 @@ def level_of(drives: Sequence[Driving]) -> float:
     return math.sqrt(float(np.nansum(ay2**2)) / max(float(np.nansum(ay2)), 1e-9))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Fit:
-    """Result of a fit: θ [n] and its covariance [n, n]."""
-
-    theta: FloatArray
-    covariance: FloatArray
-
-
 class JointProblem:
-    """The fit of one car to the driving of its logs, which were read with ``vehicle_file``; ``taught``: its prior."""
+    """The fit of one car to the driving of its logs, which were read with ``vehicle_file``."""
 
-    def __init__(
-        self, drives: Sequence[Driving], vehicle_file: VehicleParameters, taught: Sequence[TaughtParameter] = ()
-    ) -> None:
-        self.parameters = with_taught(parameters_of(vehicle_file), taught, level_of(drives))
+    def __init__(self, drives: Sequence[Driving], vehicle_file: VehicleParameters) -> None:
+        self.parameters = parameters_of(vehicle_file)
         self._drives, self._file = drives, vehicle_file
         self._filter = low_pass(CUTOFF_HZ, STEP_S)
         self._kept = [np.flatnonzero(counted(d))[::KEPT_STEPS] for d in drives]
@@ -195,9 +188,15 @@ class JointProblem:
         self._weight = math.sqrt(KEPT_STEPS * STEP_S / CORRELATION_S)
         self._least_std = self._error_std = np.array(ERROR_STD)
 
-    def solve(self) -> Fit:
-        """Return the parameters of the lowest cost, and with them the standard deviation of the errors."""
-        theta = np.zeros(len(self.parameters))
+    def teach(self, taught: Sequence[TaughtParameter], theta: FloatArray) -> FloatArray:
+        """Take the prior that drives with ground truth gave; return the parameters at θ as distances from it."""
+        values = self.values(theta)
+        self.parameters = with_taught(self.parameters, taught, level_of(self._drives))
+        return np.array([p.theta(values[p.name]) for p in self.parameters])
+
+    def solve(self, theta: FloatArray | None = None) -> FloatArray:
+        """Return the parameters of the lowest cost, from ``theta`` on, with the standard deviation of their errors."""
+        theta = np.zeros(len(self.parameters)) if theta is None else theta
         for _ in range(SCALES):
             error_std = np.maximum(self._least_std, self._rms(self.errors_of(theta)))
             self._error_std = error_std
@@ -214,7 +213,7 @@ class JointProblem:
             theta = descent.theta
             if np.allclose(np.maximum(self._least_std, self._rms(self.errors_of(theta))), error_std, rtol=SAME_SCALE):
                 break
-        return Fit(theta, self._covariance(theta))
+        return theta
 
     def errors_of(self, theta: FloatArray) -> FloatArray:
         """Return errors over ``ERROR_STD`` [2, K]."""
@@ -288,7 +287,8 @@ class JointProblem:
         np.add.at(gradients, np.tile(self._block, len(centre)), jacobian * residuals[:, None])
         return inverse, gradients
 
-    def _covariance(self, theta: FloatArray) -> FloatArray:
+    def covariance(self, theta: FloatArray) -> FloatArray:
+        """Return the covariance of the parameters at the lowest cost."""
         inverse, gradients = self._curvature(theta)
         blocks = len(gradients)
         spread = gradients.T @ gradients * (blocks / max(blocks - 1, 1))

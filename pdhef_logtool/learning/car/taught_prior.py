@@ -8,8 +8,8 @@ bank of a road enters them.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,10 +28,11 @@ from pdhef_logtool.estimators.calibration.joint import (
     parameters_of,
 )
 from pdhef_logtool.estimators.calibration.single_track import SPEED
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.learning.truth import MODEL_STD_RAD, weight_of
+from pdhef_logtool.records.running_mean import running_mean
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.tracks import StateTrack
 
-#: Least error of the sideslip of a single track, rad; larger errors count linearly.
-SIDESLIP_STD_RAD = math.radians(0.3)
 #: What ground truth teaches.
 TYRES = (FRONT_STIFFNESS, REAR_STIFFNESS, PEAK, RELAXATION)
 #: Correlation of a parameter between two drives of a car, about the mean of its prior (docs/teaching.md).
@@ -41,26 +42,35 @@ CORRELATION = 0.6
 SLOW_S = 4.0
 
 
-class TaughtProblem(JointProblem):
-    """The joint fit with v_y / v_x of the ground truth [N] by drive, NaN where unknown, on the grid of the driving."""
+@dataclass(frozen=True, slots=True, eq=False)
+class TaughtDriving:
+    """Driving for a calibration; on its grid [N] v_y / v_x of the ground truth, NaN where unknown, and its weight."""
 
-    def __init__(
-        self, drives: Sequence[Driving], slopes: Sequence[FloatArray], vehicle_file: VehicleParameters
-    ) -> None:
-        super().__init__(drives, vehicle_file)
-        self._least_std = self._error_std = np.array([*ERROR_STD, SIDESLIP_STD_RAD])
-        self._slopes = [slope[kept] for slope, kept in zip(slopes, self._kept, strict=True)]
+    driving: Driving
+    slopes: FloatArray
+    weights: FloatArray
+
+
+class TaughtProblem(JointProblem):
+    """The joint fit with v_y / v_x of the ground truth besides."""
+
+    def __init__(self, drives: Sequence[TaughtDriving], vehicle_file: VehicleParameters) -> None:
+        super().__init__([d.driving for d in drives], vehicle_file)
+        self._least_std = self._error_std = np.array([*ERROR_STD, MODEL_STD_RAD])
+        self._taught = [(d.slopes[k], d.weights[k]) for d, k in zip(drives, self._kept, strict=True)]
 
     def errors_of(self, theta: FloatArray) -> FloatArray:
         """Return errors of yaw rate, a_y and sideslip over their standard deviations, [3, K]."""
-        errors = super().errors_of(theta)
-        of_drives = zip(self._drives, self._out, self._kept, self._slopes, strict=True)
-        rows = [_without_slow(out[2, k] / d.columns[SPEED, k] - slope) for d, out, k, slope in of_drives]
+        errors, rows = super().errors_of(theta), []
+        for d, out, k, (slopes, weights) in zip(self._drives, self._out, self._kept, self._taught, strict=True):
+            error = out[2, k] / d.columns[SPEED, k] - slopes
+            fast = error - running_mean(error, round(0.5 * SLOW_S / (KEPT_STEPS * STEP_S)), weights)
+            rows.append(np.nan_to_num(np.sqrt(weights) * fast))
         return np.concatenate([errors, np.concatenate(rows)[None] / self._error_std[2]])
 
 
 def taught_parameters(
-    drives: Sequence[Driving], slopes: Sequence[FloatArray], vehicle_file: VehicleParameters, support: float = 1.0
+    drives: Sequence[TaughtDriving], vehicle_file: VehicleParameters, support: float = 1.0
 ) -> tuple[TaughtParameter, ...]:
     """Return the prior of a car's calibration from its drives, which were read with ``vehicle_file``.
 
@@ -68,9 +78,9 @@ def taught_parameters(
     prior, so that the sensors of a later drive can overrule it.
     """
     correlation = support * CORRELATION
-    problem = TaughtProblem(drives, slopes, vehicle_file)
-    fit, level = problem.solve(), float(f"{level_of(drives):.4g}")
-    variances = np.minimum(np.diag(fit.covariance), 1.0)
+    problem = TaughtProblem(drives, vehicle_file)
+    theta, level = problem.solve(), float(f"{level_of([d.driving for d in drives]):.4g}")
+    variances = np.minimum(np.diag(problem.covariance(theta)), 1.0)
     stds = np.sqrt(1.0 - correlation**2 * (1.0 - variances))
     return tuple(
         TaughtParameter(
@@ -79,27 +89,19 @@ def taught_parameters(
             std=float(f"{s * p.std:.6g}"),
             ay_m_s2=level,
         )
-        for p, t, s in zip(parameters_of(vehicle_file), fit.theta, stds, strict=True)
+        for p, t, s in zip(parameters_of(vehicle_file), theta, stds, strict=True)
         if p.name in TYRES
     )
 
 
-def slopes_of(driving: Driving, stamps_ns: IntArray, sideslip_rad: FloatArray) -> FloatArray:
-    """Return v_y / v_x of the ground truth [N] on the grid of a drive; NaN between stamps where it is unknown."""
-    if not len(driving.stamps_ns):
-        return np.empty(0)
-    start = int(driving.stamps_ns[0])
+def taught_driving(driving: Driving, truth: StateTrack) -> TaughtDriving:
+    """Return driving with a ground truth of any stamps, unknown between stamps where it is and outside of stretches."""
+    start = int(driving.stamps_ns[0]) if len(driving.stamps_ns) else 0
     middle_ns = driving.stamps_ns - round(0.5 * STEP_S * 1e9)  # a cell has the mean of its samples
-    seconds, grid = ((s - start).astype(np.float64) for s in (stamps_ns, middle_ns))
-    return np.interp(grid, seconds, np.tan(sideslip_rad), left=np.nan, right=np.nan)
-
-
-def _without_slow(error: FloatArray) -> FloatArray:
-    """Return errors [K] less their mean over :data:`SLOW_S` about each, 0 where unknown."""
-    finite = np.isfinite(error)
-    half = round(0.5 * SLOW_S / (KEPT_STEPS * STEP_S))
-    sums, counts = (np.concatenate([[0.0], np.cumsum(x)]) for x in (np.where(finite, error, 0.0), finite))
-    first = np.maximum(np.arange(error.size) - half, 0)
-    last = np.minimum(np.arange(error.size) + half + 1, error.size)
-    mean = (sums[last] - sums[first]) / np.maximum(counts[last] - counts[first], 1.0)
-    return np.where(finite, error - mean, 0.0)
+    seconds, grid = ((s - start).astype(np.float64) for s in (truth.stamps_ns, middle_ns))
+    slopes = np.interp(grid, seconds, np.tan(np.where(truth.valid, truth.sideslip_rad, np.nan)), np.nan, np.nan)
+    std = np.interp(grid, seconds, np.nan_to_num(truth.sideslip_std_rad))
+    inside = np.zeros(len(grid), dtype=np.bool_)
+    for first, last in driving.stretches:
+        inside[first:last] = True
+    return TaughtDriving(driving, np.where(inside, slopes, np.nan), weight_of(std))

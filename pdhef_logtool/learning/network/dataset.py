@@ -39,7 +39,7 @@ from pdhef_logtool.results.run_report import tool_versions, write_json
 from pdhef_logtool.storage.documents import DIGEST, digest, is_sealed, read_sealed, seal, validated
 
 FORMAT = "pdhef.residual-dataset"
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 MANIFEST = "manifest.json"
 #: Of more vehicles a bundle names the number.
 NAMED_VEHICLES = 4
@@ -64,7 +64,7 @@ FloatArray32: TypeAlias = NDArray[np.float32]
 class DriveWriter:
     """Writes the Parquet file of one drive; the same rows give the same bytes, however they are handed over.
 
-    ``picking`` states which rows are identified from.
+    ``picking`` states which rows are identified from, ``truth_source`` what gave their true sideslip.
 
     Raises
     ------
@@ -72,14 +72,16 @@ class DriveWriter:
         When the file cannot be written.
     """
 
-    def __init__(self, path: Path, picking: Picking = EVERYTHING, rows_a_group: int = ROWS_A_GROUP) -> None:
-        self._schema, self._picking = arrow_schema(_SCHEMA), picking
+    def __init__(
+        self, path: Path, picking: Picking = EVERYTHING, rows_a_group: int = ROWS_A_GROUP, truth_source: str = ""
+    ) -> None:
+        self._schema, self._picking, self._truth_source = arrow_schema(_SCHEMA), picking, truth_source
         self._file = RowGroups(path, self._schema, rows_a_group, ["segment", "cell", "draw"], joined=True)
 
     def append(self, rows: ResidualRows) -> Picked:
         """Take the next rows of the drive; return which of them are identified from."""
         picked = self._picking.of(rows)
-        self._file.append("", _table(rows, picked, self._schema))
+        self._file.append("", _table(rows, picked, self._truth_source, self._schema))
         return picked
 
     def finish(self, entry: Mapping[str, Any]) -> None:
@@ -91,12 +93,13 @@ class DriveWriter:
         self._file.abort()
 
 
-def _table(rows: ResidualRows, picked: Picked, schema: pa.Schema) -> pa.Table:
+def _table(rows: ResidualRows, picked: Picked, truth_source: str, schema: pa.Schema) -> pa.Table:
     columns: dict[str, Any] = {name: rows.features[:, i] for i, name in enumerate(FEATURES)}
     columns |= {name: rows.targets[:, i] for i, (name, _) in enumerate(TARGETS)}
     columns |= {name: rows.truth_velocity[:, i] for i, name in enumerate(TRUTH)}
     columns |= {"stamp_ns": rows.stamps_ns, "weight": rows.weight, "segment": rows.segment.astype(np.int32)}
     columns |= {"truth_std_rad": rows.truth_std_rad, "region": rows.region}
+    columns |= {"truth_source": np.full(len(rows), truth_source)}
     columns |= {"chosen": picked.chosen, "cell": picked.cell, "draw": picked.draw}
     arrays = []
     for f in schema:

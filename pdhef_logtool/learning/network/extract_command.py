@@ -16,6 +16,7 @@ import numpy as np
 
 from pdhef_logtool.car.car import NO_INTERVALS, VEHICLE_FILE, Car
 from pdhef_logtool.car.parts import physics_sha256
+from pdhef_logtool.car.taught import ESTIMATED
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
 from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.correlation import GAP_PERIODS as TRUTH_GAP_PERIODS
@@ -62,6 +63,7 @@ from pdhef_logtool.learning.network.residuals import (
     difference_noise,
     residual_windows,
 )
+from pdhef_logtool.learning.truth import TruthAt, teaching_reference
 from pdhef_logtool.learning.variation import MAX_VARIATION, vary
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
@@ -140,7 +142,7 @@ class ExtractSettings:
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON-able values; files by name only."""
         config = self.config.to_dict()
-        used = ("car", "mapping", "start", "end", "sensors", "prefer_truth")
+        used = ("car", "mapping", "start", "end", "sensors", "prefer_truth", "reference", "gnss")
         return {
             **{k: config[k] for k in used},
             **({} if config["friction"] == "auto" else {"friction": config["friction"]}),
@@ -473,17 +475,19 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         return kept
     with read_cached(job.log_input, job.car, job.mapping, settings.config.read_options) as drive:
         drive.plan = plan = _strict_truth(drive.plan)
-        _check_plan(plan, job)
+        reference, _ = teaching_reference(drive, settings.config)
+        _check_plan(plan, job, estimated=reference is not None)
         smoothing = _choose_smoothing(plan, settings)
+        truth = _truth_facts(plan, smoothing, estimated=reference is not None)
         service = _in_service(drive, job)
         physics = filter_of(service.car, settings.model, use_speed=drive.options.use_speed)
         varied = vary(physics.vehicle, settings.vary, f"{settings.seed}:{source}")
         physics = replace(physics, vehicle=varied.vehicle)
         drive.friction = friction_of(plan, varied.vehicle, drive.options, varied.friction_factor)
         condition = None if settings.where is None else condition_of(settings.where)
-        writer = DriveWriter(target, Picking(condition, f"{settings.seed}:{source}"))
+        writer = DriveWriter(target, Picking(condition, f"{settings.seed}:{source}"), truth_source=truth["kind"])
         try:
-            counts = _counted(drive, physics, smoothing, service, writer, progress)
+            counts = _counted(drive, physics, smoothing, service, reference, writer, progress)
             if not counts.rows:
                 raise no_samples(job.log_input.path)
             friction = drive.friction
@@ -503,7 +507,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
                 "taught_sha256": None if service.model is None else service.model.sha256,
                 "period_s": plan.alignment.grid_period_s,
                 **counts.to_dict(),
-                "truth": _truth_facts(plan, smoothing),
+                "truth": truth,
                 "friction_from": friction.label + (f", {friction.summary}" if friction.summary else ""),
                 **({"friction_factor": varied.friction_factor} if settings.vary else {}),
                 "losses": [asdict(x) for x in drive.losses],
@@ -565,6 +569,7 @@ def _counted(
     physics: PhysicsFilter | PhysicsUkf,
     smoothing: _Smoothing,
     service: _Service,
+    reference: TruthAt | None,
     writer: DriveWriter,
     progress: Callable[[float], None],
 ) -> _Counts:
@@ -572,7 +577,8 @@ def _counted(
 
     def windows() -> Iterator[DriveWindow]:
         for window in drive.windows():
-            yield replace(window, signals=service.read(window.signals))
+            truth = window.truth if reference is None else reference(window.signals.stamps_ns)
+            yield replace(window, signals=service.read(window.signals), truth=truth)
             progress(window.share_done)
 
     counts, period_s = _Counts(), drive.plan.alignment.grid_period_s
@@ -634,10 +640,10 @@ def _strict_truth(plan: DrivePlan) -> DrivePlan:
     return replace(plan, truth=replace(plan.truth, max_gap_s=gaps))
 
 
-def _check_plan(plan: DrivePlan, job: _Job) -> None:
+def _check_plan(plan: DrivePlan, job: _Job, *, estimated: bool) -> None:
     where = str(job.log_input.path)
     needed = {"vx_m_s", "vy_m_s", "yaw_rate_rad_s"}
-    if plan.truth is None or not needed <= plan.derivation.keys():
+    if not estimated and (plan.truth is None or not needed <= plan.derivation.keys()):
         raise EstimatorError(
             expected="ground truth from which v_x, v_y and yaw rate follow",
             got=", ".join(sorted(needed & plan.derivation.keys())) or "none",
@@ -678,11 +684,11 @@ def _choose_smoothing(plan: DrivePlan, settings: ExtractSettings) -> _Smoothing:
     return _Smoothing(SMOOTHING_HALF_S, f"{said}: not within {limits}", noise)
 
 
-def _truth_facts(plan: DrivePlan, smoothing: _Smoothing) -> dict[str, Any]:
+def _truth_facts(plan: DrivePlan, smoothing: _Smoothing, *, estimated: bool) -> dict[str, Any]:
     topics = {s.topic for s in plan.mapping.truth.values()}
     perfect = bool(topics) and all(t.startswith(PERFECT_PREFIX) for t in topics)
     return {
-        "kind": "perfect" if perfect else "recorded",
+        "kind": ESTIMATED if estimated else "perfect" if perfect else "recorded",
         "quantities": dict(plan.derivation),
         "latency_s": plan.truth_latency_s,
         "smoothing_half_s": smoothing.half_s,

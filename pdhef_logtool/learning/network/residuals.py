@@ -45,6 +45,7 @@ from pdhef_logtool.estimators.physics_model import (
     settle_forces,
     step_count,
 )
+from pdhef_logtool.learning.truth import weight_of
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.steps import StepColumns
@@ -59,8 +60,6 @@ SMOOTHING_HALF_S = 0.15
 #: Noise of ground truth in a one-step difference, of v̇_y in m/s² and ṙ in rad/s², up to which nothing is smoothed:
 #: well below what a training target varies by (0.2 and more).
 NEGLIGIBLE_NOISE = (0.05, 0.05)
-#: Sideslip error of a single track, at which ground truth of the same uncertainty has half the weight, rad.
-MODEL_STD_RAD = math.radians(0.3)
 
 _CHUNK = 16384
 #: Third differences of white noise have 20 times its variance.
@@ -79,7 +78,7 @@ class ResidualRows:
     targets : [N, 2], increments of v_y in m/s and of r in rad/s from this stamp to the next; NaN where unknown.
     step_s : [N], time to the next stamp; NaN at the last row.
     weight : [N], 0 unless target and features can be used and the next row carries on from this one; 1 with exact
-        ground truth, 1/2 where its sideslip is as uncertain as that of a single track (:data:`MODEL_STD_RAD`).
+        ground truth, 1/2 where its sideslip is as uncertain as that of a single track (:func:`~..truth.weight_of`).
     segment : int64 [N], a new number wherever the parallel filter starts again: sequences must not cross it.
     truth_velocity : [N, 2], true v_x and v_y at the stamp, for networks that learn them; NaN where unknown.
     truth_std_rad : [N], 1-sigma of the true sideslip. region : [N], gain of the region of validity of the car's taught
@@ -351,7 +350,7 @@ def residual_windows(
             features=steps.features[part],
             targets=targets[part],
             step_s=step_s[part],
-            weight=np.where(usable[part], 1.0 / (1.0 + (steps.truth_std_rad[part] / MODEL_STD_RAD) ** 2), 0.0),
+            weight=np.where(usable[part], weight_of(steps.truth_std_rad[part]), 0.0),
             segment=steps.segment[part],
             truth_velocity=steps.state[part, :2],
             truth_std_rad=steps.truth_std_rad[part],

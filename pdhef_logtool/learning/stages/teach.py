@@ -18,12 +18,12 @@ import numpy as np
 from pdhef_logtool.car.car import TAUGHT_FILE, Car
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.car.store import Change
-from pdhef_logtool.car.taught import Taught, TaughtParameter
+from pdhef_logtool.car.taught import ESTIMATED, GROUND_TRUTH, Taught, TaughtParameter
 from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.reading import Drive, WholeDrive
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
-from pdhef_logtool.estimators.calibration.driving import Driving
+from pdhef_logtool.estimators.calibration.driving import STEP_S
 from pdhef_logtool.estimators.corrected import features_of
 from pdhef_logtool.estimators.latency_compensation import compensate
 from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
@@ -31,14 +31,16 @@ from pdhef_logtool.estimators.table import FEATURES, make_estimator
 from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference
 from pdhef_logtool.evaluation.comparison import end_to_end
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
-from pdhef_logtool.learning.car.taught_prior import slopes_of, taught_parameters
-from pdhef_logtool.learning.drives import TEACH, DriveRecord, no_drive, no_true_sideslip, record_of
+from pdhef_logtool.learning.car.taught_prior import TaughtDriving, taught_driving, taught_parameters
+from pdhef_logtool.learning.drives import TEACH, DriveRecord, no_drive, record_of
 from pdhef_logtool.learning.split import TRAINING
 from pdhef_logtool.learning.stages.task import StageOutput, Task
+from pdhef_logtool.learning.truth import teaching_reference, weight_of
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.steps import release
+from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.residual_model.ladder import NONE
 from pdhef_logtool.residual_model.ladder_fit import (
     LadderFit,
@@ -47,6 +49,7 @@ from pdhef_logtool.residual_model.ladder_fit import (
     fit_ladder,
 )
 from pdhef_logtool.residual_model.slow_features import SlowFeatures
+from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.self_calibrating import lacking, read_driving, self_calibrated
 
 #: Least driving with ground truth, and length from which on little more is gained (docs/learn.md).
@@ -63,21 +66,32 @@ BENDS_M_S2, LIMIT_M_S2 = 2.0, 5.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpenedDrive:
-    """A drive with ground truth in memory: its reading, driving for the calibration, signals with ground truth."""
+    """A drive in memory: its reading, signals with the sideslip that teaches, and the driving with it."""
 
     drive: Drive
-    driving: Driving
     whole: WholeDrive
-    slopes: FloatArray
+    taught: TaughtDriving
+
+    @property
+    def truth(self) -> StateTrack:
+        """The sideslip that teaches."""
+        assert self.whole.truth is not None
+        return self.whole.truth
+
+    @property
+    def seconds(self) -> float:
+        """Driving with it."""
+        return float(np.count_nonzero(np.isfinite(self.taught.slopes))) * STEP_S
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Teaching:
-    """What drives taught: prior, its support, residual, whether its drives calibrated their car, what to drive next."""
+    """What drives taught by a truth: prior, its support, residual, whether drives calibrated their car, what next."""
 
     parameters: tuple[TaughtParameter, ...]
     ladder: LadderFit
     calibrated: bool
+    truth: str
     prior_test: Interval | None
     support: float
     drives: tuple[dict[str, Any], ...]
@@ -89,7 +103,7 @@ class Teaching:
         tried = ", ".join(f"{t.rung} {t.rmse_deg:.3f}°" for t in self.ladder.trials)
         rung = "no residual" if self.ladder.rung == NONE else f"residual model {self.ladder.rung}"
         return (
-            f"{rung}, by held-out blocks of {self.ladder.seconds:.0f} s with ground truth"
+            f"{rung}, taught by {self.truth}, by held-out blocks of {self.ladder.seconds:.0f} s"
             f" (RMSE without constants: {tried or 'not tried'})"
         )
 
@@ -106,12 +120,12 @@ def teach(task: Task) -> StageOutput:
 
     def read(log: LogInput) -> tuple[DriveRecord, OpenedDrive | None]:
         with read_cached(log, car, task.mapping, task.options) as drive:
-            return open_drive(drive)
+            return open_drive(drive, task.settings.config)
 
     records, drives = task.read(task.split.parts[TRAINING], read, 0.3)
     if not drives:
         raise no_drive("a true sideslip and the signals of a calibration", TEACH)
-    seconds = math.fsum(float(np.sum(np.isfinite(d.slopes))) * 0.02 for d in drives)
+    seconds = math.fsum(d.seconds for d in drives)
     if seconds < LEAST_S:
         expected = f"at least {LEAST_S:g} s of driving with ground truth above {car.vehicle.low_speed_blend_m_s:g} m/s"
         raise EstimatorError(expected=expected, got=f"{seconds:.1f} s", where=TEACH, remedy="give more drives")
@@ -122,6 +136,7 @@ def teach(task: Task) -> StageOutput:
         parameters=taught.parameters,
         residual=taught.ladder.model,
         calibrated=taught.calibrated,
+        truth=taught.truth,
         evidence=taught.evidence,
         drives=tuple(r.learnt_on for r in records if not r.left_out),
         figures=figures,
@@ -131,23 +146,21 @@ def teach(task: Task) -> StageOutput:
     return StageOutput(change, records, taught.evidence, figures)
 
 
-def open_drive(drive: Drive) -> tuple[DriveRecord, OpenedDrive | None]:
+def open_drive(drive: Drive, config: RunConfig) -> tuple[DriveRecord, OpenedDrive | None]:
     """Return the record of an open drive and what teaching takes of it; None with the reason in the record."""
     missing = sorted({*lacking(drive), *(FEATURES - drive.available)})
-    left_out = f"the log has no {', '.join(missing)}" if missing else no_true_sideslip(drive.plan)
-    if left_out:
-        return record_of(drive, left_out=left_out), None
-    driving, whole = read_driving(drive), drive.whole(fill_friction=drive.friction.bank is None)
+    at, lacks = (None, f"the log has no {', '.join(missing)}") if missing else teaching_reference(drive, config)
+    if lacks:
+        return record_of(drive, left_out=lacks), None
+    whole = drive.whole(fill_friction=drive.friction.bank is None)
+    if at is not None:
+        whole = replace(whole, truth=at(whole.signals.stamps_ns))
     assert whole.truth is not None
-    true = np.where(whole.truth.valid, whole.truth.sideslip_rad, np.nan)
-    slopes = slopes_of(driving, whole.signals.stamps_ns, true)
-    inside = np.zeros(len(slopes), dtype=np.bool_)
-    for first, last in driving.stretches:
-        inside[first:last] = True
-    slopes = np.where(inside, slopes, np.nan)
-    if not np.isfinite(slopes).any():
+    taught = taught_driving(read_driving(drive), whole.truth)
+    if not np.isfinite(taught.slopes).any():
         return record_of(drive, left_out="no driving with a true sideslip above the low-speed limit"), None
-    return record_of(drive, whole=whole), OpenedDrive(drive, driving, whole, slopes)
+    record = record_of(drive, whole=whole)
+    return record if at is None else replace(record, truth=(ESTIMATED,)), OpenedDrive(drive, whole, taught)
 
 
 def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = lambda _text, _share: None) -> Teaching:
@@ -158,13 +171,13 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
     support = _support(test)
     parameters: tuple[TaughtParameter, ...] = ()
     if support > 0.0:
-        parameters = taught_parameters([d.driving for d in drives], [d.slopes for d in drives], vehicle, support)
+        parameters = taught_parameters([d.taught for d in drives], vehicle, support)
     calibrations = [_calibration(d, parameters) for d in drives]
     progress("fitting the residual", 0.8)
     lacks = [lacking_of(d, c) for d, c in zip(drives, calibrations, strict=True)]
     seconds = {False: 0.0, True: 0.0}
     for drive, calibration in zip(drives, calibrations, strict=True):
-        seconds[not calibration.refused] += drive.driving.seconds
+        seconds[not calibration.refused] += drive.taught.driving.seconds
     calibrated = seconds[True] >= seconds[False]  # a residual of one kind of physics is none of the other
     fitted = [lack for lack, c in zip(lacks, calibrations, strict=True) if calibrated is not bool(c.refused)]
     ladder = fit_ladder(fitted, seed=seed)
@@ -178,7 +191,7 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
         lines.append(
             {
                 "name": drive.drive.name,
-                "seconds": round(drive.driving.seconds, 1),
+                "seconds": round(drive.taught.driving.seconds, 1),
                 "calibration": calibration.refused or "as later drives",
                 "physics_deg": before,
                 "corrected_deg": after,
@@ -186,11 +199,12 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
                 "corrected_without_constant_deg": after_free,
             }
         )
-    return Teaching(parameters, ladder, calibrated, test, support, tuple(lines), _more(drives, ladder))
+    truth = " and ".join(sorted({ESTIMATED if d.truth.name == REFERENCE else GROUND_TRUTH for d in drives}))
+    return Teaching(parameters, ladder, calibrated, truth, test, support, tuple(lines), _more(drives, ladder))
 
 
 def _calibration(drive: OpenedDrive, parameters: Sequence[TaughtParameter]) -> SelfCalibration:
-    calibration = self_calibrate([drive.driving], drive.drive.car.vehicle, taught=parameters)
+    calibration = self_calibrate([drive.taught.driving], drive.drive.car.vehicle, taught=parameters)
     return replace(calibration, varied=())
 
 
@@ -201,46 +215,43 @@ def lacking_of(drive: OpenedDrive, calibration: SelfCalibration) -> TaughtDrive:
     physics, signals = estimator, drive.whole.signals
     if isinstance(estimator, SelfCalibrated):
         physics, signals = estimator.estimator, estimator.given(signals)
-    assert isinstance(physics, AdaptivePhysics) and drive.whole.truth is not None
+    assert isinstance(physics, AdaptivePhysics)
     steps, _ = physics.run(signals, None)
     track, _ = compensate(physics, signals, steps)
     features, _ = features_of(physics, steps, signals, None, None)
     arrived = release(signals.ready_ns, signals.stamps_ns)
-    error = signal_error(track, drive.whole.truth, "sideslip_rad", car.vehicle.low_speed_blend_m_s)
+    error = signal_error(track, drive.truth, "sideslip_rad", car.vehicle.low_speed_blend_m_s)
     settled = signals.stamps_ns - signals.stamps_ns[0] > SETTLE_NS
     error = np.where(arrived.arrived & settled, error, np.nan)
     at_stamps = SlowFeatures(features.odd[arrived.row], features.even[arrived.row])
-    return TaughtDrive(drive.drive.name, signals.stamps_ns, at_stamps, -error)
+    return TaughtDrive(
+        drive.drive.name, signals.stamps_ns, at_stamps, -error, weight_of(np.nan_to_num(drive.truth.sideslip_std_rad))
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fold:
-    """Drives that teach, with their ground truth, and the part of another one, or of the same, that is scored."""
+    """Drives that teach, and the part of another one, or of the same, that is scored."""
 
-    driving: tuple[Driving, ...]
-    slopes: tuple[FloatArray, ...]
+    taught: tuple[TaughtDriving, ...]
     scored: OpenedDrive
     part: slice
 
 
 def _folds(drives: Sequence[OpenedDrive]) -> list[_Fold]:
     """Return folds with each drive left out; of one drive each half."""
-    folds = []
     if len(drives) > 1:
-        for drive in drives[:MOST_LEFT_OUT]:
-            others = [d for d in drives if d is not drive]
-            taught = tuple(d.driving for d in others), tuple(d.slopes for d in others)
-            folds.append(_Fold(*taught, drive, slice(None)))
-        return folds
-    (drive,) = drives
-    cells, stamps = len(drive.driving.stamps_ns), drive.whole.signals.stamps_ns
-    known_cells = np.cumsum(np.isfinite(drive.slopes))
+        left_out = drives[:MOST_LEFT_OUT]
+        return [_Fold(tuple(d.taught for d in drives if d is not drive), drive, slice(None)) for drive in left_out]
+    folds, (drive,) = [], drives
+    driving, stamps = drive.taught.driving, drive.whole.signals.stamps_ns
+    cells, known_cells = len(driving.stamps_ns), np.cumsum(np.isfinite(drive.taught.slopes))
     half_way = int(np.searchsorted(known_cells, known_cells[-1] // 2))
-    middle = int(np.searchsorted(stamps, drive.driving.stamps_ns[half_way]))
+    middle = int(np.searchsorted(stamps, driving.stamps_ns[half_way]))
     for first, last, part in ((0, half_way, slice(middle, None)), (half_way, cells, slice(0, middle))):
-        half = drive.driving.between(first, last)
-        if half.seconds >= LEAST_HALF_S:
-            folds.append(_Fold((half,), (drive.slopes,), drive, part))
+        half = replace(drive.taught, driving=driving.between(first, last))
+        if half.driving.seconds >= LEAST_HALF_S:
+            folds.append(_Fold((half,), drive, part))
     return folds
 
 
@@ -254,11 +265,12 @@ def _prior_test(drives: Sequence[OpenedDrive], progress: Any) -> Interval | None
     vehicle = drives[0].drive.car.vehicle
     for number, fold in enumerate(folds):
         progress(f"testing the prior on {fold.scored.drive.name}", 0.35 + 0.4 * number / len(folds))
-        prior = taught_parameters(fold.driving, fold.slopes, vehicle)
+        prior = taught_parameters(fold.taught, vehicle)
         stamps.append(fold.scored.whole.signals.stamps_ns[fold.part])
         for column, parameters in zip(errors, (prior, ()), strict=True):
-            lack = lacking_of(fold.scored, _calibration(fold.scored, parameters)).lacking_rad[fold.part]
-            column.append(lack - np.nanmedian(lack) if np.isfinite(lack).any() else lack)
+            scored = lacking_of(fold.scored, _calibration(fold.scored, parameters))
+            lack, root = scored.lacking_rad[fold.part], np.sqrt(scored.weight[fold.part])
+            column.append(root * (lack - np.nanmedian(lack)) if np.isfinite(lack).any() else lack)
     if not folds:
         return None
     with_prior, without = (np.concatenate(column) for column in errors)
@@ -275,8 +287,7 @@ def _support(test: Interval | None) -> float:
 def _more(drives: Sequence[OpenedDrive], ladder: LadderFit) -> tuple[str, ...]:
     """Return what to drive next, in sentences."""
     texts = []
-    truths = [d.whole.truth for d in drives]
-    ay = np.concatenate([t.vx_m_s * t.yaw_rate_rad_s for t in truths if t is not None])
+    ay = np.concatenate([d.truth.vx_m_s * d.truth.yaw_rate_rad_s for d in drives])
     ay = ay[np.isfinite(ay)]
     if ladder.seconds < ENOUGH_S:
         texts.append(
@@ -304,6 +315,7 @@ def figures_of(taught: Teaching) -> dict[str, Any]:
         "blocks": ladder.blocks,
         "rungs": [asdict(t) for t in ladder.trials],
         "calibrated": taught.calibrated,
+        "truth": taught.truth,
         "prior_support": round(taught.support, 3),
         "prior_against_untaught_deg": [None if math.isnan(x) else math.degrees(x) for x in bounds],
         "parameters": [p.model_dump() for p in taught.parameters],
