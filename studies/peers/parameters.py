@@ -64,16 +64,13 @@ def shown_by_truth(driving: Driving, truth: StateTrack, vehicle: VehicleParamete
         parts.append(np.stack([steer, front, np.gradient(vy, STEP_S) + vx * rate]))
     rows = np.concatenate(parts, axis=1)
     gentle = rows[:, np.abs(rows[2]) < GENTLE * GRAVITY_M_S2 * vehicle.assumed_friction]
-    return {STEERING: _jackknife(_log_steering, gentle), PEAK: _jackknife(_log_grip, rows)}
+    grip = _jackknife(lambda r: math.log(np.quantile(np.abs(r[2]), 0.99)), rows)
+    return {STEERING: _jackknife(_log_steering, gentle), PEAK: grip}
 
 
 def _log_steering(rows: FloatArray) -> float:
     known = np.stack([rows[1], rows[2], np.ones(rows.shape[1])], axis=1)
     return math.log(max(float(np.linalg.lstsq(known, rows[0], rcond=None)[0][0]), 1e-3))
-
-
-def _log_grip(rows: FloatArray) -> float:
-    return math.log(float(np.quantile(np.abs(rows[2]), 0.99)))
 
 
 def _jackknife(figure: Callable[[FloatArray], float], rows: FloatArray) -> tuple[float, float]:
