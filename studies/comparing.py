@@ -137,8 +137,8 @@ def cost(drives: int) -> list[str]:
             check=True, capture_output=True, text=True,
         )  # fmt: skip
         seconds = _processor_s() - before
-    *_, verdict, peak_kib = done.stdout.strip().split("\n")
-    equal = "equal" if "Verdict: equal" in verdict else verdict
+    verdict, *_, peak_kib = done.stdout.strip().split("\n")
+    equal = "equal" if "Result   equal" in verdict else verdict
     return [f"{drives:,}", f"{int(made.stdout):,}", equal, f"{seconds:.1f}", f"{int(peak_kib) / 1024:.0f}"]
 
 

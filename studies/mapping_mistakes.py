@@ -27,10 +27,11 @@ from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.mounting import scaled_source, survey_log
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import Mapping, auto_map, fit_clocks, load_mapping
+from pdhef_logtool.mapping import Mapping, auto_map, fit_clocks
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import PdhefError
+from studies.peers.drives import PEER_DRIVES, mapping_of, vehicle_of
 from truthsim.drive import simulate_drive, write_drive
 from truthsim.manoeuvres import MANOEUVRES
 from truthsim.vehicle_choice import choose_vehicle
@@ -209,11 +210,11 @@ def main(arguments: Sequence[str]) -> int:
     samples = Path(__file__).parents[1] / "sample_logs"
     counts: Counter[str] = Counter()
     for path in [Path(a) for a in arguments if a != "-v"] or [samples / f"{name}.mcap" for name in SAMPLES]:
-        file = path.parent / f"{path.name}.signals.toml"
+        peer = next((d for d in PEER_DRIVES if d.log == path.name), None)
         vehicle = path.parent / ("vehicle_mu03.toml" if path.stem == "sweep" else "vehicle.toml")
-        vehicle = vehicle if vehicle.exists() else path.parent / f"{path.name}.vehicle.toml"
         car = Car.load(vehicle).vehicle if vehicle.exists() else default_vehicle()
-        for found in outcomes(path, car, load_mapping(file) if file.exists() else None):
+        car = car if peer is None else vehicle_of(peer, path.parent)
+        for found in outcomes(path, car, None if peer is None else mapping_of(peer, path.parent)):
             counts[found.verdict] += 1
             if found.verdict != "named":
                 print(f"{found.log} {found.signal} {found.kind}: {found.verdict}")

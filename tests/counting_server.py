@@ -185,27 +185,6 @@ def cutting(after_bytes: int, times: int = 10**9) -> Fault:
     return fault
 
 
-def trickling() -> Fault:
-    """Send a byte now and then, without an end."""
-
-    def fault(handler: _Handler, _: int) -> bool:
-        path = handler.path.split("?")[0].lstrip("/")
-        data = handler.of.files[path]
-        handler.note(path, 0, 0)
-        handler.send_response(206)
-        handler.send_header("Content-Range", f"bytes 0-4095/{len(data)}")
-        handler.send_header("Content-Length", "4096")
-        handler.end_headers()
-        for at in range(40):
-            handler.wfile.write(data[at : at + 1])
-            handler.wfile.flush()
-            time.sleep(0.05)
-        handler.close_connection = True
-        return True
-
-    return fault
-
-
 def stalling(seconds: float) -> Fault:
     """Say nothing."""
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from numba.extending import register_jitable
 
 from pdhef_logtool.records.signals import FloatArray
+from truthsim.road import interpolated
 
 
 class Driver(NamedTuple):
@@ -42,28 +43,15 @@ PATH_X, PATH_Y, PATH_YAW, PATH_SPEED = range(4)
 
 
 @register_jitable
-def _path_at(path: FloatArray, step_m: float, at_m: float, column: int) -> float:
-    """Interpolate one column of a path table; beyond its end the last row applies."""
-    place = at_m / step_m
-    last = path.shape[0] - 1
-    if place <= 0.0:
-        return float(path[0, column])
-    if place >= last:
-        return float(path[last, column])
-    i = int(place)
-    return float(path[i, column] + (place - i) * (path[i + 1, column] - path[i, column]))
-
-
-@register_jitable
 def track_progress_m(
     path: FloatArray, step_m: float, progress_m: float, x_m: float, y_m: float, ahead_m: float
 ) -> float:
     """Arc length of the path's point beside the car, found by stepping on from the last one; never backwards."""
     progress = progress_m
     for _ in range(3):
-        yaw = _path_at(path, step_m, progress, PATH_YAW)
-        along = (x_m - _path_at(path, step_m, progress, PATH_X)) * math.cos(yaw) + (
-            y_m - _path_at(path, step_m, progress, PATH_Y)
+        yaw = interpolated(path, progress / step_m, PATH_YAW)
+        along = (x_m - interpolated(path, progress / step_m, PATH_X)) * math.cos(yaw) + (
+            y_m - interpolated(path, progress / step_m, PATH_Y)
         ) * math.sin(yaw)
         progress = max(progress_m, progress + min(along, ahead_m))
     return progress
@@ -87,8 +75,8 @@ def preview_steer_rad(
     distance = max(driver.preview_min_m, driver.preview_s * speed_m_s)
     last_m = step_m * (path.shape[0] - 1)
     at_m = progress_m + distance
-    dx = _path_at(path, step_m, at_m, PATH_X) - x_m
-    dy = _path_at(path, step_m, at_m, PATH_Y) - y_m
+    dx = interpolated(path, at_m / step_m, PATH_X) - x_m
+    dy = interpolated(path, at_m / step_m, PATH_Y) - y_m
     if at_m > last_m:
         yaw = path[path.shape[0] - 1, PATH_YAW]
         dx += (at_m - last_m) * math.cos(yaw)
@@ -142,9 +130,9 @@ def target_speed_m_s(path: FloatArray, step_m: float, stops: FloatArray, memory:
         at_m = min(at_m, stops[k, 0])
     if k > 0:
         at_m = max(at_m, stops[k - 1, 0] + 2.0)
-    speed = _path_at(path, step_m, at_m, PATH_SPEED)
-    ahead = _path_at(path, step_m, at_m + 0.5, PATH_SPEED)
-    behind = _path_at(path, step_m, at_m - 0.5, PATH_SPEED)
+    speed = interpolated(path, at_m / step_m, PATH_SPEED)
+    ahead = interpolated(path, (at_m + 0.5) / step_m, PATH_SPEED)
+    behind = interpolated(path, (at_m - 0.5) / step_m, PATH_SPEED)
     return speed, 0.5 * (ahead * ahead - behind * behind)
 
 

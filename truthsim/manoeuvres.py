@@ -265,26 +265,13 @@ def _severe_lane_change(request: Request) -> Plan:
 # ---- open loop ----
 
 
-def _sweep_phase(t_s: FloatArray, span_s: float, low_hz: float, high_hz: float) -> FloatArray:
-    """Phase (rad) of a sine whose frequency grows linearly over a span."""
-    return np.asarray(2.0 * np.pi * (low_hz * t_s + 0.5 * (high_hz - low_hz) / span_s * t_s**2))
-
-
-def _sine_sweep(request: Request) -> Plan:
-    """Open-loop sine after one second straight, its frequency growing from 0.6 to 1 Hz and its amplitude with it."""
+def _swept_sine(request: Request, low_hz: float, high_hz: float, *, share: float, first: float) -> Plan:
+    """Open-loop sine after one second straight; its frequency grows, and its amplitude from the share ``first`` on."""
     t = np.maximum(_times_s(request.duration_s) - 1.0, 0.0)
     span = max(request.duration_s - 1.0, CONTROL_STEP_S)
-    top = steer_for(request.friction * GRAVITY_M_S2, request.speed_m_s)
-    steer = request.scale * top * (0.1 + 0.9 * t / span) * np.sin(_sweep_phase(t, span, 0.6, 1.0))
-    return Plan(request.speed_m_s, request.duration_s, steer_rad=steer)
-
-
-def _sine_sweep_wide(request: Request) -> Plan:
-    """Open-loop sine of one amplitude after one second straight, from 0.5 to 2 Hz."""
-    t = np.maximum(_times_s(request.duration_s) - 1.0, 0.0)
-    span = max(request.duration_s - 1.0, CONTROL_STEP_S)
-    top = steer_for(0.4 * request.friction * GRAVITY_M_S2, request.speed_m_s)
-    steer = request.scale * top * np.sin(_sweep_phase(t, span, 0.5, 2.0))
+    top = steer_for(share * request.friction * GRAVITY_M_S2, request.speed_m_s)
+    phase = 2.0 * np.pi * (low_hz * t + 0.5 * (high_hz - low_hz) / span * t**2)
+    steer = request.scale * top * (first + (1.0 - first) * t / span) * np.sin(phase)
     return Plan(request.speed_m_s, request.duration_s, steer_rad=steer)
 
 
@@ -616,7 +603,7 @@ _CATALOGUE = (
         peak_share=0.92,
         least_share=0.90,
         default_duration_s=lambda _: 12.0,
-        plan=_sine_sweep,
+        plan=lambda request: _swept_sine(request, 0.6, 1.0, share=1.0, first=0.1),
     ),
     Manoeuvre(
         name="sine-sweep-wide",
@@ -626,7 +613,7 @@ _CATALOGUE = (
         peak_share=0.40,
         least_share=0.38,
         default_duration_s=lambda _: 20.0,
-        plan=_sine_sweep_wide,
+        plan=lambda request: _swept_sine(request, 0.5, 2.0, share=0.4, first=1.0),
     ),
     Manoeuvre(
         name="sine-with-dwell",

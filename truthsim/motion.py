@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 
@@ -46,7 +42,6 @@ class Motion:
     ----------
     times_s : [N], every ``period_s``.
     observed : [N, phases, columns of ``truthsim.vehicle.OBSERVED``]; phase j is ``phases_s[j]`` after the row's time.
-    finite : False when the integration left the finite numbers.
     """
 
     times_s: FloatArray
@@ -58,105 +53,90 @@ class Motion:
         return self.observed[:, phase, OBSERVED.index(name)]
 
 
-@cache
-def _compiled_loop() -> Callable[..., None]:
-    """Compile (or load from the cache) the loop.
+# positional: it is compiled and called in one place, just below, with the columns of one record
+@njit(cache=True)
+def _loop(
+    start_speed_m_s: float,
+    steer_table: FloatArray,
+    path: FloatArray,
+    stops: FloatArray,
+    torque_table: FloatArray,
+    road_table: FloatArray,
+    friction: float,
+    vehicle: Vehicle,
+    driver: Driver,
+    state: FloatArray,
+    rows: int,
+    period: int,
+    phases: FloatArray,
+    substeps: int,
+    observed: FloatArray,
+) -> None:
+    """Drive and write what is observed to ``observed`` [rows, phases, columns]."""
+    follows = path.shape[0] > 0
+    memory = np.zeros(MEMORY_SIZE)
+    scratch, stage, view = np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.zeros(OBSERVED_SIZE)
+    k1, k2, k3, k4 = np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.zeros(STATE_SIZE)
+    road = np.zeros(ROAD_SIZE)
+    dt = CONTROL_STEP_S / substeps
+    distance = 0.0
+    steer, next_steer = 0.0, 0.0
+    if not follows:
+        next_steer = steer_table[0]
+    for k in range((rows - 1) * period + int(phases[-1]) + 1):
+        steer = next_steer
+        see(state, view)
+        speed = view[3]
+        brake_hold = False
+        if follows:
+            memory[PROGRESS] = track_progress_m(path, PATH_STEP_M, memory[PROGRESS], view[0], view[1], 5.0)
+            target, target_rate = target_speed_m_s(path, PATH_STEP_M, stops, memory)
+            brake_hold = standing(stops, memory, speed, CONTROL_STEP_S)
+            course = view[2] + (np.arctan2(view[4], speed) if speed > 3.0 else 0.0)
+            demand = preview_steer_rad(driver, path, PATH_STEP_M, memory[PROGRESS], view[0], view[1], course, speed)
+            next_steer = steer if brake_hold else move_steering(driver, memory, demand, CONTROL_STEP_S)
+        else:
+            target, target_rate = start_speed_m_s, 0.0
+            next_steer = steer_table[min(k + 1, steer_table.shape[0] - 1)]
+        drive, brake = pedal_torques_n_m(driver, memory, target, target_rate, speed, CONTROL_STEP_S)
+        if brake_hold:
+            drive, brake = 0.0, driver.hold_brake_n_m
 
-    Numba's cache compares the file of the compiled function alone. The digest of all files that are compiled into it is
-    a closure variable, which Numba does put into its key: an edited tyre is never run from an old cache entry.
-    """
-    folder = Path(__file__).parent
-    digest = hashlib.sha256()
-    for name in ("motion.py", "driver.py", "vehicle.py", "tyres.py", "road.py", "manoeuvres.py"):
-        digest.update((folder / name).read_bytes())
-    sources = digest.hexdigest()
+        if k < torque_table.shape[0] and torque_table[k, 0] == torque_table[k, 0]:
+            drive, brake = torque_table[k, 0], torque_table[k, 1]
+        at_m = memory[PROGRESS] if follows else distance
+        distance += speed * CONTROL_STEP_S
+        read_road(
+            road_table,
+            PATH_STEP_M,
+            at_m,
+            vehicle.cg_to_front_axle_m,
+            vehicle.cg_to_rear_axle_m,
+            friction,
+            road,
+        )
 
-    # positional: it is compiled and called in one place, just below, with the columns of one record
-    @njit(cache=True)
-    def loop(
-        start_speed_m_s: float,
-        steer_table: FloatArray,
-        path: FloatArray,
-        stops: FloatArray,
-        torque_table: FloatArray,
-        road_table: FloatArray,
-        friction: float,
-        vehicle: Vehicle,
-        driver: Driver,
-        state: FloatArray,
-        rows: int,
-        period: int,
-        phases: FloatArray,
-        substeps: int,
-        observed: FloatArray,
-    ) -> str:
-        follows = path.shape[0] > 0
-        memory = np.zeros(MEMORY_SIZE)
-        scratch, stage, view = np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.zeros(OBSERVED_SIZE)
-        k1, k2, k3, k4 = np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.zeros(STATE_SIZE)
-        road = np.zeros(ROAD_SIZE)
-        dt = CONTROL_STEP_S / substeps
-        distance = 0.0
-        steer, next_steer = 0.0, 0.0
-        if not follows:
-            next_steer = steer_table[0]
-        for k in range((rows - 1) * period + int(phases[-1]) + 1):
-            steer = next_steer
-            see(state, view)
-            speed = view[3]
-            brake_hold = False
-            if follows:
-                memory[PROGRESS] = track_progress_m(path, PATH_STEP_M, memory[PROGRESS], view[0], view[1], 5.0)
-                target, target_rate = target_speed_m_s(path, PATH_STEP_M, stops, memory)
-                brake_hold = standing(stops, memory, speed, CONTROL_STEP_S)
-                course = view[2] + (np.arctan2(view[4], speed) if speed > 3.0 else 0.0)
-                demand = preview_steer_rad(driver, path, PATH_STEP_M, memory[PROGRESS], view[0], view[1], course, speed)
-                next_steer = steer if brake_hold else move_steering(driver, memory, demand, CONTROL_STEP_S)
-            else:
-                target, target_rate = start_speed_m_s, 0.0
-                next_steer = steer_table[min(k + 1, steer_table.shape[0] - 1)]
-            drive, brake = pedal_torques_n_m(driver, memory, target, target_rate, speed, CONTROL_STEP_S)
-            if brake_hold:
-                drive, brake = 0.0, driver.hold_brake_n_m
+        row = k // period
+        for j in range(phases.shape[0]):
+            if k - row * period == int(phases[j]) and row < rows:
+                observe(state, steer, drive, brake, road, vehicle, scratch, observed[row, j])
 
-            if k < torque_table.shape[0] and torque_table[k, 0] == torque_table[k, 0]:
-                drive, brake = torque_table[k, 0], torque_table[k, 1]
-            at_m = memory[PROGRESS] if follows else distance
-            distance += speed * CONTROL_STEP_S
-            read_road(
-                road_table,
-                PATH_STEP_M,
-                at_m,
-                vehicle.cg_to_front_axle_m,
-                vehicle.cg_to_rear_axle_m,
-                friction,
-                road,
-            )
-
-            row = k // period
-            for j in range(phases.shape[0]):
-                if k - row * period == int(phases[j]) and row < rows:
-                    observe(state, steer, drive, brake, road, vehicle, scratch, observed[row, j])
-
-            for i in range(substeps):
-                a = steer + (next_steer - steer) * i / substeps
-                c = steer + (next_steer - steer) * (i + 1) / substeps
-                b = 0.5 * (a + c)
-                derivative(state, a, drive, brake, road, vehicle, k1, view)
-                for n in range(STATE_SIZE):
-                    stage[n] = state[n] + 0.5 * dt * k1[n]
-                derivative(stage, b, drive, brake, road, vehicle, k2, view)
-                for n in range(STATE_SIZE):
-                    stage[n] = state[n] + 0.5 * dt * k2[n]
-                derivative(stage, b, drive, brake, road, vehicle, k3, view)
-                for n in range(STATE_SIZE):
-                    stage[n] = state[n] + dt * k3[n]
-                derivative(stage, c, drive, brake, road, vehicle, k4, view)
-                for n in range(STATE_SIZE):
-                    state[n] += dt / 6.0 * (k1[n] + 2.0 * k2[n] + 2.0 * k3[n] + k4[n])
-        return sources
-
-    return loop  # type: ignore[no-any-return]
+        for i in range(substeps):
+            a = steer + (next_steer - steer) * i / substeps
+            c = steer + (next_steer - steer) * (i + 1) / substeps
+            b = 0.5 * (a + c)
+            derivative(state, a, drive, brake, road, vehicle, k1, view)
+            for n in range(STATE_SIZE):
+                stage[n] = state[n] + 0.5 * dt * k1[n]
+            derivative(stage, b, drive, brake, road, vehicle, k2, view)
+            for n in range(STATE_SIZE):
+                stage[n] = state[n] + 0.5 * dt * k2[n]
+            derivative(stage, b, drive, brake, road, vehicle, k3, view)
+            for n in range(STATE_SIZE):
+                stage[n] = state[n] + dt * k3[n]
+            derivative(stage, c, drive, brake, road, vehicle, k4, view)
+            for n in range(STATE_SIZE):
+                state[n] += dt / 6.0 * (k1[n] + 2.0 * k2[n] + 2.0 * k3[n] + k4[n])
 
 
 def simulate_motion(
@@ -182,7 +162,7 @@ def simulate_motion(
     phases = np.round(np.array(phases_s) / CONTROL_STEP_S)
     rows = int(np.floor(plan.duration_s / period_s + 1e-9)) + 1
     observed = np.full((rows, phases.shape[0], OBSERVED_SIZE), np.nan)
-    _compiled_loop()(
+    _loop(
         plan.start_speed_m_s,
         plan.steer_rad,
         plan.path,

@@ -10,7 +10,7 @@ from truthsim.vehicle import BANK, BANK_PER_M, FRICTION, GRADE, GRADE_PER_M
 
 
 @register_jitable
-def _at(table: FloatArray, place: float, column: int) -> float:
+def interpolated(table: FloatArray, place: float, column: int) -> float:
     """Interpolate a column at a place counted in rows; beyond the ends the outer rows apply."""
     last = table.shape[0] - 1
     if place <= 0.0:
@@ -42,11 +42,15 @@ def read_road(
         return
     for axle in range(2):
         place = (at_m + (front_m if axle == 0 else -rear_m)) / step_m
-        road[FRICTION + 2 * axle] = _at(table, place, ROAD_FRICTION_LEFT)
-        road[FRICTION + 2 * axle + 1] = _at(table, place, ROAD_FRICTION_RIGHT)
+        road[FRICTION + 2 * axle] = interpolated(table, place, ROAD_FRICTION_LEFT)
+        road[FRICTION + 2 * axle + 1] = interpolated(table, place, ROAD_FRICTION_RIGHT)
     place = at_m / step_m
-    road[BANK] = _at(table, place, ROAD_BANK)
-    road[GRADE] = _at(table, place, ROAD_GRADE)
+    road[BANK] = interpolated(table, place, ROAD_BANK)
+    road[GRADE] = interpolated(table, place, ROAD_GRADE)
     # Over two rows, so that the slope of a table does not jump at each of them.
-    road[BANK_PER_M] = (_at(table, place + 1.0, ROAD_BANK) - _at(table, place - 1.0, ROAD_BANK)) / (2.0 * step_m)
-    road[GRADE_PER_M] = (_at(table, place + 1.0, ROAD_GRADE) - _at(table, place - 1.0, ROAD_GRADE)) / (2.0 * step_m)
+    road[BANK_PER_M] = (interpolated(table, place + 1.0, ROAD_BANK) - interpolated(table, place - 1.0, ROAD_BANK)) / (
+        2.0 * step_m
+    )
+    road[GRADE_PER_M] = (
+        interpolated(table, place + 1.0, ROAD_GRADE) - interpolated(table, place - 1.0, ROAD_GRADE)
+    ) / (2.0 * step_m)

@@ -79,25 +79,6 @@ class SensorNoise(NamedTuple):
 
 #: Values that may be below 0: places and an offset.
 SIGNED = frozenset({"imu_x_m", "imu_y_m", "imu_z_m", "rtk_heading_offset_rad", "rtk_x_m", "rtk_y_m"})
-#: Sensors that err in nothing but delay, tilt, wheel slip and quantisation.
-NO_NOISE = SensorNoise(
-    acceleration_m_s2=0.0,
-    yaw_rate_rad_s=0.0,
-    steer_rad=0.0,
-    wheel_speed_m_s=0.0,
-    acceleration_bias_m_s2=0.0,
-    yaw_rate_bias_rad_s=0.0,
-    steer_bias_rad=0.0,
-    wheel_scale=0.0,
-    acceleration_walk_m_s2=0.0,
-    yaw_rate_walk_rad_s=0.0,
-    rtk_position_m=0.0,
-    rtk_velocity_m_s=0.0,
-    rtk_heading_rad=0.0,
-    rtk_yaw_rate_rad_s=0.0,
-    rtk_tilt_rad=0.0,
-)
-
 
 #: Quality of a satellite fix, as NMEA GGA counts it.
 RTK_FIXED, RTK_FLOAT, RTK_LOST = 4, 5, 0

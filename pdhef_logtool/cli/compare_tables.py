@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING
 from rich.padding import Padding
 from rich.text import Text
 
-from pdhef_logtool.cli.console import table
+from pdhef_logtool.cli.console import table, three_lines
 from pdhef_logtool.cli.plan_tables import plan_line, render_plan
 from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison
 from pdhef_logtool.results.comparison_words import (
+    assumed_text,
     interval_text,
     largest_text,
+    next_text,
     notes_of,
     one_signal_a_drive,
-    paired_text,
     percent,
     verdict_text,
 )
@@ -34,9 +35,13 @@ _MOST_DRIVES, _MOST_SIGNALS = 5, 8
 
 
 def render_comparison(comparison: Comparison, console: Console) -> None:
-    """Print a comparison, the verdict last."""
+    """Print a comparison: verdict, assumptions and next step, then what they are drawn from."""
+    requirements = comparison.requirements
+    said = Text.assemble("" if requirements is None else Text.assemble(plan_line(requirements), "; "),
+                         "; gate closed: ".join((verdict_text(comparison), *comparison.failures)))  # fmt: skip
+    console.print(three_lines(said, assumed_text(comparison), next_text(comparison)))
+    console.print()
     console.print(Text.assemble(("A ", "bold"), comparison.a, ("  B ", "bold"), comparison.b), soft_wrap=True)
-    _line(paired_text(comparison), console)
     for line in comparison.unpaired:
         _line(f"without partner: {line}", console)
     if comparison.differences:
@@ -53,12 +58,9 @@ def render_comparison(comparison: Comparison, console: Console) -> None:
         _print_signals(comparison, console)
     if comparison.others:
         _print_others(comparison.others, console)
-    console.print(Text.assemble("\n", ("Verdict: ", "bold"), verdict_text(comparison)))
-    for line in comparison.failures:
-        _line(f"gate closed: {line}", console)
-    if comparison.requirements is not None:
-        console.print(Text.assemble("\n", ("Plan on B: ", "bold"), plan_line(comparison.requirements)))
-        render_plan(comparison.requirements, console)
+    if requirements is not None:
+        console.print("\nPlan on B", style="bold")
+        render_plan(requirements, console)
 
 
 def _line(text: str, console: Console) -> None:

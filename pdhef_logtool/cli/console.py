@@ -21,6 +21,7 @@ from pdhef_logtool.storage.documents import jsonable
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
 
 class _Result(Protocol):
@@ -64,6 +65,18 @@ def table(*heads: str, fold: int = 0) -> Table:
         side: Literal["left", "right"] = "right" if head.startswith(">") else "left"
         made.add_column(head.removeprefix(">"), justify=side, overflow="fold" if number < fold else "ellipsis")
     return made
+
+
+def three_lines(result: str | Text, assumed: str, following: str) -> Table:
+    """Return the three lines that come first on the terminal: result, assumptions, next step."""
+    from rich.table import Table
+
+    lines = Table.grid(padding=(0, 2, 0, 0))
+    lines.add_column(no_wrap=True, style="bold")
+    lines.add_column(overflow="fold")
+    for head, text in (("Result", result), ("Assumed", assumed), ("Next", following)):
+        lines.add_row(head, text)
+    return lines
 
 
 def cell(value: float | None, factor: float = 1.0, digits: int = 2) -> str:

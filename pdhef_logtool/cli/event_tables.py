@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pdhef_logtool.cli.console import table
+from pdhef_logtool.cli.console import table, three_lines
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -17,6 +17,13 @@ _MOST_EVENTS, _MOST_NAMED = 50, 5
 
 def render_events(events: FoundEvents, console: Console) -> None:
     """Print the events, and what was not searched."""
+    seconds = sum(e.end_s - e.start_s for e in events.events)
+    drives, count = len({e.drive for e in events.events}), len(events.events)
+    summary = f"{count} event{'s' * (count != 1)} in {drives} of {events.searched} drives, {seconds:.2f} s in all"
+    left_out = f"; {len(events.left_out)} drives are not searched, see below" if events.left_out else ""
+    following = "nothing is needed" if not count or events.clips else "--clip writes one MCAP file per event"
+    console.print(three_lines(summary, f"{events.where} of {events.of}{left_out}", following))
+    console.print()
     if events.events:
         made = table("drive", ">from, s", ">to, s", ">for, s", ">peak", fold=1)
         for event in events.events[:_MOST_EVENTS]:
@@ -26,10 +33,6 @@ def render_events(events: FoundEvents, console: Console) -> None:
         console.print(made)
         if (more := len(events.events) - _MOST_EVENTS) > 0:
             console.print(f"  and {more} more: --json, --parquet")
-    seconds_in_all = sum(e.end_s - e.start_s for e in events.events)
-    drives = len({e.drive for e in events.events})
-    summary = f"{len(events.events)} event{'s' * (len(events.events) != 1)} in {drives} of {events.searched} drives"
-    console.print(f"{summary}, {seconds_in_all:.2f} s in all")
     reasons: dict[str, list[str]] = {}
     for drive, reason in events.left_out.items():
         reasons.setdefault(reason, []).append(drive)

@@ -6,10 +6,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from pdhef_logtool.cli.console import cell, table
+from pdhef_logtool.cli.console import cell, table, three_lines
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
     from pdhef_logtool.learning.engine import LearnResult
     from pdhef_logtool.learning.network.baselines import BaselinesResult
@@ -20,14 +21,17 @@ if TYPE_CHECKING:
 
 #: Of more drives than these only those that gave nothing are listed.
 MOST_DRIVES = 40
+#: Lines of the test part that the result names.
+_SHOWN = ("zero", "physics, as given", "pd-hef, trained")
 
 
 def render_learning(result: LearnResult, console: Console) -> None:
     """Print the tables of a stage that ran alone; of several their outcomes, the test part and what more is worth."""
+    console.print(_head(result))
+    console.print()
     if not result.document:
         (stage,) = result.stages
         _RENDER[stage.name](stage.figures, console)
-        console.print(f"{len(result.drives)} drives; next: pdhef run LOG --car {result.car} -o OUT", soft_wrap=True)
         return
     stages = table("stage", "outcome", ">validation RMSE °\nbefore", ">\nafter", "of")
     for s in result.stages:
@@ -49,6 +53,19 @@ def render_learning(result: LearnResult, console: Console) -> None:
     for text in result.document["more"]:
         console.print(f"  {text}")
     console.print(f"car in {result.car}; evidence of each decision in learn.md there", soft_wrap=True)
+
+
+def _head(result: LearnResult) -> Table:
+    """Return result, assumptions and next step."""
+    stages = "; ".join(s.text if len(result.stages) == 1 else f"{s.name} {s.status}" for s in result.stages)
+    lines = [line for line in result.document.get("test", ()) if "skipped" not in line and line["name"] in _SHOWN]
+    errors = "; ".join(f"{line['name']} {line['rmse_deg'][0]:.3f}°" for line in lines)
+    left = f", {len(result.left_out)} left out" if result.left_out else ""
+    return three_lines(
+        f"{stages}; sideslip RMSE on the test part: {errors}" if errors else stages,
+        f"{len(result.drives)} drives{left}; decisions by held-out driving",
+        f"pdhef run LOG --car {result.car} -o OUT",
+    )
 
 
 def _calibration(figures: Mapping[str, Any], console: Console) -> None:

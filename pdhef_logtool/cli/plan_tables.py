@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from rich.padding import Padding
@@ -21,9 +22,13 @@ STYLES = {"PASS": "green", "FAIL": "bold red", "INCONCLUSIVE": "dim"}
 
 def plan_line(plan_result: PlanVerdicts) -> Text:
     """Return how many requirements passed, failed and are inconclusive."""
-    counts = Counter[str](v.outcome for v in plan_result.verdicts)
-    parts = [Text(f"{counts[outcome]} {outcome}", style) for outcome, style in STYLES.items() if counts[outcome]]
-    name = f"plan {plan_result.plan.file}" if plan_result.plan.file else "default plan, no gate"
+    return outcomes_text(Counter[str](v.outcome for v in plan_result.verdicts), plan_result.plan.file)
+
+
+def outcomes_text(counts: Mapping[str, int], file: str) -> Text:
+    """Return the number of requirements by outcome, and the name of the plan."""
+    parts = [Text(f"{counts[outcome]} {outcome}", style) for outcome, style in STYLES.items() if counts.get(outcome)]
+    name = f"plan {file}" if file else "default plan, no gate"
     return Text.assemble(Text(", ").join(parts), f" ({name})")
 
 

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from pdhef_logtool.reports.pages import WrittenPages
 
 commands = typer.Typer()
+#: Pages that are listed; --json lists all.
+_MOST_FILES = 20
 
 
 @options.command(
@@ -79,8 +81,19 @@ def open_page(result: WrittenPages) -> None:
 
 
 def _render(result: WrittenPages, out: Console) -> None:
-    if result.pdf is not None:
-        out.print(str(result.pdf), soft_wrap=True)
-    for page in (*result.pages, result.fleet):
-        if page.file is not None:
-            out.print(str(page.file), soft_wrap=True)
+    files = [page.file for page in (result.fleet, *result.pages) if page.file is not None]
+    logs = sum(page.file is not None for page in result.pages)
+    pdf = "" if result.pdf is None else f" and {result.pdf.name}"
+    wrong = f"; {len(result.wrong)} missing or incomplete" if result.wrong else ""
+    out.print(
+        console.three_lines(
+            f"pages{pdf} of the run and of {logs} log{'s' * (logs != 1)}{wrong}",
+            "the figures of the run; no estimator ran again",
+            "read the warnings" if result.wrong else f"open {result.pdf or files[0]}",
+        )
+    )
+    out.print()
+    for file in (*([] if result.pdf is None else [result.pdf]), *files[:_MOST_FILES]):
+        out.print(str(file), soft_wrap=True)
+    if len(files) > _MOST_FILES:
+        out.print(f"and {len(files) - _MOST_FILES} more in {result.output}", soft_wrap=True)

@@ -12,15 +12,16 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from pdhef_logtool.cli.console import cell, table
-from pdhef_logtool.cli.plan_tables import plan_line, render_plan
+from pdhef_logtool.cli.console import cell, table, three_lines
+from pdhef_logtool.cli.plan_tables import outcomes_text, plan_line, render_plan
 from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.printable import all_printable
 from pdhef_logtool.results.opened_run import PAGE_FILE
 from pdhef_logtool.results.run_report import diverged_line, reasons_line
-from pdhef_logtool.results.selected_estimate import NEARLY_HOLDS, degrees
+from pdhef_logtool.results.selected_estimate import NEARLY_HOLDS, degrees, truth_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -110,29 +111,41 @@ def render_run(result: RunResult, console: Console) -> None:
 
 def _assumed(reports: Sequence[_Report]) -> list[str]:
     """Return what is assumed of all logs, clause by clause."""
+    if reports and all(report["answer"] is None for report in reports):  # recorded estimates
+        vehicle = reports[0]["vehicle"]
+        slow = f"sideslip is scored above {vehicle['low_speed_blend_m_s']:g} m/s"
+        if vehicle["file"] is not None:
+            return [f"car {vehicle['file']}", slow]
+        return ["no car given: the ground truth is taken to be measured at the centre of gravity", slow]
     first, *others = [_clauses(_texts(report), "assumed") for report in reports] or [[]]
     return [clause for clause in first if all(clause in clauses for clauses in others)]
 
 
 def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str]) -> Table:
     """Return the three lines that come first: result, assumptions, next step."""
-    verdicts = None if result.requirements is None else plan_line(result.requirements)
-    texts = [_texts(report) for report in reports]
+    given, texts = result.requirements, [_texts(report) for report in reports]
+    failed = [r.outcome.log for r in result.results if r.report is None]
     if len(result.results) == 1:
         said = (texts[0].get("result") or _recorded(reports[0])) if texts else "the log failed"
     else:
-        said = f"{len(reports)} of {len(result.results)} logs are done"
-    steps = list(dict.fromkeys(c for t in texts for c in _clauses(t, "next")))
-    given = result.requirements
-    if given is not None:
-        ordered = sorted(given.verdicts, key=lambda v: v.outcome != "FAIL")
-        asked = [*dict.fromkeys(f"{v.requirement.id}: {v.next}" for v in ordered if v.next)]
-        steps = [*asked, *steps] if given.plan.file else [*steps, *asked]
-    return _three_lines(
-        said if verdicts is None else Text.assemble(verdicts, f"; {said}"),
+        said = f"{len(reports)} of {len(result.results)} logs are done{_range(reports)}"
+    steps = [f"{', '.join(failed[:_MOST_FAILED])} failed: read the cause below"] if failed else []
+    steps += dict.fromkeys(c for t in texts for c in _clauses(t, "next"))
+    steps = next_steps(None if given is None else given.to_dict(), steps)
+    return three_lines(
+        said if given is None else Text.assemble(plan_line(given), f"; {said}"),
         "; ".join(assumed) or ("differs by log, see below" if len(reports) > 1 else "nothing beside the log"),
-        steps[0] if steps else "nothing is needed; pdhef view OUTPUT shows the drive",
+        steps[0] if steps else f"nothing is needed; pdhef view {result.place or 'OUT'} shows the drive",
     )
+
+
+def _range(reports: Sequence[_Report]) -> str:
+    """Return the lowest and highest sideslip error of the selected estimate over several logs."""
+    errors = [_figures(r).get((r["answer"]["main"], "sideslip_rad", "all", "rmse")) for r in reports if r["answer"]]
+    scored = [e for e in errors if e is not None]
+    if not scored:
+        return ", none is scored"
+    return f"; sideslip RMSE {degrees(min(scored))} to {degrees(max(scored))} ({len(scored)} scored)"
 
 
 def _recorded(report: _Report) -> str:
@@ -141,32 +154,21 @@ def _recorded(report: _Report) -> str:
     errors = [(n, e) for n in names if (e := figures.get((n, "sideslip_rad", "all", "rmse"))) is not None]
     if not errors:
         return f"sideslip of {', '.join(names)} is not scored" if names else "nothing was estimated"
-    return f"sideslip RMSE of {', '.join(f'{name}: {degrees(error)}' for name, error in errors)}"
-
-
-def _three_lines(result: str | Text, assumed: str, following: str) -> Table:
-    lines = Table.grid(padding=(0, 2, 0, 0))
-    lines.add_column(no_wrap=True, style="bold")
-    lines.add_column(overflow="fold")
-    for head, text in (("Result", result), ("Assumed", assumed), ("Next", following)):
-        lines.add_row(head, text)
-    return lines
+    scored = ", ".join(f"{name}: {degrees(error)}" for name, error in errors)
+    return f"sideslip RMSE of {scored} ({truth_of(report, 'sideslip_rad')})"
 
 
 def _fleet_head(summary: RunSummary) -> Table:
     """Return the three lines of a run of many logs."""
-    requirements = (summary.plan or {}).get("requirements") or ()
-    counts = Counter(str(r["outcome"]) for r in requirements)
-    verdicts = ", ".join(f"{n} {outcome}" for outcome, n in sorted(counts.items()))
-    name = (summary.plan or {}).get("file") or "default plan, no gate"
+    plan = summary.plan or {}
+    counts = Counter(str(r["outcome"]) for r in plan.get("requirements") or ())
     rmse = f"median sideslip RMSE {degrees(summary.errors[0].median_rad)}" if summary.errors else "no drive is scored"
-    steps = [f"{r['id']}: {r['next']}" for outcome in ("FAIL", "INCONCLUSIVE") for r in requirements
-             if r["outcome"] == outcome and r["next"]]  # fmt: skip
-    failed = "read the failures below" if summary.failed else f"open {Path(summary.output) / PAGE_FILE}"
-    return _three_lines(
-        f"{verdicts} ({name}); {rmse} of {summary.scored} drives" if verdicts else f"{rmse} of {summary.scored} drives",
+    said = f"{rmse} of {summary.scored} drives"
+    steps = next_steps(plan, ["read the failures below"] if summary.failed else ())
+    return three_lines(
+        Text.assemble(outcomes_text(counts, plan.get("file") or ""), f"; {said}") if counts else said,
         "differs by drive, see report.json",
-        steps[0] if steps else failed,
+        steps[0] if steps else f"open {Path(summary.output) / PAGE_FILE}",
     )
 
 
@@ -370,7 +372,8 @@ def _figures(report: _Report) -> dict[tuple[str, str, str, str], float | None]:
 
 def _table(report: _Report, console: Console) -> Table:
     """Return the figures of the estimators that are shown, in as many columns as the terminal is wide enough for."""
-    values, shown = _figures(report), _shown(report)
+    values = _figures(report)
+    shown = [e for e in _shown(report) if any(name == e["name"] for name, *_ in values)]  # --keep metrics has less
     names = [e["name"] for e in shown]
     asked = _columns(truth=report["truth"]["available"])
     columns = [c for c in asked if any(values.get((name, *c.key)) is not None for name in names)]

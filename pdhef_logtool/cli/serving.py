@@ -10,6 +10,7 @@ from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options, panels
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.extras import required
 
 commands = typer.Typer()
 _LOOPBACK = "127.0.0.1"
@@ -32,19 +33,9 @@ def serve(
     show: Annotated[bool, Option("--open", help="Open the page in the browser.")] = False,
 ) -> None:
     """Show the drives of runs in a browser: filter, sort, overlay runs, open a drive, export CSV."""
-    try:
-        import uvicorn
-
-        from pdhef_logtool.reports.server import Library, application
-    except ModuleNotFoundError as error:
-        if error.name not in ("starlette", "uvicorn"):
-            raise
-        raise UsageError(
-            expected="the extra serve",
-            got=f"{error.name} is not installed",
-            where="pdhef serve",
-            remedy="pip install 'pdhef-logtool[serve]'",
-        ) from error
+    required("starlette", "serve", "makes the pages", "pdhef serve")
+    uvicorn = required("uvicorn", "serve", "serves the pages", "pdhef serve")
+    from pdhef_logtool.reports.server import Library, application
     from pdhef_logtool.results.opened_run import open_run
 
     library = Library([open_run(output) for output in outputs])

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from typer import Argument, Option
+from typer import Argument
 
 from pdhef_logtool.cli import console, options, panels
 from pdhef_logtool.records.errors import UsageError
@@ -22,7 +21,7 @@ commands = typer.Typer()
 @options.command(
     commands,
     "pdhef trend week1 week2 week3",
-    "pdhef trend runs/* --max-regression 5% --html trend.html",
+    "pdhef trend runs/* --max-regression 5%",
     "pdhef trend week1 week2 week3 --estimator physics --json",
     panel=panels.READ,
     notes="Runs are compared drive by drive with the run before and with the first run. Marks are corrected for their "
@@ -35,27 +34,17 @@ def trend(
     estimator: options.ComparedEstimator = None,
     metric: options.ComparedMetric = None,
     cluster: options.Cluster = None,
-    html: Annotated[Path | None, Option(help="HTML file for the trend.")] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Compare the sideslip error of several runs, one row per run, and mark regressions."""
     from pdhef_logtool.cli.comparing import figure_asked
     from pdhef_logtool.results.opened_run import open_run
     from pdhef_logtool.results.trend import trend_of
-    from pdhef_logtool.storage.object_store import is_url
-    from pdhef_logtool.storage.outputs import check_no_input
 
     if len(runs) < 2:
         raise UsageError(expected="two runs or more", got=str(len(runs)), where="RUN")
-    check_no_input([Path(x) for x in runs if not is_url(x)], [] if html is None else [html])
     figure = figure_asked(max_regression, estimator, metric)
-    result = trend_of([open_run(run) for run in runs], figure, cluster)
-    if html is not None:
-        from pdhef_logtool.reports.trend import trend_page
-        from pdhef_logtool.storage.files import write_bytes
-
-        write_bytes(html, trend_page(result))
-    console.finish(result, _render, as_json)
+    console.finish(trend_of([open_run(run) for run in runs], figure, cluster), _render, as_json)
 
 
 def _render(result: Trend, out: Console) -> None:
@@ -64,12 +53,21 @@ def _render(result: Trend, out: Console) -> None:
     from pdhef_logtool.results.comparison_words import change_text
     from pdhef_logtool.results.trend import mark, shown_median
 
-    count = len(result.regressions)
+    count, what = len(result.regressions), f"of {result.figure.short} in {len(result.rows)} runs"
+    pairs = [
+        (result.rows[number - 1 if "previous" in row.regression else 0].run, row.run)
+        for number, row in enumerate(result.rows)
+        if row.regression
+    ]
+    accepted = f", increases up to {100.0 * result.figure.limit:g} % are accepted" if result.figure.limit else ""
     out.print(
-        f"{count} of {len(result.rows)} runs with a regression of {result.figure.label}"
-        if count
-        else f"No significant regression of {result.figure.label} in {len(result.rows)} runs"
+        console.three_lines(
+            f"{count or 'no'} significant regression{'s' * (count > 1)} {what}",
+            f"the order is that of time; sign test over common drives, Holm's correction{accepted}",
+            "pdhef compare {} {}".format(*pairs[0]) if pairs else "nothing is needed",
+        )
     )
+    out.print()
     table = console.table(
         "run", ">logs", ">failed", ">scored", ">median", ">change to the previous run", ">to the first run", "", fold=1
     )

@@ -19,7 +19,7 @@ commands = typer.Typer()
     "pdhef plan init -o plan.toml",
     "pdhef plan init --from thresholds.toml -o plan.toml",
     panel=panels.RUN,
-    notes="docs/report.md describes the entries, schemas/plan.schema.json is the JSON Schema.",
+    notes="docs/formats.md describes the entries, schemas/plan.schema.json is the JSON Schema.",
 )
 def plan(
     action: Annotated[str, Argument(metavar="init", help="init: write a commented plan.")],

@@ -17,7 +17,7 @@ from pathlib import Path
 #: The folder that contains the packages: a checkout or ``site-packages``.
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("pdhef_logtool", "truthsim")
-_COMPILED = b"compiled.cache import njit"
+_COMPILED = re.compile(rb"compiled\.cache import njit|numba\.extending import register_jitable")
 _IMPORT = re.compile(rb"^from ((?:pdhef_logtool|truthsim)[\w.]*) import (?:\(([^)]*)\)|(.*))", re.MULTILINE)
 
 
@@ -28,7 +28,7 @@ def compiled_sources(root: Path = ROOT) -> tuple[Path, ...]:
         (path, text)
         for package in PACKAGES
         for path in sorted((root / package).rglob("*.py"))
-        if _COMPILED in (text := path.read_bytes())
+        if _COMPILED.search(text := path.read_bytes())
     ]
     sources = {path for path, _ in compiled}
     for _, text in compiled:

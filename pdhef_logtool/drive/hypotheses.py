@@ -41,6 +41,8 @@ MOST_ENERGY, _ANY_GAIN = 20.0, 2.0
 #: Energies of hypotheses (negative logarithms of their prior odds): mistakes are seldom, two of them more so, units of
 #: another quantity are the slips of templates, and a field that is something else explains any gain.
 PRIORS = {"unit": 5.0, "sign": 5.0, "sign and unit": 9.0, "foreign": 5.7, "field": 14.0, "open": 0.0}
+#: One that nothing documents: most recorders count to the left.
+PRIORS["open sign"] = 1.0
 #: Of signals that explain a contradiction equally well the first is the likeliest: no standard states how a steering
 #: angle counts, and an axis of an IMU is turned more often than the sign of a gyro that is read from the right one.
 _OFTEN_WRONG = ("steering_wheel_rad", "steer_rad", "wheels", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
@@ -76,8 +78,8 @@ class Relation:
 
     @property
     def decides_unit(self) -> bool:
-        """Return whether no other unit that is met in mappings would be plausible as well."""
-        return self.expected[1] < DECIDES_UNIT * self.expected[0]
+        """Return whether no other unit that is met in mappings would be plausible between the two regressions."""
+        return self.expected[1] < DECIDES_UNIT * self.expected[0] * self.correlation**2
 
     @property
     def tells(self) -> bool:
@@ -146,8 +148,8 @@ class Hypothesis:
     @property
     def energy(self) -> float:
         """The negative logarithm of its prior odds."""
-        if self.kind == "open":
-            return 0.0
+        if self.kind.startswith("open"):
+            return PRIORS[self.kind]
         names = {"wheels" if n.startswith("wheel_speed") else n for n in self.factors}
         rank = max(_OFTEN_WRONG.index(n) if n in _OFTEN_WRONG else len(_OFTEN_WRONG) for n in names)
         seldom = 0.0 if rank < 2 else (_SELDOM + _SELDOM_STEP * rank) * (2.0 if self.kind == "foreign" else 1.0)
@@ -170,13 +172,19 @@ class Posterior:
         shares = [(sum(p for p, chosen in self.sets if any(h is m for h in chosen)), m) for m in mistakes.values()]
         return sorted(shares, key=lambda x: -x[0])
 
+    def turned(self, name: str) -> float:
+        """Return the probability that an open sign is the other one."""
+        return sum(p for p, c in self.sets if any(h.kind == "open sign" and name in h.factors for h in c))
+
 
 def posterior(relations: Sequence[Relation], hypotheses: Sequence[Hypothesis]) -> Posterior:
     """Return the probabilities of sets of at most two hypotheses, given the relations that count."""
     telling = [r for r in relations if r.tells]
     touched = {n for r in telling for n in r.powers}
     # With a signal that no relation is about, a mistake is another one of the same likelihood.
-    useful = [h for h in hypotheses if h.factors.keys() <= touched]
+    useful = [
+        h for h in hypotheses if h.factors.keys() <= touched or (h.kind == "open sign" and h.factors.keys() & touched)
+    ]
 
     @cache
     def of_relation(i: int, factor: float) -> float:
@@ -201,18 +209,25 @@ def posterior(relations: Sequence[Relation], hypotheses: Sequence[Hypothesis]) -
     return Posterior(tuple((w / total, tuple(useful[i] for i in k)) for k, w in ordered))
 
 
-def known_hypotheses(names: Sequence[str], together: Sequence[tuple[str, ...]] = ()) -> list[Hypothesis]:
+def known_hypotheses(
+    names: Sequence[str], together: Sequence[tuple[str, ...]] = (), open_signs: Sequence[tuple[str, ...]] = ()
+) -> list[Hypothesis]:
     """List the mistakes that mappings make with these signals.
 
     Parameters
     ----------
     together : signals of one sensor, whose units or signs are wrong together.
+    open_signs : signals whose sign nothing documents; those of a group share it. A recorder may turn all of them.
     """
     groups = [[n for n in group if n in names] for group in together]
     parts = [part for group in groups for size in range(2, len(group) + 1) for part in combinations(group, size)]
     # The mean of the wheels is no signal.
     alone = [(n,) for n in names if n != "wheel_speeds"]
     out = [h for part in (*alone, *dict.fromkeys(parts)) for h in _of_part(part)]
+    every = tuple(n for group in open_signs for n in group)
+    out = [h for h in out if h.kind != "sign" or not h.factors.keys() <= set(every)]
+    for part in dict.fromkeys([*open_signs, *([every] if every else [])]):
+        out.append(Hypothesis(dict.fromkeys(part, -1.0), f"{_together(part)} count to the right", "open sign"))
     wheels = [(*g,) for g in groups if g and all(n.startswith("wheel_speed") for n in g)]
     return out + [Hypothesis(dict.fromkeys(part, math.nan), _together(part), "field") for part in (*alone, *wheels)]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -60,14 +60,14 @@ class Measured:
         columns = {n: c for n, c in self.columns.items() if n not in gone}
         return replace(self, columns=columns, topics={n: t for n, t in self.topics.items() if n not in gone})
 
-    def posterior(self, *, mounting_is_known: bool) -> Posterior:
+    def posterior(self, *, mounting_is_known: bool, open_signs: Sequence[tuple[str, ...]] = ()) -> Posterior:
         """Return the probabilities of the mistakes that mappings make with these signals."""
         groups = self.groups(mounting_is_known=mounting_is_known)
-        return posterior(self.relations, known_hypotheses(list(self.columns), groups))
+        return posterior(self.relations, known_hypotheses(list(self.columns), groups, open_signs))
 
-    def agrees(self, name: str, *, mounting_is_known: bool) -> bool:
+    def agrees(self, name: str, *, mounting_is_known: bool, open_signs: Sequence[tuple[str, ...]] = ()) -> bool:
         """Return whether a signal is wrong by these relations too, if one of them counts."""
-        mistakes = self.posterior(mounting_is_known=mounting_is_known).of(name)
+        mistakes = self.posterior(mounting_is_known=mounting_is_known, open_signs=open_signs).of(name)
         return sum(p for p, _ in mistakes) > 0.5 or not any(r.tells and name in r.powers for r in self.relations)
 
     def groups(self, *, mounting_is_known: bool) -> list[tuple[str, ...]]:
@@ -113,9 +113,12 @@ def measure(
     if mapping is not None:
         scales |= {n: s.scale for n, s in mapping.signals.items()}
         scales |= {f"truth.{n}": s.scale for n, s in mapping.truth.items()}
-    return Measured(
-        columns, speed_name, tuple(measured_relations(columns, speed_name, _known(vehicle))), topics, scales
-    )
+    sources = {} if mapping is None else {f"truth.{n}": (s.topic, s.paths) for n, s in mapping.truth.items()}
+    related = measured_relations(columns, speed_name, _known(vehicle))
+    # Two quantities of ground truth that are read from one field agree by themselves.
+    read = [[sources[n] for n in r.powers if n in sources] for r in related]
+    related = [r for r, fields in zip(related, read, strict=True) if len(set(fields)) == len(fields)]
+    return Measured(columns, speed_name, tuple(related), topics, scales)
 
 
 def drive_columns(

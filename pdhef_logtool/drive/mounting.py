@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.checks import check_drive
-from pdhef_logtool.drive.checks.by_relations import explained_factors
+from pdhef_logtool.drive.checks.by_relations import CERTAIN, explained_factors
 from pdhef_logtool.drive.checks.mounting import CORRECTED, MOUNTING
 from pdhef_logtool.drive.checks.running import misread_channels
 from pdhef_logtool.drive.columns import derivative, halves, independent_samples, moving_at
@@ -522,7 +522,11 @@ def survey_log(
     if not rescale:
         return survey
     if mapping.origin == "auto":
-        return _rescaled(survey, log, clocks, span_ns)
+        settled = _with_settled_signs(survey)
+        if settled == mapping:
+            return _rescaled(survey, log, clocks, span_ns)
+        again = survey_log(log, settled, clocks, span_ns, vehicle)
+        return replace(again, corrected=(*survey.corrected, *again.corrected))
 
     def checks_of(other: Mapping) -> tuple[Check, ...]:
         return survey_log(log, other, fit_clocks(log, other, *span_ns), span_ns, vehicle, rescale=False).checks
@@ -558,6 +562,25 @@ def _by_frames(
     rotation, named = placed_rotation(placed), _named_rows(mapping, accelerations, rates)
     alone = Mounting(rotation, named, f"{believed}; the drive does not show the rest", confident=False)
     return placed, check if alone.is_as_named else frames_alone(placed, believed), alone
+
+
+def _with_settled_signs(survey: Survey) -> Mapping:
+    """Return the mapping with the signs that nothing documents as all of the drive shows them, and two parts of it."""
+    mapping, known = survey.mapping, survey.is_mounted
+    groups, sections = mapping.open_signs, {"truth.": dict(mapping.truth), "": dict(mapping.signals)}
+    probable = survey.measured.posterior(mounting_is_known=known, open_signs=groups)
+    turned = [g for g in groups if probable.turned(g[0]) >= CERTAIN]
+    notes, parts = list(mapping.notes), list(survey.measured.parts(survey.vehicle)) if turned else []
+    for group in turned:
+        if all(part.agrees(group[0], mounting_is_known=known, open_signs=groups) for part in parts):
+            notes.append(f"{' and '.join(group)}: read as positive to the right, which nothing documents but the drive")
+            for name in group:
+                prefix = "truth." if name.startswith("truth.") else ""
+                section = sections[prefix]
+                section[name.removeprefix(prefix)] = scaled_source(section[name.removeprefix(prefix)], -1.0)
+    if len(notes) == len(mapping.notes):
+        return mapping
+    return replace(mapping, signals=sections[""], truth=sections["truth."], notes=tuple(notes), open_signs=())
 
 
 def _rescaled(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from pdhef_logtool.drive.checks.by_relations import AXIS
+from pdhef_logtool.drive.checks.by_relations import AXIS, UNEXPLAINED
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping, auto_map
 from pdhef_logtool.mapping.records import SignalSource
@@ -29,7 +29,7 @@ def with_other_fields(
     ----------
     checks_of : returns the checks of another mapping of the log.
     """
-    failed = {c.name for c in checks if c.verdict == "failed"}
+    failed = _contradicted(checks)
     if mapping.origin != "file" or not failed:
         return tuple(checks)
     doubted = {c.subject for c in checks if c.verdict != "passed" and c.name.endswith(_MISREAD)}
@@ -39,7 +39,7 @@ def with_other_fields(
             again = checks_of(_replaced(mapping, others)) if others else ()
         except PdhefError:  # the other fields cannot be read
             continue
-        still = {c.name for c in again if c.verdict == "failed"}
+        still = _contradicted(again)
         wrong = {c.subject for c in again if c.name in still}
         if others and not wrong & others.keys() and len(still) < len(failed):
             break
@@ -48,6 +48,10 @@ def with_other_fields(
     renamed = tuple(_check(name, source, checks) for name, source in others.items())
     kept = (c for c in checks if c.subject not in others and not (c.verdict == "failed" and c.name not in still))
     return (*renamed, *kept)
+
+
+def _contradicted(checks: Sequence[Check]) -> set[str]:
+    return {c.name for c in checks if c.verdict == "failed" or c.remedy == UNEXPLAINED}
 
 
 def _others(log: DriveLog, mapping: Mapping) -> dict[str, SignalSource]:

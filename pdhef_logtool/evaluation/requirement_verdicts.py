@@ -34,8 +34,12 @@ from pdhef_logtool.records.signals import FloatArray
 Outcome: TypeAlias = Literal["PASS", "FAIL", "INCONCLUSIVE"]
 #: A margin relative to an estimated reference is at least so many of its standard deviations.
 REFERENCE_SDS = 2.0
+#: Of a coverage that is too low.
+NARROW = "the estimate states too small an uncertainty; the size of its error is judged by other requirements"
 #: A share of drives below this is not shown.
 _SHARE_SHOWN = 0.5
+#: Next steps of requirements that are named.
+_MOST_NEXT = 4
 #: More driving than this many times that of now is no advice.
 _MOST_TIMES = 30.0
 
@@ -326,6 +330,8 @@ def _decide(
         return "INCONCLUSIVE", f"{interval}; the limit is closer than {sds}", to_do
     if outcome == "PASS":
         return outcome, interval, ""
+    if requirement.metric == "coverage95":
+        return outcome, f"{interval}; {NARROW}", "recalibrate the intervals on drives like these"
     place = "the worst drive" if exposure.drives > 1 else "the largest error"
     return outcome, interval, f"look at {place} first"
 
@@ -449,3 +455,15 @@ def gates(verdicts: Sequence[RequirementVerdict], *, strict: bool) -> bool:
 def of_documents(verdicts: Sequence[Mapping[str, Any]], outcome: Outcome) -> list[Mapping[str, Any]]:
     """Return the verdicts of a document with an outcome."""
     return [v for v in verdicts if v["outcome"] == outcome]
+
+
+def next_steps(plan: Mapping[str, Any] | None, more: Sequence[str] = ()) -> list[str]:
+    """Return what to do by a document: failed requirements, inconclusive ones, ``more``; of the default plan last."""
+    requirements = (plan or {}).get("requirements") or ()
+    ids: dict[str, list[str]] = {}
+    for r in (*of_documents(requirements, "FAIL"), *of_documents(requirements, "INCONCLUSIVE")):
+        if r["next"]:
+            ids.setdefault(str(r["next"]), []).append(str(r["id"]))
+    asked = [f"{', '.join(names)}: {text}" for text, names in ids.items()][:_MOST_NEXT]
+    others = [*filter(None, more)]
+    return [*asked, *others] if (plan or {}).get("file") else [*others, *asked]

@@ -263,7 +263,7 @@ def plan_from_dict(raw: dict[str, Any], *, where: str, file: str = "") -> Valida
             expected="the entries of a validation plan",
             got="; ".join(problems),
             where=where,
-            remedy="docs/report.md describes every entry",
+            remedy="docs/formats.md#plantoml describes every entry",
         )
     return ValidationPlan(tuple(r for r in requirements if r is not None), title, file)
 
@@ -347,7 +347,7 @@ def default_plan() -> ValidationPlan:
         (
             Requirement("sideslip", "Sideslip is accurate enough for stability control", beta, limit=degree),
             Requirement("use", "Sideslip is 10 % better than zero sideslip", beta, baseline="zero", max_ratio=0.9),
-            Requirement("interval", "The 95 % interval contains the ground truth", beta, "coverage95", limit=0.9),
+            Requirement("interval", "The 95 % interval of sideslip is wide enough", beta, "coverage95", limit=0.9),
             Requirement("yaw-rate", "Yaw rate is accurate", "yaw_rate_rad_s", limit=degree),
             Requirement("speed", "Longitudinal speed is accurate", "vx_m_s", limit=0.3),
         ),

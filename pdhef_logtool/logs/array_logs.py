@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.resource_limits import ResourceLimits
-from pdhef_logtool.logs.table_columns import Sheet, extra, field_name, read_head, stamps_of, tables_of, unique
+from pdhef_logtool.logs.table_columns import Sheet, field_name, read_head, stamps_of, tables_of, unique
 from pdhef_logtool.logs.table_log import Table, TableLog
 from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.extras import required
 from pdhef_logtool.records.signals import IntArray, Loss
 
 _HDF5_MAT = b"MATLAB 7.3"
@@ -230,7 +231,7 @@ def _text_of(struct_: Mapping[str, Any], *names: str) -> str:
 
 def _hdf5_variables(file: LogFile, losses: list[Loss]) -> Iterator[tuple[str, NDArray[Any], str]]:
     """Yield the arrays of a MAT file of version 7.3 by path; a dataset that cannot be read is a loss."""
-    h5py = extra("h5py", "MAT files of version 7.3", file.place)
+    h5py = required("h5py", "formats", "reads MAT files of version 7.3", file.place)
     datasets: list[tuple[str, Callable[[], NDArray[Any]]]] = []
 
     def visit(name: str, item: Any) -> None:

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.can_decoding import Frames
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.log_file import LogFile
-from pdhef_logtool.logs.table_columns import extra, number_stamps
+from pdhef_logtool.logs.table_columns import number_stamps
 from pdhef_logtool.logs.table_log import TableLog
 from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.extras import required
 from pdhef_logtool.records.signals import FloatArray, Loss
 
 #: Of CAN FD.
@@ -35,7 +36,7 @@ def open_asc(file: LogFile) -> TableLog:
 
 
 def _open(file: LogFile, reader: str, kind: str) -> TableLog:
-    io = extra("can.io", f"{kind.upper()} files", file.place)
+    io = required("can.io", "formats", f"reads {kind.upper()} files", file.place)
     size = file.path.stat().st_size
     losses: list[Loss] = []
     blocks: list[_Block] = []

@@ -89,9 +89,7 @@ def with_free_stem(log: LogInput, taken: Container[str]) -> LogInput:
     """Return a log under its stem, or with digits behind it where :func:`as_taken` of the stem is among the taken."""
     if as_taken(log.stem) not in taken:
         return log
-    digits = hashlib.sha256(os.fsencode("/".join(_parts(log.path)))).hexdigest()
-    made = (_portable(log.stem, digits[:n]) for n in range(8, len(digits) + 1))
-    return replace(log, stem=next(stem for stem in made if as_taken(stem) not in taken))
+    return replace(log, stem=_with_digits(log.stem, "/".join(_parts(log.path)), taken))
 
 
 def one_place(argument: str, *, private_redirects: bool = False) -> LogPlace:
@@ -282,11 +280,16 @@ def _with_stems(paths: list[LogPlace]) -> list[LogInput]:
         if not _stays(names[i], counts):
             place = paths[i]
             origin = place.identity if isinstance(place, RemotePlace) else "/".join(relative[i])
-            digits = hashlib.sha256(os.fsencode(origin)).hexdigest()
-            made = (_portable(names[i], digits[:n]) for n in range(8, len(digits) + 1))
-            stems[i] = next(stem for stem in made if as_taken(stem) not in taken)
+            stems[i] = _with_digits(names[i], origin, taken)
         taken.add(as_taken(stems[i]))
     return [LogInput(p, stems[i]) for i, p in enumerate(paths)]
+
+
+def _with_digits(name: str, origin: str, taken: Container[str]) -> str:
+    """Return a portable name that is free, with digits of its origin."""
+    digits = hashlib.sha256(os.fsencode(origin)).hexdigest()
+    made = (_portable(name, digits[:n]) for n in range(8, len(digits) + 1))
+    return next(stem for stem in made if as_taken(stem) not in taken)
 
 
 def _stays(name: str, counts: Mapping[str, int]) -> bool:

@@ -25,9 +25,10 @@ from pdhef_logtool.logs.can_decoding import Frames
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.table_columns import NO_TIME, extra, field_name, placed, unique
+from pdhef_logtool.logs.table_columns import NO_TIME, field_name, placed, unique
 from pdhef_logtool.logs.table_log import Table, TableLog
 from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.extras import required
 from pdhef_logtool.records.signals import IntArray, Loss
 from pdhef_logtool.storage.files import scratch_folder
 
@@ -42,7 +43,7 @@ _LONGEST_S = 4e9
 
 def open_mdf(file: LogFile) -> TableLog:
     """Open an MDF file; groups and channels that cannot be read are losses."""
-    asammdf = extra("asammdf", "MDF files", file.place)
+    asammdf = required("asammdf", "formats", "reads MDF files", file.place)
     logging.getLogger("asammdf").setLevel(logging.CRITICAL)
     losses: list[Loss] = []
     with file.meter.running(file.path.stat().st_size):

@@ -138,27 +138,8 @@ def compile_getter(schema: MessageSchema, selection: Selection) -> Callable[[Any
 
     The function gives None for what a message lacks, and for None.
     """
-    descriptor = schema.message_class.DESCRIPTOR
-    components = selection.components
-    if len(components) == 1:
-        return _compile_steps(descriptor, components[0])
-    # The components of a time or a vector share all but their last step.
-    shared = _compile_steps(descriptor, components[0][:-1])
-    parent = _descriptor_at(descriptor, components[0][:-1])
-    parts = tuple(_compile_steps(parent, steps[-1:]) for steps in components)
-
-    def get_all(message: Any) -> object:
-        struct = shared(message)
-        return tuple(part(struct) for part in parts)
-
-    return get_all
-
-
-def _descriptor_at(descriptor: Any, steps: Sequence[Step]) -> Any:
-    for step in steps:
-        if isinstance(step, str):
-            descriptor = descriptor.fields_by_name[step].message_type
-    return descriptor
+    getters = [_compile_steps(schema.message_class.DESCRIPTOR, steps) for steps in selection.components]
+    return getters[0] if len(getters) == 1 else lambda message: tuple(get(message) for get in getters)
 
 
 def _compile_steps(descriptor: Any, steps: Sequence[Step]) -> Callable[[Any], object]:

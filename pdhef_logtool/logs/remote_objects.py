@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import re
-import time
 from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
@@ -17,7 +16,7 @@ from typing import Any, NoReturn, TypeVar
 
 from pdhef_logtool.logs.byte_source import ChangedError, SourceError
 from pdhef_logtool.logs.remote_place import RemotePlace
-from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.extras import required
 
 T = TypeVar("T")
 
@@ -42,11 +41,6 @@ class Patience:
 
 
 PATIENCE = Patience()
-
-
-#: A connection that brings less than this in the long run is given up like a silent one.
-_LEAST_BYTES_S = 512
-_LONG_RUN_SILENCES = 4
 
 
 class TryAgainError(Exception):
@@ -154,7 +148,7 @@ class HttpObject(RemoteObject):
     """An object of a web server, whose redirects are checked. Proxies and ``netrc`` are the environment's."""
 
     def __init__(self, place: RemotePlace) -> None:
-        aiohttp = _imported("aiohttp", "http", place)
+        aiohttp = required("aiohttp", "http", f"reads {place.scheme}://", place)
         import fsspec
 
         timeout = aiohttp.ClientTimeout(total=None, sock_connect=PATIENCE.connect_s, sock_read=PATIENCE.silence_s)
@@ -216,13 +210,13 @@ class HttpObject(RemoteObject):
             self.require_unchanged(pinned, state)
             if int(part[1]) != start or int(part[2]) >= end:
                 raise self.error("other bytes than were asked for", "the server does not give ranges: read a copy")
-            return Answer(state, start, paced(response.content.iter_chunked(_BLOCK_BYTES)))
+            return Answer(state, start, response.content.iter_chunked(_BLOCK_BYTES))
         if response.status == 200:  # the server gives no ranges: all of it comes
             if head.get("Content-Encoding", "identity") != "identity":
                 raise self.error("an answer that is compressed on its way", "read a copy")
             state = ObjectState(int(head.get("Content-Length", -1)), etag, modified)
             self.require_unchanged(pinned, state)
-            return Answer(state, 0, paced(response.content.iter_chunked(_BLOCK_BYTES)))
+            return Answer(state, 0, response.content.iter_chunked(_BLOCK_BYTES))
         if response.status == 206:
             raise self.error("a part of unknown size", "the server does not give ranges: read a copy")
         return self.refuse(response.status, _seconds(head.get("Retry-After", "")))
@@ -289,7 +283,7 @@ class S3Object(RemoteObject):
         first = int(part[1]) if part is not None and part[1] is not None else 0
         if part is not None and first != start:
             raise self.error("other bytes than were asked for", "the store does not give ranges: read a copy")
-        return Answer(state, first, paced(body.iter_chunks(_BLOCK_BYTES)))
+        return Answer(state, first, body.iter_chunks(_BLOCK_BYTES))
 
 
 def keys_below(prefix: RemotePlace) -> list[str]:
@@ -342,7 +336,7 @@ async def try_in_turn(
 
 def s3_system(place: RemotePlace) -> Any:
     """Return fsspec's file system for S3, which asks once: how often a request is made again is decided here."""
-    _imported("s3fs", "s3", place)
+    required("s3fs", "s3", "reads s3://", place)
     import fsspec
 
     client = {
@@ -351,20 +345,6 @@ def s3_system(place: RemotePlace) -> Any:
         "retries": {"total_max_attempts": 1},
     }
     return fsspec.filesystem("s3", config_kwargs=client, use_listings_cache=False)
-
-
-def _imported(module: str, extra: str, place: RemotePlace) -> Any:
-    from importlib import import_module
-
-    try:
-        return import_module(module)
-    except ImportError:
-        raise UsageError(
-            expected=f"the package {module}, which reads {place.scheme}://",
-            got="an installation without it",
-            where=str(place),
-            remedy=f"pip install 'pdhef-logtool[{extra}]'",
-        ) from None
 
 
 def _conditions(pinned: ObjectState | None) -> dict[str, str]:
@@ -388,17 +368,6 @@ def _status_of(error: Any) -> tuple[int, float]:
 def _seconds(text: str) -> float:
     """Return the seconds of a Retry-After header; 0 where it gives a date, or none."""
     return float(text) if text.strip().isdecimal() else 0.0
-
-
-async def paced(blocks: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
-    """Pass the blocks of an answer on; raises TryAgainError where they come so slowly that they never end."""
-    began, came = time.monotonic(), 0
-    async for block in blocks:
-        yield block
-        came += len(block)
-        passed_s = time.monotonic() - began
-        if passed_s > _LONG_RUN_SILENCES * PATIENCE.silence_s and came < _LEAST_BYTES_S * passed_s:
-            raise TryAgainError(f"{came} bytes in {passed_s:.3g} s")
 
 
 async def _nothing() -> AsyncIterator[bytes]:

@@ -22,7 +22,6 @@ from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
 from pdhef_logtool.records.signals import Loss
 
-_LARGEST_ID = 0xFFFF
 #: Times of MCAP are unsigned; those that readers give are not.
 _UNSIGNED = (1 << 64) - 1
 _NEVER_NS = int(np.iinfo(np.int64).max)
@@ -64,8 +63,8 @@ def register_channels(
 ) -> SourceChannels:
     """Add every channel of a log to a writer but those whose topic is to be left out.
 
-    Channels that only repeat over split files become one. Channels of an MCAP keep their ids (those of the first file
-    where the ids of split files contradict each other). A ROS 1 channel whose definition does not parse cannot be
+    Channels that only repeat over split files become one. Channels keep their ids (those of the first file where the
+    ids of split files contradict each other). A ROS 1 channel whose definition does not parse cannot be
     converted and is left out with a loss.
     """
     ids: dict[_Key, int] = {}
@@ -74,7 +73,6 @@ def register_channels(
     lost: list[Loss] = []
     ids_by_content: dict[tuple[object, ...], int] = {}
     verbatim: set[_Key] = set()
-    places = _Places(log)
     for c, container in enumerate(log.containers):
         same_file: set[int] = set()
         for channel in container.channels.values():
@@ -101,48 +99,13 @@ def register_channels(
             )
             id_ = ids_by_content.get(identity)
             if id_ is None or id_ in same_file:  # two publishers of one file stay two channels
-                id_ = writer.add_channel(target, *places.of(c, target))
+                id_ = writer.add_channel(target)
                 ids_by_content[identity] = id_
             same_file.add(id_)
             ids[(c, channel.id)] = id_
-            if target is channel and places.keeps(c, channel, id_):
+            if target is channel and container.whole_chunks and writer.has_ids_of(id_, channel):
                 verbatim.add((c, channel.id))
     return SourceChannels(ids, converters, frozenset(numbered), tuple(lost), frozenset(verbatim))
-
-
-class _Places:
-    """Ids of the channels and schemas of MCAP files in the copy: unchanged if these are free."""
-
-    def __init__(self, log: ColumnarLog) -> None:
-        self._files = {c: f for c, f in enumerate(log.containers) if f.whole_chunks}
-        used = [id_ for f in self._files.values() for id_ in f.channels]
-        self._next_channel = max(used, default=0) + 1
-        self._channels: dict[int, int] = {}  # schema id by channel id, both of the copy
-        self._schemas: dict[int, tuple[str, str, bytes]] = {}
-
-    def of(self, c: int, channel: ChannelRecord) -> tuple[int | None, int | None]:
-        """Return the channel id and the schema id for a new channel; None: the writer's choice."""
-        if c not in self._files:
-            return None, None
-        schema_id = self._schema(channel)
-        id_ = channel.id
-        if id_ in self._channels:
-            id_, self._next_channel = self._next_channel, self._next_channel + 1
-        if id_ > _LARGEST_ID:
-            return None, schema_id
-        self._channels[id_] = 0 if schema_id is None else schema_id
-        return id_, schema_id
-
-    def _schema(self, channel: ChannelRecord) -> int | None:
-        if not channel.schema_id:
-            return None
-        definition = (channel.schema_name, channel.schema_encoding, channel.schema_data)
-        fits = self._schemas.setdefault(channel.schema_id, definition) == definition
-        return channel.schema_id if fits else None
-
-    def keeps(self, c: int, channel: ChannelRecord, id_: int) -> bool:
-        """Return whether a channel keeps its ids in the copy."""
-        return c in self._files and id_ == channel.id and self._channels.get(id_) == channel.schema_id
 
 
 def iterate_copy(

@@ -8,14 +8,13 @@ import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.table_log import Table
-from pdhef_logtool.records.errors import LogError, UsageError
+from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
 
 if TYPE_CHECKING:
@@ -305,19 +304,6 @@ def _of_long_form(sheet: Sheet, stamps: IntArray) -> Iterator[tuple[Sheet, IntAr
 def whole_days(date: dt.date) -> int:
     """Return the ns of a date's midnight."""
     return (date - dt.date(1970, 1, 1)).days * 86_400 * 10**9
-
-
-def extra(module: str, what: str, place: object) -> Any:
-    """Return a module of the extra ``formats``; raises UsageError with the command that installs it."""
-    try:
-        return import_module(module)
-    except ImportError:
-        raise UsageError(
-            expected=f"the package {module.partition('.')[0]}, which reads {what}",
-            got="an installation without it",
-            where=str(place),
-            remedy="pip install 'pdhef-logtool[formats]'",
-        ) from None
 
 
 def read_head(names: Sequence[str]) -> tuple[list[str], dict[str, str]]:

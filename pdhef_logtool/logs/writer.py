@@ -219,8 +219,8 @@ class McapLogWriter:
         )
         self._encoders[topic] = (channel, encoder)
 
-    def add_channel(self, record: ChannelRecord, channel_id: int | None = None, schema_id: int | None = None) -> int:
-        """Add a channel as a file has it, otherwise as :meth:`add_raw_channel`."""
+    def add_channel(self, record: ChannelRecord) -> int:
+        """Add a channel as a file has it, with its ids where these are free, as :meth:`add_raw_channel`."""
         return self.add_raw_channel(
             record.topic,
             schema_name=record.schema_name,
@@ -228,9 +228,13 @@ class McapLogWriter:
             schema_data=record.schema_data,
             message_encoding=record.encoding,
             metadata=record.metadata,
-            channel_id=channel_id,
-            schema_id=schema_id,
+            channel_id=record.id,
+            schema_id=record.schema_id,
         )
+
+    def has_ids_of(self, channel_id: int, record: ChannelRecord) -> bool:
+        """Return whether a channel has the ids of a record, which a :class:`RawChunk` of its file needs."""
+        return channel_id == record.id and self._channels[channel_id].schema_id == record.schema_id
 
     def add_raw_channel(
         self,
@@ -242,47 +246,47 @@ class McapLogWriter:
         message_encoding: str,
         metadata: Mapping[str, str],
         channel_id: int | None = None,
-        schema_id: int | None = None,
+        schema_id: int = 0,
     ) -> int:
         """Add a channel for :class:`RawMessage` and return its id; without name and encoding it has no schema.
 
-        Ids are given out in ascending order unless named: a :class:`RawChunk` needs its channels and schemas under
-        the ids that it contains.
+        The ids are those named if these are free, otherwise others in ascending order.
 
         Raises
         ------
-        OutputError : an id is taken by something else, or there are too many channels.
+        OutputError : there are too many channels.
         """
         schema = 0
         if schema_name or schema_encoding:
             schema = self._add_schema(schema_name, schema_encoding, schema_data, schema_id)
-        if channel_id is None:
-            channel_id = self._free_id(self._channels)
-        elif channel_id in self._channels:
-            raise self._taken("channel", channel_id)
         channel = Channel(
-            id=channel_id, topic=topic, message_encoding=message_encoding, metadata=dict(metadata), schema_id=schema
+            id=self._free_id(self._channels, channel_id),
+            topic=topic,
+            message_encoding=message_encoding,
+            metadata=dict(metadata),
+            schema_id=schema,
         )
-        self._channels[channel_id] = channel
+        self._channels[channel.id] = channel
         self._emit_record(channel)
-        return channel_id
+        return channel.id
 
-    def _add_schema(self, name: str, encoding: str, data: bytes, id_: int | None) -> int:
+    def _add_schema(self, name: str, encoding: str, data: bytes, wanted: int) -> int:
         key = (name, encoding, data)
-        if id_ is None:
-            id_ = self._schema_ids.get(key) or self._free_id(self._schemas)
-        schema = self._schemas.get(id_)
-        if schema is None:
-            schema = Schema(id=id_, data=data, encoding=encoding, name=name)
-            self._schemas[id_] = schema
-            self._schema_ids.setdefault(key, id_)
-            self._emit_record(schema)
-        elif (schema.name, schema.encoding, schema.data) != key:
-            raise self._taken("schema", id_)
-        return id_
+        held = self._schemas.get(wanted)
+        if held is not None and (held.name, held.encoding, held.data) == key:
+            return wanted
+        if key in self._schema_ids and (held is not None or not wanted):
+            return self._schema_ids[key]
+        schema = Schema(id=self._free_id(self._schemas, wanted or None), data=data, encoding=encoding, name=name)
+        self._schemas[schema.id] = schema
+        self._schema_ids.setdefault(key, schema.id)
+        self._emit_record(schema)
+        return schema.id
 
-    def _free_id(self, taken: Mapping[int, object]) -> int:
-        """Return an id above all that are taken, or a gap where there is none above."""
+    def _free_id(self, taken: Mapping[int, object], wanted: int | None) -> int:
+        """Return the wanted id, otherwise one above all that are taken, or a gap where there is none above."""
+        if wanted is not None and 0 <= wanted <= _LARGEST_ID and wanted not in taken:
+            return wanted
         above = max(taken, default=0) + 1
         if above <= _LARGEST_ID:
             return above
@@ -290,9 +294,6 @@ class McapLogWriter:
         if free is None:
             raise OutputError(expected="at most 65535 channels", got="more", where=str(self._path))
         return free
-
-    def _taken(self, what: str, id_: int) -> OutputError:
-        return OutputError(expected=f"a {what} id that is free", got=str(id_), where=str(self._path))
 
     def write(self, batches: Sequence[TopicBatch], raws: Iterable[RawMessage | RawChunk] = ()) -> None:
         """Write messages merged by log time; on equal times raw messages come first, then batches in their order.

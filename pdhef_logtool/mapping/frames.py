@@ -22,12 +22,11 @@ MOST_STEPS = 16
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placement:
-    """A sensor in a car's frame: the rotation [3, 3] of its axes to the frame's, and its position [3] there in m."""
+    """A sensor in a car's frame: the rotation [3, 3] of its axes to the frame's."""
 
     frame: str
     base: str
     rotation: FloatArray
-    position_m: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,18 +44,14 @@ def placement_of(log: DriveLog, topic: str) -> Placement | None:
     steps = _fixed_frames(log) if frame else {}
     if frame not in steps:
         return None
-    current, rotation, position = frame, np.eye(3), np.zeros(3)
+    current, rotation = frame, np.eye(3)
     for _ in range(MOST_STEPS):
         step = steps.get(current)
         if step is None or current.rpartition("/")[2] in BASES:
             break
-        rotation, position = step.rotation @ rotation, step.rotation @ position + step.position_m
-        current = step.parent
-    return (
-        Placement(frame, current, rotation, position)
-        if current.rpartition("/")[2] in BASES and current != frame
-        else None
-    )
+        current, rotation = step.parent, step.rotation @ rotation
+    is_placed = current.rpartition("/")[2] in BASES and current != frame
+    return Placement(frame, current, rotation) if is_placed else None
 
 
 def holds_fixed_frames(topic: TopicInfo) -> bool:

@@ -1,4 +1,4 @@
-"""How a car moved by its positions and headings: what needs no convention of signs and no unit of a sensor."""
+"""How fast a car moved by its positions: this needs no unit of a sensor."""
 
 from __future__ import annotations
 
@@ -35,30 +35,10 @@ def _path(fields: Fields) -> tuple[FloatArray, FloatArray] | None:
     return None
 
 
-def path_turn(fields: Fields) -> FloatArray | None:
-    """Return how fast the direction of the positions' path turns to the left, rad/s [M]; None without positions."""
-    steps = _path(fields)
-    if steps is None:
-        return None
-    moved = np.hypot(*steps)
-    with np.errstate(invalid="ignore"):
-        far = moved > 0.3 * float(np.nanquantile(moved, 0.9))
-        return _turn_rate(fields, np.where(far, np.arctan2(*steps), np.nan))
-
-
 def path_speed(fields: Fields) -> FloatArray | None:
     """Return the speed along the positions' path, m/s [M]; None without positions."""
     steps = _path(fields)
     return None if steps is None else np.hypot(*steps) / (2 * _HALF * CELL_NS * 1e-9)
-
-
-def heading_turn(fields: Fields) -> FloatArray | None:
-    """Return how fast a navigation system's heading turns to the left, rad/s but for its scale; None without one."""
-    for item in fields.candidates:
-        if item.meaning.quantity == "heading" and item.role == "navigation" and item.seen.changes:
-            degrees = item.seen.largest > 7.0
-            return -_turn_rate(fields, np.radians(item.seen.cells) if degrees else item.seen.cells)
-    return None
 
 
 def _step(fields: Fields, cells: FloatArray) -> FloatArray:
@@ -66,9 +46,3 @@ def _step(fields: Fields, cells: FloatArray) -> FloatArray:
     out = np.full_like(rows, np.nan)
     out[:, _HALF:-_HALF] = rows[:, 2 * _HALF :] - rows[:, : -2 * _HALF]
     return out.ravel()
-
-
-def _turn_rate(fields: Fields, angle_rad: FloatArray) -> FloatArray:
-    """Return the change of an angle a second [M], the short way round."""
-    change = _step(fields, angle_rad)
-    return np.asarray(np.angle(np.exp(1j * change)) / (2 * _HALF * CELL_NS * 1e-9))

@@ -190,6 +190,7 @@ def auto_map(
         origin="auto",
         notes=tuple(draft.notes),
         checks=weighed.checks,
+        open_signs=weighed.open_signs,
     )
     candidates = weighed.candidates
     if decoded is not None:

@@ -174,6 +174,7 @@ class Mapping:
         are no part of :meth:`sources`: only ``pdhef metrics`` reads them.
     fill_recognised : what the file does not name is taken from recognised types.
     checks : what stays undecided of fields that were taken by their names.
+    open_signs : signals (ground truth: ``truth.NAME``) whose sign nothing documents; those of a group share it.
     file : it was read from. recorder : type by topic of the logs that it is for.
     recorders : the mappings of a folder; a log takes that of its recorder.
     """
@@ -187,6 +188,7 @@ class Mapping:
     estimates: dict[str, dict[str, SignalSource]] = field(default_factory=dict)
     fill_recognised: bool = False
     checks: tuple[Check, ...] = ()
+    open_signs: tuple[tuple[str, ...], ...] = ()
     file: str = field(default="", compare=False, repr=False)
     recorder: tuple[tuple[str, str], ...] = ()
     recorders: tuple[Mapping, ...] = ()

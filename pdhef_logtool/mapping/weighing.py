@@ -32,7 +32,6 @@ from pdhef_logtool.mapping.fields import CLEAR, Fields, mean_of
 from pdhef_logtool.mapping.gnss_signals import has_heading
 from pdhef_logtool.mapping.naming import words_of
 from pdhef_logtool.mapping.records import SignalSource
-from pdhef_logtool.mapping.signs import SLOW_M_S, WITNESSES, WORDS, judge_signs
 from pdhef_logtool.mapping.units import RADII_M, decide_units
 from pdhef_logtool.mapping.unlabelled_fields import identified, needs_unlabelled, unlabelled_columns
 from pdhef_logtool.mapping.vendors import Vendors
@@ -58,6 +57,9 @@ FOLLOWS = 0.5
 WHEEL_UNIT = 0.04
 #: Metres by which curvature becomes an angle: wheelbases of model cars to lorries, and those times a steering ratio.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
+#: Signals to both sides, whose sign may be open; speeds below give no information.
+_SIGNED = ("steer_rad", "steering_wheel_rad", "yaw_rate_rad_s", "ay_m_s2")
+SLOW_M_S = 1.0
 #: Unit of rotational speeds, and the usual radius of a wheel.
 RPM = 2.0 * math.pi / 60.0
 USUAL_RADIUS_M = 0.3
@@ -65,7 +67,7 @@ USUAL_RADIUS_M = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Weighed:
-    """Result of weighing: sources to take, all candidates, notes, and undecided checks."""
+    """Result of weighing: sources to take, candidates, notes, undecided checks, signs that nothing documents."""
 
     signals: dict[str, SignalSource] = field(default_factory=dict)
     truth: dict[str, SignalSource] = field(default_factory=dict)
@@ -73,6 +75,7 @@ class Weighed:
     notes: tuple[str, ...] = ()
     rivals: tuple[tuple[str, tuple[str, ...]], ...] = ()
     checks: tuple[Check, ...] = ()
+    open_signs: tuple[tuple[str, ...], ...] = ()
 
 
 def weigh(
@@ -170,7 +173,10 @@ class _Weighing:
             self._wheels(usable)
         if not have & {"steer_rad", "steering_wheel_rad"}:
             self._steering([f for f in usable if f.meaning.quantity == "steering"])
-        self._signs()
+        rate, wheels = self._chosen("yaw_rate_rad_s"), self._wheels_turn()
+        relation = None if rate is None or wheels is None else fit(wheels, self.fields.pieces.smooth(rate.si))
+        if rate is not None and relation is not None and abs(relation.correlation) > CLEAR:
+            _rate_by_track(rate, abs(relation.slope))
         self._follow()
         for name, item in self.taken.items():
             self._tell(name, item)
@@ -341,37 +347,15 @@ class _Weighing:
             item.doubts.append(f"it could be {rest[0][0]} in {rest[0][1][0]} as well")
         return name, True
 
-    # ------------------------------------------------------------------------------------------------ signs
-
-    def _signs(self) -> None:
-        """Turn the signs that contradict others if there is one way to do so; report what remains open."""
-        trio = {
-            "steer": self._chosen("steer_rad", "steering_wheel_rad"),
-            "rate": self._chosen("yaw_rate_rad_s"),
-            "ay": self._chosen("ay_m_s2"),
-        }
-        rate, wheels = trio["rate"], self._wheels_turn()
-        relation = None if rate is None or wheels is None else fit(wheels, self.fields.pieces.smooth(rate.si))
-        if rate is not None and relation is not None and abs(relation.correlation) > CLEAR:
-            _rate_by_track(rate, abs(relation.slope))
-        signs = judge_signs(self.fields, trio, self._speed() or self.fields.wheel_turns(), wheels)
-        for item in (trio[n] for n in signs.turned):
-            if item is not None:
-                item.sign = -item.sign
-                item.reasons.append(f"sign turned: {signs.contradiction} contradict one another")
-        hangs = signs.contradiction == f"{WORDS['rate']} and {WITNESSES['gravity']}"  # imu.mounting shows it
-        if signs.contradiction and not hangs and not (signs.decided and signs.absolute):
-            turned = ", ".join(WORDS[n] for n in signs.turned)
-            taken = f"{turned} was turned as the odd one" if turned else "the wrong one is not observable"
-            self.checks.append(
-                Check(
-                    "mapping.sign",
-                    "mapping",
-                    "undecided",
-                    f"the signs of {signs.contradiction} contradict one another; {taken}",
-                    'give the wrong one a negative scale in a mapping file, or --waive "mapping.sign"',
-                )
-            )
+    def _open_signs(self) -> tuple[tuple[str, ...], ...]:
+        """Return the signals whose sign no documentation, name or mounting gives; those that share an axis together."""
+        open_fields = {n: f for n, f in self.taken.items() if n in _SIGNED and _has_open_sign(f)}
+        open_truth = {n: f for n, f in self.truth.items() if n in ("vy_m_s", "yaw_rate_rad_s") and not f.fixed}
+        lateral, across = open_fields.get("ay_m_s2"), open_truth.get("vy_m_s")
+        groups = [(n,) for n in open_fields] + [(f"truth.{n}",) for n in open_truth if n != "vy_m_s"]
+        if lateral is not None and across is not None and _share_axis(lateral, across):
+            groups[groups.index(("ay_m_s2",))] = ("ay_m_s2", "truth.vy_m_s")
+        return tuple(groups)
 
     def _is_of_ours(self, check: Check) -> bool:
         """Return whether a check is of an accelerometer that is taken."""
@@ -460,20 +444,10 @@ class _Weighing:
             self._tell(f"truth.{name}", item)
 
     def _truth_turns(self) -> bool:
-        """Give the ground truth the signs of the sensors; return whether its yaw rate is the sensor's."""
-        lateral, across = self._chosen("ay_m_s2"), self.truth.get("vy_m_s")
-        if lateral is not None and across is not None and lateral.sign < 0.0 and _share_axis(lateral, across):
-            across.sign = -1.0
-            across.reasons.append(f"sign turned as that of {lateral.path}: their axis is one")
-        sensor = self._chosen("yaw_rate_rad_s")
-        true = self.truth.get("yaw_rate_rad_s")
+        """Return whether the yaw rate of the ground truth is the sensor's, up to its sign."""
+        sensor, true = self._chosen("yaw_rate_rad_s"), self.truth.get("yaw_rate_rad_s")
         relation = None if sensor is None or true is None else fit(sensor.si, true.si)
-        if true is None or relation is None or abs(relation.correlation) < CLEAR:
-            return False
-        if relation.correlation < 0.0 and not true.fixed:
-            true.sign = -true.sign
-            true.reasons.append("sign turned: it is that of the sensor's yaw rate reversed")
-        return abs(relation.correlation) > 0.97 and abs(abs(relation.slope) - 1.0) < 0.1
+        return relation is not None and abs(relation.correlation) > 0.97 and abs(abs(relation.slope) - 1.0) < 0.1
 
     # ------------------------------------------------------------------------------------------- what is stated
 
@@ -517,7 +491,13 @@ class _Weighing:
             notes=tuple(self.notes),
             rivals=tuple(self.rivals),
             checks=(*(c for c in self.fields.checks if self._is_of_ours(c)), *self.checks),
+            open_signs=self._open_signs(),
         )
+
+
+def _has_open_sign(item: Field) -> bool:
+    """Return whether neither documentation nor a name gives the sign of a field, and no mounting shows it."""
+    return not (item.fixed or item.is_downward) and (item.meaning.quantity == "steering" or not item.is_axis)
 
 
 def _share_axis(first: Field, second: Field) -> bool:

@@ -142,9 +142,7 @@ class StateTrack:
     def between(self, start_ns: int | None, end_ns: int) -> StateTrack:
         """Return the stamps in [start_ns, end_ns), from the first one when ``start_ns`` is None."""
         first = 0 if start_ns is None else int(np.searchsorted(self.stamps_ns, start_ns))
-        part = slice(first, int(np.searchsorted(self.stamps_ns, end_ns)))
-        columns = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
-        return StateTrack(name=self.name, **{c: v[part] if len(v) == len(self) else v for c, v in columns.items()})
+        return self.rows(first, int(np.searchsorted(self.stamps_ns, end_ns)))
 
     def without_sideslip_below(self, speed_m_s: float) -> StateTrack:
         """Return the track with its sideslip unknown (NaN) where its own speed is lower: it has no direction there."""

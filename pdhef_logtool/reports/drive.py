@@ -12,7 +12,7 @@ from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.reports.charts import Charts
 from pdhef_logtool.reports.drive_figures import DriveFigures, Roles, drive_figures
 from pdhef_logtool.reports.drive_tables import by_segment, consistency, definitions, disagreements, residuals, scores
-from pdhef_logtool.reports.first_screen import next_steps, plan_head, tested_drive
+from pdhef_logtool.reports.first_screen import plan_head, steps_of, tested_drive
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.fleet import cause_and_remedy
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
@@ -96,7 +96,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         roles=roles,
         plan=plan_head(report.get("plan")),
         tested=tested_drive(report, log.outcome),
-        steps=next_steps(report.get("plan"), _next_of_estimate(report)),
+        steps=steps_of(report),
         identical=[] if roles is None else identical_to(report, roles.main),
         verdicts=verdicts_of(report),
         drawn=figures,
@@ -136,11 +136,6 @@ def roles_of(report: Mapping[str, Any]) -> Roles | None:
     others = [n for n in names if n not in identical]
     rival = next((n for n in (rival_of_verdict, _PHYSICS, *others) if n in others and n != main), "")
     return Roles(main, rival, tuple(n for n in names if n not in (main, rival)))
-
-
-def _next_of_estimate(report: Mapping[str, Any]) -> str:
-    answer = report.get("answer") or {}
-    return str((answer.get("texts") or {}).get("next") or "")
 
 
 def identical_to(report: Mapping[str, Any], main: str) -> list[str]:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pdhef_logtool.evaluation.requirement_verdicts import of_documents
+from pdhef_logtool.evaluation.requirement_verdicts import next_steps, of_documents
 from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import shown
 from pdhef_logtool.records.printable import printable
@@ -18,7 +18,6 @@ from pdhef_logtool.records.printable import printable
 _KINDS = {"PASS": "pass", "FAIL": "fail", "INCONCLUSIVE": "unknown"}
 #: Versions that a first screen names; the appendix has all.
 _VERSIONS = ("pdhef-logtool", "python", "numpy")
-_MOST_NEXT = 4
 #: What follows a value: its interval in brackets.
 _INTERVAL = re.compile(r"^\((.*?)\)")
 _UNIT = re.compile(r"_(rad_s|rad|m_s2|m_s)$")
@@ -97,21 +96,10 @@ def _exposure(exposure: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def next_steps(plan: Mapping[str, Any] | None, more: str = "") -> list[str]:
-    """Return what to do: that of failed requirements, then of inconclusive ones, then ``more`` (clauses)."""
-    requirements = (plan or {}).get("requirements") or ()
-    steps = [
-        f"{r['id']}: {r['next']}"
-        for outcome in ("FAIL", "INCONCLUSIVE")
-        for r in of_documents(requirements, outcome)
-        if r["next"]
-    ]
-    by_text: dict[str, list[str]] = {}
-    for step in steps:
-        name, _, text = step.partition(": ")
-        by_text.setdefault(text, []).append(name)
-    joined = [f"{', '.join(names)}: {text}" for text, names in by_text.items()]
-    return [*joined[:_MOST_NEXT], *filter(None, more.split("; "))]
+def steps_of(report: Mapping[str, Any]) -> list[str]:
+    """Return what to do by the report.json of a drive."""
+    texts = (report.get("answer") or {}).get("texts") or {}
+    return next_steps(report.get("plan"), (texts.get("next") or "").split("; "))
 
 
 def tested_drive(report: Mapping[str, Any], outcome: str = "") -> list[tuple[str, str]]:

@@ -18,9 +18,10 @@ from typing import Any
 
 from markupsafe import Markup
 
+from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.reports.drive import drive_page
-from pdhef_logtool.reports.first_screen import PlanHead, next_steps, plan_head, tested_drive, tested_run
+from pdhef_logtool.reports.first_screen import PlanHead, plan_head, steps_of, tested_drive, tested_run
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.reports.pictures import picture
 from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun
@@ -161,12 +162,11 @@ def _section(log: OpenedLog, report: Mapping[str, Any] | None, *, positions: boo
         for key in keys
         if key in charts.figures
     ]
-    more = ((report.get("answer") or {}).get("texts") or {}).get("next") or ""
     return DriveSection(
         log.label,
         log.outcome,
         plan_head(report.get("plan")),
         tested_drive(report, log.outcome),
-        next_steps(report.get("plan"), more),
+        steps_of(report),
         drawn,
     )

@@ -6,17 +6,11 @@ it through the state alone, so that no window changes a bit. Sums are taken in o
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.core import cgutils
-from numba.core.errors import TypingError
-from numba.extending import intrinsic
 
 from pdhef_logtool.compiled.cache import njit
 
@@ -24,8 +18,6 @@ Float32Array: TypeAlias = np.ndarray[Any, np.dtype[np.float32]]
 
 #: A step is run for an input and its mirror image, or for an input and nothing.
 SIDES = 2
-#: Columns of weights come in blocks of so many, each of two vectors; what is missing is 0.
-_COLUMNS, _LANES = 32, 16
 #: Steps that a layer takes before the next one does: its weights and what passes between stay in the cache.
 _TILE_STEPS = 128
 
@@ -51,64 +43,23 @@ def _tanh(x):  # type: ignore[no-untyped-def]
     return x * over / under
 
 
-@intrinsic
-def _add_products(_typing, x, weights, out, first):  # type: ignore[no-untyped-def]
-    """Add the products of vectors x [2, K] with a block of weights [K, 32] to the columns of out [2, M] from ``first``.
-
-    Written in the compiler's own language: sums stay in registers over the loop, which of a loop in Python it does not
-    find out. ``contract`` lets a product and a sum be one instruction, where the processor has one.
-    """
-    if any(a.layout != "C" or a.dtype != types.float32 for a in (x, weights, out)):
-        raise TypingError("expected float32 arrays in C order")
-
-    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        x, weights, out = (
-            context.make_array(kind)(context, builder, value)
-            for kind, value in zip(signature.args[:3], args[:3], strict=True)
-        )
-        rows, columns = (cgutils.unpack_tuple(builder, a.shape)[axis] for a, axis in ((weights, 0), (out, 1)))
-        lane, vector = ir.FloatType(), ir.VectorType(ir.FloatType(), _LANES)
-        number, undefined = ir.IntType(64), ir.Constant(vector, ir.Undefined)
-        first_lane = ir.Constant(ir.VectorType(ir.IntType(32), _LANES), [0] * _LANES)
-
-        def place(base: Any, index: Any, add: int = 0) -> Any:
-            return builder.bitcast(builder.gep(base, [builder.add(index, number(add))]), vector.as_pointer())
-
-        def load(base: Any, index: Any, add: int = 0) -> Any:
-            value = builder.load(place(base, index, add))
-            value.align = lane.get_abi_size(context.target_data)
-            return value
-
-        sums = []
-        for side in range(SIDES):
-            start = builder.add(args[3], builder.mul(number(side), columns))
-            for add in range(0, _COLUMNS, _LANES):
-                kept = cgutils.alloca_once_value(builder, load(out.data, start, add))
-                sums.append((side, add, place(out.data, start, add), kept))
-        with cgutils.for_range(builder, rows) as loop:
-            row = builder.mul(loop.index, number(_COLUMNS))
-            of_row = {add: load(weights.data, row, add) for add in range(0, _COLUMNS, _LANES)}
-            both = []
-            for side in range(SIDES):
-                index = builder.add(loop.index, builder.mul(number(side), rows))
-                value = builder.insert_element(undefined, builder.load(builder.gep(x.data, [index])), ir.IntType(32)(0))
-                both.append(builder.shuffle_vector(value, undefined, first_lane))
-            for side, add, _, kept in sums:
-                product = builder.fmul(both[side], of_row[add], flags=("contract",))
-                builder.store(builder.fadd(product, builder.load(kept), flags=("contract",)), kept)
-        for _, _, target, kept in sums:
-            stored = builder.store(builder.load(kept), target)
-            stored.align = lane.get_abi_size(context.target_data)
-        return context.get_dummy_value()
-
-    return types.void(x, weights, out, first), generate
-
-
 @_compiled
 def _multiply(x, weights, out):  # type: ignore[no-untyped-def]
-    """Add x [2, K] times weights, in blocks [M/32, K, 32], to out [2, M]."""
-    for block in range(weights.shape[0]):
-        _add_products(x, weights[block], out, block * _COLUMNS)
+    """Add x [2, K] times weights [K, M] to out [2, M]; four rows of weights at a time, in their order."""
+    rows, columns = weights.shape
+    whole = rows - rows % 4
+    one, other = out[0], out[1]
+    for k in range(0, whole, 4):
+        a, b, c, d = x[0, k], x[0, k + 1], x[0, k + 2], x[0, k + 3]
+        e, f, g, h = x[1, k], x[1, k + 1], x[1, k + 2], x[1, k + 3]
+        w0, w1, w2, w3 = weights[k], weights[k + 1], weights[k + 2], weights[k + 3]
+        for m in range(columns):
+            one[m] = one[m] + a * w0[m] + b * w1[m] + c * w2[m] + d * w3[m]
+            other[m] = other[m] + e * w0[m] + f * w1[m] + g * w2[m] + h * w3[m]
+    for k in range(whole, rows):
+        for m in range(columns):
+            one[m] += x[0, k] * weights[k, m]
+            other[m] += x[1, k] * weights[k, m]
 
 
 @_compiled
@@ -126,7 +77,7 @@ def _dense(x, weights, bias, cut, out):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _recur(gates, weights, h, c, out):  # type: ignore[no-untyped-def]
-    """Run one LSTM layer over what its inputs give to the gates [T, 2, ≥4 H], which are changed.
+    """Run one LSTM layer over what its inputs give to the gates [T, 2, 4 H], which are changed.
 
     The gates are input, forget, cell, output; those with a sigmoid come as half of what it is taken of, for
     σ(x) = (1 + tanh(x/2)) / 2. ``h`` and ``c`` [2, H] are moved, ``h`` of each step goes to out [T, 2, H].
@@ -151,15 +102,14 @@ NetworkState: TypeAlias = Float32Array
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForwardPass:
-    """A network's weights as the compiled code takes them, [blocks, K, 32] each.
+    """A network's weights as the compiled code takes them, [K, M] each.
 
-    ``layers`` are (of the input, of the state, bias), ``head`` is (weights, bias), its ``widths`` without filling.
+    ``layers`` are (of the input, of the state, bias), ``head`` is (weights, bias).
     """
 
     layers: tuple[tuple[Float32Array, Float32Array, Float32Array], ...]
     head: tuple[tuple[Float32Array, Float32Array], ...]
     hidden: int
-    widths: tuple[int, ...]
 
     @classmethod
     def of(cls, weights: dict[str, Float32Array], layers: int, head: Sequence[int]) -> ForwardPass:
@@ -169,62 +119,35 @@ class ForwardPass:
             bias = weights[f"lstm.bias_ih_l{n}"] + weights[f"lstm.bias_hh_l{n}"]
             half = np.full(len(bias), 0.5, dtype=np.float32)
             half[len(bias) // 2 : len(bias) * 3 // 4] = 1.0  # the cell's gate is a tanh
-            of_input, of_state = (weights[f"lstm.weight_{of}_l{n}"].T * half for of in ("ih", "hh"))
-            stacked.append((_blocks(of_input), _blocks(of_state), _filled(bias * half)))
+            of_input, of_state = (
+                np.ascontiguousarray(weights[f"lstm.weight_{of}_l{n}"].T * half) for of in ("ih", "hh")
+            )
+            stacked.append((of_input, of_state, bias * half))
         dense = [f"head.{3 * n}" for n in range(len(head) + 1)]
         return cls(
             layers=tuple(stacked),
-            head=tuple((_blocks(weights[f"{d}.weight"].T), _filled(weights[f"{d}.bias"])) for d in dense),
+            head=tuple((np.ascontiguousarray(weights[f"{d}.weight"].T), weights[f"{d}.bias"]) for d in dense),
             hidden=len(weights["lstm.weight_hh_l0"]) // 4,
-            widths=tuple(len(weights[f"{d}.bias"]) for d in dense),
         )
 
     def initial_state(self) -> NetworkState:
         """Return a state of zeros."""
-        return _aligned((len(self.layers), 2, SIDES, self.hidden))
+        return np.zeros((len(self.layers), 2, SIDES, self.hidden), dtype=np.float32)
 
     def run(self, inputs: Float32Array, state: NetworkState) -> tuple[Float32Array, NetworkState]:
         """Run [T, 2, k] from a state; returns [T, 2, outputs] and the state after."""
-        after = self.initial_state()
-        after[...] = state
-        steps = min(len(inputs), _TILE_STEPS)
-        gates, hidden = (_aligned((steps, SIDES, width)) for width in (len(self.layers[0][2]), self.hidden))
-        dense = [_aligned((steps, SIDES, len(bias))) for _, bias in self.head]
-        said = np.empty((len(inputs), SIDES, self.widths[-1]), dtype=np.float32)
+        after = state.copy()
+        said = np.empty((len(inputs), SIDES, len(self.head[-1][1])), dtype=np.float32)
         for first in range(0, len(inputs), _TILE_STEPS):
             x = np.ascontiguousarray(inputs[first : first + _TILE_STEPS], dtype=np.float32)
-            gate = gates[: len(x)]
             for (of_input, of_state, bias), (h, c) in zip(self.layers, after, strict=True):
-                _dense(x, of_input, bias, False, gate)
-                x = hidden[: len(x)]
-                _recur(gate, of_state, h, c, x)
-            for n, ((weights, bias), out) in enumerate(zip(self.head, dense, strict=True)):
-                _dense(x, weights, bias, n + 1 < len(self.head), out[: len(x)])
-                x = np.ascontiguousarray(out[: len(x), :, : self.widths[n]])
+                gates, hidden = (np.empty((len(x), SIDES, n), dtype=np.float32) for n in (len(bias), self.hidden))
+                _dense(x, of_input, bias, False, gates)
+                _recur(gates, of_state, h, c, hidden)
+                x = hidden
+            for n, (weights, bias) in enumerate(self.head):
+                dense = np.empty((len(x), SIDES, len(bias)), dtype=np.float32)
+                _dense(x, weights, bias, n + 1 < len(self.head), dense)
+                x = dense
             said[first : first + len(x)] = x
         return said, after
-
-
-def _aligned(shape: tuple[int, ...]) -> Float32Array:
-    """Return zeros that begin where a line of the cache does: vectors that cross lines take half as long again."""
-    size, line = 4 * math.prod(shape), 64
-    memory = np.zeros(size + line, dtype=np.uint8)
-    first = -memory.ctypes.data % line
-    view: Float32Array = memory[first : first + size].view(np.float32).reshape(shape)
-    return view
-
-
-def _filled(values: Float32Array) -> Float32Array:
-    """Return values [..., M] with zeros up to whole blocks."""
-    *before, columns = values.shape
-    filled = _aligned((*before, -(-columns // _COLUMNS) * _COLUMNS))
-    filled[..., :columns] = values
-    return filled
-
-
-def _blocks(weights: Float32Array) -> Float32Array:
-    """Return weights [K, M] as blocks [M/32, K, 32]."""
-    filled = _filled(weights).reshape(len(weights), -1, _COLUMNS).transpose(1, 0, 2)
-    blocks = _aligned(filled.shape)
-    blocks[...] = filled
-    return blocks

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.results.changed_signals import ChangedSignal
 from pdhef_logtool.results.comparing import INDEPENDENT, ComparedFigure, Comparison
@@ -11,6 +12,8 @@ from pdhef_logtool.results.paired_change import LEAST_CLUSTERS
 from pdhef_logtool.results.sink import TRUTH
 
 _COLUMN_UNITS = {"rad": "rad", "rad_s": "rad/s", "m_s": "m/s", "m_s2": "m/s^2"}
+#: Figures that a verdict names.
+_MOST_NAMED = 3
 _BY = {"signals": "the content of their signals", "content": "the hashes of their files", "name": "their names alone"}
 
 
@@ -25,7 +28,7 @@ def paired_text(comparison: Comparison) -> str:
 
 def verdict_text(comparison: Comparison) -> str:
     """Return the verdict in a sentence."""
-    if comparison.verdict == "equal":
+    if comparison.equal and comparison.verdict == "equal":
         return "equal: all figures of all pairs are the same bit for bit"
     text = {
         "worse": "B is worse",
@@ -35,17 +38,41 @@ def verdict_text(comparison: Comparison) -> str:
         "inconclusive": "inconclusive with these drives",
         "no figure": "no drive has the figure on both sides (is there ground truth?)",
     }[comparison.verdict]
+    decisive = [f for f in comparison.figures if f.verdict == comparison.verdict]
     if comparison.verdict == "no figure":
-        return f"{text}: {', '.join(f.figure.label for f in comparison.figures if f.verdict == 'no figure')}"
-    detectable = [f.detectable for f in comparison.figures if f.verdict == "inconclusive"]
-    if any(math.isfinite(d) for d in detectable):
-        text += f"; an increase of {percent(max(d for d in detectable if math.isfinite(d)))} would have been detected"
-    elif detectable:
-        text += (
-            f": too few independent drives (at least {LEAST_CLUSTERS} drives or clusters; a design effect reduces "
-            "their number)"
+        return f"{text}: {', '.join(f.figure.label for f in decisive)}"
+    changes = [f"{f.figure.short} {change_text(f)} of {f.change.drives} drives" for f in decisive[:_MOST_NAMED]]
+    return f"{text}: {', '.join(changes)}" if changes and comparison.verdict != "equal" else text
+
+
+def assumed_text(comparison: Comparison) -> str:
+    """Return what the verdict takes for granted."""
+    dependence = next((dependence_text(f, comparison.cluster) for f in comparison.figures if f.drives), "")
+    differences = "what else differs (below) counts as part of B"
+    return "; ".join(
+        filter(None, [dependence.rstrip("."), paired_text(comparison), differences if comparison.differences else ""])
+    )
+
+
+def next_text(comparison: Comparison) -> str:
+    """Return the next step."""
+    plan, verdict = comparison.requirements, comparison.verdict
+    steps = next_steps(None if plan is None else plan.to_dict())
+    if comparison.unpaired and not comparison.allow_unpaired:
+        steps = ["run both on the same drives, or accept the difference: --allow-unpaired", *steps]
+    if verdict == "worse":
+        worst = next(f for f in comparison.figures if f.verdict == "worse").drives[0]
+        steps.append(f"look at {worst.drive} first: its error increased most")
+    elif verdict == "inconclusive":
+        detectable = [f.detectable for f in comparison.figures if f.verdict == verdict and math.isfinite(f.detectable)]
+        steps.append(
+            f"compare more drives; these detect an increase of {percent(max(detectable))} with 80 % power"
+            if detectable
+            else f"compare at least {LEAST_CLUSTERS} independent drives or clusters (design effect)"
         )
-    return text
+    elif verdict == "no figure":
+        steps.append("compare drives with ground truth, or another --metric")
+    return steps[0] if steps else "nothing is needed"
 
 
 def notes_of(comparison: Comparison) -> list[str]:

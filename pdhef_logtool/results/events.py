@@ -45,7 +45,8 @@ class FoundEvents:
 
     Attributes
     ----------
-    where : the condition. searched : drives that were looked at. events : in the order of the run's drives.
+    where : the condition. of : estimator of its columns. searched : drives that were looked at. events : in the order
+        of the run's drives.
     left_out : drives that could not be looked at, with the reason; ``unreadable``: how many of them are damaged or
         failed; ``damaged``: a line a damaged one. failed : whether something of the run could not be read.
     clips : files that were written.
@@ -55,6 +56,7 @@ class FoundEvents:
     searched: int
     events: tuple[FoundEvent, ...]
     left_out: Mapping[str, str]
+    of: str = "the selected estimates"
     failed: bool = False
     unreadable: int = 0
     damaged: tuple[str, ...] = ()
@@ -114,7 +116,16 @@ def find_events(
     if not searched:
         _check_tracks([log for log in run.logs if log.label not in damaged], condition, estimator)
     lines = tuple(damaged.values())
-    return FoundEvents(condition.text, searched, tuple(events), left_out, unreadable > 0, unreadable, lines)
+    return FoundEvents(
+        condition.text,
+        searched,
+        tuple(events),
+        left_out,
+        estimator or "the selected estimates",
+        unreadable > 0,
+        unreadable,
+        lines,
+    )
 
 
 def write_events(path: Path, events: FoundEvents) -> None:

@@ -84,12 +84,16 @@ class Figures:
 
 def figures_of_rows(rows: Iterable[MetricRow]) -> Figures:
     """Return the figures of rows at hand."""
+    return _figures((r.log, r.estimator, r.signal, r.segment, r.metric, r.value, r.n) for r in rows)
+
+
+def _figures(rows: Iterable[tuple[str, str, str, str, str, float | None, int]]) -> Figures:
     values: dict[_Key, tuple[float, int]] = {}
     names: dict[str, dict[str, None]] = {}
-    for r in rows:
-        values[r.log, r.estimator, r.signal, r.segment, r.metric] = r.value, r.n
-        if _is_estimator(r.estimator):
-            names.setdefault(r.log, {})[r.estimator] = None
+    for log, name, signal, segment, metric, value, n in rows:
+        values[log, name, signal, segment, metric] = (math.nan if value is None else value), n
+        if "~" not in name and name not in (SENSORS, TRUTH, REFERENCE):
+            names.setdefault(log, {})[name] = None
     return Figures(values, {log: list(of_log) for log, of_log in names.items()})
 
 
@@ -108,17 +112,7 @@ def figures_of_file(metrics: pl.LazyFrame, plan: ValidationPlan, mains: Iterable
         rows = rows.filter(pl.col("estimator").cast(pl.String).is_in(sorted(named)))
     columns = ("log", "estimator", "signal", "segment", "metric")
     table = rows.select(*(pl.col(c).cast(pl.String) for c in columns), "value", "n").collect()
-    values: dict[_Key, tuple[float, int]] = {}
-    names: dict[str, dict[str, None]] = {}
-    for log, name, signal, segment, metric, value, n in table.iter_rows():
-        values[log, name, signal, segment, metric] = (math.nan if value is None else value), n
-        if _is_estimator(name):
-            names.setdefault(log, {})[name] = None
-    return Figures(values, {log: list(of_log) for log, of_log in names.items()})
-
-
-def _is_estimator(name: str) -> bool:
-    return "~" not in name and name not in (SENSORS, TRUTH, REFERENCE)
+    return _figures(table.iter_rows())
 
 
 #: Figures of another run, and its drive by the label of this run's.

@@ -105,7 +105,7 @@ def _result(report: Report, main: MainFacts, figures: _Figures) -> str:
         return f"Sideslip estimate: {main.name}; {_from_reference(report, main, figures)}"
     if rmse is None:
         return f"Sideslip of {main.name} is not scored: {_why_not_scored(report, main)}{_scored_instead(main, figures)}"
-    said = [f"Sideslip RMSE of {main.name}: {degrees(rmse)} ({_truth_of(report, 'sideslip_rad')})"]
+    said = [f"Sideslip RMSE of {main.name}: {degrees(rmse)} ({truth_of(report, 'sideslip_rad')})"]
     rivals = [(name, text) for name, text in (("physics", "physics"), ("zero", "zero sideslip")) if name != main.name]
     others = [(text, other) for name, text in rivals if (other := _error(figures, name)) is not None]
     others = [(text, other) for text, other in others if (text, other) != ("physics", rmse)]  # residual gain 0
@@ -153,7 +153,7 @@ def _against(rmse: float, other: float, text: str) -> str:
     return f"1/{shown} of {beside}" if times > 2.0 else f"{100.0 * (1.0 - rmse / other):.0f} % lower than {beside}"
 
 
-def _truth_of(report: Report, name: str) -> str:
+def truth_of(report: Report, name: str) -> str:
     """Return the topics that a ground truth quantity comes from, as far as its derivation names them."""
     by_name = {q["name"]: q for q in report["truth"]["quantities"]}
     parts = [by_name[n] for n in (name, "vx_m_s", "vy_m_s") if n in by_name]

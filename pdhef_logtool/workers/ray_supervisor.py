@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.extras import required
 from pdhef_logtool.records.processes import process_name
 from pdhef_logtool.workers.fork_server import describe_error
 from pdhef_logtool.workers.supervisor import Crew, Ended, Failure, Limits, Tell
@@ -101,12 +102,7 @@ def _ended(ray: Any, reference: Any, number: int, item: T) -> Ended[T, Any]:
 @contextmanager
 def _connected(address: str) -> Iterator[Any]:
     """Connect to a cluster, and leave it unless this process was connected before."""
-    try:
-        import ray
-    except ImportError:
-        raise UsageError(
-            expected="Ray", got="none installed", where="--ray", remedy="pip install 'pdhef-logtool[ray]'"
-        ) from None
+    ray = required("ray", "ray", "distributes a run over a cluster", "--ray")
     if ray.is_initialized():
         yield ray
         return

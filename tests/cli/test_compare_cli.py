@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from pdhef_logtool.cli.app import app
 from pdhef_logtool.records.errors import UsageError
-from tests.results.made_run import write_estimates, write_run
+from tests.results.made_run import row, write_estimates, write_run
 from truthsim.samples import convert_to_rosbag2
 
 TEN = {f"drive_{i}": 0.001 * (1 + i) for i in range(10)}
@@ -39,18 +39,21 @@ def runs(tmp_path: Path) -> tuple[str, str]:
 def test_a_regression_is_told_with_its_drives_and_where_they_part(runs: tuple[str, str]) -> None:
     code, text = _pdhef("compare", *runs, "--max-regression", "5%")
     assert code == 4
-    assert all(len(line) <= 80 for line in text.splitlines()[1:])
+    assert all(len(line) <= 80 for line in text.splitlines() if not line.startswith("A "))
     assert "configuration: friction auto → 0.3" in text
     assert re.search(r"drive_9 +0\.573 +0\.682 +\+19\.0 %", text)
     assert "0.573 °" in text  # the largest difference of the tracks
-    assert "Verdict: B is worse" in text
-    assert "gate closed: sideslip_rad rmse (all): worse" in text
+    first = " ".join(text[: text.index("\nA ")].split())
+    assert first.startswith("Result B is worse: sideslip RMSE +14.5 % (+11.4 % to +17.6 %) of 10 drives; gate closed: ")
+    assert first.endswith("Next look at drive_9 first: its error increased most")
 
 
 def test_the_same_run_is_equal(runs: tuple[str, str]) -> None:
     code, text = _pdhef("compare", runs[0], runs[0], "--max-regression", "0.05", "--strict")
     assert code == 0
-    assert text.splitlines()[-1] == "Verdict: equal: all figures of all pairs are the same bit for bit"
+    assert (
+        text.splitlines()[0].split(maxsplit=1)[1].rstrip() == "equal: all figures of all pairs are the same bit for bit"
+    )
 
 
 def test_json_and_junit_say_the_same(runs: tuple[str, str], tmp_path: Path) -> None:
@@ -66,9 +69,37 @@ def test_json_and_junit_say_the_same(runs: tuple[str, str], tmp_path: Path) -> N
     assert [s.get("name") for s in root] == ["plan.toml", "compare"]
     assert (root[0].get("tests"), root[0].get("failures"), root[0].get("skipped")) == ("2", "1", "1")
     _, text = _pdhef("compare", *runs, "--plan", str(plan))
-    assert "Plan on B: 1 FAIL, 1 INCONCLUSIVE (plan plan.toml)" in text
+    assert text.startswith("Result   1 FAIL, 1 INCONCLUSIVE (plan plan.toml); B is worse: ")
+    assert "\nNext     A: look at the worst drive first" in text
     assert _pdhef("compare", runs[0], runs[0], "--plan", str(plan))[0] == 0
     assert _pdhef("compare", runs[0], runs[0], "--plan", str(plan), "--strict")[0] == 4
+
+
+@pytest.mark.parametrize("width", ["80", "120"])
+@pytest.mark.parametrize(
+    ("command", "result"),
+    [
+        (("compare", "A", "B"), "B is worse"),
+        (("trend", "A", "B", "A"), "1 significant regression of sideslip RMSE in 3 runs"),
+        (("events", "B", "--where", "sideslip_deg > 0.5"), "1 event in 1 of 1 drives, 0.49 s in all"),
+        (("report", "A"), "pages of the run and of 10 logs"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, tuple) else "",
+)
+def test_three_lines_come_first(
+    command: tuple[str, ...], result: str, width: str, runs: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", width)
+    _, text = _pdhef(*({"A": runs[0], "B": runs[1]}.get(word, word) for word in command))
+    head = re.split(r"\n *\n", text)[0]
+    assert re.findall(r"^(\w+) +\S", head, re.MULTILINE) == ["Result", "Assumed", "Next"]
+    assert result in " ".join(head.split())
+
+
+def test_runs_whose_other_figures_differ_are_not_called_equal_bit_for_bit(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", TEN)
+    b = write_run(tmp_path / "b", TEN, rows=[row(drive, 0.1, estimator="zero") for drive in TEN])
+    assert _pdhef("compare", str(a), str(b))[1].startswith("Result   no figure that was asked for changed ")
 
 
 @pytest.mark.parametrize("option", ["--html", "--junit"])

@@ -254,6 +254,7 @@ def test_what_compiled_code_is_made_of() -> None:
     assert {
         "pdhef_logtool/estimators/physics_filter.py",
         "truthsim/motion.py",
+        "truthsim/tyres.py",
         "pdhef_logtool/compiled/vectors.py",
     } <= names
     assert "pdhef_logtool/records/signals.py" in names  # constants

@@ -19,7 +19,6 @@ from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
-from pdhef_logtool.records.errors import OutputError
 
 pytestmark = pytest.mark.slow
 
@@ -306,14 +305,17 @@ def test_ids_at_the_end_of_their_range_leave_room_for_more(tmp_path: Path) -> No
     assert set(summary.schemas) == {0xFFFF, 1}
 
 
-def test_a_taken_id_is_refused(tmp_path: Path) -> None:
+def test_ids_that_are_taken_are_replaced(tmp_path: Path) -> None:
     channel = {"schema_encoding": "ros2msg", "schema_data": TEXT, "message_encoding": "cdr", "metadata": {}}
-    with McapLogWriter(tmp_path / "x.mcap") as writer:
-        writer.add_raw_channel("/a", schema_name="A", channel_id=3, schema_id=2, **channel)
-        with pytest.raises(OutputError, match="channel id"):
-            writer.add_raw_channel("/b", schema_name="A", channel_id=3, schema_id=2, **channel)
-        with pytest.raises(OutputError, match="schema id"):
-            writer.add_raw_channel("/b", schema_name="B", channel_id=4, schema_id=2, **channel)
+    target = tmp_path / "x.mcap"
+    with McapLogWriter(target) as writer:
+        asked = (("/a", "A", 0, 2), ("/b", "A", 0, 2), ("/c", "B", 4, 2), ("/d", "A", 5, 7), ("/e", "A", 6, 2))
+        for topic, schema, channel_id, schema_id in asked:
+            writer.add_raw_channel(topic, schema_name=schema, channel_id=channel_id, schema_id=schema_id, **channel)
+    with target.open("rb") as stream:
+        channels = make_reader(stream).get_summary().channels.values()
+    ids = {c.topic: (c.id, c.schema_id) for c in channels}
+    assert ids == {"/a": (0, 2), "/b": (1, 2), "/c": (4, 3), "/d": (5, 7), "/e": (6, 2)}
 
 
 def test_an_index_that_omits_a_message_does_not_hide_it(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.logs.remote_source import RemoteSource, join_ranges, without
 from pdhef_logtool.records.errors import EXIT_FAILURE, LogError, UsageError
 from tests.camera_log import with_camera, write_apart
-from tests.counting_server import CountingServer, cutting, serving, slow, stalling, status, trickling
+from tests.counting_server import CountingServer, cutting, serving, slow, stalling, status
 
 pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
 
@@ -42,7 +42,6 @@ def saloon() -> Car:
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     quick = remote_objects.Patience(connect_s=2.0, silence_s=0.2, tries=3, first_wait_s=0.01, most_wait_s=0.02)
     monkeypatch.setattr(remote_objects, "PATIENCE", quick)
-    monkeypatch.setattr(remote_objects, "_LONG_RUN_SILENCES", 1)
     yield
     for spool in list(remote_source._spools.values()):
         assert spool.users == 0, "a source was not closed"
@@ -334,10 +333,9 @@ def served(sample_logs_dir: Path) -> Iterator[CountingServer]:
         (status(403), "it refuses access", 1),
         (status(302, {"Location": "/dlc.mcap"}), "cannot be asked for", None),
         (cutting(100), "an answer that is cut, 3 times in turn", 3),
-        (trickling(), "bytes in", None),
         (stalling(0.4), "silence of 0.2 s, 3 times in turn", 3),
     ],
-    ids=["429", "503", "503 later", "404", "403", "round and round", "cuts", "trickles", "stalls"],
+    ids=["429", "503", "503 later", "404", "403", "round and round", "cuts", "stalls"],
 )
 def test_faults_end_in_one_line(served: CountingServer, fault, words: str, requests: int | None) -> None:
     served.fault = fault

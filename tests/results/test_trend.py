@@ -10,7 +10,7 @@ import pytest
 
 from pdhef_logtool.cli.app import app
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.reports.trend import trend_page
+from pdhef_logtool.results.comparison_words import change_text
 from pdhef_logtool.results.gate import Figure
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.results.trend import Trend, trend_of
@@ -60,7 +60,7 @@ def test_equal_and_unrelated_runs_are_no_regressions(tmp_path: Path) -> None:
     found = of([folder, folder, other])
     assert found.rows[1].previous is not None and found.rows[1].previous.verdict == "equal"
     assert found.rows[2].previous is None and found.rows[2].regression == ()
-    assert "no common drive" in trend_page(found).decode()
+    assert change_text(found.rows[2].previous) == "no common drive with the figure"
 
 
 def test_runs_in_which_logs_failed_are_rows_too(tmp_path: Path) -> None:
@@ -69,7 +69,7 @@ def test_runs_in_which_logs_failed_are_rows_too(tmp_path: Path) -> None:
     b = write_run(tmp_path / "b", {"d": 0.1}, entries=[entry("d"), bad])
     found = of([a, b, b])
     assert [(r.failed, r.scored) for r in found.rows] == [(1, 0), (1, 1), (1, 1)] and found.regressions == ()
-    assert "no common drive with the figure" in trend_page(found).decode()
+    assert change_text(found.rows[1].first) == "no common drive with the figure"
     with pytest.raises(UsageError, match="an estimator of these runs: pd-hef, got pd-hof"):
         trend_of([open_run(b), open_run(b)], Figure(estimator="pd-hof"))
 
@@ -80,16 +80,15 @@ def test_a_drive_whose_estimator_has_seen_the_ground_truth_is_not_in_the_median(
     assert [(r.scored, r.median) for r in of([a, a]).rows] == [(1, 0.1)] * 2
 
 
-def test_the_command_prints_rows_json_and_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_rows_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folders = runs_of(tmp_path, 1.0, 1.0, 1.5)
     failed = entry("bad", outcome="failed: no log", main=None)
     write_run(tmp_path / "r3", dict.fromkeys(DRIVES, 0.01), entries=[*map(entry, DRIVES), failed])
-    pdhef("trend", *folders, "--html", tmp_path / "t.html")
+    pdhef("trend", *folders)
     out = capsys.readouterr().out
-    assert out.startswith("1 of 3 runs with a regression of sideslip_rad rmse (all)")
+    assert out.startswith("Result   1 significant regression of sideslip RMSE in 3 runs")
+    assert f"\nNext     pdhef compare {folders[1]} {folders[2]}" in out
     assert "regression against the previous and the first run" in out and "versions: numpy 2.1 → 2.2" in out
-    page = (tmp_path / "t.html").read_text()
-    assert page.count("<tr><td>") == 3 and 'data-figure="changes"' in page
     document = said(capsys, "trend", *folders, tmp_path / "r3", "--max-regression", "5%")
     assert document["regressions"][0].endswith("r2") and document["runs"][3]["failed"] == 1
     assert document["runs"][2]["previous"]["median"] == pytest.approx(0.5, abs=0.1)

@@ -11,7 +11,6 @@ from truthsim.manoeuvres import MANOEUVRES, Plan, Request
 from truthsim.motion import Motion, simulate_motion
 from truthsim.sensors import (
     IMU_PERIOD_S,
-    NO_NOISE,
     ORIGIN_GEODETIC,
     STEER_PHASE_S,
     WHEEL_PHASE_S,
@@ -25,6 +24,13 @@ from truthsim.vehicle import Vehicle
 
 G = 9.80665
 PHASES = (0.0, STEER_PHASE_S, WHEEL_PHASE_S)
+#: Sensors that err in nothing but delay, tilt, wheel slip and quantisation.
+NO_NOISE = SensorNoise(
+    acceleration_m_s2=0.0, yaw_rate_rad_s=0.0, steer_rad=0.0, wheel_speed_m_s=0.0, wheel_scale=0.0,
+    acceleration_bias_m_s2=0.0, yaw_rate_bias_rad_s=0.0, steer_bias_rad=0.0,
+    acceleration_walk_m_s2=0.0, yaw_rate_walk_rad_s=0.0,
+    rtk_position_m=0.0, rtk_velocity_m_s=0.0, rtk_heading_rad=0.0, rtk_yaw_rate_rad_s=0.0, rtk_tilt_rad=0.0,
+)  # fmt: skip
 WHITE_ONLY = NO_NOISE._replace(
     acceleration_m_s2=0.12, yaw_rate_rad_s=0.004, steer_rad=0.0008, wheel_speed_m_s=0.08, rtk_yaw_rate_rad_s=0.001
 )

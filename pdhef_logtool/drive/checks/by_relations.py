@@ -18,6 +18,8 @@ from pdhef_logtool.records.signals import GNSS
 #: Probability of a mistake from which on a check fails, below which it passes, and from which on it is undone at once;
 #: share of a signal's mistakes from which on one is named.
 FAILS, DOUBTED, CERTAIN, NAMED = 0.85, 0.005, 0.97, 0.05
+#: What an undecided check states of a signal that the drive contradicts and no unit or sign explains.
+UNEXPLAINED = "no unit or sign explains it: the car may slide, a sensor may fail for a while, or the field is another"
 _LACKS_WHEELBASE = "needs the wheelbase of a vehicle file, or speeds that only full-size vehicles reach"
 _LACKS_SIDESLIP = "needs sideslip that changes fast"
 #: What a drive lacks that shows the sign of a signal and not its unit.
@@ -87,8 +89,7 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
         others = " and ".join(sorted({n for h in chosen for n in h.factors} & set(relations[0].powers)))
         return [UNIT.undecided(relations[0].evidence, name, f"needs {others} that is right")]
     if not any(r.accepts(factors[r.text]) for r in usable):
-        remedy = "no unit or sign explains it: the car may slide, or a sensor may fail for a while"
-        return [UNIT.undecided(usable[0].evidence, name, remedy)]
+        return [UNIT.undecided(usable[0].evidence, name, UNEXPLAINED)]
     return _passed(name, usable)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
-from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind
+from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind, is_beyond
 from pdhef_logtool.drive.columns import derivative, fit, independent_samples, median_known
 from pdhef_logtool.drive.relations import gentle_at
 from pdhef_logtool.records.checks import Check
@@ -42,11 +42,12 @@ def _levels(drive: CheckedDrive) -> Iterator[Check]:
         is_gentle_enough = independent_samples(int(np.count_nonzero(finite & at_ease))) >= LEVEL_SAMPLES
         use = finite & at_ease if is_gentle_enough else finite
         bias = sensors.ax_bias_m_s2 if name == "ax_m_s2" else sensors.ay_bias_m_s2
-        left = float(np.mean(rest[use]))
+        left, error = float(np.mean(rest[use])), 0.0
         # Roll, and tyres near their limit, change the gain: what is left in the middle of no driving is a tilt.
         line = fit(columns[name], [np.ones_like(driven), driven], use)
-        left = left if line is None else min(left, float(line[0][0]), key=abs)
-        check = _level(name, left - bias, float(np.mean(columns[name][use])) - bias)
+        if line is not None:
+            left, error = min(left, float(line[0][0]), key=abs), float(line[1][0])
+        check = _level(name, left - bias, error, float(np.mean(columns[name][use])) - bias)
         # A drive in circles has a mean too: without the yaw rate and the speed only all of gravity is gravity.
         is_known |= name == "ax_m_s2" and speed is not None
         is_gravity = is_known or abs(float(np.mean(rest[use]))) > GRAVITY_ALONE_M_S2
@@ -69,15 +70,15 @@ def _driven(
     return driven, at_ease
 
 
-def _level(name: str, rest: float, mean: float) -> Check:
+def _level(name: str, rest: float, error: float, mean: float) -> Check:
     # A wrong sign or unit of the speed makes the rest wrong, not the mean: both must exceed the limit.
     size = min(abs(rest), abs(mean))
-    evidence = f"mean {mean:.2f} m/s^2, after removal of the driving {rest:.2f}"
+    evidence = f"mean {mean:.2f} m/s^2, after removal of the driving {rest:.2f} +- {error:.2f}"
     if size > OTHER_AXIS_M_S2:
         return Check(f"{name}.axis", name, "failed", f"{evidence}: that is gravity", "map a level axis of the sensor")
-    if size > LEVEL_M_S2:
+    if is_beyond(size, error, (0.0, LEVEL_M_S2)):
         return LEVEL.failed(evidence, name, tilt=math.degrees(math.asin(size / GRAVITY_M_S2)))
-    return LEVEL.passed(evidence, name)
+    return LEVEL.passed(evidence, name) if size <= LEVEL_M_S2 else LEVEL.undecided(evidence, name)
 
 
 LEVEL = CheckKind(
@@ -85,6 +86,7 @@ LEVEL = CheckKind(
     compares="the mean of an accelerometer with what driving explains of it",
     fails="more than 0.8 m/s² are left: a tilt of 4.7 degrees, or a bias; beyond 5 m/s² `axis` fails",
     remedy="the sensor is tilted by {tilt:.1f} deg, which belongs in the mapping, or has a bias: a fit's matter",
+    lacks="needs gentle driving: a car that slides accelerates by more than speed and yaw rate show",
     function=_levels,
 )
 CHECKS = (LEVEL,)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind
-from pdhef_logtool.drive.columns import fit, moving_at
+from pdhef_logtool.drive.columns import fit, halves, moving_at
 from pdhef_logtool.drive.relations import gentle_at
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
@@ -62,7 +62,13 @@ def _offset_check(columns: Mapping[str, FloatArray]) -> Check | None:
     if result is None:
         return OFFSET.undecided("too little gentle driving")
     offset, error = result
+    parts = [
+        sideslip_offset({n: np.where(p, c, np.nan) for n, c in columns.items()})
+        for p in halves(len(columns["ay_m_s2"]))
+    ]
+    shown = " and ".join(f"{math.degrees(p[0]):.2f}" for p in parts if p is not None)
     evidence = f"{math.degrees(offset):.2f} +- {math.degrees(error):.2f} deg are left where the car goes straight"
+    evidence += f" ({shown} in alternate parts of the drive)" if " and " in shown else ""
     return OFFSET.of_figure(offset, error, (-SIDESLIP_OFFSET_RAD, SIDESLIP_OFFSET_RAD), evidence)
 
 
@@ -77,7 +83,8 @@ OFFSET = CheckKind(
     "truth.sideslip_rad.offset",
     compares="ground-truth sideslip on straights with 0",
     fails="it is off by 0.15 degrees",
-    remedy="the heading of ground truth is turned: a tyre, a crossfall or a bias of a_y makes less of that",
+    remedy="the heading of ground truth is turned against the car (a tyre, a crossfall or a bias of a_y makes less of "
+    "that): pdhef inspect --write-mapping takes it off",
     lacks="needs straights and bends",
 )
 CHECKS = (FRAME, OFFSET)

@@ -1,0 +1,27 @@
+"""Packages that an extra of the installation brings."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from pdhef_logtool.records.errors import UsageError
+
+
+def required(module: str, extra: str, use: str, where: object) -> Any:
+    """Return a module of an extra; raises UsageError with the command that installs it.
+
+    Parameters
+    ----------
+    use : what the package does, as ``reads MDF files``.
+    where : what needs it: a log, a command or an option.
+    """
+    try:
+        return import_module(module)
+    except ImportError:
+        raise UsageError(
+            expected=f"the package {module.partition('.')[0]}, which {use}",
+            got="an installation without it",
+            where=str(where),
+            remedy=f"pip install 'pdhef-logtool[{extra}]'",
+        ) from None
