@@ -88,7 +88,7 @@ class RunConfig:
     calibrate : calibration of a car without validation data, without ground truth: per ``log``, ``online`` on what the
         log has shown so far (causal), on the ``pool`` of all logs, or ``off``.
     reference : sideslip reference (not causal, without tyre data): ``auto`` (where the log has no ground truth of
-        sideslip), ``on`` (beside ground truth as well) or ``off``.
+        sideslip), ``on`` (beside ground truth as well; in ``learn`` and ``extract`` in its place) or ``off``.
     gnss : ``auto`` (``physics``, ``pd-hef`` and the reference use GNSS velocity where the log has it) or ``off``.
     no_position : keep latitude, longitude and all other positions and headings out of the outputs; topics that may
         contain one are not copied, and no reduced logs (``cache``) are written.

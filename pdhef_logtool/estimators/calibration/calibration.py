@@ -278,8 +278,8 @@ def calibrate_online(
 def _understeer(
     problem: JointProblem, theta: FloatArray, covariance: FloatArray, vehicle_file: VehicleParameters
 ) -> Understeer:
-    def gradient(at: FloatArray) -> float:
-        vehicle = problem.vehicle(at)
+    def gradient(place: FloatArray) -> float:
+        vehicle = problem.vehicle(place)
         return vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction)
 
     centre = gradient(theta)

@@ -299,8 +299,6 @@ class DatasetDrive:
     name: str
     split: str
     path: Path
-    rows: int
-    usable_rows: int
     period_s: float
     entry: Mapping[str, Any]
     limits: Sequence[float] | None = None
@@ -343,14 +341,12 @@ class DatasetDrive:
 class Dataset:
     """A residual dataset: what its manifest states, and its drives, each read on first access.
 
-    ``features`` names the columns of :attr:`DriveArrays.features` in order; ``sha256`` identifies the content;
-    ``model`` is the filter that features come from and residuals are of (:data:`~.bundle.MODELS`).
+    ``sha256`` identifies the content; ``model`` is the filter that features come from and residuals are of
+    (:data:`~.bundle.MODELS`).
     """
 
     folder: Path
     model: str
-    features: tuple[str, ...]
-    period_s: float
     sha256: str
     drives: tuple[DatasetDrive, ...]
     manifest: Mapping[str, Any]
@@ -398,16 +394,12 @@ def read_dataset(folder: Path) -> Dataset:
         return Dataset(
             folder=folder,
             model=str(document["model"]),
-            features=tuple(document["features"]),
-            period_s=float(document["period_s"]),
             sha256=str(document["sha256"]),
             drives=tuple(
                 DatasetDrive(
                     name=d["name"],
                     split=d["split"],
                     path=folder / d["file"],
-                    rows=int(d["rows"]),
-                    usable_rows=int(d["usable_rows"]),
                     period_s=float(d["period_s"]),
                     entry=d,
                     limits=limits if d["split"] == CHOSEN_SPLIT else None,

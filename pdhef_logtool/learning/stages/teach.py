@@ -86,7 +86,7 @@ class OpenedDrive:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Teaching:
-    """What drives taught by a truth: prior, its support, residual, whether drives calibrated their car, what next."""
+    """What drives taught: prior, its support, residual, whether they calibrated their car, what taught, what next."""
 
     parameters: tuple[TaughtParameter, ...]
     ladder: LadderFit
@@ -152,18 +152,18 @@ def teach(task: Task) -> StageOutput:
 def open_drive(drive: Drive, config: RunConfig) -> tuple[DriveRecord, OpenedDrive | None]:
     """Return the record of an open drive and what teaching takes of it; None with the reason in the record."""
     missing = sorted({*lacking(drive), *(FEATURES - drive.available)})
-    at, lacks = (None, f"the log has no {', '.join(missing)}") if missing else teaching_reference(drive, config)
+    truth_at, lacks = (None, f"the log has no {', '.join(missing)}") if missing else teaching_reference(drive, config)
     if lacks:
         return record_of(drive, left_out=lacks), None
     whole = drive.whole(fill_friction=drive.friction.bank is None)
-    if at is not None:
-        whole = replace(whole, truth=at(whole.signals.stamps_ns))
+    if truth_at is not None:
+        whole = replace(whole, truth=truth_at(whole.signals.stamps_ns))
     assert whole.truth is not None
     taught = taught_driving(read_driving(drive), whole.truth)
     if not np.isfinite(taught.slopes).any():
         return record_of(drive, left_out="no driving with a true sideslip above the low-speed limit"), None
     record = record_of(drive, whole=whole)
-    return record if at is None else replace(record, truth=(ESTIMATED,)), OpenedDrive(drive, whole, taught)
+    return record if truth_at is None else replace(record, truth=(ESTIMATED,)), OpenedDrive(drive, whole, taught)
 
 
 def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = lambda _text, _share: None) -> Teaching:
