@@ -34,7 +34,7 @@ from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.learning.car.taught_prior import taught_driving
-from pdhef_logtool.learning.stages.teach import LEAST_S, OpenedDrive, Teaching, learn_from, open_drive
+from pdhef_logtool.learning.stages.teach import LEAST_S, OpenedDrive, learn_from, open_drive
 from pdhef_logtool.learning.truth import independent
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.signals import Signals
@@ -89,37 +89,29 @@ class TeachCar:
 _F1TENTH = sorted(p.log for p in PEER_DRIVES if p.car == "1:10 F1TENTH")
 CARS = (
     TeachCar("250 LM", (TeachPart("revs_250lm_a.mcap", None, "150"), TeachPart("revs_250lm_a.mcap", "150"))),
-    TeachCar(
-        "GTI",
-        (
-            TeachPart("gti_pole_aa.mcap"),
-            TeachPart("gti_low_speed.mcap"),
-            TeachPart("niki_gti_1khz.mcap", None, "50"),
-            TeachPart("stanford_wet_1.mcap", steering_gain=1.0 / 13.9),
-        ),
-    ),
+    TeachCar("GTI", (
+        TeachPart("gti_pole_aa.mcap"), TeachPart("gti_low_speed.mcap"), TeachPart("niki_gti_1khz.mcap", None, "50"),
+        TeachPart("stanford_wet_1.mcap", steering_gain=1.0 / 13.9),
+    )),
     TeachCar("V40", (TeachPart("v40_slalom.mcap"), TeachPart("v40_swd_gnss.mcap"))),
     TeachCar("TT-S", (TeachPart("tts_kk.mcap", None, "62"), TeachPart("tts_kk.mcap", "62"))),
     TeachCar("Polaris", (TeachPart("polaris_a.mcap"), TeachPart("polaris_b.mcap"))),
     TeachCar("1:10 DART", (TeachPart("dart_circles_fast.mcap"), TeachPart("dart_steer_rate.mcap"))),
     TeachCar("1:10 F1TENTH", tuple(map(TeachPart, _F1TENTH)), taught_on=5),
-)
+)  # fmt: skip
 SIMULATED = "simulated"
 #: Manoeuvre, km/h, seconds of the drives of a simulated car; seeds of the cars, and cars of each seed. The settings
 #: were chosen on the first seed.
 SIMULATED_DRIVES = (
-    ("road", 90.0, 120.0),
-    ("sine-sweep", 90.0, 30.0),
-    ("dlc", 80.0, 26.0),
-    ("fishhook", 70.0, 24.0),
+    ("road", 90.0, 120.0), ("sine-sweep", 90.0, 30.0), ("dlc", 80.0, 26.0), ("fishhook", 70.0, 24.0),
     ("sine-with-dwell", 80.0, 24.0),
-)
+)  # fmt: skip
 SEEDS, CARS_PER_SEED, LEAST_SPEED_M_S = (29, 31), 4, 3.0
 
 PAGE = """# Teaching on recorded drives
 
 This page shows what a car that was taught on one drive with ground truth is worth on another drive of the same car.
-{command}
+Command: `python -m studies.teaching`.
 
 Sideslip RMSE in degrees; in brackets without the constant of each drive, which may be an offset of the ground truth.
 Each drive calibrates its car on its own sensors, not causal. *untaught* and *taught*: `physics` without and with the
@@ -144,8 +136,8 @@ worse by more than max(5 %, 0.03°)).
 With `--set reference=on`, `learn` takes the [sideslip reference](reference.md) of drives without ground truth, weighted
 by its standard deviation, where GNSS makes it independent of the other sensors. Pairs with at least {least_s:.0f} s of
 that: geometric mean of the ratio to untaught, its largest value, and pairs worse by more than max(5 %, 0.03°). GNSS of
-the V40 is recorded, that of all others is made from ground truth (Doppler 10 Hz). The default is off: no recorded
-receiver has proven it.
+the V40 is recorded, that of all others is made from ground truth (Doppler 10 Hz). The default is off: it is
+not validated with a recorded receiver.
 
 {reference}
 """
@@ -179,12 +171,8 @@ class PairResult:
     @property
     def worse(self) -> bool:
         """Whether teaching costs more than it may."""
-        return self.is_worse(self.hybrid)
-
-    def is_worse(self, taught: Score) -> bool:
-        """Whether this teaching costs more than it may."""
         limit = max((1.0 + WORSE_SHARE) * self.untaught.rmse_deg, self.untaught.rmse_deg + WORSE_DEG)
-        return taught.rmse_deg > limit
+        return self.hybrid.rmse_deg > limit
 
     @property
     def ratio(self) -> float:
@@ -192,9 +180,9 @@ class PairResult:
         return self.hybrid.rmse_deg / self.untaught.rmse_deg
 
     @property
-    def reference_ratio(self) -> float:
-        """The same of a car that the reference taught, NaN if none was."""
-        return math.nan if self.reference is None else self.reference.rmse_deg / self.untaught.rmse_deg
+    def referred(self) -> PairResult | None:
+        """The same if the reference teaches, None if it cannot."""
+        return None if self.reference is None else replace(self, hybrid=self.reference)
 
 
 def peer_of(part: TeachPart) -> PeerDrive:
@@ -239,7 +227,7 @@ def received(part: TeachPart, car: Car) -> Signals | None:
 
 
 def score(
-    drive: OpenedDrive, car: Car, name: str, taught: Taught | None, least_speed_m_s: float, most_stamps: int
+    drive: OpenedDrive, car: Car, name: str, taught: Taught | None, least_speed_m_s: float, most_stamps: int = 0
 ) -> Score:
     """Calibrate a car on a drive and score an estimator, with its intervals up to ``most_stamps``."""
     prior = () if taught is None else taught.parameters
@@ -256,66 +244,41 @@ def score(
     error = signal_error(track, drive.truth, "sideslip_rad", least_speed_m_s)
     kept = np.isfinite(error)
     degrees = np.degrees(error[kept])
-    return Score(
-        float(np.sqrt(np.mean(degrees**2))),
-        float(np.std(degrees)),
-        float(np.mean(track.network_trust[kept] > 0.0)),
-        float(np.mean(np.abs(error[kept]) <= NORMAL_95 * track.sideslip_std_rad[kept])) if wanted else None,
-    )
-
-
-def taught_of(teaching: Teaching, car: Car) -> Taught:
-    """Return the part of a car that drives taught."""
-    return Taught(
-        physics_sha256=car.physics_sha256,
-        parameters=teaching.parameters,
-        residual=teaching.ladder.model,
-        calibrated=teaching.calibrated,
-        evidence=teaching.evidence,
-    )
+    covered = float(np.mean(np.abs(error[kept]) <= NORMAL_95 * track.sideslip_std_rad[kept])) if wanted else None
+    active = float(np.mean(track.network_trust[kept] > 0.0))
+    return Score(float(np.sqrt(np.mean(degrees**2))), float(np.std(degrees)), active, covered)
 
 
 def pairs_of(car: TeachCar) -> Iterator[PairResult]:
     """Yield the results of a car's pairs."""
-    vehicle = vehicle_of(peer_of(car.parts[0]))
-    of_file = Car.of(vehicle)
+    of_file = Car.of(vehicle_of(peer_of(car.parts[0])))
     drives = [opened(part, of_file) for part in car.parts]
-    numbers = range(len(drives))
+    choices = [((a,), b) for a, b in permutations(range(len(drives)), 2)]
     if car.taught_on > 1:
-        choices = [(tuple(numbers[: car.taught_on]), k) for k in numbers[car.taught_on :]]
-    else:
-        choices = [((a,), b) for a, b in permutations(numbers, 2)]
+        choices = [(tuple(range(car.taught_on)), k) for k in range(car.taught_on, len(drives))]
     names, least = [part.name for part in car.parts], peer_of(car.parts[0]).least_speed_m_s
     references = [by_reference(d, received(part, of_file)) for d, part in zip(drives, car.parts, strict=True)]
     yield from taught_pairs(car.name, of_file, names, (drives, references, drives), choices, least, MOST_STAMPS)
 
 
 def taught_pairs(
-    car_name: str,
-    car: Car,
-    names: Sequence[str],
-    drives: tuple[Sequence[OpenedDrive], Sequence[OpenedDrive], Sequence[OpenedDrive]],
-    choices: Sequence[tuple[tuple[int, ...], int]],
-    least: float,
-    most_stamps: int = 0,
-) -> Iterator[PairResult]:
+    car_name: str, car: Car, names: Sequence[str], drives: tuple[Sequence[OpenedDrive], ...],
+    choices: Sequence[tuple[tuple[int, ...], int]], least: float, most_stamps: int = 0,
+) -> Iterator[PairResult]:  # fmt: skip
     """Yield the results of pairs; ``drives`` : with ground truth and reference that teach, and with what scores."""
     *teaching, scored = drives
     untaught = [score(d, car, "physics", None, least, most_stamps) for d in scored]
     paper = replace(car, network=open_model(None))
-    kinematic = [score(d, car, "kinematic", None, least, 0).rmse_deg for d in scored]
-    of_paper = [score(d, paper, PAPER, None, least, 0).rmse_deg for d in scored]
-    learned: dict[tuple[int, ...], list[Taught | None]] = {}
+    kinematic = [score(d, car, "kinematic", None, least).rmse_deg for d in scored]
+    of_paper = [score(d, paper, PAPER, None, least).rmse_deg for d in scored]
+    learned: dict[tuple[int, ...], tuple[Taught, Taught | None]] = {}
     for teachers, k in choices:
         if teachers not in learned:
-            by_truth = [[of_truth[i] for i in teachers] for of_truth in teaching]
-            enough = [sum(d.seconds for d in of_truth) >= LEAST_S for of_truth in by_truth]
-            learned[teachers] = [
-                taught_of(learn_from(d), car) if e else None for d, e in zip(by_truth, enough, strict=True)
-            ]
-        taught, by_reference = learned[teachers]
-        assert taught is not None
-        reference = None if by_reference is None else score(scored[k], car, "pd-hef", by_reference, least, 0)
+            by_truth, referred = ([d[i] for i in teachers] for d in teaching)
+            enough = sum(d.seconds for d in referred) >= LEAST_S
+            learned[teachers] = learn_from(by_truth).part(car), learn_from(referred).part(car) if enough else None
+        taught, of_reference = learned[teachers]
+        reference = None if of_reference is None else score(scored[k], car, "pd-hef", of_reference, least)
         prior, hybrid = (score(scored[k], car, n, taught, least, most_stamps) for n in ("physics", "pd-hef"))
         taught_on = ", ".join(names[i] for i in teachers) if len(teachers) == 1 else f"{len(teachers)} runs"
         rung = "none" if taught.residual is None else taught.residual.rung
@@ -349,25 +312,18 @@ def simulated_table(results: Sequence[PairResult]) -> str:
     """Return a table of the simulated pairs by seed and the manoeuvre that teaches."""
     names = [name for name, _, _ in SIMULATED_DRIVES]
 
-    def of_paper(seed: int, scored: str) -> str:
-        of = [r for r in results if r.car.startswith(f"{SIMULATED} {seed}-") and r.scored == scored]
-        ratios = [r.paper_deg / r.untaught.rmse_deg for r in of]
-        return f"{geometric_mean(ratios)} ({max(ratios):.2f})" if ratios else "–"
+    def cell(ratios: Sequence[float], more: str = "") -> str:
+        return f"{geometric_mean(ratios)} ({max(ratios):.2f}{more})" if ratios else "–"
 
     body = []
-    for seed, taught in ((s, t) for s in SEEDS for t in names):
-        cells = []
-        for scored in names:
-            pairs = [
-                r for r in results
-                if r.car.startswith(f"{SIMULATED} {seed}-") and (r.taught, r.scored) == (taught, scored)
-            ]  # fmt: skip
-            ratios = [r.ratio for r in pairs]
-            worse = sum(r.worse for r in pairs)
-            cells.append(f"{geometric_mean(ratios)} ({max(ratios):.2f}; {worse})" if ratios else "–")
-        body.append([str(seed), taught, *cells])
-        if taught == names[-1]:
-            body.append([str(seed), "(paper's network)", *(of_paper(seed, scored) for scored in names)])
+    for seed in SEEDS:
+        of = {s: [r for r in results if r.car.startswith(f"{SIMULATED} {seed}-") and r.scored == s] for s in names}
+        for taught in names:
+            pairs = [[r for r in of[s] if r.taught == taught] for s in names]
+            cells = [cell([r.ratio for r in p], f"; {sum(r.worse for r in p)}") for p in pairs]
+            body.append([str(seed), taught, *cells])
+        of_paper = [cell([r.paper_deg / r.untaught.rmse_deg for r in of[s]]) for s in names]
+        body.append([str(seed), "(paper's network)", *of_paper])
     return table(["seed", "taught on", *names], body, right_from=2)
 
 
@@ -377,16 +333,12 @@ def pair_table(results: Sequence[PairResult]) -> str:
     def cell(s: Score) -> str:
         return f"{s.rmse_deg:.3f} ({s.without_constant_deg:.3f})"
 
-    body = [
-        [
+    body = [[
             r.car, r.taught, r.scored, cell(r.untaught), cell(r.prior), cell(r.hybrid),
-            number(r.ratio, 2) + (" worse" if r.worse else ""), number(r.reference_ratio, 2), number(r.paper_deg, 3),
-            r.rung,
-            f"{r.hybrid.active:.0%}",
+            number(r.ratio, 2) + (" worse" if r.worse else ""), geometric_mean([p.ratio] if (p := r.referred) else []),
+            number(r.paper_deg, 3), r.rung, f"{r.hybrid.active:.0%}",
             " / ".join("–" if s.covered is None else f"{s.covered:.0%}" for s in (r.untaught, r.hybrid)),
-        ]
-        for r in results
-    ]  # fmt: skip
+        ] for r in results]  # fmt: skip
     head = "car, taught on, scored on, untaught, taught, pd-hef, ratio, reference, paper, residual, active, 95 %"
     return table(head.split(", "), body, right_from=3)
 
@@ -421,12 +373,12 @@ def reference_table(results: Sequence[PairResult]) -> str:
     body = []
     for name in ("recorded", *(f"{SIMULATED} {seed}" for seed in SEEDS)):
         of = [r for r in results if r.car.startswith(name) or (name == "recorded" and not r.car.startswith(SIMULATED))]
-        pairs = [(r, r.reference) for r in of if r.reference is not None]
-        means = [geometric_mean([r.ratio for r, _ in pairs]), geometric_mean([r.reference_ratio for r, _ in pairs])]
-        largest = number(max((r.reference_ratio for r, _ in pairs), default=math.nan), 2)
-        body.append([name, f"{len(pairs)} of {len(of)}", *means, largest, str(sum(r.is_worse(s) for r, s in pairs))])
-    head = ["drives", "pairs", "by ground truth", "by the reference", "largest", "worse"]
-    return table(head, body, right_from=1)
+        pairs = [(r, p) for r in of if (p := r.referred) is not None]
+        means = (geometric_mean(list(ratios)) for ratios in zip(*((r.ratio, p.ratio) for r, p in pairs), strict=True))
+        largest = number(max((p.ratio for _, p in pairs), default=math.nan), 2)
+        worse = str(sum(p.worse for _, p in pairs))
+        body.append([name, f"{len(pairs)} of {len(of)}", *(means if pairs else "––"), largest, worse])
+    return table(["drives", "pairs", "by ground truth", "by the reference", "largest", "worse"], body, right_from=1)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -468,11 +420,10 @@ def stored_results(file: Path) -> list[PairResult]:
 
 def write_page(folder: Path, results: Sequence[PairResult]) -> None:
     """Write the page of results."""
-    command = "Command: `python -m studies.teaching`."
     recorded = [r for r in results if not r.car.startswith(SIMULATED)]
-    parts = {"pairs": pair_table(recorded), "summary": summary(recorded), "simulated": simulated_table(results)}
-    parts |= {"reference": reference_table(results)}
-    write(folder / "teaching.md", PAGE.format(command=command, seed=SEEDS[0], least_s=LEAST_S, **parts))
+    parts = {"pairs": pair_table(recorded), "summary": summary(recorded), "reference": reference_table(results)}
+    page = PAGE.format(seed=SEEDS[0], least_s=LEAST_S, simulated=simulated_table(results), **parts)
+    write(folder / "teaching.md", page)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,8 @@ commands = typer.Typer()
     "pdhef learn logs/ --car mycar -o mycar --stages intervals",
     panel=panels.LEARN,
     notes="""The default stage, teach, uses all driving with ground truth, from 20 s on: it learns the prior for the
-calibration of every later drive, and the residual that physics then lacks (taught.json in the car's folder).
+calibration of every later drive, and the residual that physics then lacks (taught.json in the car's folder). With
+--set reference=on the sideslip reference takes the place of ground truth where a log has none.
 
 Other stages, in the order in which they run: calibrate (the car by the sensors of several logs, as
 --without-truth), noise (filter noise by search), gain (residual gain of the network), network (training of the
@@ -105,7 +106,8 @@ def learn(
     panel=panels.LEARN,
     notes="Drives are split 70/15/15 by a hash of their content and --seed, unless the manifest of a simulated set or "
     "--split defines the split. Duplicates (drives with identical signals) are used once. Columns of --where: the "
-    "features, truth_vx_m_s, truth_vy_m_s; _deg and _km_h instead of _rad and _m_s (docs/retrain.md).",
+    "features, truth_vx_m_s, truth_vy_m_s; _deg and _km_h instead of _rad and _m_s (docs/retrain.md). With --set "
+    "reference=on the sideslip reference takes the place of ground truth where a log has none.",
     shared="cache sensors friction",
     car="Nominal car (default: from the manifest of a simulated set)",
 )

@@ -36,8 +36,8 @@ def teaching_reference(drive: Drive, config: RunConfig) -> tuple[TruthAt | None,
     reference = reference_of(drive, calibrate_drive(drive, config), config)
     if reference is None or reference.estimator is None:
         return None, f"{lacks}, and no sideslip reference: {'' if reference is None else reference.document['refused']}"
-    at = reference.estimator.at
-    return lambda stamps_ns: independent(at(stamps_ns)), ""
+    reference_at = reference.estimator.at
+    return lambda stamps_ns: independent(reference_at(stamps_ns)), ""
 
 
 def independent(reference: StateTrack) -> StateTrack:

@@ -88,7 +88,7 @@ class RunConfig:
     calibrate : calibration of a car without validation data, without ground truth: per ``log``, ``online`` on what the
         log has shown so far (causal), on the ``pool`` of all logs, or ``off``.
     reference : sideslip reference (not causal, without tyre data): ``auto`` (where the log has no ground truth of
-        sideslip), ``on`` (beside ground truth as well) or ``off``.
+        sideslip), ``on`` (beside ground truth as well; in ``learn`` and ``extract`` in its place) or ``off``.
     gnss : ``auto`` (``physics``, ``pd-hef`` and the reference use GNSS velocity where the log has it) or ``off``.
     no_position : keep latitude, longitude and all other positions and headings out of the outputs; topics that may
         contain one are not copied, and no reduced logs (``cache``) are written.
@@ -262,9 +262,6 @@ def _toml_value(text: str) -> Any:
 
 def _read_file(path: Path) -> dict[str, Any]:
     raw = read_toml(path, "a configuration TOML file", UsageError)
-    if "thresholds" in raw:
-        remedy = "convert the file: pdhef plan init --from FILE -o plan.toml"
-        raise UsageError(expected="plan in place of thresholds", got="thresholds", where=str(path), remedy=remedy)
     if isinstance(raw.get("cache"), str) and "://" not in raw["cache"]:
         raw["cache"] = str(path.parent / raw["cache"])
     for key in _FILES:

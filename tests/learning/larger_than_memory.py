@@ -62,7 +62,7 @@ def write_set(folder: Path, drives: int, steps: int = STEPS) -> Path:
         writer.append(rows)
         writer.finish(entry)
         entries.append(entry)
-    vehicle = vehicle_entry("f" * 64, Car.load(None).datasheet, identified=False)
+    vehicle = vehicle_entry("f" * 64, Car.load(None).datasheet)
     write_manifest(folder, entries, [], settings={"model": "physics"}, seed=0, vehicles={"f" * 64: vehicle})
     return folder
 
@@ -79,7 +79,7 @@ def cost(folder: Path, work: Path, recipe: Recipe) -> tuple[float, str]:
     began = time.process_time()
     with patch("pdhef_logtool.learning.network.train_command._plot_history", lambda _: b""):  # it is not of a row
         found = train_on(data, work, recipe)
-    return (time.process_time() - began) / sum(d.rows for d in data.drives), found.bundle.sha256
+    return (time.process_time() - began) / sum(d.entry["rows"] for d in data.drives), found.bundle.sha256
 
 
 def main() -> None:

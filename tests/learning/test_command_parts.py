@@ -417,7 +417,7 @@ def test_trust_tells_its_progress_warns_and_keeps_its_evidence(
     assert [d.name for d in car.trust.drives] == ["a", "b"]
     document = result.figures
     assert (document["scored_s"], document["excited_s"], document["blocks"]) == (400.247, 100.247, 40)
-    assert document["trust_1_against_best_lower"]["value_deg2"] == pytest.approx(0.01 - 0.04)
+    assert document["against_trust_0"][4]["value_deg2"] == pytest.approx(0.01 - 0.25)
     record_json = json.loads((tmp_path / "car/network.record.json").read_text())
     assert record_json["drives"][0]["rmse_deg"] == pytest.approx([0.5, 0.4, 0.3, 0.2, 0.1])
     assert (record_json["format"], record_json["version"]) == ("pdhef-trust", 2)
@@ -437,8 +437,6 @@ def test_the_evidence_is_one_sentence_with_its_figures() -> None:
         reason="an improvement on the mean; 3 blocks are too few",
         rmse_deg=(0.5, 0.41, 0.3, 0.45, 0.7),
         against_zero=(Bound(0.0, 0.0, 0.0),) * 4 + (Bound(0.24, -0.1, 0.5),),
-        best_lower=0.5,
-        against_best=Bound(0.4, 0.1, 0.7),
         blocks=3,
         scored_s=61.6,
         excited_s=20.4,

@@ -239,6 +239,7 @@ def test_rows_are_whole_and_in_order(dataset: ExtractResult) -> None:
         "truth_vx_m_s",
         "truth_vy_m_s",
         "truth_std_rad",
+        "truth_source",
         "region",
         "weight",
         "segment",
@@ -296,7 +297,7 @@ def test_a_plain_ridge_is_trained_from_the_file_alone(sample_logs_dir: Path, tmp
     extract([str(sample_logs_dir / "road.mcap")], tmp_path / "set", ExtractSettings(config))
     (file,) = (tmp_path / "set").rglob("part-*.parquet")
     rows = pl.read_parquet(file, hive_partitioning=False).filter(pl.col("weight") > 0)[::5]
-    column = {name: rows[name].cast(pl.Float64).to_numpy() for name in rows.columns if name != "chosen"}
+    column = {name: rows[name].cast(pl.Float64).to_numpy() for name in rows.columns if rows[name].dtype.is_numeric()}
     physics = np.arctan2(column["physics_vy_m_s"], column["vx_m_s"])
     residual = np.arctan2(column["truth_vy_m_s"], column["truth_vx_m_s"]) - physics
     signals = np.stack([column["steer_rad"], column["yaw_rate_rad_s"], column["ay_m_s2"], physics], axis=1)

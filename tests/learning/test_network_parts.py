@@ -144,7 +144,7 @@ def write_dataset(folder: Path, **drives: tuple[str, ResidualRows]) -> None:
         [],
         settings=SETTINGS,
         seed=3,
-        vehicles={"f" * 64: vehicle_entry("f" * 64, CAR, identified=True)},
+        vehicles={"f" * 64: vehicle_entry("f" * 64, CAR)},
     )
 
 
@@ -174,7 +174,6 @@ def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
     assert document["cells"]["usable_s"]["train"][3] == pytest.approx(0.3) and document["choice"] is None
     data = read_dataset(tmp_path)
     assert data.vehicle_name == "test car" and data.vehicle(data.drives[0]) == CAR
-    assert data.identified_share == 1.0
     found = data.drives[2].load()
     kept = np.delete(np.arange(120), 5)
     np.testing.assert_array_equal(found.stamps_ns, rows.stamps_ns[kept])
@@ -269,8 +268,10 @@ def test_a_plan_needs_three_true_states_and_the_filters_signals() -> None:
     job: Any = SimpleNamespace(log_input=LogInput(Path("a.mcap"), "a"))
     extract_command._check_plan(plan, job)
     for changes in ({"truth": None}, {"derivation": {"vx_m_s": "x", "ay_m_s2": "x"}}):
+        without = SimpleNamespace(**{**plan.__dict__, **changes})
         with pytest.raises(EstimatorError, match="ground truth from which"):
-            extract_command._check_plan(SimpleNamespace(**{**plan.__dict__, **changes}), job)
+            extract_command._check_plan(without, job)
+        extract_command._check_plan(without, job, estimated=True)
     plan.alignment.available = available - {"ay_m_s2"}
     with pytest.raises(EstimatorError, match="no ay_m_s2"):
         extract_command._check_plan(plan, job)
@@ -662,7 +663,6 @@ def arrays(count: int = 200, **changes: Any) -> DriveArrays:
 def dataset(**drives: tuple[str, DriveArrays]) -> Any:
     held = tuple(SimpleNamespace(name=n, split=s, load=lambda a=a: a) for n, (s, a) in drives.items())
     about: dict[str, Any] = {"model": "physics", "physics_sha256": "e" * 64, "vehicle_name": "a car"}
-    about["identified_share"] = 0.5
     return SimpleNamespace(drives=held, sha256="d" * 64, vehicle=lambda _drive: CAR, **about)
 
 
@@ -749,7 +749,7 @@ def test_a_training_tells_epochs_and_writes_history_plot_and_where_it_is_from(
     assert found.test_loss == 0.5 and saved == [tmp_path]
     assert found.bundle.provenance == {
         "epochs": 2, "dataset_sha256": "d" * 64, "vehicle": "a car",
-        "identified_share": 0.5, "fine_tuned_from": BUNDLE.sha256,
+        "fine_tuned_from": BUNDLE.sha256,
         "fine_tuned_on": "a car", "test_loss": 0.5,
     }  # fmt: skip
     assert not (tmp_path / CHECKPOINT).exists()

@@ -211,7 +211,8 @@ def self_calibrate(
     theta = problem.solve()
     refused = _refusal(problem, theta, drives)
     if taught and not refused:
-        theta = problem.solve(problem.teach(taught, theta))
+        problem.teach(taught)
+        theta = problem.solve()
         refused = _refusal(problem, theta, drives)
     covariance = problem.covariance(theta)
     progress(1.0)
@@ -232,7 +233,7 @@ def self_calibrate(
         _understeer(problem, theta, covariance, vehicle_file),
         refused,
         problem.rms(theta),
-        problem.rms_of_file(),
+        problem.rms(None),
         seconds,
         len(drives),
         tuple(problem.vehicle(to, digits=6) for to in varied),
@@ -277,8 +278,8 @@ def calibrate_online(
 def _understeer(
     problem: JointProblem, theta: FloatArray, covariance: FloatArray, vehicle_file: VehicleParameters
 ) -> Understeer:
-    def gradient(at: FloatArray) -> float:
-        vehicle = problem.vehicle(at)
+    def gradient(place: FloatArray) -> float:
+        vehicle = problem.vehicle(place)
         return vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction)
 
     centre = gradient(theta)

@@ -13,7 +13,8 @@ are observable as a product only: friction stays at the file's value, the peak f
 
 The covariance of θ has three parts: the curvature of the cost, the spread of the cost's gradient between blocks of the
 drives (sandwich estimator, White 1982), which includes model error that changes within a drive, and the model error
-that all of a drive has in common, estimated on simulated cars (:data:`SHARED_SHARES`).
+that all of a drive has in common, estimated on simulated cars (:data:`SHARED_SHARES`). That of a pool is for the
+parameters of one of its drives: what these differ in is added (random effects by moments, DerSimonian and Laird 1986).
 """
 
 from __future__ import annotations
@@ -56,6 +57,9 @@ KEPT_STEPS = 4
 #: Length of the blocks whose gradients are compared: longer than a bend, so that blocks are nearly independent.
 BLOCK_S = 3.0
 ITERATIONS, DERIVATIVE_STEP, MAX_STEP, LEAST_GAIN = 40, 0.02, 1.0, 1e-3
+#: Standard deviation of the logarithm of the peak force: the road may be wet or icy, whatever friction a file states.
+#: The peak force is at least this share of what the a_y of this quantile needs: a bank and the body's roll are in it.
+PEAK_STD, REACHED_SHARE, REACHED_QUANTILE = 0.5, 0.8, 0.98
 #: Parts of ``physics`` on a calibrated car; on simulated cars with wrong files the lowest sideslip error.
 PARTS = ("lag", "roll", "bank")
 #: Cornering stiffness over axle load of any car, 1/rad, front and rear, and the standard deviations of the logarithm
@@ -71,10 +75,9 @@ FRONT_STIFFNESS, REAR_STIFFNESS = "front cornering stiffness", "rear cornering s
 PEAK, INERTIA, RELAXATION = "peak force over the file's", "yaw inertia", "relaxation length"
 STEER_OFFSET, STEER_RATIO, STEER_DELAY = "steering offset", "steering ratio", "steering delay"
 AY_GAIN, AY_BIAS, IMU_X, RATE_BIAS = "roll gain", "a_y bias", "lever of a_y", "yaw rate bias"
-#: Model error that all of a drive has in common, as a share of each prior's standard deviation: with it 95 % of the
-#: differences between drives of one simulated car are within 1.96 standard deviations. Crossfall moves the roll gain,
-#: the lag of tyres and body the delay (studies/plus_minus.py, seed 555).
-SHARED_SHARE, SHARED_SHARES = 0.2, {AY_GAIN: 0.6, STEER_DELAY: 0.4}
+#: Model error that all of a drive has in common, as a share of each prior's standard deviation: with it at least 95 %
+#: of the parameters of simulated cars are within 1.96 standard deviations. The lag of tyres and body moves the delay.
+SHARED_SHARE, SHARED_SHARES = 0.2, {STEER_DELAY: 0.4}
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,10 +96,6 @@ class Parameter:
         """Return the parameter at a normalised distance from the prior mean, within its range."""
         free = self.mean * math.exp(self.std * theta) if self.log else self.mean + self.std * theta
         return min(max(free, self.low), self.high)
-
-    def theta(self, value: float) -> float:
-        """Return the normalised distance of a value from the prior mean."""
-        return (math.log(value / self.mean) if self.log else value - self.mean) / self.std
 
 
 def _factor(name: str, unit: str, mean: float, std: float, most: float) -> Parameter:
@@ -130,7 +129,7 @@ def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
     return (
         _stiffness(vehicle_file, FRONT_STIFFNESS, front=True),
         _stiffness(vehicle_file, REAR_STIFFNESS, front=False),
-        _factor(PEAK, "1", 1.0, 0.2, 2.0),
+        _factor(PEAK, "1", 1.0, PEAK_STD, 6.0),
         _factor(INERTIA, "kg m^2", vehicle_file.yaw_inertia_kg_m2, 0.2, 2.0),
         _factor(RELAXATION, "m", vehicle_file.relaxation_length_m or 0.5, 0.4, 4.0),
         _around(STEER_OFFSET, "rad", vehicle_file.steer_offset_rad, 0.01, 0.05),
@@ -155,8 +154,9 @@ def with_taught(
     def moved(p: Parameter, t: TaughtParameter) -> Parameter:
         levels = sorted((t.ay_m_s2, level_m_s2))
         share = float(np.interp(levels[0] / levels[1], LIKE, (0.0, 1.0))) if levels[0] > 0.0 else 1.0
+        distance = (math.log(t.value / p.mean) if p.log else t.value - p.mean) / p.std
         variance = p.std**2 - share**2 * max(p.std**2 - t.std**2, 0.0)
-        return replace(p, mean=p.value(share * p.theta(t.value)), std=math.sqrt(variance))
+        return replace(p, mean=p.value(share * distance), std=math.sqrt(variance))
 
     return tuple(moved(p, by_name[p.name]) if p.name in by_name else p for p in parameters)
 
@@ -167,11 +167,23 @@ def level_of(drives: Sequence[Driving]) -> float:
     return math.sqrt(float(np.nansum(ay2**2)) / max(float(np.nansum(ay2)), 1e-9))
 
 
+def peak_reached(drives: Sequence[Driving], vehicle_file: VehicleParameters) -> float:
+    """Return the share of the file's peak force that the a_y of the driving needs."""
+    ay = np.concatenate([d.columns[AY, counted(d)] for d in drives])
+    most = sum(vehicle_file.magic_formula(front, vehicle_file.assumed_friction)[2] for front in (True, False))
+    reached = np.nanquantile(np.abs(ay), REACHED_QUANTILE) if np.isfinite(ay).any() else 0.0
+    return float(reached) * vehicle_file.mass_kg / most
+
+
 class JointProblem:
     """The fit of one car to the driving of its logs, which were read with ``vehicle_file``."""
 
     def __init__(self, drives: Sequence[Driving], vehicle_file: VehicleParameters) -> None:
-        self.parameters = parameters_of(vehicle_file)
+        reached = REACHED_SHARE * peak_reached(drives, vehicle_file)
+        self.parameters = tuple(
+            replace(p, low=min(max(p.low, reached), p.mean)) if p.name == PEAK else p
+            for p in parameters_of(vehicle_file)
+        )
         self._drives, self._file = drives, vehicle_file
         self._filter = low_pass(CUTOFF_HZ, STEP_S)
         self._kept = [np.flatnonzero(counted(d))[::KEPT_STEPS] for d in drives]
@@ -180,54 +192,54 @@ class JointProblem:
             slow_parts(columns, d.stretches, low_pass(BANK_HZ, STEP_S))
         self._out = [np.full((3, d.columns.shape[1]), np.nan) for d in drives]
         self._differences = [np.full((2, d.columns.shape[1]), np.nan) for d in drives]
-        blocks, first = [], 0
-        for kept in self._kept:
-            block = (kept * STEP_S // BLOCK_S).astype(np.int64) + first
-            first = int(block[-1]) + 1 if block.size else first
-            blocks.append(block)
-        self._block = np.unique(np.concatenate(blocks), return_inverse=True)[1]
+        blocks = [np.unique(kept * STEP_S // BLOCK_S, return_inverse=True)[1] for kept in self._kept]
+        self._first_block = np.cumsum([0, *(int(b.max()) + 1 for b in blocks)])
+        self._block = np.concatenate([b + first for b, first in zip(blocks, self._first_block[:-1], strict=True)])
         self._weight = math.sqrt(KEPT_STEPS * STEP_S / CORRELATION_S)
         self._least_std = self._error_std = np.array(ERROR_STD)
 
-    def teach(self, taught: Sequence[TaughtParameter], theta: FloatArray) -> FloatArray:
-        """Take the prior that drives with ground truth gave; return the parameters at θ as distances from it."""
-        values = self.values(theta)
+    def teach(self, taught: Sequence[TaughtParameter]) -> None:
+        """Take the prior that drives with ground truth gave."""
         self.parameters = with_taught(self.parameters, taught, level_of(self._drives))
-        return np.array([p.theta(values[p.name]) for p in self.parameters])
 
-    def solve(self, theta: FloatArray | None = None) -> FloatArray:
-        """Return the parameters of the lowest cost, from ``theta`` on, with the standard deviation of their errors."""
-        theta = np.zeros(len(self.parameters)) if theta is None else theta
+    def solve(self) -> FloatArray:
+        """Return the parameters of the lowest cost, with the standard deviation of their errors.
+
+        From a dry road, a descent does not find the minimum of one on which the tyres saturate: there are two starts.
+        Both are of the prior, for from the fit without a taught one, the taught fit often remains in its minimum.
+        """
+        self._error_std = self._least_std
+        slippery = [math.log(p.low / p.mean) / p.std if p.name == PEAK else 0.0 for p in self.parameters]
+        descents = [self._descend(start) for start in (np.zeros(len(slippery)), np.array(slippery))]
+        theta = min(descents, key=lambda found: self._cost(self.errors_of(found), found))
         for _ in range(SCALES):
             error_std = np.maximum(self._least_std, self._rms(self.errors_of(theta)))
             self._error_std = error_std
-            descent, _ = descend(
-                self.errors_of,
-                self._cost,
-                self._residuals,
-                theta,
-                iterations=ITERATIONS,
-                least_gain=lambda _: LEAST_GAIN,
-                derivative_step=DERIVATIVE_STEP,
-                max_step=MAX_STEP,
-            )
-            theta = descent.theta
+            theta = self._descend(theta)
             if np.allclose(np.maximum(self._least_std, self._rms(self.errors_of(theta))), error_std, rtol=SAME_SCALE):
                 break
         return theta
+
+    def _descend(self, theta: FloatArray) -> FloatArray:
+        descent, _ = descend(
+            self.errors_of,
+            self._cost,
+            self._residuals,
+            theta,
+            iterations=ITERATIONS,
+            least_gain=lambda _: LEAST_GAIN,
+            derivative_step=DERIVATIVE_STEP,
+            max_step=MAX_STEP,
+        )
+        return descent.theta
 
     def errors_of(self, theta: FloatArray) -> FloatArray:
         """Return errors over ``ERROR_STD`` [2, K]."""
         return self._errors(self._track(theta))
 
-    def rms(self, theta: FloatArray) -> tuple[float, float]:
-        """Return the RMS error of yaw rate and a_y."""
-        rms = self._rms(self.errors_of(theta))
-        return float(rms[OF_RATE]), float(rms[OF_AY])
-
-    def rms_of_file(self) -> tuple[float, float]:
-        """Return the RMS error of yaw rate and a_y of the vehicle file."""
-        rms = self._rms(self._errors(track_of(self._file, self._file)))
+    def rms(self, theta: FloatArray | None) -> tuple[float, float]:
+        """Return the RMS error of yaw rate and a_y; without θ that of the vehicle file."""
+        rms = self._rms(self._errors(track_of(self._file, self._file)) if theta is None else self.errors_of(theta))
         return float(rms[OF_RATE]), float(rms[OF_AY])
 
     def sideslip(self, theta: FloatArray) -> FloatArray:
@@ -284,17 +296,26 @@ class JointProblem:
             moved[i] += DERIVATIVE_STEP
             jacobian[:, i] = (self._residuals(self.errors_of(moved), centre) - residuals) / DERIVATIVE_STEP
         inverse = np.asarray(np.linalg.inv(jacobian.T @ jacobian + np.eye(theta.size)), dtype=np.float64)
-        gradients = np.zeros((int(self._block.max()) + 1, theta.size))
+        gradients = np.zeros((int(self._first_block[-1]), theta.size))
         np.add.at(gradients, np.tile(self._block, len(centre)), jacobian * residuals[:, None])
         return inverse, gradients
 
     def covariance(self, theta: FloatArray) -> FloatArray:
         """Return the covariance of the parameters at the lowest cost."""
         inverse, gradients = self._curvature(theta)
-        blocks = len(gradients)
-        spread = gradients.T @ gradients * (blocks / max(blocks - 1, 1))
+        of_drives = np.add.reduceat(gradients, self._first_block[:-1])
+        spread = _spread(gradients)
+        # What drives of a pool differ in beyond the spread of their blocks; its parameters are used for one drive.
+        more, axes = np.linalg.eigh(_spread(of_drives) - spread)
+        spread += len(of_drives) * (axes * np.maximum(more, 0.0)) @ axes.T
         shared = np.diag([SHARED_SHARES.get(p.name, SHARED_SHARE) ** 2 for p in self.parameters])
         return np.asarray(inverse + inverse @ spread @ inverse + shared, dtype=np.float64)
+
+
+def _spread(gradients: FloatArray) -> FloatArray:
+    """Return the covariance [n, n] of a sum of independent gradients [k, n]; 0 of a single one."""
+    count = len(gradients)
+    return np.asarray(gradients.T @ gradients * (count / (count - 1) if count > 1 else 0.0), dtype=np.float64)
 
 
 def counted(drive: Driving) -> BoolArray:

@@ -24,12 +24,11 @@ import numpy as np
 from pdhef_logtool.car.parts import Inflation
 from pdhef_logtool.estimators.error_features import grip_share
 from pdhef_logtool.estimators.intervals import combined, grip_factor, make_inflation
+from pdhef_logtool.evaluation.metrics import NORMAL_95
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 #: Share inside.
 COVERED = 0.95
-#: 95 % of a normal distribution lie within this many 1-sigma.
-NORMAL_95 = 1.959963984540054
 #: Bins of true abs a_y over μ g (docs/method.md#evaluation), by name: lower and upper limit.
 BINS: dict[str, tuple[float, float]] = {"low": (0.0, 0.3), "middle": (0.3, 0.6), "high": (0.6, np.inf)}
 FOLDS = 5

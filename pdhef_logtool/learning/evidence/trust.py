@@ -65,15 +65,12 @@ class TrustDecision:
     Attributes
     ----------
     rmse_deg : by gain as in :data:`TRUSTS`. against_zero : squared error of each less that of gain 0.
-    best_lower : gain below 1 with the smallest RMSE. against_best : squared error of gain 1 less that of best_lower.
     """
 
     cap: float
     reason: str
     rmse_deg: tuple[float, ...]
     against_zero: tuple[Bound, ...]
-    best_lower: float
-    against_best: Bound
     blocks: int
     scored_s: float
     excited_s: float
@@ -148,7 +145,6 @@ def decide_cap(errors: BlockErrors, *, seed: int = 0) -> TrustDecision:
         return Bound(value, float(low), float(high))
 
     lower = [int(np.argmin(mean[:i])) if total and i else 0 for i in range(len(TRUSTS))]
-    best = lower[-1]
     against_zero = tuple(bound(row - squares[0]) for row in squares)
     tolerated = [bound(row - (1.0 + TOLERANCE) ** 2 * squares[b]) for row, b in zip(squares, lower, strict=True)]
     confirmed = [
@@ -156,14 +152,12 @@ def decide_cap(errors: BlockErrors, *, seed: int = 0) -> TrustDecision:
         for t, gain, more in zip(TRUSTS, against_zero, tolerated, strict=True)
         if t > 0.0 and gain.high_deg2 < 0.0 and more.high_deg2 <= 0.0
     ]
-    cap, reason = _rule(errors, mean, against_zero[-1], max(confirmed, default=0.0), TRUSTS[best], blocks)
+    cap, reason = _rule(errors, mean, against_zero[-1], max(confirmed, default=0.0), TRUSTS[lower[-1]], blocks)
     return TrustDecision(
         cap=cap,
         reason=reason,
         rmse_deg=tuple(float(v) for v in np.sqrt(mean)),
         against_zero=against_zero,
-        best_lower=TRUSTS[best],
-        against_best=bound(squares[-1] - squares[best]),
         blocks=blocks,
         scored_s=errors.scored_s,
         excited_s=errors.excited_s,

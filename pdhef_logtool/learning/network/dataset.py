@@ -117,7 +117,11 @@ def read_entry(path: Path) -> dict[str, Any] | None:
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             entry = json.loads(file.metadata.metadata[_ENTRY])
-            if file.schema_arrow.names != arrow_schema(_SCHEMA).names:  # no checksum covers the names
+            groups = [file.metadata.row_group(g) for g in range(file.num_row_groups)]
+            types = [[g.column(i).physical_type for i in range(g.num_columns)] for g in groups]
+            of_file = [file.schema.column(i).physical_type for i in range(file.metadata.num_columns)]
+            names = arrow_schema(_SCHEMA).names  # no checksum covers these
+            if file.schema_arrow.names != names or any(t != of_file for t in types):
                 return None
             for _ in file.iter_batches():
                 pass
@@ -233,10 +237,9 @@ def remove_unnamed(folder: Path, manifest: Mapping[str, Any]) -> None:
                     parent.rmdir()
 
 
-def vehicle_entry(sha256: str, vehicle: VehicleParameters, *, identified: bool) -> dict[str, Any]:
-    """Return what the manifest states of a vehicle; ``identified``: whether driving gave its values."""
-    parameters = vehicle.model_dump(mode="json")
-    return {"name": vehicle.name, "sha256": sha256, "parameters": parameters, "identified": identified}
+def vehicle_entry(sha256: str, vehicle: VehicleParameters) -> dict[str, Any]:
+    """Return what the manifest states of a vehicle."""
+    return {"name": vehicle.name, "sha256": sha256, "parameters": vehicle.model_dump(mode="json")}
 
 
 def _sha256(path: Path) -> str:
@@ -296,8 +299,6 @@ class DatasetDrive:
     name: str
     split: str
     path: Path
-    rows: int
-    usable_rows: int
     period_s: float
     entry: Mapping[str, Any]
     limits: Sequence[float] | None = None
@@ -340,14 +341,12 @@ class DatasetDrive:
 class Dataset:
     """A residual dataset: what its manifest states, and its drives, each read on first access.
 
-    ``features`` names the columns of :attr:`DriveArrays.features` in order; ``sha256`` identifies the content;
-    ``model`` is the filter that features come from and residuals are of (:data:`~.bundle.MODELS`).
+    ``sha256`` identifies the content; ``model`` is the filter that features come from and residuals are of
+    (:data:`~.bundle.MODELS`).
     """
 
     folder: Path
     model: str
-    features: tuple[str, ...]
-    period_s: float
     sha256: str
     drives: tuple[DatasetDrive, ...]
     manifest: Mapping[str, Any]
@@ -363,12 +362,6 @@ class Dataset:
         """Names of the vehicles whose models the residuals were taken against."""
         names = sorted({str(v["name"]) for v in self.manifest["vehicles"]})
         return ", ".join(names) if len(names) <= NAMED_VEHICLES else f"{len(names)} vehicles"
-
-    @property
-    def identified_share(self) -> float | None:
-        """Share of the vehicles whose values identification found; None where the manifest is of before it was kept."""
-        shares = [v.get("identified") for v in self.manifest["vehicles"]]
-        return None if None in shares else sum(shares) / len(shares)
 
     def vehicle(self, drive: DatasetDrive) -> VehicleParameters:
         """Return the vehicle whose model a drive's residuals were taken against."""
@@ -401,16 +394,12 @@ def read_dataset(folder: Path) -> Dataset:
         return Dataset(
             folder=folder,
             model=str(document["model"]),
-            features=tuple(document["features"]),
-            period_s=float(document["period_s"]),
             sha256=str(document["sha256"]),
             drives=tuple(
                 DatasetDrive(
                     name=d["name"],
                     split=d["split"],
                     path=folder / d["file"],
-                    rows=int(d["rows"]),
-                    usable_rows=int(d["usable_rows"]),
                     period_s=float(d["period_s"]),
                     entry=d,
                     limits=limits if d["split"] == CHOSEN_SPLIT else None,

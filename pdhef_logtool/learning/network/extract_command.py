@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.car import NO_INTERVALS, VEHICLE_FILE, Car
-from pdhef_logtool.car.parts import physics_sha256
+from pdhef_logtool.car.parts import PHYSICS, physics_sha256
 from pdhef_logtool.car.taught import ESTIMATED
-from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.correlation import GAP_PERIODS as TRUTH_GAP_PERIODS
 from pdhef_logtool.drive.reading import Drive, Tell, friction_of, no_samples
@@ -29,8 +29,8 @@ from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter
-from pdhef_logtool.estimators.self_calibrated import of_friction
-from pdhef_logtool.estimators.table import FEATURES, FILTERS
+from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
+from pdhef_logtool.estimators.table import FEATURES, FILTERS, make_estimator
 from pdhef_logtool.learning.drives import (
     DriveRecord,
     drives_document,
@@ -142,10 +142,10 @@ class ExtractSettings:
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON-able values; files by name only."""
         config = self.config.to_dict()
-        used = ("car", "mapping", "start", "end", "sensors", "prefer_truth", "reference", "gnss")
+        used = ("car", "mapping", "start", "end", "sensors", "prefer_truth")
         return {
             **{k: config[k] for k in used},
-            **({} if config["friction"] == "auto" else {"friction": config["friction"]}),
+            **{k: config[k] for k in ("friction", "reference", "gnss") if config[k] != "auto"},
             "truth_smoothing": self.truth_smoothing,
             "split": self.split,
             "model": self.model,
@@ -280,7 +280,7 @@ def extract(
         results = _without_copies(_extract_all(work, jobs, reporter), reporter.warn)
         for job in work:
             sha, vehicle = job.physics
-            vehicles[sha] = vehicle_entry(sha, vehicle, identified=job.car.fitted_physics is not None)
+            vehicles[sha] = vehicle_entry(sha, vehicle)
         manifest = write(results)
         with writing(output):
             remove_unnamed(output, manifest)
@@ -483,7 +483,8 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         physics = filter_of(service.car, settings.model, use_speed=drive.options.use_speed)
         varied = vary(physics.vehicle, settings.vary, f"{settings.seed}:{source}")
         physics = replace(physics, vehicle=varied.vehicle)
-        drive.friction = friction_of(plan, varied.vehicle, drive.options, varied.friction_factor)
+        validated = drive.car.has_evidence
+        drive.friction = friction_of(plan, varied.vehicle, drive.options, varied.friction_factor, validated=validated)
         condition = None if settings.where is None else condition_of(settings.where)
         writer = DriveWriter(target, Picking(condition, f"{settings.seed}:{source}"), truth_source=truth["kind"])
         try:
@@ -538,16 +539,13 @@ def _in_service(drive: Drive, job: _Job) -> _Service:
     if taught is None or job.settings.model != PHYSICS_MODEL:
         return _Service(car, lambda signals: signals, "", None)
     calibration = self_calibrate([read_driving(drive)], car.vehicle, taught=car.taught_prior)
-    on_log = self_calibrated(drive, calibration).self_calibrated
-    if on_log is None:
+    on_log = self_calibrated(drive, calibration)
+    estimator = make_estimator(PHYSICS, on_log)
+    if not isinstance(estimator, SelfCalibrated):
         acts = None if taught.calibrated else taught.residual
         return _Service(car, lambda signals: signals, f"refused: {calibration.refused}", acts)
-    calibrated = replace(car, self_calibrated=on_log).calibrated_car
-
-    def read(signals: Signals) -> Signals:
-        return corrected_anew(of_friction(signals, on_log), car.vehicle, on_log.vehicle)
-
-    return _Service(calibrated, read, calibration.text, taught.residual if taught.calibrated else None)
+    acts = taught.residual if taught.calibrated else None
+    return _Service(on_log.calibrated_car, estimator.given, calibration.text, acts)
 
 
 def _kept(job: _Job, target: Path, source: str, split: str, fingerprint: str) -> DriveResult | None:
@@ -640,7 +638,7 @@ def _strict_truth(plan: DrivePlan) -> DrivePlan:
     return replace(plan, truth=replace(plan.truth, max_gap_s=gaps))
 
 
-def _check_plan(plan: DrivePlan, job: _Job, *, estimated: bool) -> None:
+def _check_plan(plan: DrivePlan, job: _Job, *, estimated: bool = False) -> None:
     where = str(job.log_input.path)
     needed = {"vx_m_s", "vy_m_s", "yaw_rate_rad_s"}
     if not estimated and (plan.truth is None or not needed <= plan.derivation.keys()):
@@ -684,7 +682,7 @@ def _choose_smoothing(plan: DrivePlan, settings: ExtractSettings) -> _Smoothing:
     return _Smoothing(SMOOTHING_HALF_S, f"{said}: not within {limits}", noise)
 
 
-def _truth_facts(plan: DrivePlan, smoothing: _Smoothing, *, estimated: bool) -> dict[str, Any]:
+def _truth_facts(plan: DrivePlan, smoothing: _Smoothing, *, estimated: bool = False) -> dict[str, Any]:
     topics = {s.topic for s in plan.mapping.truth.values()}
     perfect = bool(topics) and all(t.startswith(PERFECT_PREFIX) for t in topics)
     return {

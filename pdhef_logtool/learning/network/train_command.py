@@ -163,7 +163,6 @@ def train_on(
         **bundle.provenance,
         "dataset_sha256": data.sha256,
         "vehicle": data.vehicle_name,
-        "identified_share": data.identified_share,
         "fine_tuned_from": None if init is None else init.sha256,
         "fine_tuned_on": None if init is None else data.vehicle_name,
         "test_loss": test_loss,

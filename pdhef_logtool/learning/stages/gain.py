@@ -158,8 +158,6 @@ def _figures(d: TrustDecision, part: Trust) -> dict[str, Any]:
         "trusts": list(TRUSTS),
         "rmse_deg": list(d.rmse_deg),
         "against_trust_0": [_bound(b) for b in d.against_zero],
-        "best_lower_trust": d.best_lower,
-        "trust_1_against_best_lower": _bound(d.against_best),
         "blocks": d.blocks,
         "scored_s": round(d.scored_s, 3),
         "excited_s": round(d.excited_s, 3),

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.car.car import Car
@@ -12,10 +10,8 @@ from pdhef_logtool.learning.drives import NETWORK
 from pdhef_logtool.learning.split import divided
 from pdhef_logtool.learning.stages.gain import find_gain
 from pdhef_logtool.learning.stages.task import StageOutput, Task
-from pdhef_logtool.logs.discovery import Logs
 from pdhef_logtool.records.errors import EstimatorError
-from pdhef_logtool.residual_model.bundle import NO_MODEL, ModelBundle
-from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.residual_model.bundle import NO_MODEL
 
 #: Fine-tuning of a trained network; a network from random weights is a small one, for a minute or two of driving.
 GENTLY: dict[str, Any] = {"learning_rate": 5e-4, "epochs": 15}
@@ -32,6 +28,10 @@ def train_network(task: Task) -> StageOutput:
     EstimatorError
         There is too little driving, or no network is wanted.
     """
+    from pdhef_logtool.learning.network.dataset import read_dataset
+    from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
+    from pdhef_logtool.learning.network.train_command import make_recipe, train_on
+
     part, init = task.split.network_part(), task.car.network
     if str(task.settings.config.network) == NO_MODEL:
         raise EstimatorError(expected="a network", got=NO_MODEL, where="network")
@@ -44,34 +44,14 @@ def train_network(task: Task) -> StageOutput:
             where="network",
         )
     config = replace(task.settings.config, network=None)
-    work = task.work / "training"
-    train_on_parts(
-        {"train": (learns, config), "validation": (stops, config)}, work, init, progress=task.reporter.progress
-    )
+    work, sets = task.work / "training", []
+    for name, logs in (("train", learns), ("validation", stops)):
+        extract(logs, work / name, ExtractSettings(config, split=name))
+        sets.append(read_dataset(work / name))
+    both = replace(sets[0], drives=tuple(d for s in sets for d in s.drives))
+    recipe = replace(make_recipe(paper=False, seed=0, epochs=None, device="cpu"), **(SMALL if init is None else GENTLY))
     network = work / "model"
+    train_on(both, network, recipe, init=init, progress=task.reporter.progress)
     settings = replace(task.settings, config=replace(config, network=network))
     output = find_gain(replace(task, car=Car.load(config.car, network=network), settings=settings))
     return replace(output, change=replace(output.change, command=f"learn --stages {NETWORK}"))
-
-
-def train_on_parts(
-    parts: Mapping[str, tuple[Logs, RunConfig]],
-    folder: Path,
-    init: ModelBundle | None,
-    *,
-    progress: Callable[[str, float], None] = lambda _text, _share: None,
-) -> ModelBundle:
-    """Extract the logs of the parts ``train`` and ``validation`` into a folder and train; ``init`` is the start.
-
-    The network is left in ``folder/model``.
-    """
-    from pdhef_logtool.learning.network.dataset import read_dataset
-    from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
-    from pdhef_logtool.learning.network.train_command import make_recipe, train_on
-
-    for split, (logs, config) in parts.items():
-        extract(logs, folder / split, ExtractSettings(config, split=split))
-    sets = [read_dataset(folder / split) for split in parts]
-    both = replace(sets[0], drives=tuple(d for s in sets for d in s.drives))
-    recipe = replace(make_recipe(paper=False, seed=0, epochs=None, device="cpu"), **(SMALL if init is None else GENTLY))
-    return train_on(both, folder / "model", recipe, init=init, progress=progress).bundle

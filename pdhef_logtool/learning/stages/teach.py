@@ -86,7 +86,7 @@ class OpenedDrive:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Teaching:
-    """What drives taught by a truth: prior, its support, residual, whether drives calibrated their car, what next."""
+    """What drives taught: prior, its support, residual, whether they calibrated their car, what taught, what next."""
 
     parameters: tuple[TaughtParameter, ...]
     ladder: LadderFit
@@ -105,6 +105,19 @@ class Teaching:
         return (
             f"{rung}, taught by {self.truth}, by held-out blocks of {self.ladder.seconds:.0f} s"
             f" (RMSE without constants: {tried or 'not tried'})"
+        )
+
+    def part(self, car: Car, records: Sequence[DriveRecord] = ()) -> Taught:
+        """Return the part of a car that it is, from drives with these records."""
+        return Taught(
+            physics_sha256=car.physics_sha256,
+            parameters=self.parameters,
+            residual=self.ladder.model,
+            calibrated=self.calibrated,
+            truth=self.truth,
+            evidence=self.evidence,
+            drives=tuple(r.learnt_on for r in records if not r.left_out),
+            figures=figures_of(self),
         )
 
 
@@ -130,37 +143,27 @@ def teach(task: Task) -> StageOutput:
         expected = f"at least {LEAST_S:g} s of driving with ground truth above {car.vehicle.low_speed_blend_m_s:g} m/s"
         raise EstimatorError(expected=expected, got=f"{seconds:.1f} s", where=TEACH, remedy="give more drives")
     taught = learn_from(drives, seed=task.settings.seed, progress=task.reporter.progress)
-    figures = figures_of(taught)
-    part = Taught(
-        physics_sha256=car.physics_sha256,
-        parameters=taught.parameters,
-        residual=taught.ladder.model,
-        calibrated=taught.calibrated,
-        truth=taught.truth,
-        evidence=taught.evidence,
-        drives=tuple(r.learnt_on for r in records if not r.left_out),
-        figures=figures,
-    )
+    part = taught.part(car, records)
     files = {TAUGHT_FILE: (json.dumps(part.model_dump(mode="json"), indent=1) + "\n").encode()}
     change = Change(f"learn --stages {TEACH}", TAUGHT_FILE, files, {}, task.settings.to_dict(), part.drives)
-    return StageOutput(change, records, taught.evidence, figures)
+    return StageOutput(change, records, taught.evidence, part.figures)
 
 
 def open_drive(drive: Drive, config: RunConfig) -> tuple[DriveRecord, OpenedDrive | None]:
     """Return the record of an open drive and what teaching takes of it; None with the reason in the record."""
     missing = sorted({*lacking(drive), *(FEATURES - drive.available)})
-    at, lacks = (None, f"the log has no {', '.join(missing)}") if missing else teaching_reference(drive, config)
+    truth_at, lacks = (None, f"the log has no {', '.join(missing)}") if missing else teaching_reference(drive, config)
     if lacks:
         return record_of(drive, left_out=lacks), None
     whole = drive.whole(fill_friction=drive.friction.bank is None)
-    if at is not None:
-        whole = replace(whole, truth=at(whole.signals.stamps_ns))
+    if truth_at is not None:
+        whole = replace(whole, truth=truth_at(whole.signals.stamps_ns))
     assert whole.truth is not None
     taught = taught_driving(read_driving(drive), whole.truth)
     if not np.isfinite(taught.slopes).any():
         return record_of(drive, left_out="no driving with a true sideslip above the low-speed limit"), None
     record = record_of(drive, whole=whole)
-    return record if at is None else replace(record, truth=(ESTIMATED,)), OpenedDrive(drive, whole, taught)
+    return record if truth_at is None else replace(record, truth=(ESTIMATED,)), OpenedDrive(drive, whole, taught)
 
 
 def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = lambda _text, _share: None) -> Teaching:
@@ -184,21 +187,14 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
     lines = []
     for drive, calibration, lack in zip(drives, calibrations, lacks, strict=True):
         correction = None if ladder.model is None else ladder.model.evaluate(lack.features)
-        (before, before_free), (after, after_free) = (
-            corrected_rmse_deg(lack, None),
-            corrected_rmse_deg(lack, correction),
-        )
-        lines.append(
-            {
-                "name": drive.drive.name,
-                "seconds": round(drive.taught.driving.seconds, 1),
-                "calibration": calibration.refused or "as later drives",
-                "physics_deg": before,
-                "corrected_deg": after,
-                "physics_without_constant_deg": before_free,
-                "corrected_without_constant_deg": after_free,
-            }
-        )
+        line = {"name": drive.drive.name, "seconds": round(drive.taught.driving.seconds, 1)}
+        line |= {"calibration": calibration.refused or "as later drives"}
+        for name, rmse in (
+            ("physics", corrected_rmse_deg(lack, None)),
+            ("corrected", corrected_rmse_deg(lack, correction)),
+        ):
+            line |= {f"{name}_deg": rmse[0], f"{name}_without_constant_deg": rmse[1]}
+        lines.append(line)
     truth = " and ".join(sorted({ESTIMATED if d.truth.name == REFERENCE else GROUND_TRUTH for d in drives}))
     return Teaching(parameters, ladder, calibrated, truth, test, support, tuple(lines), _more(drives, ladder))
 
