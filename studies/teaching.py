@@ -250,7 +250,7 @@ def pairs_of(car: TeachCar) -> Iterator[PairResult]:
     """Yield the results of a car's pairs."""
     of_file = Car.of(vehicle_of(peer_of(car.parts[0])))
     drives = [opened(part, of_file) for part in car.parts]
-    choices = [((a,), b) for a, b in permutations(range(len(drives)), 2)]
+    choices: list[tuple[tuple[int, ...], int]] = [((a,), b) for a, b in permutations(range(len(drives)), 2)]
     if car.taught_on > 1:
         choices = [(tuple(range(car.taught_on)), k) for k in range(car.taught_on, len(drives))]
     names, least = [part.name for part in car.parts], peer_of(car.parts[0]).least_speed_m_s
