@@ -45,6 +45,10 @@ interval with 95 % coverage is 3.92 times as wide as the RMSE.
 
 {bands}
 
+The same without each part of the variance, and of recorded drives ([peers](peers.md)) with published files:
+
+{parts}
+
 ## Lateral kinematic consistency and sideslip error
 
 The v̇_y residual (column `d2`) needs no ground truth. The table compares each estimate with the estimate of the same
@@ -55,15 +59,6 @@ drive that has the lowest residual.
 Above {factor:g} times the lowest residual of {simple}, `pdhef run` warns that `pd-hef` contradicts the sensors. For a
 car without validation data it selects the fallback estimate with the lowest residual, unless `--calibrate off` requests
 causal estimates.
-
-## Published vehicle files of real cars
-
-Ground truth is used for these figures only; v̇_y residual in brackets. These drives were scored {looked} times with a
-self-calibrated car. The speed of the 250 LM, the GTI and the V40 comes from the ground truth or nearly so.
-
-{published}
-
-{said}
 
 ## Coverage of every ± that is printed
 
@@ -86,18 +81,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for simulated in simulate(SELF_CARS, SELF_SEED):
         outcomes.append(outcome_of(simulated))
         say(f"car {simulated.car}, {simulated.manoeuvre}: {outcomes[-1].calibrated['physics'][0]:.3f}")
-    published, said = "Not done: needs ../shared beside the repository.", list[str]()
-    if DRIVES.is_dir():
-        published, said = self_calibration.published_table()
+    recorded = self_calibration.recorded_bands() if DRIVES.is_dir() else {}
     write(
         out / "calibration.md",
         PAGE.format(
             **settings(),
             simulated=self_calibration.simulated_table(outcomes),
             bands=self_calibration.band_table(outcomes),
+            parts=self_calibration.parts_table(outcomes, recorded),
             d2=self_calibration.d2_table(outcomes),
-            published=published,
-            said="\n".join(said),
         ),
     )
     plus_minus.fill_page(out / "calibration.md")
@@ -116,7 +108,6 @@ def settings() -> dict[str, object]:
         "share": D2_SHARE,
         "factor": FACTOR,
         "simple": ", ".join(f"`{name}`" for name in SIMPLE),
-        "looked": self_calibration.LOOKED_AT,
         "plus_cars": plus_minus.CARS,
         "plus_seed": plus_minus.SEED,
     }

@@ -18,9 +18,8 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.drive.friction import MODEL_STD
 from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import Drive
+from pdhef_logtool.drive.reading import Drive, friction_of
 from pdhef_logtool.estimators.calibration import joint
 from pdhef_logtool.evaluation.metrics import NORMAL_95
 from studies.condition_drives import as_read
@@ -140,7 +139,7 @@ def measured(cars: int, seed: int) -> list[Printed]:
         for name, file in (("wrong", wrong_file), ("right", simulated.file)):
             car = Car.of(file.model_copy(update={"friction": None}))
             with as_read(raw, car, ReadOptions(friction="auto", prefer_truth="rtk")) as drive:
-                drive.friction.model_std = MODEL_STD[name == "right"]  # that of a car with evidence
+                drive.friction = friction_of(drive.plan, car.vehicle, drive.options, validated=name == "right")
                 printed += [(f"{text}, {name} file", error, sd) for text, error, sd in of_friction(drive, friction)]
                 if name == "wrong":
                     printed += [*of_checks(drive, simulated.file, noise)]

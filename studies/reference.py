@@ -27,6 +27,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool.estimators.calibration.joint import IMU_X_REACH
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference, refer, sideslip_std
@@ -134,7 +135,7 @@ def recorded_drive(drive: PeerDrive) -> ScoredDrive:
         mapping = with_receiver(mapping)
     car = Car.of(vehicle_of(drive))
     with read_drive(DRIVES / drive.log, car, mapping, ReadOptions()) as opened:
-        prior = prior_of(car.vehicle, calibrate_drive(opened, RunConfig()))
+        prior = prior_of(car, calibrate_drive(opened, RunConfig()))
         whole = opened.whole()
     assert whole.truth is not None
     truth = whole.truth
@@ -173,7 +174,7 @@ def simulated_drive(spec: DriveSpec, vehicle: VehicleParameters | None = None) -
         log = Path(folder) / "drive.mcap"
         write_drive(drive, log)
         with read_drive(log, car, None, ReadOptions(waived=SPIN_CHECKS)) as opened:
-            prior = prior_of(car.vehicle, calibrate_drive(opened, RunConfig()))
+            prior = prior_of(car, calibrate_drive(opened, RunConfig()))
             signals = opened.whole().signals
     t = (signals.stamps_ns - drive.start_ns) * 1e-9
     names = ("vx_m_s", "vy_m_s", "yaw_rad", "roll_rate_rad_s")
@@ -248,7 +249,7 @@ FAULTS: dict[str, Callable[[Signals], Signals]] = {
     "IMU turned and tilted by 2°": _tilted,
 }
 WRONG_AXLE = "l_r wrong by 0.15 m"
-#: Of simulated drives: the file has the accelerometer at the CG.
+#: Of simulated drives: nothing states where the accelerometer is.
 MOVED_IMU, REAR_IMU = "accelerometer at the rear axle", (("imu_x_m", -1.71),)
 #: Of recorded drives with a receiver: ground truth is taken to be the velocity of the antenna, whose position the
 #: smoother estimates, in place of that of the point that the vehicle file states.
@@ -360,6 +361,8 @@ def figures(case: Case, drive: ScoredDrive) -> Figures:
     prior = drive.prior
     if case.fault == WRONG_AXLE:
         prior = replace(prior, rear_m=prior.rear_m + 0.15)
+    elif case.fault == MOVED_IMU:
+        prior = replace(prior, unknown_imu_x_m=IMU_X_REACH * prior.wheelbase_m)
     elif case.fault in FAULTS:
         signals = FAULTS[case.fault](signals)
     start = time.process_time()

@@ -1,4 +1,4 @@
-"""Calibration without ground truth: simulated cars with wrong files, and published files of real cars.
+"""Calibration without ground truth: simulated cars with wrong files, and recorded drives with published ones.
 
 Each simulated car drives a wide sine sweep and a road. Its vehicle file, fitted to a ramp steer, gets a stiffness error
 of a factor 0.5 to 2 at each axle. Each drive calibrates the car for itself, as ``pdhef run`` does.
@@ -7,13 +7,10 @@ of a factor 0.5 to 2 at each axle. Each drive calibrates the car for itself, as 
 
 from __future__ import annotations
 
-import json
 import sys
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 
@@ -24,22 +21,20 @@ from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import DrivingReader
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
+from pdhef_logtool.estimators.self_calibrated import CAR_STD_RAD, D2_SHARE, OPEN_LOOP
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, signal_error
 from pdhef_logtool.evaluation.metrics.lateral_consistency import consistency_rows
-from pdhef_logtool.records.errors import PdhefError, SimulationError
-from pdhef_logtool.records.reporter import Reporter
+from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator
-from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.selection import FACTOR
 from pdhef_logtool.runs.self_calibrating import driven_d2, log_sensors
 from studies.condition_drives import SIDESLIP, as_logged
 from studies.drawn_cars import BASE, KINDS, draw_car
-from studies.pages import DRIVES, ROOT, number, table
+from studies.pages import DRIVES, number, table
+from studies.peers.drives import FULL_SIZE, PEER_DRIVES, mapping_of, read_peer_drive, vehicle_of
 from truthsim.batch import sensor_noise
 from truthsim.drive import Drive, simulate_drive
 from truthsim.sensors import SensorNoise
@@ -49,19 +44,9 @@ from truthsim.vehicle_choice import choose_vehicle
 DRIVEN: tuple[tuple[str, float, float | None], ...] = (("sine-sweep-wide", 90.0, None), ("road", 100.0, 240.0))
 FRICTIONS = (0.85, 1.0)
 WRONG = (0.5, 2.0)
-REFERENCE = ROOT / "tests" / "reference"
-#: Published file and mapping, log, and the least speed in m/s that is scored.
-PUBLISHED = {
-    "250 LM": ("revs_250lm", "revs_250lm_a.mcap"),
-    "GTI": ("niki_gti", "niki_gti_1khz.mcap"),
-    "TT-S": ("tts_kk", "tts_kk.mcap"),
-    "V40": ("lunda_v40", "lunda_v40"),
-}
-#: Times that a published drive was scored with a self-calibrated car while this was built, this page included.
-LOOKED_AT = 22
-BASELINES = ("zero", "kinematic", "open-loop", "phy-ukf")
-#: Sideslip RMSE in degrees that was aimed at.
-TARGETS = {"250 LM": 0.40, "TT-S": 0.55, "GTI": 1.0}
+#: Parts of an interval; coverage of a drive that is asked.
+OWN, OF_CAR, CONSISTENCY, PARAMETERS = "own", "s_car", "v̇_y residual", "parameters"
+LEAST_COVERAGE = 0.90
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,15 +119,46 @@ def taken(signals: Signals, file: VehicleParameters, calibration: SelfCalibratio
     return replace(car, self_calibrated=replace(calibrated, varied=calibration.varied, driven_d2_m_s=driven))
 
 
-def band_of(drive: WholeDrive, car: Car) -> tuple[float, float]:
-    """Return coverage of the 95 % interval of ``physics``, and its mean whole width over RMSE."""
+def bands_of(drive: WholeDrive, car: Car) -> dict[str, tuple[float, float]]:
+    """Return coverage of the 95 % interval of ``physics`` and its mean whole width over RMSE: all of it, and by part.
+
+    A part is what the head of :mod:`~pdhef_logtool.estimators.self_calibrated` adds; its figures are those without it.
+    """
+    found = car.self_calibrated
     assert drive.truth is not None
-    estimator = make_estimator("physics", car)
-    track = calibrator(car, [estimator]).add(run_window(estimator, drive.signals)[0], drive.signals)
-    error = signal_error(track, drive.truth, SIDESLIP, car.vehicle.low_speed_blend_m_s)
+    assert found is not None
+    estimator, slow = make_estimator("physics", car), car.vehicle.low_speed_blend_m_s
+    own = run_window(estimator, drive.signals)[0]
+    track = calibrator(car, [estimator]).add(own, drive.signals)
+    error = signal_error(track, drive.truth, SIDESLIP, slow)
     finite = np.isfinite(error) & np.isfinite(track.sideslip_std_rad)
-    error, half = error[finite], NORMAL_95 * track.sideslip_std_rad[finite]
-    return float(np.mean(np.abs(error) <= half)), float(2.0 * np.mean(half) / np.sqrt(np.mean(error**2)))
+    error, variance = error[finite], track.sideslip_std_rad[finite] ** 2
+    d2 = D2_SHARE * np.nan_to_num(found.driven_d2_m_s) / np.maximum(np.abs(track.vx_m_s[finite]), slow)
+    parts = {
+        OWN: (found.error_scale * own.sideslip_std_rad[finite]) ** 2,
+        OF_CAR: np.full(error.size, (found.error_scale * CAR_STD_RAD) ** 2),
+        CONSISTENCY: d2**2,
+    }
+    parts[PARAMETERS] = variance - sum(parts.values())
+
+    def band(squares: FloatArray) -> tuple[float, float]:
+        half = NORMAL_95 * np.sqrt(np.maximum(squares, 0.0))
+        return float(np.mean(np.abs(error) <= half)), float(2.0 * np.mean(half) / np.sqrt(np.mean(error**2)))
+
+    return {ALL: band(variance)} | {name: band(variance - part) for name, part in parts.items()}
+
+
+def recorded_bands() -> dict[str, dict[str, tuple[float, float]]]:
+    """Return :func:`bands_of` of the recorded drives of full-size cars with published files, by log."""
+    bands = {}
+    for one in PEER_DRIVES:
+        if one.group == FULL_SIZE:
+            file = vehicle_of(one)
+            drive = read_peer_drive(DRIVES / one.log, file, mapping_of(one))
+            car = taken(drive.signals, file, calibrate(drive.signals, file))
+            if car.self_calibrated is not None:
+                bands[one.log.partition(".")[0]] = bands_of(drive, car)
+    return bands
 
 
 def errors_of(
@@ -176,7 +192,7 @@ class Outcome:
     calibrated: dict[str, tuple[float, float]]
     from_right: dict[str, tuple[float, float]]
     refused: str
-    bands: tuple[tuple[float, float], ...]  # from the wrong file and the right one, without those refused: band_of
+    bands: tuple[dict[str, tuple[float, float]], ...]  # from the wrong file and the right one, without those refused
 
 
 def outcome_of(simulated: Simulated) -> Outcome:
@@ -196,7 +212,7 @@ def outcome_of(simulated: Simulated) -> Outcome:
         errors_of(simulated.drive, calibrated, after, calibration),
         errors_of(simulated.drive, as_right, after, from_right),
         calibration.refused,
-        tuple(band_of(simulated.drive, car) for car in (calibrated, as_right) if car.self_calibrated is not None),
+        tuple(bands_of(simulated.drive, car) for car in (calibrated, as_right) if car.self_calibrated is not None),
     )
 
 
@@ -236,10 +252,25 @@ def band_table(outcomes: Sequence[Outcome]) -> str:
     """Return coverage and width of the 95 % intervals on calibrated cars."""
     body = []
     for name in [*dict.fromkeys(o.manoeuvre for o in outcomes), "all"]:
-        pairs = [b for o in outcomes if name in (o.manoeuvre, "all") for b in o.bands]
+        pairs = [b[ALL] for o in outcomes if name in (o.manoeuvre, "all") for b in o.bands]
         shares, width = coverage_cells(pairs)
         body.append([name, str(len(pairs)), *shares, width])
     return table(["drive", "intervals", *COVERAGE_HEAD], body, right_from=1)
+
+
+def parts_table(outcomes: Sequence[Outcome], recorded: dict[str, dict[str, tuple[float, float]]]) -> str:
+    """Return width and lowest coverage of the intervals, and those without each of their parts."""
+    simulated, body = [b for o in outcomes for b in o.bands], []
+    for name in (ALL, OWN, OF_CAR, CONSISTENCY, PARAMETERS):
+        cells = []
+        for bands in (simulated, list(recorded.values())):
+            width = np.median([b[name][1] for b in bands]) if bands else np.nan
+            cells += [number(float(width), 1), f"{min((b[name][0] for b in bands), default=np.nan):.0%}"]
+        low = [f"{log} {b[name][0]:.0%}" for log, b in recorded.items() if b[name][0] < LEAST_COVERAGE]
+        body.append([name if name == ALL else f"without {name}", *cells, ", ".join(low) or "–"])
+    head = ["interval", "simulated: median width / RMSE", "lowest coverage"]
+    head += ["recorded: median width / RMSE", "lowest coverage", f"recorded drives below {LEAST_COVERAGE:.0%}"]
+    return table(head, body, right_from=1)
 
 
 def d2_table(outcomes: Sequence[Outcome]) -> str:
@@ -261,52 +292,6 @@ def d2_table(outcomes: Sequence[Outcome]) -> str:
             body.append([f"{low:g} to {high:g}", str(inside.size), *cells])
     head = ["v̇_y residual / lowest of the others", "estimates", "RMSE ratio: lowest", "10 %", "median", "most"]
     return table(head, body, right_from=1)
-
-
-def published_table() -> tuple[str, list[str]]:
-    """Return the published files on their drives, and the text of each calibration."""
-    body, said = [], []
-    for car, (name, log) in PUBLISHED.items():
-        try:
-            figures, report = published_run(name, log)
-        except PdhefError as error:
-            body.append([car, f"not done: {error}"])
-            continue
-        best = min(BASELINES, key=lambda n: figures[n][0])
-        shown = (*BASELINES, OPEN_LOOP, "physics", "pd-hef")
-        cells = [_cell(figures.get(n)) for n in shown]
-        ratio = figures["pd-hef"][0] / figures[best][0] if "pd-hef" in figures else float("nan")
-        body.append([car, *cells, number(ratio, 2), number(TARGETS.get(car, float("nan")), 2)])
-        calibration = report["self_calibration"]
-        said.append(f"- {car}: {'not asked' if calibration is None else calibration['text']}")
-        said += [f"  {w}" for w in report["warnings"] if "WARNING" in w]
-    head = ["car", *BASELINES, OPEN_LOOP, "physics", "pd-hef", "pd-hef / best baseline", "target"]
-    return table(head, body, right_from=1), said
-
-
-def _cell(figure: tuple[float, float] | None) -> str:
-    return "–" if figure is None else f"{figure[0]:.3f} ({figure[1]:.3f})"
-
-
-def published_run(name: str, log: str) -> tuple[dict[str, tuple[float, float]], dict]:  # type: ignore[type-arg]
-    """Run a published file on its drive as a user would; return RMSE in degrees and d2 by estimator, and the report."""
-    estimators = ("zero", "kinematic", "open-loop", "phy-ukf", OPEN_LOOP, "physics", "pd-hef")
-    with tempfile.TemporaryDirectory() as folder:
-        config = RunConfig(
-            car=REFERENCE / "vehicles" / f"{name}.toml",
-            mapping=REFERENCE / "mappings" / f"{name}.toml",
-            annotate="none",
-            estimators=estimators,
-        )
-        result = run_logs([str(DRIVES / log)], Path(folder) / "out", config, reporter=Reporter(warn=say))
-    report = json.loads(json.dumps(result.results[0].report))
-    whole = {(m["estimator"], m["signal"], m["metric"]): m["value"] for m in report["metrics"] if m["segment"] == ALL}
-    figures = {}
-    for estimator in estimators:
-        rmse, d2 = whole.get((estimator, "sideslip_rad", "rmse")), whole.get((estimator, "vy_m_s", "d2"))
-        if rmse is not None:
-            figures[estimator] = float(np.degrees(rmse)), float("nan") if d2 is None else d2
-    return figures, report
 
 
 def say(text: str) -> None:

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.padding import Padding
 from rich.text import Text
 
-from pdhef_logtool.cli.console import table, three_lines
-from pdhef_logtool.cli.plan_tables import plan_line, render_plan
+from pdhef_logtool.cli.console import print_indented, table, three_lines
+from pdhef_logtool.cli.plan_tables import joined, plan_line, render_plan
 from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison
 from pdhef_logtool.results.comparison_words import (
@@ -37,17 +36,17 @@ _MOST_DRIVES, _MOST_SIGNALS = 5, 8
 def render_comparison(comparison: Comparison, console: Console) -> None:
     """Print a comparison: verdict, assumptions and next step, then what they are drawn from."""
     requirements = comparison.requirements
-    said = Text.assemble("" if requirements is None else Text.assemble(plan_line(requirements), "; "),
-                         "; gate closed: ".join((verdict_text(comparison), *comparison.failures)))  # fmt: skip
-    console.print(three_lines(said, assumed_text(comparison), next_text(comparison)))
+    said = "; gate closed: ".join((verdict_text(comparison), *comparison.failures))
+    result = said if requirements is None else joined(plan_line(requirements), said, requirements.plan.file)
+    console.print(three_lines(result, assumed_text(comparison), next_text(comparison)))
     console.print()
     console.print(Text.assemble(("A ", "bold"), comparison.a, ("  B ", "bold"), comparison.b), soft_wrap=True)
     for line in comparison.unpaired:
-        _line(f"without partner: {line}", console)
+        print_indented(f"without partner: {line}", console)
     if comparison.differences:
         console.print("\nWhat else differs", style="bold")
         for line in comparison.differences:
-            _line(line, console)
+            print_indented(line, console)
     if comparison.changed:
         console.print(f"\n{comparison.changed} of {sum(comparison.pairs.values())} drives have a changed figure")
     if comparison.figures and not comparison.equal:
@@ -63,10 +62,6 @@ def render_comparison(comparison: Comparison, console: Console) -> None:
         render_plan(requirements, console)
 
 
-def _line(text: str, console: Console) -> None:
-    console.print(Padding(text, (0, 0, 0, 2), expand=False))
-
-
 def _print_figures(comparison: Comparison, console: Console) -> None:
     made = table("\nfigure", ">\ndrives", ">median\nchange", ">95 %\ninterval", ">\nlimit", "\nverdict", fold=1)
     for row in comparison.figures:
@@ -78,7 +73,7 @@ def _print_figures(comparison: Comparison, console: Console) -> None:
     console.print()
     console.print(made)
     for note in notes_of(comparison):
-        _line(note, console)
+        print_indented(note, console)
 
 
 def _print_drives(figure: ComparedFigure, console: Console) -> None:
@@ -111,7 +106,7 @@ def _print_signals(comparison: Comparison, console: Console) -> None:
     )
     console.print(made)
     if more := len(comparison.signals) - len(shown[:_MOST_SIGNALS]):
-        _line(f"{more} more signals of these drives in --json", console)
+        print_indented(f"{more} more signals of these drives in --json", console)
 
 
 def _print_others(others: Sequence[ComparedFigure], console: Console) -> None:

@@ -105,7 +105,8 @@ def _gate(
 
 def figure_asked(max_regression: str | None, estimator: str | None, metric: str | None) -> Figure:
     """Return the figure that options ask for; raises UsageError."""
-    from pdhef_logtool.results.gate import MAIN, Figure, figure_problems, share_of
+    from pdhef_logtool.evaluation.units import share_of
+    from pdhef_logtool.results.gate import MAIN, Figure, figure_problems
 
     limit = None if max_regression is None else share_of(max_regression)
     if max_regression is not None and limit is None:

@@ -79,6 +79,13 @@ def three_lines(result: str | Text, assumed: str, following: str) -> Table:
     return lines
 
 
+def print_indented(line: str | Text, console: Console) -> None:
+    """Print a line, and its continuations, two columns to the right."""
+    from rich.padding import Padding
+
+    console.print(Padding(line, (0, 0, 0, 2), expand=False))
+
+
 def cell(value: float | None, factor: float = 1.0, digits: int = 2) -> str:
     """Return a number for a table, a dash where there is none."""
     return "-" if value is None else f"{round(value * factor, digits) + 0.0:.{digits}f}"  # no -0

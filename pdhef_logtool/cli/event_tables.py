@@ -17,9 +17,9 @@ _MOST_EVENTS, _MOST_NAMED = 50, 5
 
 def render_events(events: FoundEvents, console: Console) -> None:
     """Print the events, and what was not searched."""
-    seconds = sum(e.end_s - e.start_s for e in events.events)
+    total_s = sum(e.end_s - e.start_s for e in events.events)
     drives, count = len({e.drive for e in events.events}), len(events.events)
-    summary = f"{count} event{'s' * (count != 1)} in {drives} of {events.searched} drives, {seconds:.2f} s in all"
+    summary = f"{count} event{'s' * (count != 1)} in {drives} of {events.searched} drives, {total_s:.2f} s in all"
     left_out = f"; {len(events.left_out)} drives are not searched, see below" if events.left_out else ""
     following = "nothing is needed" if not count or events.clips else "--clip writes one MCAP file per event"
     console.print(three_lines(summary, f"{events.where} of {events.of}{left_out}", following))
@@ -28,8 +28,8 @@ def render_events(events: FoundEvents, console: Console) -> None:
         made = table("drive", ">from, s", ">to, s", ">for, s", ">peak", fold=1)
         for event in events.events[:_MOST_EVENTS]:
             peak = "-" if event.peak is None else f"{event.peak:.4g}"
-            seconds = f"{event.end_s - event.start_s:.2f}"
-            made.add_row(event.drive, f"{event.start_s:.2f}", f"{event.end_s:.2f}", seconds, peak)
+            lasts = f"{event.end_s - event.start_s:.2f}"
+            made.add_row(event.drive, f"{event.start_s:.2f}", f"{event.end_s:.2f}", lasts, peak)
         console.print(made)
         if (more := len(events.events) - _MOST_EVENTS) > 0:
             console.print(f"  and {more} more: --json, --parquet")

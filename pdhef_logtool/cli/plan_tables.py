@@ -6,10 +6,10 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from rich.padding import Padding
 from rich.text import Text
 
-from pdhef_logtool.cli.console import table
+from pdhef_logtool.cli.console import print_indented, table
+from pdhef_logtool.evaluation.requirement_verdicts import joint_notes
 from pdhef_logtool.evaluation.validation_plan import shown
 
 if TYPE_CHECKING:
@@ -32,6 +32,11 @@ def outcomes_text(counts: Mapping[str, int], file: str) -> Text:
     return Text.assemble(Text(", ").join(parts), f" ({name})")
 
 
+def joined(verdicts: Text, said: str, file: str | None) -> Text:
+    """Return verdicts and result, those of the default plan last."""
+    return Text.assemble(verdicts, "; ", said) if file else Text.assemble(said, "; ", verdicts)
+
+
 def render_plan(plan_result: PlanVerdicts, console: Console) -> None:
     """Print the requirements in a table, and what the inconclusive ones need."""
     made = table("", "id", "requirement", ">value", ">margin", fold=3)
@@ -46,8 +51,7 @@ def render_plan(plan_result: PlanVerdicts, console: Console) -> None:
             what = v.reason.removeprefix(f"{shown(v.value, v.requirement.unit)}; ") if v.value is not None else v.reason
             to_do.setdefault(f"{what}. Next: {v.next}" if v.next else what, []).append(v.requirement.id)
     for what, ids in to_do.items():
-        console.print(Padding(f"{', '.join(ids)}: {what}", (0, 0, 0, 2)))
-    notes = dict.fromkeys(note for v in plan_result.verdicts for note in v.notes)
-    for note in notes:
-        console.print(Padding(f"note: {note}", (0, 0, 0, 2)))
+        print_indented(f"{', '.join(ids)}: {what}", console)
+    for note in joint_notes({v.requirement.id: v.notes for v in plan_result.verdicts}):
+        print_indented(f"note: {note}", console)
     console.print()

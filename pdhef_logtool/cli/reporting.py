@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from pdhef_logtool.reports.pages import WrittenPages
 
 commands = typer.Typer()
-#: Pages that are listed; --json lists all.
-_MOST_FILES = 20
 
 
 @options.command(
@@ -92,8 +90,3 @@ def _render(result: WrittenPages, out: Console) -> None:
             "read the warnings" if result.wrong else f"open {result.pdf or files[0]}",
         )
     )
-    out.print()
-    for file in (*([] if result.pdf is None else [result.pdf]), *files[:_MOST_FILES]):
-        out.print(str(file), soft_wrap=True)
-    if len(files) > _MOST_FILES:
-        out.print(f"and {len(files) - _MOST_FILES} more in {result.output}", soft_wrap=True)

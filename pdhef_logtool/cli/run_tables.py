@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from rich.measure import Measurement
-from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from pdhef_logtool.cli.console import cell, table, three_lines
-from pdhef_logtool.cli.plan_tables import outcomes_text, plan_line, render_plan
+from pdhef_logtool.cli.console import cell, print_indented, table, three_lines
+from pdhef_logtool.cli.plan_tables import joined, outcomes_text, plan_line, render_plan
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.units import LABELS, read_unit
@@ -133,7 +132,7 @@ def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str])
     steps += dict.fromkeys(c for t in texts for c in _clauses(t, "next"))
     steps = next_steps(None if given is None else given.to_dict(), steps)
     return three_lines(
-        said if given is None else Text.assemble(plan_line(given), f"; {said}"),
+        said if given is None else joined(plan_line(given), said, given.plan.file),
         "; ".join(assumed) or ("differs by log, see below" if len(reports) > 1 else "nothing beside the log"),
         steps[0] if steps else f"nothing is needed; pdhef view {result.place or 'OUT'} shows the drive",
     )
@@ -166,7 +165,7 @@ def _fleet_head(summary: RunSummary) -> Table:
     said = f"{rmse} of {summary.scored} drives"
     steps = next_steps(plan, ["read the failures below"] if summary.failed else ())
     return three_lines(
-        Text.assemble(outcomes_text(counts, plan.get("file") or ""), f"; {said}") if counts else said,
+        joined(outcomes_text(counts, plan.get("file") or ""), said, plan.get("file")) if counts else said,
         "differs by drive, see report.json",
         steps[0] if steps else f"open {Path(summary.output) / PAGE_FILE}",
     )
@@ -207,17 +206,13 @@ def render_fleet(summary: RunSummary, console: Console) -> None:
 def _print_some(labels: Sequence[str], count: int, console: Console) -> None:
     """Name the first of so many logs."""
     more = f" and {count - _MOST_FAILED} more" if count > _MOST_FAILED else ""
-    _print_indented(", ".join(labels[:_MOST_FAILED]) + more, console)
+    print_indented(", ".join(labels[:_MOST_FAILED]) + more, console)
 
 
 def _print_outputs(output: Path | str, console: Console) -> None:
     page = Path(output) / PAGE_FILE
     shown = f"; open {page} in a browser" if page.is_file() else ""
     console.print(f"outputs in {output}{shown}", soft_wrap=True)
-
-
-def _print_indented(line: str | Text, console: Console) -> None:
-    console.print(Padding(line, (0, 0, 0, 2)))
 
 
 def _render_one_of_several(report: _Report, assumed: Sequence[str], console: Console) -> None:
@@ -254,13 +249,13 @@ def _print_log(  # positional: what both callers have at hand
 ) -> None:
     console.print(Text.assemble((report["log"]["name"], "bold"), about))
     for line in above:
-        _print_indented(line, console)
+        print_indented(line, console)
     if texts:
         console.print(_lines(texts))
     if tabled:
         console.print(_table(report, console))
     for line in below:
-        _print_indented(line, console)
+        print_indented(line, console)
     console.print()
 
 

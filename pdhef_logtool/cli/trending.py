@@ -48,8 +48,6 @@ def trend(
 
 
 def _render(result: Trend, out: Console) -> None:
-    from rich.padding import Padding
-
     from pdhef_logtool.results.comparison_words import change_text
     from pdhef_logtool.results.trend import mark, shown_median
 
@@ -59,12 +57,14 @@ def _render(result: Trend, out: Console) -> None:
         for number, row in enumerate(result.rows)
         if row.regression
     ]
+    higher = any(c and c.change.median > 0.0 for row in result.rows for c in (row.previous, row.first))
+    otherwise = "more common drives would show whether an increase is real" if higher else "nothing is needed"
     accepted = f", increases up to {100.0 * result.figure.limit:g} % are accepted" if result.figure.limit else ""
     out.print(
         console.three_lines(
             f"{count or 'no'} significant regression{'s' * (count > 1)} {what}",
             f"the order is that of time; sign test over common drives, Holm's correction{accepted}",
-            "pdhef compare {} {}".format(*pairs[0]) if pairs else "nothing is needed",
+            "pdhef compare {} {}".format(*pairs[0]) if pairs else otherwise,
         )
     )
     out.print()
@@ -82,4 +82,4 @@ def _render(result: Trend, out: Console) -> None:
     for row in result.regressions:
         out.print(f"\n{row.run}: {mark(row)}", style="bold")
         for line in row.differences or ("nothing else differs from the run before",):
-            out.print(Padding(line, (0, 0, 0, 2), expand=False))
+            console.print_indented(line, out)

@@ -36,8 +36,8 @@ from pdhef_logtool.compiled import sources
 from pdhef_logtool.records import processes
 from pdhef_logtool.records.printable import printable
 
-#: How long the first run compiles on two processors, in seconds; a rough figure for the user.
-COMPILING_S = 25
+#: How long the first run compiles, in seconds; a rough figure for the user.
+COMPILING_S = 40
 
 
 def _without_blas() -> None:
@@ -151,15 +151,12 @@ def kept_in() -> Path | None:
 
 
 def _remove_stale(places: Iterable[Path]) -> None:
-    """Remove, as far as it can be written, the code of other sources, and what versions without a digest kept."""
+    """Remove, as far as it can be written, the code of other sources."""
     digest = sources.compiled_digest().partition("-")[0]
     with contextlib.suppress(OSError):
         for folder in [f for place in places if place.is_dir() for f in place.iterdir()]:
             if re.fullmatch("[0-9a-f]{16}-[0-9a-f]{8}", folder.name) and not folder.name.startswith(digest):
                 shutil.rmtree(folder, ignore_errors=True)
-        for package in sources.PACKAGES:
-            for file in (sources.ROOT / package).rglob("__pycache__/*.nb[ic]"):
-                file.unlink(missing_ok=True)
 
 
 def _private_folder() -> Path | None:
@@ -292,19 +289,8 @@ def _stamp(file: str) -> bytes:
     return b"" if path in sources.compiled_sources() else hashlib.sha256(path.read_bytes()).digest()
 
 
-def is_kept(name: str) -> bool:
-    """Return whether there is machine code of a function, ``module.function``, for some arguments."""
-    return any(any(folder.glob(f"{name}-*.nbi")) for folder in (_installed(), kept_in()) if folder is not None)
-
-
 #: Whether the note that compiling begins was printed.
 announced = False
-
-
-def be_silent() -> None:
-    """Print no note about compiling in this process and its forks, as another process prints it."""
-    global announced
-    announced = True
 
 
 def announce() -> None:

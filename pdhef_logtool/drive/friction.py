@@ -57,7 +57,6 @@ class FrictionSource:
     constant : given to all estimators; None leaves the signals' own (and the vehicle file's where they have none).
     bank : estimates it; None where nothing is estimated.
     factor : error made on purpose in the friction of topic or option, for training (docs/method.md#limits).
-    stamps, observable_stamps : of the windows so far.
     model_std : 1-sigma of the estimate's error that comes of the vehicle file (:data:`MODEL_STD`).
     """
 
@@ -66,8 +65,6 @@ class FrictionSource:
     constant: float | None = None
     bank: FrictionBank | None = None
     factor: float = 1.0
-    stamps: int = 0
-    observable_stamps: int = 0
     model_std: float = 0.0
     _carry: FrictionState | None = None
     _std: list[FloatArray] = field(default_factory=list)
@@ -75,7 +72,7 @@ class FrictionSource:
 
     def afresh(self) -> FrictionSource:
         """Return the same source at the start of a drive."""
-        return FrictionSource(self.label, self.note, self.constant, self.bank, self.factor, model_std=self.model_std)
+        return replace(self, _carry=None, _std=[], _observable=[])
 
     def fill(self, signals: Signals) -> Signals:
         """Return the next window's signals with their friction."""
@@ -84,8 +81,6 @@ class FrictionSource:
         if self.bank is None:
             return signals if self.factor == 1.0 else replace(signals, friction=signals.friction * self.factor)
         estimate, self._carry = self.bank.run(signals, self._carry)
-        self.stamps += len(signals)
-        self.observable_stamps += int(np.count_nonzero(estimate.observable))
         self._std.append(estimate.std)
         self._observable.append(estimate.observable)
         return replace(signals, friction=estimate.friction)
@@ -113,20 +108,20 @@ class FrictionSource:
     @property
     def observable_share(self) -> float:
         """Share of the stamps so far at which the drive shows its friction; NaN where nothing is estimated."""
-        return self.observable_stamps / self.stamps if self.stamps else math.nan
+        return float(np.mean(self.observable)) if self.observable.size else math.nan
 
     @property
     def observable_std(self) -> float:
         """Median 1-sigma of the estimate where it is observable; NaN where it never is."""
-        return float(np.median(self.std[self.observable])) if self.observable_stamps else math.nan
+        return float(np.median(self.std[self.observable])) if self.observable.any() else math.nan
 
     @property
     def summary(self) -> str:
         """What came of an estimate, for the report; empty where nothing is estimated."""
-        if not self.stamps:
+        if not self.observable.size:
             return ""
         text = f"observable {100 * self.observable_share:.0f} % of the time"
-        if self.observable_stamps:
+        if self.observable.any():
             text += f", median 1-sigma {self.observable_std:.2f} there"
         return text + "; elsewhere it goes back to that of a dry road"
 
@@ -139,6 +134,7 @@ def friction_source(
     *,
     use_speed: bool = True,
     factor: float = 1.0,
+    validated: bool = True,
 ) -> FrictionSource:
     """Decide where a drive's friction comes from.
 
@@ -149,6 +145,7 @@ def friction_source(
     ----------
     choice : of :func:`parse_friction`. available : signals that the log provides. topic : of its friction, ``/a.b``.
     factor : on the friction of topic or option; a vehicle file must contain its wrong friction already.
+    validated : whether a drive has shown that the tyres of the vehicle are right.
 
     Raises
     ------
@@ -170,11 +167,11 @@ def friction_source(
         return FrictionSource(f"vehicle file, {vehicle.friction:g}", constant=constant)
     from pdhef_logtool.estimators.friction_bank import NEEDS, FrictionBank
 
-    bank = FrictionBank(vehicle, use_speed=use_speed)
+    bank = FrictionBank(vehicle, use_speed, validated)
     missing = sorted(NEEDS - available)
     if not missing:
         nothing = "neither log nor vehicle file gives a friction: it is estimated on line" if choice == "auto" else ""
-        return FrictionSource("estimate", nothing, bank=bank)
+        return FrictionSource("estimate", nothing, bank=bank, model_std=MODEL_STD[validated])
     if choice == "estimate":
         raise UsageError(
             expected="a log with what an estimate of friction needs",

@@ -41,8 +41,7 @@ MOST_ENERGY, _ANY_GAIN = 20.0, 2.0
 #: Energies of hypotheses (negative logarithms of their prior odds): mistakes are seldom, two of them more so, units of
 #: another quantity are the slips of templates, and a field that is something else explains any gain.
 PRIORS = {"unit": 5.0, "sign": 5.0, "sign and unit": 9.0, "foreign": 5.7, "field": 14.0, "open": 0.0}
-#: One that nothing documents: most recorders count to the left.
-PRIORS["open sign"] = 1.0
+PRIORS |= {"open sign": 1.0}  # that nothing documents: most recorders count to the left
 #: Of signals that explain a contradiction equally well the first is the likeliest: no standard states how a steering
 #: angle counts, and an axis of an IMU is turned more often than the sign of a gyro that is read from the right one.
 _OFTEN_WRONG = ("steering_wheel_rad", "steer_rad", "wheels", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
@@ -155,6 +154,11 @@ class Hypothesis:
         seldom = 0.0 if rank < 2 else (_SELDOM + _SELDOM_STEP * rank) * (2.0 if self.kind == "foreign" else 1.0)
         return PRIORS[self.kind] + seldom + 0.5 * (len(names) - 1) + (0.0 if self.is_exact else 0.5)
 
+    def is_about(self, names: set[str]) -> bool:
+        """Return whether all of it, or of an open sign a part, is of these signals."""
+        shared = len(self.factors.keys() & names)
+        return shared == len(self.factors) or (self.kind == "open sign" and shared > 0)
+
     def acts_on(self, relation: Relation) -> float:
         """Return what undoing it multiplies the relation's gain with."""
         return math.prod(f ** relation.powers[n] for n, f in self.factors.items() if n in relation.powers)
@@ -182,9 +186,7 @@ def posterior(relations: Sequence[Relation], hypotheses: Sequence[Hypothesis]) -
     telling = [r for r in relations if r.tells]
     touched = {n for r in telling for n in r.powers}
     # With a signal that no relation is about, a mistake is another one of the same likelihood.
-    useful = [
-        h for h in hypotheses if h.factors.keys() <= touched or (h.kind == "open sign" and h.factors.keys() & touched)
-    ]
+    useful = [h for h in hypotheses if h.is_about(touched)]
 
     @cache
     def of_relation(i: int, factor: float) -> float:

@@ -51,7 +51,8 @@ from pdhef_logtool.drive.truth import (
 )
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, fit_clocks, read_signals
-from pdhef_logtool.mapping.frames import Placement, placement_of
+from pdhef_logtool.mapping.frames import placement_of
+from pdhef_logtool.mapping.mapping_file import entries_of
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import BoolArray, Channel, FloatArray
@@ -369,7 +370,6 @@ class Survey:
     latency: LatencyEstimate | None
     triads: tuple[Triad | None, Triad | None] = (None, None)
     mounting: Mounting | None = None
-    placed: Placement | None = None
     framed: Check | None = None
     corrected: tuple[Check, ...] = ()
     reread: Callable[[tuple[Check, ...]], tuple[Check, ...]] | None = None
@@ -459,7 +459,7 @@ class Survey:
         resolved = units_told(self.measured.relations, doubted)
         for check in self.mapping.checks:
             signal = check.name.removesuffix(".candidate")
-            if check.name in ("imu.mounting", "mapping.sign") and self.mounting is not None and self.mounting.confident:
+            if check.name == "imu.mounting" and self.mounting is not None and self.mounting.confident:
                 continue
             # A doubt about a unit stays unless the drive rules out all others: a gain that passes is wider than some.
             if f"{signal}.sign" not in passed or (signal in doubted and signal not in resolved):
@@ -499,7 +499,7 @@ def survey_log(
     blind = mounting is not None and mounting.confident
     if not blind and truth is not None:
         mounting = find_mounting(measured, triads, mapping)
-    placed, framed, by_frames = _by_frames(log, mapping, channels, triads, mounting)
+    framed, by_frames = _by_frames(log, mapping, channels, triads, mounting)
     mounting = by_frames or mounting
     channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
     measured = measured.without(extra)
@@ -516,17 +516,13 @@ def survey_log(
         measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     latency = truth_latency(channels, truth)
     survey = Survey(
-        mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, placed, framed,
+        mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, framed,
         tuple(corrected),
     )  # fmt: skip
     if not rescale:
         return survey
     if mapping.origin == "auto":
-        settled = _with_settled_signs(survey)
-        if settled == mapping:
-            return _rescaled(survey, log, clocks, span_ns)
-        again = survey_log(log, settled, clocks, span_ns, vehicle)
-        return replace(again, corrected=(*survey.corrected, *again.corrected))
+        return _decided(survey, log, clocks, span_ns)
 
     def checks_of(other: Mapping) -> tuple[Check, ...]:
         return survey_log(log, other, fit_clocks(log, other, *span_ns), span_ns, vehicle, rescale=False).checks
@@ -540,17 +536,12 @@ def _by_frames(
     channels: MappedChannels,
     triads: tuple[Triad | None, Triad | None],
     by_drive: Mounting | None,
-) -> tuple[Placement | None, Check | None, Mounting | None]:
-    """Return where recorded frames put the IMU, the check of it, and the mounting where they alone state it.
-
-    Parameters
-    ----------
-    found : what the drive shows.
-    """
+) -> tuple[Check | None, Mounting | None]:
+    """Return the check of recorded frames, and the mounting where they alone state it."""
     accelerations, rates = triads
     placed = None if accelerations is None else placement_of(log, accelerations.source.topic)
     if placed is None or accelerations is None or rates is None:
-        return placed, None, None
+        return None, None
     components = [channels.signals.get(n) for n in ACCELERATIONS]
     force = np.array([np.nanmean(c.values) if c is not None and len(c) else np.nan for c in components])
     sure = by_drive if by_drive is not None and by_drive.confident else None
@@ -558,66 +549,51 @@ def _by_frames(
     check = frames_check(placed, shown, evidence, force)
     believed = "" if sure is not None else gravity_agrees(placed, force)
     if not believed:
-        return placed, check, None
+        return check, None
     rotation, named = placed_rotation(placed), _named_rows(mapping, accelerations, rates)
     alone = Mounting(rotation, named, f"{believed}; the drive does not show the rest", confident=False)
-    return placed, check if alone.is_as_named else frames_alone(placed, believed), alone
+    return check if alone.is_as_named else frames_alone(placed, believed), alone
 
 
-def _with_settled_signs(survey: Survey) -> Mapping:
-    """Return the mapping with the signs that nothing documents as all of the drive shows them, and two parts of it."""
-    mapping, known = survey.mapping, survey.is_mounted
-    groups, sections = mapping.open_signs, {"truth.": dict(mapping.truth), "": dict(mapping.signals)}
-    probable = survey.measured.posterior(mounting_is_known=known, open_signs=groups)
-    turned = [g for g in groups if probable.turned(g[0]) >= CERTAIN]
-    notes, parts = list(mapping.notes), list(survey.measured.parts(survey.vehicle)) if turned else []
-    for group in turned:
-        if all(part.agrees(group[0], mounting_is_known=known, open_signs=groups) for part in parts):
-            notes.append(f"{' and '.join(group)}: read as positive to the right, which nothing documents but the drive")
-            for name in group:
-                prefix = "truth." if name.startswith("truth.") else ""
-                section = sections[prefix]
-                section[name.removeprefix(prefix)] = scaled_source(section[name.removeprefix(prefix)], -1.0)
-    if len(notes) == len(mapping.notes):
-        return mapping
-    return replace(mapping, signals=sections[""], truth=sections["truth."], notes=tuple(notes), open_signs=())
+def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:
+    """Return the survey with the signs that nothing documents, or one wrong unit or sign, as the drive shows them.
 
-
-def _rescaled(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:
-    """Return the survey with the one unit or sign corrected that alone contradicts everything else, with a note.
-
-    No part of the drive may contradict it, by itself.
-
-    Ground truth takes no part in it: it is only checked.
+    It must be certain, and no part of the drive may contradict it by itself. Ground truth takes no part where something
+    documented is corrected, which is a failed check.
     """
-    mapping = survey.mapping
-    factors = explained_factors(survey.measured.without_truth(), mounting_is_known=survey.is_mounted, most=1)
-    if factors:
-        sound, shares = without_faulty_samples(survey.channels.signals, survey.vehicle)
+    mapping, is_mounted, measured = survey.mapping, survey.is_mounted, survey.measured
+    groups = mapping.open_signs
+    probable = measured.posterior(mounting_is_known=is_mounted, open_signs=groups)
+    turned = [n for g in groups if probable.turned(g[0]) >= CERTAIN for n in g]
+    factors = dict.fromkeys(turned, (-1.0, "nothing documents its sign, and the drive shows it"))
+    if not turned:
+        groups, measured = (), measured.without_truth()
+        factors = explained_factors(measured, mounting_is_known=is_mounted, most=1)
+        sound, shares = without_faulty_samples(survey.channels.signals, survey.vehicle) if factors else ({}, {})
         if shares:
-            factors = explained_factors(
-                measure(sound, vehicle=survey.vehicle), mounting_is_known=survey.is_mounted, most=1
-            )
-    parts = [part.without_truth() for part in survey.measured.parts(survey.vehicle)] if factors else []
-    signals, notes = dict(mapping.signals), list(mapping.notes)
+            factors = explained_factors(measure(sound, vehicle=survey.vehicle), mounting_is_known=is_mounted, most=1)
+    parts = list(measured.parts(survey.vehicle)) if factors else []
+    sections, notes = {"truth.": dict(mapping.truth), "": dict(mapping.signals)}, list(mapping.notes)
     checks = list(survey.corrected)
     for name, (factor, evidence) in factors.items():
-        if name in signals and all(part.agrees(name, mounting_is_known=survey.is_mounted) for part in parts):
-            signals[name] = scaled_source(signals[name], factor)
+        section = sections[name[:6] if name.startswith("truth.") else ""]
+        source = section.get(name.removeprefix("truth."))
+        if source is not None and all(p.agrees(name, mounting_is_known=is_mounted, open_signs=groups) for p in parts):
+            section[source.name] = scaled_source(source, factor)
             notes.append(f"{name} is read with {factor:.6g} times its scale: {evidence}")
-            checks.append(_corrected(name, signals[name], notes[-1]))
-    if signals == mapping.signals:
+            checks += [] if turned else [_corrected(name, section[source.name], notes[-1])]
+    if len(notes) == len(mapping.notes):
         return survey
-    scaled = replace(mapping, signals=signals, notes=tuple(notes))
-    corrected = survey_log(log, scaled, clocks, span_ns, survey.vehicle, rescale=False)
+    scaled = replace(mapping, signals=sections[""], truth=sections["truth."], notes=tuple(notes), open_signs=())
+    again = survey_log(log, scaled, clocks, span_ns, survey.vehicle, rescale=bool(turned))
     # A failing sensor resembles a wrong unit of another one; after a right correction nothing contradicts any more.
-    failed = [check.name for check in corrected.checks if check.verdict == "failed"]
-    is_bad = any(n.endswith((".sign", ".unit", ".axis", ".fault")) for n in failed)
-    return survey if is_bad else replace(corrected, corrected=tuple(checks))
+    failed = [check.name for check in again.checks if check.verdict == "failed"]
+    is_bad = not turned and any(n.endswith((".sign", ".unit", ".axis", ".fault")) for n in failed)
+    return survey if is_bad else replace(again, corrected=(*checks, *again.corrected))
 
 
 def _corrected(name: str, source: SignalSource, note: str) -> Check:
-    return CORRECTED.failed(note, name, field=_shown(source.field), scale=_shown(source.scale))
+    return CORRECTED.failed(note, name, entries=entries_of(source, "field", "scale"))
 
 
 def scaled_source(source: SignalSource, factor: float) -> SignalSource:
@@ -675,12 +651,7 @@ def mounting_checks(mapping: Mapping, mounting: Mounting, triads: tuple[Triad | 
             if mounting.confident:
                 checks.append(MOUNTING.passed(mounting.evidence, name))
             continue
-        source = turned[name]
         evidence = f"{mounting.text}: {mounting.evidence}"
-        check = MOUNTING.failed(evidence, name, field=_shown(source.field), scale=_shown(source.scale))
+        check = MOUNTING.failed(evidence, name, entries=entries_of(turned[name], "field", "scale"))
         checks.append(check if mounting.confident else replace(check, verdict="undecided"))
     return checks
-
-
-def _shown(value: object) -> str:
-    return repr(list(value)).replace("'", '"') if isinstance(value, tuple) else repr(value).replace("'", '"')

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pdhef_logtool.drive.checks.by_relations import AXIS, UNEXPLAINED
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping, auto_map
+from pdhef_logtool.mapping.mapping_file import entries_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import PdhefError
@@ -78,11 +79,7 @@ def _replaced(mapping: Mapping, others: dict[str, SignalSource]) -> Mapping:
 def _check(name: str, source: SignalSource, checks: Sequence[Check]) -> Check:
     doubts = [c for verdict in ("failed", "undecided") for c in checks if (c.subject, c.verdict) == (name, verdict)]
     evidence = doubts[0].evidence if doubts else "it contradicts others that fail"
-    field = str(list(source.field)).replace("'", '"') if isinstance(source.field, tuple) else f'"{source.field}"'
-    lines = f'topic = "{source.topic}", field = {field}, scale = {_shown(source.scale)}'
     check = AXIS.failed(f"{evidence}; with {source.label} all checks of it pass", name, signal_name=name)
-    return replace(check, remedy=f"another field is mapped: in the mapping {lines}")
-
-
-def _shown(scale: float | tuple[float, ...]) -> str:
-    return str([float(f"{s:.9g}") for s in scale]) if isinstance(scale, tuple) else f"{scale:.9g}"
+    return replace(
+        check, remedy=f"another field is mapped: in the mapping {entries_of(source, 'topic', 'field', 'scale')}"
+    )

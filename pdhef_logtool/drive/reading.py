@@ -9,7 +9,7 @@ from typing import Self, cast
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.friction import MODEL_STD, FrictionSource, friction_source
+from pdhef_logtool.drive.friction import FrictionSource, friction_source
 from pdhef_logtool.drive.options import ReadOptions, time_slice
 from pdhef_logtool.drive.setup import CLOCK_START_S, LogUntil, Setup, is_device_clock, load_setup
 from pdhef_logtool.drive.windows import DrivePlan, DriveReader, DriveWindow, plan_drive, setup_of
@@ -342,8 +342,7 @@ def read_drive(
         for note in plan.mapping.notes[len(used.notes) :]:
             told(note)
         _tell_doubts(plan, options, told)
-        friction = friction_of(plan, car.vehicle, options)
-        friction.model_std = MODEL_STD[car.has_evidence]
+        friction = friction_of(plan, car.vehicle, options, validated=car.has_evidence)
         if friction.note:
             remarks.append(friction.note)
     except BaseException as error:
@@ -453,7 +452,7 @@ def _tell_doubts(plan: DrivePlan, options: ReadOptions, tell: Tell) -> None:
 
 
 def friction_of(
-    plan: DrivePlan, vehicle: VehicleParameters, options: ReadOptions, factor: float = 1.0
+    plan: DrivePlan, vehicle: VehicleParameters, options: ReadOptions, factor: float = 1.0, *, validated: bool
 ) -> FrictionSource:
     """Return the friction of a drive as the options choose it, for a vehicle; ``factor`` makes it wrong on purpose."""
     source = plan.mapping.signals.get("friction")
@@ -461,7 +460,10 @@ def friction_of(
     if options.friction is None:
         return FrictionSource(f"topic {topic}" if topic else "none")
     available = plan.alignment.available
-    return friction_source(options.friction, vehicle, available, topic, use_speed=options.use_speed, factor=factor)
+    use_speed = options.use_speed
+    return friction_source(
+        options.friction, vehicle, available, topic, use_speed=use_speed, factor=factor, validated=validated
+    )
 
 
 def _nbytes(record: Signals | StateTrack) -> int:

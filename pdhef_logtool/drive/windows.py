@@ -41,7 +41,6 @@ from pdhef_logtool.mapping import (
     merge_losses,
     read_signals,
 )
-from pdhef_logtool.mapping.frames import Placement
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.ledger import Role, SampleCount
 from pdhef_logtool.records.readings import impossible_readings
@@ -71,7 +70,7 @@ class DrivePlan:
     dependent : ground truth quantities that are an input of the estimators, with the reason.
     derivation : by ground truth quantity, how it is derived.
     decided_s : seconds of the log, or of that of the set-up, that the sensors' part was decided on.
-    checks : of signals, ground truth and vehicle file. placed : where recorded frames put the IMU.
+    checks : of signals, ground truth and vehicle file.
     refused : mapped channels, those of ground truth with ``truth.``, that nothing is computed from, with the reason.
     """
 
@@ -88,7 +87,6 @@ class DrivePlan:
     end_ns: int
     decided_s: float
     checks: tuple[Check, ...] = ()
-    placed: Placement | None = None
     refused: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -183,7 +181,6 @@ def plan_drive(
         end_ns=end_ns,
         decided_s=(end_ns - start_ns) * 1e-9 if setup is None else setup.decided_s,
         checks=looked_at.checks,
-        placed=looked_at.placed,
         refused=refused,
     )
 

@@ -259,14 +259,13 @@ class AdaptivePhysics:
 
     def run(self, signals: Signals, state: AdaptiveState | None) -> tuple[MixtureSteps, AdaptiveState]:
         """Process one window (see :class:`~.base.Estimator`)."""
-        c = state
-        checked, inputs = self.inputs(signals, c.inputs if c else None)
+        checked, inputs = self.inputs(signals, state.inputs if state else None)
         faults, rate = checked.faults, self.trust * checked.rate
         filters = self.filters
-        before: Sequence[FilterState | None] = c.filters if c else [None] * len(filters)
+        before: Sequence[FilterState | None] = state.filters if state else [None] * len(filters)
         runs = [f.run(faults.filtered, b, rate, faults.extra_r) for f, b in zip(filters, before, strict=True)]
         steps = tuple(filter_steps for filter_steps, _ in runs)
-        gathered, evidence = gather_evidence(steps, c.filters if c else None, c.evidence if c else None)
+        gathered, evidence = gather_evidence(steps, state.filters if state else None, state.evidence if state else None)
         weights = weigh(gathered, np.stack([filter_steps.valid for filter_steps in steps], axis=1))
         raised = r_scale(faults.extra_r, self.physics.measurement_std)
         after = AdaptiveState(inputs, tuple(state for _, state in runs), evidence)

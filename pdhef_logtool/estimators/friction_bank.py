@@ -11,18 +11,24 @@ much larger than the noise, and a filter that claims a smaller covariance is not
 a straight road would look slippery). The power η < 1 counts neighbouring samples, whose model errors are the same, as
 fewer than they are.
 
-The estimate is the weighted mean, but not less than the lateral acceleration reached just now needs. What is at
-step k was known before the samples of step k: a filter that uses it is not handed its own measurement back.
+Where no drive has shown that the tyres of the vehicle file are right, eight more filters assume friction 1 and tyres
+that are softer or stiffer at either axle. Only what they cannot explain, saturation, then shows a slippery road.
+
+The estimate is the weighted mean, but not less than the lateral acceleration that was reached needs; this bound is
+forgotten once the weights show saturation. What is at step k was known before the samples of step k: a filter that
+uses it is not handed its own measurement back.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
 from pdhef_logtool.car.nominal_model import (
+    ModelParameters,
     measured_lateral_acceleration,
     model_parameters,
     state_derivative,
@@ -42,6 +48,8 @@ NEEDS = frozenset({"steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
 GRID = (0.12, 0.2, 0.3, 0.4, 0.5, 0.62, 0.75, 0.88, 1.0, 1.12)
 PRIOR = (0.015, 0.02, 0.025, 0.025, 0.03, 0.055, 0.14, 0.27, 0.27, 0.15)
 USUAL_FRICTION = sum(mu * weight for mu, weight in zip(GRID, PRIOR, strict=True))
+#: Stiffness of the front and rear axle over that of the file, where it may be wrong: one 1-sigma of its prior from it.
+STIFFNESS = tuple(pair for pair in product((0.625, 1.0, 1.6), repeat=2) if pair != (1.0, 1.0))
 #: Process 1-sigma per √s of v_y (m/s) and r (rad/s); measurement 1-sigma of a_y (m/s²) and r (rad/s), at model-error
 #: level; all by the sideslip errors that follow, on simulated drives that no table is made of.
 Q_VY, Q_YAW_RATE = 0.3, 0.1
@@ -54,19 +62,15 @@ LEAST_SPEED_BLENDS = 1.67
 LONGEST_STEP_S = 0.1
 #: A filter that assumes too little grip drifts off; it is held within this |v_y| / v_x.
 MAX_VY_SHARE = 0.7
-#: The lower bound is this share of what the a_y of the last tenth of a second needs.
+#: The lower bound is this share of what the smoothed a_y that was reached needs.
 BOUND_SHARE, BOUND_SMOOTHING_S = 0.9, 0.1
 #: Friction is observable where the 1-sigma of the weights is below this; that of the prior is 0.23.
 OBSERVABLE_STD = 0.12
 
-#: A speed that changes by this much more or less than a_x + v_y r, smoothed over the time beside it (no hill is so
-#: steep), is that of wheels that spin or lock; the bank then waits for the last time.
-WHEEL_SLIP_M_S2, WHEEL_SLIP_SMOOTHING_S, WHEEL_SLIP_WAIT_S = 3.0, 0.2, 2.0
-
-# Scalars that are carried: whether the states are started, smoothed a_y, of the step before steering and speed, the
-# smoothed rate of the speed beyond a_x, and how long to wait yet.
-_STARTED, _AY, _STEER, _SPEED, _EXCESS, _WAIT = range(6)
-_MEMORY = 6
+# Scalars that are carried: whether the states are started, smoothed a_y, the highest one that counts, and of the step
+# before steering and speed.
+_STARTED, _AY, _REACHED, _STEER, _SPEED = range(5)
+_MEMORY = 5
 _NOT_MEASURED = 1e12  # variance of a channel without a sample
 _STEP_VY, _STEP_YAW_RATE = 0.02, 0.002  # for difference quotients
 
@@ -174,9 +178,12 @@ def _weigh(weights, prior, log_likelihood, keep):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True)
-def _bank(drive, grid, prior, p, ay_per_friction, bank, out_mu, out_std):  # type: ignore[no-untyped-def]
-    """Run the bank over one window; weights [M], x [M, 2], P [M, 3] and memory of ``bank`` are updated in place."""
-    dt, vx, steer, usable, ax, ay, yaw_rate = drive
+def _bank(drive, grid, spread, prior, models, ay_per_friction, bank, out_mu, out_std):  # type: ignore[no-untyped-def]
+    """Run the bank over one window; weights [M], x [M, 2], P [M, 3] and memory of ``bank`` are updated in place.
+
+    ``spread`` [M] : 1-sigma of the friction where a filter is right. ``models`` : M model parameters.
+    """
+    dt, vx, steer, usable, ay, yaw_rate = drive
     weights, x, P, memory = bank
     count = grid.shape[0]
     likelihood = np.zeros(count)
@@ -185,41 +192,32 @@ def _bank(drive, grid, prior, p, ay_per_friction, bank, out_mu, out_std):  # typ
         square = 0.0
         for j in range(count):
             mean += weights[j] * grid[j]
-            square += weights[j] * grid[j] * grid[j]
+            square += weights[j] * (grid[j] * grid[j] + spread[j] * spread[j])
         out_std[k] = math.sqrt(max(0.0, square - mean * mean))
-        out_mu[k] = max(mean, BOUND_SHARE * abs(memory[_AY]) / ay_per_friction)
+        out_mu[k] = max(mean, BOUND_SHARE * memory[_REACHED] / ay_per_friction)
+        forgotten = math.exp(-max(0.0, dt[k]) / FORGETTING_S)
         if not dt[k] <= LONGEST_STEP_S:
             memory[_STARTED] = 0.0
             memory[_AY] = 0.0
-            memory[_EXCESS] = 0.0
-        else:
-            if math.isfinite(ay[k]):
-                memory[_AY] += (1.0 - math.exp(-dt[k] / BOUND_SMOOTHING_S)) * (ay[k] - memory[_AY])
-            if math.isfinite(ax[k]) and math.isfinite(vx[k]) and math.isfinite(memory[_SPEED]):
-                turning = 0.0  # v_y r, by the bank
-                if memory[_STARTED] != 0.0:
-                    for j in range(count):
-                        turning += weights[j] * x[j, 0] * x[j, 1]
-                excess = (vx[k] - memory[_SPEED]) / dt[k] - ax[k] - turning
-                memory[_EXCESS] += (1.0 - math.exp(-dt[k] / WHEEL_SLIP_SMOOTHING_S)) * (excess - memory[_EXCESS])
-            memory[_WAIT] = max(0.0, memory[_WAIT] - dt[k])
-            if abs(memory[_EXCESS]) > WHEEL_SLIP_M_S2:
-                memory[_WAIT] = WHEEL_SLIP_WAIT_S
-        if not usable[k] or memory[_WAIT] > 0.0:
+        elif math.isfinite(ay[k]):
+            memory[_AY] += (1.0 - math.exp(-dt[k] / BOUND_SMOOTHING_S)) * (ay[k] - memory[_AY])
+        kept = forgotten if mean < USUAL_FRICTION - OBSERVABLE_STD else 1.0
+        memory[_REACHED] = max(kept * memory[_REACHED], abs(memory[_AY]))
+        if not usable[k]:
             memory[_STARTED] = 0.0
         elif memory[_STARTED] == 0.0:
             rate = yaw_rate[k] if math.isfinite(yaw_rate[k]) else 0.0
             for j in range(count):
-                x[j, 0], x[j, 1] = p.rear_m * rate, rate  # the rear axle rolls without slip
+                x[j, 0], x[j, 1] = models[j].rear_m * rate, rate  # the rear axle rolls without slip
                 P[j, 0], P[j, 1], P[j, 2] = INITIAL_VY_STD**2, 0.0, INITIAL_YAW_RATE_STD**2
             memory[_STARTED] = 1.0
         else:
             over = (0.5 * (memory[_SPEED] + vx[k]), 0.5 * (memory[_STEER] + steer[k]))
             now = (vx[k], steer[k], ay[k], yaw_rate[k])
             for j in range(count):
-                likelihood[j] = LIKELIHOOD_POWER * _step(x[j], P[j], over, now, grid[j], dt[k], p)
+                likelihood[j] = LIKELIHOOD_POWER * _step(x[j], P[j], over, now, grid[j], dt[k], models[j])
         if dt[k] > 0.0:  # not at the very first stamp
-            _weigh(weights, prior, likelihood, math.exp(-dt[k] / FORGETTING_S))
+            _weigh(weights, prior, likelihood, forgotten)
         likelihood[:] = 0.0
         memory[_STEER] = steer[k]
         memory[_SPEED] = vx[k]
@@ -233,16 +231,26 @@ class FrictionBank:
     ----------
     vehicle : parameters; its friction is not looked at by the bank.
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter that gives the speed.
+    validated : whether a drive has shown that the tyres of the vehicle are right.
     """
 
     vehicle: VehicleParameters
     use_speed: bool = True
+    validated: bool = True
 
     @property
-    def _speed_filter(self) -> PhysicsUkf:
-        vehicle = self.vehicle.model_copy(update={"friction": USUAL_FRICTION})
-        # The bank detects slipping wheels itself and waits.
-        return PhysicsUkf(vehicle, use_speed=self.use_speed, slip_gate=False)
+    def _filters(self) -> tuple[FloatArray, FloatArray, FloatArray, tuple[ModelParameters, ...]]:
+        """Return friction, its 1-sigma, prior weight [M] and model of each filter."""
+        models = (model_parameters(self.vehicle, roll_correction=True),) * len(GRID)
+        grid, prior, exact = np.array(GRID), np.array(PRIOR), np.zeros(len(GRID))
+        if self.validated:
+            return grid, exact, prior, models
+        others = (self.vehicle.with_stiffness(*pair) for pair in STIFFNESS)
+        models += tuple(model_parameters(vehicle, roll_correction=True) for vehicle in others)
+        more = np.ones(len(STIFFNESS))
+        unknown = math.sqrt(prior @ (grid - USUAL_FRICTION) ** 2)
+        prior = np.append(prior, more / len(more)) / 2.0  # as likely, together, as the tyres of the file
+        return np.append(grid, more), np.append(exact, unknown * more), prior, models
 
     @property
     def ay_per_friction(self) -> float:
@@ -254,29 +262,25 @@ class FrictionBank:
     def run(self, signals: Signals, state: FrictionState | None) -> tuple[FrictionEstimate, FrictionState]:
         """Estimate over one window; windows join bit for bit. ``signals.friction`` is not looked at."""
         signals = without_impossible(signals)
-        steps, speed_carry = self._speed_filter.run(
-            _without_friction(signals), None if state is None else state.speed_filter
+        vehicle = self.vehicle.model_copy(update={"friction": USUAL_FRICTION})
+        unknown = replace(signals, friction=np.full(len(signals), np.nan))
+        speed_filter = PhysicsUkf(vehicle, use_speed=self.use_speed)
+        steps, speed_carry = speed_filter.run(unknown, None if state is None else state.speed_filter)
+        grid, spread, prior, models = self._filters
+        count, bank = (
+            len(signals),
+            (prior.copy(), np.zeros((len(grid), 2)), np.zeros((len(grid), 3)), np.zeros(_MEMORY)),
         )
-        parameters = model_parameters(self.vehicle, roll_correction=True)
-        grid, prior = np.array(GRID), np.array(PRIOR)
-        count = len(signals)
-        if state is None:
-            weights, x, P, memory = prior.copy(), np.zeros((len(grid), 2)), np.zeros((len(grid), 3)), np.zeros(_MEMORY)
-        else:
-            weights, x, P, memory = state.weights.copy(), state.x.copy(), state.P.copy(), state.memory.copy()
+        if state is not None:
+            bank = state.weights.copy(), state.x.copy(), state.P.copy(), state.memory.copy()
         before_ns = state.last_stamp_ns if state else None
         dt = step_durations_s(signals.stamps_ns, before_ns)
         vx = np.where(steps.valid, steps.x[:, VX], np.nan)
-        usable = np.asarray(vx > LEAST_SPEED_BLENDS * parameters.blend_high_m_s)
+        usable = np.asarray(vx > LEAST_SPEED_BLENDS * models[0].blend_high_m_s)
         friction, std = np.empty(count), np.empty(count)
         drive = (
-            dt, vx, steps.inputs[:, U_STEER].copy(), usable, signals.ax_m_s2, signals.ay_m_s2, signals.yaw_rate_rad_s,
+            dt, vx, steps.inputs[:, U_STEER].copy(), usable, signals.ay_m_s2, signals.yaw_rate_rad_s,
         )  # fmt: skip
-        bank = (weights, x, P, memory)
-        _bank(drive, grid, prior, parameters, self.ay_per_friction, bank, friction, std)
-        after = FrictionState(weights, x, P, memory, last_stamp_ns(signals.stamps_ns, before_ns), speed_carry)
+        _bank(drive, grid, spread, prior, models, self.ay_per_friction, bank, friction, std)
+        after = FrictionState(*bank, last_stamp_ns(signals.stamps_ns, before_ns), speed_carry)
         return FrictionEstimate(friction, std, std < OBSERVABLE_STD), after
-
-
-def _without_friction(signals: Signals) -> Signals:
-    return replace(signals, friction=np.full(len(signals), np.nan))

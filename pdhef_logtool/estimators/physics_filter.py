@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pdhef_logtool.car.nominal_model import ModelParameters, dynamic_share, model_parameters
-from pdhef_logtool.car.parts import PHYSICS, FilterNoise
+from pdhef_logtool.car.parts import LIMIT_GAIN, PHYSICS, FilterNoise
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, corrected_anew
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.compiled.vectors import (
@@ -94,8 +94,9 @@ FORCE_SCALE_STD = 0.05
 UNKNOWN_STEER_STD, MAX_STEER_STD, UNKNOWN_STEER_WALK = 0.1, 0.2, 0.2
 
 #: Beyond this share of the grip, the largest of about the last ``LIMIT_TIME_S``, tyre models are least certain
-#: (docs/method.md#limit). ``limit_gain`` of a file that neither ground truth nor calibration has validated.
-LINEAR_SHARE, LIMIT_TIME_S, FILE_LIMIT_GAIN = 0.36, 0.5, 8.0
+#: (docs/method.md#limit). ``limit_lag_m`` of a file that neither ground truth nor calibration has validated, in
+#: wheelbases: chosen on simulated cars with right and wrong files. More helps single manoeuvres and harms laps.
+LINEAR_SHARE, LIMIT_TIME_S, FILE_LAG = 0.36, 0.5, 1.1
 
 #: The column of a block of points that contains the centre.
 _CENTRE = AY_BIAS
@@ -242,13 +243,15 @@ def _process_noise(q_std, ax_known, dt, layout, q):  # type: ignore[no-untyped-d
 
 
 @_compiled
-def _limit_factor(x, friction, dt, limit_gain, p, memory):  # type: ignore[no-untyped-def]
-    """Return the factor on the process noise of the axle forces: 1 in the linear range, more beyond it."""
+def _yield_to_kinematics(x, friction, dt, limits, p, f, memory):  # type: ignore[no-untyped-def]
+    """Return the factor on the process noise of the axle forces, 1 in the linear range, and how they lag beyond it."""
     most = friction * (p.front_D_n + p.rear_D_n) / p.mass_kg
     used = abs(x[FRONT] + x[REAR]) / most
     memory[base.M_GRIP] = max(used, memory[base.M_GRIP] * math.exp(-dt / LIMIT_TIME_S))
     beyond = max(0.0, memory[base.M_GRIP] - LINEAR_SHARE)
-    return 1.0 + limit_gain * beyond * beyond
+    if limits[1] > 0.0:
+        f = PhysicsParameters(limits[1] * beyond, *f[1:])
+    return 1.0 + limits[0] * beyond * beyond, f
 
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
@@ -407,7 +410,7 @@ def _find_steering(x, P, std):  # type: ignore[no-untyped-def]
 
 # positional: as _predict.
 @njit(cache=True)
-def _filter(window, tuning, limit_gain, layout, p, f, estimate, out, links):  # type: ignore[no-untyped-def]
+def _filter(window, tuning, limits, layout, p, f, estimate, out, links):  # type: ignore[no-untyped-def]
     """Run over one window; ``estimate`` is moved in place. ``links`` are of length 0 where nobody asks for them."""
     dt, steer, ax, ay, yaw_rate, speed, friction, residual_rate, extra_r = window
     q_std, r_std, initial_std, standstill_std, _, _, scale, rules = tuning
@@ -462,8 +465,8 @@ def _filter(window, tuning, limit_gain, layout, p, f, estimate, out, links):  # 
             if not factored:
                 wide_root(P, places, there, L)
             factored = False
-            if limit_gain > 0.0:
-                factor = _limit_factor(x, over.friction, now.dt, limit_gain, p, memory)
+            if limits[0] > 0.0:
+                factor, f = _yield_to_kinematics(x, over.friction, now.dt, limits, p, f, memory)
                 q_std[FRONT], q_std[REAR] = factor * front_std, factor * rear_std
             noise = (q_std, noise[1], scale + 1.0 if guessed and hidden else scale)
             _draw(x, L, noise[2], constants, points)
@@ -559,6 +562,7 @@ class PhysicsFilter(base.LinkedFilter):
         priors of the biases.
     q_std : process 1-sigma per √s of [v_x, v_y, r, b_ax, f_f, f_r], forces over mass in m/s².
     limit_gain : growth of the process noise of the axle forces beyond the linear range; 0: none.
+    limit_lag_m : growth of the length over which they return to the tyres' beyond it, none within; 0: the car's lag.
     r_std : 1-sigma of [a_y, r, v_x].
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
     slip_gate : leave out the speed of wheels that spin or lock (:mod:`~.speed_slip`).
@@ -568,11 +572,12 @@ class PhysicsFilter(base.LinkedFilter):
 
     algorithm = "physics-filter"
     version = 1
-    options = ("slip_gate", "standstill", "limit_gain")
+    options = ("slip_gate", "standstill", "limit_gain", "limit_lag_m")
 
     vehicle: VehicleParameters
     q_std: tuple[float, ...] = PHYSICS_Q_STD
     limit_gain: float = 0.0
+    limit_lag_m: float = 0.0
     r_std: tuple[float, float, float] | None = None
     use_speed: bool = True
     slip_gate: bool = True
@@ -634,7 +639,7 @@ class PhysicsFilter(base.LinkedFilter):
         out: base.Posterior,
         links: base.LinkColumns,
     ) -> None:
-        _filter(window, tuning, self.limit_gain, *self.parameters, estimate, out, links)
+        _filter(window, tuning, (self.limit_gain, self.limit_lag_m), *self.parameters, estimate, out, links)
 
     def _predict_kernel(
         self, pending: base.PendingPredictions, start: base.PredictionStart, predicted: base.Predicted
@@ -665,8 +670,8 @@ def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:
     """Return ``physics`` of a car, with what was found through it and its noise where the car has them.
 
     A car without identified parts has none: a static single track with the sensors' noise. If no drive with ground
-    truth has validated it, its axle forces lag, for only forces that are states can depart from the tyre model, and do
-    so at the limit. What tuned noise leaves out of the process noise is what was found through the filter.
+    truth has validated it, its axle forces may depart from the tyre model, for longer the more grip the car uses: only
+    forces that lag can. What tuned noise leaves out of the process noise is what was found through the filter.
     """
     vehicle, noise = car.physics_vehicle, car.noise.get(PHYSICS)
     if noise is not None and car.fitted_physics is not None:
@@ -675,5 +680,5 @@ def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:
     physics = physics_filter(vehicle, noise, use_speed=use_speed)
     if noise is None and not car.has_evidence:
         lagging = vehicle.model_copy(update={"physics": vehicle.physics.model_copy(update={"lag": True})})
-        physics = replace(physics, vehicle=lagging, limit_gain=FILE_LIMIT_GAIN)
+        physics = replace(physics, vehicle=lagging, limit_gain=LIMIT_GAIN, limit_lag_m=FILE_LAG * vehicle.wheelbase_m)
     return physics if vehicle == car.vehicle else replace(physics, read_with=car.vehicle)

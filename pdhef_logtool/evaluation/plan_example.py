@@ -10,7 +10,7 @@ from typing import Any
 
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.segments import SEGMENTS
-from pdhef_logtool.evaluation.units import SIGNALS, typed_unit
+from pdhef_logtool.evaluation.units import SIGNALS, share_of, typed_unit
 from pdhef_logtool.evaluation.validation_plan import AT_LEAST, MEANS, SQUARES, WORST_DRIVE, comparable, plan_from_dict
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.storage.documents import read_toml
@@ -20,7 +20,7 @@ EXAMPLE = f"""\
 # Each requirement gets PASS, FAIL or INCONCLUSIVE by the confidence interval of its value over drives
 # (below five drives: over blocks of 10 s within them). Exit code 4: a requirement failed.
 # signal: {", ".join(SIGNALS)}
-{textwrap.fill(", ".join(SEGMENTS), initial_indent="# segment: ", subsequent_indent="#   ")}
+{textwrap.fill(", ".join(SEGMENTS), 110, initial_indent="# segment: ", subsequent_indent="# ", break_on_hyphens=False)}
 title = "Sideslip of the sedan"
 
 [[requirement]]
@@ -139,11 +139,8 @@ def _figure(table: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
     if problem:
         return entries, problem
     share = table.get("max_regression", 0.0)
-    text = str(share).strip()
-    try:
-        value = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
-    except ValueError:
-        return entries, f"max_regression {text!r} is no share"
+    if (value := share_of(str(share))) is None:
+        return entries, f"max_regression {share!r} is no share"
     return _checked({**entries, "baseline": RUN, "max_ratio": round(1.0 + value, 9)})
 
 

@@ -23,8 +23,6 @@ _RESAMPLES, _SEED = 2000, 0
 _MOST_UNITS = 1000
 #: Largest studentised deviation, in quantiles of Student's t: of few units some resamples have nearly no spread.
 _MOST_DEVIATION = 2.0
-#: Resamples times units that are in memory at once.
-_AT_ONCE = 1 << 21
 #: From so many drives on the bootstrap alone covers.
 _LOGNORMAL = 300
 
@@ -129,17 +127,11 @@ def _error(top: FloatArray, below: FloatArray, counts: FloatArray, power: float,
 def _deviations(top: FloatArray, below: FloatArray, power: float, centre: float, *, log: bool) -> FloatArray:
     """Return (statistic − centre) / its error over resamples of the units."""
     n = len(top)
-    rng = np.random.default_rng(_SEED)
-    step = max(1, _AT_ONCE // n)
-    parts = []
-    for start in range(0, _RESAMPLES, step):
-        m = min(step, _RESAMPLES - start)
-        counts = rng.multinomial(n, np.full(n, 1.0 / n), size=m).astype(np.float64)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = (counts @ top) / (counts @ below)
-            statistic = power * np.log(ratio) if log else ratio
-            parts.append((statistic - centre) / _error(top, below, counts, power, log=log))
-    deviations = np.concatenate(parts)
+    counts = np.random.default_rng(_SEED).multinomial(n, np.full(n, 1.0 / n), size=_RESAMPLES).astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = (counts @ top) / (counts @ below)
+        statistic = power * np.log(ratio) if log else ratio
+        deviations = (statistic - centre) / _error(top, below, counts, power, log=log)
     usable = deviations[np.isfinite(deviations)]
     return usable if usable.size else np.zeros(1)
 

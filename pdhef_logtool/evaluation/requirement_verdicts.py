@@ -38,8 +38,6 @@ REFERENCE_SDS = 2.0
 NARROW = "the estimate states too small an uncertainty; the size of its error is judged by other requirements"
 #: A share of drives below this is not shown.
 _SHARE_SHOWN = 0.5
-#: Next steps of requirements that are named.
-_MOST_NEXT = 4
 #: More driving than this many times that of now is no advice.
 _MOST_TIMES = 30.0
 
@@ -312,12 +310,13 @@ def _decide(
     missing: str,
 ) -> tuple[Outcome, str, str]:
     """Return outcome, reason and next step."""
-    where = "" if requirement.segment == "all" else f" of {requirement.segment}"
+    where = "" if requirement.segment == "all" else f" ({requirement.segment})"
     if not exposure.drives or not math.isfinite(bounded.value):
         reason, _, remedy = missing.partition("; ")
         return "INCONCLUSIVE", reason or "no drive has this metric", remedy or _what_to_record(requirement)
     if lacking:
-        return "INCONCLUSIVE", f"too little driving: {'; '.join(w for w, _ in lacking)}", _more(lacking, where)
+        more = f"drive {' and '.join(more for _, more in lacking)} more{where}, with ground truth"
+        return "INCONCLUSIVE", f"too little driving: {'; '.join(w for w, _ in lacking)}", more
     if _without_bounds(requirement, bounded):
         return "INCONCLUSIVE", *_too_few(requirement, bounded, basis, where)
     outcome = _outcome(requirement, bounded)
@@ -380,10 +379,6 @@ def _lacking(requirement: Requirement, exposure: Exposure, drives: Sequence[Driv
             has_words = "an unknown number" if has is None else layout.format(has)
             lacking.append((f"{has_words} of {needed:g} {word}", f"{layout.format(needed - (has or 0.0))} {word}"))
     return lacking
-
-
-def _more(lacking: Sequence[tuple[str, str]], where: str) -> str:
-    return f"drive {' and '.join(more for _, more in lacking)} more{where}, with ground truth"
 
 
 def _what_to_record(requirement: Requirement) -> str:
@@ -457,6 +452,15 @@ def of_documents(verdicts: Sequence[Mapping[str, Any]], outcome: Outcome) -> lis
     return [v for v in verdicts if v["outcome"] == outcome]
 
 
+def joint_notes(notes: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return the notes of requirements by their id, each once, with the ids where it is not of all."""
+    ids: dict[str, list[str]] = {}
+    for name, of_requirement in notes.items():
+        for note in of_requirement:
+            ids.setdefault(note.rstrip("."), []).append(name)
+    return [note if len(names) == len(notes) else f"{', '.join(names)}: {note}" for note, names in ids.items()]
+
+
 def next_steps(plan: Mapping[str, Any] | None, more: Sequence[str] = ()) -> list[str]:
     """Return what to do by a document: failed requirements, inconclusive ones, ``more``; of the default plan last."""
     requirements = (plan or {}).get("requirements") or ()
@@ -464,6 +468,6 @@ def next_steps(plan: Mapping[str, Any] | None, more: Sequence[str] = ()) -> list
     for r in (*of_documents(requirements, "FAIL"), *of_documents(requirements, "INCONCLUSIVE")):
         if r["next"]:
             ids.setdefault(str(r["next"]), []).append(str(r["id"]))
-    asked = [f"{', '.join(names)}: {text}" for text, names in ids.items()][:_MOST_NEXT]
+    asked = [f"{', '.join(names)}: {text}" for text, names in ids.items()]
     others = [*filter(None, more)]
     return [*asked, *others] if (plan or {}).get("file") else [*others, *asked]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from pdhef_logtool.records.geometry import DEGREES
 
 #: Signals compared sample by sample, with their unit.
@@ -44,3 +46,12 @@ def read_unit(unit: str) -> tuple[str, float]:
 def typed_unit(unit: str) -> tuple[str, float]:
     """Return the unit that people type for one of metrics.parquet, and the factor to it."""
     return _TYPED.get(unit, (unit, 1.0))
+
+
+def share_of(text: str) -> float | None:
+    """Return the share that ``5%`` or ``0.05`` represents; None for what is none, or above 10."""
+    try:
+        share = float(text.strip().removesuffix("%")) / (100.0 if text.strip().endswith("%") else 1.0)
+    except ValueError:
+        return None
+    return share if math.isfinite(share) and 0.0 <= share <= 10.0 else None

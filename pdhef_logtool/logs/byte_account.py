@@ -19,8 +19,7 @@ class ByteLedger:
     unwanted : sound as far as is known, and never asked for: attachments, metadata, index, other topics' chunks.
     lost : damaged, cut, above the resource limits. If the place of damage is unknown: the record that reports it.
     cut : the file ends before its time. What should follow is in no sum.
-    checksummed : of ``decoded``, the bytes that a checksum of the file covers and that agree with it; None in a record
-        of an earlier version.
+    checksummed : of ``decoded``, the bytes that a checksum of the file covers and that agree with it.
 
     In a database the rows' data count, one row behind the other; all else of the file is unwanted while rows can be
     read to the end, and lost where they cannot.
@@ -32,14 +31,13 @@ class ByteLedger:
     unwanted: int
     lost: int
     cut: bool
-    checksummed: int | None = None
+    checksummed: int
 
 
 def checksummed_share(ledgers: Sequence[ByteLedger]) -> float | None:
-    """Return which share of the bytes that were read a verified checksum covers; None where that is not known."""
+    """Return which share of the bytes that were read a verified checksum covers; None where none was read."""
     decoded = sum(ledger.decoded for ledger in ledgers)
-    checksummed = [ledger.checksummed for ledger in ledgers if ledger.checksummed is not None]
-    return sum(checksummed) / decoded if decoded and len(checksummed) == len(ledgers) else None
+    return sum(ledger.checksummed for ledger in ledgers) / decoded if decoded else None
 
 
 def checksum_text(share: float | None) -> str:

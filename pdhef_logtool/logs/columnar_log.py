@@ -330,15 +330,7 @@ class ColumnarLog(DriveLog):
         quiet: bool = False,
         stamps: Collection[str] = (),
     ) -> dict[str, Columns]:
-        """Read the fields asked for of messages with log time in [start, end).
-
-        With ``quiet`` messages that do not decode are not reported as a loss. ``stamps`` are further topics; only their
-        times are read.
-
-        Raises
-        ------
-        MappingError : the log has no such topic, no such field, or cannot decode the topic.
-        """
+        """Read fields of messages; see :class:`~pdhef_logtool.logs.drive_log.DriveLog`."""
         plans = {topic: self._plan(topic, tuple(dict.fromkeys(paths))) for topic, paths in requests.items()}
         if not quiet:
             wanted = {(c, channel.id) for topic in requests for c, channel in self._by_topic[topic]}

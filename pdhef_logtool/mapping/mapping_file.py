@@ -437,6 +437,11 @@ def _lines(
     return [f"{names[n]} = {_toml(v)}" for n, v in values.items() if n in always or v != default[n]]
 
 
+def entries_of(source: SignalSource, *names: str) -> str:
+    """Return entries of a source's table in one line, for a remedy."""
+    return ", ".join(f"{name} = {_toml(getattr(source, name))}" for name in names)
+
+
 def _toml(value: str | float | tuple[str, ...] | tuple[float, ...]) -> str:
     if isinstance(value, str):
         # A JSON string is a TOML basic string, but for DEL, which TOML wants escaped.

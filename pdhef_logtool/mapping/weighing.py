@@ -173,10 +173,7 @@ class _Weighing:
             self._wheels(usable)
         if not have & {"steer_rad", "steering_wheel_rad"}:
             self._steering([f for f in usable if f.meaning.quantity == "steering"])
-        rate, wheels = self._chosen("yaw_rate_rad_s"), self._wheels_turn()
-        relation = None if rate is None or wheels is None else fit(wheels, self.fields.pieces.smooth(rate.si))
-        if rate is not None and relation is not None and abs(relation.correlation) > CLEAR:
-            _rate_by_track(rate, abs(relation.slope))
+        self._rate_by_track()
         self._follow()
         for name, item in self.taken.items():
             self._tell(name, item)
@@ -347,12 +344,28 @@ class _Weighing:
             item.doubts.append(f"it could be {rest[0][0]} in {rest[0][1][0]} as well")
         return name, True
 
+    def _rate_by_track(self) -> None:
+        """Find the unit of a yaw rate by the track that it gives with the wheels' difference: model cars to lorries."""
+        rate, wheels = self._chosen("yaw_rate_rad_s"), self._wheels_turn()
+        if rate is None or wheels is None or rate.unit_known or rate.fixed:
+            return
+        relation = fit(wheels, self.fields.pieces.smooth(rate.si))
+        if relation is None or abs(relation.correlation) <= CLEAR:
+            return
+        for unit, factor in rate.factors:
+            track_m = abs(relation.slope) * rate.factors[0][1] / factor
+            if 0.1 < track_m < 3.0:
+                rate.use(unit)
+                rate.reasons.append(f"unit {unit} by the wheels' difference: a track of {track_m:.2f} m")
+                return
+
     def _open_signs(self) -> tuple[tuple[str, ...], ...]:
         """Return the signals whose sign no documentation, name or mounting gives; those that share an axis together."""
         open_fields = {n: f for n, f in self.taken.items() if n in _SIGNED and _has_open_sign(f)}
         open_truth = {n: f for n, f in self.truth.items() if n in ("vy_m_s", "yaw_rate_rad_s") and not f.fixed}
         lateral, across = open_fields.get("ay_m_s2"), open_truth.get("vy_m_s")
-        groups = [(n,) for n in open_fields] + [(f"truth.{n}",) for n in open_truth if n != "vy_m_s"]
+        groups: list[tuple[str, ...]] = [(n,) for n in open_fields]
+        groups += [(f"truth.{n}",) for n in open_truth if n != "vy_m_s"]
         if lateral is not None and across is not None and _share_axis(lateral, across):
             groups[groups.index(("ay_m_s2",))] = ("ay_m_s2", "truth.vy_m_s")
         return tuple(groups)
@@ -566,18 +579,6 @@ def truth_topic(weighable: Sequence[Field]) -> str:
         if worth > best[0] and (fields[0].role != "sensor" or worth >= 1.5 or fields[0].fixed):
             best = (worth, name)
     return best[1]
-
-
-def _rate_by_track(rate: Field, slope_m: float) -> None:
-    """Find the unit of a yaw rate by the track that it gives with the wheels' difference: model cars to lorries."""
-    if rate.unit_known or rate.fixed:
-        return
-    for unit, factor in rate.factors:
-        track_m = slope_m * rate.factors[0][1] / factor
-        if 0.1 < track_m < 3.0:
-            rate.use(unit)
-            rate.reasons.append(f"unit {unit} by the wheels' difference: a track of {track_m:.2f} m")
-            return
 
 
 def _curvature(speed: Field | None, rate: Field | None, ay: Field | None) -> FloatArray | None:

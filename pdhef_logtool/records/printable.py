@@ -39,10 +39,6 @@ def _all_printable(value: Any) -> Any:
         return value
     if type(value) is str:
         return printable(value)
-    if type(value) is dict:
-        return {_all_printable(k): _all_printable(v) for k, v in value.items()}
-    if type(value) is list:
-        return [_all_printable(v) for v in value]
     if isinstance(value, PurePath):
         return type(value)(printable(value))
     if isinstance(value, Mapping):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pdhef_logtool.records.signals import BoolArray, FloatArray
+from pdhef_logtool.records.signals import FloatArray
 
 
 def running_mean(columns: FloatArray, half: int, weights: FloatArray | float = 1.0) -> FloatArray:
@@ -14,7 +14,7 @@ def running_mean(columns: FloatArray, half: int, weights: FloatArray | float = 1
     """
     rows, n = np.arange(len(columns)), len(columns)
     table = columns.reshape(n, -1)
-    finite: BoolArray = np.asarray(np.isfinite(table).all(axis=1), dtype=np.bool_)
+    finite = np.asarray(np.isfinite(table).all(axis=1))
     weight = np.where(finite, weights, 0.0)[:, None]
     table = np.hstack([weight * np.where(finite[:, None], table, 0.0), weight])
     sums = np.concatenate([np.zeros((1, table.shape[1])), np.cumsum(table, axis=0)])

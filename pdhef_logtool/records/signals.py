@@ -186,10 +186,10 @@ class Signals:
 
     def __post_init__(self) -> None:
         """Fill columns that are not given with NaN."""
-        for f in fields(Signals):
-            column = getattr(self, f.name)
-            if f.name != "available" and len(column) != len(self):
-                object.__setattr__(self, f.name, np.full((len(self), *column.shape[1:]), np.nan))
+        for name in _COLUMNS:
+            column = getattr(self, name)
+            if len(column) != len(self):
+                object.__setattr__(self, name, np.full((len(self), *column.shape[1:]), np.nan))
 
     def __len__(self) -> int:
         """Return the number of stamps."""
@@ -197,15 +197,15 @@ class Signals:
 
     def rows(self, start: int, end: int) -> Signals:
         """Return the stamps [start, end)."""
-        columns = {f.name: getattr(self, f.name)[start:end] for f in fields(Signals) if f.name != "available"}
-        return Signals(**columns, available=self.available)
+        return Signals(**{c: getattr(self, c)[start:end] for c in _COLUMNS}, available=self.available)
+
+
+_COLUMNS = tuple(f.name for f in fields(Signals) if f.name != "available")
 
 
 def join_signals(windows: Sequence[Signals]) -> Signals:
     """Join consecutive windows of one drive in time order."""
-    columns = {
-        f.name: np.concatenate([getattr(w, f.name) for w in windows]) for f in fields(Signals) if f.name != "available"
-    }
+    columns = {c: np.concatenate([getattr(w, c) for w in windows]) for c in _COLUMNS}
     return Signals(**columns, available=windows[0].available)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -171,28 +172,13 @@ def make_track(name: str, stamps_ns: IntArray, **columns: FloatArray | IntArray 
     ``sideslip_rad`` is derived as atan2(v_y, v_x) when it is not given.
     """
     n = int(stamps_ns.shape[0])
-    values: dict[str, object] = {"name": name, "stamps_ns": stamps_ns}
-    for f in fields(StateTrack):
-        if f.name in values:
-            continue
-        if f.name in columns:
-            values[f.name] = columns[f.name]
-        elif f.name in OPTIONAL_COLUMNS:
-            continue
-        elif f.name == "covariance":
-            values[f.name] = np.empty((0, 3, 3))
-        elif f.name == "valid":
-            values[f.name] = np.ones(n, dtype=np.bool_)
-        elif f.name == "diverged":
-            values[f.name] = np.zeros(n, dtype=np.bool_)
-        else:
-            values[f.name] = np.full(n, np.nan)
+    needed = [f.name for f in fields(StateTrack) if f.name not in OPTIONAL_COLUMNS]
+    values: dict[str, Any] = {c: np.full(n, np.nan) for c in needed if c not in columns}
+    values |= {"covariance": np.empty((0, 3, 3)), "valid": np.ones(n, np.bool_), "diverged": np.zeros(n, np.bool_)}
+    values |= {"name": name, "stamps_ns": stamps_ns, **columns}
     if "sideslip_rad" not in columns and "vx_m_s" in columns and "vy_m_s" in columns:
         values["sideslip_rad"] = np.arctan2(columns["vy_m_s"], columns["vx_m_s"])
-    unknown = set(columns) - {f.name for f in fields(StateTrack)}
-    if unknown:
-        raise TypeError(f"unknown track columns: {sorted(unknown)}")
-    return StateTrack(**values)  # type: ignore[arg-type]
+    return StateTrack(**values)
 
 
 def diagonal_covariance(stds: Sequence[FloatArray]) -> FloatArray:
@@ -208,8 +194,7 @@ def diagonal_covariance(stds: Sequence[FloatArray]) -> FloatArray:
 
 def concatenate(tracks: list[StateTrack]) -> StateTrack:
     """Join the windows of one track in time order."""
-    first = tracks[0]
     joined = {
         f.name: np.concatenate([getattr(t, f.name) for t in tracks]) for f in fields(StateTrack) if f.name != "name"
     }
-    return StateTrack(name=first.name, **joined)
+    return StateTrack(name=tracks[0].name, **joined)

@@ -18,8 +18,6 @@ from pdhef_logtool.results.fleet import cause_and_remedy
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
 from pdhef_logtool.results.run_report import reasons_line
 
-#: What reports of earlier versions do not state: the default of a vehicle file.
-_LOW_SPEED_M_S = 3.0
 #: The strongest filter on physics alone.
 _PHYSICS = "physics"
 #: Of a shorter drive nothing can be stated with any certainty.
@@ -70,14 +68,12 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         return DrivePage(render("failed.html", label=log.label, cause=cause, remedy=remedy, back=back), Charts())
     figures, why_none, wrong = None, "", ""
     roles = roles_of(report)
-    low_speed = report["vehicle"].get("low_speed_blend_m_s")
     if roles is None:
         why_none = "Nothing was estimated, so that there is nothing to draw."
     else:
         try:
             path = log.file(ESTIMATES_FILE)
-            slow = _LOW_SPEED_M_S if low_speed is None else low_speed
-            figures = None if path is None else drive_figures(path, report, roles, slow)
+            figures = None if path is None else drive_figures(path, report, roles)
         except OutputError as error:
             wrong = f"the figures cannot be drawn: {error}"
             why_none = f"{wrong[0].upper()}{wrong[1:]}"
@@ -101,7 +97,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         verdicts=verdicts_of(report),
         drawn=figures,
         why_none=why_none,
-        notices=_notices(report, figures, low_speed),
+        notices=_notices(report, figures),
         scores=[] if roles is None else scores(report, roles),
         segments=[] if roles is None else by_segment(report, roles),
         consistency=consistency(report, roles),
@@ -169,7 +165,7 @@ def verdicts_of(report: Mapping[str, Any]) -> list[Verdict]:
     return [Verdict("sideslip", "result", str(answer["texts"]["result"]))]
 
 
-def _notices(report: Mapping[str, Any], figures: DriveFigures | None, low_speed: float | None) -> list[str]:
+def _notices(report: Mapping[str, Any], figures: DriveFigures | None) -> list[str]:
     """Return the warnings that a reader needs before the figures."""
     said = []
     duration = report["log"]["duration_s"]
@@ -189,11 +185,6 @@ def _notices(report: Mapping[str, Any], figures: DriveFigures | None, low_speed:
         )
     if figures is not None and figures.absent:
         said.append(f"Not in estimates.parquet, so not drawn: {', '.join(figures.absent)}.")
-    if low_speed is None:
-        said.append(
-            f"This report is of an earlier version: sideslip is left out below {_LOW_SPEED_M_S:g} m/s, "
-            "the default of cars."
-        )
     return said
 
 

@@ -103,19 +103,19 @@ class DriveFigures:
         return any(key in self.charts.figures for key in ("path", *(key for key, *_ in _PLANES)))
 
 
-def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles, low_speed_m_s: float) -> DriveFigures | None:
+def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> DriveFigures | None:
     """Return the figures of a drive, None where the file contains no row of its answer.
 
     Parameters
     ----------
-    path : estimates.parquet. low_speed_m_s : sideslip is a gap below it.
+    path : estimates.parquet. Sideslip is a gap below the low-speed limit of the report.
 
     Raises
     ------
     OutputError
         The file is damaged.
     """
-    tracks = Tracks(path, low_speed_m_s)
+    tracks = Tracks(path, report["vehicle"]["low_speed_blend_m_s"])
     if roles.main not in tracks.names or not len(stamps := tracks.stamps(roles.main)):
         return None
     grid, origin_ns = grid_of(stamps), int(report["log"]["start_ns"])

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pdhef_logtool.evaluation.requirement_verdicts import next_steps, of_documents
+from pdhef_logtool.evaluation.requirement_verdicts import joint_notes, next_steps, of_documents
 from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import shown
 from pdhef_logtool.records.printable import printable
@@ -60,8 +60,8 @@ def plan_head(plan: Mapping[str, Any] | None) -> PlanHead | None:
     name = f"Plan {plan['file']}" if plan.get("file") else "Default plan (orientation, decides no exit code)"
     worst = next((k for o, k in (("FAIL", "fail"), ("INCONCLUSIVE", "unknown")) if counts[o]), "pass")
     order = [r for outcome in ("FAIL", "INCONCLUSIVE", "PASS") for r in of_documents(requirements, outcome)]
-    notes = dict.fromkeys(note for r in requirements for note in r.get("notes") or ())
-    return PlanHead(worst, f"{name}: {', '.join(parts)}", [_line(r) for r in order], [*notes])
+    notes = joint_notes({str(r["id"]): r.get("notes") or () for r in requirements})
+    return PlanHead(worst, f"{name}: {', '.join(parts)}", [_line(r) for r in order], notes)
 
 
 def _line(requirement: Mapping[str, Any]) -> RequirementLine:
@@ -90,9 +90,9 @@ def _exposure(exposure: Mapping[str, Any]) -> str:
         return "nothing"
     parts = [f"{exposure['drives']} {'drive' if exposure['drives'] == 1 else 'drives'}"]
     if exposure["minutes"] is not None:
-        parts.append(f"{exposure['minutes']:.1f} min")
+        parts.append(duration(60.0 * exposure["minutes"]))
     if exposure["km"] is not None:
-        parts.append(f"{exposure['km']:.1f} km")
+        parts.append(f"{exposure['km']:.1f} km" if exposure["km"] < 100.0 else f"{exposure['km']:.0f} km")
     return ", ".join(parts)
 
 
@@ -130,7 +130,8 @@ def duration(seconds: float) -> str:
     """Return a duration as people read it."""
     if seconds < 120.0:
         return f"{seconds:.1f} s"
-    return f"{seconds / 60.0:.1f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
+    hours = seconds / 3600.0
+    return f"{seconds / 60.0:.1f} min" if hours < 2.0 else f"{hours:.1f} h" if hours < 100.0 else f"{hours:.0f} h"
 
 
 def versions(installed: Mapping[str, str]) -> str:

@@ -48,18 +48,18 @@ def _multiply(x, weights, out):  # type: ignore[no-untyped-def]
     """Add x [2, K] times weights [K, M] to out [2, M]; four rows of weights at a time, in their order."""
     rows, columns = weights.shape
     whole = rows - rows % 4
-    one, other = out[0], out[1]
+    straight, mirrored = out[0], out[1]
     for k in range(0, whole, 4):
         a, b, c, d = x[0, k], x[0, k + 1], x[0, k + 2], x[0, k + 3]
         e, f, g, h = x[1, k], x[1, k + 1], x[1, k + 2], x[1, k + 3]
         w0, w1, w2, w3 = weights[k], weights[k + 1], weights[k + 2], weights[k + 3]
         for m in range(columns):
-            one[m] = one[m] + a * w0[m] + b * w1[m] + c * w2[m] + d * w3[m]
-            other[m] = other[m] + e * w0[m] + f * w1[m] + g * w2[m] + h * w3[m]
+            straight[m] = straight[m] + a * w0[m] + b * w1[m] + c * w2[m] + d * w3[m]
+            mirrored[m] = mirrored[m] + e * w0[m] + f * w1[m] + g * w2[m] + h * w3[m]
     for k in range(whole, rows):
         for m in range(columns):
-            one[m] += x[0, k] * weights[k, m]
-            other[m] += x[1, k] * weights[k, m]
+            straight[m] += x[0, k] * weights[k, m]
+            mirrored[m] += x[1, k] * weights[k, m]
 
 
 @_compiled

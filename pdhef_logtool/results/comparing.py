@@ -446,7 +446,7 @@ def _of_rows(figure: Figure, both: pl.DataFrame, grouping: _Grouping) -> Compare
     known_a, known_b = known_a.fill_null(value=False), known_b.fill_null(value=False)
     used = both.filter(known_a & known_b)
     a, b = used["value_a"].to_numpy(), used["value_b"].to_numpy()
-    ratios = log_ratios(a, b, figure.floor)
+    ratios = log_ratios(a, b)
     change = paired_change(ratios, *grouping.of(used["place"].to_list()))
     same = bool(np.array_equal(a, b)) and bool(np.array_equal(used["n_a"].to_numpy(), used["n_b"].to_numpy()))
     verdict: FigureVerdict = change.verdict(figure.limit or 0.0)

@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
-from pdhef_logtool.evaluation.units import read_unit
+from pdhef_logtool.evaluation.units import SCORED_SIGNALS, read_unit
 from pdhef_logtool.results.changed_signals import ChangedSignal
 from pdhef_logtool.results.comparing import INDEPENDENT, ComparedFigure, Comparison
 from pdhef_logtool.results.paired_change import LEAST_CLUSTERS
 from pdhef_logtool.results.sink import TRUTH
 
-_COLUMN_UNITS = {"rad": "rad", "rad_s": "rad/s", "m_s": "m/s", "m_s2": "m/s^2"}
-#: Figures that a verdict names.
-_MOST_NAMED = 3
 _BY = {"signals": "the content of their signals", "content": "the hashes of their files", "name": "their names alone"}
 
 
@@ -41,7 +38,7 @@ def verdict_text(comparison: Comparison) -> str:
     decisive = [f for f in comparison.figures if f.verdict == comparison.verdict]
     if comparison.verdict == "no figure":
         return f"{text}: {', '.join(f.figure.label for f in decisive)}"
-    changes = [f"{f.figure.short} {change_text(f)} of {f.change.drives} drives" for f in decisive[:_MOST_NAMED]]
+    changes = [f"{f.figure.short} {change_text(f)} of {f.change.drives} drives" for f in decisive]
     return f"{text}: {', '.join(changes)}" if changes and comparison.verdict != "equal" else text
 
 
@@ -117,12 +114,6 @@ def interval_text(figure: ComparedFigure) -> str:
     return f"{percent(low)} to {percent(high)}" if math.isfinite(figure.change.low) else "-"
 
 
-def unit_of_column(column: str) -> str:
-    """Return the unit of a column of estimates.parquet by its name."""
-    plain = column.replace("_std", "")
-    return next((unit for end, unit in sorted(_COLUMN_UNITS.items(), reverse=True) if plain.endswith(f"_{end}")), "1")
-
-
 def one_signal_a_drive(comparison: Comparison) -> list[ChangedSignal]:
     """Return the signal that was asked about of each drive, else its first, and the first of a changed ground truth."""
     asked = comparison.figures[0].figure.signal
@@ -136,7 +127,7 @@ def one_signal_a_drive(comparison: Comparison) -> list[ChangedSignal]:
 
 def largest_text(signal: ChangedSignal) -> str:
     """Return the largest difference with its unit."""
-    unit, factor = read_unit(unit_of_column(signal.signal))
+    unit, factor = read_unit(SCORED_SIGNALS.get(signal.signal.replace("_std", ""), "1"))
     return "-" if signal.largest is None else f"{signal.largest * factor:.3g} {unit}".strip()
 
 

@@ -113,7 +113,7 @@ class Distribution:
 
 @dataclass(frozen=True, slots=True)
 class Rank:
-    """The place of an estimator: those that it is shown to be better than and worse than, pair by pair.
+    """The place of an estimator: those that it is shown to be better than, pair by pair.
 
     ``place``: None where no difference between two estimators is significant. ``against_answer``: the median of its
     error over the selected estimate's, less 1; None for one that always is the selected estimate.
@@ -123,7 +123,6 @@ class Rank:
     estimator: str
     drives: int
     better_than: tuple[str, ...]
-    worse_than: tuple[str, ...]
     against_answer: Median | None
 
 
@@ -445,7 +444,6 @@ def _ranking(drives: Sequence[FleetDrive], names: Sequence[str]) -> list[Rank]:
             estimator=name,
             drives=int(np.isfinite(errors[name]).sum()),
             better_than=tuple(n for n in order if n in beats[name]),
-            worse_than=tuple(n for n in order if n in lost[name]),
             against_answer=None if mains == {name} else _share(_median(change(ANSWER, name))),
         )
         for name in order

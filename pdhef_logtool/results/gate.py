@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import re
 from dataclasses import dataclass
 
 from pdhef_logtool.evaluation.metrics.registry import registered
@@ -14,7 +12,6 @@ from pdhef_logtool.storage.documents import unknown
 
 #: Name for the selected estimate of each drive in A.
 MAIN = "main"
-_SHARE = re.compile(r"\s*([0-9]*\.?[0-9]+)\s*(%?)\s*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +19,7 @@ class Figure:
     """A figure of metrics.parquet whose lower value is better.
 
     ``estimator``: a name on both sides, or :data:`MAIN`. ``limit``: the share by which it may become worse, None where
-    nothing is asked of it. ``floor``: figures below count as the floor, in the unit of metrics.parquet.
+    nothing is asked of it.
     """
 
     signal: str = "sideslip_rad"
@@ -30,7 +27,6 @@ class Figure:
     segment: str = "all"
     estimator: str = MAIN
     limit: float | None = None
-    floor: float = 0.0
 
     @property
     def label(self) -> str:
@@ -66,15 +62,3 @@ def figure_problems(signal: str, metric: str, segment: str, where: str = "") -> 
     compared = tuple(name for name, metric in registered().items() if metric.best == "lower")
     choices = (("signal", signal, tuple(SIGNALS)), ("metric", metric, compared), ("segment", segment, SEGMENTS))
     return [f"{where}{key} = {unknown(value, allowed)}" for key, value, allowed in choices if value not in allowed]
-
-
-def share_of(text: str | float) -> float | None:
-    """Return the share that ``5%``, ``0.05`` or a number represents; None for what is none, or above 10."""
-    if isinstance(text, str):
-        match = _SHARE.fullmatch(text)
-        if match is None:
-            return None
-        share = float(match[1]) / (100.0 if match[2] else 1.0)
-    else:
-        share = float(text)
-    return share if math.isfinite(share) and 0.0 <= share <= 10.0 else None

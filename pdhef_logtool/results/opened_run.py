@@ -224,7 +224,8 @@ def open_run(output: Path | str) -> OpenedRun:
         got = f"format {document.get('format')!r}"
         raise OutputError(expected=what, got=got, where=str(path), remedy=_REMEDY)
     validated(_Run, document, str(path), OutputError, expected=what, remedy=_REMEDY)
-    logs = tuple(_opened(entry, folder / LOGS, mirror) for entry in document["logs"])
+    place = folder / LOGS
+    logs = tuple(_opened(entry, place, mirror) for entry in document["logs"])
     return OpenedRun(folder, document, logs, mirror)
 
 

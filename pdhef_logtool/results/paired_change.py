@@ -71,11 +71,10 @@ class PairedChange:
         return math.expm1(log_change)
 
 
-def log_ratios(a: FloatArray, b: FloatArray, floor: float = 0.0) -> FloatArray:
-    """Return ln(b / a) [N] of figures ≥ 0; what is below ``floor`` counts as the floor, 0 against 0 as no change."""
-    low, high = np.maximum(a, floor), np.maximum(b, floor)
+def log_ratios(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return ln(b / a) [N] of figures ≥ 0; 0 against 0 is no change."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(low == high, 0.0, np.log(high) - np.log(low))
+        return np.where(a == b, 0.0, np.log(b) - np.log(a))
 
 
 def paired_change(

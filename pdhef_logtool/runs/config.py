@@ -262,9 +262,6 @@ def _toml_value(text: str) -> Any:
 
 def _read_file(path: Path) -> dict[str, Any]:
     raw = read_toml(path, "a configuration TOML file", UsageError)
-    if "thresholds" in raw:
-        remedy = "convert the file: pdhef plan init --from FILE -o plan.toml"
-        raise UsageError(expected="plan in place of thresholds", got="thresholds", where=str(path), remedy=remedy)
     if isinstance(raw.get("cache"), str) and "://" not in raw["cache"]:
         raw["cache"] = str(path.parent / raw["cache"])
     for key in _FILES:

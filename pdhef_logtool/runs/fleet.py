@@ -169,8 +169,6 @@ def _given_limits(config: RunConfig) -> Limits | None:
 
 def _run_alone(log: LogInput, output: Path, job: _Job, reporter: Reporter) -> RunResult:
     """Run one log in this process; its error is that of the run."""
-    from pdhef_logtool.runs.compiling import compile_for
-
     job.check_places([log], output)
     config, car = job.config, job.cars.of_log(log)
     pool = calibrate_pool([log], car, job.mapping, config) if config.calibrate == "pool" else None
@@ -178,7 +176,7 @@ def _run_alone(log: LogInput, output: Path, job: _Job, reporter: Reporter) -> Ru
         try:
             result = run_log(
                 log, outputs, config, car, job.mapping,
-                pool=pool, validation=job.validation, prepare=compile_for, reporter=reporter,
+                pool=pool, validation=job.validation, reporter=reporter,
             )  # fmt: skip
         except Exception:
             raise

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
@@ -281,7 +281,6 @@ def run_log(
     *,
     pool: SelfCalibration | None = None,
     validation: ValidationPlan | None = None,
-    prepare: Callable[[Sequence[str]], None] = lambda _names: None,
     reporter: Reporter = SILENT,
 ) -> LogResult:
     """Run one log and replace its folder ``logs/<stem>`` of the outputs.
@@ -290,7 +289,6 @@ def run_log(
     ----------
     pool : what all logs of the run together state of the car; None: the log states it, if it is asked.
     validation : plan that the report gives verdicts on; None: the default plan.
-    prepare : called with the names of the estimators before they run.
 
     Raises
     ------
@@ -302,7 +300,6 @@ def run_log(
         calibration = checked(drive, pool if pool is not None else calibrate_drive(drive, config))
         car = self_calibrated(drive, calibration)
         ready, skipped, requested = _choose_estimators(drive, config, car)
-        prepare([e.name for e in ready])
         reference = reference_of(drive, calibration, config)
         if reference is not None and reference.estimator is not None:
             ready, requested = [*ready, reference.estimator], requested | {REFERENCE}

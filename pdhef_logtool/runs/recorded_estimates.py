@@ -121,12 +121,6 @@ def score_log(
         with closing(open_log(log_input.path, reading.limits, reading.msgs, Wanted(frozenset()))) as log:
             mapping = mapping_for_recorder(log, mapping)
     validation = read_validation_plan(config, junit)
-    if config.car is None:
-        slow = car.vehicle.low_speed_blend_m_s
-        reporter.warn(
-            f"no --car: the ground truth is taken to be measured at the centre of gravity, sideslip is scored above "
-            f"{slow:g} m/s, and segments are cut at friction {car.vehicle.assumed_friction:g}"
-        )
     check_places([log_input], output, config, mapping, junit)
     scoring = _Scoring(config, car, reporter, estimates, truth, name, validation)
     with nullcontext() if output is None else OutputFolder(output, (LOGS,)) as outputs:

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.records.signals import Signals, join_signals
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
     from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
     from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference
     from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
@@ -48,9 +49,7 @@ def reference_of(drive: Drive, calibration: SelfCalibration | None, config: RunC
     if missing:
         return DriveReference(None, _document([], f"the log has no {', '.join(missing)}"))
     speed = drive.mapping.signals.get("speed_m_s")
-    prior = replace(
-        prior_of(drive.car.vehicle, calibration), speed_over_ground=speed is not None and speed.combine == "norm"
-    )
+    prior = replace(prior_of(drive.car, calibration), speed_over_ground=speed is not None and speed.combine == "norm")
     spans = list(_spans(drive, prior, use_gnss=config.gnss != "off"))
     used = [span for span in spans if not span.refused]
     refused = "" if used else next((span.refused for span in spans), "the log has no samples")
@@ -61,17 +60,19 @@ def reference_of(drive: Drive, calibration: SelfCalibration | None, config: RunC
     return DriveReference(estimator, _document(spans, refused))
 
 
-def prior_of(vehicle: VehicleParameters, calibration: SelfCalibration | None) -> ReferencePrior:
-    """Return what is known of a car before its drive: the geometry of its file, sensors as the log calibrated them."""
-    from pdhef_logtool.estimators.calibration.joint import AY_BIAS, AY_GAIN, IMU_X, RATE_BIAS
+def prior_of(car: Car, calibration: SelfCalibration | None) -> ReferencePrior:
+    """Return what is known of a car before its drive: the geometry of its file, sensors as the log calibrated them.
+
+    Without calibration or ground truth nothing has shown that the accelerometer is where no file states another place.
+    """
+    from pdhef_logtool.estimators.calibration.joint import AY_BIAS, AY_GAIN, IMU_X, IMU_X_REACH, RATE_BIAS
     from pdhef_logtool.estimators.reference.drive import ReferencePrior
 
-    wheelbase = vehicle.cg_to_front_axle_m + vehicle.cg_to_rear_axle_m
-    gain = 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2
+    vehicle = car.vehicle
     prior: dict[str, Any] = {
         "imu_x_m": vehicle.imu_position_m[0],
         "imu_x_std_m": _FILE_STD_M,
-        "ay_gain": gain,
+        "ay_gain": 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2,
         "friction": vehicle.assumed_friction,
     }
     if calibration is not None and calibration.parameters:
@@ -86,10 +87,12 @@ def prior_of(vehicle: VehicleParameters, calibration: SelfCalibration | None) ->
         }
         if not calibration.refused:
             prior["friction"] = calibration.vehicle.assumed_friction
+    elif not car.has_evidence and vehicle.imu_position_m[0] == 0.0:
+        prior["unknown_imu_x_m"] = IMU_X_REACH * vehicle.wheelbase_m
     antenna = vehicle.gnss_antenna_position_m
     if antenna is not None:
         prior["antenna_m"] = antenna[:2]
-    return ReferencePrior(vehicle.cg_to_rear_axle_m, wheelbase, **prior)
+    return ReferencePrior(vehicle.cg_to_rear_axle_m, vehicle.wheelbase_m, **prior)
 
 
 def _spans(drive: Drive, prior: ReferencePrior, *, use_gnss: bool) -> Iterator[SideslipReference]:
@@ -121,7 +124,6 @@ def _document(spans: Sequence[SideslipReference], refused: str) -> dict[str, Any
     longest = max(spans, key=lambda span: len(span.stamps_ns), default=None)
     knots = sum(len(span.stamps_ns) for span in spans)
     valid = sum(int(span.valid.sum()) for span in spans)
-    parameters = () if longest is None else longest.parameters
     return {
         "refused": refused or None,
         "gnss": any(span.with_gnss for span in spans),
@@ -130,6 +132,6 @@ def _document(spans: Sequence[SideslipReference], refused: str) -> dict[str, Any
         "spans": len(spans),
         "parameters": [
             {"name": p.name, "unit": p.unit, "value": p.value, "std": p.std, "prior": p.prior, "limit": p.limit}
-            for p in parameters
+            for p in (longest.parameters if longest else ())
         ],
     }

@@ -91,7 +91,7 @@ class StoredOutput(Mirror):
         self._journal_bytes = -1
 
     def __enter__(self) -> Self:
-        """Take apply to the place and see what is there."""
+        """Lock the place and see what is there."""
         self.objects.acquire()
         try:
             for name in self.objects.names():
@@ -191,7 +191,7 @@ class StoredOutput(Mirror):
                 self._journal_bytes = size
 
     def _keep(self) -> None:
-        """Renew the contain and put the journal until the end; a store that fails for a while is asked again."""
+        """Renew the lock and put the journal until the end; a store that fails for a while is asked again."""
         wait_s = EVERY_S
         while not self._ended.wait(wait_s):
             began = time.monotonic()

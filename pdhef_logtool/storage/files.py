@@ -55,11 +55,13 @@ class PendingFile:
 
     def __init__(self, target: Path) -> None:
         self.target = target
-        name = target.name if len(os.fsencode(target.name)) <= _LONGEST_NAME else _digest(target.name)
+        name = target.name
+        if len(os.fsencode(name)) > _LONGEST_NAME:
+            name = hashlib.sha256(os.fsencode(name)).hexdigest()
         self.path = target.with_name(f".{name}.{process_name()}.partial")
         with writing(target):
             target.parent.mkdir(parents=True, exist_ok=True)
-            self._remove()
+            self.path.unlink(missing_ok=True)
         if target.parent not in _swept:
             _swept.add(target.parent)
             sweep_files(target.parent)
@@ -78,10 +80,7 @@ class PendingFile:
     def discard(self) -> None:
         """Remove the temporary file, if there is one."""
         with contextlib.suppress(OSError):
-            self._remove()
-
-    def _remove(self) -> None:
-        self.path.unlink(missing_ok=True)
+            self.path.unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
         """Return itself."""
@@ -93,10 +92,6 @@ class PendingFile:
             self.commit()
         else:
             self.discard()
-
-
-def _digest(name: str) -> str:
-    return hashlib.sha256(os.fsencode(name)).hexdigest()
 
 
 def open_new(path: Path, mode: Literal["wb", "ab"] = "wb") -> IO[bytes]:

@@ -14,7 +14,7 @@ import shutil
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from studies.torture.logs import log_judge
 from studies.torture.numerics import odd_drives, write_hours
 from studies.torture.outside import measured
 from studies.torture.places import PLACES
-from studies.torture.workers import LIMIT_BYTES, LIMIT_S, Tally, Verdict, run_cases
+from studies.torture.workers import LIMIT_BYTES, LIMIT_S, NO_VERDICT, Verdict, run_cases
 
 _SHARED = ROOT.parent / "shared" / "torture"
 _THREE = ("--estimators", "zero,kinematic,phy-ukf")
@@ -38,23 +38,17 @@ def mutations(work: Path, seed: int, jobs: int, logs: int, configs: int) -> dict
     collected = {}
     for name, make, count in (("logs", log_judge, logs), ("configurations", config_judge, configs)):
         begin = time.monotonic()
-        tallies = run_cases(make(work, seed), count, work / f"{name}-{seed}.jsonl", jobs=jobs, tell=_say)
-        collected[name] = {"seed": seed, "wall_s": time.monotonic() - begin, **_sum(tallies, count)}
+        cases = run_cases(make(work, seed), count, work / f"{name}-{seed}.jsonl", jobs=jobs, tell=_say)
+        collected[name] = {
+            "seed": seed,
+            "wall_s": time.monotonic() - begin,
+            "count": count,
+            "ends": dict(sorted(Counter(case.end for case in cases).items())),
+            "problems": [(case.number, case.problem[-800:]) for case in cases if case.problem],
+            "slowest_s": max((case.wall_s for case in cases), default=0.0),
+            "peak_bytes": max((case.peak_bytes for case in cases), default=0),
+        }
     return collected
-
-
-def _sum(tallies: Iterable[Tally], count: int) -> dict[str, Any]:
-    tallies = list(tallies)
-    ends: Counter[str] = Counter()
-    for tally in tallies:
-        ends.update(tally.ends)
-    return {
-        "count": min(count, sum(ends.values())),
-        "ends": dict(sorted(ends.items())),
-        "problems": [(n, p[-800:]) for t in tallies for n, p in t.problems],
-        "slowest_s": max((t.slowest_s for t in tallies), default=0.0),
-        "peak_bytes": max((t.peak_bytes for t in tallies), default=0),
-    }
 
 
 def one_by_one(part: str, work: Path, cases: Mapping[str, Callable[[Path], Verdict]]) -> list[dict[str, Any]]:
@@ -174,7 +168,7 @@ def _cell(text: str) -> str:
     return " ".join(text.split())[-200:].replace("|", "/")
 
 
-_ENDS = ("exit 0", "exit 1", "exit 2", "exit 3", "internal error", "hang", "memory")
+_ENDS = ("exit 0", "exit 1", "exit 2", "exit 3", "internal error", NO_VERDICT)
 
 
 def _mutations(collected: dict[str, Any]) -> str:

@@ -18,13 +18,13 @@ _CHECKED = ("zstd.mcap", "lz4.mcap", "plain.mcap", "unchunked.mcap", "noindex.mc
 
 
 def log_judge(work: Path, seed: int):  # type: ignore[no-untyped-def]
-    """Return what judges one mutated log by its number; the seeds are made first, and what runs need is loaded."""
+    """Return what judges one mutated log by its number; the seeds are made first, and what runs need is compiled."""
     seeds = write_seeds(work / "seeds")
     counts = {}
     for name in seeds:
         ended = command("inspect", str(work / "seeds" / name), "--json")
         counts[name] = _messages(ended.out)
-    # Without a page: polars' threads would not live in a fork of this process, and its first query there would wait.
+    # To compile takes longer than a case may.
     warm = (*_RUN[:2], "--estimators", "phy-ukf", "--no-report")
     command("run", str(work / "seeds" / "plain.bag"), "-o", str(work / "warm"), *warm)
     return partial(judge_log, work, seed, seeds, counts)

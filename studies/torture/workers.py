@@ -1,4 +1,4 @@
-"""Cases in monitored processes: what hangs or grows is killed and reported; no case is repeated."""
+"""Cases in supervised processes: what hangs or grows is killed and reported."""
 
 from __future__ import annotations
 
@@ -7,22 +7,27 @@ import io
 import json
 import os
 import re
+import resource
 import signal
 import sys
 import time
 import traceback
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from multiprocessing import Pipe
-from multiprocessing.connection import Connection, wait
+from dataclasses import astuple, dataclass, field
+from functools import partial
 from pathlib import Path
 from unittest.mock import patch
+
+from pdhef_logtool.estimators.table import FILTERS
+from pdhef_logtool.workers.supervisor import Limits, Tell, supervise
 
 #: What no case may take.
 LIMIT_S = 10.0
 LIMIT_BYTES = 1 << 30
-BLOCK = 500
+#: End of a case whose process died, hung or grew too large, or which the judge could not judge.
+NO_VERDICT = "no verdict"
+_TOLD_EVERY = 500
+_PRELOAD = ("pdhef_logtool.runs.*", "pdhef_logtool.logs.*", "pdhef_logtool.cli.*", *FILTERS)
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
@@ -44,14 +49,14 @@ class Verdict:
     costs: Mapping[str, float] = field(default_factory=dict)
 
 
-@dataclass(slots=True)
-class Tally:
-    """Counts of a block of cases, as one line of the journal."""
+@dataclass(frozen=True, slots=True)
+class Case:
+    """How a case ended by its number, as one line of the journal; the peak is that of its process so far."""
 
-    first: int
-    ends: Counter[str] = field(default_factory=Counter)
-    problems: list[tuple[int, str]] = field(default_factory=list)
-    slowest_s: float = 0.0
+    number: int
+    end: str
+    problem: str
+    wall_s: float = 0.0
     peak_bytes: int = 0
 
 
@@ -103,115 +108,37 @@ def run_cases(
     *,
     jobs: int = 2,
     tell: Callable[[str], None] = print,
-) -> list[Tally]:
-    """Judge the cases 0 to ``count`` - 1 in blocks, each in a forked process; none that is in the journal already."""
-    done = {t.first: t for t in read_journal(journal)}
-    left = [range(a, min(a + BLOCK, count)) for a in range(0, count, BLOCK) if a not in done]
+) -> list[Case]:
+    """Judge the cases 0 to ``count`` - 1 in supervised processes; none that is in the journal already."""
+    done = {case.number: case for case in read_journal(journal)}
+    left = [n for n in range(count) if n not in done]
+    limits = Limits(silence_s=LIMIT_S, memory_bytes=LIMIT_BYTES)
     journal.parent.mkdir(parents=True, exist_ok=True)
-    running: list[_Block] = []
     with journal.open("a") as file:
-        while left or running:
-            while left and len(running) < jobs:
-                running.append(_Block(judge_case, left.pop(0)))
-            wait([b.pipe for b in running], timeout=0.05)
-            for block in list(running):
-                if not block.watch():
-                    continue
-                running.remove(block)
-                done[block.tally.first] = block.tally
-                file.write(json.dumps({f.name: getattr(block.tally, f.name) for f in fields(block.tally)}) + "\n")
-                file.flush()
-                tell(f"{journal.stem}: {min(len(done) * BLOCK, count)} of {count}")
-    return [done[a] for a in sorted(done) if a < count]
+        for ended in supervise(partial(_case, judge_case), left, jobs=jobs, limits=limits, preload=_PRELOAD):
+            case = ended.result
+            if case is None:
+                case = Case(ended.item, NO_VERDICT, "" if ended.failure is None else ended.failure.reason)
+            done[case.number] = case
+            file.write(json.dumps(astuple(case)) + "\n")
+            file.flush()
+            if len(done) % _TOLD_EVERY == 0:
+                tell(f"{journal.stem}: {len(done)} of {count}")
+    return [done[n] for n in range(count)]
 
 
-def read_journal(journal: Path) -> Iterator[Tally]:
-    """Return the blocks that are done; a line that a kill cut is none."""
+def _case(judge_case: Callable[[int], Verdict], number: int, tell: Tell) -> Case:
+    del tell
+    begin = time.monotonic()
+    verdict = judge_case(number)
+    peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
+    return Case(number, verdict.end, verdict.problem, time.monotonic() - begin, peak_bytes)
+
+
+def read_journal(journal: Path) -> Iterator[Case]:
+    """Return the cases that are done; a line that a kill cut is none."""
     if not journal.is_file():
         return
     for line in journal.read_text().splitlines():
         with contextlib.suppress(ValueError):
-            raw = json.loads(line)
-            raw["ends"], raw["problems"] = Counter(raw["ends"]), [(n, p) for n, p in raw["problems"]]
-            yield Tally(**raw)
-
-
-class _Block:
-    """A forked process over some cases; a new one goes on behind a case that had to be killed."""
-
-    def __init__(self, judge_case: Callable[[int], Verdict], cases: range) -> None:
-        self.judge_case, self.cases = judge_case, cases
-        self.tally = Tally(cases.start)
-        self._fork(cases)
-
-    def _fork(self, cases: range) -> None:
-        self.pipe, theirs = Pipe(duplex=False)
-        sys.stdout.flush()
-        self.case, self.since = cases.start, time.monotonic()
-        self.pid = os.fork()
-        if self.pid == 0:
-            os.setsid()
-            self.pipe.close()
-            with contextlib.suppress(BaseException):
-                _work(self.judge_case, cases, theirs)
-            os._exit(0)
-        theirs.close()
-
-    def watch(self) -> bool:
-        """Read the messages of the process; kill it if it takes too much; return whether the block is done."""
-        try:
-            while self.pipe.poll():
-                number, end, problem = self.pipe.recv()
-                now = time.monotonic()
-                self.tally.slowest_s = max(self.tally.slowest_s, now - self.since)
-                self._note(number, end, problem)
-                self.case, self.since = number + 1, now
-        except EOFError:
-            os.waitpid(self.pid, 0)
-            if self.case >= self.cases.stop:
-                return True
-            return self._killed("died", "the process died")
-        size = _resident_bytes(self.pid)
-        self.tally.peak_bytes = max(self.tally.peak_bytes, size)
-        if size > LIMIT_BYTES:
-            return self._kill("memory", f"{size >> 20} MiB")
-        if time.monotonic() - self.since > LIMIT_S and self.case < self.cases.stop:
-            return self._kill("hang", f"longer than {LIMIT_S:.0f} s")
-        return False
-
-    def _note(self, number: int, end: str, problem: str) -> None:
-        self.tally.ends[end] += 1
-        if problem:
-            self.tally.problems.append((number, problem))
-
-    def _kill(self, end: str, problem: str) -> bool:
-        with contextlib.suppress(OSError):
-            os.killpg(self.pid, signal.SIGKILL)
-        os.waitpid(self.pid, 0)
-        return self._killed(end, problem)
-
-    def _killed(self, end: str, problem: str) -> bool:
-        self.pipe.close()
-        self._note(self.case, end, problem)
-        after = range(self.case + 1, self.cases.stop)
-        if not after:
-            return True
-        self._fork(after)
-        return False
-
-
-def _work(judge_case: Callable[[int], Verdict], cases: range, pipe: Connection) -> None:
-    for number in cases:
-        try:
-            verdict = judge_case(number)
-        except BaseException:  # noqa: BLE001 (a case that this harness cannot judge is reported as a problem)
-            verdict = Verdict("no verdict", traceback.format_exc()[-3000:])
-        pipe.send((number, verdict.end, verdict.problem))
-
-
-def _resident_bytes(pid: int) -> int:
-    try:
-        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    except (OSError, IndexError, ValueError):
-        return 0
-    return pages * os.sysconf("SC_PAGE_SIZE")
+            yield Case(*json.loads(line))

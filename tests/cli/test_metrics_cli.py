@@ -54,11 +54,11 @@ def _plan(tmp_path: Path, limit: float) -> str:
     return str(path)
 
 
-def test_table_goes_to_stdout_and_assumptions_to_stderr(annotated: str) -> None:
+def test_table_and_assumptions_go_to_stdout(annotated: str) -> None:
     result = called("metrics", annotated, *ESTIMATE)
     assert result.returncode == 0
     assert "phy-ukf" in result.stdout
-    assert "no --car" in result.stderr
+    assert "no car given" in result.stdout
     assert "outputs in" not in result.stdout
     assert all(len(line) <= 100 for line in result.stdout.splitlines())
 

@@ -57,7 +57,7 @@ def _facts(path: Path, mapping: Mapping | None, options: ReadOptions) -> dict[st
             "losses": drive.losses,
             "samples": (drive.samples, drive.sample_ledger, drive.byte_ledgers),
             "log": (drive.file, log.kind, log.topics, log.start_ns, log.end_ns),
-            "plan": repr((plan.clocks, plan.alignment, plan.latency, plan.dependent, plan.derivation, plan.placed)),
+            "plan": repr((plan.clocks, plan.alignment, plan.latency, plan.dependent, plan.derivation)),
         }
 
 

@@ -168,7 +168,23 @@ def test_the_mirrored_drive_has_the_mirrored_reference():
 def test_a_drive_with_an_implausible_sensor_is_refused_with_the_parameter(change, named):
     found = refer(change(SLALOM.signals), PRIOR)
     assert named in found.refused
+    assert " 1 is" not in found.refused  # the unit of a number
     assert not found.valid.any()
+
+
+@pytest.mark.parametrize("moved_m", [-1.7, -0.5, 1.0])
+def test_where_nothing_states_the_accelerometer_the_interval_contains_its_lever(moved_m):
+    """The estimate itself is that of the file: a free position explains what the axle law lacks."""
+    driven = SLALOM
+    t = driven.signals.stamps_ns * 1e-9
+    turning = np.gradient(np.gradient(driven.heading, t - t[0]), t - t[0])
+    moved = replace(driven.signals, ay_m_s2=driven.signals.ay_m_s2 + moved_m * turning)
+    stated, unknown = (refer(moved, replace(PRIOR, imu_x_std_m=0.05, unknown_imu_x_m=u)) for u in (0.0, 1.1))
+    np.testing.assert_array_equal(stated.vy_m_s, unknown.vy_m_s)
+    error, std = driven.error_deg(unknown)
+    assert np.mean(np.abs(error) < 1.96 * std) > 0.95
+    assert (std >= driven.error_deg(stated)[1]).all()
+    assert unknown.valid.sum() <= stated.valid.sum()
 
 
 def test_a_stretch_without_imu_is_not_valid_and_the_rest_is():

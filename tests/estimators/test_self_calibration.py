@@ -190,6 +190,21 @@ def test_a_pool_knows_more_than_each_of_its_logs() -> None:
         assert together < single
 
 
+def test_a_pool_states_what_its_drives_differ_in() -> None:
+    """A steering offset in one of three drives widens that of the pool, beyond the offset of each drive."""
+    parts = [with_noise(cut(wide().signals, a, a + 2000), a) for a in (0, 2000, 4000)]
+
+    def offset(*added_rad: float) -> tuple[float, float]:
+        logs = [driving(replace(s, steer_rad=s.steer_rad + x), RIGHT) for s, x in zip(parts, added_rad, strict=True)]
+        found = next(p for p in self_calibrate(logs, RIGHT).parameters if p.name == "steering offset")
+        return found.value, found.sd
+
+    (_, alike), (value, apart) = offset(0.0, 0.0, 0.0), offset(0.0, 0.0, 0.01)
+    assert alike < 0.003
+    assert apart > 1.5 * alike
+    assert all(abs(value - true) < 1.96 * apart for true in (0.0, 0.01))
+
+
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 2**31), share=st.floats(0.05, 0.98))
 def test_any_losses_give_a_grid_whose_stretches_are_whole(seed: int, share: float) -> None:

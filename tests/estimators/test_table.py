@@ -27,7 +27,7 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import LookingAhead
 from pdhef_logtool.estimators.intervals import SIDESLIP_TERMS, make_inflation
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.physics_filter import FILE_LIMIT_GAIN, PHYSICS_Q_STD
+from pdhef_logtool.estimators.physics_filter import FILE_LAG, PHYSICS_Q_STD
 from pdhef_logtool.estimators.presets import OPTIONS, options_of, preset_of, split_names
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
 from pdhef_logtool.estimators.table import (
@@ -176,7 +176,8 @@ def test_physics_runs_on_any_car_and_without_a_fit_it_has_no_part() -> None:
     adaptive = make_estimator("physics", bare)
     assert isinstance(adaptive, AdaptivePhysics)
     estimator = adaptive.physics
-    assert (estimator.q_std, estimator.r_std, estimator.limit_gain) == (PHYSICS_Q_STD, None, FILE_LIMIT_GAIN)
+    assert (estimator.q_std, estimator.r_std) == (PHYSICS_Q_STD, None)
+    assert estimator.limit_lag_m == FILE_LAG * VEHICLE.wheelbase_m
     assert estimator.vehicle.physics.names == ("lag",)
     assert estimator.vehicle == VEHICLE.model_copy(update={"physics": estimator.vehicle.physics})
 

@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, Writer
 from rich.console import Console
 
 from pdhef_logtool.cli.app import app
-from pdhef_logtool.logs.byte_account import ByteAccount, ByteLedger, checksummed_share
+from pdhef_logtool.logs.byte_account import ByteAccount, checksummed_share
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import RemotePlace
@@ -182,4 +182,3 @@ def test_bytes_count_as_covered_where_they_were_read_and_are_not_lost() -> None:
     assert ledger.checksummed == 10
     assert checksummed_share([ledger]) == 10 / 55
     assert checksummed_share([]) is None
-    assert checksummed_share([ledger, ByteLedger("slim log of an earlier version", 9, 9, 0, 0, cut=False)]) is None

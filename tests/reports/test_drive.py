@@ -186,7 +186,7 @@ def test_the_first_screen_has_verdicts_what_was_tested_the_worst_place_and_next_
     order = [
         "Plan plan.toml: 1 FAIL, 1 INCONCLUSIVE, 1 PASS", "FAIL Title 1 SR-1", "INCONCLUSIVE Title 2 SR-2",
         "PASS Title 0 SR-0 value 0.458° limit ≤ 0.573° margin +0.115° scored 1 drive, 2.0 min, 3.0 km",
-        "Interval from blocks of 10 s.", "Tested Car sedan", "Largest error", "Next SR-1: do 1 SR-2: do 2",
+        "Note: interval from blocks of 10 s.", "Tested Car sedan", "Largest error", "Next SR-1: do 1 SR-2: do 2",
         "Comparison with physics", "Over time",
     ]  # fmt: skip
     places = [text.find(part) for part in order]
@@ -282,7 +282,7 @@ def hostile_run(folder: Path) -> Path:
         versions=dict.fromkeys(HOSTILE, all_of_it),
         verdicts=[{"signal": h, "outcome": h, "text": h, "rival": h} for h in HOSTILE],
         metadata=dict(zip(HOSTILE, HOSTILE, strict=True)),
-        vehicle={"name": all_of_it, "file": all_of_it, "sha256": "0", "proven": False},
+        vehicle={"name": all_of_it, "file": all_of_it, "sha256": "0", "proven": False, "low_speed_blend_m_s": 3.0},
     )
 
 

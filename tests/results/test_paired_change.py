@@ -75,10 +75,9 @@ def test_holm_corrects_for_being_several() -> None:
     assert holm([]) == []
 
 
-def test_what_is_below_the_floor_and_zero_against_zero_is_no_change() -> None:
+def test_zero_against_zero_is_no_change() -> None:
     a, b = np.array([0.01, 0.0, 0.1, 0.0]), np.array([0.02, 0.0, 0.2, 0.1])
     np.testing.assert_allclose(log_ratios(a, b), [math.log(2), 0.0, math.log(2), math.inf])
-    np.testing.assert_allclose(log_ratios(a, b, 0.05), [0.0, 0.0, math.log(2), math.log(2)])
     wild = paired_change(np.array([math.inf, -math.inf, 0.1, 0.1, 0.1, 0.1]))
     assert wild.median == pytest.approx(0.1)
 

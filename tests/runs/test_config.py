@@ -176,9 +176,3 @@ def test_a_car_and_a_network_may_be_named_by_word(tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text('car = "saloon"\nnetwork = "none"\n')
     config = load_config(tmp_path / "c.toml", {})
     assert (config.car, config.network) == (Path("saloon"), Path("none"))
-
-
-def test_thresholds_in_a_settings_file_are_answered_with_the_plan(tmp_path: Path) -> None:
-    (tmp_path / "pdhef.toml").write_text('thresholds = "limits.toml"\n')
-    with pytest.raises(UsageError, match="expected plan in place of thresholds, got thresholds; convert the file"):
-        load_config(tmp_path / "pdhef.toml", {})

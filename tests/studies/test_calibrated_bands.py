@@ -16,9 +16,13 @@ def test_the_bands_of_calibrated_cars_hold_and_are_no_wider_than_they_must() -> 
         wrong = one.file.with_stiffness(*one.factors)
         found = study.calibrate(one.drive.signals, wrong)
         assert not found.refused
-        bands.append(study.band_of(one.drive, study.taken(one.drive.signals, wrong, found)))
-    coverage, width = np.array(bands).T
+        bands.append(study.bands_of(one.drive, study.taken(one.drive.signals, wrong, found)))
+    coverage, width = np.array([b[study.ALL] for b in bands]).T
     assert np.mean(coverage) > 0.9
     assert np.min(coverage) > 0.7
     # s_car and the model error of real cars are included, which these hardly have: their errors are below 0.1°.
     assert np.median(width) < 16.0
+    for band in bands:
+        less = [width for name, (_, width) in band.items() if name != study.ALL]
+        assert len(less) == 4
+        assert max(less) <= band[study.ALL][1]

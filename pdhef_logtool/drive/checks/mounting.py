@@ -18,13 +18,13 @@ MOUNTING = CheckKind(
     "SIGNAL.mounting",
     compares="the axis that the mapping reads with the axis that the drive shows",
     fails="they are not the same",
-    remedy="in the mapping: field = {field}, scale = {scale}",
+    remedy="in the mapping: {entries}",
 )
 CORRECTED = CheckKind(
     "SIGNAL.corrected",
     compares="unit, sign and axis that recognition reads, without a mapping file, with what the drive shows",
     fails="the drive contradicts them with certainty: the run reads what it shows",
-    remedy="confirm it in a mapping file: field = {field}, scale = {scale}",
+    remedy="confirm it in a mapping file: {entries}",
 )
 CHECKS = (FAULT, MOUNTING, CORRECTED)
 

@@ -233,7 +233,7 @@ def self_calibrate(
         _understeer(problem, theta, covariance, vehicle_file),
         refused,
         problem.rms(theta),
-        problem.rms_of_file(),
+        problem.rms(None),
         seconds,
         len(drives),
         tuple(problem.vehicle(to, digits=6) for to in varied),

@@ -13,7 +13,8 @@ are observable as a product only: friction stays at the file's value, the peak f
 
 The covariance of θ has three parts: the curvature of the cost, the spread of the cost's gradient between blocks of the
 drives (sandwich estimator, White 1982), which includes model error that changes within a drive, and the model error
-that all of a drive has in common, estimated on simulated cars (:data:`SHARED_SHARES`).
+that all of a drive has in common, estimated on simulated cars (:data:`SHARED_SHARES`). That of a pool is for the
+parameters of one of its drives: what these differ in is added (random effects by moments, DerSimonian and Laird 1986).
 """
 
 from __future__ import annotations
@@ -56,6 +57,9 @@ KEPT_STEPS = 4
 #: Length of the blocks whose gradients are compared: longer than a bend, so that blocks are nearly independent.
 BLOCK_S = 3.0
 ITERATIONS, DERIVATIVE_STEP, MAX_STEP, LEAST_GAIN = 40, 0.02, 1.0, 1e-3
+#: Standard deviation of the logarithm of the peak force: the road may be wet or icy, whatever friction a file states.
+#: The peak force is at least this share of what the a_y of this quantile needs: a bank and the body's roll are in it.
+PEAK_STD, REACHED_SHARE, REACHED_QUANTILE = 0.5, 0.8, 0.98
 #: Parts of ``physics`` on a calibrated car; on simulated cars with wrong files the lowest sideslip error.
 PARTS = ("lag", "roll", "bank")
 #: Cornering stiffness over axle load of any car, 1/rad, front and rear, and the standard deviations of the logarithm
@@ -63,17 +67,17 @@ PARTS = ("lag", "roll", "bank")
 USUAL_STIFFNESS, USUAL_STIFFNESS_STD, FILE_STIFFNESS_STD = (13.5, 18.0), 0.35, 0.5
 #: Ratio of the levels of a_y of two drives up to which one teaches the other nothing, and from which on all.
 LIKE = (0.3, 0.5)
-#: Usual share of gravity in a_y by body roll, rad/(m/s²), where the file has none (3 degrees per g).
-USUAL_ROLL_GRADIENT = 0.005
+#: Usual share of gravity in a_y by body roll, rad/(m/s²), where the file has none (3 degrees per g), and 1-sigma of the
+#: accelerometer's position, wheelbases.
+USUAL_ROLL_GRADIENT, IMU_X_REACH = 0.005, 0.4
 
 FRONT_STIFFNESS, REAR_STIFFNESS = "front cornering stiffness", "rear cornering stiffness"
 PEAK, INERTIA, RELAXATION = "peak force over the file's", "yaw inertia", "relaxation length"
 STEER_OFFSET, STEER_RATIO, STEER_DELAY = "steering offset", "steering ratio", "steering delay"
 AY_GAIN, AY_BIAS, IMU_X, RATE_BIAS = "roll gain", "a_y bias", "lever of a_y", "yaw rate bias"
-#: Model error that all of a drive has in common, as a share of each prior's standard deviation: with it 95 % of the
-#: differences between drives of one simulated car are within 1.96 standard deviations. Crossfall moves the roll gain,
-#: the lag of tyres and body the delay (studies/plus_minus.py, seed 555).
-SHARED_SHARE, SHARED_SHARES = 0.2, {AY_GAIN: 0.6, STEER_DELAY: 0.4}
+#: Model error that all of a drive has in common, as a share of each prior's standard deviation: with it at least 95 %
+#: of the parameters of simulated cars are within 1.96 standard deviations. The lag of tyres and body moves the delay.
+SHARED_SHARE, SHARED_SHARES = 0.2, {STEER_DELAY: 0.4}
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,11 +125,11 @@ def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
     """
     sensors = vehicle_file.sensors
     gradient = vehicle_file.roll_gradient_rad_per_m_s2 or USUAL_ROLL_GRADIENT
-    reach = 0.4 * vehicle_file.wheelbase_m
+    reach = IMU_X_REACH * vehicle_file.wheelbase_m
     return (
         _stiffness(vehicle_file, FRONT_STIFFNESS, front=True),
         _stiffness(vehicle_file, REAR_STIFFNESS, front=False),
-        _factor(PEAK, "1", 1.0, 0.2, 2.0),
+        _factor(PEAK, "1", 1.0, PEAK_STD, 6.0),
         _factor(INERTIA, "kg m^2", vehicle_file.yaw_inertia_kg_m2, 0.2, 2.0),
         _factor(RELAXATION, "m", vehicle_file.relaxation_length_m or 0.5, 0.4, 4.0),
         _around(STEER_OFFSET, "rad", vehicle_file.steer_offset_rad, 0.01, 0.05),
@@ -163,11 +167,23 @@ def level_of(drives: Sequence[Driving]) -> float:
     return math.sqrt(float(np.nansum(ay2**2)) / max(float(np.nansum(ay2)), 1e-9))
 
 
+def peak_reached(drives: Sequence[Driving], vehicle_file: VehicleParameters) -> float:
+    """Return the share of the file's peak force that the a_y of the driving needs."""
+    ay = np.concatenate([d.columns[AY, counted(d)] for d in drives])
+    most = sum(vehicle_file.magic_formula(front, vehicle_file.assumed_friction)[2] for front in (True, False))
+    reached = np.nanquantile(np.abs(ay), REACHED_QUANTILE) if np.isfinite(ay).any() else 0.0
+    return float(reached) * vehicle_file.mass_kg / most
+
+
 class JointProblem:
     """The fit of one car to the driving of its logs, which were read with ``vehicle_file``."""
 
     def __init__(self, drives: Sequence[Driving], vehicle_file: VehicleParameters) -> None:
-        self.parameters = parameters_of(vehicle_file)
+        reached = REACHED_SHARE * peak_reached(drives, vehicle_file)
+        self.parameters = tuple(
+            replace(p, low=min(max(p.low, reached), p.mean)) if p.name == PEAK else p
+            for p in parameters_of(vehicle_file)
+        )
         self._drives, self._file = drives, vehicle_file
         self._filter = low_pass(CUTOFF_HZ, STEP_S)
         self._kept = [np.flatnonzero(counted(d))[::KEPT_STEPS] for d in drives]
@@ -176,12 +192,9 @@ class JointProblem:
             slow_parts(columns, d.stretches, low_pass(BANK_HZ, STEP_S))
         self._out = [np.full((3, d.columns.shape[1]), np.nan) for d in drives]
         self._differences = [np.full((2, d.columns.shape[1]), np.nan) for d in drives]
-        blocks, first = [], 0
-        for kept in self._kept:
-            block = (kept * STEP_S // BLOCK_S).astype(np.int64) + first
-            first = int(block[-1]) + 1 if block.size else first
-            blocks.append(block)
-        self._block = np.unique(np.concatenate(blocks), return_inverse=True)[1]
+        blocks = [np.unique(kept * STEP_S // BLOCK_S, return_inverse=True)[1] for kept in self._kept]
+        self._first_block = np.cumsum([0, *(int(b.max()) + 1 for b in blocks)])
+        self._block = np.concatenate([b + first for b, first in zip(blocks, self._first_block[:-1], strict=True)])
         self._weight = math.sqrt(KEPT_STEPS * STEP_S / CORRELATION_S)
         self._least_std = self._error_std = np.array(ERROR_STD)
 
@@ -190,41 +203,43 @@ class JointProblem:
         self.parameters = with_taught(self.parameters, taught, level_of(self._drives))
 
     def solve(self) -> FloatArray:
-        """Return the parameters of the lowest cost, from the prior on, with the standard deviation of their errors.
+        """Return the parameters of the lowest cost, with the standard deviation of their errors.
 
-        From the fit without a taught prior on, the taught one often remains in its minimum (1:10 cars).
+        From a dry road, a descent does not find the minimum of one on which the tyres saturate: there are two starts.
+        Both are of the prior, for from the fit without a taught one, the taught fit often remains in its minimum.
         """
-        theta = np.zeros(len(self.parameters))
+        self._error_std = self._least_std
+        slippery = [math.log(p.low / p.mean) / p.std if p.name == PEAK else 0.0 for p in self.parameters]
+        descents = [self._descend(start) for start in (np.zeros(len(slippery)), np.array(slippery))]
+        theta = min(descents, key=lambda found: self._cost(self.errors_of(found), found))
         for _ in range(SCALES):
             error_std = np.maximum(self._least_std, self._rms(self.errors_of(theta)))
             self._error_std = error_std
-            descent, _ = descend(
-                self.errors_of,
-                self._cost,
-                self._residuals,
-                theta,
-                iterations=ITERATIONS,
-                least_gain=lambda _: LEAST_GAIN,
-                derivative_step=DERIVATIVE_STEP,
-                max_step=MAX_STEP,
-            )
-            theta = descent.theta
+            theta = self._descend(theta)
             if np.allclose(np.maximum(self._least_std, self._rms(self.errors_of(theta))), error_std, rtol=SAME_SCALE):
                 break
         return theta
+
+    def _descend(self, theta: FloatArray) -> FloatArray:
+        descent, _ = descend(
+            self.errors_of,
+            self._cost,
+            self._residuals,
+            theta,
+            iterations=ITERATIONS,
+            least_gain=lambda _: LEAST_GAIN,
+            derivative_step=DERIVATIVE_STEP,
+            max_step=MAX_STEP,
+        )
+        return descent.theta
 
     def errors_of(self, theta: FloatArray) -> FloatArray:
         """Return errors over ``ERROR_STD`` [2, K]."""
         return self._errors(self._track(theta))
 
-    def rms(self, theta: FloatArray) -> tuple[float, float]:
-        """Return the RMS error of yaw rate and a_y."""
-        rms = self._rms(self.errors_of(theta))
-        return float(rms[OF_RATE]), float(rms[OF_AY])
-
-    def rms_of_file(self) -> tuple[float, float]:
-        """Return the RMS error of yaw rate and a_y of the vehicle file."""
-        rms = self._rms(self._errors(track_of(self._file, self._file)))
+    def rms(self, theta: FloatArray | None) -> tuple[float, float]:
+        """Return the RMS error of yaw rate and a_y; without θ that of the vehicle file."""
+        rms = self._rms(self._errors(track_of(self._file, self._file)) if theta is None else self.errors_of(theta))
         return float(rms[OF_RATE]), float(rms[OF_AY])
 
     def sideslip(self, theta: FloatArray) -> FloatArray:
@@ -281,17 +296,26 @@ class JointProblem:
             moved[i] += DERIVATIVE_STEP
             jacobian[:, i] = (self._residuals(self.errors_of(moved), centre) - residuals) / DERIVATIVE_STEP
         inverse = np.asarray(np.linalg.inv(jacobian.T @ jacobian + np.eye(theta.size)), dtype=np.float64)
-        gradients = np.zeros((int(self._block.max()) + 1, theta.size))
+        gradients = np.zeros((int(self._first_block[-1]), theta.size))
         np.add.at(gradients, np.tile(self._block, len(centre)), jacobian * residuals[:, None])
         return inverse, gradients
 
     def covariance(self, theta: FloatArray) -> FloatArray:
         """Return the covariance of the parameters at the lowest cost."""
         inverse, gradients = self._curvature(theta)
-        blocks = len(gradients)
-        spread = gradients.T @ gradients * (blocks / max(blocks - 1, 1))
+        of_drives = np.add.reduceat(gradients, self._first_block[:-1])
+        spread = _spread(gradients)
+        # What drives of a pool differ in beyond the spread of their blocks; its parameters are used for one drive.
+        more, axes = np.linalg.eigh(_spread(of_drives) - spread)
+        spread += len(of_drives) * (axes * np.maximum(more, 0.0)) @ axes.T
         shared = np.diag([SHARED_SHARES.get(p.name, SHARED_SHARE) ** 2 for p in self.parameters])
         return np.asarray(inverse + inverse @ spread @ inverse + shared, dtype=np.float64)
+
+
+def _spread(gradients: FloatArray) -> FloatArray:
+    """Return the covariance [n, n] of a sum of independent gradients [k, n]; 0 of a single one."""
+    count = len(gradients)
+    return np.asarray(gradients.T @ gradients * (count / (count - 1) if count > 1 else 0.0), dtype=np.float64)
 
 
 def counted(drive: Driving) -> BoolArray:

@@ -40,7 +40,9 @@ class ReferencePrior:
 
     ``rear_m``, ``wheelbase_m``: geometry. ``friction``: of the road, for the end of the linear range. ``imu_x_m``,
     ``ay_gain``, ``ay_bias_m_s2``, ``yaw_rate_bias_rad_s``: errors of the sensors as the log was read, with 1-sigmas of
-    the first two. ``antenna_m``: position x, y of the antenna from the CG, NaN if unknown.
+    the first two. ``unknown_imu_x_m``: 1-sigma of a position that the drive does not show; it counts in the intervals
+    alone, for a free one explains what the law lacks. ``antenna_m``: position x, y of the antenna from the CG, NaN if
+    unknown.
     ``speed_over_ground``: the speed is the length of a velocity over ground, not that of wheels.
     """
 
@@ -49,6 +51,7 @@ class ReferencePrior:
     friction: float = LINEAR_FRICTION
     imu_x_m: float = 0.0
     imu_x_std_m: float = 0.1
+    unknown_imu_x_m: float = 0.0
     ay_gain: float = 1.05
     ay_gain_std: float = 0.04
     ay_bias_m_s2: float = 0.0
@@ -125,7 +128,7 @@ _PARAMETERS = (
 
 
 def _priors(prior: ReferencePrior, n: int, *, tilts: bool) -> tuple[FloatArray, FloatArray]:
-    """Return mean and 1-sigma of the first state, [n] each; v_x, v_y and heading are set by :func:`refer`.
+    """Return mean and 1-sigma of the first state, [n] each; what :func:`_smooth` sets is left.
 
     ``tilts``: roll and pitch rate give the tilt of the accelerometers, so that a_y and a_x have no gain.
     """
@@ -134,11 +137,8 @@ def _priors(prior: ReferencePrior, n: int, *, tilts: bool) -> tuple[FloatArray, 
     x, y = prior.antenna_m
     has_antenna = math.isfinite(x)
     for entry, value, sigma in (
-        (s.VX, 0.0, 1.0),
-        (s.VY, 0.0, 1.0),
-        (s.AX_BIAS, 0.0, s.BIAS_M_S2),
-        (s.AY_BIAS, 0.0, s.BIAS_M_S2),
-        (s.LAW_ERROR, 0.0, 1.0),
+        ([s.VX, s.VY, s.LAW_ERROR], 0.0, 1.0),
+        ([s.AX_BIAS, s.AY_BIAS], 0.0, s.BIAS_M_S2),
         (s.COMPLIANCE, 0.006, 0.004),
         (s.YAW_COMPLIANCE, 0.003, 0.004),
         (s.RATE_COMPLIANCE, 0.006 * small, 0.006 * small),
@@ -148,21 +148,16 @@ def _priors(prior: ReferencePrior, n: int, *, tilts: bool) -> tuple[FloatArray, 
         (s.AX_GAIN, 0.0 if tilts else 0.02, TILT_GAIN_STD if tilts else 0.02),
         (s.IMU_YAW, 0.0, IMU_YAW_STD_RAD),
         (s.IMU_Y, 0.0, 0.2 * small),
-        (s.ROLL_RATE_BIAS, 0.0, 0.01),
-        (s.PITCH_RATE_BIAS, 0.0, 0.01),
+        ([s.ROLL_RATE_BIAS, s.PITCH_RATE_BIAS], 0.0, 0.01),
         (s.SPEED_SCALE, 0.0, 0.02),
         (s.IMU_X, prior.imu_x_m, prior.imu_x_std_m),
         (s.YAW_RATE_BIAS, prior.yaw_rate_bias_rad_s, 0.005),
         (s.YAW_RATE_GAIN, 0.0, YAW_RATE_GAIN_STD),
-        (s.HEADING, 0.0, 0.3),
-        (s.EAST_ERROR, 0.0, s.RECEIVER_M_S),
-        (s.NORTH_ERROR, 0.0, s.RECEIVER_M_S),
+        ([s.EAST_ERROR, s.NORTH_ERROR], 0.0, s.RECEIVER_M_S),
         (s.ANTENNA_X, x if has_antenna else 0.0, (0.1 if has_antenna else 0.7) * small),
         (s.ANTENNA_Y, y if has_antenna else 0.0, (0.1 if has_antenna else ANTENNA_Y_STD_M) * small),
         (s.GNSS_DELAY, 0.0, 0.06),
         (s.ANTENNA_HEIGHT, 1.2 * small, 0.6 * small),
-        (s.EAST, 0.0, FIRST_POSITION_M),
-        (s.NORTH, 0.0, FIRST_POSITION_M),
     ):
         mean[entry], std[entry] = value, sigma
     return mean[:n], std[:n]
@@ -177,13 +172,12 @@ def refer(signals: Signals, prior: ReferencePrior, *, use_gnss: bool = True) -> 
     rows[:, s.GNSS_OFFSET] -= scanned_delay(rows)
     with_gnss = use_gnss and gnss_follows_imu(rows)
     noise = sensor_noise(signals, rows)
-    alone = best = _smooth(rows, prior, noise, s.WITHOUT_GNSS)
-    if with_gnss:
-        rows = without_jumps(rows)
-        aided = with_gnss_speed(rows)
-        has_position = np.isfinite(rows[:, s.POSITION_EAST]).any()
-        guess = first_guess(rows, alone.states)
-        best = _smooth(aided, prior, noise, s.WITH_POSITION if has_position else s.WITH_GNSS, guess)
+    rows = without_jumps(rows) if with_gnss else rows
+    alone, best = _solve(rows, prior, noise, gnss=with_gnss)
+    if prior.unknown_imu_x_m > 0.0:
+        moved = replace(prior, imu_x_m=prior.imu_x_m + prior.unknown_imu_x_m)
+        vx, vy = (_solve(rows, moved, noise, gnss=with_gnss)[1].states - best.states)[:, [s.VX, s.VY]].T
+        best = replace(best, covariance=best.covariance + np.stack([vx * vx, vx * vy, vy * vy], axis=1))
     gnss_share = np.clip(1.0 - best.covariance[:, 2] / np.maximum(alone.covariance[:, 2], 1e-12), 0.0, 1.0)
     vx, vy = best.states[:, s.VX], best.states[:, s.VY]
     law_m_s = np.where(rows[:, s.LAW_STD] > 0.0, rows[:, s.LAW_STD] * np.hypot(vx, vy), np.inf)
@@ -220,6 +214,15 @@ class _Smoothed:
     covariance: FloatArray
     last_variance: FloatArray
     moved_m_s: float
+
+
+def _solve(rows: FloatArray, prior: ReferencePrior, noise: FloatArray, *, gnss: bool) -> tuple[_Smoothed, _Smoothed]:
+    """Return what is smoothed without GNSS, and with it where it is used."""
+    alone = _smooth(rows, prior, noise, s.WITHOUT_GNSS)
+    if not gnss:
+        return alone, alone
+    n = s.WITH_POSITION if np.isfinite(rows[:, s.POSITION_EAST]).any() else s.WITH_GNSS
+    return alone, _smooth(with_gnss_speed(rows), prior, noise, n, first_guess(rows, alone.states))
 
 
 def _smooth(
@@ -263,8 +266,8 @@ def _parameters(smoothed: _Smoothed, prior: ReferencePrior, *, tilts: bool) -> t
 def _refusal(smoothed: _Smoothed, parameters: tuple[ReferenceParameter, ...]) -> str:
     if not np.isfinite(smoothed.states).all() or smoothed.moved_m_s > UNSETTLED_M_S:
         return f"the smoother has not settled (v_y still moves by {smoothed.moved_m_s:.2g} m/s)"
-    far = [p for p in parameters if abs(p.value - p.prior) > p.limit]
-    if far:
-        p = far[0]
-        return f"{p.name} {p.value:.3g} {p.unit} is implausible (expected {p.prior:.3g} ± {p.limit:.2g})"
+    for p in parameters:
+        if abs(p.value - p.prior) > p.limit:
+            value = f"{p.name} {p.value:.3g} {p.unit}".removesuffix(" 1")  # a number without a unit
+            return f"{value} is implausible (expected {p.prior:.3g} ± {p.limit:.2g})"
     return ""

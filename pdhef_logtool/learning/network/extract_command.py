@@ -483,7 +483,8 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         physics = filter_of(service.car, settings.model, use_speed=drive.options.use_speed)
         varied = vary(physics.vehicle, settings.vary, f"{settings.seed}:{source}")
         physics = replace(physics, vehicle=varied.vehicle)
-        drive.friction = friction_of(plan, varied.vehicle, drive.options, varied.friction_factor)
+        validated = drive.car.has_evidence
+        drive.friction = friction_of(plan, varied.vehicle, drive.options, varied.friction_factor, validated=validated)
         condition = None if settings.where is None else condition_of(settings.where)
         writer = DriveWriter(target, Picking(condition, f"{settings.seed}:{source}"), truth_source=truth["kind"])
         try:

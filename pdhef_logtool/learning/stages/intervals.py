@@ -137,7 +137,7 @@ def _run_drive(log: LogInput, number: int, task: Task) -> tuple[DriveRecord, _Ra
         runs += [(draw.vehicle, draw.friction_factor, True) for draw in draws]
     ran: _Ran = []
     for assumed, factor, wrong in runs:
-        seen = friction_of(drive.plan, assumed, options, factor).fill(drive.signals)
+        seen = friction_of(drive.plan, assumed, options, factor, validated=car.has_evidence).fill(drive.signals)
         if not ran and "friction" not in drive.plan.alignment.available:
             signals = replace(signals, friction=seen.friction)  # the best that is known of the drive, for the bins
         presumed = car if assumed is vehicle else car.with_vehicle(assumed)
