@@ -176,7 +176,7 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
         return LadderFit(None, math.inf, trials, seconds, len(problem.blocks))
     taken = linear if chosen == LINEAR else problem
     ridge = _best_ridge(taken, ())
-    weights = _solve(taken.whole, ridge)
+    weights = _solve(list(taken.whole), ridge)
     random = 0 if chosen == LINEAR else count
     used = phi[:, : ODD_COUNT + random]
     rmse_rad = math.radians(next(t.rmse_deg for t in trials if t.rung == chosen))

@@ -265,7 +265,7 @@ def _prior_test(drives: Sequence[OpenedDrive], progress: Any) -> Interval | None
         stamps.append(fold.scored.whole.signals.stamps_ns[fold.part])
         for column, parameters in zip(errors, (prior, ()), strict=True):
             scored = lacking_of(fold.scored, _calibration(fold.scored, parameters))
-            lack, root = scored.lacking_rad[fold.part], np.sqrt(scored.weight[fold.part])
+            lack, root = scored.lacking_rad[fold.part], np.sqrt(np.asarray(scored.weight)[fold.part])
             column.append(root * (lack - np.nanmedian(lack)) if np.isfinite(lack).any() else lack)
     if not folds:
         return None
