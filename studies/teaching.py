@@ -207,7 +207,7 @@ def opened(part: TeachPart, car: Car) -> OpenedDrive:
 def by_reference(drive: OpenedDrive, received: Signals | None = None) -> OpenedDrive:
     """Return a drive that the reference teaches, of signals with a receiver, else with GNSS made from ground truth."""
     truth, vehicle = drive.truth, drive.drive.car.vehicle
-    prior = prior_of(vehicle, self_calibrate([drive.taught.driving], vehicle))
+    prior = prior_of(drive.drive.car, self_calibrate([drive.taught.driving], vehicle))
     heading = np.cumsum(np.nan_to_num(truth.yaw_rate_rad_s) * np.gradient(truth.stamps_ns * 1e-9))
     made = ScoredDrive(drive.whole.signals, prior, truth.vx_m_s, truth.vy_m_s, heading, np.zeros(len(truth)))
     span = refer(with_gnss(made, RECEIVERS[MADE]) if received is None else received, prior)
