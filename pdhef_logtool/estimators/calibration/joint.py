@@ -57,14 +57,14 @@ KEPT_STEPS = 4
 #: Length of the blocks whose gradients are compared: longer than a bend, so that blocks are nearly independent.
 BLOCK_S = 3.0
 ITERATIONS, DERIVATIVE_STEP, MAX_STEP, LEAST_GAIN = 40, 0.02, 1.0, 1e-3
-#: Standard deviation of the logarithm of the peak force: the road may be wet or icy, whatever friction a file states.
-#: The peak force is at least this share of what the a_y of this quantile needs: a bank and the body's roll are in it.
-PEAK_STD, REACHED_SHARE, REACHED_QUANTILE = 0.5, 0.8, 0.98
+#: The peak force is at least this share of what this quantile of a_y needs: a bank and the body's roll are in it.
+REACHED_SHARE, REACHED_QUANTILE = 0.8, 0.98
 #: Parts of ``physics`` on a calibrated car; on simulated cars with wrong files the lowest sideslip error.
 PARTS = ("lag", "roll", "bank")
 #: Cornering stiffness over axle load of any car, 1/rad, front and rear, and the standard deviations of the logarithm
-#: about it and about the file's value. The compliance of the steering makes front axles softer.
-USUAL_STIFFNESS, USUAL_STIFFNESS_STD, FILE_STIFFNESS_STD = (13.5, 18.0), 0.35, 0.5
+#: about it and about the file's value; the last also of the peak force, for the road may be wet or icy. The compliance
+#: of the steering makes front axles softer.
+USUAL_STIFFNESS, USUAL_STIFFNESS_STD, FILE_TYRE_STD = (13.5, 18.0), 0.35, 0.5
 #: Ratio of the levels of a_y of two drives up to which one teaches the other nothing, and from which on all.
 LIKE = (0.3, 0.5)
 #: Usual share of gravity in a_y by body roll, rad/(m/s²), where the file has none (3 degrees per g), and 1-sigma of the
@@ -110,7 +110,7 @@ def _around(name: str, unit: str, mean: float, std: float, most: float) -> Param
 
 def _stiffness(vehicle_file: VehicleParameters, name: str, *, front: bool) -> Parameter:
     """Return a cornering stiffness whose prior combines the file's value with that of any car."""
-    of_file, of_usual = FILE_STIFFNESS_STD**-2, USUAL_STIFFNESS_STD**-2
+    of_file, of_usual = FILE_TYRE_STD**-2, USUAL_STIFFNESS_STD**-2
     file = vehicle_file.cornering_stiffness_n_per_rad(front, vehicle_file.assumed_friction)
     usual = USUAL_STIFFNESS[0 if front else 1] * vehicle_file.axle_load_n(front)
     mean = math.exp((of_file * math.log(file) + of_usual * math.log(usual)) / (of_file + of_usual))
@@ -129,7 +129,7 @@ def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
     return (
         _stiffness(vehicle_file, FRONT_STIFFNESS, front=True),
         _stiffness(vehicle_file, REAR_STIFFNESS, front=False),
-        _factor(PEAK, "1", 1.0, PEAK_STD, 6.0),
+        _factor(PEAK, "1", 1.0, FILE_TYRE_STD, 6.0),
         _factor(INERTIA, "kg m^2", vehicle_file.yaw_inertia_kg_m2, 0.2, 2.0),
         _factor(RELAXATION, "m", vehicle_file.relaxation_length_m or 0.5, 0.4, 4.0),
         _around(STEER_OFFSET, "rad", vehicle_file.steer_offset_rad, 0.01, 0.05),
@@ -211,7 +211,7 @@ class JointProblem:
         self._error_std = self._least_std
         slippery = [math.log(p.low / p.mean) / p.std if p.name == PEAK else 0.0 for p in self.parameters]
         descents = [self._descend(start) for start in (np.zeros(len(slippery)), np.array(slippery))]
-        theta = min(descents, key=lambda found: self._cost(self.errors_of(found), found))
+        theta = min(descents, key=lambda end: self._cost(self.errors_of(end), end))
         for _ in range(SCALES):
             error_std = np.maximum(self._least_std, self._rms(self.errors_of(theta)))
             self._error_std = error_std
@@ -370,7 +370,7 @@ def prior_variations(
     """
     std, (x, y, z) = {p.name: p.std for p in priors or parameters_of(vehicle)}, vehicle.imu_position_m
     if priors is None:
-        std |= dict.fromkeys((FRONT_STIFFNESS, REAR_STIFFNESS), FILE_STIFFNESS_STD)
+        std |= dict.fromkeys((FRONT_STIFFNESS, REAR_STIFFNESS), FILE_TYRE_STD)
     return (
         vehicle.with_stiffness(math.exp(std[FRONT_STIFFNESS]), 1.0),
         vehicle.with_stiffness(1.0, math.exp(std[REAR_STIFFNESS])),
