@@ -670,8 +670,9 @@ def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:
     """Return ``physics`` of a car, with what was found through it and its noise where the car has them.
 
     A car without identified parts has none: a static single track with the sensors' noise. If no drive with ground
-    truth has validated it, its axle forces may depart from the tyre model, for longer the more grip the car uses: only
-    forces that lag can. What tuned noise leaves out of the process noise is what was found through the filter.
+    truth has validated it, its body rolls, which a_y feels, and its axle forces may depart from the tyre model, for
+    longer the more grip the car uses: only forces that lag can. What tuned noise leaves out of the process noise is what
+    was found through the filter.
     """
     vehicle, noise = car.physics_vehicle, car.noise.get(PHYSICS)
     if noise is not None and car.fitted_physics is not None:
@@ -679,6 +680,7 @@ def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:
         noise = noise.model_copy(update={"q_std": (*noise.q_std, *fitted[len(noise.q_std) :])})
     physics = physics_filter(vehicle, noise, use_speed=use_speed)
     if noise is None and not car.has_evidence:
-        lagging = vehicle.model_copy(update={"physics": vehicle.physics.model_copy(update={"lag": True})})
-        physics = replace(physics, vehicle=lagging, limit_gain=LIMIT_GAIN, limit_lag_m=FILE_LAG * vehicle.wheelbase_m)
+        parts = vehicle.physics.model_copy(update={"lag": True, "roll": True})
+        vehicle = vehicle.model_copy(update={"physics": parts})
+        physics = replace(physics, vehicle=vehicle, limit_gain=LIMIT_GAIN, limit_lag_m=FILE_LAG * vehicle.wheelbase_m)
     return physics if vehicle == car.vehicle else replace(physics, read_with=car.vehicle)
