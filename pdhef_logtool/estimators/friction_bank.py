@@ -178,12 +178,13 @@ def _weigh(weights, prior, log_likelihood, keep):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True)
-def _bank(drive, grid, spread, prior, models, ay_per_friction, bank, out_mu, out_std):  # type: ignore[no-untyped-def]
+def _bank(drive, filters, ay_per_friction, bank, out_mu, out_std):  # type: ignore[no-untyped-def]
     """Run the bank over one window; weights [M], x [M, 2], P [M, 3] and memory of ``bank`` are updated in place.
 
-    ``spread`` [M] : 1-sigma of the friction where a filter is right. ``models`` : M model parameters.
+    ``filters`` : friction, its 1-sigma where a filter is right, prior weight [M] and M model parameters.
     """
     dt, vx, steer, usable, ay, yaw_rate = drive
+    grid, spread, prior, models = filters
     weights, x, P, memory = bank
     count = grid.shape[0]
     likelihood = np.zeros(count)
@@ -266,7 +267,7 @@ class FrictionBank:
         unknown = replace(signals, friction=np.full(len(signals), np.nan))
         speed_filter = PhysicsUkf(vehicle, use_speed=self.use_speed)
         steps, speed_carry = speed_filter.run(unknown, None if state is None else state.speed_filter)
-        grid, spread, prior, models = self._filters
+        filters = grid, _, prior, models = self._filters
         count, bank = (
             len(signals),
             (prior.copy(), np.zeros((len(grid), 2)), np.zeros((len(grid), 3)), np.zeros(_MEMORY)),
@@ -281,6 +282,6 @@ class FrictionBank:
         drive = (
             dt, vx, steps.inputs[:, U_STEER].copy(), usable, signals.ay_m_s2, signals.yaw_rate_rad_s,
         )  # fmt: skip
-        _bank(drive, grid, spread, prior, models, self.ay_per_friction, bank, friction, std)
+        _bank(drive, filters, self.ay_per_friction, bank, friction, std)
         after = FrictionState(*bank, last_stamp_ns(signals.stamps_ns, before_ns), speed_carry)
         return FrictionEstimate(friction, std, std < OBSERVABLE_STD), after

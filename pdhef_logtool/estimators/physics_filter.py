@@ -671,8 +671,8 @@ def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:
 
     A car without identified parts has none: a static single track with the sensors' noise. If no drive with ground
     truth has validated it, its body rolls, which a_y feels, and its axle forces may depart from the tyre model, for
-    longer the more grip the car uses: only forces that lag can. What tuned noise leaves out of the process noise is what
-    was found through the filter.
+    longer the more grip the car uses: only forces that lag can. What tuned noise leaves out of the process noise is
+    what was found through the filter.
     """
     vehicle, noise = car.physics_vehicle, car.noise.get(PHYSICS)
     if noise is not None and car.fitted_physics is not None:

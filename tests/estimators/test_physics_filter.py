@@ -589,8 +589,8 @@ def test_beyond_the_linear_range_kinematics_count_more():
 
 def test_a_file_that_nothing_has_validated_yields_at_the_limit():
     """Its tyres are half as stiff as the car's. In the linear range it is the filter of a car without lag."""
-    oracle = Oracle(parts("lag"))
-    v = oracle.as_vehicle(physics=PhysicsParts())
+    oracle = Oracle(parts("lag", "roll"))
+    v = oracle.as_vehicle(physics=PhysicsParts(roll=True))
     tyres = Tyres(**{name: tyre.model_copy(update={"B": 0.5 * tyre.B}) for name, tyre in v.tyres})
     soft = v.model_copy(update={"tyres": tyres})
     made = oracle.drive(slalom(0.09, 0.5), 8.0)

@@ -264,9 +264,9 @@ def test_rows_are_whole_and_in_order(dataset: ExtractResult) -> None:
 
 def test_reading_back_gives_arrays_for_training(dataset: ExtractResult) -> None:
     data = read_dataset(dataset.output)
-    assert data.features == FEATURES
-    assert data.period_s == pytest.approx(0.01)
+    assert tuple(data.manifest["features"]) == FEATURES
     for one in data.drives:
+        assert one.period_s == pytest.approx(0.01)
         found = one.load()
         frame = pl.read_parquet(one.path, hive_partitioning=False).filter(pl.col(FEATURES[0]).is_not_null())
         np.testing.assert_array_equal(found.features, frame.select(FEATURES).to_numpy())
@@ -501,7 +501,7 @@ def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
     assert "dlc" in result.stdout and "train: 1 drives" in result.stdout
     assert result.stderr.splitlines() == ["warning: dlc: perfect ground truth used; /rtk/fix, /rtk/odometry not used"]
     (drive,) = read_dataset(out).drives
-    assert drive.usable_rows > 0.99 * drive.rows
+    assert drive.entry["usable_rows"] > 0.99 * drive.entry["rows"]
     rtk = called("extract", log, "-o", str(tmp_path / "rtk"), "--set", "prefer_truth=rtk", "--split", "train", "--json")
     assert rtk.returncode == 0, rtk.stderr
     document = json.loads(rtk.stdout)

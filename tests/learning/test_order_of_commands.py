@@ -60,7 +60,7 @@ class Commands:
         self._logs = {
             name: [str(sample_logs_dir / f"{log}.mcap") for log in logs.split()]
             for name, logs in {
-                "calibrate": "dlc sweep",
+                "calibrate": "dlc step fishhook",
                 "noise": "dlc",
                 "gain": "dlc",
                 "intervals": "dlc step fishhook sweep road",

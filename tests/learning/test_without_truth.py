@@ -28,7 +28,7 @@ def config(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> R
 
 @pytest.fixture(scope="module")
 def pool(sample_logs_dir: Path, config: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> LearnResult:
-    logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "sweep")]
+    logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step", "fishhook")]
     return run_stage("calibrate", logs, tmp_path_factory.mktemp("out") / "car", config)
 
 
@@ -48,12 +48,12 @@ def test_the_car_says_what_it_rests_on_and_that_no_truth_was_looked_at(pool: Lea
     assert "without_truth = true" in text
     assert "no ground truth was used" in text
     car = Car.load(pool.car)
-    assert [d.name for d in car.learnt_on] == ["dlc", "sweep"]
-    assert all(d.end_s > 5.0 for d in car.learnt_on)
+    assert [d.name for d in car.learnt_on] == ["dlc", "step", "fishhook"]
+    assert all(d.end_s >= 5.0 for d in car.learnt_on)
     assert car.vehicle.name.endswith("(calibrated without ground truth)")
     assert car.has_evidence  # it is not calibrated once more in a run
     assert make_estimator("physics", car).causal
-    assert pool.figures["self_calibration"]["logs"] == 2
+    assert pool.figures["self_calibration"]["logs"] == 3
 
 
 def test_one_log_is_no_pool(sample_logs_dir: Path, config: RunConfig, tmp_path: Path) -> None:

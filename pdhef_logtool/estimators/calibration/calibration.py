@@ -223,7 +223,7 @@ def self_calibrate(
     )
     idle = [p.name for p in parameters if p.name in (FRONT_STIFFNESS, REAR_STIFFNESS) and p.sd > EXPORTED_STD]
     if exported and idle and not refused:
-        refused = f"the driving does not excite the {' and the '.join(idle)}"
+        refused = f"the driving does not determine the {' and the '.join(idle)}"
     root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
     varied = varied_parameters(theta, root, problem.sideslip, VARIED)
     return SelfCalibration(
