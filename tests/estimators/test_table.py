@@ -178,7 +178,7 @@ def test_physics_runs_on_any_car_and_without_a_fit_it_has_no_part() -> None:
     estimator = adaptive.physics
     assert (estimator.q_std, estimator.r_std) == (PHYSICS_Q_STD, None)
     assert estimator.limit_lag_m == FILE_LAG * VEHICLE.wheelbase_m
-    assert estimator.vehicle.physics.names == ("lag",)
+    assert estimator.vehicle.physics.names == ("lag", "roll")
     assert estimator.vehicle == VEHICLE.model_copy(update={"physics": estimator.vehicle.physics})
 
 

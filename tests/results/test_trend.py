@@ -87,7 +87,7 @@ def test_the_command_prints_rows_and_json(tmp_path: Path, capsys: pytest.Capture
     pdhef("trend", *folders)
     out = capsys.readouterr().out
     assert out.startswith("Result   1 significant regression of sideslip RMSE in 3 runs")
-    assert f"Next pdhef compare {folders[1]} {folders[2]}" in " ".join(out.split())
+    assert f"Nextpdhefcompare{folders[1]}{folders[2]}" in "".join(out.split())  # long paths are wrapped
     assert "regression against the previous and the first run" in out and "versions: numpy 2.1 → 2.2" in out
     document = said(capsys, "trend", *folders, tmp_path / "r3", "--max-regression", "5%")
     assert document["regressions"][0].endswith("r2") and document["runs"][3]["failed"] == 1
