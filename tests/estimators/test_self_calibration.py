@@ -102,6 +102,18 @@ def test_a_wrong_steering_gain_is_found() -> None:
     assert abs(math.log(ratio.value / (1.1 * RIGHT.steering_ratio))) < 1.96 * ratio.sd
 
 
+@pytest.mark.parametrize("share", [0.5, 0.3])
+def test_a_slippery_road_is_found_although_the_file_is_of_a_dry_one(share: float) -> None:
+    """The file's tyres have the stiffness of the car's and more grip, as a file for asphalt has of a car on ice."""
+    dry = Tyres(**{n: t.model_copy(update={"B": share * t.B, "D_n": t.D_n / share}) for n, t in RIGHT.tyres})
+    file = RIGHT.model_copy(update={"tyres": dry, "friction": None})
+    signals = with_noise(drive(sweep(0.08), 20.0).signals, 12)
+    by = {p.name: p for p in found(replace(signals, friction=np.full(len(signals), np.nan)), file).parameters}
+    peak = by["peak force over the file's"]
+    assert peak.excited
+    assert abs(math.log(peak.value / (share * FRICTION))) < min(3.0 * peak.sd, 0.2)
+
+
 def test_errors_that_no_parameter_explains_leave_the_prior() -> None:
     signals = with_noise(wide().signals, 10)
     rng = np.random.default_rng(11)
