@@ -25,7 +25,7 @@ from pdhef_logtool.estimators.calibration.joint import (
     FRONT_STIFFNESS,
     REAR_STIFFNESS,
     JointProblem,
-    counted,
+    driven,
     parameters_of,
     prior_variations,
     prior_vehicle,
@@ -293,7 +293,7 @@ def _refusal(problem: JointProblem, theta: FloatArray, drives: Sequence[Driving]
     """Return why a fit is not used: it explains too little, or the car slides."""
     rms = problem.rms(theta)
     for name, column, row in (("yaw rate", YAW_RATE, OF_RATE), ("lateral acceleration", AY, OF_AY)):
-        measured = np.concatenate([d.columns[column][counted(d)] for d in drives])
+        measured = driven(drives, column)
         share = rms[row] / max(float(np.sqrt(np.mean(measured**2))), 1e-9)
         if share > LARGEST_SHARE and rms[row] > LARGEST_ERROR * ERROR_STD[row]:
             return f"the model leaves {share:.0%} of the {name}, at most {LARGEST_SHARE:.0%} is plausible"

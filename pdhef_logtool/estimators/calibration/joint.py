@@ -97,6 +97,10 @@ class Parameter:
         free = self.mean * math.exp(self.std * theta) if self.log else self.mean + self.std * theta
         return min(max(free, self.low), self.high)
 
+    def theta(self, value: float) -> float:
+        """Return the normalised distance of a value from the prior mean, also outside the range."""
+        return (math.log(value / self.mean) if self.log else value - self.mean) / self.std
+
 
 def _factor(name: str, unit: str, mean: float, std: float, most: float) -> Parameter:
     """Return a parameter with a logarithmic prior, between 1 / ``most`` and ``most`` times its mean."""
@@ -154,22 +158,21 @@ def with_taught(
     def moved(p: Parameter, t: TaughtParameter) -> Parameter:
         levels = sorted((t.ay_m_s2, level_m_s2))
         share = float(np.interp(levels[0] / levels[1], LIKE, (0.0, 1.0))) if levels[0] > 0.0 else 1.0
-        distance = (math.log(t.value / p.mean) if p.log else t.value - p.mean) / p.std
         variance = p.std**2 - share**2 * max(p.std**2 - t.std**2, 0.0)
-        return replace(p, mean=p.value(share * distance), std=math.sqrt(variance))
+        return replace(p, mean=p.value(share * p.theta(t.value)), std=math.sqrt(variance))
 
     return tuple(moved(p, by_name[p.name]) if p.name in by_name else p for p in parameters)
 
 
 def level_of(drives: Sequence[Driving]) -> float:
     """Return the RMS of a_y, m/s², weighted by its square: straight driving hardly counts."""
-    ay2 = np.concatenate([d.columns[AY, counted(d)] ** 2 for d in drives])
+    ay2 = driven(drives, AY) ** 2
     return math.sqrt(float(np.nansum(ay2**2)) / max(float(np.nansum(ay2)), 1e-9))
 
 
 def peak_reached(drives: Sequence[Driving], vehicle_file: VehicleParameters) -> float:
     """Return the share of the file's peak force that the a_y of the driving needs."""
-    ay = np.concatenate([d.columns[AY, counted(d)] for d in drives])
+    ay = driven(drives, AY)
     most = sum(vehicle_file.magic_formula(front, vehicle_file.assumed_friction)[2] for front in (True, False))
     reached = np.nanquantile(np.abs(ay), REACHED_QUANTILE) if np.isfinite(ay).any() else 0.0
     return float(reached) * vehicle_file.mass_kg / most
@@ -209,7 +212,7 @@ class JointProblem:
         Both are of the prior, for from the fit without a taught one, the taught fit often remains in its minimum.
         """
         self._error_std = self._least_std
-        slippery = [math.log(p.low / p.mean) / p.std if p.name == PEAK else 0.0 for p in self.parameters]
+        slippery = [p.theta(p.low) if p.name == PEAK else 0.0 for p in self.parameters]
         descents = [self._descend(start) for start in (np.zeros(len(slippery)), np.array(slippery))]
         theta = min(descents, key=lambda end: self._cost(self.errors_of(end), end))
         for _ in range(SCALES):
@@ -324,6 +327,11 @@ def counted(drive: Driving) -> BoolArray:
     for first, last in drive.stretches:
         inside[first + round(SETTLE_S / STEP_S) : last] = True
     return inside
+
+
+def driven(drives: Sequence[Driving], column: int) -> FloatArray:
+    """Return a column of all samples that count [K]."""
+    return np.concatenate([d.columns[column, counted(d)] for d in drives])
 
 
 def _vehicle_with(vehicle_file: VehicleParameters, values: Mapping[str, float], digits: int) -> VehicleParameters:
