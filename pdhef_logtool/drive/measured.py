@@ -10,7 +10,7 @@ import numpy as np
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.columns import columns_on_grid, derivative, halves, median_known, moving_at
 from pdhef_logtool.drive.hypotheses import Posterior, Relation, known_hypotheses, posterior
-from pdhef_logtool.drive.relations import direction_rate, measured_relations
+from pdhef_logtool.drive.relations import CG_VY, direction_rate, measured_relations
 from pdhef_logtool.drive.truth import TruthTrack, channel_of
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
@@ -130,7 +130,9 @@ def drive_columns(
         for name in _TRUTH:
             channels[f"truth.{name}"] = channel_of(derived, name)
         # As mapped: a wrong unit is wrapped away in what is derived of it, and a derived a_y gives no new information.
-        channels |= {f"truth.{n}": truth[n] for n in ("sideslip_rad", "ay_m_s2") if n in truth}
+        if "vy_m_s" in truth and "truth.vy_m_s" in channels:
+            channels[CG_VY] = channels["truth.vy_m_s"]
+        channels |= {f"truth.{n}": truth[n] for n in ("vy_m_s", "sideslip_rad", "ay_m_s2") if n in truth}
     columns = columns_on_grid(channels)
     if "truth.x_m" in columns and "truth.y_m" in columns:
         vx, vy = derivative(columns.pop("truth.x_m")), derivative(columns.pop("truth.y_m"))

@@ -50,7 +50,7 @@ from pdhef_logtool.drive.truth import (
     yaw_rate_channel,
 )
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, fit_clocks, read_signals
+from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, auto_map, fit_clocks, read_signals
 from pdhef_logtool.mapping.frames import placement_of
 from pdhef_logtool.mapping.mapping_file import entries_of
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
@@ -524,10 +524,16 @@ def survey_log(
     if mapping.origin == "auto":
         return _decided(survey, log, clocks, span_ns)
 
-    def checks_of(other: Mapping) -> tuple[Check, ...]:
-        return survey_log(log, other, fit_clocks(log, other, *span_ns), span_ns, vehicle, rescale=False).checks
+    def survey_of(other: Mapping, *, rescale: bool) -> Survey:
+        return survey_log(log, other, fit_clocks(log, other, *span_ns), span_ns, vehicle, rescale=rescale)
 
-    return replace(survey, reread=lambda checks: with_other_fields(checks, log, mapping, checks_of))
+    def checks_of(other: Mapping) -> tuple[Check, ...]:
+        return survey_of(other, rescale=False).checks
+
+    def recognise() -> Mapping:
+        return survey_of(auto_map(log).mapping, rescale=True).mapping
+
+    return replace(survey, reread=lambda checks: with_other_fields(checks, mapping, checks_of, recognise))
 
 
 def _by_frames(

@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from pdhef_logtool.drive.checks.by_relations import AXIS, UNEXPLAINED
-from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.mapping import Mapping, auto_map
+from pdhef_logtool.drive.checks.by_relations import AXIS, SUSPICIONS
+from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.mapping.mapping_file import entries_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.checks import Check
@@ -22,19 +21,22 @@ _MISREAD = (".sign", ".unit", ".axis", ".mounting", ".magnitude", ".frame", ".le
 
 
 def with_other_fields(
-    checks: Sequence[Check], log: DriveLog, mapping: Mapping, checks_of: Callable[[Mapping], Sequence[Check]]
+    checks: Sequence[Check],
+    mapping: Mapping,
+    checks_of: Callable[[Mapping], Sequence[Check]],
+    recognise: Callable[[], Mapping],
 ) -> tuple[Check, ...]:
     """Return the checks of a mapping file, with those of signals replaced that another field of the log is right for.
 
     Parameters
     ----------
-    checks_of : returns the checks of another mapping of the log.
+    checks_of : returns the checks of another mapping of the log. recognise : what is read without a mapping file.
     """
     failed = _contradicted(checks)
-    if mapping.origin != "file" or not failed:
+    if not failed:
         return tuple(checks)
     doubted = {c.subject for c in checks if c.verdict != "passed" and c.name.endswith(_MISREAD)}
-    differing = _others(log, mapping)
+    differing = _others(recognise, mapping)
     for others in ({n: s for n, s in differing.items() if n in doubted}, differing):
         try:
             again = checks_of(_replaced(mapping, others)) if others else ()
@@ -47,18 +49,18 @@ def with_other_fields(
     else:
         return tuple(checks)
     renamed = tuple(_check(name, source, checks) for name, source in others.items())
-    kept = (c for c in checks if c.subject not in others and not (c.verdict == "failed" and c.name not in still))
+    kept = (c for c in checks if c.subject not in others and c.name not in failed - still)
     return (*renamed, *kept)
 
 
 def _contradicted(checks: Sequence[Check]) -> set[str]:
-    return {c.name for c in checks if c.verdict == "failed" or c.remedy == UNEXPLAINED}
+    return {c.name for c in checks if c.verdict == "failed" or c.remedy.startswith(SUSPICIONS)}
 
 
-def _others(log: DriveLog, mapping: Mapping) -> dict[str, SignalSource]:
+def _others(recognise: Callable[[], Mapping], mapping: Mapping) -> dict[str, SignalSource]:
     """Return by signal the source that recognition reads it from, where that is another one."""
     try:
-        recognised = auto_map(log).mapping
+        recognised = recognise()
     except PdhefError:
         return {}
     pairs = [(n, s, recognised.signals.get(n)) for n, s in mapping.signals.items()]

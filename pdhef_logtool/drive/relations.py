@@ -16,6 +16,9 @@ from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 MIN_PARTIAL_CORRELATION = 0.8
 #: Share of the curvature that a_y must leave: at one speed they are one regressor.
 SEPARABLE = 0.15
+#: Column of the ground-truth v_y at the CG, where v_y itself is mapped and is a column as mapped: the lever's part of a
+#: v_y at the CG would hide its unit.
+CG_VY = "truth.vy_m_s at the CG"
 #: One of two sides that moves by more must move the other. Crossfall and grade alone move an accelerometer by less (5 %
 #: are 0.5 m/s^2), and noise of 1 Hz bandwidth moves a gyro by less.
 MOVES_M_S2 = 1.0
@@ -76,7 +79,9 @@ def measured_relations(
         relations += _courses(columns, speed)
     relations += _twice(columns, "yaw_rate_rad_s", "truth.yaw_rate_rad_s", MOVES_RAD_S)
     relations += _twice(columns, "ay_m_s2", "truth.ay_m_s2", MOVES_M_S2)
-    return relations + _sideslips(columns)
+    bends = {"ay_m_s2", "yaw_rate_rad_s"}
+    agree = any(r.tells and r.accepts() for r in relations if r.powers.keys() >= bends)
+    return relations + _sideslips(columns) + _axle_sideslips(columns, vehicle, speed_name, agree)
 
 
 # ------------------------------------------------------------------------------------------- relations
@@ -383,14 +388,14 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
         return []
     ay, vx, vy, rate = (columns[n] for n in names)
     subject = "truth.sideslip_rad" if "truth.sideslip_rad" in columns else "truth.vy_m_s"
-    sideslip = columns.get("truth.sideslip_rad", np.arctan2(vy, vx))
     moving, ones = _moving(columns, vx), np.ones_like(ay)
     text = f"ay_m_s2 - v_x r against the derivative of {subject}"
     of_vx = subject != "truth.sideslip_rad"  # the sideslip is then v_y over v_x, else v_y is v_x times its tangent
     powers = {subject: -1, "ay_m_s2": 1} | ({} if of_vx else {"truth.vx_m_s": -1})
     kinematic = _partial(text, powers, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving)
     with np.errstate(divide="ignore", invalid="ignore"):
-        curvature = rate / vx
+        curvature, ratio = rate / vx, vy / vx  # no angle: it would not be in proportion to a wrong v_y
+    sideslip = columns.get("truth.sideslip_rad", ratio)
     text = f"{subject} against -ay_m_s2, apart from curvature"
     gentle = gentle_at(vx * rate, moving)
     powers = {subject: 1, "ay_m_s2": -1} | ({"truth.vx_m_s": -1} if of_vx else {})
@@ -411,6 +416,29 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
             if abs(r.gain) > low
         ),
     ]
+
+
+def _axle_sideslips(
+    columns: Mapping[str, FloatArray], vehicle: VehicleParameters | None, speed_name: str | None, agree: bool
+) -> list[Relation]:
+    """Relate the ground-truth sideslip to that of the vehicle file's rear axle, v_y = l r - C a_y v.
+
+    Only where a_y and r ``agree``: it would not be known which of both terms is wrong.
+    """
+    subject = next((n for n in ("truth.sideslip_rad", "truth.vy_m_s") if n in columns), "")
+    ay, rate, sideslip = (columns.get(n) for n in ("ay_m_s2", "yaw_rate_rad_s", subject))
+    if vehicle is None or speed_name is None or not agree or ay is None or rate is None or sideslip is None:
+        return []
+    is_moved = subject == "truth.vy_m_s" and CG_VY not in columns
+    lever = vehicle.cg_to_rear_axle_m + (0.0 if is_moved else vehicle.truth_position_m[0])
+    stiffness = vehicle.cornering_stiffness_n_per_rad(False, vehicle.assumed_friction)
+    compliance = vehicle.mass_kg * vehicle.cg_to_front_axle_m / (vehicle.wheelbase_m * stiffness)
+    speed, text = columns[speed_name], f"{subject} against the rear axle of the vehicle file"
+    expected, gentle = lever * rate - compliance * ay * speed, gentle_at(speed * rate, _moving(columns, speed))
+    if subject == "truth.sideslip_rad":
+        with np.errstate(divide="ignore", invalid="ignore"):
+            expected /= speed
+    return compare(text, {subject: 1, "ay_m_s2": -1}, expected, sideslip, gentle, KNOWN_LENGTH)
 
 
 def _partial(

@@ -10,16 +10,20 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from pdhef_logtool.drive.checks.kind import CheckKind
-from pdhef_logtool.drive.hypotheses import Hypothesis, Posterior, Relation
+from pdhef_logtool.drive.hypotheses import Hypothesis, Posterior, Relation, units_of
 from pdhef_logtool.drive.measured import WHEEL_SPEEDS, Measured
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import GNSS
 
-#: Probability of a mistake from which on a check fails, below which it passes, and from which on it is undone at once;
-#: share of a signal's mistakes from which on one is named.
-FAILS, DOUBTED, CERTAIN, NAMED = 0.85, 0.005, 0.97, 0.05
+#: Probability of a mistake from which on a check fails, is suspected, is not ruled out, and is undone at once; share of
+#: a signal's mistakes from which on one is named.
+FAILS, SUSPECTED, DOUBTED, CERTAIN, NAMED = 0.85, 0.5, 0.005, 0.97, 0.05
+#: Units that are closer (mph and km/h) are told by a speed, not by tyres.
+FAR_UNIT = 1.2
 #: What an undecided check states of a signal that the drive contradicts and no unit or sign explains.
 UNEXPLAINED = "no unit or sign explains it: the car may slide, a sensor may fail for a while, or the field is another"
+#: What the remedies of mistakes begin with that are certain or suspected.
+SUSPICIONS = ("perhaps ", "no single mistake explains it", UNEXPLAINED)
 _LACKS_WHEELBASE = "needs the wheelbase of a vehicle file, or speeds that only full-size vehicles reach"
 _LACKS_SIDESLIP = "needs sideslip that changes fast"
 #: What a drive lacks that shows the sign of a signal and not its unit.
@@ -82,7 +86,11 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
     if wrong > DOUBTED:
         likely = [h for p, h in mistakes if p > NAMED * wrong]
         checks = _failed(name, likely, [r for r in relations if not r.accepts()] or relations, measured)
-        return checks if wrong > FAILS else [replace(c, verdict="undecided") for c in checks]
+        if wrong > FAILS:
+            return checks
+        words = " or ".join(dict.fromkeys(h.words for h in likely))
+        weak = f"needs {_LACKS.get(name, _BENDS)} to rule out that {words}"
+        return [replace(c, verdict="undecided", remedy=c.remedy if wrong > SUSPECTED else weak) for c in checks]
     factors = {r.text: math.prod(h.acts_on(r) for h in chosen) for r in relations}
     usable = [r for r in relations if not math.isnan(factors[r.text])]
     if not usable:
@@ -90,12 +98,15 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
         return [UNIT.undecided(relations[0].evidence, name, f"needs {others} that is right")]
     if not any(r.accepts(factors[r.text]) for r in usable):
         return [UNIT.undecided(usable[0].evidence, name, UNEXPLAINED)]
-    return _passed(name, usable)
+    return _passed(name, usable, factors)
 
 
-def _passed(name: str, usable: Sequence[Relation]) -> list[Check]:
+def _passed(name: str, usable: Sequence[Relation], factors: dict[str, float]) -> list[Check]:
     best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
-    if name in _LACKS_FOR_UNIT and not any(r.decides_unit for r in usable):
+    others = [f for f, _ in units_of(name.removeprefix("truth.")) if abs(math.log(f)) > FAR_UNIT]
+    if name in _LACKS_FOR_UNIT and not all(
+        any(not r.accepts(factors[r.text] * f ** r.powers[name]) for r in usable) for f in others
+    ):
         return [SIGN.passed(best.evidence, name), UNIT.undecided(best.evidence, name, _LACKS_FOR_UNIT[name])]
     return [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
 
@@ -119,7 +130,7 @@ def _failed(
 ) -> list[Check]:
     if math.isnan(mistakes[0].factors[name]):
         look_at = " and ".join(relations[0].powers)
-        remedy = f"no single mistake explains it: look at the field, unit and sign of {look_at}"
+        remedy = f"{SUSPICIONS[1]}: look at the field, unit and sign of {look_at}"
         return [UNIT.failed(relations[0].evidence, name, remedy=remedy)]
     mistakes = [h for h in mistakes if not math.isnan(h.factors[name])]
     wrong = [c for a, c in (("sign", SIGN), ("unit", UNIT)) if any(a in _ASPECTS[h.kind] for h in mistakes)]
@@ -133,10 +144,10 @@ def _failed(
         ((factor, line),) = lines.items()
         words = " or ".join(dict.fromkeys(h.words for h in mistakes))
         times = f"multiply its scale in the mapping by {factor:.6g}"
-        remedy = f"perhaps {words}: {times}" + (f", {line}" if line else "")
+        remedy = f"{SUSPICIONS[0]}{words}: {times}" + (f", {line}" if line else "")
     else:
         shown = [f"{h.words} ({line})" if (line := lines[h.factors[name]]) else h.words for h in mistakes]
-        remedy = "perhaps " + " or ".join(shown)
+        remedy = SUSPICIONS[0] + " or ".join(shown)
     return [kind.failed(evidence, name, remedy=remedy) for kind in wrong]
 
 

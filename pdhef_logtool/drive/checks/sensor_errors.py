@@ -10,7 +10,7 @@ import numpy as np
 
 from pdhef_logtool.drive.checks.kind import SURE, CheckedDrive, CheckKind
 from pdhef_logtool.drive.columns import GRID_S, derivative, earlier, fit, moving_at
-from pdhef_logtool.drive.relations import GAIN_RANGE
+from pdhef_logtool.drive.relations import CG_VY, GAIN_RANGE
 from pdhef_logtool.drive.truth import LatencyEstimate
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.running_mean import running_mean
@@ -63,8 +63,8 @@ def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
     """
     nothing = (math.nan, math.inf)
     lever = gain = ay_gain = delay = nothing
-    needed = [columns.get(f"truth.{n}") for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")]
-    vx, vy, rate = needed
+    vx, vy, rate = (columns.get(f"truth.{n}") for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
+    vy = columns.get(CG_VY, vy)
     gyro, ay = columns.get("yaw_rate_rad_s"), columns.get("ay_m_s2")
     if rate is not None and gyro is not None:
         everywhere = np.ones(rate.shape[0], np.bool_)
