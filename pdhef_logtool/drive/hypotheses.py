@@ -28,7 +28,7 @@ UNRELATED_CORRELATION = 0.25
 TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M = 16.0, 0.3
 _TYPICAL = (*(f for t in (TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M) for f in (t, 1.0 / t)),)
 #: Factors between units that mappings confuse for any quantity: degrees, g, km/h.
-_FOREIGN = (1.0 / DEGREE, G_M_S2, 3.6)
+FOREIGN = (1.0 / DEGREE, G_M_S2, 3.6)
 #: Factors that differ by less in the logarithm are one unit (km/h and mph are 0.48 apart), and ranges of gains that are
 #: narrower rule out all units but one: wider ones are lengths of any car.
 SAME_FACTOR, DECIDES_UNIT = 0.25, 13.0
@@ -251,7 +251,7 @@ def _of_part(part: tuple[str, ...]) -> Iterator[Hypothesis]:
         has = "has" if is_one else "have"
         yield Hypothesis(dict.fromkeys(part, -1.0), f"{words} {has} the wrong sign", "sign")
     verb = "are" if words.endswith("speeds") else "is"
-    for factor in (f for size in _FOREIGN for f in (size, 1.0 / size)):
+    for factor in (f for size in FOREIGN for f in (size, 1.0 / size)):
         if all(abs(math.log(factor / other)) > SAME_FACTOR for other, _ in units):
             text = f"{words} {verb} off by a factor of {1.0 / factor:.4g}"
             yield Hypothesis(dict.fromkeys(part, factor), text, "foreign")

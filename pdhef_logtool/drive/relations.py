@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
+from pdhef_logtool.drive.columns import derivative, independent_samples, median_known, moving_at
 from pdhef_logtool.drive.hypotheses import BLOCKS, MIN_CORRELATION, MIN_SAMPLES, Relation, block_gains
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
@@ -46,7 +46,7 @@ ROAD_WHEEL_LENGTH_M, FULL_SIZE_LENGTH_M = (0.15, 12.0), (1.2, 12.0)
 STEERING_WHEEL_LENGTH_M, FULL_SIZE_STEERING_WHEEL_LENGTH_M = (12.0, 240.0), (22.0, 240.0)
 FULL_SIZE_M_S = (12.0, 70.0)
 #: The same over L + K v² of the vehicle file, with room for a wrong ratio in it, and tyres near their limit. A speed
-#: that is wrong itself must not make it longer than at the last.
+#: that is wrong itself must not make it longer than at the last: the slowest of speed, ground truth and a_y / r counts.
 KNOWN_LENGTH, FAST_M_S = (0.4, 2.5), 40.0
 #: Track from a 1:10 car to a truck.
 TRACK_M = (0.12, 3.0)
@@ -192,14 +192,18 @@ def _moving(columns: Mapping[str, FloatArray], speed: FloatArray) -> BoolArray:
 
 
 def _lengths(
-    speed: FloatArray, vehicle: VehicleParameters | None
+    columns: Mapping[str, FloatArray], speed: FloatArray, vehicle: VehicleParameters | None
 ) -> tuple[tuple[str, tuple[float, float], float], ...]:
     """Return by steering signal the plausible effective wheelbases, m, and the typical one."""
     finite = np.abs(speed[np.isfinite(speed)])
     if vehicle is not None:
         gradient = max(0.0, vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction))
-        typical_speed = min(float(np.median(finite)) if finite.size else 0.0, FAST_M_S)
-        road = vehicle.wheelbase_m + gradient * typical_speed**2
+        paces = [median_known(np.abs(c)) for c in (speed, columns.get("truth.vx_m_s")) if c is not None]
+        if "ay_m_s2" in columns:
+            known = np.isfinite(columns["ay_m_s2"]) & np.isfinite(columns["yaw_rate_rad_s"])
+            ay, rate = (columns[n][known] for n in ("ay_m_s2", "yaw_rate_rad_s"))
+            paces.append(float(ay.std() / max(rate.std(), 1e-9)) if known.any() else FAST_M_S)
+        road = vehicle.wheelbase_m + gradient * min(*paces, FAST_M_S) ** 2
         wheel = road * vehicle.steering_ratio
         low, high = KNOWN_LENGTH
         return (
@@ -228,7 +232,7 @@ def _steering(
     gentle = gentle_at(yaw * speed, moving)
     driven = yaw[gentle & np.isfinite(yaw)]
     is_turning = driven.size > 0 and bool(driven.std() > max(MOVES_RAD_S, abs(driven.mean())))  # to both sides
-    for name, lengths, typical in _lengths(speed, vehicle):
+    for name, lengths, typical in _lengths(columns, speed, vehicle):
         steer = columns.get(name)
         if steer is None:
             continue

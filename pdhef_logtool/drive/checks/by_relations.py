@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from pdhef_logtool.drive.checks.kind import CheckKind
-from pdhef_logtool.drive.hypotheses import Hypothesis, Posterior, Relation, units_of
+from pdhef_logtool.drive.hypotheses import FOREIGN, Hypothesis, Posterior, Relation, units_of
 from pdhef_logtool.drive.measured import WHEEL_SPEEDS, Measured
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import GNSS
@@ -103,11 +103,12 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
 
 def _passed(name: str, usable: Sequence[Relation], factors: dict[str, float]) -> list[Check]:
     best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
-    others = [f for f, _ in units_of(name.removeprefix("truth.")) if abs(math.log(f)) > FAR_UNIT]
-    if name in _LACKS_FOR_UNIT and not all(
-        any(not r.accepts(factors[r.text] * f ** r.powers[name]) for r in usable) for f in others
-    ):
-        return [SIGN.passed(best.evidence, name), UNIT.undecided(best.evidence, name, _LACKS_FOR_UNIT[name])]
+    foreign = () if name.startswith("steer") else FOREIGN  # wheelbases differ by more
+    others = {*(f for f, _ in units_of(name.removeprefix("truth."))), *(f**p for f in foreign for p in (1.0, -1.0))}
+    telling = [f for f in others if abs(math.log(f)) > FAR_UNIT and not name.startswith("wheel_speed")]
+    if any(all(r.accepts(factors[r.text] * f ** r.powers[name]) for r in usable) for f in telling):
+        lacks = _LACKS_FOR_UNIT.get(name, f"needs {_LACKS.get(name, _BENDS)}")
+        return [SIGN.passed(best.evidence, name), UNIT.undecided(best.evidence, name, lacks)]
     return [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
 
 

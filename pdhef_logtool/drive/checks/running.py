@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
-from pdhef_logtool.drive.checks.by_relations import relation_checks
+from pdhef_logtool.drive.checks.by_relations import explained_factors, relation_checks
 from pdhef_logtool.drive.checks.kind import CheckedDrive
-from pdhef_logtool.drive.checks.mounting import fault_check
+from pdhef_logtool.drive.checks.mounting import FAULTY_SHARE, fault_check
 from pdhef_logtool.drive.checks.registry import registered
 from pdhef_logtool.drive.delays import LateSensor
 from pdhef_logtool.drive.faulty_samples import without_faulty_samples
@@ -58,11 +58,14 @@ def check_drive(
         )
         return _all_checks(drive)
 
-    checks = checks_of(measure(signals, truth, derived, vehicle) if measured is None else measured)
+    whole = measure(signals, truth, derived, vehicle) if measured is None else measured
+    checks = checks_of(whole)
     if all(check.verdict != "failed" for check in checks):
         return checks
     sound, shares = without_faulty_samples(signals, vehicle or default_vehicle())
-    if not shares:
+    # A detector of faults cannot distinguish a dead channel from one in another unit; the whole drive can.
+    spoilt = {n for n, share in shares.items() if share > FAULTY_SHARE}
+    if not shares or spoilt & explained_factors(whole, mounting_is_known=mounting_is_known).keys():
         return checks
     faults = (fault_check(name, share) for name, share in shares.items())
     again = measure(sound, truth, derived, vehicle)
