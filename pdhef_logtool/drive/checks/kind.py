@@ -105,9 +105,9 @@ class CheckedDrive:
 
     @property
     def speed(self) -> FloatArray | None:
-        """The column used as the speed [N]."""
+        """The column used as the speed [N]; None if relations show it to be wrong."""
         name = self.measured.speed_name
-        return None if name is None else self.measured.columns[name]
+        return None if name is None or name in self.wrong else self.measured.columns[name]
 
     @property
     def wrong(self) -> set[str]:

@@ -57,7 +57,8 @@ def _steering(drive: CheckedDrive) -> list[Check]:
     rate, steer = columns.get("yaw_rate_rad_s"), columns.get("steer_rad")
     if steer is None and "steering_wheel_rad" in columns:
         steer = columns["steering_wheel_rad"] / vehicle.steering_ratio
-    if not drive.has_file or speed is None or rate is None or steer is None:
+    is_misread = drive.wrong & {"yaw_rate_rad_s", "steer_rad", "steering_wheel_rad"}
+    if not drive.has_file or speed is None or rate is None or steer is None or is_misread:
         return []
     with np.errstate(divide="ignore", invalid="ignore"):
         curved = vehicle.wheelbase_m * rate / speed

@@ -1,0 +1,133 @@
+"""A wrong unit of v_y shows whatever its lever is, and one field is not two quantities, whatever the drive excites."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
+from pdhef_logtool.drive.checks import check_drive
+from pdhef_logtool.drive.checks.by_relations import SUSPICIONS
+from pdhef_logtool.drive.measured import measure
+from pdhef_logtool.drive.other_fields import with_other_fields
+from pdhef_logtool.drive.truth import derive_truth
+from pdhef_logtool.mapping import Mapping, SignalSource
+from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.signals import Channel
+from tests.drive.test_checks import drive
+
+VEHICLE = default_vehicle().model_copy(update={"mass_kg": default_vehicle().mass_kg + 1.0})
+TEXT = "truth.vy_m_s against the rear axle of the vehicle file"
+
+
+def with_truth(vehicle: VehicleParameters, vy_factor: float) -> tuple[dict[str, Channel], dict[str, Channel]]:
+    """A drive on linear tyres; its ground truth is measured where the vehicle file has it."""
+    signals = drive(3, wheel_radius_m=vehicle.wheel_radius_m)
+    rate = signals["yaw_rate_rad_s"]
+    time_s = 1e-9 * (rate.stamps_ns - rate.stamps_ns[0])
+    speed = signals["speed_m_s"]
+    vx = np.interp(rate.stamps_ns, speed.stamps_ns, speed.values)
+    smooth = np.convolve(rate.values, np.ones(21) / 21.0, "same")
+    stiffness = vehicle.cornering_stiffness_n_per_rad(False, vehicle.assumed_friction)
+    compliance = vehicle.mass_kg * vehicle.cg_to_front_axle_m / (vehicle.wheelbase_m * stiffness)
+    lever = vehicle.cg_to_rear_axle_m + vehicle.truth_position_m[0]
+    vy = lever * smooth - compliance * smooth * vx**2 + 0.002 * np.sin(31.0 * time_s)
+    values = {"vx_m_s": vx, "vy_m_s": vy * vy_factor, "yaw_rate_rad_s": smooth}
+    return signals, {n: replace(rate, name=n, values=v) for n, v in values.items()}
+
+
+def checks_of(vehicle: VehicleParameters, vy_factor: float) -> dict[str, Check]:
+    signals, truth = with_truth(vehicle, vy_factor)
+    derived = derive_truth(truth, truth_position_m=vehicle.truth_position_m)
+    return {c.name: c for c in check_drive(signals, truth, derived, vehicle)}
+
+
+@settings(max_examples=4, deadline=None, derandomize=True)
+@given(place_m=st.floats(-1.4, 1.0), factor=st.floats(0.01, 100.0))
+def test_gains_of_v_y_are_in_proportion_to_its_scale(place_m: float, factor: float) -> None:
+    vehicle = VEHICLE.model_copy(update={"truth_position_m": (place_m, 0.0, 0.0)})
+    gains = []
+    for scale in (1.0, factor):
+        signals, truth = with_truth(vehicle, scale)
+        derived = derive_truth(truth, truth_position_m=vehicle.truth_position_m)
+        relations = measure(signals, truth, derived, vehicle).relations
+        gains.append({r.text: abs(r.gain) ** r.powers["truth.vy_m_s"] for r in relations if "truth.vy_m_s" in r.powers})
+    assert TEXT in gains[0]
+    for text in gains[0].keys() & gains[1].keys():  # one that gives no information is left out
+        assert gains[1][text] == pytest.approx(factor * gains[0][text], rel=1e-6)
+
+
+@pytest.mark.parametrize("place_m", [-1.1, 0.0])
+@pytest.mark.parametrize("factor", [1.0, 57.2958, 1.0 / 57.2958, 9.80665, 1.0 / 9.80665])
+def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m: float, factor: float) -> None:
+    vehicle = VEHICLE.model_copy(update={"truth_position_m": (place_m, 0.0, 0.0)})
+    checks = checks_of(vehicle, factor)
+    if factor == 1.0:
+        assert not [n for n, c in checks.items() if c.verdict == "failed" and n.startswith("truth.vy_m_s.")]
+    else:
+        assert checks["truth.vy_m_s.unit"].verdict != "passed"
+
+
+@pytest.mark.parametrize("factor", [57.2958, 1.0 / 57.2958, 9.80665])
+def test_a_wrong_speed_does_not_make_the_steering_wrong(factor: float) -> None:
+    signals = {n: c for n, c in drive(3).items() if not n.startswith("wheel")}
+    speed = signals["speed_m_s"]
+    signals["speed_m_s"] = replace(speed, values=speed.values * factor)
+    found = check_drive(signals, vehicle=VEHICLE)
+    failed = [c for c in found if c.verdict == "failed"]
+    assert [c.name for c in failed] == ["speed_m_s.unit"]
+    assert f"by {1.0 / factor:.6g}" in failed[0].remedy
+
+
+def test_a_unit_that_the_drive_leaves_open_is_not_checkable() -> None:
+    """At a low correlation both regressions reach far: 3.6 times as much would be plausible too."""
+    signals = drive(3)
+    ay = signals["ay_m_s2"]
+    noise = np.random.default_rng(1).standard_normal(ay.values.size // 100 + 1).repeat(100)[: ay.values.size]
+    loud = replace(ay, values=0.4 * ay.values + 0.55 * noise)
+    kept = {n: signals[n] for n in ("yaw_rate_rad_s", "speed_m_s")} | {"ay_m_s2": loud}
+    checks = {c.name: c for c in check_drive(kept)}
+    unit = checks.get("ay_m_s2.unit", checks.get("ay_m_s2.sign"))
+    assert unit is not None
+    assert unit.verdict == "undecided"
+    assert unit.remedy.startswith("needs ")
+
+
+# --------------------------------------------------------------------------------- two quantities of one field
+
+RATE = SignalSource("yaw_rate_rad_s", "/imu", "angular_velocity.z", "header.stamp")
+STEER = SignalSource("steer_rad", "/can", "steer", "header.stamp")
+
+
+def judged(mapping: Mapping) -> Sequence[Check]:
+    """A drive that excites nothing."""
+    return [Check(f"{n}.sign", n, "undecided", "too quiet", "needs bends") for n in mapping.signals]
+
+
+def test_one_field_for_two_quantities_is_named_without_excitation() -> None:
+    right = Mapping({"yaw_rate_rad_s": RATE, "steer_rad": STEER}, {}, origin="file")
+    wrong = replace(right, signals={**right.signals, "steer_rad": replace(RATE, name="steer_rad")})
+    checks = with_other_fields(judged(wrong), wrong, judged, lambda: right)
+    assert [(c.name, c.verdict) for c in checks if c.verdict == "failed"] == [("steer_rad.axis", "failed")]
+    assert 'topic = "/can", field = "steer"' in checks[0].remedy
+    assert tuple(with_other_fields(judged(right), right, judged, lambda: wrong)) == tuple(judged(right))
+
+
+def test_the_same_quantity_of_one_field_is_right() -> None:
+    truth = {"yaw_rate_rad_s": RATE, "vx_m_s": replace(STEER, name="vx_m_s")}
+    mapping = Mapping({"yaw_rate_rad_s": RATE, "speed_m_s": replace(STEER, name="speed_m_s")}, truth, origin="file")
+    assert tuple(with_other_fields(judged(mapping), mapping, judged, lambda: Mapping({}, {}))) == tuple(judged(mapping))
+
+
+def test_suspicions_ask_for_another_field_and_weak_ones_do_not() -> None:
+    mapping = Mapping({"steer_rad": STEER}, {}, origin="file")
+    other = Mapping({"steer_rad": replace(STEER, field="steer_measured")}, {})
+    for remedy, is_named in ((f"{SUSPICIONS[0]}steer_rad is in degrees", True), ("needs bends to rule it out", False)):
+        checks = [Check("steer_rad.unit", "steer_rad", "undecided", "a gain", remedy)]
+        found = with_other_fields(checks, mapping, lambda _: (), lambda: other)
+        assert [c.name for c in found if c.verdict == "failed"] == (["steer_rad.axis"] if is_named else [])
