@@ -2,10 +2,10 @@
 
 ``python -m studies.mapping_mistakes [LOG ...]`` counts them over logs, by default the sample logs;
 ``--sound COUNT SEED SECONDS`` counts failed checks and corrections over sound simulated drives instead: all manoeuvres,
-random cars of three classes, hills and banks included, for so much processor time at most. A mistake is *named*
-if a failed check of its signal has the factor or the axis that undoes it in its remedy, *stopped* if a check of its
-signal fails with another remedy, *open* if the checks of its signal are undecided, *silent* if they pass, and *other*
-if another signal fails instead.
+random cars of three classes, hills and banks included, for so much processor time at most. A mistake is *named* if a
+failed check of its signal has the factor or the axis that undoes it in its remedy, *refused* if a mapping file with it
+is, *stopped* if a check of its signal fails with another remedy, *open* if the checks of its signal are undecided,
+*silent* if they pass, and *other* if another signal fails instead.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from pdhef_logtool.drive.mounting import scaled_source, survey_log
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, auto_map, fit_clocks
+from pdhef_logtool.mapping.mapping_file import contradictions
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import PdhefError
@@ -143,6 +144,10 @@ def _outcome(log: DriveLog, right: Mapping, subject: str, kind: str, vehicle: Ve
     wrong = mistaken(right, subject, kind)
     if wrong is None:
         return
+    name = Path(str(log.path)).stem
+    if contradictions(wrong):
+        yield Outcome(name, subject, kind, "refused", ())
+        return
     clocks = fit_clocks(log, wrong, log.start_ns, log.end_ns)
     checks = survey_log(log, wrong, clocks, (log.start_ns, log.end_ns), vehicle).checks
     members = _members(right, subject)
@@ -150,7 +155,7 @@ def _outcome(log: DriveLog, right: Mapping, subject: str, kind: str, vehicle: Ve
     assert source is not None
     scale = source.scale if isinstance(source.scale, float | int) else 1.0
     shown = tuple(c for c in checks if c.verdict != "passed")
-    yield Outcome(Path(str(log.path)).stem, subject, kind, verdict(checks, members, subject, kind, scale), shown)
+    yield Outcome(name, subject, kind, verdict(checks, members, subject, kind, scale), shown)
 
 
 #: Cars of the sound drives, each in random variants; their speeds over a manoeuvre's own, friction, and longest drive.
@@ -216,7 +221,7 @@ def main(arguments: Sequence[str]) -> int:
         car = car if peer is None else vehicle_of(peer, path.parent)
         for found in outcomes(path, car, None if peer is None else mapping_of(peer, path.parent)):
             counts[found.verdict] += 1
-            if found.verdict != "named":
+            if found.verdict not in ("named", "refused"):
                 print(f"{found.log} {found.signal} {found.kind}: {found.verdict}")
                 for check in found.checks if "-v" in arguments else ():
                     print(f"    {check.verdict} {check.name}: {check.evidence}; {check.remedy}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import permutations, product
 
 import numpy as np
 
@@ -41,13 +40,10 @@ def rotation_text(rotation: FloatArray) -> str:
 
 def nearest_step(rotation: FloatArray) -> FloatArray:
     """Return the multiple of 90 degrees [3, 3] that a rotation is nearest to."""
-    steps = []
-    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        matrix = np.zeros((3, 3))
-        matrix[range(3), order] = signs
-        if np.linalg.det(matrix) > 0.0:
-            steps.append(matrix)
-    return max(steps, key=lambda p: float(np.sum(p * rotation)))
+    from scipy.spatial.transform import Rotation
+
+    steps = np.rint(Rotation.create_group("O").as_matrix()) + 0.0
+    return np.asarray(steps[np.argmax(np.sum(steps * rotation, axis=(1, 2)))])
 
 
 def placed_rotation(placed: Placement) -> FloatArray:

@@ -342,12 +342,9 @@ def _parts_tilted(turn: _Turn) -> bool:
 
 def _level_only(rest: FloatArray) -> FloatArray:
     """Return the smallest rotation that brings the vertical where ``rest`` brings it."""
-    up = rest[2]
-    axis = np.cross(up, np.array([0.0, 0.0, 1.0]))
-    sine, cosine = float(np.linalg.norm(axis)), float(up[2])
-    x, y, z = axis / sine
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + sine * cross + (1.0 - cosine) * cross @ cross)
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.align_vectors([[0.0, 0.0, 1.0]], [rest[2]])[0].as_matrix())
 
 
 # ------------------------------------------------------------------------------------- into the mapping

@@ -7,7 +7,6 @@ only if all checks of them then pass, and fewer fail than before, the checks nam
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -33,21 +32,20 @@ def with_other_fields(
     ----------
     checks_of : returns the checks of another mapping of the log. recognise : what is read without a mapping file.
     """
-    failed, shared = _contradicted(checks), _of_one_field(mapping)
-    if not failed and not shared:
+    failed = _contradicted(checks)
+    if not failed:
         return tuple(checks)
     mounted = {c.subject for c in checks if c.verdict == "failed" and c.name.endswith(".mounting")}
-    doubted = shared | {c.subject for c in checks if c.verdict != "passed" and c.name.endswith(_MISREAD)}
+    doubted = {c.subject for c in checks if c.verdict != "passed" and c.name.endswith(_MISREAD)}
     differing = {n: s for n, s in _others(recognise, mapping).items() if n not in mounted}
     for others in ({n: s for n, s in differing.items() if n in doubted}, differing):
         try:
-            again = checks_of(right := _replaced(mapping, others)) if others else ()
+            again = checks_of(_replaced(mapping, others)) if others else ()
         except PdhefError:  # the other fields cannot be read
             continue
         still = _contradicted(again)
         wrong = {c.subject for c in again if c.name in still}
-        left = len(still) + len(_of_one_field(right)) if others else math.inf
-        if not wrong & others.keys() and left < len(failed) + len(shared):
+        if others and not wrong & others.keys() and len(still) < len(failed):
             break
     else:
         return tuple(checks)
@@ -62,21 +60,6 @@ def _contradicted(checks: Sequence[Check]) -> set[str]:
         for c in checks
         if c.name.endswith(_MISREAD) and (c.verdict == "failed" or c.remedy.startswith(SUSPICIONS))
     }
-
-
-def _of_one_field(mapping: Mapping) -> set[str]:
-    """Return the signals that are read from a field from which another quantity is read too: one of them is wrong."""
-    sources = {**mapping.signals, **{f"truth.{n}": s for n, s in mapping.truth.items()}}
-    names: dict[tuple[str, tuple[str, ...]], list[str]] = {}
-    for name, source in sources.items():
-        names.setdefault((source.topic, source.paths), []).append(name)
-    return {n for shared in names.values() if len({_quantity(n) for n in shared}) > 1 for n in shared}
-
-
-def _quantity(name: str) -> str:
-    """Return what a signal is, of whatever sensor."""
-    bare = name.removeprefix("truth.").removeprefix("gnss_")
-    return next((q for q in ("speed", "steer") if q in bare), "speed" if bare == "vx_m_s" else bare)
 
 
 def _others(recognise: Callable[[], Mapping], mapping: Mapping) -> dict[str, SignalSource]:

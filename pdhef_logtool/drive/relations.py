@@ -37,6 +37,8 @@ COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
 REAR_LEVER_M, REAR_LEVER_TYPICAL_M = (1.0, 12.0), 1.6
 #: Beyond, sideslip times lateral acceleration is no longer small beside the derivative of the speed.
 STRAIGHT_M_S2 = 3.0
+#: No car reverses for long at more. The sign of a faster speed is known, and not its unit.
+REVERSE_M_S = 10.0
 #: Rim speed over ground speed, 5 % of slip and 5 % of radius; angular over rim speed, wheels of 4 cm to 80 cm radius.
 WHEEL_RANGE = (0.88, 1.14)
 WHEEL_PER_RADIAN_RANGE = (1.25, 25.0)
@@ -77,8 +79,12 @@ def measured_relations(
         relations += _speeds(columns, speed_name, speed)
         relations += _wheel_differences(columns, speed_name, speed)
         relations += _courses(columns, speed)
-    relations += _twice(columns, "yaw_rate_rad_s", "truth.yaw_rate_rad_s", MOVES_RAD_S)
-    relations += _twice(columns, "ay_m_s2", "truth.ay_m_s2", MOVES_M_S2)
+    twice = (("yaw_rate_rad_s", SAME_RANGE, MOVES_RAD_S), ("ay_m_s2", GAIN_RANGE, MOVES_M_S2))
+    for name, expected, moves in twice:
+        other, text = f"truth.{name}", f"truth.{name} against {name}"
+        if name in columns and other in columns:
+            sides, everywhere = (columns[name], columns[other]), np.ones(columns[name].shape[0], np.bool_)
+            relations += compare(text, {other: 1, name: -1}, *sides, everywhere, expected, moves=moves)
     bends = {"ay_m_s2", "yaw_rate_rad_s"}
     agree = any(r.tells and r.accepts() for r in relations if r.powers.keys() >= bends)
     return relations + _sideslips(columns) + _axle_sideslips(columns, vehicle, speed_name, agree)
@@ -193,30 +199,21 @@ def _moving(columns: Mapping[str, FloatArray], speed: FloatArray) -> BoolArray:
 
 def _lengths(
     columns: Mapping[str, FloatArray], speed: FloatArray, vehicle: VehicleParameters | None
-) -> tuple[tuple[str, tuple[float, float], float], ...]:
-    """Return by steering signal the plausible effective wheelbases, m, and the typical one."""
-    finite = np.abs(speed[np.isfinite(speed)])
-    if vehicle is not None:
-        gradient = max(0.0, vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction))
-        paces = [median_known(np.abs(c)) for c in (speed, columns.get("truth.vx_m_s")) if c is not None]
-        if "ay_m_s2" in columns:
-            known = np.isfinite(columns["ay_m_s2"]) & np.isfinite(columns["yaw_rate_rad_s"])
-            ay, rate = (columns[n][known] for n in ("ay_m_s2", "yaw_rate_rad_s"))
-            paces.append(float(ay.std() / max(rate.std(), 1e-9)) if known.any() else FAST_M_S)
-        road = vehicle.wheelbase_m + gradient * min(*paces, FAST_M_S) ** 2
-        wheel = road * vehicle.steering_ratio
-        low, high = KNOWN_LENGTH
-        return (
-            ("steer_rad", (low * road, high * road), road),
-            ("steering_wheel_rad", (low * wheel, high * wheel), wheel),
-        )
-    is_full_size = finite.size and FULL_SIZE_M_S[0] < np.quantile(finite, 0.9) < FULL_SIZE_M_S[1]
-    road_wheel = FULL_SIZE_LENGTH_M if is_full_size else ROAD_WHEEL_LENGTH_M
-    steering_wheel = FULL_SIZE_STEERING_WHEEL_LENGTH_M if is_full_size else STEERING_WHEEL_LENGTH_M
-    return tuple(
-        (name, lengths, float(np.sqrt(lengths[0] * lengths[1])))
-        for name, lengths in (("steer_rad", road_wheel), ("steering_wheel_rad", steering_wheel))
-    )
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the plausible effective wheelbases by road-wheel and by steering-wheel angle, m."""
+    if vehicle is None:
+        finite = np.abs(speed[np.isfinite(speed)])
+        is_full_size = finite.size and FULL_SIZE_M_S[0] < np.quantile(finite, 0.9) < FULL_SIZE_M_S[1]
+        full_size = FULL_SIZE_LENGTH_M, FULL_SIZE_STEERING_WHEEL_LENGTH_M
+        return full_size if is_full_size else (ROAD_WHEEL_LENGTH_M, STEERING_WHEEL_LENGTH_M)
+    paces = [median_known(np.abs(c)) for c in (speed, columns.get("truth.vx_m_s")) if c is not None]
+    if "ay_m_s2" in columns:
+        known = np.isfinite(columns["ay_m_s2"]) & np.isfinite(columns["yaw_rate_rad_s"])
+        ay, rate = (columns[n][known] for n in ("ay_m_s2", "yaw_rate_rad_s"))
+        paces.append(float(ay.std() / max(rate.std(), 1e-9)) if known.any() else FAST_M_S)
+    gradient = max(0.0, vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction))
+    low, high = (f * (vehicle.wheelbase_m + gradient * min(*paces, FAST_M_S) ** 2) for f in KNOWN_LENGTH)
+    return (low, high), (low * vehicle.steering_ratio, high * vehicle.steering_ratio)
 
 
 def _steering(
@@ -232,8 +229,8 @@ def _steering(
     gentle = gentle_at(yaw * speed, moving)
     driven = yaw[gentle & np.isfinite(yaw)]
     is_turning = driven.size > 0 and bool(driven.std() > max(MOVES_RAD_S, abs(driven.mean())))  # to both sides
-    for name, lengths, typical in _lengths(columns, speed, vehicle):
-        steer = columns.get(name)
+    for name, lengths in zip(("steer_rad", "steering_wheel_rad"), _lengths(columns, speed, vehicle), strict=True):
+        steer, typical = columns.get(name), float(np.sqrt(lengths[0] * lengths[1]))
         if steer is None:
             continue
         powers = {name: 1, "yaw_rate_rad_s": -1, speed_name: 1}
@@ -278,6 +275,11 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
             blocks=tuple(float(np.median(b)) for b in np.array_split(ratios, BLOCKS)),
         )  # fmt: skip
         relations.append(replace(relation, signless=name == "truth.position_speed_m_s"))
+    of_wheels = any(n.startswith("wheel") and n.endswith("_rad_s") for n in columns) and speed_name == "wheel_speeds"
+    fast = speed[np.abs(speed) > REVERSE_M_S * (3.0 if of_wheels else 1.0)]
+    if (samples := independent_samples(fast.size)) >= 2.0 * MIN_SAMPLES:
+        text, ahead = f"{speed_name} where it is too fast for reversing", float(np.sign(np.median(fast)))
+        relations.append(Relation(text, {speed_name: 1}, 1.0, ahead, (0.0, np.inf), samples))
     return relations
 
 
@@ -368,17 +370,6 @@ def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:
         return np.where(moving_at(speed) & (speed > 1.0), (vx * ay - vy * ax) / speed**2, np.nan)
 
 
-def _twice(columns: Mapping[str, FloatArray], sensor: str, truth: str, moves: float) -> list[Relation]:
-    if sensor not in columns or truth not in columns:
-        return []
-    everywhere = np.ones(columns[sensor].shape[0], np.bool_)
-    powers = {truth: 1, sensor: -1}
-    expected = SAME_RANGE if sensor.startswith("yaw") else GAIN_RANGE
-    return compare(
-        f"{truth} against {sensor}", powers, columns[sensor], columns[truth], everywhere, expected, moves=moves
-    )
-
-
 def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     """Relate the ground-truth sideslip to a_y and curvature: by kinematics where it moves fast, by the rear axle else.
 
@@ -396,30 +387,24 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     text = f"ay_m_s2 - v_x r against the derivative of {subject}"
     of_vx = subject != "truth.sideslip_rad"  # the sideslip is then v_y over v_x, else v_y is v_x times its tangent
     powers = {subject: -1, "ay_m_s2": 1} | ({} if of_vx else {"truth.vx_m_s": -1})
-    kinematic = _partial(text, powers, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving)
+    others = [derivative(rate), vx * rate, ones]
+    relations = _partial(text, powers, derivative(vy), ay, others, moving, SIDESLIP_RANGE)
     with np.errstate(divide="ignore", invalid="ignore"):
         curvature, ratio = rate / vx, vy / vx  # no angle: it would not be in proportion to a wrong v_y
     sideslip = columns.get("truth.sideslip_rad", ratio)
     text = f"{subject} against -ay_m_s2, apart from curvature"
     gentle = gentle_at(vx * rate, moving)
     powers = {subject: 1, "ay_m_s2": -1} | ({"truth.vx_m_s": -1} if of_vx else {})
-    handling = _partial(text, powers, -ay, sideslip, [curvature, ones], gentle)
+    relations += _partial(text, powers, -ay, sideslip, [curvature, ones], gentle, COMPLIANCE_RAD_PER_M_S2)
     text = f"{subject} against curvature, apart from a_y"
     powers = {subject: 1, turning: -1} | ({} if of_vx else {"truth.vx_m_s": 1})
-    rolling = _partial(text, powers, curvature, sideslip, [ay, ones], gentle, SEPARABLE)
-    (low, most), lever = REAR_LEVER_M, REAR_LEVER_TYPICAL_M
-    return [
-        *(replace(r, expected=SIDESLIP_RANGE) for r in kinematic),
-        *(replace(r, expected=COMPLIANCE_RAD_PER_M_S2) for r in handling),
+    rolling = _partial(text, powers, curvature, sideslip, [ay, ones], gentle, REAR_LEVER_M, SEPARABLE)
+    for r in rolling:
+        low, most = REAR_LEVER_M
         # Blocks that only agree on the sign leave the size open.
-        *(
-            replace(
-                r, expected=(low, most if abs(r.correlation) > MIN_PARTIAL_CORRELATION else 2 * most), typical=lever
-            )
-            for r in rolling
-            if abs(r.gain) > low
-        ),
-    ]
+        most *= 1.0 if abs(r.correlation) > MIN_PARTIAL_CORRELATION else 2.0
+        relations += [replace(r, expected=(low, most), typical=REAR_LEVER_TYPICAL_M)] if abs(r.gain) > low else []
+    return relations
 
 
 def _axle_sideslips(
@@ -452,6 +437,7 @@ def _partial(
     measured: FloatArray,
     others: list[FloatArray],
     use: BoolArray,
+    expected: tuple[float, float],
     separable: float = 0.0,
 ) -> list[Relation]:  # positional: both sides of a relation and what is wanted of them
     """Return the relation between what regression on other columns leaves of two columns; none if that is little."""
@@ -466,7 +452,7 @@ def _partial(
         left.append(out)
     if np.nanstd(left[0]) < separable * np.std(reference[finite]):
         return []
-    relations = compare(text, powers, left[0], left[1], finite, (0.0, np.inf))
+    relations = compare(text, powers, left[0], left[1], finite, expected)
     # That so many blocks of the drive agree on the sign is no chance.
     is_steady = [len(r.blocks) > BLOCKS // 2 and len(set(np.sign(r.blocks))) == 1 for r in relations]
     least = [MIN_CORRELATION if steady else MIN_PARTIAL_CORRELATION for steady in is_steady]

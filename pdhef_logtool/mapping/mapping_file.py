@@ -159,7 +159,7 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
         every = (*mapping.sources(), *(s for e in estimates.values() for s in e.values()))
         names = [s.name for s in every if s.can_signal is not None]
         problems += [f"{name}: field = {CAN_PREFIX}... needs [can] with a dbc" for name in names]
-    problems += _contradictions(mapping)
+    problems += contradictions(mapping)
     if problems:
         raise MappingFileError(
             expected="the entries of mapping.toml",
@@ -273,7 +273,8 @@ def _read_gate(raw: object, problems: list[str]) -> QualityGate | None:
     return QualityGate(minimum=model.min, maximum=model.max, values=tuple(model.values), **values)
 
 
-def _contradictions(mapping: Mapping) -> list[str]:
+def contradictions(mapping: Mapping) -> list[str]:
+    """Return why a mapping contradicts itself: two names of one signal, or one field for two signals of a section."""
     problems = []
     pairs = [("steer_rad", "steering_wheel_rad")]
     pairs += [(f"wheel_speed_{w}_m_s", f"wheel_speed_{w}_rad_s") for w in WHEELS]

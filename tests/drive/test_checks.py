@@ -169,7 +169,7 @@ def test_standing_or_missing_data_decide_nothing() -> None:
     assert check_drive({}) == ()
     empty = {n: replace(c, stamps_ns=c.stamps_ns[:0], values=c.values[:0]) for n, c in channels.items()}
     assert failed(empty) == set()
-    assert verdicts(check_drive({"speed_m_s": channels["speed_m_s"]}), "undecided") == {"speed_m_s.sign"}
+    assert verdicts(check_drive({"speed_m_s": channels["speed_m_s"]}), "undecided") == {"speed_m_s.unit"}
 
 
 @pytest.mark.slow

@@ -15,11 +15,9 @@ from pdhef_logtool.drive.measured import WHEEL_SPEEDS, Measured
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import GNSS
 
-#: Probability of a mistake from which on a check fails, is suspected, is not ruled out, and is undone at once; share of
-#: a signal's mistakes from which on one is named.
-FAILS, SUSPECTED, DOUBTED, CERTAIN, NAMED = 0.85, 0.5, 0.005, 0.97, 0.05
-#: Units that are closer (mph and km/h) are told by a speed, not by tyres.
-FAR_UNIT = 1.2
+#: Probability of a mistake from which on a check fails, below which it passes, and from which on it is undone at once;
+#: share of a signal's mistakes from which on one is named.
+FAILS, DOUBTED, CERTAIN, NAMED = 0.85, 0.005, 0.97, 0.05
 #: What an undecided check states of a signal that the drive contradicts and no unit or sign explains.
 UNEXPLAINED = "no unit or sign explains it: the car may slide, a sensor may fail for a while, or the field is another"
 #: What the remedies of mistakes begin with that are certain or suspected.
@@ -90,7 +88,7 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
             return checks
         words = " or ".join(dict.fromkeys(h.words for h in likely))
         weak = f"needs {_LACKS.get(name, _BENDS)} to rule out that {words}"
-        return [replace(c, verdict="undecided", remedy=c.remedy if wrong > SUSPECTED else weak) for c in checks]
+        return [replace(c, verdict="undecided", remedy=c.remedy if wrong > 0.5 else weak) for c in checks]
     factors = {r.text: math.prod(h.acts_on(r) for h in chosen) for r in relations}
     usable = [r for r in relations if not math.isnan(factors[r.text])]
     if not usable:
@@ -103,10 +101,12 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
 
 def _passed(name: str, usable: Sequence[Relation], factors: dict[str, float]) -> list[Check]:
     best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
-    foreign = () if name.startswith("steer") else FOREIGN  # wheelbases differ by more
-    others = {*(f for f, _ in units_of(name.removeprefix("truth."))), *(f**p for f in foreign for p in (1.0, -1.0))}
-    telling = [f for f in others if abs(math.log(f)) > FAR_UNIT and not name.startswith("wheel_speed")]
-    if any(all(r.accepts(factors[r.text] * f ** r.powers[name]) for r in usable) for f in telling):
+    # Radii of wheels and wheelbases differ by more; mph and km/h are told by a speed, not by tyres.
+    foreign = () if name.startswith(("steer", "wheel")) else FOREIGN
+    units = {f for f, said in units_of(name.removeprefix("truth.")) if said not in ("is in m/s", "is in rad/s")}
+    units |= {f**p for f in foreign for p in (1.0, -1.0)}
+    units = {f for f in units if name not in _LACKS_FOR_UNIT or max(f, 1.0 / f) > 3.0}
+    if any(all(r.accepts(factors[r.text] * f ** r.powers.get(name, 0)) for r in usable) for f in units):
         lacks = _LACKS_FOR_UNIT.get(name, f"needs {_LACKS.get(name, _BENDS)}")
         return [SIGN.passed(best.evidence, name), UNIT.undecided(best.evidence, name, lacks)]
     return [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]

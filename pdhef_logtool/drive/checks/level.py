@@ -10,6 +10,7 @@ import numpy as np
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind, is_beyond
 from pdhef_logtool.drive.columns import derivative, fit, independent_samples, median_known
+from pdhef_logtool.drive.frames import IS_GRAVITY_M_S2
 from pdhef_logtool.drive.relations import gentle_at
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import BoolArray, FloatArray
@@ -20,7 +21,6 @@ LEVEL_M_S2 = 0.8
 OTHER_AXIS_M_S2 = 5.0
 #: Independent samples of gentle driving from which on a mean is a tilt or a bias, and no manoeuvre: 10 s.
 LEVEL_SAMPLES = 20.0
-GRAVITY_ALONE_M_S2 = 0.75 * GRAVITY_M_S2
 
 
 def _levels(drive: CheckedDrive) -> Iterator[Check]:
@@ -50,7 +50,7 @@ def _levels(drive: CheckedDrive) -> Iterator[Check]:
         check = _level(name, left - bias, error, float(np.mean(columns[name][use])) - bias)
         # A drive in circles has a mean too: without the yaw rate and the speed only all of gravity is gravity.
         is_known |= name == "ax_m_s2" and speed is not None
-        is_gravity = is_known or abs(float(np.mean(rest[use]))) > GRAVITY_ALONE_M_S2
+        is_gravity = is_known or abs(float(np.mean(rest[use]))) > IS_GRAVITY_M_S2[0]
         if (driving_is_known and is_known and is_gentle_enough) or (check.name == f"{name}.axis" and is_gravity):
             yield check
 
