@@ -417,7 +417,7 @@ class Survey:
         latency: LatencyEstimate | None,
         measured: Measured,
     ) -> tuple[Check, ...]:
-        drive_checks = check_drive(
+        return check_drive(
             self.channels.signals,
             truth,
             derived,
@@ -427,16 +427,6 @@ class Survey:
             mounting_is_known=self.is_mounted,
             measured=measured,
         )
-        if self.mounting is not None and self.is_mounted:
-            # Right axes have right signs, and gravity gives the unit.
-            settled = {f"{n}.sign" for n in MOUNTED}
-            evidence = self.mounting.evidence
-            passed = [replace(c, verdict="passed", evidence=evidence, remedy="") for c in drive_checks]
-            drive_checks = tuple(
-                k if c.verdict == "undecided" and c.name in settled else c
-                for c, k in zip(drive_checks, passed, strict=True)
-            )
-        return drive_checks
 
     @cached_property
     def late(self) -> tuple[LateSensor, ...]:

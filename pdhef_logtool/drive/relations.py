@@ -103,12 +103,19 @@ def compare(
     *,
     moves: float | None = None,
     either: bool = True,
+    gentle: BoolArray | None = None,
 ) -> list[Relation]:  # positional: both sides of a relation and what is wanted of them
     """Return the relation between two columns where ``use`` and both are known; none without driving.
 
     ``moves``: both sides have one unit, and one that moves by more than this, 1-sigma, must move the other; with
-    ``either`` False the reference must move the measured side only.
+    ``either`` False the reference must move the measured side only. ``gentle``: where the relation counts instead if it
+    is only plausible there. A sign, a unit and an axis are wrong everywhere, not where the car slides alone.
     """
+    if gentle is not None:
+        relations = compare(text, powers, reference, measured, use, expected, moves=moves)
+        at_ease = compare(text, powers, reference, measured, gentle, expected, moves=moves)
+        is_right = all(r.accepts() and not r.unrelated for r in relations)
+        return at_ease if not is_right and at_ease and all(r.tells and r.accepts() for r in at_ease) else relations
     use = use & np.isfinite(reference) & np.isfinite(measured)
     samples = independent_samples(int(np.count_nonzero(use)))
     if samples < MIN_SAMPLES:
@@ -128,27 +135,6 @@ def compare(
     return [Relation(text, powers, correlation, gain, expected, samples, both, blocks=blocks)]
 
 
-def compare_at_ease(
-    text: str,
-    powers: dict[str, int],
-    reference: FloatArray,
-    measured: FloatArray,
-    use: tuple[BoolArray, BoolArray],
-    expected: tuple[float, float],
-    *,
-    moves: float | None = None,
-) -> list[Relation]:  # positional: both sides of a relation and what is wanted of them
-    """Return the relation over the first of ``use``, or over the second where only that is reliable.
-
-    A sign, a unit and an axis are wrong everywhere; a relation in gentle driving is not wrong where the car slides.
-    """
-    relations = compare(text, powers, reference, measured, use[0], expected, moves=moves)
-    if all(r.accepts() and not r.unrelated for r in relations):
-        return relations
-    gentle = compare(text, powers, reference, measured, use[1], expected, moves=moves)
-    return gentle if gentle and all(r.tells and r.accepts() for r in gentle) else relations
-
-
 def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace: FloatArray) -> list[Relation]:
     """Relate the accelerations to speed and yaw rate, of the sensors or of ground truth."""
     relations: list[Relation] = []
@@ -157,8 +143,8 @@ def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace
     if yaw is not None and left is not None:
         powers = {f"{prefix}ay_m_s2": 1, f"{prefix}yaw_rate_rad_s": -1, pace_name: -1}
         text = f"{prefix}ay_m_s2 against {prefix}yaw_rate_rad_s x speed"
-        use = (moving, gentle_at(yaw * pace, moving))
-        relations += compare_at_ease(text, powers, yaw * pace, left, use, GAIN_RANGE, moves=MOVES_M_S2)
+        turns, gentle = yaw * pace, gentle_at(yaw * pace, moving)
+        relations += compare(text, powers, turns, left, moving, GAIN_RANGE, moves=MOVES_M_S2, gentle=gentle)
     if forward is not None:
         powers = {f"{prefix}ax_m_s2": 1, pace_name: -1}
         text = f"{prefix}ax_m_s2 against the derivative of the speed"
@@ -325,8 +311,8 @@ def _wheel_differences(columns: Mapping[str, FloatArray], speed_name: str, speed
             either = [
                 r
                 for text, difference in pairs
-                for r in compare_at_ease(
-                    f"{text} against {name}", powers, columns[name], factor * difference, (moving, gentle), TRACK_M
+                for r in compare(
+                    f"{text} against {name}", powers, columns[name], factor * difference, moving, TRACK_M, gentle=gentle
                 )
             ]
             relations += _best(either)
@@ -352,11 +338,11 @@ def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relat
     for name in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s"):
         if name in columns:
             text = f"{name} against the turning of the ground-truth path"
-            use = (moving, gentle_at(columns[name] * speed, moving))
+            yaw, gentle = columns[name], gentle_at(columns[name] * speed, moving)
             either = [
                 r
                 for turning in turnings
-                for r in compare_at_ease(text, {name: 1}, turning, columns[name], use, GAIN_RANGE, moves=MOVES_RAD_S)
+                for r in compare(text, {name: 1}, turning, yaw, moving, GAIN_RANGE, moves=MOVES_RAD_S, gentle=gentle)
             ]
             relations += _best(either)
     return relations
