@@ -57,12 +57,13 @@ def gravity_agrees(placed: Placement, force: FloatArray) -> str:
     tilt = _tilt_deg(placed, force)
     if tilt is None or tilt > TILT_DEG:
         return ""
-    return f"the recorded frames give it ({_named(placed)}), and gravity is {tilt:.0f} deg off their vertical"
+    named = f"{placed.frame} in {placed.base}"
+    return f"the recorded frames give it ({named}), and gravity is {tilt:.0f} deg off their vertical"
 
 
 def frames_check(placed: Placement, shown: FloatArray | None, evidence: str, force: FloatArray) -> Check | None:
     """Compare frames against the rotation [3, 3] that the drive shows, else with gravity; None without both."""
-    said = f"the recorded frames ({_named(placed)}): {rotation_text(placed_rotation(placed))}"
+    said = f"the recorded frames ({placed.frame} in {placed.base}): {rotation_text(placed_rotation(placed))}"
     apart = None if shown is None else _between_deg(placed.rotation, shown)
     tilt = _tilt_deg(placed, force)
     if apart is not None and apart <= APART_DEG:
@@ -80,10 +81,6 @@ def frames_alone(placed: Placement, believed: str) -> Check:
     """Report that nothing but frames and gravity shows how the IMU lies."""
     evidence = f"{rotation_text(placed_rotation(placed))}: {believed}; the drive does not show the rest"
     return Check("imu.frames", "ay_m_s2", "undecided", evidence, _REMEDY)
-
-
-def _named(placed: Placement) -> str:
-    return f"{placed.frame} in {placed.base}"
 
 
 def _tilt_deg(placed: Placement, force: FloatArray) -> float | None:

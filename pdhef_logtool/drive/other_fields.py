@@ -37,7 +37,10 @@ def with_other_fields(
         return tuple(checks)
     mounted = {c.subject for c in checks if c.verdict == "failed" and c.name.endswith(".mounting")}
     doubted = {c.subject for c in checks if c.verdict != "passed" and c.name.endswith(_MISREAD)}
-    differing = {n: s for n, s in _others(recognise, mapping).items() if n not in mounted}
+    try:
+        differing = {n: s for n, s in _others(recognise(), mapping).items() if n not in mounted}
+    except PdhefError:  # nothing is recognised
+        return tuple(checks)
     for others in ({n: s for n, s in differing.items() if n in doubted}, differing):
         try:
             again = checks_of(_replaced(mapping, others)) if others else ()
@@ -62,12 +65,8 @@ def _contradicted(checks: Sequence[Check]) -> set[str]:
     }
 
 
-def _others(recognise: Callable[[], Mapping], mapping: Mapping) -> dict[str, SignalSource]:
+def _others(recognised: Mapping, mapping: Mapping) -> dict[str, SignalSource]:
     """Return by signal the source that recognition reads it from, where that is another one."""
-    try:
-        recognised = recognise()
-    except PdhefError:
-        return {}
     pairs = [(n, s, recognised.signals.get(n)) for n, s in mapping.signals.items()]
     pairs += [(f"truth.{n}", s, recognised.truth.get(n)) for n, s in mapping.truth.items()]
     return {

@@ -87,7 +87,8 @@ def measured_relations(
             relations += compare(text, {other: 1, name: -1}, *sides, everywhere, expected, moves=moves)
     bends = {"ay_m_s2", "yaw_rate_rad_s"}
     agree = any(r.tells and r.accepts() for r in relations if r.powers.keys() >= bends)
-    return relations + _sideslips(columns) + _axle_sideslips(columns, vehicle, speed_name, agree)
+    axle = _axle_sideslips(columns, vehicle, speed_name, agree)
+    return relations + axle + _sideslips(columns, is_known=bool(axle))
 
 
 # ------------------------------------------------------------------------------------------- relations
@@ -356,12 +357,12 @@ def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:
         return np.where(moving_at(speed) & (speed > 1.0), (vx * ay - vy * ax) / speed**2, np.nan)
 
 
-def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
+def _sideslips(columns: Mapping[str, FloatArray], *, is_known: bool) -> list[Relation]:
     """Relate the ground-truth sideslip to a_y and curvature: by kinematics where it moves fast, by the rear axle else.
 
     a_y - v_x r is the derivative of v_y; the lever of an accelerometer, the roll of the body and a bias are next to
     it and go with the derivative of the yaw rate, with v_x r and with nothing. In gentle driving sideslip is the
-    curvature times a lever, less a_y times the compliance of the rear tyres.
+    curvature times a lever, less a_y times the compliance of the rear tyres, if neither ``is_known`` from a file.
     """
     turning = next((n for n in ("truth.yaw_rate_rad_s", "yaw_rate_rad_s") if n in columns), "")
     names = ("ay_m_s2", "truth.vx_m_s", "truth.vy_m_s", turning)
@@ -375,6 +376,8 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     powers = {subject: -1, "ay_m_s2": 1} | ({} if of_vx else {"truth.vx_m_s": -1})
     others = [derivative(rate), vx * rate, ones]
     relations = _partial(text, powers, derivative(vy), ay, others, moving, SIDESLIP_RANGE)
+    if is_known:
+        return relations
     with np.errstate(divide="ignore", invalid="ignore"):
         curvature, ratio = rate / vx, vy / vx  # no angle: it would not be in proportion to a wrong v_y
     sideslip = columns.get("truth.sideslip_rad", ratio)

@@ -86,7 +86,7 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
         checks = _failed(name, likely, [r for r in relations if not r.accepts()] or relations, measured)
         if wrong > FAILS:
             return checks
-        words = " or ".join(dict.fromkeys(h.words for h in likely))
+        words = " or ".join(dict.fromkeys(h.words + " is another field" * (h.kind == "field") for h in likely))
         weak = f"needs {_LACKS.get(name, _BENDS)} to rule out that {words}"
         return [replace(c, verdict="undecided", remedy=c.remedy if wrong > 0.5 else weak) for c in checks]
     factors = {r.text: math.prod(h.acts_on(r) for h in chosen) for r in relations}

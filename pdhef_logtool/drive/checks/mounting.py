@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pdhef_logtool.drive.checks.kind import CheckKind
-from pdhef_logtool.records.checks import Check
 
 #: A sensor whose silent samples held so much of the drive's motion is itself a failed check.
 FAULTY_SHARE = 0.5
@@ -27,9 +26,3 @@ CORRECTED = CheckKind(
     remedy="confirm it in a mapping file: {entries}",
 )
 CHECKS = (FAULT, MOUNTING, CORRECTED)
-
-
-def fault_check(name: str, share: float) -> Check:
-    """Return the check of a signal whose faulty samples take a share of the drive's motion."""
-    evidence = f"{share:.0%} of what the car did fell into samples of it that are stuck or dead"
-    return FAULT.failed(evidence, name) if share > FAULTY_SHARE else FAULT.passed(evidence, name)

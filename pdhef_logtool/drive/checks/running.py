@@ -8,7 +8,7 @@ from dataclasses import replace
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.checks.by_relations import explained_factors, relation_checks
 from pdhef_logtool.drive.checks.kind import CheckedDrive
-from pdhef_logtool.drive.checks.mounting import FAULTY_SHARE, fault_check
+from pdhef_logtool.drive.checks.mounting import FAULT, FAULTY_SHARE
 from pdhef_logtool.drive.checks.registry import registered
 from pdhef_logtool.drive.delays import LateSensor
 from pdhef_logtool.drive.faulty_samples import without_faulty_samples
@@ -64,13 +64,19 @@ def check_drive(
         return checks
     sound, shares = without_faulty_samples(signals, vehicle or default_vehicle())
     # A detector of faults cannot distinguish a dead channel from one in another unit; the whole drive can.
-    spoilt = {n for n, share in shares.items() if share > FAULTY_SHARE}
-    if not shares or spoilt & explained_factors(whole, mounting_is_known=mounting_is_known).keys():
+    if not shares.keys() - explained_factors(whole, mounting_is_known=mounting_is_known).keys():
         return checks
-    faults = (fault_check(name, share) for name, share in shares.items())
+    evidence = "{:.0%} of what the car did fell into samples of it that are stuck or dead"
+    faults = [FAULT.failed(evidence.format(share), n) for n, share in shares.items() if share > FAULTY_SHARE]
     again = measure(sound, truth, derived, vehicle)
     again = again if measured is None else replace(again, scales=measured.scales)
-    return (*(c for c in faults if c.verdict == "failed"), *checks_of(again))
+    # What passes only without samples of its own sensor is not known to be right.
+    doubted = {c.name: c.remedy for c in checks if c.verdict == "failed" and c.subject in shares}
+    checks = checks_of(again)
+    for n in (c.name for c in checks if c.verdict == "passed" and c.name in doubted):
+        remedy = f"needs a drive without faults of it: {doubted[n]}"
+        checks = tuple(replace(c, verdict="undecided", remedy=remedy) if c.name == n else c for c in checks)
+    return (*faults, *checks)
 
 
 def misread_channels(checks: Sequence[Check], waived: Sequence[str] = ()) -> dict[str, str]:
