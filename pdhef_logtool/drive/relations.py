@@ -195,9 +195,9 @@ def _lengths(
         return full_size if is_full_size else (ROAD_WHEEL_LENGTH_M, STEERING_WHEEL_LENGTH_M)
     paces = [median_known(np.abs(c)) for c in (speed, columns.get("truth.vx_m_s")) if c is not None]
     if "ay_m_s2" in columns:
-        known = np.isfinite(columns["ay_m_s2"]) & np.isfinite(columns["yaw_rate_rad_s"])
-        ay, rate = (columns[n][known] for n in ("ay_m_s2", "yaw_rate_rad_s"))
-        paces.append(float(ay.std() / max(rate.std(), 1e-9)) if known.any() else FAST_M_S)
+        ay, rate = (columns[n] for n in ("ay_m_s2", "yaw_rate_rad_s"))
+        finite = np.isfinite(ay) & np.isfinite(rate)
+        paces.append(float(ay[finite].std() / max(rate[finite].std(), 1e-9)) if finite.any() else FAST_M_S)
     gradient = max(0.0, vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction))
     low, high = (f * (vehicle.wheelbase_m + gradient * min(*paces, FAST_M_S) ** 2) for f in KNOWN_LENGTH)
     return (low, high), (low * vehicle.steering_ratio, high * vehicle.steering_ratio)
