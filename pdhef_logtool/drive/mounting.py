@@ -289,7 +289,10 @@ def _snapped(turn: _Turn) -> FloatArray:
         return step
     is_turned = abs(yaw) > max(TURNED_DEG, 3.0 * turn.error_deg) and _parts_turned(turn, yaw)
     if tilt > TURNED_DEG and _parts_tilted(turn):
-        return rotation if is_turned else _level_only(rest) @ step
+        from scipy.spatial.transform import Rotation
+
+        level_only = Rotation.align_vectors([[0.0, 0.0, 1.0]], [rest[2]])[0].as_matrix()
+        return rotation if is_turned else np.asarray(level_only @ step)
     if not is_turned:
         return step
     c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
@@ -338,13 +341,6 @@ def _parts_tilted(turn: _Turn) -> bool:
     first, second = ups
     tilts = [math.degrees(math.acos(float(np.clip(x, -1.0, 1.0)))) for x in (first[2], second[2], first @ second)]
     return min(tilts[:2]) > TURNED_DEG and tilts[2] < PARTS_AGREE_DEG
-
-
-def _level_only(rest: FloatArray) -> FloatArray:
-    """Return the smallest rotation that brings the vertical where ``rest`` brings it."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.align_vectors([[0.0, 0.0, 1.0]], [rest[2]])[0].as_matrix())
 
 
 # ------------------------------------------------------------------------------------- into the mapping
@@ -432,10 +428,7 @@ class Survey:
     def late(self) -> tuple[LateSensor, ...]:
         """The sensors whose stamps are late as the signals alone show; a sensor that fails for a while is none."""
         sensors = late_sensors(self.channels.signals)
-        if not sensors:
-            return ()
-        sound, shares = without_faulty_samples(self.channels.signals, self.vehicle)
-        return late_sensors(sound) if shares else sensors
+        return sensors and late_sensors(without_faulty_samples(self.channels.signals, self.vehicle)[0])
 
     def _of_names(self, drive_checks: tuple[Check, ...]) -> Iterator[Check]:
         """Yield what the mapping's names left undecided and the drive has not settled since."""

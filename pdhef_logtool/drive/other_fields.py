@@ -86,6 +86,5 @@ def _check(name: str, source: SignalSource, checks: Sequence[Check]) -> Check:
     doubts = [c for verdict in ("failed", "undecided") for c in checks if (c.subject, c.verdict) == (name, verdict)]
     evidence = doubts[0].evidence if doubts else "it contradicts others that fail"
     check = AXIS.failed(f"{evidence}; with {source.label} all checks of it pass", name, signal_name=name)
-    return replace(
-        check, remedy=f"another field is mapped: in the mapping {entries_of(source, 'topic', 'field', 'scale')}"
-    )
+    entries = entries_of(source, "topic", "field", "scale")
+    return replace(check, remedy=f"another field is mapped: in the mapping {entries}")

@@ -273,10 +273,7 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
 def yaw_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
     """Return other measurements of the yaw rate than the gyro's, to any factor; steering has no certain sign."""
     references = [(n, columns[n]) for n in ("truth.course_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns]
-    if speed_name is None:
-        return references
-    speed = columns[speed_name]
-    return references + _axle_differences(columns, speed)
+    return references + ([] if speed_name is None else _axle_differences(columns, columns[speed_name]))
 
 
 def steering_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
@@ -374,8 +371,7 @@ def _sideslips(columns: Mapping[str, FloatArray], *, is_known: bool) -> list[Rel
     text = f"ay_m_s2 - v_x r against the derivative of {subject}"
     of_vx = subject != "truth.sideslip_rad"  # the sideslip is then v_y over v_x, else v_y is v_x times its tangent
     powers = {subject: -1, "ay_m_s2": 1} | ({} if of_vx else {"truth.vx_m_s": -1})
-    others = [derivative(rate), vx * rate, ones]
-    relations = _partial(text, powers, derivative(vy), ay, others, moving, SIDESLIP_RANGE)
+    relations = _partial(text, powers, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving, SIDESLIP_RANGE)
     if is_known:
         return relations
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -388,12 +384,7 @@ def _sideslips(columns: Mapping[str, FloatArray], *, is_known: bool) -> list[Rel
     text = f"{subject} against curvature, apart from a_y"
     powers = {subject: 1, turning: -1} | ({} if of_vx else {"truth.vx_m_s": 1})
     rolling = _partial(text, powers, curvature, sideslip, [ay, ones], gentle, REAR_LEVER_M, SEPARABLE)
-    for r in rolling:
-        low, most = REAR_LEVER_M
-        # Blocks that only agree on the sign leave the size open.
-        most *= 1.0 if abs(r.correlation) > MIN_PARTIAL_CORRELATION else 2.0
-        relations += [replace(r, expected=(low, most), typical=REAR_LEVER_TYPICAL_M)] if abs(r.gain) > low else []
-    return relations
+    return relations + [replace(r, typical=REAR_LEVER_TYPICAL_M) for r in rolling if abs(r.gain) > REAR_LEVER_M[0]]
 
 
 def _axle_sideslips(

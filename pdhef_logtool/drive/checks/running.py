@@ -68,8 +68,7 @@ def check_drive(
         return checks
     evidence = "{:.0%} of what the car did fell into samples of it that are stuck or dead"
     faults = [FAULT.failed(evidence.format(share), n) for n, share in shares.items() if share > FAULTY_SHARE]
-    again = measure(sound, truth, derived, vehicle)
-    again = again if measured is None else replace(again, scales=measured.scales)
+    again = replace(measure(sound, truth, derived, vehicle), scales=whole.scales)
     # What passes only without samples of its own sensor is not known to be right.
     doubted = {c.name: c.remedy for c in checks if c.verdict == "failed" and c.subject in shares}
     checks = checks_of(again)
