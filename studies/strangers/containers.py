@@ -75,11 +75,29 @@ def write(topics: Sequence[Topic], path: Path, container: str) -> Path:
 def _mcap(topics: Sequence[Topic], path: Path) -> Path:
     path = path.with_suffix(".mcap")
     with McapLogWriter(path) as writer:
+        joints = [t for t in topics if t.type_name == "sensor_msgs/msg/JointState"]
         for topic in topics:
-            text = definition(topic.type_name)
-            writer.add_topic(topic.name, topic.type_name, constants=topic.constants, definition=text)
-        writer.write([TopicBatch(t.name, t.arrival_ns, t.stamps_ns, t.fields) for t in topics])
+            if topic not in joints:
+                text = definition(topic.type_name)
+                writer.add_topic(topic.name, topic.type_name, constants=topic.constants, definition=text)
+        raws = [message for topic in joints for message in _joints(writer, topic)]
+        writer.write([TopicBatch(t.name, t.arrival_ns, t.stamps_ns, t.fields) for t in topics if t not in joints], raws)
     return path
+
+
+def _joints(writer: McapLogWriter, topic: Topic) -> Iterator[RawMessage]:
+    """Yield the messages of joints, whose names are an array of texts."""
+    types, kind = _store(False).types, topic.type_name
+    text = definition(kind).encode()
+    about: dict[str, Any] = {"schema_encoding": "ros2msg", "schema_data": text, "message_encoding": "cdr"}
+    channel = writer.add_raw_channel(topic.name, schema_name=kind, metadata={}, **about)
+    names = str(topic.constants["name"]).split()
+    columns = {name: topic.fields[name] for name in ("position", "velocity", "effort")}
+    for i, (arrival, stamp) in enumerate(zip(topic.arrival_ns.tolist(), topic.stamps_ns.tolist(), strict=True)):
+        time = types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
+        header = types["std_msgs/msg/Header"](stamp=time, frame_id="")
+        joints = types[kind](header=header, name=names, **{name: values[i] for name, values in columns.items()})
+        yield RawMessage(channel, arrival, stamp, i, bytes(_store(False).serialize_cdr(joints, kind)))
 
 
 def _messages(topics: Sequence[Topic], path: Path, *, ros1: bool) -> Iterator[tuple[Topic, int, int, bytes]]:
