@@ -93,7 +93,10 @@ def is_unit(text: str) -> bool:
 
 
 def split_unit(text: str) -> tuple[str, str]:
-    """Return name and unit of a title such as ``Speed (km/h)``; the unit is empty where the title has none."""
+    """Return name and unit of a title (``Speed (km/h)``, ``"Speed"|"km/h"|0|250``); empty where it has none."""
+    if "|" in text:
+        text, unit, *_ = (part.strip('" ') for part in text.split("|"))
+        return text, unit if is_unit(unit) else ""
     match = _BRACKETED.match(text.strip())
     return (match[1], match[2].strip()) if match and match[1] and is_unit(match[2]) else (text.strip(), "")
 
@@ -224,7 +227,7 @@ def _clocks(sheet: Sheet, names: Mapping[str, str]) -> list[str]:
 
 def _is_clock(column: NDArray[Any] | Series) -> bool:
     if isinstance(column, np.ndarray):
-        return column.dtype.kind in "iufM" and len(column) > 0
+        return column.dtype.kind in "iufM" and (len(column) == 1 or bool((column != column[:1]).any()))
     return bool((text_stamps(column.head(20)) != NO_TIME).any())
 
 

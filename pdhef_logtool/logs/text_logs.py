@@ -112,10 +112,16 @@ def _layout(lines: Sequence[str], where: str) -> tuple[str, list[str], list[str]
     if not above:
         got = "none" if first else "no row of numbers below it"
         raise LogError(expected="a CSV file with a row of column names", got=got, where=where)
-    cells = [cell.strip() for cell in above[-1]]
-    if len(above) > 1 and all(not c or is_unit(c) for c in cells) and any(cells):
-        return separator, above[-2], above[-1], first
-    return separator, above[-1], [], first
+    below = above[-3:]  # titles, and below them units and sources
+    names = max(reversed(range(len(below))), key=lambda i: len({c.strip() for c in below[i] if not is_unit(c)} - {""}))
+    units = next((row for row in below[names + 1 :] if _are_units(row)), [])
+    return separator, below[names], units, first
+
+
+def _are_units(cells: Sequence[str]) -> bool:
+    """Return whether half of the cells that are not empty, or more, are units."""
+    given = [cell for cell in cells if cell.strip().lower() not in _EMPTY]
+    return 0 < len(given) <= 2 * sum(map(is_unit, given))
 
 
 def _separator(lines: Sequence[str]) -> str:

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.logs.table_log import SIGNED, signs_of
 from pdhef_logtool.mapping.can_frames import CanSignalLog, decoded_frames, holds_frames
 from pdhef_logtool.mapping.candidates import Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
@@ -31,6 +32,8 @@ _FIELDS: dict[str, dict[str, str]] = VOCABULARY["types"]
 #: Where types keep their velocities, and first entries of the covariances whose −1 disowns a quantity (REP 145).
 TWIST_FIELDS, TWIST_COVARIANCES = _FIELDS["twist"], _FIELDS["twist_covariance"]
 NO_SENSORS = tuple(VOCABULARY["topics"]["no_sensors"].split())
+#: A lateral velocity with a smaller range is a filler, or the noise of a wheel odometry.
+LEAST_LATERAL_M_S = 0.05
 #: Start of the note on a steering angle that is a command.
 FROM_COMMAND = "steer_rad comes from the command"
 PERFECT_PREFIX = "/truth/perfect"
@@ -273,6 +276,13 @@ def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
         for t, role in rest
         if is_joints(t) and role != "command" and not joint_names(draft.log, t)
     ]
+    for topic, _ in rest:
+        paths = {f.path for f in draft.log.fields(topic.name, quiet=True)}
+        draft.notes += [
+            f"{topic.name}.{path} is not used: it is a magnitude, and {sign} contains its sign"
+            for path, sign in signs_of(paths).items()
+            if f"{path}{SIGNED}" not in paths and not is_command(path)
+        ]
     if weighed.truth:
         draft.replace_truth(weighed.truth)
     draft.notes += weighed.notes
@@ -629,6 +639,8 @@ def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
         if _is_truth(topic) and _type(topic) in _FIELDS["several_positions"]:
             draft.doubt("ground-truth position", (topic.name,), None, _FIELDS["several_positions"][_type(topic)])
     velocity = _map_truth_velocity(draft, candidates)
+    if velocity is None:
+        _name_those_that_slip(draft, [t for t in topics if t not in candidates])
     _map_truth_position(draft, candidates, velocity)
 
 
@@ -670,6 +682,18 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
         if draft.is_given(chosen.name, full) and not filler:
             draft.take(draft.truth, name, chosen.name, full)
     return chosen
+
+
+def _name_those_that_slip(draft: _Draft, topics: list[TopicInfo]) -> None:
+    """Name the twists with a lateral velocity, which may be ground truth although no name gives that."""
+    told = {s.topic for s in draft.signals.values()}.union(*(a.candidates for a in draft.ambiguities))
+    for topic in topics:
+        is_twist = (
+            _type(topic) in TWIST_FIELDS and topic.name not in told and not _words(topic.name) & _TOPICS["command"]
+        )
+        if is_twist and _span(draft.values(topic.name, _twist(topic, "linear", "y"))) > LEAST_LATERAL_M_S:
+            reason = "it contains a lateral velocity, but its name is not that of ground truth"
+            draft.doubt("ground-truth velocity", (topic.name,), None, reason)
 
 
 def _looks_like_body_frame(forward: FloatArray, left: FloatArray) -> bool | None:

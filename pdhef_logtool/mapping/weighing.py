@@ -270,7 +270,9 @@ class _Weighing:
             if times is None and reference is None:
                 kind, unit, reason, doubt = self._wheel_unit_by_turning(mean)
             else:
-                kind, unit, reason, doubt = _wheel_unit(times, reference)
+                beside = [f for f in self.taken.values() if f.topic is first.topic and not (f.meaning.unit or f.fixed)]
+                in_si = len(beside) > 2 and all(f.factors[0][1] == 1.0 for f in beside)
+                kind, unit, reason, doubt = _wheel_unit(times, reference, in_si=in_si)
             for item in wheels.values():
                 item.factors = ((unit[0], unit[1]),)
                 item.unit_known = not doubt
@@ -301,6 +303,9 @@ class _Weighing:
         speed = self._speed()
         rate = self._chosen("yaw_rate_rad_s")
         ay = self._chosen("ay_m_s2")
+        wheels = [f for n, f in self.taken.items() if n.startswith("wheel_speed") and n.endswith("m_s")]
+        if speed is None and wheels:  # in their likeliest unit
+            speed = wheels[0].standing_for(mean_of([f.si for f in wheels]))
         curvature = _curvature(speed, rate, ay)
         judged: list[tuple[float, str, Field]] = []
         for item in candidates:
@@ -599,12 +604,15 @@ def _unlikely(name: str, metres: float) -> float:
     return abs(math.log(metres / (2.7 if name == "steer_rad" else 43.0)))
 
 
-def _wheel_unit(times: float | None, reference: Field | None) -> tuple[str, tuple[str, float], str, str]:
+def _wheel_unit(
+    times: float | None, reference: Field | None, *, in_si: bool = False
+) -> tuple[str, tuple[str, float], str, str]:
     """Return quantity, unit, reason and doubt of wheel speeds whose name has no unit.
 
     Parameters
     ----------
     times : how many of them are 1 m/s by the reference, a speed; None where there is none, or no one number.
+    in_si : the other signals of their topic are in SI units, none of which is in its name.
     """
     if times is None or reference is None:
         doubt = "the unit of the wheel speeds is not given, and no speed to compare with; taken as m/s"
@@ -617,6 +625,9 @@ def _wheel_unit(times: float | None, reference: Field | None) -> tuple[str, tupl
             also = (
                 f"it could be rad/s with a radius of {1 / times:.3f} m as well" if factor < 1.0 and off > 0.01 else ""
             )
+            if in_si and also:
+                doubt = f"it could be {unit} as well; taken as rad/s, as the rest is in SI units"
+                return "wheel rate", ("rad/s", 1.0), f"{said}: a radius of {1 / times:.3f} m", doubt
             return "wheel speed", (unit, factor), said, unsure or also
     if RADII_M[0] < 1 / times < RADII_M[1]:
         return "wheel rate", ("rad/s", 1.0), f"{said}: a radius of {1 / times:.3f} m", unsure

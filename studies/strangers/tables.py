@@ -100,7 +100,7 @@ def _sources(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
 def _pipes(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
     """Write titles of name, unit, limits and rate between bars."""
     titles = [f'"{n}"|"{u}"|0.0|0.0|100' for n, u in map(_split, columns)]
-    clock = [f"{s // 10**6},{s // 10**6 + 1_764_000_000_000}" for s in (stamps - stamps[0]).tolist()]
+    clock = [f"{(s - int(stamps[0])) // 10**6},{s // 10**6}" for s in stamps.tolist()]
     path.write_text(_text(clock, columns, ['"Interval"|"ms"|0|0|1', '"Utc"|"ms"|0|0|1', *titles], ","))
 
 
