@@ -607,6 +607,10 @@ def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
     kind = _type(chosen)
     path = _FIELDS["speed"][kind] if kind in _FIELDS["speed"] else _twist(chosen, "linear", "x")
     draft.take(draft.signals, "speed_m_s", chosen.name, path)
+    if kind in TWIST_FIELDS and _span(draft.values(chosen.name, _twist(chosen, "linear", "y"))) > LEAST_LATERAL_M_S:
+        draft.notes.append(
+            f"{chosen.name} contains a lateral velocity, which is not used: its name is not that of ground truth"
+        )
 
 
 def _map_wheel_speeds(draft: _Draft, topics: list[TopicInfo]) -> None:
@@ -639,8 +643,6 @@ def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
         if _is_truth(topic) and _type(topic) in _FIELDS["several_positions"]:
             draft.doubt("ground-truth position", (topic.name,), None, _FIELDS["several_positions"][_type(topic)])
     velocity = _map_truth_velocity(draft, candidates)
-    if velocity is None:
-        _name_those_that_slip(draft, [t for t in topics if t not in candidates])
     _map_truth_position(draft, candidates, velocity)
 
 
@@ -682,18 +684,6 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
         if draft.is_given(chosen.name, full) and not filler:
             draft.take(draft.truth, name, chosen.name, full)
     return chosen
-
-
-def _name_those_that_slip(draft: _Draft, topics: list[TopicInfo]) -> None:
-    """Name the twists with a lateral velocity, which may be ground truth although no name gives that."""
-    told = {s.topic for s in draft.signals.values()}.union(*(a.candidates for a in draft.ambiguities))
-    for topic in topics:
-        is_twist = (
-            _type(topic) in TWIST_FIELDS and topic.name not in told and not _words(topic.name) & _TOPICS["command"]
-        )
-        if is_twist and _span(draft.values(topic.name, _twist(topic, "linear", "y"))) > LEAST_LATERAL_M_S:
-            reason = "it contains a lateral velocity, but its name is not that of ground truth"
-            draft.doubt("ground-truth velocity", (topic.name,), None, reason)
 
 
 def _looks_like_body_frame(forward: FloatArray, left: FloatArray) -> bool | None:
