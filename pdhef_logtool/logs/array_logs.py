@@ -81,6 +81,9 @@ def _arrow_column(column: Any) -> Any:
         column = column.cast(column.type.value_type)
     if pa.types.is_timestamp(column.type):
         return column.cast(pa.timestamp("ns")).to_numpy()
+    if pa.types.is_duration(column.type) or pa.types.is_time(column.type):
+        kind = pa.duration if pa.types.is_duration(column.type) else pa.time64
+        return column.cast(kind("ns")).cast(pa.int64()).to_numpy() / 1e9
     if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
         return pl.Series(column.to_pylist(), dtype=pl.String)
     if pa.types.is_boolean(column.type) or (column.null_count and pa.types.is_integer(column.type)):

@@ -153,8 +153,14 @@ def text_stamps(texts: Series) -> IntArray:
 
     texts = texts.str.strip_chars().str.replace(",", ".").str.replace(" ", "T")
     texts = texts.str.replace(r"^(\d\d)\.(\d\d)\.(\d{4})", "$3-$2-$1")
+    # With a slash the month comes first, where it can be one.
+    texts = texts.str.replace(r"^(1[3-9]|2\d|3[01])/(\d\d?)/(\d{4})", "$2/$1/$3")
+    texts = texts.str.replace(r"^(\d\d?)/(\d\d?)/(\d{4})", "$3-$1-$2")
+    for _ in range(2):
+        texts = texts.str.replace(r"-(\d)([T-])", "-0$1$2")
     first = next((t for t in texts.drop_nulls().head(100) if t), "")
     if "-" not in first and "/" not in first:
+        texts = pl.select(pl.when(texts.str.count_matches(":") == 1).then("0:" + texts).otherwise(texts)).to_series()
         parts = texts.str.split_exact(":", 2).struct.unnest()
         hours, minutes, seconds = (parts[c].cast(pl.Float64, strict=False).to_numpy() for c in parts.columns)
         return number_stamps(unwrapped(3600.0 * hours + 60.0 * minutes + seconds), "s")

@@ -40,7 +40,9 @@ if TYPE_CHECKING:
 #: Lines at the start of a CSV file in which its header must be.
 _HEAD_LINES = 200
 _NUMBER = re.compile(r"\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?\s*")
-_TIME_TEXT = re.compile(r"\s*(\d\d\.\d\d\.\d{4}.*|\d{4}-\d\d-\d\d([T ].*)?|\d{1,2}:\d\d:\d\d([.,]\d+)?Z?)\s*")
+_TIME_TEXT = re.compile(
+    r"\s*(\d{1,4}[./]\d{1,2}[./]\d{2,4}([T ].*)?|\d{4}-\d\d-\d\d([T ].*)?|(\d{1,2}:)?\d{1,2}:\d\d([.,]\d+)?Z?)\s*"
+)
 _EMPTY = frozenset({"", "nan", "null", "none", "na", "n/a", "-"})
 _TRUTHS = {"true": 1.0, "false": 0.0}
 
@@ -108,7 +110,7 @@ def _layout(lines: Sequence[str], where: str) -> tuple[str, list[str], list[str]
     width = max((len(row) for row in rows[-20:]), default=0)
     first = next((i for i, row in enumerate(rows) if len(row) == width > 1 and _is_values(row)), 0)
     widths = {width, width - 1} if first and not rows[first][-1].strip() else {width}  # rows may end with a separator
-    above = [row for row in rows[:first] if len(row) in widths]
+    above = [row for row in rows[:first] if len(row) in widths and not _is_values(row)]
     if not above:
         got = "none" if first else "no row of numbers below it"
         raise LogError(expected="a CSV file with a row of column names", got=got, where=where)

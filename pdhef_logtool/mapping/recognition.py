@@ -32,8 +32,6 @@ _FIELDS: dict[str, dict[str, str]] = VOCABULARY["types"]
 #: Where types keep their velocities, and first entries of the covariances whose −1 disowns a quantity (REP 145).
 TWIST_FIELDS, TWIST_COVARIANCES = _FIELDS["twist"], _FIELDS["twist_covariance"]
 NO_SENSORS = tuple(VOCABULARY["topics"]["no_sensors"].split())
-#: A lateral velocity with a smaller range is a filler, or the noise of a wheel odometry.
-LEAST_LATERAL_M_S = 0.05
 #: Start of the note on a steering angle that is a command.
 FROM_COMMAND = "steer_rad comes from the command"
 PERFECT_PREFIX = "/truth/perfect"
@@ -607,7 +605,7 @@ def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
     kind = _type(chosen)
     path = _FIELDS["speed"][kind] if kind in _FIELDS["speed"] else _twist(chosen, "linear", "x")
     draft.take(draft.signals, "speed_m_s", chosen.name, path)
-    if kind in TWIST_FIELDS and _span(draft.values(chosen.name, _twist(chosen, "linear", "y"))) > LEAST_LATERAL_M_S:
+    if kind in TWIST_FIELDS and _span(draft.values(chosen.name, _twist(chosen, "linear", "y"))) > 0.0:
         draft.notes.append(
             f"{chosen.name} contains a lateral velocity, which is not used: its name is not that of ground truth"
         )

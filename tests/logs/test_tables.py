@@ -88,6 +88,8 @@ DIALECTS = {
         RELATIVE_NS,
     ),
     "bars": (_csv(SECONDS, '"time"|"s"|0|1,"ay"|"m/s²"|-3.0|3.0|100,"speed"|"km/h"|0.0|9.0|50').encode(), RELATIVE_NS),
+    "minutes": (_csv([f"05:{t:06.3f}" for t in TIME_S], _HEAD).encode(), RELATIVE_NS + 300 * 10**9),
+    "month-first": (_csv([f"5/1/2024 {t.partition('T')[2]}" for t in _iso()], _HEAD).encode(), NOON_NS),
     "dead-clock": (_csv([f"0,{t}" for t in SECONDS], "utc," + _HEAD).encode(), RELATIVE_NS),
     "extra-comma": (_csv(SECONDS, _HEAD).replace("\n", ",\n").encode(), RELATIVE_NS),
 }
@@ -267,6 +269,15 @@ def test_a_parquet_file_with_units_nulls_and_structs(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read["parquet"].fields["imu_ay"], AY)
     np.testing.assert_array_equal(read["parquet"].log_time_ns, NOON_NS + np.round(TIME_S * 1e9).astype(np.int64))
     np.testing.assert_array_equal(read["parquet_2"].fields["gnss_speed"], SPEED[::10])
+
+
+@pytest.mark.parametrize("kind", [pa.duration("us"), pa.time64("us")])
+def test_durations_and_times_of_day_are_times(kind: pa.DataType, tmp_path: Path) -> None:
+    clock = pa.array(np.round(TIME_S * 1e6).astype(np.int64)).cast(kind)
+    pq.write_table(pa.table({"t": clock, "ay": AY}), tmp_path / "a.parquet")
+    with closing(open_log(tmp_path / "a.parquet")) as log:
+        read = log.read({"parquet": ["ay"]})["parquet"]
+    np.testing.assert_allclose((read.log_time_ns - RELATIVE_NS) * 1e-9, TIME_S, atol=1e-9)
 
 
 def test_a_damaged_row_group_is_a_loss(tmp_path: Path) -> None:
