@@ -54,16 +54,7 @@ _WEEK_TIME = re.compile(
 _SIGNAL = re.compile(r"(?:signal|channel|variable|parameter|sensor|tag|key|name)(?:_?name)?")
 _VALUE = re.compile(r"(?:physical_|signal_|phys_)?(?:value|val|wert)")
 _DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")
-_FACTORS_NS = {
-    "s": 10**9,
-    "sec": 10**9,
-    "secs": 10**9,
-    "seconds": 10**9,
-    "ms": 10**6,
-    "us": 10**3,
-    "µs": 10**3,
-    "ns": 1,
-}
+_FACTORS_NS = dict.fromkeys(("s", "sec", "secs", "seconds"), 10**9) | {"ms": 10**6, "us": 10**3, "µs": 10**3, "ns": 1}
 _GPS_EPOCH_NS = 315_964_800 * 10**9
 _WEEK_S = 604_800
 #: GPS time minus UTC in s, from a time in s since 1970 on.

@@ -218,13 +218,16 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
             if info.path in documented_fields:
                 results.append((topic, role, info, documented_fields[info.path].meaning, True))
             elif not documented_fields or info.path.count(".") or vendors.is_export(topic.type_name):
-                # The third element shows whether an array without a length has axes.
-                meaning = meaning_of(topic.name, topic.type_name, info.path, info.unit) or (
-                    meaning_of(topic.name, topic.type_name, info.path.replace("[]", "[2]"), info.unit)
-                )
-                if meaning is not None:
-                    results.append((topic, role, info, meaning, False))
+                meaning = _meaning_by_names(topic, info)
+                results += [] if meaning is None else [(topic, role, info, meaning, False)]
     return results
+
+
+def _meaning_by_names(topic: TopicInfo, info: FieldInfo) -> Meaning | None:
+    """Return what names give; the third element shows whether an array without a length has axes."""
+    paths = dict.fromkeys((info.path, info.path.replace("[]", "[2]")))
+    found = (meaning_of(topic.name, topic.type_name, path, info.unit) for path in paths)
+    return next((meaning for meaning in found if meaning is not None), None)
 
 
 def _is_setpoint(topic: TopicInfo, info: FieldInfo) -> bool:

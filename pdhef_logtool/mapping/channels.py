@@ -87,12 +87,8 @@ def clean_samples(
     """
     columns = values if values.ndim == 2 else values[:, np.newaxis]
     finite = (np.abs(columns) < LARGEST).all(axis=1)
-    in_range = np.ones(values.shape[0], np.bool_)
-    with np.errstate(invalid="ignore"):
-        if valid_min is not None:
-            in_range &= (columns >= valid_min).all(axis=1)
-        if valid_max is not None:
-            in_range &= (columns <= valid_max).all(axis=1)
+    low, high = -np.inf if valid_min is None else valid_min, np.inf if valid_max is None else valid_max
+    in_range = ((columns >= low) & (columns <= high)).all(axis=1)
     keep = finite & in_range
     nan_at = np.flatnonzero(~finite)
     out_of_range_at = np.flatnonzero(finite & ~in_range)

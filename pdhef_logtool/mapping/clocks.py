@@ -258,18 +258,17 @@ def _better_stamp(log: DriveLog, source: SignalSource) -> tuple[str, str] | None
     """Return a stamp of a source's messages that is better than its own, and why; None if none is."""
     if source.stamp_unit != "ros" or source.stamp in ("publish_time", AUTO_STAMP):
         return None
-    judged = {"log_time": _judged_stamps(log, replace(source, stamp="log_time"))}
-
-    def judge(path: str) -> tuple[str, float]:
-        if path not in judged:
-            judged[path] = _judged_stamps(log, replace(source, stamp=path))
-        return judged[path]
-
-    why, varies = judge(source.stamp)
-    headers = [p for p in stamp_paths(log.fields(source.topic)) if p != source.stamp]
-    others = [p for p in headers if source.stamp != "log_time" and not judge(p)[0]]
+    headers = [p for p in stamp_paths(log.fields(source.topic)) if source.stamp not in (p, "log_time")]
+    sources = {p: replace(source, stamp=p) for p in (source.stamp, *headers, *RECORDER_STAMPS)}
+    request = {source.read_topic: [*dict.fromkeys(path for s in sources.values() for path in stamp_request(log, s))]}
+    columns = log.read(request, log.start_ns, min(log.end_ns, log.start_ns + SURVEY_WINDOW_NS)).get(source.read_topic)
+    if columns is None or not len(columns):
+        return None
+    judged = {p: _judged_stamps(log, columns, s) for p, s in sources.items()}
+    why, varies = judged[source.stamp]
+    others = [p for p in headers if not judged[p][0]]
     # The time of publication is one if a recorder kept it: more regular than when the messages were recorded.
-    if not others and (why or source.stamp == "log_time") and judge("publish_time")[1] < judged["log_time"][1]:
+    if not others and (why or source.stamp == "log_time") and judged["publish_time"][1] < judged["log_time"][1]:
         others = ["publish_time"]
     if not others:
         return None
@@ -279,18 +278,14 @@ def _better_stamp(log: DriveLog, source: SignalSource) -> tuple[str, str] | None
     return (best, why) if why else None
 
 
-def _judged_stamps(log: DriveLog, source: SignalSource) -> tuple[str, float]:
-    """Judge the stamps of a source in the first seconds.
+def _judged_stamps(log: DriveLog, columns: Columns, source: SignalSource) -> tuple[str, float]:
+    """Judge the stamps of a source in some seconds.
 
     Returns
     -------
     why they are no measure of time, empty where they are, and how much their steps vary, in periods; infinite for
     stamps that are not on the log's clock.
     """
-    request = {source.read_topic: list(stamp_request(log, source))}
-    columns = log.read(request, log.start_ns, min(log.end_ns, log.start_ns + SURVEY_WINDOW_NS)).get(source.read_topic)
-    if columns is None or not len(columns):
-        return "", 0.0
     raw, usable = raw_stamps(log, columns, source)
     missing = why_missing(int(np.count_nonzero(usable)), len(columns))
     if missing:

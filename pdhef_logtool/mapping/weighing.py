@@ -60,8 +60,8 @@ _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
 #: Signals to both sides, whose sign may be open; speeds below give no information.
 _SIGNED = ("steer_rad", "steering_wheel_rad", "yaw_rate_rad_s", "ay_m_s2")
 SLOW_M_S = 1.0
-#: Unit of rotational speeds, and the usual radius of a wheel.
-RPM = 2.0 * math.pi / 60.0
+#: Units of rotational speeds, and the usual radius of a wheel.
+TURNING = (("rad/s", 1.0), ("rpm", 2.0 * math.pi / 60.0))
 USUAL_RADIUS_M = 0.3
 
 
@@ -201,13 +201,13 @@ class _Weighing:
         near = [f for f in good[1:] if f.score > best.score - 0.1 and not self.fields.agree(best, f)]
         if near:
             best = self._better([best, *near])
-            self.rivals.append(
-                (
-                    name,
-                    tuple(f"{f.topic.name}.{f.path}" for f in [best, *(x for x in [good[0], *near] if x is not best)]),
-                )
-            )
+        self._choose(name, best, [f for f in (good[0], *near) if f is not best])
+
+    def _choose(self, name: str, best: Field, rivals: Sequence[Field]) -> None:
+        """Take a field for a signal, and name the others that could be it."""
         self.taken[name] = best
+        if rivals:
+            self.rivals.append((name, tuple(f"{f.topic.name}.{f.path}" for f in (best, *rivals))))
 
     def _follows_ax(self, item: Field) -> None:
         """Raise the score of a speed with a weak name where its rate of change follows a_x."""
@@ -289,7 +289,7 @@ class _Weighing:
             return _wheel_unit(None, None)
         metres = abs(relation.slope)
         ways = [(abs(math.log(metres / unit[1])) / math.log(1.3), "wheel speed", unit) for unit in SPEEDS]
-        for turning in (("rad/s", 1.0), ("rpm", RPM)):  # a name of a speed is a speed first
+        for turning in TURNING:  # a name of a speed is a speed first
             off = abs(math.log(metres / turning[1] / USUAL_RADIUS_M)) / math.log(1.3)
             ways.append((1.0 + off, "wheel rate", turning))
         (_, kind, taken), (_, _, other) = sorted(ways)[:2]
@@ -322,12 +322,8 @@ class _Weighing:
             return
         judged.sort(key=lambda j: (-j[0], -j[2].topic.messages, j[2].topic.name, j[2].path))
         _, name, best = judged[0]
-        rivals = [
-            o for s, n, o in judged[1:] if s > judged[0][0] - 0.1 and n == name and not self.fields.agree(best, o)
-        ]
-        if rivals:
-            self.rivals.append((name, tuple(f"{f.topic.name}.{f.path}" for f in [best, *rivals])))
-        self.taken[name] = best
+        near = [f for score, n, f in judged[1:] if score > judged[0][0] - 0.1 and n == name]
+        self._choose(name, best, [f for f in near if not self.fields.agree(best, f)])
 
     def _steering_kind(self, item: Field, relation: Fit | None) -> tuple[str, bool | None]:
         """Return the signal that a steering angle is, and whether it follows the car's turning (None: unknown)."""
@@ -629,10 +625,9 @@ def _wheel_unit(
                 doubt = f"it could be {unit} as well; taken as rad/s, as the rest is in SI units"
                 return "wheel rate", ("rad/s", 1.0), f"{said}: a radius of {1 / times:.3f} m", doubt
             return "wheel speed", (unit, factor), said, unsure or also
-    if RADII_M[0] < 1 / times < RADII_M[1]:
-        return "wheel rate", ("rad/s", 1.0), f"{said}: a radius of {1 / times:.3f} m", unsure
-    if RADII_M[0] < 1 / (times * RPM) < RADII_M[1]:
-        return "wheel rate", ("rpm", RPM), f"{said}: a radius of {1 / (times * RPM):.3f} m in rpm", unsure
+    for unit, factor in TURNING:
+        if RADII_M[0] < (radius_m := 1.0 / (times * factor)) < RADII_M[1]:
+            return "wheel rate", (unit, factor), f"{said}: a radius of {radius_m:.3f} m in {unit}", unsure
     return "wheel speed", ("m/s", 1.0), "", f"{said}, which is no unit of wheel speeds; taken as m/s"
 
 

@@ -155,12 +155,12 @@ def _mcap_ros1(topics: Sequence[Topic], path: Path) -> Path:
     return path
 
 
-def _rosbag2(topics: Sequence[Topic], path: Path) -> Path:
+def _rosbag2(topics: Sequence[Topic], path: Path, plugin: str = "SQLITE3") -> Path:
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     shutil.rmtree(path, ignore_errors=True)
     store = _store(False)
-    with Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+    with Writer(path, version=9, storage_plugin=StoragePlugin[plugin]) as writer:
         connections = {t.name: writer.add_connection(t.name, t.type_name, typestore=store) for t in topics}
         for topic, arrival, _, data in _messages(topics, path, ros1=False):
             writer.write(connections[topic.name], arrival, data)
@@ -174,29 +174,6 @@ def _rosbag2_bare(topics: Sequence[Topic], path: Path) -> Path:
             connection.execute("DROP TABLE message_definitions")
             connection.execute("UPDATE schema SET schema_version = 3")
         connection.close()
-    return path
-
-
-def _rosbag2_mcap(topics: Sequence[Topic], path: Path) -> Path:
-    shutil.rmtree(path, ignore_errors=True)
-    path.mkdir(parents=True)
-    stored = _mcap(topics, path / f"{path.name}_0")
-    count = sum(len(t.stamps_ns) for t in topics)
-    start = min(int(t.arrival_ns[0]) for t in topics if len(t.arrival_ns))
-    end = max(int(t.arrival_ns[-1]) for t in topics if len(t.arrival_ns))
-    rows = "".join(
-        f"    - topic_metadata:\n        name: {t.name}\n        type: {t.type_name}\n"
-        "        serialization_format: cdr\n        offered_qos_profiles: ''\n"
-        f"      message_count: {len(t.stamps_ns)}\n"
-        for t in topics
-    )
-    (path / "metadata.yaml").write_text(
-        "rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: mcap\n"
-        f"  relative_file_paths:\n    - {stored.name}\n  duration:\n    nanoseconds: {end - start}\n"
-        f"  starting_time:\n    nanoseconds_since_epoch: {start}\n  message_count: {count}\n"
-        f"  topics_with_message_count:\n{rows}  compression_format: ''\n  compression_mode: ''\n",
-        encoding="utf-8",
-    )
     return path
 
 
@@ -317,7 +294,7 @@ _WRITERS: dict[str, Callable[[Sequence[Topic], Path], Path]] = {
     "rosbag1": _rosbag1,
     "rosbag2": _rosbag2,
     "rosbag2-bare": _rosbag2_bare,
-    "rosbag2-mcap": _rosbag2_mcap,
+    "rosbag2-mcap": lambda topics, path: _rosbag2(topics, path, "MCAP"),
     **dict(tables.writers()),
     **dict(buses.writers()),
 }
