@@ -605,8 +605,7 @@ def _map_wheel_speeds(draft: _Draft, topics: list[TopicInfo]) -> None:
     if chosen is None:
         return
     for wheel in WHEELS:
-        name = f"wheel_speed_{wheel}_m_s"
-        draft.take(draft.signals, name, chosen.name, f"{wheel}_m_s")
+        draft.take(draft.signals, f"wheel_speed_{wheel}_m_s", chosen.name, f"{wheel}_m_s")
 
 
 # ------------------------------------------------------------------------------------------------ ground truth

@@ -432,7 +432,8 @@ class _Weighing:
         documented, named = _truth_of([f for f in its if f.fixed]), _truth_of(its)
         # Documented fields before names, unless names alone give a sideslip: channels of modules beside a receiver.
         self.truth = named if not documented or _SLIP & set(named) - set(documented) else documented
-        if not self.truth:
+        if not self.truth or self._is_of_another_frame(its):
+            self.truth = {}
             return
         first = its[0]
         if first.role == "sensor" and self.truth.get("yaw_rate_rad_s") is self.taken.get("yaw_rate_rad_s"):
@@ -444,18 +445,20 @@ class _Weighing:
             if first.role != "navigation":
                 del self.taken[signal]
         if first.role == "sensor" and not (agrees and "reference" in first.topic.name.lower()):
-            self.checks.append(
-                Check(
-                    "truth.source",
-                    "truth",
-                    "undecided",
-                    f"{first.topic.name} contains a sideslip, measured or estimated: its name does not give which",
-                    'name it under [truth] in a mapping file, or --waive "truth.source"',
-                )
-            )
+            evidence = f"{first.topic.name} contains a sideslip, measured or estimated: its name does not give which"
+            remedy = 'name it under [truth] in a mapping file, or --waive "truth.source"'
+            self.checks.append(Check("truth.source", "truth", "undecided", evidence, remedy))
         self.notes.append(f"ground truth is taken from {first.topic.name}, by the names of its fields")
         for name, item in self.truth.items():
             self._tell(f"truth.{name}", item)
+
+    def _is_of_another_frame(self, its: Sequence[Field]) -> bool:
+        """Return whether the x beside a lateral velocity's y is not the speed: the vector is not one of the body."""
+        across, along = self.truth.get("vy_m_s"), self.truth.get("vx_m_s")
+        if across is None or along is None or across.fixed:
+            return False
+        beside = [f for f in its if f.meaning.quantity == "speed" and triad_of(f) == triad_of(across)]
+        return any(f is not along and not self.fields.agree(f, along) for f in beside)
 
     def _truth_turns(self) -> bool:
         """Return whether the yaw rate of the ground truth is the sensor's, up to its sign."""
@@ -475,15 +478,9 @@ class _Weighing:
             )
         item.doubts += item.unit_doubt
         if item.doubts:
-            self.checks.append(
-                Check(
-                    f"{name}.candidate",
-                    name,
-                    "undecided",
-                    f"{item.topic.name}.{item.path} is taken, but {'; '.join(item.doubts)}",
-                    f'look at it (pdhef inspect --fields), name it in a mapping file, or --waive "{name}.candidate"',
-                )
-            )
+            evidence = f"{item.topic.name}.{item.path} is taken, but {'; '.join(item.doubts)}"
+            remedy = f'look at it (pdhef inspect --fields), name it in a mapping file, or --waive "{name}.candidate"'
+            self.checks.append(Check(f"{name}.candidate", name, "undecided", evidence, remedy))
 
     def result(self) -> Weighed:
         """Return everything as records."""

@@ -354,6 +354,14 @@ def test_a_sideslip_that_does_not_say_what_it_is_is_told() -> None:
     assert "truth.source" in undecided(auto)
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_vector_whose_x_is_not_the_speed_is_no_velocity_of_the_body(turned: bool) -> None:
+    yaw = np.cumsum(RATE) * 0.01 if turned else 0.02 * RATE
+    state = topic(speed_mps=V, velocities__x=V * np.cos(yaw), velocities__y=V * np.sin(yaw))
+    state.fields = {n.replace("velocities", "linear_velocities"): v for n, v in state.fields.items()}
+    assert ("vy_m_s" in found(state=state).mapping.truth) is not turned
+
+
 def test_odometry_stands_in_for_a_gyro_and_a_navigation_system_for_a_speed() -> None:
     odometry = topic(
         "nav_msgs/msg/Odometry",
