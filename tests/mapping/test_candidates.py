@@ -664,6 +664,10 @@ def test_a_rate_of_the_steering_is_no_steering_angle() -> None:
         ("Lateral", "m/s^2", "acceleration", "y", 1.0),
         ("StePinComp_An_Est", "Degrees", "steering", "wheel", DEG),
         ("WHEELSPEEDRL", "km/h", "wheel speed", "rl", 1 / 3.6),
+        ("Angle volant", "deg", "steering", "wheel", DEG),
+        ("Vitesse de lacet", "deg/s", "rate", "z", DEG),
+        ("Accelerazione laterale", "g", "acceleration", "y", G),
+        ("Velocidad", "km/h", "speed", "", 1 / 3.6),
     ],
 )
 def test_abbreviations_and_spelled_out_units(

@@ -97,12 +97,13 @@ def test_numbers_as_stamps(unit: str, factor: float) -> None:
     np.testing.assert_allclose(signals["ay_m_s2"].stamps_ns - (topic.log_time_ns - 2 * MS), 0, atol=500)
 
 
-def test_a_stamp_in_two_numbers_is_exact() -> None:
+@pytest.mark.parametrize("names", [("sec", "nanosec"), ("seconds", "nanos")])
+def test_a_stamp_in_two_numbers_is_exact(names: tuple[str, str]) -> None:
     log = imu_log()
     topic = log.contents["/imu"]
     stamps = topic.fields.pop("header.stamp")
-    topic.fields["header.stamp.sec"] = (stamps // 1_000_000_000).astype(np.float64)
-    topic.fields["header.stamp.nanosec"] = (stamps % 1_000_000_000).astype(np.float64)
+    topic.fields[f"header.stamp.{names[0]}"] = (stamps // 1_000_000_000).astype(np.float64)
+    topic.fields[f"header.stamp.{names[1]}"] = (stamps % 1_000_000_000).astype(np.float64)
     signals, _, _ = read_all(log, imu_mapping())
     np.testing.assert_array_equal(signals["ay_m_s2"].stamps_ns, stamps)
 
