@@ -63,7 +63,7 @@ def _head(result: LearnResult) -> Table:
     left = f", {len(result.left_out)} left out" if result.left_out else ""
     return three_lines(
         f"{stages}; sideslip RMSE on the test part: {errors}" if errors else stages,
-        f"{len(result.drives)} drives{left}; decisions by held-out driving",
+        f"{len(result.drives)} drive{'s' * (len(result.drives) != 1)}{left}; decisions by held-out driving",
         f"pdhef run LOG --car {result.car} -o OUT",
     )
 
@@ -126,10 +126,11 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
     """Print the rungs that were tried, what the drives taught is worth on them, and what to drive next."""
     rungs = table("residual model", ">RMSE °, held-out\nblocks", ">difference °²", ">± 1 se", "outcome")
     for t in figures["rungs"]:
-        against = [
-            cell(t[key] if t["against"] else None, digits=4) for key in ("difference_deg2", "standard_error_deg2")
-        ]
-        rungs.add_row(t["rung"], cell(t["rmse_deg"], digits=3), *against, "accepted" if t["taken"] else "rejected")
+        outcome = ("better" if t["taken"] else "not better") if t["against"] else ""
+        against = [cell(t[k] if t["against"] else None, digits=4) for k in ("difference_deg2", "standard_error_deg2")]
+        rungs.add_row(
+            t["rung"], cell(t["rmse_deg"], digits=3), *against, "used" if t["rung"] == figures["rung"] else outcome
+        )
     console.print(rungs)
     console.print()
     drives = table("drive", ">seconds", ">physics °", ">with residual °", "calibration", fold=4)
@@ -137,7 +138,6 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
         errors = (cell(d[key], digits=3) for key in ("physics_deg", "corrected_deg"))
         drives.add_row(d["name"], cell(d["seconds"], digits=0), *errors, d["calibration"])
     console.print(drives)
-    console.print(f"  {figures['evidence']}")
     console.print(
         f"  probability that the tyre prior lowers other drives' errors: {figures['prior_support']:.2f} (0: unused)"
     )

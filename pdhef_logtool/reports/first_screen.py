@@ -106,7 +106,9 @@ def tested_drive(report: Mapping[str, Any], outcome: str = "") -> list[tuple[str
     """Return what was tested in one drive: term and text."""
     log, vehicle, answer = report["log"], report["vehicle"], report.get("answer") or {}
     file = f" ({vehicle['file']})" if vehicle.get("file") else ""
-    state = "validated on drives with ground truth" if vehicle.get("proven") else "parameters not validated"
+    state = f"taught by {vehicle['taught']}" if vehicle.get("taught") else "parameters not validated"
+    if vehicle.get("proven"):
+        state = "validated on drives with ground truth"
     if not vehicle.get("file"):
         state = "no car given: default sedan"
     ran = ", ".join(e["name"] for e in report["estimators"] if e["outcome"] == "ran")

@@ -95,7 +95,7 @@ def paired_change(
         return PairedChange(0, 0, nan, nan, nan, nan, nan, nan, 1.0)
     ascending = np.sort(ratios)
     lower, upper = float(ascending[(n - 1) // 2]), float(ascending[n // 2])
-    median = lower if lower == upper else 0.5 * (lower + upper)
+    median = 0.0 if lower == -upper else lower if lower == upper else 0.5 * (lower + upper)  # may be infinite
     above = (ratios > median).astype(np.float64) - (ratios < median)
     effect = dependence(above, {"cluster": clusters} if clusters is not None else factors or {})
     votes = sign_p(ratios, effect)

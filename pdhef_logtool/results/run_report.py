@@ -165,7 +165,8 @@ class ReportFacts:
     """Everything that report.json states about one log.
 
     ``vehicle_file``: the car's folder or file, None where none was given; ``vehicle_proven``: whether driving with
-    ground truth showed it to be right. ``low_speed_m_s``: below it sideslip is not scored.
+    ground truth showed it to be right; ``vehicle_taught``: what taught it, None without. ``low_speed_m_s``: below it
+    sideslip is not scored.
     ``main``: the estimator of the selected estimate, None where nothing was estimated.
     ``warnings``: what may be wrong; ``remarks``: what else is worth knowing.
     ``calibration``: what the drive stated of its car without ground truth, None where it was not asked.
@@ -185,6 +186,7 @@ class ReportFacts:
     truth: TruthFacts
     vehicle_file: str | None = None
     vehicle_proven: bool = False
+    vehicle_taught: str | None = None
     sensors: Mapping[str, float] = field(default_factory=dict)
     assumed: Sequence[AssumedValue] = ()
     setup: Mapping[str, Any] | None = None
@@ -293,6 +295,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
             "sha256": facts.vehicle_sha256,
             "file": facts.vehicle_file,
             "proven": facts.vehicle_proven,
+            "taught": facts.vehicle_taught,
             "sensors": dict(facts.sensors),
             "assumed": list(facts.assumed),
             "low_speed_blend_m_s": facts.low_speed_m_s,

@@ -256,14 +256,15 @@ def _model(report: Report, causal: bool) -> list[str]:
     """Return the car of an estimator with a vehicle model, and what it is based on."""
     vehicle, calibration = report["vehicle"], report["self_calibration"]
     used = calibration is not None and not calibration["refused"]
+    taught = f", taught by {vehicle['taught']}" if vehicle.get("taught") else ""
     if used and (calibration.get("online", False) or not causal):
         where = "this log" if calibration["logs"] == 1 else f"{calibration['logs']} logs"
         therefore = "as it goes on" if causal else "therefore not causal"
-        return [_car(vehicle), f"calibrated on {where} without ground truth, {therefore}"]
+        return [_car(vehicle) + taught, f"calibrated on {where} without ground truth, {therefore}"]
     if vehicle["file"] is None:
         return [_car(vehicle)]
     proven = "validated on drives with ground truth" if vehicle["proven"] else "parameters of its file, not validated"
-    return [f"{_car(vehicle)}, {proven}"]
+    return [f"{_car(vehicle)}{taught or f', {proven}'}"]
 
 
 def _friction(friction: Mapping[str, Any]) -> str:
@@ -289,10 +290,10 @@ def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]
     elif main.distrusted:
         steps.append("check the vehicle file: mass, wheelbase, tyres, steering ratio")
     share = figures.get((main.name, "sideslip_rad", "coverage95"))
-    if vehicle["file"] is not None and not vehicle["proven"]:
+    if vehicle["file"] is not None and not (vehicle["proven"] or vehicle.get("taught")):
         given = f"--car {vehicle['file']} -o mycar"
         steps.append(
-            f"identify and validate the car with this ground truth: pdhef learn LOG {given}"
+            f"teach the car with this ground truth: pdhef learn LOG {given}"
             if _error(figures, main.name) is not None
             else f"calibrate the car with several logs: pdhef learn LOGS {given} --without-truth"
         )

@@ -770,6 +770,7 @@ def report_facts(
         vehicle_sha256=car.physics_sha256,
         vehicle_file=car.file_name,
         vehicle_proven=car.has_evidence,
+        vehicle_taught=None if car.taught is None else car.taught.truth,
         sensors=car.vehicle.sensors.model_dump(),
         assumed=drive.car.assumed,
         setup={"source": drive.setup_source, "decided_s": plan.decided_s, "causal_from_s": drive.causal_from_s},

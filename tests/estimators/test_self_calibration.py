@@ -13,10 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import FRICTION, Drive, cut, drive, keep, with_noise
 
+from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.calibration import calibration as rules
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving, DrivingReader
+from pdhef_logtool.estimators.calibration.joint import REAR_STIFFNESS
 from pdhef_logtool.records.signals import Signals
 
 RIGHT = default_vehicle()
@@ -150,6 +152,20 @@ def test_what_straight_driving_does_not_excite_keeps_its_prior() -> None:
 def test_a_car_that_slides_all_the_time_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rules, "SLIDING_RAD", 0.001)
     assert "the rear axle slides in" in found(wide().signals, RIGHT).refused
+
+
+def test_a_taught_prior_that_the_driving_contradicts_is_not_used() -> None:
+    log, rear = driving(wide().signals, RIGHT), RIGHT.cornering_stiffness_n_per_rad(False, FRICTION)
+    untaught, right, absurd = (
+        self_calibrate([log], RIGHT, taught=taught)
+        for taught in (
+            (),
+            [TaughtParameter(name=REAR_STIFFNESS, value=rear, std=0.1)],
+            [TaughtParameter(name=REAR_STIFFNESS, value=0.06 * rear, std=1e-4)],
+        )
+    )
+    assert absurd.vehicle == untaught.vehicle and not absurd.refused
+    assert right.vehicle != untaught.vehicle and not right.refused
 
 
 def test_steering_that_does_not_explain_the_yaw_rate_is_refused() -> None:

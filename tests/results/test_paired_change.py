@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -128,6 +128,7 @@ def test_factors_that_are_nested_or_equal_count_once_and_crossed_ones_add() -> N
     ratios=st.lists(st.floats(-3.0, 3.0) | st.sampled_from([math.inf, -math.inf, 0.0]), min_size=1, max_size=40),
     groups=st.integers(1, 8),
 )
+@example(ratios=[math.inf] * 3 + [-math.inf] * 3, groups=1)
 def test_bounds_enclose_the_median_and_follow_the_sign(ratios: list[float], groups: int) -> None:
     values = np.array(ratios)
     factors = {"day": [i % groups for i in range(len(values))], "car": [None] * len(values)}

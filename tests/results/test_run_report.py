@@ -99,6 +99,7 @@ def test_report_follows_its_schema_and_keeps_what_it_was_told(tmp_path):
         "sha256": SHA,
         "file": None,
         "proven": False,
+        "taught": None,
         "sensors": {},
         "assumed": [],
         "low_speed_blend_m_s": None,

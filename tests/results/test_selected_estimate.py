@@ -137,6 +137,14 @@ def test_the_next_steps_are_few_and_the_most_important_first() -> None:
     assert texts()["next"] == ""
 
 
+def test_a_taught_car_is_called_taught_and_is_not_to_be_taught_again() -> None:
+    untaught = texts(metrics=errors_deg(pd_hef=0.1), vehicle_proven=False)
+    taught = texts(metrics=errors_deg(pd_hef=0.1), vehicle_proven=False, vehicle_taught="ground truth")
+    assert "teach the car with this ground truth: pdhef learn LOG --car golf" in untaught["next"]
+    assert "pdhef learn" not in taught["next"]
+    assert "car golf, taught by ground truth" in taught["assumed"] and "not validated" not in taught["assumed"]
+
+
 def test_hindsight_is_said_apart_and_chooses_nothing() -> None:
     answer = report(metrics=errors_deg(pd_hef=0.3, physics=0.2, zero=0.1))["answer"]
     assert answer["main"] == "pd-hef"

@@ -199,7 +199,7 @@ def self_calibrate(
     Parameters
     ----------
     taught : prior that drives with ground truth gave. It makes no calibration plausible that is refused without it: the
-        model does not explain such driving with any parameters.
+        model does not explain such driving with any parameters. It is not used where the fit is refused with it alone.
     exported : whether it is written to a car, for which the driving must excite both cornering stiffnesses.
     """
     drives = [d for d in drives if len(d.stretches)]
@@ -211,9 +211,10 @@ def self_calibrate(
     theta = problem.solve()
     refused = _refusal(problem, theta, drives)
     if taught and not refused:
-        problem.teach(taught)
-        theta = problem.solve()
-        refused = _refusal(problem, theta, drives)
+        with_prior = problem.taught(taught)
+        place = with_prior.solve()
+        if not _refusal(with_prior, place, drives):
+            problem, theta = with_prior, place
     covariance = problem.covariance(theta)
     progress(1.0)
     std = np.sqrt(np.diag(covariance))

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -201,9 +202,11 @@ class JointProblem:
         self._weight = math.sqrt(KEPT_STEPS * STEP_S / CORRELATION_S)
         self._least_std = self._error_std = np.array(ERROR_STD)
 
-    def teach(self, taught: Sequence[TaughtParameter]) -> None:
-        """Take the prior that drives with ground truth gave."""
-        self.parameters = with_taught(self.parameters, taught, level_of(self._drives))
+    def taught(self, taught: Sequence[TaughtParameter]) -> JointProblem:
+        """Return the fit with the prior that drives with ground truth gave."""
+        problem = copy(self)
+        problem.parameters = with_taught(self.parameters, taught, level_of(self._drives))
+        return problem
 
     def solve(self) -> FloatArray:
         """Return the parameters of the lowest cost, with the standard deviation of their errors.
