@@ -226,8 +226,8 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
 def _meaning_by_names(topic: TopicInfo, info: FieldInfo) -> Meaning | None:
     """Return what names give; the third element shows whether an array without a length has axes."""
     paths = dict.fromkeys((info.path, info.path.replace("[]", "[2]")))
-    found = (meaning_of(topic.name, topic.type_name, path, info.unit) for path in paths)
-    return next((meaning for meaning in found if meaning is not None), None)
+    meanings = (meaning_of(topic.name, topic.type_name, path, info.unit) for path in paths)
+    return next((meaning for meaning in meanings if meaning is not None), None)
 
 
 def _is_setpoint(topic: TopicInfo, info: FieldInfo) -> bool:

@@ -244,7 +244,7 @@ def with_usable_stamps(log: DriveLog, mapping: Mapping) -> Mapping:
     better = {key: other for key, source in keys.items() if (other := _better_stamp(log, source)) is not None}
     if not better:
         return mapping
-    notes = [f"{topic} is read by {best}, not {own}: {why}" for (topic, own), (best, why) in better.items()]
+    notes = [f"{topic} is read by {best}, not {stamp}: {why}" for (topic, stamp), (best, why) in better.items()]
 
     def moved(sources: Mapped[str, SignalSource]) -> dict[str, SignalSource]:
         chosen = {n: better.get((s.topic, s.stamp), (s.stamp, ""))[0] for n, s in sources.items()}

@@ -605,7 +605,7 @@ def _wheel_unit(
     Parameters
     ----------
     times : how many of them are 1 m/s by the reference, a speed; None where there is none, or no one number.
-    in_si : the other signals of their topic are in SI units, none of which is in its name.
+    in_si : the other signals of their topic are in SI units, although no name gives a unit.
     """
     if times is None or reference is None:
         doubt = "the unit of the wheel speeds is not given, and no speed to compare with; taken as m/s"
