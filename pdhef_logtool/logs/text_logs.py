@@ -40,9 +40,7 @@ if TYPE_CHECKING:
 #: Lines at the start of a CSV file in which its header must be.
 _HEAD_LINES = 200
 _NUMBER = re.compile(r"\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?\s*")
-_TIME_TEXT = re.compile(
-    r"\s*(\d{1,4}[./]\d{1,2}[./]\d{2,4}([T ].*)?|\d{4}-\d\d-\d\d([T ].*)?|(\d{1,2}:)?\d{1,2}:\d\d([.,]\d+)?Z?)\s*"
-)
+_TIME_TEXT = re.compile(r"\s*(\d{1,4}[./-]\d\d?[./-]\d{2,4}([T ].*)?|(\d\d?:)?\d\d?:\d\d([.,]\d+)?Z?)\s*")
 _EMPTY = frozenset({"", "nan", "null", "none", "na", "n/a", "-"})
 _TRUTHS = {"true": 1.0, "false": 0.0}
 
@@ -79,8 +77,7 @@ def open_vbo(file: LogFile) -> TableLog:
         }
         titles = [t.strip() for t in sections.get("header", ()) if t.strip()]
         if not mark or not titles:
-            got = "a file without them"
-            raise LogError(expected="a VBO file with [header] and [data]", got=got, where=str(file.place))
+            raise LogError(expected="a VBO file with [header] and [data]", got="none of them", where=str(file.place))
         fields = unique(field_name(title) for title in titles)
         losses: list[Loss] = []
         columns = _columns(data.split("\n"), " ", fields, str(file.place), losses)

@@ -180,9 +180,7 @@ class _Weighing:
 
     def note_unlabelled(self, topic: str, evidence: str) -> None:
         """Note that the fields of a topic are identified by values alone."""
-        self.notes.append(
-            f"quantities of {topic} are identified by values alone: left and right may be exchanged in all of it"
-        )
+        self.notes.append(f"quantities of {topic} are identified by values alone: left and right may be exchanged")
         evidence = f"the names of {topic} give no quantities; {evidence}; left and right are not observable"
         remedy = 'look at them (pdhef inspect --fields), name them in a mapping file, or --waive "mapping.names"'
         self.checks.append(Check("mapping.names", "mapping", "undecided", evidence, remedy))
@@ -404,9 +402,7 @@ class _Weighing:
             return
         for item in there.values():
             if is_of_one_sign(item.seen.values) and not item.anchor:
-                item.doubts.append(
-                    "it is never negative although the car turns both ways: its sign may be in another field"
-                )
+                item.doubts.append("it is never negative although the car turns: its sign may be in another field")
 
     def _chosen(self, *names: str) -> Field | None:
         """Return what is taken for the first of these signals that there is, or mapped already."""
