@@ -302,7 +302,7 @@ def _steering(
     fields: Fields, columns: Sequence[Field], speed: FloatArray, rate: FloatArray, *, sure: bool
 ) -> list[Field]:
     """Return the column that follows the path's curvature far better than others, as a steering angle."""
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         slow = max(1.0, 0.25 * float(np.nanquantile(speed, 0.95)))
         curve = fields.pieces.smooth(np.where(speed > slow, rate / speed, np.nan))
     if not spread(curve * speed**2) > EXCITED_A_M_S2:

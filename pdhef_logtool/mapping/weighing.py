@@ -582,7 +582,7 @@ def _curvature(speed: Field | None, rate: Field | None, ay: Field | None) -> Flo
     v = speed.si
     if not np.isfinite(v).any():
         return None
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         moving = v > max(SLOW_M_S, 0.25 * float(np.nanquantile(v, 0.95)))
         curve = np.where(moving, rate.si / v if rate is not None else ay.si / v**2 if ay is not None else v, np.nan)
     return curve if spread(curve) > EXCITED_CURVATURE_1_M else None
