@@ -138,9 +138,11 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
         errors = (cell(d[key], digits=3) for key in ("physics_deg", "corrected_deg"))
         drives.add_row(d["name"], cell(d["seconds"], digits=0), *errors, d["calibration"])
     console.print(drives)
-    console.print(
-        f"  probability that the tyre prior lowers other drives' errors: {figures['prior_support']:.2f} (0: unused)"
-    )
+    for prior in figures["priors"]:
+        console.print(
+            f"  probability that the tyre prior of drives at {prior['ay_m_s2']:.1f} m/s² lowers the errors of others: "
+            f"{prior['support']:.2f} (0: unused)"
+        )
     for text in figures["more"]:
         console.print(f"  {text}")
 

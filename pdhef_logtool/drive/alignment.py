@@ -390,6 +390,13 @@ def _grid_channel(periods: Mapping[str, float | None]) -> str:
             remedy="map an IMU topic (pdhef inspect LOG shows the topics and fields)",
         )
     fastest = min(period_by_name.values())
+    if fastest < 1e-5:  # no sensor of a car is so fast
+        raise MappingError(
+            expected="stamps of at most 100,000 samples a second",
+            got=f"{1.0 / max(fastest, 1e-9):.3g} samples a second",
+            where="alignment",
+            remedy="give the unit of the times in their column's name (time_s) or as stamp_unit in a mapping file",
+        )
     return next(name for name, period in period_by_name.items() if period <= 2.0 * fastest)
 
 

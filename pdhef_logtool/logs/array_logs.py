@@ -10,6 +10,7 @@ import io
 import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -43,9 +44,8 @@ def open_parquet(file: LogFile) -> TableLog:
     losses: list[Loss] = []
     with file.meter.running(file.path.stat().st_size), pq.ParquetFile(file.path) as source:
         groups = [source.metadata.row_group(i) for i in range(source.num_row_groups)]
-        file.meter.limits.check(
-            "chunk_ratio", sum(g.total_byte_size for g in groups) / max(1, file.path.stat().st_size), str(file.place)
-        )
+        ratio = sum(g.total_byte_size for g in groups) / max(1, file.path.stat().st_size)
+        file.meter.limits.check("chunk_ratio", ratio, str(file.place))
         parts = []
         for number, group in enumerate(groups):
             try:
@@ -81,6 +81,9 @@ def _arrow_column(column: Any) -> Any:
         column = column.cast(column.type.value_type)
     if pa.types.is_timestamp(column.type):
         return column.cast(pa.timestamp("ns")).to_numpy()
+    if pa.types.is_duration(column.type) or pa.types.is_time(column.type):
+        kind = pa.duration if pa.types.is_duration(column.type) else pa.time64
+        return column.cast(kind("ns")).cast(pa.int64()).to_numpy() / 1e9
     if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
         return pl.Series(column.to_pylist(), dtype=pl.String)
     if pa.types.is_boolean(column.type) or (column.null_count and pa.types.is_integer(column.type)):
@@ -129,10 +132,8 @@ def _mat_tables(
             sheets.append((struct_, length, Sheet(name, columns, units[struct_])))
     clocks = {}
     for struct_, length, sheet in sheets:
-        try:
+        with suppress(LogError):
             clocks[struct_, length] = stamps_of(sheet, where)
-        except LogError:
-            continue
     rows: list[tuple[Sheet, IntArray]] = []
     for struct_, length, sheet in sheets:
         clock = _clock_of(struct_, length, clocks)
@@ -168,9 +169,8 @@ def _vectors(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:
     if array.ndim == 1:
         return {field_name(name): array}
     array = array if array.shape[0] >= array.shape[1] else array.T
-    if array.shape[1] > _MOST_COLUMNS:
-        return {}
-    return {f"{field_name(name)}_{i}": array[:, i] for i in range(array.shape[1])}
+    columns = range(array.shape[1] if array.shape[1] <= _MOST_COLUMNS else 0)
+    return {f"{field_name(name)}_{i}": array[:, i] for i in columns}
 
 
 def _variables(file: LogFile, losses: list[Loss]) -> Iterator[tuple[str, NDArray[Any], str]]:
@@ -189,15 +189,27 @@ def _variables(file: LogFile, losses: list[Loss]) -> Iterator[tuple[str, NDArray
                 raise ValueError("the file ends inside of it")
             if kind == _COMPRESSED:
                 element = _inflated(element[8:], file.meter.limits)
+            _check_tags(element, 0, len(element), order)
             values = loadmat(io.BytesIO(data[:_MAT_HEAD] + element), simplify_cells=True)
         except Exception as error:  # noqa: BLE001  any error of a damaged element
-            losses.append(
-                Loss("bad-variable", f"a variable cannot be read: {describe_damage(error)[1]}", str(file.place))
-            )
+            what = f"a variable cannot be read: {describe_damage(error)[1]}"
+            losses.append(Loss("bad-variable", what, str(file.place)))
             continue
         for name, value in values.items():
             if not name.startswith("__"):
                 yield from _leaves(name, value, 0)
+
+
+def _check_tags(data: bytes, at: int, end: int, order: str) -> None:
+    """Raise ValueError for an element that no writer makes: SciPy ends the process for some of these."""
+    while at + 8 <= end:
+        kind, size = struct.unpack_from(f"{order}II", data, at)
+        small = kind >> 16  # size of an element inside of its tag
+        if not 1 <= kind & 0xFFFF <= 18 or small > 4 or (not small and at + 8 + size > end):
+            raise ValueError("an element of it has no valid type or size")
+        if kind == _MATRIX:
+            _check_tags(data, at + 8, at + 8 + size, order)
+        at += 8 if small else 8 + size + -size % 8
 
 
 def _inflated(stored: bytes, limits: ResourceLimits) -> bytes:

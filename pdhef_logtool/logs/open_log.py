@@ -180,10 +180,11 @@ def _head_of(path: Path) -> bytes:
 
 def _open_plain(file: LogFile) -> Container | DriveLog:
     head = _head_of(file.path)
-    log_format = recognised_format(head, file.path.name)
+    is_pointer = head.startswith(LFS_POINTER[:HEAD_BYTES])
+    log_format = None if is_pointer else recognised_format(head, file.path.name)
     if log_format is None:
         got, remedy = "a file that is none of these" if head else "an empty file", _REMEDY
-        if head.startswith(LFS_POINTER[:HEAD_BYTES]):
+        if is_pointer:
             got, remedy = "a pointer of Git LFS in place of the recording", "git lfs pull in its repository"
         raise LogError(expected=what_is_a_log(), got=got, where=str(file.place), remedy=remedy)
     opened = log_format.open(file)

@@ -54,16 +54,7 @@ _WEEK_TIME = re.compile(
 _SIGNAL = re.compile(r"(?:signal|channel|variable|parameter|sensor|tag|key|name)(?:_?name)?")
 _VALUE = re.compile(r"(?:physical_|signal_|phys_)?(?:value|val|wert)")
 _DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")
-_FACTORS_NS = {
-    "s": 10**9,
-    "sec": 10**9,
-    "secs": 10**9,
-    "seconds": 10**9,
-    "ms": 10**6,
-    "us": 10**3,
-    "µs": 10**3,
-    "ns": 1,
-}
+_FACTORS_NS = dict.fromkeys(("s", "sec", "secs", "seconds"), 10**9) | {"ms": 10**6, "us": 10**3, "µs": 10**3, "ns": 1}
 _GPS_EPOCH_NS = 315_964_800 * 10**9
 _WEEK_S = 604_800
 #: GPS time minus UTC in s, from a time in s since 1970 on.
@@ -93,7 +84,10 @@ def is_unit(text: str) -> bool:
 
 
 def split_unit(text: str) -> tuple[str, str]:
-    """Return name and unit of a title such as ``Speed (km/h)``; the unit is empty where the title has none."""
+    """Return name and unit of a title (``Speed (km/h)``, ``"Speed"|"km/h"|0|250``); empty where it has none."""
+    if "|" in text:
+        text, unit, *_ = (part.strip('" ') for part in text.split("|"))
+        return text, unit if is_unit(unit) else ""
     match = _BRACKETED.match(text.strip())
     return (match[1], match[2].strip()) if match and match[1] and is_unit(match[2]) else (text.strip(), "")
 
@@ -150,8 +144,14 @@ def text_stamps(texts: Series) -> IntArray:
 
     texts = texts.str.strip_chars().str.replace(",", ".").str.replace(" ", "T")
     texts = texts.str.replace(r"^(\d\d)\.(\d\d)\.(\d{4})", "$3-$2-$1")
+    # With a slash the month comes first, where it can be one.
+    texts = texts.str.replace(r"^(1[3-9]|2\d|3[01])/(\d\d?)/(\d{4})", "$2/$1/$3")
+    texts = texts.str.replace(r"^(\d\d?)/(\d\d?)/(\d{4})", "$3-$1-$2")
+    for _ in range(2):
+        texts = texts.str.replace(r"-(\d)([T-])", "-0$1$2")
     first = next((t for t in texts.drop_nulls().head(100) if t), "")
     if "-" not in first and "/" not in first:
+        texts = pl.select(pl.when(texts.str.count_matches(":") == 1).then("0:" + texts).otherwise(texts)).to_series()
         parts = texts.str.split_exact(":", 2).struct.unnest()
         hours, minutes, seconds = (parts[c].cast(pl.Float64, strict=False).to_numpy() for c in parts.columns)
         return number_stamps(unwrapped(3600.0 * hours + 60.0 * minutes + seconds), "s")
@@ -224,7 +224,7 @@ def _clocks(sheet: Sheet, names: Mapping[str, str]) -> list[str]:
 
 def _is_clock(column: NDArray[Any] | Series) -> bool:
     if isinstance(column, np.ndarray):
-        return column.dtype.kind in "iufM" and len(column) > 0
+        return column.dtype.kind in "iufM" and (len(column) == 1 or bool((column != column[:1]).any()))
     return bool((text_stamps(column.head(20)) != NO_TIME).any())
 
 

@@ -65,10 +65,15 @@ class Table:
         return cls(name, stamps_ns, fields, lambda path, rows: columns[path][rows], type_name)
 
 
+def signs_of(paths: Collection[str]) -> dict[str, str]:
+    """Return the paths of signs by those of their magnitudes."""
+    return {m: path for path in paths if (m := _SIGN.sub("", path)) != path and m in paths}
+
+
 def _with_signs(table: Table) -> Table:
     """Add a column ``<name>_signed`` for each magnitude whose sign is in another column (1: negative)."""
     names = {f.path: f for f in table.fields}
-    signs = {m: path for path in names if (m := _SIGN.sub("", path)) != path and m in names}
+    signs = signs_of(names)
     if not signs:
         return table
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 #: Lines at the start of a CSV file in which its header must be.
 _HEAD_LINES = 200
 _NUMBER = re.compile(r"\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?\s*")
-_TIME_TEXT = re.compile(r"\s*(\d\d\.\d\d\.\d{4}.*|\d{4}-\d\d-\d\d([T ].*)?|\d{1,2}:\d\d:\d\d([.,]\d+)?Z?)\s*")
+_TIME_TEXT = re.compile(r"\s*(\d{1,4}[./-]\d\d?[./-]\d{2,4}([T ].*)?|(\d\d?:)?\d\d?:\d\d([.,]\d+)?Z?)\s*")
 _EMPTY = frozenset({"", "nan", "null", "none", "na", "n/a", "-"})
 _TRUTHS = {"true": 1.0, "false": 0.0}
 
@@ -77,8 +77,7 @@ def open_vbo(file: LogFile) -> TableLog:
         }
         titles = [t.strip() for t in sections.get("header", ()) if t.strip()]
         if not mark or not titles:
-            got = "a file without them"
-            raise LogError(expected="a VBO file with [header] and [data]", got=got, where=str(file.place))
+            raise LogError(expected="a VBO file with [header] and [data]", got="none of them", where=str(file.place))
         fields = unique(field_name(title) for title in titles)
         losses: list[Loss] = []
         columns = _columns(data.split("\n"), " ", fields, str(file.place), losses)
@@ -108,14 +107,20 @@ def _layout(lines: Sequence[str], where: str) -> tuple[str, list[str], list[str]
     width = max((len(row) for row in rows[-20:]), default=0)
     first = next((i for i, row in enumerate(rows) if len(row) == width > 1 and _is_values(row)), 0)
     widths = {width, width - 1} if first and not rows[first][-1].strip() else {width}  # rows may end with a separator
-    above = [row for row in rows[:first] if len(row) in widths]
+    above = [row for row in rows[:first] if len(row) in widths and not _is_values(row)]
     if not above:
         got = "none" if first else "no row of numbers below it"
         raise LogError(expected="a CSV file with a row of column names", got=got, where=where)
-    cells = [cell.strip() for cell in above[-1]]
-    if len(above) > 1 and all(not c or is_unit(c) for c in cells) and any(cells):
-        return separator, above[-2], above[-1], first
-    return separator, above[-1], [], first
+    below = above[-3:]  # titles, and below them units and sources
+    names = max(reversed(range(len(below))), key=lambda i: len({c.strip() for c in below[i] if not is_unit(c)} - {""}))
+    units = next((row for row in below[names + 1 :] if _are_units(row)), [])
+    return separator, below[names], units, first
+
+
+def _are_units(cells: Sequence[str]) -> bool:
+    """Return whether half of the cells that are not empty, or more, are units."""
+    given = [cell for cell in cells if cell.strip().lower() not in _EMPTY]
+    return 0 < len(given) <= 2 * sum(map(is_unit, given))
 
 
 def _separator(lines: Sequence[str]) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.table_log import SIGNED
+from pdhef_logtool.logs.table_log import signs_of
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
 from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
@@ -209,19 +209,25 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
             results += [(topic, role, FieldInfo(path, "number"), meaning, False) for path, meaning in joints]
             continue
         documented_fields = vendors.fields_of(topic.type_name)
-        paths = {f.path for f in fields}
+        magnitudes = signs_of({f.path for f in fields})
         for info in fields:
             if info.kind != "number" or info.path.count("[]") > info.path.endswith("[]") or _is_setpoint(topic, info):
                 continue
-            if f"{info.path}{SIGNED}" in paths:
+            if info.path in magnitudes:
                 continue
             if info.path in documented_fields:
                 results.append((topic, role, info, documented_fields[info.path].meaning, True))
             elif not documented_fields or info.path.count(".") or vendors.is_export(topic.type_name):
-                meaning = meaning_of(topic.name, topic.type_name, info.path, info.unit)
-                if meaning is not None:
-                    results.append((topic, role, info, meaning, False))
+                meaning = _meaning_by_names(topic, info)
+                results += [] if meaning is None else [(topic, role, info, meaning, False)]
     return results
+
+
+def _meaning_by_names(topic: TopicInfo, info: FieldInfo) -> Meaning | None:
+    """Return what names give; the third element shows whether an array without a length has axes."""
+    paths = dict.fromkeys((info.path, info.path.replace("[]", "[2]")))
+    meanings = (meaning_of(topic.name, topic.type_name, path, info.unit) for path in paths)
+    return next((meaning for meaning in meanings if meaning is not None), None)
 
 
 def _is_setpoint(topic: TopicInfo, info: FieldInfo) -> bool:

@@ -13,6 +13,7 @@ from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.mapping.can_frames import CanSignalLog, with_can_signals
 from pdhef_logtool.mapping.checking import resolve_mapping
 from pdhef_logtool.mapping.clocks import ClockModel, clock_key, stamp_request, stamps_on_log_clock
+from pdhef_logtool.mapping.evidence import LARGEST
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.records.ledger import Role
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, BoolArray, Channel, FloatArray, IntArray, Loss
@@ -74,7 +75,7 @@ def clean_samples(
     valid_min: float | None = None,
     valid_max: float | None = None,
 ) -> CleanSamples:
-    """Drop what is not finite or out of range, sort by stamp, and keep the first arrival of each stamp.
+    """Drop what is no number of a car or out of range, sort by stamp, and keep the first arrival of each stamp.
 
     The result does not depend on the order of the samples: samples of one stamp and one arrival are distinguished by
     value, the smallest first.
@@ -85,13 +86,9 @@ def clean_samples(
     values : float64 [N] or [N, k]; a row counts as bad when any of its entries is.
     """
     columns = values if values.ndim == 2 else values[:, np.newaxis]
-    finite = np.isfinite(columns).all(axis=1)
-    in_range = np.ones(values.shape[0], np.bool_)
-    with np.errstate(invalid="ignore"):
-        if valid_min is not None:
-            in_range &= (columns >= valid_min).all(axis=1)
-        if valid_max is not None:
-            in_range &= (columns <= valid_max).all(axis=1)
+    finite = (np.abs(columns) < LARGEST).all(axis=1)
+    low, high = -np.inf if valid_min is None else valid_min, np.inf if valid_max is None else valid_max
+    in_range = ((columns >= low) & (columns <= high)).all(axis=1)
     keep = finite & in_range
     nan_at = np.flatnonzero(~finite)
     out_of_range_at = np.flatnonzero(finite & ~in_range)

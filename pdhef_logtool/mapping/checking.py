@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from difflib import get_close_matches
+from itertools import product
 from typing import TypeVar
 
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -18,8 +19,8 @@ STAMP_PATHS = ("header.stamp", "stamp", "timestamp")
 STAMP_NAMES = ("stamp", "timestamp")
 
 #: Names that seconds and nanoseconds have in encodings without a time type.
-SECONDS_NAMES = ("sec", "secs")
-NANOSECONDS_NAMES = ("nanosec", "nsec", "nsecs")
+SECONDS_NAMES = ("sec", "secs", "seconds")
+NANOSECONDS_NAMES = ("nanosec", "nsec", "nsecs", "nanos", "nanoseconds")
 
 TimedT = TypeVar("TimedT", SignalSource, QualityGate)
 
@@ -52,12 +53,8 @@ def has_path(fields: tuple[FieldInfo, ...], path: str) -> bool:
 
 def split_stamp(path: str, paths: set[str]) -> tuple[str, str] | None:
     """Return the paths of a stamp's seconds and nanoseconds where a schema writes them as two numbers."""
-    for seconds in SECONDS_NAMES:
-        for nanoseconds in NANOSECONDS_NAMES:
-            pair = (f"{path}.{seconds}", f"{path}.{nanoseconds}")
-            if pair[0] in paths and pair[1] in paths:
-                return pair
-    return None
+    pairs = ((f"{path}.{s}", f"{path}.{ns}") for s, ns in product(SECONDS_NAMES, NANOSECONDS_NAMES))
+    return next((pair for pair in pairs if paths.issuperset(pair)), None)
 
 
 def resolve_mapping(log: DriveLog, mapping: Mapping) -> Mapping:

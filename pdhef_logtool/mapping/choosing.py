@@ -184,6 +184,6 @@ def _topics_there_are(log: DriveLog) -> str:
     """Return what a log without sensors has instead: its types, and whether they have messages."""
     if not log.topics:
         return "no topics"
-    types = ", ".join(sorted({t.type_name.replace("/msg/", "/") for t in log.topics}))
+    types = ", ".join(sorted({t.type_name.replace("/msg/", "/") or t.name for t in log.topics}))
     empty = [t.name for t in log.topics if not t.messages]
     return types + (f"; {', '.join(empty)} without messages" if empty else "")

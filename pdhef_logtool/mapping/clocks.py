@@ -235,55 +235,57 @@ def why_missing(usable: int, messages: int) -> str:
 
 
 def with_usable_stamps(log: DriveLog, mapping: Mapping) -> Mapping:
-    """Return the mapping with another stamp of a message, of its outer or inner header, where its own is worse.
+    """Return the mapping with another time of a message where its own is worse: of a header, or of its publication.
 
     The first ten seconds decide: gaps, steps back, rate, and how regular the steps are. If no stamp of a message is
-    usable, the source keeps its own: :func:`fit_clocks`
-    then takes the recorder's time, and gives the reason.
+    usable, the source keeps its own: :func:`fit_clocks` then takes the recorder's time, and gives the reason.
     """
-    notes: dict[tuple[str, str], str] = {}
-    chosen: dict[tuple[str, str], str] = {}
-    for source in mapping.sources():
-        key = (source.topic, source.stamp)
-        if key in chosen or source.stamp in (*RECORDER_STAMPS, AUTO_STAMP) or source.can_signal is not None:
-            continue
-        chosen[key] = source.stamp
-        others = [path for path in stamp_paths(log.fields(source.topic)) if path != source.stamp]
-        if not others or source.stamp_unit != "ros":
-            continue
-        judged = {p: _judged_stamps(log, replace(source, stamp=p)) for p in (source.stamp, *others)}
-        good = [path for path in others if not judged[path][0]]
-        if not good:
-            continue
-        best = min(good, key=lambda p: judged[p][1])
-        (why, varies), (_, least) = judged[source.stamp], judged[best]
-        if not why and varies > IRREGULAR and least < REGULAR_SHARE * varies:
-            why = f"its steps vary by {varies:.0%} of its period, those of {best} by {least:.0%}"
-        if why:
-            chosen[key] = best
-            notes[key] = f"{source.topic} is read by {best}, not {source.stamp}: {why}"
-    if not notes:
+    keys = {(s.topic, s.stamp): s for s in reversed([*mapping.sources()]) if s.can_signal is None}
+    better = {key: other for key, source in keys.items() if (other := _better_stamp(log, source)) is not None}
+    if not better:
         return mapping
+    notes = [f"{topic} is read by {best}, not {stamp}: {why}" for (topic, stamp), (best, why) in better.items()]
 
     def moved(sources: Mapped[str, SignalSource]) -> dict[str, SignalSource]:
-        return {n: replace(s, stamp=chosen.get((s.topic, s.stamp), s.stamp)) for n, s in sources.items()}
+        chosen = {n: better.get((s.topic, s.stamp), (s.stamp, ""))[0] for n, s in sources.items()}
+        return {n: replace(s, stamp=chosen[n]) for n, s in sources.items()}
 
     signals, truth = moved(mapping.signals), moved(mapping.truth)
-    return replace(mapping, signals=signals, truth=truth, notes=(*mapping.notes, *notes.values()))
+    return replace(mapping, signals=signals, truth=truth, notes=(*mapping.notes, *notes))
 
 
-def _judged_stamps(log: DriveLog, source: SignalSource) -> tuple[str, float]:
-    """Judge the stamps of a source in the first seconds.
+def _better_stamp(log: DriveLog, source: SignalSource) -> tuple[str, str] | None:
+    """Return a stamp of a source's messages that is better than its own, and why; None if none is."""
+    if source.stamp_unit != "ros" or source.stamp in ("publish_time", AUTO_STAMP):
+        return None
+    headers = [p for p in stamp_paths(log.fields(source.topic)) if source.stamp not in (p, "log_time")]
+    sources = {p: replace(source, stamp=p) for p in (source.stamp, *headers, *RECORDER_STAMPS)}
+    request = {source.read_topic: [*dict.fromkeys(path for s in sources.values() for path in stamp_request(log, s))]}
+    columns = log.read(request, log.start_ns, min(log.end_ns, log.start_ns + SURVEY_WINDOW_NS)).get(source.read_topic)
+    if columns is None or not len(columns):
+        return None
+    judged = {p: _judged_stamps(log, columns, s) for p, s in sources.items()}
+    why, varies = judged[source.stamp]
+    others = [p for p in headers if not judged[p][0]]
+    # The time of publication is one if a recorder kept it: more regular than when the messages were recorded.
+    if not others and (why or source.stamp == "log_time") and judged["publish_time"][1] < judged["log_time"][1]:
+        others = ["publish_time"]
+    if not others:
+        return None
+    best = min(others, key=lambda p: judged[p][1])
+    if not why and varies > IRREGULAR and judged[best][1] < REGULAR_SHARE * varies:
+        why = f"its steps vary by {varies:.0%} of its period, those of {best} by {judged[best][1]:.0%}"
+    return (best, why) if why else None
+
+
+def _judged_stamps(log: DriveLog, columns: Columns, source: SignalSource) -> tuple[str, float]:
+    """Judge the stamps of a source in some seconds.
 
     Returns
     -------
     why they are no measure of time, empty where they are, and how much their steps vary, in periods; infinite for
     stamps that are not on the log's clock.
     """
-    request = {source.read_topic: list(stamp_request(log, source))}
-    columns = log.read(request, log.start_ns, min(log.end_ns, log.start_ns + SURVEY_WINDOW_NS)).get(source.read_topic)
-    if columns is None or not len(columns):
-        return "", 0.0
     raw, usable = raw_stamps(log, columns, source)
     missing = why_missing(int(np.count_nonzero(usable)), len(columns))
     if missing:
@@ -296,10 +298,12 @@ def _judged_stamps(log: DriveLog, source: SignalSource) -> tuple[str, float]:
         return "its stamps are constant", np.inf
     if not 1.0 / FASTEST < span_s / max(log_span_s, 1e-9) < FASTEST:
         return f"its stamps advance by {span_s:.3g} s in {log_span_s:.3g} s", np.inf
-    low, middle, high = np.quantile(np.diff(np.sort(stamps)), [0.1, 0.5, 0.9])
+    steps = np.diff(np.sort(stamps))
+    low, middle, high = np.quantile(steps, [0.1, 0.5, 0.9])
+    mean = float(steps.mean())  # far from the middle where messages came in bursts
     delay_ns = float(np.median(log_time - stamps))
-    varies = float(high - low) / max(float(middle), 1.0) if 0.0 <= delay_ns <= MAX_CREDIBLE_DELAY_NS else np.inf
-    return why_unusable(stamps, log_time), varies
+    varies = max(float(high - low), abs(mean - float(middle))) / mean
+    return why_unusable(stamps, log_time), varies if 0.0 <= delay_ns <= MAX_CREDIBLE_DELAY_NS else np.inf
 
 
 def why_unusable(stamps_ns: IntArray, log_time_ns: IntArray) -> str:

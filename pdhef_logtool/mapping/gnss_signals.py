@@ -123,16 +123,9 @@ def receiver_signals(topic: str, stamp: str, paths: Collection[str]) -> dict[str
                 for name, path, scale, offset in receiver.signals
                 if f"{base}{path}" in there
             }
-            return _with_covariance(sources, topic, stamp, base) if _is_fix(receiver) else sources
+            if "position_covariance_type" in receiver.fields:  # 1 sigma: the root of the mean variance east and north
+                squared = tuple(f"{base}position_covariance[{i}]" for i in (0, 4))
+                accuracy = SignalSource(_POSITION_ACCURACY, topic, squared, stamp, (0.5, 0.5), combine="root")
+                sources[_POSITION_ACCURACY] = accuracy
+            return sources
     return {}
-
-
-def _is_fix(receiver: Receiver) -> bool:
-    return "position_covariance_type" in receiver.fields
-
-
-def _with_covariance(sources: dict[str, SignalSource], topic: str, stamp: str, base: str) -> dict[str, SignalSource]:
-    """Add the position's 1-sigma of a NavSatFix: the root of the mean variance to the east and north."""
-    paths = tuple(f"{base}position_covariance[{i}]" for i in (0, 4))
-    accuracy = SignalSource(_POSITION_ACCURACY, topic, paths, stamp, (0.5, 0.5), combine="root")
-    return {**sources, _POSITION_ACCURACY: accuracy}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -28,17 +29,7 @@ def length_of(velocity: SignalSource) -> SignalSource:
     """Return the speed that a velocity of ground truth has: the length of its level part, of three in ECEF."""
     level = len(velocity.paths) if velocity.name == "ecef_velocity_m_s" else 2
     scale = velocity.scale[:level] if isinstance(velocity.scale, tuple) else (velocity.scale,) * level
-    return SignalSource(
-        "speed_m_s",
-        velocity.topic,
-        velocity.paths[:level],
-        velocity.stamp,
-        scale,
-        latency_s=velocity.latency_s,
-        stamp_unit=velocity.stamp_unit,
-        clock=velocity.clock,
-        combine="norm",
-    )
+    return replace(velocity, name="speed_m_s", field=velocity.paths[:level], scale=scale, offset=0.0, combine="norm")
 
 
 def speed_over_ground(

@@ -38,7 +38,8 @@ def words_of(name: str) -> tuple[str, ...]:
     words: list[str] = []
     for letter, latin in (("ä", "ae"), ("ö", "oe"), ("ü", "ue"), ("Ä", "Ae"), ("Ö", "Oe"), ("Ü", "Ue")):
         name = name.replace(letter, latin)
-    for part in re.split(r"[^A-Za-z0-9]+", _SIDES.sub(lambda m: f"_{m[1][0]}{m[2]}", name)):
+    name = _CORNER_AT_END.sub(r"_\g<0>_", _SIDES.sub(lambda m: f"_{m[1][0]}{m[2]}", name))
+    for part in re.split(r"[^A-Za-z0-9]+", name):
         if part.lower() in _SYNONYMS:
             words += _SYNONYMS[part.lower()].split()
             continue
@@ -52,6 +53,10 @@ def words_of(name: str) -> tuple[str, ...]:
 
 #: A wheel as ``FrL``, and behind letters for a speed.
 _SIDES = re.compile(r"(?<=[a-z_])(Fr|Re)([LR])(?![a-z])")
+#: A wheel before or behind a word without a capital between: ``LFspeed``, ``WHEELSPEEDFL``.
+_CORNER_AT_END = re.compile(
+    r"(?<![A-Za-z])(?:[LR][FR]|[FR][LR])(?=[a-z]{2})|(?<=SPEED|speed)(?:[FR][LR]|[fr][lr])(?![A-Za-z])"
+)
 _CORNER_SPEED = re.compile(r"(?:ws|vw|w|v|n)(?=(?:fl|fr|rl|rr)$)")
 
 
@@ -161,13 +166,21 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
     return None
 
 
+_TURNING = frozenset({"rate", "velocity", "gyro", "gyroscope"})
+
+
 def _strength_of_leaf(
     leaf_words: tuple[str, ...], inner: tuple[str, ...], named: str, *, has_unit: bool
 ) -> float | None:
-    """Return how much a leaf alone gives: less for a v without a unit, 0 for the yaw of a rate, None for a voltage."""
+    """Return how much a leaf alone gives: less for a v without a unit, None for a voltage.
+
+    The yaw of a rate and the v (values) of an inertial sensor give nothing: 0.
+    """
+    if leaf_words == ("v",) and (_TURNING | {"accel", "acceleration", "accelerometer"}) & set(inner):
+        return 0.0
     if "v" in leaf_words and set(leaf_words) <= _WORDS["of_v"] and not unit_of(named, "speed")[0]:
-        return None if has_unit else 0.6
-    return 0.0 if leaf_words == ("yaw",) and {"rate", "velocity", "gyro", "gyroscope"} & set(inner) else 1.0
+        return None if has_unit else 0.8 if {"ego", "veh", "vehicle", "car"} & set(leaf_words) else 0.6
+    return 0.0 if leaf_words == ("yaw",) and _TURNING & set(inner) else 1.0
 
 
 def _with_unit(

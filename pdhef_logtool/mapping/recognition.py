@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.logs.table_log import SIGNED, signs_of
 from pdhef_logtool.mapping.can_frames import CanSignalLog, decoded_frames, holds_frames
 from pdhef_logtool.mapping.candidates import Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
@@ -260,25 +261,29 @@ def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
         measured = next(s.label for n, s in weighed.signals.items() if n.startswith("steer"))
         draft.doubt("steering", (measured, command.label), measured, "a measured angle is preferred to a command")
     draft.signals.update(weighed.signals)
-    both = (
-        mean_of_sides(draft.log, {t.name: t for t in topics}, draft.signals["steer_rad"])
-        if "steer_rad" in weighed.signals
-        else None
-    )
+    steer = weighed.signals.get("steer_rad")
+    both = None if steer is None else mean_of_sides(draft.log, {t.name: t for t in topics}, steer)
     if both is not None:
         draft.signals["steer_rad"] = both
         draft.notes.append(f"steer_rad is the mean of the two steered wheels in {both.topic}")
-    draft.notes += [
-        f"{t.name} is not used: the joints or their order differ between messages"
-        for t, role in rest
-        if is_joints(t) and role != "command" and not joint_names(draft.log, t)
-    ]
+    draft.notes += _why_not_weighed(draft.log, rest)
     if weighed.truth:
         draft.replace_truth(weighed.truth)
     draft.notes += weighed.notes
     for name, fields in weighed.rivals:
         draft.doubt(name, fields, fields[0], "the best score, then most messages")
     return weighed
+
+
+def _why_not_weighed(log: DriveLog, topics: list[tuple[TopicInfo, Role]]) -> Iterator[str]:
+    """Yield why names of fields are not enough: joints of changing order, magnitudes with their sign apart."""
+    for topic, role in topics:
+        if is_joints(topic) and role != "command" and not joint_names(log, topic):
+            yield f"{topic.name} is not used: the joints or their order differ between messages"
+        paths = {f.path for f in log.fields(topic.name, quiet=True)}
+        for path, sign in signs_of(paths).items():
+            if f"{path}{SIGNED}" not in paths and not is_command(path):
+                yield f"{topic.name}.{path} is not used: it is a magnitude, and {sign} contains its sign"
 
 
 def _map_documented_truth(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
@@ -451,21 +456,12 @@ def _twist(topic: TopicInfo, part: str, axis: str) -> str:
 def _has_its_fields(log: DriveLog, topic: TopicInfo) -> bool:
     """Return whether a topic of a known type can be read as that type; a name alone promises nothing."""
     kind = _type(topic)
-    if kind in IMU_TYPES:
-        fields = log.fields(topic.name)
-        return any(has_path(fields, p) for p in _IMU_PATHS)
-    needed: list[str] = []
-    if kind in FIX_TYPES:
-        needed += ["latitude", "longitude"]
+    needed = ["latitude", "longitude"] if kind in FIX_TYPES else []
     needed += [table[kind] for table in (_FIELDS["steering"], _FIELDS["speed"]) if kind in table]
-    either: list[str] = []
-    if kind in TWIST_FIELDS:
-        either.append(_twist(topic, "linear", "x"))
-    if kind in _FIELDS["pose"]:
-        either.append(_join(_FIELDS["pose"][kind], "position.x"))
-    if not needed and not either:
-        return True
-    fields = log.fields(topic.name)
+    either = list(_IMU_PATHS) if kind in IMU_TYPES else []
+    either += [_twist(topic, "linear", "x")] if kind in TWIST_FIELDS else []
+    either += [_join(_FIELDS["pose"][kind], "position.x")] if kind in _FIELDS["pose"] else []
+    fields = log.fields(topic.name) if needed or either else ()
     return all(has_path(fields, p) for p in needed) and (not either or any(has_path(fields, p) for p in either))
 
 
@@ -597,6 +593,10 @@ def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
     kind = _type(chosen)
     path = _FIELDS["speed"][kind] if kind in _FIELDS["speed"] else _twist(chosen, "linear", "x")
     draft.take(draft.signals, "speed_m_s", chosen.name, path)
+    if kind in TWIST_FIELDS and _span(draft.values(chosen.name, _twist(chosen, "linear", "y"))) > 0.0:
+        draft.notes.append(
+            f"{chosen.name} contains a lateral velocity, which is not used: its name is not that of ground truth"
+        )
 
 
 def _map_wheel_speeds(draft: _Draft, topics: list[TopicInfo]) -> None:
@@ -605,8 +605,7 @@ def _map_wheel_speeds(draft: _Draft, topics: list[TopicInfo]) -> None:
     if chosen is None:
         return
     for wheel in WHEELS:
-        name = f"wheel_speed_{wheel}_m_s"
-        draft.take(draft.signals, name, chosen.name, f"{wheel}_m_s")
+        draft.take(draft.signals, f"wheel_speed_{wheel}_m_s", chosen.name, f"{wheel}_m_s")
 
 
 # ------------------------------------------------------------------------------------------------ ground truth

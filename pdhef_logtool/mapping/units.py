@@ -64,15 +64,9 @@ def _say_mounting(fields: Fields, z: Field, gravity: FloatArray) -> None:
         return
     along = "xyz"[int(np.argmax(np.abs(gravity)))]
     sense = "-" if gravity["xyz".index(along)] < 0.0 else "+"
-    fields.checks.append(
-        Check(
-            "imu.mounting",
-            "ay_m_s2",
-            "undecided",
-            f"gravity is along {sense}{along} of {triad_of(z)}, not along +z: its axes are not the car's",
-            'turn them in a mapping file, or --waive "imu.mounting"',
-        )
-    )
+    evidence = f"gravity is along {sense}{along} of {triad_of(z)}, not along +z: its axes are not the car's"
+    remedy = 'turn them in a mapping file, or --waive "imu.mounting"'
+    fields.checks.append(Check("imu.mounting", "ay_m_s2", "undecided", evidence, remedy))
 
 
 def _by_wheel_rates(fields: Fields) -> None:
@@ -170,15 +164,10 @@ def _by_siblings(fields: Fields) -> None:
     """Take the unit of the other accelerations, or velocities, of a message: nobody mixes them."""
     for kinds in ({"acceleration"}, {"speed", "velocity"}):
         settled = {leaf_group(f): f for f in fields.candidates if f.meaning.quantity in kinds and f.unit_known}
-        for item in fields.candidates:
-            other = settled.get(leaf_group(item))
-            if (
-                item.meaning.quantity in kinds
-                and not item.unit_known
-                and other is not None
-                and item.meaning.strength > 0.6
-            ):
-                same = [u for u, s in item.factors if math.isclose(s, other.factors[0][1], rel_tol=1e-6)]
-                if same:
-                    item.use(same[0])
-                    item.reasons.append(f"unit {same[0]} as of {other.path}")
+        mine = (f for f in fields.candidates if f.meaning.quantity in kinds and f.meaning.strength > 0.6)
+        for item in [f for f in mine if not f.unit_known and leaf_group(f) in settled]:
+            other = settled[leaf_group(item)]
+            same = [u for u, s in item.factors if math.isclose(s, other.factors[0][1], rel_tol=1e-6)]
+            if same:
+                item.use(same[0])
+                item.reasons.append(f"unit {same[0]} as of {other.path}")

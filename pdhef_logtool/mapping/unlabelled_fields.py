@@ -302,31 +302,25 @@ def _steering(
     fields: Fields, columns: Sequence[Field], speed: FloatArray, rate: FloatArray, *, sure: bool
 ) -> list[Field]:
     """Return the column that follows the path's curvature far better than others, as a steering angle."""
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         slow = max(1.0, 0.25 * float(np.nanquantile(speed, 0.95)))
         curve = fields.pieces.smooth(np.where(speed > slow, rate / speed, np.nan))
     if not spread(curve * speed**2) > EXCITED_A_M_S2:
         return []
-    ranked: list[tuple[float, Field]] = []
-    for item in columns:
-        relation = fit(fields.pieces.smooth(item.seen.cells), curve)
-        if relation is not None and abs(relation.correlation) > STEERS:
-            ranked.append((abs(relation.correlation), item))
-    ranked.sort(key=lambda c: -c[0])
+    relations = ((fit(fields.pieces.smooth(item.seen.cells), curve), item) for item in columns)
+    fits = [(abs(relation.correlation), item) for relation, item in relations if relation is not None]
+    ranked = sorted((f for f in fits if f[0] > STEERS), key=lambda f: -f[0])
     if not ranked:
         return []
     first, best = ranked[0]
     rivals = [o for c, o in ranked[1:] if c > first - CLEARER and not _is_copy(best, o)]
     why = f"it follows the path's curvature (correlation {first:.2f})"
     meaning = Meaning("steering", "", 1.0 if sure and not rivals else WEAK, "", None, why)
-    results = replace(best, meaning=meaning, factors=ANGLES, reasons=[], doubts=[], is_weak=not sure or bool(rivals))
-    if not sure:
-        results.doubts.append("its name gives no quantity, and its values do not decide")
-    if rivals:
-        results.doubts.append(
-            f"its name gives no quantity, and {rivals[0].path} follows the path's curvature equally well"
-        )
-    return [results]
+    doubts = [] if sure else ["its name gives no quantity, and its values do not decide"]
+    doubts += [
+        f"its name gives no quantity, and {f.path} follows the path's curvature equally well" for f in rivals[:1]
+    ]
+    return [replace(best, meaning=meaning, factors=ANGLES, reasons=[], doubts=doubts, is_weak=bool(doubts))]
 
 
 def _is_copy(a: Field, b: Field) -> bool:

@@ -60,8 +60,8 @@ _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
 #: Signals to both sides, whose sign may be open; speeds below give no information.
 _SIGNED = ("steer_rad", "steering_wheel_rad", "yaw_rate_rad_s", "ay_m_s2")
 SLOW_M_S = 1.0
-#: Unit of rotational speeds, and the usual radius of a wheel.
-RPM = 2.0 * math.pi / 60.0
+#: Units of rotational speeds, and the usual radius of a wheel.
+TURNING = (("rad/s", 1.0), ("rpm", 2.0 * math.pi / 60.0))
 USUAL_RADIUS_M = 0.3
 
 
@@ -180,9 +180,7 @@ class _Weighing:
 
     def note_unlabelled(self, topic: str, evidence: str) -> None:
         """Note that the fields of a topic are identified by values alone."""
-        self.notes.append(
-            f"quantities of {topic} are identified by values alone: left and right may be exchanged in all of it"
-        )
+        self.notes.append(f"quantities of {topic} are identified by values alone: left and right may be exchanged")
         evidence = f"the names of {topic} give no quantities; {evidence}; left and right are not observable"
         remedy = 'look at them (pdhef inspect --fields), name them in a mapping file, or --waive "mapping.names"'
         self.checks.append(Check("mapping.names", "mapping", "undecided", evidence, remedy))
@@ -201,13 +199,13 @@ class _Weighing:
         near = [f for f in good[1:] if f.score > best.score - 0.1 and not self.fields.agree(best, f)]
         if near:
             best = self._better([best, *near])
-            self.rivals.append(
-                (
-                    name,
-                    tuple(f"{f.topic.name}.{f.path}" for f in [best, *(x for x in [good[0], *near] if x is not best)]),
-                )
-            )
+        self._choose(name, best, [f for f in (good[0], *near) if f is not best])
+
+    def _choose(self, name: str, best: Field, rivals: Sequence[Field]) -> None:
+        """Take a field for a signal, and name the others that could be it."""
         self.taken[name] = best
+        if rivals:
+            self.rivals.append((name, tuple(f"{f.topic.name}.{f.path}" for f in (best, *rivals))))
 
     def _follows_ax(self, item: Field) -> None:
         """Raise the score of a speed with a weak name where its rate of change follows a_x."""
@@ -270,7 +268,9 @@ class _Weighing:
             if times is None and reference is None:
                 kind, unit, reason, doubt = self._wheel_unit_by_turning(mean)
             else:
-                kind, unit, reason, doubt = _wheel_unit(times, reference)
+                beside = [f for f in self.taken.values() if f.topic is first.topic and not (f.meaning.unit or f.fixed)]
+                in_si = len(beside) > 2 and all(f.factors[0][1] == 1.0 for f in beside)
+                kind, unit, reason, doubt = _wheel_unit(times, reference, in_si=in_si)
             for item in wheels.values():
                 item.factors = ((unit[0], unit[1]),)
                 item.unit_known = not doubt
@@ -287,7 +287,7 @@ class _Weighing:
             return _wheel_unit(None, None)
         metres = abs(relation.slope)
         ways = [(abs(math.log(metres / unit[1])) / math.log(1.3), "wheel speed", unit) for unit in SPEEDS]
-        for turning in (("rad/s", 1.0), ("rpm", RPM)):  # a name of a speed is a speed first
+        for turning in TURNING:  # a name of a speed is a speed first
             off = abs(math.log(metres / turning[1] / USUAL_RADIUS_M)) / math.log(1.3)
             ways.append((1.0 + off, "wheel rate", turning))
         (_, kind, taken), (_, _, other) = sorted(ways)[:2]
@@ -301,6 +301,9 @@ class _Weighing:
         speed = self._speed()
         rate = self._chosen("yaw_rate_rad_s")
         ay = self._chosen("ay_m_s2")
+        wheels = [f for n, f in self.taken.items() if n.startswith("wheel_speed") and n.endswith("m_s")]
+        if speed is None and wheels:  # in their likeliest unit
+            speed = wheels[0].standing_for(mean_of([f.si for f in wheels]))
         curvature = _curvature(speed, rate, ay)
         judged: list[tuple[float, str, Field]] = []
         for item in candidates:
@@ -317,12 +320,8 @@ class _Weighing:
             return
         judged.sort(key=lambda j: (-j[0], -j[2].topic.messages, j[2].topic.name, j[2].path))
         _, name, best = judged[0]
-        rivals = [
-            o for s, n, o in judged[1:] if s > judged[0][0] - 0.1 and n == name and not self.fields.agree(best, o)
-        ]
-        if rivals:
-            self.rivals.append((name, tuple(f"{f.topic.name}.{f.path}" for f in [best, *rivals])))
-        self.taken[name] = best
+        near = [f for score, n, f in judged[1:] if score > judged[0][0] - 0.1 and n == name]
+        self._choose(name, best, [f for f in near if not self.fields.agree(best, f)])
 
     def _steering_kind(self, item: Field, relation: Fit | None) -> tuple[str, bool | None]:
         """Return the signal that a steering angle is, and whether it follows the car's turning (None: unknown)."""
@@ -403,9 +402,7 @@ class _Weighing:
             return
         for item in there.values():
             if is_of_one_sign(item.seen.values) and not item.anchor:
-                item.doubts.append(
-                    "it is never negative although the car turns both ways: its sign may be in another field"
-                )
+                item.doubts.append("it is never negative although the car turns: its sign may be in another field")
 
     def _chosen(self, *names: str) -> Field | None:
         """Return what is taken for the first of these signals that there is, or mapped already."""
@@ -431,7 +428,8 @@ class _Weighing:
         documented, named = _truth_of([f for f in its if f.fixed]), _truth_of(its)
         # Documented fields before names, unless names alone give a sideslip: channels of modules beside a receiver.
         self.truth = named if not documented or _SLIP & set(named) - set(documented) else documented
-        if not self.truth:
+        if not self.truth or self._is_of_another_frame(its):
+            self.truth = {}
             return
         first = its[0]
         if first.role == "sensor" and self.truth.get("yaw_rate_rad_s") is self.taken.get("yaw_rate_rad_s"):
@@ -443,18 +441,20 @@ class _Weighing:
             if first.role != "navigation":
                 del self.taken[signal]
         if first.role == "sensor" and not (agrees and "reference" in first.topic.name.lower()):
-            self.checks.append(
-                Check(
-                    "truth.source",
-                    "truth",
-                    "undecided",
-                    f"{first.topic.name} contains a sideslip, measured or estimated: its name does not give which",
-                    'name it under [truth] in a mapping file, or --waive "truth.source"',
-                )
-            )
+            evidence = f"{first.topic.name} contains a sideslip, measured or estimated: its name does not give which"
+            remedy = 'name it under [truth] in a mapping file, or --waive "truth.source"'
+            self.checks.append(Check("truth.source", "truth", "undecided", evidence, remedy))
         self.notes.append(f"ground truth is taken from {first.topic.name}, by the names of its fields")
         for name, item in self.truth.items():
             self._tell(f"truth.{name}", item)
+
+    def _is_of_another_frame(self, its: Sequence[Field]) -> bool:
+        """Return whether the x beside a lateral velocity's y is not the speed: the vector is not one of the body."""
+        across, along = self.truth.get("vy_m_s"), self.truth.get("vx_m_s")
+        if across is None or along is None or across.fixed:
+            return False
+        beside = [f for f in its if f.meaning.quantity == "speed" and triad_of(f) == triad_of(across)]
+        return any(f is not along and not self.fields.agree(f, along) for f in beside)
 
     def _truth_turns(self) -> bool:
         """Return whether the yaw rate of the ground truth is the sensor's, up to its sign."""
@@ -474,15 +474,9 @@ class _Weighing:
             )
         item.doubts += item.unit_doubt
         if item.doubts:
-            self.checks.append(
-                Check(
-                    f"{name}.candidate",
-                    name,
-                    "undecided",
-                    f"{item.topic.name}.{item.path} is taken, but {'; '.join(item.doubts)}",
-                    f'look at it (pdhef inspect --fields), name it in a mapping file, or --waive "{name}.candidate"',
-                )
-            )
+            evidence = f"{item.topic.name}.{item.path} is taken, but {'; '.join(item.doubts)}"
+            remedy = f'look at it (pdhef inspect --fields), name it in a mapping file, or --waive "{name}.candidate"'
+            self.checks.append(Check(f"{name}.candidate", name, "undecided", evidence, remedy))
 
     def result(self) -> Weighed:
         """Return everything as records."""
@@ -588,7 +582,7 @@ def _curvature(speed: Field | None, rate: Field | None, ay: Field | None) -> Flo
     v = speed.si
     if not np.isfinite(v).any():
         return None
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         moving = v > max(SLOW_M_S, 0.25 * float(np.nanquantile(v, 0.95)))
         curve = np.where(moving, rate.si / v if rate is not None else ay.si / v**2 if ay is not None else v, np.nan)
     return curve if spread(curve) > EXCITED_CURVATURE_1_M else None
@@ -599,12 +593,15 @@ def _unlikely(name: str, metres: float) -> float:
     return abs(math.log(metres / (2.7 if name == "steer_rad" else 43.0)))
 
 
-def _wheel_unit(times: float | None, reference: Field | None) -> tuple[str, tuple[str, float], str, str]:
+def _wheel_unit(
+    times: float | None, reference: Field | None, *, in_si: bool = False
+) -> tuple[str, tuple[str, float], str, str]:
     """Return quantity, unit, reason and doubt of wheel speeds whose name has no unit.
 
     Parameters
     ----------
     times : how many of them are 1 m/s by the reference, a speed; None where there is none, or no one number.
+    in_si : the other signals of their topic are in SI units, although no name gives a unit.
     """
     if times is None or reference is None:
         doubt = "the unit of the wheel speeds is not given, and no speed to compare with; taken as m/s"
@@ -617,11 +614,13 @@ def _wheel_unit(times: float | None, reference: Field | None) -> tuple[str, tupl
             also = (
                 f"it could be rad/s with a radius of {1 / times:.3f} m as well" if factor < 1.0 and off > 0.01 else ""
             )
+            if in_si and also:
+                doubt = f"it could be {unit} as well; taken as rad/s, as the rest is in SI units"
+                return "wheel rate", ("rad/s", 1.0), f"{said}: a radius of {1 / times:.3f} m", doubt
             return "wheel speed", (unit, factor), said, unsure or also
-    if RADII_M[0] < 1 / times < RADII_M[1]:
-        return "wheel rate", ("rad/s", 1.0), f"{said}: a radius of {1 / times:.3f} m", unsure
-    if RADII_M[0] < 1 / (times * RPM) < RADII_M[1]:
-        return "wheel rate", ("rpm", RPM), f"{said}: a radius of {1 / (times * RPM):.3f} m in rpm", unsure
+    for unit, factor in TURNING:
+        if RADII_M[0] < (radius_m := 1.0 / (times * factor)) < RADII_M[1]:
+            return "wheel rate", (unit, factor), f"{said}: a radius of {radius_m:.3f} m in {unit}", unsure
     return "wheel speed", ("m/s", 1.0), "", f"{said}, which is no unit of wheel speeds; taken as m/s"
 
 

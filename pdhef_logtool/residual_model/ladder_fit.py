@@ -129,22 +129,15 @@ class _Problem:
         kept = [*range(columns + 1), -1]
         return _Problem(self.blocks[:, kept][:, :, kept], self.drives, self.whole[:, kept][:, :, kept])
 
-    def held_out(self, block: int) -> tuple[int, ...]:
-        """Return the blocks that no choice for a block may see: those of its drive, itself alone of a single drive."""
-        of_drive = np.flatnonzero(self.drives == self.drives[block])
-        return tuple(map(int, of_drive)) if len(of_drive) < len(self.drives) else (block,)
-
     def block_error(self, block: int, without: Sequence[int], ridge: float | None) -> float:
-        """Return the sum of squares of a block after a fit without some blocks; ``ridge`` None fits constants alone.
-
-        The weights are of other drives where there are such, for they are used on later ones.
-        """
+        """Return the sum of squares of a block after a fit without some blocks; ``ridge`` None fits constants alone."""
         used = ~np.isin(np.arange(len(self.drives)), without)
         sums = {d: self.blocks[used & (self.drives == d)].sum(axis=0) for d in np.unique(self.drives)}
-        same = sums.pop(self.drives[block])
-        others = [s for s in sums.values() if s[0, 0] > 0.0] or [same]
-        weights = np.zeros(self.blocks.shape[1] - 2) if ridge is None else _solve(others, ridge)
-        constant = (same[-1, 0] - weights @ same[0, 1:-1]) / same[0, 0] if same[0, 0] > 0.0 else 0.0
+        weights = np.zeros(self.blocks.shape[1] - 2)
+        if ridge is not None:
+            weights = _solve([s for s in sums.values() if s[0, 0] > 0.0], ridge)
+        first = sums[self.drives[block]][0]
+        constant = (first[-1] - weights @ first[1:-1]) / first[0] if first[0] > 0.0 else 0.0
         left = np.concatenate([[-constant], -weights, [1.0]])
         return float(left @ self.blocks[block] @ left)
 
@@ -243,14 +236,14 @@ def _climb(problems: dict[str, _Problem]) -> tuple[tuple[RungTrial, ...], str]:
     if count < 3:
         return tuple(trials), chosen
     for rung, problem in problems.items():
-        ridges = [_best_ridge(problem, problem.held_out(k)) for k in range(count)]
-        errors[rung] = np.array([problem.block_error(k, (k,), ridge) for k, ridge in enumerate(ridges)])
+        errors[rung] = np.array([problem.block_error(k, (k,), _best_ridge(problem, (k,))) for k in range(count)])
         difference = (errors[rung] - errors[chosen]) * math.degrees(1.0) ** 2
         spread = float(np.std(difference, ddof=1)) * math.sqrt(count)
         total = float(difference.sum())
         rmse, before = (_rmse_deg(errors[name], seconds) for name in (rung, chosen))
         taken = total + STANDARD_ERRORS * spread < 0.0 and rmse < (1.0 - LEAST_GAIN) * before
-        trials.append(RungTrial(rung, rmse, chosen, total / seconds.sum(), spread / seconds.sum(), taken))
+        whole_s = float(seconds.sum())
+        trials.append(RungTrial(rung, rmse, chosen, total / whole_s, spread / whole_s, taken))
         chosen = rung if taken else chosen
     return tuple(trials), chosen
 

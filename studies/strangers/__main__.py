@@ -28,6 +28,8 @@ from studies.strangers.scoring import Score, look, score_log
 #: What layouts held out gave when they were run for the first time: those now held out, and those that were before.
 FIRST_RUNS = {
     "held_out": "held-out layouts were built last",
+    "stacks": "layouts of public stacks and loggers were held out before",
+    "exports": "layouts of exports and buses were held out before",
     "fleets": "layouts of fleets and proving grounds (tables, buses, messages) were held out before",
     "tables": "layouts of table formats were held out before",
     "sensors": "layouts of sensors and controllers were held out before",
@@ -37,29 +39,20 @@ FIRST_RUNS = {
 
 def result_of(score: Score, name: str, group: str, what: str, page_url: str = "") -> Result:
     """Return what is kept of a score."""
-    items: dict[str, str] = {}
-    wrong: dict[str, str] = {}
-    verdicts: dict[str, str] = {}
-    doubted: list[str] = []
-    for f in score.findings:
-        items[f.item] = f.verdict if f.verdict != "wrong" else "wrong, reported" if f.told else "wrong, not reported"
-        if f.verdict == "wrong":
-            wrong[f.item] = f.what
-        if f.verdict == "right":
-            together = next((v for v in ("failed", "undecided", "passed") if v in f.checked), "none")
-            verdicts[f.item] = together
-            doubted += [f.item] if f.doubted else []
-    silent = tuple(f"{f.item} ({f.what})" for f in score.findings if f.verdict == "wrong" and not f.told)
+    wrong = [f for f in score.findings if f.verdict == "wrong"]
+    right = [f for f in score.findings if f.verdict == "right"]
+    ends = {True: "wrong, reported", False: "wrong, not reported"}
+    verdicts = ("failed", "undecided", "passed")
     return Result(
         name=name,
         group=group,
         what=what,
         page=page_url,
-        items=items,
-        wrong=wrong,
-        verdicts=verdicts,
-        doubted=tuple(doubted),
-        silent=silent,
+        items={f.item: ends[f.told] if f.verdict == "wrong" else f.verdict for f in score.findings},
+        wrong={f.item: f.what for f in wrong},
+        verdicts={f.item: next((v for v in verdicts if v in f.checked), "none") for f in right},
+        doubted=tuple(f.item for f in right if f.doubted),
+        silent=tuple(f"{f.item} ({f.what})" for f in wrong if not f.told),
         alarms=score.false_alarms,
         named=score.cause_named,
         said=score.told.text,

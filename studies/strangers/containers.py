@@ -75,11 +75,29 @@ def write(topics: Sequence[Topic], path: Path, container: str) -> Path:
 def _mcap(topics: Sequence[Topic], path: Path) -> Path:
     path = path.with_suffix(".mcap")
     with McapLogWriter(path) as writer:
+        joints = [t for t in topics if t.type_name == "sensor_msgs/msg/JointState"]
         for topic in topics:
-            text = definition(topic.type_name)
-            writer.add_topic(topic.name, topic.type_name, constants=topic.constants, definition=text)
-        writer.write([TopicBatch(t.name, t.arrival_ns, t.stamps_ns, t.fields) for t in topics])
+            if topic not in joints:
+                text = definition(topic.type_name)
+                writer.add_topic(topic.name, topic.type_name, constants=topic.constants, definition=text)
+        raws = [message for topic in joints for message in _joints(writer, topic)]
+        writer.write([TopicBatch(t.name, t.arrival_ns, t.stamps_ns, t.fields) for t in topics if t not in joints], raws)
     return path
+
+
+def _joints(writer: McapLogWriter, topic: Topic) -> Iterator[RawMessage]:
+    """Yield the messages of joints, whose names are an array of texts."""
+    types, kind = _store(False).types, topic.type_name
+    text = definition(kind).encode()
+    about: dict[str, Any] = {"schema_encoding": "ros2msg", "schema_data": text, "message_encoding": "cdr"}
+    channel = writer.add_raw_channel(topic.name, schema_name=kind, metadata={}, **about)
+    names = str(topic.constants["name"]).split()
+    columns = {name: topic.fields[name] for name in ("position", "velocity", "effort")}
+    for i, (arrival, stamp) in enumerate(zip(topic.arrival_ns.tolist(), topic.stamps_ns.tolist(), strict=True)):
+        time = types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
+        header = types["std_msgs/msg/Header"](stamp=time, frame_id="")
+        joints = types[kind](header=header, name=names, **{name: values[i] for name, values in columns.items()})
+        yield RawMessage(channel, arrival, stamp, i, bytes(_store(False).serialize_cdr(joints, kind)))
 
 
 def _messages(topics: Sequence[Topic], path: Path, *, ros1: bool) -> Iterator[tuple[Topic, int, int, bytes]]:
@@ -137,12 +155,12 @@ def _mcap_ros1(topics: Sequence[Topic], path: Path) -> Path:
     return path
 
 
-def _rosbag2(topics: Sequence[Topic], path: Path) -> Path:
+def _rosbag2(topics: Sequence[Topic], path: Path, plugin: str = "SQLITE3") -> Path:
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     shutil.rmtree(path, ignore_errors=True)
     store = _store(False)
-    with Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+    with Writer(path, version=9, storage_plugin=StoragePlugin[plugin]) as writer:
         connections = {t.name: writer.add_connection(t.name, t.type_name, typestore=store) for t in topics}
         for topic, arrival, _, data in _messages(topics, path, ros1=False):
             writer.write(connections[topic.name], arrival, data)
@@ -156,29 +174,6 @@ def _rosbag2_bare(topics: Sequence[Topic], path: Path) -> Path:
             connection.execute("DROP TABLE message_definitions")
             connection.execute("UPDATE schema SET schema_version = 3")
         connection.close()
-    return path
-
-
-def _rosbag2_mcap(topics: Sequence[Topic], path: Path) -> Path:
-    shutil.rmtree(path, ignore_errors=True)
-    path.mkdir(parents=True)
-    stored = _mcap(topics, path / f"{path.name}_0")
-    count = sum(len(t.stamps_ns) for t in topics)
-    start = min(int(t.arrival_ns[0]) for t in topics if len(t.arrival_ns))
-    end = max(int(t.arrival_ns[-1]) for t in topics if len(t.arrival_ns))
-    rows = "".join(
-        f"    - topic_metadata:\n        name: {t.name}\n        type: {t.type_name}\n"
-        "        serialization_format: cdr\n        offered_qos_profiles: ''\n"
-        f"      message_count: {len(t.stamps_ns)}\n"
-        for t in topics
-    )
-    (path / "metadata.yaml").write_text(
-        "rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: mcap\n"
-        f"  relative_file_paths:\n    - {stored.name}\n  duration:\n    nanoseconds: {end - start}\n"
-        f"  starting_time:\n    nanoseconds_since_epoch: {start}\n  message_count: {count}\n"
-        f"  topics_with_message_count:\n{rows}  compression_format: ''\n  compression_mode: ''\n",
-        encoding="utf-8",
-    )
     return path
 
 
@@ -299,7 +294,7 @@ _WRITERS: dict[str, Callable[[Sequence[Topic], Path], Path]] = {
     "rosbag1": _rosbag1,
     "rosbag2": _rosbag2,
     "rosbag2-bare": _rosbag2_bare,
-    "rosbag2-mcap": _rosbag2_mcap,
+    "rosbag2-mcap": lambda topics, path: _rosbag2(topics, path, "MCAP"),
     **dict(tables.writers()),
     **dict(buses.writers()),
 }

@@ -130,9 +130,7 @@ def _look(log: DriveLog) -> tuple[SignalMapping | None, Told, dict[str, Channel]
     document = inspection.to_dict()
     warnings = document.get("warnings") or []
     said += [w["message"] for w in warnings]
-    said += [str(a) for a in inspection.ambiguities]
-    said += list(inspection.notes)
-    said += [f"missing: {name}" for name in inspection.missing]
+    said += [*map(str, inspection.ambiguities), *inspection.notes, *(f"missing: {name}" for name in inspection.missing)]
     suspects = frozenset(name for w in warnings for name in (w["suspects"] or w["signals"]))
     checks = list(document.get("checks") or ())
     more, refused_run = _checks_of_a_run(Path(str(log.path)))
@@ -213,9 +211,7 @@ def _means(at_ns: Any, values: FloatArray, width: int, count: int) -> FloatArray
 
 def floor_of(name: str) -> float:
     """Return the least difference that counts for a channel."""
-    if name in FLOORS:
-        return FLOORS[name]
-    return FLOORS["rad_s"] if name.endswith("rad_s") else FLOORS["m_s"]
+    return FLOORS.get(name, FLOORS["rad_s" if name.endswith("rad_s") else "m_s"])
 
 
 def bias_of(name: str) -> float:
@@ -293,12 +289,8 @@ def _sources(mapping: SignalMapping) -> dict[str, str]:
 def _is_told(name: str, sources: Mapping[str, str], messages: Told) -> bool:
     """Return whether a check that did not pass is on the channel, or a doubt names it or its source."""
     subject = name.removeprefix("truth.")
-    if subject in messages.suspects:
-        return True
-    for check in messages.checks:
-        if check["verdict"] != "passed" and check["subject"] in (name, subject):
-            return True
-    return _is_doubted(name, sources.get(name, ""), messages)
+    bad = {check["subject"] for check in messages.checks if check["verdict"] != "passed"} | messages.suspects
+    return bool({name, subject} & bad) or _is_doubted(name, sources.get(name, ""), messages)
 
 
 #: Words of a sentence that doubts what it names.

@@ -86,6 +86,32 @@ def _bare(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
     path.write_text(_text(clock, columns, ["Time", *columns], ","))
 
 
+def _sources(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    """Write a lap timer's export: remarks, names of which some are equal, units, sources."""
+    names = [_split(title) for title in columns]
+    above = ["This file is created using a lap timer", "Format,3", 'Track name,"Test"', "Created,24/11/2025,14:05", ""]
+    above.append(",".join(["timestamp", "fragment_id", *(n for n, _ in names)]))
+    above.append(",".join(["unix time", "", *(u.partition("|")[0] for _, u in names)]))
+    above.append(",".join(["", "", *(u.partition("|")[2] for _, u in names)]))
+    rows = _text([f"{s / 1e9:.3f},0" for s in stamps.tolist()], columns, [], ",")
+    path.write_text("\n".join([*above, rows]), encoding="utf-8")
+
+
+def _pipes(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    """Write titles of name, unit, limits and rate between bars."""
+    titles = [f'"{n}"|"{u}"|0.0|0.0|100' for n, u in map(_split, columns)]
+    clock = [f"{(s - int(stamps[0])) // 10**6},{s // 10**6}" for s in stamps.tolist()]
+    path.write_text(_text(clock, columns, ['"Interval"|"ms"|0|0|1', '"Utc"|"ms"|0|0|1', *titles], ","))
+
+
+def _units_row(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    """Write a row of units below the names, and a count before the time."""
+    names = [_split(title) for title in columns]
+    head = [",".join(["FRAME", "TIME", *(n for n, _ in names)]), ",".join(["n/a", "s", *(u for _, u in names)])]
+    clock = [f"{11630 + 10 * i}.00000,{s / 1e9:.5f}" for i, s in enumerate((stamps - stamps[0]).tolist())]
+    path.write_text("\n".join([*head, _text(clock, columns, [], ",")]), encoding="utf-8")
+
+
 def _long_rows(topics: Sequence[Topic]) -> list[tuple[int, str, float, str]]:
     """Return a row for each value: time in ns, signal, value, unit."""
     rows = [
@@ -173,6 +199,18 @@ def _mat_series(path: Path, topics: Sequence[Topic]) -> None:
     savemat(path, {"data": series})
 
 
+def _mat_pairs(path: Path, topics: Sequence[Topic]) -> None:
+    """Write two vectors for each signal, its values and its times."""
+    from scipy.io import savemat
+
+    vectors: dict[str, Any] = {"Sample_rate": 100.0, "Start_time": "2025/11/24 14:05:12.125"}
+    for topic in topics:
+        for name, values in topic.fields.items():
+            vectors[f"Data1_time_{name}"] = (topic.arrival_ns - topics[0].arrival_ns[0]) * 1e-9
+            vectors[f"Data1_{name}"] = values
+    savemat(path, vectors)
+
+
 def _mat_recorder(path: Path, topics: Sequence[Topic]) -> None:
     """Write one struct with axes X and signals Y, as a real-time recorder exports."""
     from scipy.io import savemat
@@ -235,6 +273,9 @@ _TABLES: dict[str, tuple[str, Callable[[Path, IntArray, dict[str, Any]], None]]]
     "csv-lab": (".csv", _lab),
     "csv-dated": (".csv", _dated),
     "csv-bare": (".csv", _bare),
+    "csv-sources": (".csv", _sources),
+    "csv-pipes": (".csv", _pipes),
+    "csv-units": (".csv", _units_row),
     "parquet-nested": (".parquet", _nested_parquet),
     "parquet": (".parquet", _parquet),
     "vbo": (".vbo", _vbo),
@@ -246,6 +287,7 @@ _GROUPS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
     "mat-series": (".mat", _mat_series),
     "mat-recorder": (".mat", _mat_recorder),
     "mat-7.3": (".mat", _mat_hdf5),
+    "mat-pairs": (".mat", _mat_pairs),
     "mdf": (".mf4", _mdf),
 }
 

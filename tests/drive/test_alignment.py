@@ -107,6 +107,14 @@ def test_grid_order_and_a_slow_gyro_does_not_set_the_clock():
     assert np.isfinite(signals.yaw_rate_rad_s).sum() == slow.size  # a measurement counts once
 
 
+def test_stamps_in_a_wrong_unit_are_refused_in_one_line():
+    """Nanoseconds that were milliseconds make a grid of a hundred thousand million rows a second."""
+    stamps = np.arange(500) * 10
+    channels = {name: channel(name, stamps, np.ones(500)) for name in ("ay_m_s2", "speed_m_s")}
+    with pytest.raises(MappingError, match=r"1e\+08 samples a second"):
+        plan_alignment(channels, steering_ratio=16.0, wheel_radius_m=0.3)
+
+
 def test_an_imu_channel_of_another_device_is_brought_to_the_grid():
     channels = imu()
     other = regular(0, 10, 100) + 3 * MS

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, defaul
 from pdhef_logtool.estimators.calibration import calibration as rules
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving, DrivingReader
-from pdhef_logtool.estimators.calibration.joint import REAR_STIFFNESS
+from pdhef_logtool.estimators.calibration.joint import LIKE, REAR_STIFFNESS, like_drives, parameters_of, with_taught
 from pdhef_logtool.records.signals import Signals
 
 RIGHT = default_vehicle()
@@ -166,6 +167,28 @@ def test_a_taught_prior_that_the_driving_contradicts_is_not_used() -> None:
     )
     assert absurd.vehicle == untaught.vehicle and not absurd.refused
     assert right.vehicle != untaught.vehicle and not right.refused
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(0.05, 12.0), max_size=8))
+def test_drives_of_a_group_are_alike_in_their_level_and_groups_ascend(levels: list[float]) -> None:
+    groups = [[levels[k] for k in group] for group in like_drives(levels)]
+    assert sorted(level for group in groups for level in group) == sorted(levels)
+    assert all(min(group) >= LIKE[1] * max(group) for group in groups)
+    assert all(max(low) < LIKE[1] * max(high) for low, high in pairwise(groups))
+
+
+def test_of_priors_at_several_levels_the_nearest_one_counts() -> None:
+    taught = [TaughtParameter(name=REAR_STIFFNESS, value=v, std=0.2, ay_m_s2=a) for v, a in ((1e5, 2.0), (2e5, 7.0))]
+    parameters = parameters_of(RIGHT)
+
+    def rear(level_m_s2: float) -> float:
+        moved = with_taught(parameters, taught, level_m_s2)
+        assert [p for p in moved if p.name != REAR_STIFFNESS] == [p for p in parameters if p.name != REAR_STIFFNESS]
+        return next(p.mean for p in moved if p.name == REAR_STIFFNESS)
+
+    assert [rear(level) for level in (0.0, 2.0, 3.0, 5.0, 9.0)] == pytest.approx([1e5, 1e5, 1e5, 2e5, 2e5])
+    assert rear(0.1) == next(p.mean for p in parameters if p.name == REAR_STIFFNESS)
 
 
 def test_steering_that_does_not_explain_the_yaw_rate_is_refused() -> None:

@@ -63,7 +63,7 @@ def test_a_drive_teaches_a_prior_that_later_drives_start_from(
 ) -> None:
     car = Car.load(result.car, network="none")
     assert car.taught is not None and not car.has_evidence and car.notes == ()
-    assert bool(car.taught_prior) is (result.figures["prior_support"] > 0.0)
+    assert bool(car.taught_prior) is (any(p["support"] > 0.0 for p in result.figures["priors"]))
     taught = taught_parameters([drive.taught], car.vehicle)
     by_name = {p.name: p for p in taught}
     parameters = {p.name: p for p in parameters_of(car.vehicle)}
@@ -74,6 +74,15 @@ def test_a_drive_teaches_a_prior_that_later_drives_start_from(
     assert abs(np.log(by_name[FRONT_STIFFNESS].value / true)) < 0.2
     prior = {p.name: p.prior for p in self_calibrate([drive.taught.driving], car.vehicle, taught=taught).parameters}
     assert [prior[name] for name in TYRES] == pytest.approx([by_name[name].value for name in TYRES])
+
+
+def test_a_manoeuvre_at_the_limit_does_not_spoil_what_roads_teach(sample_logs_dir: Path, bare: Path) -> None:
+    roads = [opened(sample_logs_dir / "road.mcap", bare, start=a, end=b) for a, b in (("60", "90"), ("95", "125"))]
+    change = opened(sample_logs_dir / "dlc.mcap", bare)
+    alone, mixed = learn_from(roads), learn_from([change, *roads])
+    low, high = mixed.priors
+    assert high.level_m_s2 > 2.0 * low.level_m_s2
+    assert low.figures == alone.priors[0].figures and low.parameters == alone.parameters
 
 
 def test_what_a_drive_does_not_excite_keeps_its_prior(drive: OpenedDrive) -> None:
@@ -115,8 +124,9 @@ def test_an_offset_of_the_ground_truth_changes_neither_prior_nor_residual(drive:
 def test_the_prior_of_several_drives_is_tested_with_each_left_out(sample_logs_dir: Path, bare: Path) -> None:
     drives = [opened(sample_logs_dir / "road.mcap", bare, start=a, end=b) for a, b in (("60", "90"), ("95", "125"))]
     taught, car = learn_from(drives), drives[0].drive.car.vehicle
-    assert taught.prior_test is not None and taught.prior_test.blocks >= 4
-    assert (taught.support > 0.5) == (taught.prior_test.value < 0.0)
+    (prior,) = taught.priors
+    assert prior.test is not None and prior.test.blocks >= 4
+    assert (prior.support > 0.5) == (prior.test.value < 0.0)
     assert _support(None) == _support(Interval(0.0, 0.0, 0.0, 9)) == 0.0
     assert _support(Interval(-1.0, -2.96, 0.96, 9)) == pytest.approx(0.841, abs=1e-3)
     file, weak, full = (

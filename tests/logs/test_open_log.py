@@ -81,6 +81,14 @@ def test_what_is_no_log_is_one_clear_line(tmp_path: Path, content: bytes, got: s
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".vbo", ".asc", ".mat"])
+def test_a_pointer_of_git_lfs_is_named_by_any_suffix(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"drive{suffix}"
+    path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 9\n")
+    with pytest.raises(LogError, match="git lfs pull"):
+        open_log(path)
+
+
 def test_a_database_without_the_tables_of_rosbag2_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "notes.db3"
     with sqlite3.connect(path) as db:

@@ -296,6 +296,23 @@ def test_a_magnitude_without_its_sign_is_said() -> None:
     assert "never negative" in checks["yaw_rate_rad_s.candidate"]
 
 
+def test_a_magnitude_whose_sign_is_in_another_field_is_not_taken() -> None:
+    bus = topic(steering_angle_deg=np.abs(RATE), steering_angle_deg_sign=1.0 * (RATE < 0.0))
+    auto = found(bus=bus, **SPEED)
+    assert not {"steer_rad", "steering_wheel_rad"} & set(auto.mapping.signals)
+    assert any("steering_angle_deg_sign contains its sign" in note for note in auto.mapping.notes)
+
+
+@pytest.mark.parametrize("speed", [True, False])
+def test_wheels_in_si_units_where_all_else_is_in_si_units(speed: bool) -> None:
+    """0.284 m may be the radius of a wheel, and nearly km/h."""
+    rates = {f"WheelSpd_{w}": V / 0.284 for w in ("FL", "FR", "RL", "RR")}
+    beside = {"speed": V, "ax": AX, "ay": AY, "az": 9.81 + 0.0 * AX, "yaw_rate": RATE}
+    auto = found(log=topic(**rates, **beside) if speed else topic(**rates), **({} if speed else SPEED))
+    assert ("wheel_speed_fl_rad_s" if speed else "wheel_speed_fl_m_s") in auto.mapping.signals
+    assert any("as well" in c.evidence for c in auto.mapping.checks)
+
+
 def test_axes_are_held_against_wheels_of_unknown_radius_too() -> None:
     turned = imu_fields()
     turned["linear_acceleration__x"], turned["linear_acceleration__y"] = -AY, AX
@@ -335,6 +352,14 @@ def test_a_sideslip_that_does_not_say_what_it_is_is_told() -> None:
     auto = found(imu__data=topic(**imu_fields()), esp=topic(sideslip_deg=RATE), **SPEED)
     assert set(auto.mapping.truth) == {"sideslip_rad"}
     assert "truth.source" in undecided(auto)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_vector_whose_x_is_not_the_speed_is_no_velocity_of_the_body(turned: bool) -> None:
+    yaw = np.cumsum(RATE) * 0.01 if turned else 0.02 * RATE
+    state = topic(speed_mps=V, velocities__x=V * np.cos(yaw), velocities__y=V * np.sin(yaw))
+    state.fields = {n.replace("velocities", "linear_velocities"): v for n, v in state.fields.items()}
+    assert ("vy_m_s" in found(state=state).mapping.truth) is not turned
 
 
 def test_odometry_stands_in_for_a_gyro_and_a_navigation_system_for_a_speed() -> None:
@@ -565,6 +590,16 @@ def test_units_of_names(leaf: str, kind: str, unit: str) -> None:
         ("state.twist.twist.linear.x", "speed"),
         ("state.twist.twist.linear.y", "velocity"),
         ("state.twist.twist.angular.z", "rate"),
+        ("wheel_angle", "steering"),
+        ("wheel_angle_speed", ""),
+        ("steering_angle_sign", ""),
+        ("cross_acceleration", "acceleration"),
+        ("speed_vessel_frame.y", "velocity"),
+        ("accelerometer.acceleration.v[1]", "acceleration"),
+        ("gyroscope.gyroUncalibrated.v[2]", "rate"),
+        ("vEgo", "speed"),
+        ("LFspeed", "wheel speed"),
+        ("AFRspeed", ""),
     ],
 )
 def test_what_is_beside_a_quantity_is_not_it(path: str, quantity: str) -> None:
@@ -623,6 +658,16 @@ def test_a_rate_of_the_steering_is_no_steering_angle() -> None:
         ("Raddrehzahl_VR", "1/min", "wheel rate", "fr", 2.0 * math.pi / 60.0),
         ("wheel_rl", "U/min", "wheel rate", "rl", 2.0 * math.pi / 60.0),
         ("pose.yaw", "", "heading", "", None),
+        ("Yaw", "Deg/Sec", "rate", "z", DEG),
+        ("IMU_YawRtVal", "deg/s", "rate", "z", DEG),
+        ("VehYaw_W_Actl", "rad/s", "rate", "z", 1.0),
+        ("Lateral", "m/s^2", "acceleration", "y", 1.0),
+        ("StePinComp_An_Est", "Degrees", "steering", "wheel", DEG),
+        ("WHEELSPEEDRL", "km/h", "wheel speed", "rl", 1 / 3.6),
+        ("Angle volant", "deg", "steering", "wheel", DEG),
+        ("Vitesse de lacet", "deg/s", "rate", "z", DEG),
+        ("Accelerazione laterale", "g", "acceleration", "y", G),
+        ("Velocidad", "km/h", "speed", "", 1 / 3.6),
     ],
 )
 def test_abbreviations_and_spelled_out_units(
@@ -636,7 +681,17 @@ def test_abbreviations_and_spelled_out_units(
 
 @pytest.mark.parametrize(
     ("name", "unit"),
-    [("gx", ""), ("V", "V"), ("YR", ""), ("LWS_Speed", "°/s"), ("FL_Susp_Vel", "mm/s"), ("VW_FL", "bar"), ("str", "")],
+    [
+        ("gx", ""),
+        ("V", "V"),
+        ("YR", ""),
+        ("LWS_Speed", "°/s"),
+        ("FL_Susp_Vel", "mm/s"),
+        ("VW_FL", "bar"),
+        ("str", ""),
+        ("StePinRelInit_An_Sns", "Degrees"),
+        ("Lateral", "deg"),
+    ],
 )
 def test_abbreviations_of_other_quantities_are_none(name: str, unit: str) -> None:
     assert meaning_of("log", "", name, unit) is None

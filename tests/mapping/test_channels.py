@@ -97,12 +97,13 @@ def test_numbers_as_stamps(unit: str, factor: float) -> None:
     np.testing.assert_allclose(signals["ay_m_s2"].stamps_ns - (topic.log_time_ns - 2 * MS), 0, atol=500)
 
 
-def test_a_stamp_in_two_numbers_is_exact() -> None:
+@pytest.mark.parametrize("names", [("sec", "nanosec"), ("seconds", "nanos")])
+def test_a_stamp_in_two_numbers_is_exact(names: tuple[str, str]) -> None:
     log = imu_log()
     topic = log.contents["/imu"]
     stamps = topic.fields.pop("header.stamp")
-    topic.fields["header.stamp.sec"] = (stamps // 1_000_000_000).astype(np.float64)
-    topic.fields["header.stamp.nanosec"] = (stamps % 1_000_000_000).astype(np.float64)
+    topic.fields[f"header.stamp.{names[0]}"] = (stamps // 1_000_000_000).astype(np.float64)
+    topic.fields[f"header.stamp.{names[1]}"] = (stamps % 1_000_000_000).astype(np.float64)
     signals, _, _ = read_all(log, imu_mapping())
     np.testing.assert_array_equal(signals["ay_m_s2"].stamps_ns, stamps)
 
@@ -200,7 +201,7 @@ def messy_samples(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     stamps = rng.integers(1, 12, n)  # Few values, so that stamps collide.
     arrival = stamps + rng.integers(0, 3, n)
-    values = rng.choice([np.nan, -2.0, 0.0, 1.0, 2.0, 9.0], n)
+    values = rng.choice([np.nan, -3e13, -2.0, 0.0, 1.0, 2.0, 9.0], n)
     return stamps.astype(np.int64), arrival.astype(np.int64), values
 
 
@@ -221,12 +222,12 @@ def test_cleaning_agrees_with_a_dictionary(samples: tuple[np.ndarray, ...]) -> N
     stamps, arrival, values = samples
     best: dict[int, tuple[int, float]] = {}
     for s, a, v in zip(stamps.tolist(), arrival.tolist(), values.tolist(), strict=True):
-        if np.isfinite(v) and v <= 5.0 and (s not in best or (a, v) < best[s]):
+        if abs(v) < 1e12 and v <= 5.0 and (s not in best or (a, v) < best[s]):
             best[s] = (a, v)
     got = clean_samples(stamps, arrival, values, valid_max=5.0)
     assert got.stamps_ns.tolist() == sorted(best)
     assert got.values.tolist() == [best[s][1] for s in sorted(best)]
-    assert len(got.nan_at) == int(np.isnan(values).sum())
+    assert len(got.nan_at) == int((~(np.abs(values) < 1e12)).sum())
     assert len(got.out_of_range_at) == int((values > 5.0).sum())
 
 

@@ -163,6 +163,7 @@ def test_names_tell_sensors_from_truth(name: str, role: str) -> None:
     assert ("vy_m_s" in auto.mapping.truth) == (role == "truth")
     # What is not taken is told.
     assert [a.chosen for a in auto.ambiguities] == ([None] if role == "neither" else [])
+    assert any("lateral velocity, which" in n for n in auto.mapping.notes) == (role == "speed")
 
 
 def test_commands_are_no_sensors() -> None:

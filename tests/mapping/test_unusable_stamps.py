@@ -152,6 +152,39 @@ def test_the_stamp_of_a_nested_message_that_is_a_time_is_read(inner: IntArray, o
     assert bool(mapping.notes) == (chosen == "header.stamp")
 
 
+#: Written a hundred at a time.
+BURSTS = np.repeat(TRUE[99::100], 100) + 20 * MS + np.tile(np.arange(100) * 1000, N // 100)
+
+
+@pytest.mark.parametrize(
+    ("header", "published", "recorded", "chosen"),
+    [
+        (None, TRUE + MS, BURSTS, "publish_time"),
+        (None, BURSTS, BURSTS, "log_time"),  # a recorder that has no other time
+        (None, TRUE * 0, BURSTS, "log_time"),
+        (None, TRUE - 3600 * S, BURSTS, "log_time"),  # regular, and of another clock
+        (None, TRUE + MS, LOG, "log_time"),
+        (TRUE, TRUE + MS, BURSTS, "header.stamp"),
+        (TRUE * 0, TRUE + MS, BURSTS, "publish_time"),
+        (TRUE * 0, BURSTS, BURSTS, "header.stamp"),  # log time serves, and the reason is given there
+    ],
+)
+def test_the_time_of_publication_is_read_where_it_is_the_only_regular_one(
+    header: IntArray | None, published: IntArray, recorded: IntArray, chosen: str
+) -> None:
+    fields = {"v": np.arange(float(N))} | ({} if header is None else {"header.stamp": header})
+    log = FakeLog({"/imu": FakeTopic("a/b", recorded, fields, publish_time_ns=published)})
+    own = "log_time" if header is None else "header.stamp"
+    mapping = Mapping(signals={"ay_m_s2": SignalSource("ay_m_s2", "/imu", "v", stamp=own)})
+    better = with_usable_stamps(log, mapping)
+    assert better.signals["ay_m_s2"].stamp == chosen
+    assert bool(better.notes) == (chosen != own)
+    clocks = fit_clocks(log, better, log.start_ns, log.end_ns)
+    if chosen == "publish_time":
+        read = read_signals(log, better, clocks, log.start_ns, log.end_ns)
+        np.testing.assert_array_equal(read.signals["ay_m_s2"].stamps_ns, published)
+
+
 @given(
     burst=st.integers(1, 12), spread_us=st.integers(0, 3000), period_ms=st.integers(40, 300), seed=st.integers(0, 99)
 )

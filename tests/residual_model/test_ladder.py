@@ -113,12 +113,6 @@ def test_each_drive_may_have_its_own_constant() -> None:
     assert np.allclose(a, b, atol=1e-9)
 
 
-def test_an_error_that_one_of_several_drives_has_alone_is_not_taught() -> None:
-    alone = taught(600.0, 1, linear)
-    assert fit_ladder([alone], rungs=("linear",)).rung == "linear"
-    assert fit_ladder([alone, taught(100.0, 2), taught(100.0, 3)], rungs=("linear",)).rung == "none"
-
-
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10_000), st.floats(0.1, 3.0))
 def test_the_mirrored_drive_has_the_mirrored_residual(seed: int, size: float) -> None:

@@ -152,17 +152,32 @@ def with_taught(
 ) -> tuple[Parameter, ...]:
     """Return the parameters with the prior that drives with ground truth gave them, for driving at a level of a_y.
 
-    Tyres at 8 m/s² are others than on a road: of unlike driving, a part of what it taught is not used.
+    Tyres at 8 m/s² are others than on a road: of several levels, the nearest one counts, and of what unlike driving
+    taught only a part.
     """
-    by_name = {t.name: t for t in taught}
 
-    def moved(p: Parameter, t: TaughtParameter) -> Parameter:
-        levels = sorted((t.ay_m_s2, level_m_s2))
-        share = float(np.interp(levels[0] / levels[1], LIKE, (0.0, 1.0))) if levels[0] > 0.0 else 1.0
+    def likeness(t: TaughtParameter) -> float:
+        return min(t.ay_m_s2, level_m_s2) / max(t.ay_m_s2, level_m_s2, 1e-9)
+
+    def moved(p: Parameter) -> Parameter:
+        t = max((t for t in taught if t.name == p.name), key=likeness, default=None)
+        if t is None:
+            return p
+        share = float(np.interp(likeness(t), LIKE, (0.0, 1.0))) if likeness(t) > 0.0 else 1.0
         variance = p.std**2 - share**2 * max(p.std**2 - t.std**2, 0.0)
         return replace(p, mean=p.value(share * p.theta(t.value)), std=math.sqrt(variance))
 
-    return tuple(moved(p, by_name[p.name]) if p.name in by_name else p for p in parameters)
+    return tuple(map(moved, parameters))
+
+
+def like_drives(levels_m_s2: Sequence[float]) -> list[list[int]]:
+    """Return drives by their level of a_y in groups, in which each teaches the others all; the lowest level first."""
+    groups: list[list[int]] = []
+    for k in sorted(range(len(levels_m_s2)), key=lambda k: -levels_m_s2[k]):
+        if not groups or levels_m_s2[k] < LIKE[1] * levels_m_s2[groups[-1][0]]:
+            groups.append([])
+        groups[-1].append(k)
+    return [sorted(group) for group in reversed(groups)]
 
 
 def level_of(drives: Sequence[Driving]) -> float:

@@ -24,6 +24,7 @@ from pdhef_logtool.drive.reading import Drive, WholeDrive
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import STEP_S
+from pdhef_logtool.estimators.calibration.joint import level_of, like_drives
 from pdhef_logtool.estimators.corrected import features_of
 from pdhef_logtool.estimators.latency_compensation import compensate
 from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
@@ -85,17 +86,37 @@ class OpenedDrive:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Teaching:
-    """What drives taught: prior, its support, residual, whether they calibrated their car, what taught, what next."""
+class TestedPrior:
+    """Prior of like driving at a level of a_y, its test, and the probability that it lowers other drives' errors."""
 
+    level_m_s2: float
+    test: Interval | None
+    support: float
     parameters: tuple[TaughtParameter, ...]
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """Level, probability, and the RMSE with the prior less that without, in degrees with its interval."""
+        t = self.test
+        against = [None if math.isnan(x) else math.degrees(x) for x in (() if t is None else (t.value, t.low, t.high))]
+        return {"ay_m_s2": self.level_m_s2, "support": round(self.support, 3), "against_untaught_deg": against}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Teaching:
+    """What drives taught: priors, residual, whether they calibrated their car, what taught, what next."""
+
+    priors: tuple[TestedPrior, ...]
     ladder: LadderFit
     calibrated: bool
     truth: str
-    prior_test: Interval | None
-    support: float
     drives: tuple[dict[str, Any], ...]
     more: tuple[str, ...]
+
+    @property
+    def parameters(self) -> tuple[TaughtParameter, ...]:
+        """The priors of all levels of a_y."""
+        return tuple(p for prior in self.priors for p in prior.parameters)
 
     @property
     def evidence(self) -> str:
@@ -168,13 +189,10 @@ def open_drive(drive: Drive, config: RunConfig) -> tuple[DriveRecord, OpenedDriv
 
 def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = lambda _text, _share: None) -> Teaching:
     """Return what drives of one car teach, which were read with its vehicle file."""
-    vehicle = drives[0].drive.car.vehicle
     progress("fitting the prior", 0.3)
-    test = _prior_test(drives, progress)
-    support = _support(test)
-    parameters: tuple[TaughtParameter, ...] = ()
-    if support > 0.0:
-        parameters = taught_parameters([d.taught for d in drives], vehicle, support)
+    groups = like_drives([level_of([d.taught.driving]) for d in drives])
+    priors = tuple(_prior_of([drives[k] for k in group], progress) for group in groups)
+    parameters = tuple(p for prior in priors for p in prior.parameters)
     calibrations = [_calibration(d, parameters) for d in drives]
     progress("fitting the residual", 0.8)
     lacks = [lacking_of(d, c) for d, c in zip(drives, calibrations, strict=True)]
@@ -196,7 +214,15 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
             line |= {f"{name}_deg": rmse[0], f"{name}_without_constant_deg": rmse[1]}
         lines.append(line)
     truth = " and ".join(sorted({ESTIMATED if d.truth.name == REFERENCE else GROUND_TRUTH for d in drives}))
-    return Teaching(parameters, ladder, calibrated, truth, test, support, tuple(lines), _more(drives, ladder))
+    return Teaching(priors, ladder, calibrated, truth, tuple(lines), _more(drives, ladder))
+
+
+def _prior_of(drives: Sequence[OpenedDrive], progress: Any) -> TestedPrior:
+    """Return the prior of like drives with its test; without parameters where nothing supports it."""
+    test, taught = _prior_test(drives, progress), [d.taught for d in drives]
+    support, level = _support(test), float(f"{level_of([d.driving for d in taught]):.4g}")
+    parameters = taught_parameters(taught, drives[0].drive.car.vehicle, support) if support > 0.0 else ()
+    return TestedPrior(level, test, support, parameters)
 
 
 def _calibration(drive: OpenedDrive, parameters: Sequence[TaughtParameter]) -> SelfCalibration:
@@ -301,8 +327,7 @@ def _more(drives: Sequence[OpenedDrive], ladder: LadderFit) -> tuple[str, ...]:
 
 def figures_of(taught: Teaching) -> dict[str, Any]:
     """Return the figures as JSON-able values."""
-    test, ladder = taught.prior_test, taught.ladder
-    bounds = () if test is None else (test.value, test.low, test.high)
+    ladder = taught.ladder
     return {
         "evidence": taught.evidence,
         "rung": ladder.rung,
@@ -312,8 +337,7 @@ def figures_of(taught: Teaching) -> dict[str, Any]:
         "rungs": [asdict(t) for t in ladder.trials],
         "calibrated": taught.calibrated,
         "truth": taught.truth,
-        "prior_support": round(taught.support, 3),
-        "prior_against_untaught_deg": [None if math.isnan(x) else math.degrees(x) for x in bounds],
+        "priors": [prior.figures for prior in taught.priors],
         "parameters": [p.model_dump() for p in taught.parameters],
         "drives": list(taught.drives),
         "more": list(taught.more),

@@ -121,10 +121,12 @@ def _taken(inspection: Inspection, section: str, report: SignalReport, candidate
         why = "named by the mapping file"
     else:
         why = f"recognised type {kind.replace('/msg/', '/')}" if candidate is None else candidate.reason
+    doubts = [] if candidate is None or not candidate.doubt else [candidate.doubt]
+    if candidate is not None and candidate.source.paths != source.paths:  # the mounting gives another axis
+        why, doubts = f"in place of {_label(candidate.source)}, which is {candidate.reason}", []
     subject = report.name if section == "signals" else f"truth.{report.name}"
-    wrong = [f"{c.name} {c.verdict}: {c.evidence}" for c in inspection.checks
-             if c.subject == subject and c.verdict != "passed"]  # fmt: skip
-    doubts = [*([candidate.doubt] if candidate is not None and candidate.doubt else []), *wrong]
+    bad = [c for c in inspection.checks if c.subject == subject and c.verdict != "passed"]
+    doubts += [f"{c.name} {c.verdict}: {c.evidence}" for c in bad if not (doubts and c.name.endswith(".candidate"))]
     low, high = inspection.lines.get((section, report.name), (np.empty(0), np.empty(0)))
     length = "length of the vector" if source.columns > 1 else ""
     figures = _figures(report.minimum, report.maximum, report.unit, report.rate_hz, source)

@@ -527,18 +527,15 @@ def _clock_notes(mapping: Mapping, clocks: dict[str, ClockModel]) -> list[str]:
 def mapping_comments(inspection: Inspection) -> dict[str, str]:
     """Return comments for :func:`pdhef_logtool.mapping.mapping_to_toml` that help to edit the mapping."""
     types = {t.name: t.type for t in inspection.topics}
+    bad = [c for c in inspection.checks if c.verdict != "passed"]
     comments: dict[str, str] = {}
     for section, reports in (("signals", inspection.signals), ("truth", inspection.truth)):
         for name, report in reports.items():
-            text = f"{types.get(report.topic, '')}, {_number(report.rate_hz)} Hz"
+            text = ", ".join(t for t in (types.get(report.topic), f"{_number(report.rate_hz)} Hz") if t)
             if math.isfinite(report.minimum):
                 text += f", {_number(report.minimum)} to {_number(report.maximum)} {report.unit}"
             subject = name if section == "signals" else f"truth.{name}"
-            doubts = [
-                c
-                for c in inspection.checks
-                if c.verdict != "passed" and subject in (c.subject, c.name.removesuffix(".candidate"))
-            ]
+            doubts = [c for c in bad if subject in (c.subject, c.name.removesuffix(".candidate"))]
             done = any(p.subject == subject for p in inspection.proposals)
             lines = [] if done else [f"CHECK {c.name} {c.verdict}: {c.evidence}; {c.remedy}" for c in doubts]
             comments[f"{section}.{name}"] = "\n".join([text, *lines])
