@@ -144,18 +144,13 @@ def _outcome(log: DriveLog, right: Mapping, subject: str, kind: str, vehicle: Ve
     wrong = mistaken(right, subject, kind)
     if wrong is None:
         return
-    name = Path(str(log.path)).stem
-    if contradictions(wrong):
-        yield Outcome(name, subject, kind, "refused", ())
-        return
-    clocks = fit_clocks(log, wrong, log.start_ns, log.end_ns)
-    checks = survey_log(log, wrong, clocks, (log.start_ns, log.end_ns), vehicle).checks
-    members = _members(right, subject)
-    source = _source(right, members[0])
-    assert source is not None
-    scale = source.scale if isinstance(source.scale, float | int) else 1.0
+    span_ns, members = (log.start_ns, log.end_ns), _members(right, subject)
+    is_refused = bool(contradictions(wrong))
+    checks = () if is_refused else survey_log(log, wrong, fit_clocks(log, wrong, *span_ns), span_ns, vehicle).checks
+    scale = getattr(_source(right, members[0]), "scale", 1.0)
+    stated = verdict(checks, members, subject, kind, scale if isinstance(scale, float | int) else 1.0)
     shown = tuple(c for c in checks if c.verdict != "passed")
-    yield Outcome(name, subject, kind, verdict(checks, members, subject, kind, scale), shown)
+    yield Outcome(Path(str(log.path)).stem, subject, kind, "refused" if is_refused else stated, shown)
 
 
 #: Cars of the sound drives, each in random variants; their speeds over a manoeuvre's own, friction, and longest drive.
