@@ -126,11 +126,10 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
     """Print the rungs that were tried, what the drives taught is worth on them, and what to drive next."""
     rungs = table("residual model", ">RMSE °, held-out\nblocks", ">difference °²", ">± 1 se", "outcome")
     for t in figures["rungs"]:
-        outcome = ("better" if t["taken"] else "not better") if t["against"] else ""
+        outcome = "" if not t["against"] else "better" if t["taken"] else "not better"
+        outcome = "used" if t["rung"] == figures["rung"] else outcome
         against = [cell(t[k] if t["against"] else None, digits=4) for k in ("difference_deg2", "standard_error_deg2")]
-        rungs.add_row(
-            t["rung"], cell(t["rmse_deg"], digits=3), *against, "used" if t["rung"] == figures["rung"] else outcome
-        )
+        rungs.add_row(t["rung"], cell(t["rmse_deg"], digits=3), *against, outcome)
     console.print(rungs)
     console.print()
     drives = table("drive", ">seconds", ">physics °", ">with residual °", "calibration", fold=4)
@@ -138,10 +137,9 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
         errors = (cell(d[key], digits=3) for key in ("physics_deg", "corrected_deg"))
         drives.add_row(d["name"], cell(d["seconds"], digits=0), *errors, d["calibration"])
     console.print(drives)
-    for prior in figures["priors"]:
+    for p in figures["priors"]:
         console.print(
-            f"  probability that the tyre prior of drives at {prior['ay_m_s2']:.1f} m/s² lowers the errors of others: "
-            f"{prior['support']:.2f} (0: unused)"
+            f"  tyre prior at {p['ay_m_s2']:.1f} m/s²: helps with a probability of {p['support']:.2f} (0: unused)"
         )
     for text in figures["more"]:
         console.print(f"  {text}")

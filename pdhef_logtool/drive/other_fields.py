@@ -58,11 +58,8 @@ def with_other_fields(
 
 
 def _contradicted(checks: Sequence[Check]) -> set[str]:
-    return {
-        c.name
-        for c in checks
-        if c.name.endswith(_MISREAD) and (c.verdict == "failed" or c.remedy.startswith(SUSPICIONS))
-    }
+    about = (c for c in checks if c.name.endswith(_MISREAD))
+    return {c.name for c in about if c.verdict == "failed" or c.remedy.startswith(SUSPICIONS)}
 
 
 def _others(recognised: Mapping, mapping: Mapping) -> dict[str, SignalSource]:

@@ -200,16 +200,16 @@ def _variables(file: LogFile, losses: list[Loss]) -> Iterator[tuple[str, NDArray
                 yield from _leaves(name, value, 0)
 
 
-def _check_tags(data: bytes, at: int, end: int, order: str) -> None:
+def _check_tags(data: bytes, start: int, end: int, order: str) -> None:
     """Raise ValueError for an element that no writer makes: SciPy ends the process for some of these."""
-    while at + 8 <= end:
-        kind, size = struct.unpack_from(f"{order}II", data, at)
+    while start + 8 <= end:
+        kind, size = struct.unpack_from(f"{order}II", data, start)
         small = kind >> 16  # size of an element inside of its tag
-        if not 1 <= kind & 0xFFFF <= 18 or small > 4 or (not small and at + 8 + size > end):
+        if not 1 <= kind & 0xFFFF <= 18 or small > 4 or (not small and start + 8 + size > end):
             raise ValueError("an element of it has no valid type or size")
         if kind == _MATRIX:
-            _check_tags(data, at + 8, at + 8 + size, order)
-        at += 8 if small else 8 + size + -size % 8
+            _check_tags(data, start + 8, start + 8 + size, order)
+        start += 8 if small else 8 + size + -size % 8
 
 
 def _inflated(stored: bytes, limits: ResourceLimits) -> bytes:

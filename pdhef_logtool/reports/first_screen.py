@@ -107,8 +107,7 @@ def tested_drive(report: Mapping[str, Any], outcome: str = "") -> list[tuple[str
     log, vehicle, answer = report["log"], report["vehicle"], report.get("answer") or {}
     file = f" ({vehicle['file']})" if vehicle.get("file") else ""
     state = f"taught by {vehicle['taught']}" if vehicle.get("taught") else "parameters not validated"
-    if vehicle.get("proven"):
-        state = "validated on drives with ground truth"
+    state = "validated on drives with ground truth" if vehicle.get("proven") else state
     if not vehicle.get("file"):
         state = "no car given: default sedan"
     ran = ", ".join(e["name"] for e in report["estimators"] if e["outcome"] == "ran")

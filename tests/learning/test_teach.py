@@ -82,7 +82,7 @@ def test_a_manoeuvre_at_the_limit_does_not_spoil_what_roads_teach(sample_logs_di
     alone, mixed = learn_from(roads), learn_from([change, *roads])
     low, high = mixed.priors
     assert high.level_m_s2 > 2.0 * low.level_m_s2
-    assert low.figures == alone.priors[0].figures and low.parameters == alone.parameters
+    assert low.support == alone.priors[0].support > 0.0 and mixed.parameters == alone.parameters
 
 
 def test_what_a_drive_does_not_excite_keeps_its_prior(drive: OpenedDrive) -> None:

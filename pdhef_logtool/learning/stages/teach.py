@@ -94,29 +94,18 @@ class TestedPrior:
     support: float
     parameters: tuple[TaughtParameter, ...]
 
-    @property
-    def figures(self) -> dict[str, Any]:
-        """Level, probability, and the RMSE with the prior less that without, in degrees with its interval."""
-        t = self.test
-        against = [None if math.isnan(x) else math.degrees(x) for x in (() if t is None else (t.value, t.low, t.high))]
-        return {"ay_m_s2": self.level_m_s2, "support": round(self.support, 3), "against_untaught_deg": against}
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Teaching:
-    """What drives taught: priors, residual, whether they calibrated their car, what taught, what next."""
+    """What drives taught: priors with their parameters, residual, whether they calibrated their car, what next."""
 
     priors: tuple[TestedPrior, ...]
+    parameters: tuple[TaughtParameter, ...]
     ladder: LadderFit
     calibrated: bool
     truth: str
     drives: tuple[dict[str, Any], ...]
     more: tuple[str, ...]
-
-    @property
-    def parameters(self) -> tuple[TaughtParameter, ...]:
-        """The priors of all levels of a_y."""
-        return tuple(p for prior in self.priors for p in prior.parameters)
 
     @property
     def evidence(self) -> str:
@@ -214,7 +203,7 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
             line |= {f"{name}_deg": rmse[0], f"{name}_without_constant_deg": rmse[1]}
         lines.append(line)
     truth = " and ".join(sorted({ESTIMATED if d.truth.name == REFERENCE else GROUND_TRUTH for d in drives}))
-    return Teaching(priors, ladder, calibrated, truth, tuple(lines), _more(drives, ladder))
+    return Teaching(priors, parameters, ladder, calibrated, truth, tuple(lines), _more(drives, ladder))
 
 
 def _prior_of(drives: Sequence[OpenedDrive], progress: Any) -> TestedPrior:
@@ -327,7 +316,11 @@ def _more(drives: Sequence[OpenedDrive], ladder: LadderFit) -> tuple[str, ...]:
 
 def figures_of(taught: Teaching) -> dict[str, Any]:
     """Return the figures as JSON-able values."""
-    ladder = taught.ladder
+    ladder, priors = taught.ladder, []
+    for p in taught.priors:
+        t = (p.test.value, p.test.low, p.test.high) if p.test else ()
+        against = [None if math.isnan(x) else math.degrees(x) for x in t]
+        priors.append({"ay_m_s2": p.level_m_s2, "support": round(p.support, 3), "against_untaught_deg": against})
     return {
         "evidence": taught.evidence,
         "rung": ladder.rung,
@@ -337,7 +330,7 @@ def figures_of(taught: Teaching) -> dict[str, Any]:
         "rungs": [asdict(t) for t in ladder.trials],
         "calibrated": taught.calibrated,
         "truth": taught.truth,
-        "priors": [prior.figures for prior in taught.priors],
+        "priors": priors,
         "parameters": [p.model_dump() for p in taught.parameters],
         "drives": list(taught.drives),
         "more": list(taught.more),
