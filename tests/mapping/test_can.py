@@ -21,6 +21,7 @@ from mcap.writer import Writer
 from pdhef_logtool.logs.can_decoding import signal_values
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, check_mapping, fit_clocks, load_mapping, mapping_to_toml, read_signals
+from pdhef_logtool.mapping.evidence import LARGEST
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.runs.inspection.report import inspect_log
 
@@ -234,7 +235,7 @@ def test_frames_of_every_encoding_decode_as_cantools_decodes_them(
     channels = _read(path, _mapping(folder, _FIELDS, more))
     for name, field in _FIELDS.items():
         channel = channels.signals[name]
-        expected = _expected(frames, field)
+        expected = [(t, v) for t, v in _expected(frames, field) if abs(v) < LARGEST]  # no number of a car
         assert channel.stamps_ns.tolist() == [t for t, _ in expected]
         assert channel.values.tolist() == pytest.approx([v for _, v in expected], rel=1e-15)
     short = sum(f.id == 256 and not f.extended and len(f.data) < 8 for f in frames)
