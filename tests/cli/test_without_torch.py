@@ -11,7 +11,17 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 #: Read by every Python process that starts, workers too: as if PyTorch were not installed.
-_BLOCKED = "import sys\nsys.modules['torch'] = None\n"
+_BLOCKED = """
+import sys
+from importlib.machinery import PathFinder
+
+class WithoutTorch(PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        return None if name.partition(".")[0] == "torch" else super().find_spec(name, path, target)
+
+sys.meta_path[sys.meta_path.index(PathFinder)] = WithoutTorch
+"""
 _CODE = """
 import contextlib, io, sys
 from pdhef_logtool.cli.app import main
