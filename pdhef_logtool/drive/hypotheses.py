@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations
+from itertools import combinations, count
 
 import numpy as np
 
@@ -159,6 +159,10 @@ class Hypothesis:
         shared = len(self.factors.keys() & names)
         return shared == len(self.factors) or (self.kind == "open sign" and shared > 0)
 
+    def goes_with(self, other: Hypothesis) -> bool:
+        """Return whether both may be true: of different signals, and neither is a foreign factor."""
+        return not self.factors.keys() & other.factors.keys() and "foreign" not in (self.kind, other.kind)
+
     def acts_on(self, relation: Relation) -> float:
         """Return what undoing it multiplies the relation's gain with."""
         return math.prod(f ** relation.powers[n] for n, f in self.factors.items() if n in relation.powers)
@@ -192,18 +196,18 @@ def posterior(relations: Sequence[Relation], hypotheses: Sequence[Hypothesis]) -
     def of_relation(i: int, factor: float) -> float:
         return _ANY_GAIN if math.isnan(factor) else telling[i].energy(factor)
 
-    def of_set(*chosen: Hypothesis) -> float:
-        factors = (math.prod(h.acts_on(r) for h in chosen) for r in telling)
-        return sum(h.energy for h in chosen) + sum(of_relation(i, f) for i, f in enumerate(factors))
+    priors, acts = [h.energy for h in useful], [[h.acts_on(r) for r in telling] for h in useful]
+    none = [1.0] * len(telling)
 
-    alone = sorted(((of_set(h), i) for i, h in enumerate(useful)))
+    def of_set(*chosen: int) -> float:
+        factors = map(math.prod, zip(none, *(acts[k] for k in chosen), strict=True))
+        return sum(priors[k] for k in chosen) + sum(map(of_relation, count(), factors))
+
+    alone = sorted((of_set(i), i) for i in range(len(useful)))
     scored: dict[tuple[int, ...], float] = {(): of_set()}
     scored |= {(i,): energy for energy, i in alone}
     pairs = {(min(i, j), max(i, j)) for _, i in alone[:BEAM] for j in range(len(useful)) if j != i}
-    for i, j in pairs:
-        a, b = useful[i], useful[j]
-        if not a.factors.keys() & b.factors.keys() and "foreign" not in (a.kind, b.kind):
-            scored[i, j] = of_set(a, b)
+    scored |= {(i, j): of_set(i, j) for i, j in pairs if useful[i].goes_with(useful[j])}
     least = min(scored.values())
     weights = {k: math.exp(least - e) for k, e in scored.items() if e < least + 25.0}
     total = sum(weights.values())
