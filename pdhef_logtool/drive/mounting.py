@@ -548,9 +548,10 @@ def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_
     documented is corrected, which is a failed check.
     """
     mapping, is_mounted, measured = survey.mapping, survey.is_mounted, survey.measured
-    groups = mapping.open_signs
-    probable = measured.posterior(mounting_is_known=is_mounted, open_signs=groups)
-    turned = [n for g in groups if probable.turned(g[0]) >= CERTAIN for n in g]
+    groups, turned = mapping.open_signs, []
+    if groups:
+        probable = measured.posterior(mounting_is_known=is_mounted, open_signs=groups)
+        turned = [n for g in groups if probable.turned(g[0]) >= CERTAIN for n in g]
     factors = dict.fromkeys(turned, (-1.0, "nothing documents its sign, and the drive shows it"))
     if not turned:
         groups, measured = (), measured.without_truth()

@@ -75,7 +75,7 @@ def clean_samples(
     valid_min: float | None = None,
     valid_max: float | None = None,
 ) -> CleanSamples:
-    """Drop what is no number of a car or out of range, sort by stamp, and keep the first arrival of each stamp.
+    """Drop values that are not finite, implausible or out of range, sort by stamp, and keep the first of each stamp.
 
     The result does not depend on the order of the samples: samples of one stamp and one arrival are distinguished by
     value, the smallest first.

@@ -64,7 +64,7 @@ def check_drive(
         return checks
     sound, shares = without_faulty_samples(signals, vehicle or default_vehicle())
     # A detector of faults cannot distinguish a dead channel from one in another unit; the whole drive can.
-    if not shares.keys() - explained_factors(whole, mounting_is_known=mounting_is_known).keys():
+    if not shares or not shares.keys() - explained_factors(whole, mounting_is_known=mounting_is_known).keys():
         return checks
     evidence = "{:.0%} of what the car did fell into samples of it that are stuck or dead"
     faults = [FAULT.failed(evidence.format(share), n) for n, share in shares.items() if share > FAULTY_SHARE]
