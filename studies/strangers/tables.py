@@ -86,6 +86,12 @@ def _bare(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
     path.write_text(_text(clock, columns, ["Time", *columns], ","))
 
 
+def _plain(path: Path, stamps: IntArray, columns: dict[str, Any], separator: str = ",") -> None:
+    """Write the columns as they are; one of them is the time."""
+    rows = (separator.join(f"{v:.15g}" for v in row) for row in zip(*(v.tolist() for v in columns.values()), strict=True))
+    path.write_text("\n".join([separator.join(columns), *rows, ""]), encoding="utf-8")
+
+
 def _sources(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
     """Write a lap timer's export: remarks, names of which some are equal, units, sources."""
     names = [_split(title) for title in columns]
@@ -126,6 +132,17 @@ def _long_rows(topics: Sequence[Topic]) -> list[tuple[int, str, float, str]]:
 def _long_csv(path: Path, topics: Sequence[Topic]) -> None:
     rows = [f"{stamp / 1e9:.6f},{name},{value:.9g}" for stamp, name, value, _ in _long_rows(topics)]
     path.write_text("\n".join(["timestamp,signal,value", *rows, ""]))
+
+
+def _records_csv(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a stream of values with columns on the session beside them."""
+    about = "expire_at,lap,meta_event,meta_session,meta_source,meta_time,original_vehicle_id,outing"
+    rows = [f"{about},telemetry_name,telemetry_value,timestamp,vehicle_id,vehicle_number"]
+    for stamp, name, value, _ in _long_rows(topics):
+        clock, late = np.datetime_as_string(np.array([stamp, stamp + 10**14], "datetime64[ns]"), "ms")
+        about = f",1,I_R04_2025-11-24,R1,kafka:raw,{late}Z,CAR-002-2,0"
+        rows.append(f"{about},{name},{value:.6g},{clock}Z,CAR-002-2,2")
+    path.write_text("\n".join([*rows, ""]))
 
 
 def _long_parquet(path: Path, topics: Sequence[Topic]) -> None:
@@ -273,6 +290,8 @@ _TABLES: dict[str, tuple[str, Callable[[Path, IntArray, dict[str, Any]], None]]]
     "csv-lab": (".csv", _lab),
     "csv-dated": (".csv", _dated),
     "csv-bare": (".csv", _bare),
+    "csv-plain": (".csv", _plain),
+    "csv-tabs": (".txt", partial(_plain, separator="\t")),
     "csv-sources": (".csv", _sources),
     "csv-pipes": (".csv", _pipes),
     "csv-units": (".csv", _units_row),
@@ -282,6 +301,7 @@ _TABLES: dict[str, tuple[str, Callable[[Path, IntArray, dict[str, Any]], None]]]
 }
 _GROUPS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
     "csv-long": (".csv", _long_csv),
+    "csv-records": (".csv", _records_csv),
     "parquet-long": (".parquet", _long_parquet),
     "mat": (".mat", _mat),
     "mat-series": (".mat", _mat_series),
