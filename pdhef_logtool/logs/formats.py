@@ -67,7 +67,7 @@ FORMATS = (
     LogFormat("a ROS 1 bag", f"{__package__}.rosbag1_log:Rosbag1Container.open", (".bag",), ROSBAG1_MAGIC),
     LogFormat("a rosbag2 database", f"{__package__}.rosbag2_sqlite_log:SqliteContainer.open", (".db3",), SQLITE_MAGIC),
     LogFormat("a VBO file", f"{__package__}.text_logs:open_vbo", (".vbo",)),
-    LogFormat("a CSV file", f"{__package__}.text_logs:open_csv", (".csv", ".tsv"), is_general=True),
+    LogFormat("a CSV file", f"{__package__}.text_logs:open_csv", (".csv", ".tsv", ".txt"), is_general=True),
     LogFormat("a Parquet file", f"{__package__}.array_logs:open_parquet", (".parquet",), b"PAR1", is_general=True),
     LogFormat("a MAT file", f"{__package__}.array_logs:open_mat", (".mat",), b"MATLAB ", is_general=True),
     LogFormat("an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), (b"MDF     ", b"UnFinMF ")),

@@ -43,7 +43,7 @@ _LATIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "O
 
 _TIME = re.compile(
     r"(?:(?:time|t|timestamp|time_?stamps?|stamp|utc|utc_time|gps_time|date_?time|datetime|zeit|log_time|rel(?:ative)?_time|"
-    r"elapsed(?:_time)?|time_of_day)(?:_(?:s|sec|secs|seconds|ms|us|ns))?|seconds|time_utc|epoch)"
+    r"elapsed(?:_time)?|time_of_day)(?:_(?:s|sec|secs|seconds|ms|us|ns))?|seconds|milli(?:s|seconds)|micros|time_utc|epoch)"
 )
 _TIME_LIKE = re.compile(r"time|zeit|clock|stamp")
 _WEEK = re.compile(r"(?:gps|gnss)?_?week(?:_?(?:number|no|nr))?")
@@ -51,10 +51,19 @@ _WEEK_TIME = re.compile(
     r"(?:(?:gps|gnss)_)?(?:i?tow|sow|time_of_week|seconds_of_week|week_seconds|seconds|time)(?:_m?s)?"
 )
 #: Columns of a table in long form, with a row for each value.
-_SIGNAL = re.compile(r"(?:signal|channel|variable|parameter|sensor|tag|key|name)(?:_?name)?")
-_VALUE = re.compile(r"(?:physical_|signal_|phys_)?(?:value|val|wert)")
+_SIGNAL = re.compile(
+    r"(?:signal|channel|variable|parameter|sensor|tag|key|telemetry|metric|pid|name)(?:_?(?:name|id))?"
+)
+_VALUE = re.compile(r"(?:physical_|signal_|phys_|telemetry_|metric_)?(?:value|val|wert)")
 _DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")
-_FACTORS_NS = dict.fromkeys(("s", "sec", "secs", "seconds"), 10**9) | {"ms": 10**6, "us": 10**3, "µs": 10**3, "ns": 1}
+_FACTORS_NS = dict.fromkeys(("s", "sec", "secs", "seconds"), 10**9) | {
+    "millis": 10**6,
+    "micros": 10**3,
+    "ms": 10**6,
+    "us": 10**3,
+    "µs": 10**3,
+    "ns": 1,
+}
 _GPS_EPOCH_NS = 315_964_800 * 10**9
 _WEEK_S = 604_800
 #: GPS time minus UTC in s, from a time in s since 1970 on.
@@ -216,10 +225,19 @@ def _clocks(sheet: Sheet, names: Mapping[str, str]) -> list[str]:
     """Return the columns with times, the best first; ``names`` are all columns by their names in lower case."""
     clocks = [name for n, name in names.items() if _TIME.fullmatch(n)]
     clocks = [n for n in reversed(clocks) if _is_clock(sheet.columns[n])]
-    ascending = [(n, name) for n, name in names.items() if not clocks and _ascends(sheet.columns[name])]
-    clocks = clocks or [name for n, name in ascending if _TIME_LIKE.search(n)]
+    ascending = [(n, name) for n, name in reversed(names.items()) if not clocks and _ascends(sheet.columns[name])]
+    clocks = clocks or sorted(
+        (name for n, name in ascending if _TIME_LIKE.search(n)), key=lambda n: not _dates(sheet, n)
+    )
     dates = [name for _, name in ascending if sheet.columns[name].dtype.kind == "M"]  # type: ignore[union-attr]
     return clocks or dates or [name for _, name in ascending if sheet.units.get(name, "").lower() in _FACTORS_NS]
+
+
+def _dates(sheet: Sheet, name: str) -> bool:
+    """Return whether a column contains dates, not times since the start of a recording or of a device."""
+    column = np.asarray(sheet.columns[name])
+    unit = sheet.units.get(name, "")
+    return column.dtype.kind == "M" or int(np.median(number_stamps(column.astype(np.float64), unit))) >= _FIRST_DATE_NS
 
 
 def _is_clock(column: NDArray[Any] | Series) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,11 +23,6 @@ if TYPE_CHECKING:
     from cantools.database.can import Database
 
     from pdhef_logtool.logs.can_decoding import Frames
-
-
-#: End of the name of a column that is made of a magnitude and its sign, and how the name of a sign differs from it.
-SIGNED = "_signed"
-_SIGN = re.compile(r"(?<![A-Za-z0-9])(?:VZ|vorzeichen|sign|sgn)_|_(?:VZ|vorzeichen|sign|sgn)$", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,29 +59,6 @@ class Table:
         return cls(name, stamps_ns, fields, lambda path, rows: columns[path][rows], type_name)
 
 
-def signs_of(paths: Collection[str]) -> dict[str, str]:
-    """Return the paths of signs by those of their magnitudes."""
-    return {m: path for path in paths if (m := _SIGN.sub("", path)) != path and m in paths}
-
-
-def _with_signs(table: Table) -> Table:
-    """Add a column ``<name>_signed`` for each magnitude whose sign is in another column (1: negative)."""
-    names = {f.path: f for f in table.fields}
-    signs = signs_of(names)
-    if not signs:
-        return table
-
-    def load(path: str, rows: slice) -> NDArray[Any]:
-        magnitude = path.removesuffix(SIGNED)
-        if magnitude == path or magnitude not in signs:
-            return table.load(path, rows)
-        negative = table.load(signs[magnitude], rows) > 0
-        return np.where(negative, -1.0, 1.0) * np.abs(np.asarray(table.load(magnitude, rows), np.float64))
-
-    more = (replace(names[magnitude], path=f"{magnitude}{SIGNED}") for magnitude in signs)
-    return replace(table, fields=(*table.fields, *more), load=load)
-
-
 class TableLog(DriveLog):
     """Tables as a log. It has no messages to copy, and one ledger entry: the file was read.
 
@@ -114,7 +85,7 @@ class TableLog(DriveLog):
         self.path, self.kind = file.place, kind
         self._frames = frames
         self._file = file
-        self._tables = {table.name: _with_signs(table) for table in sorted(tables, key=lambda table: table.name)}
+        self._tables = {table.name: table for table in sorted(tables, key=lambda table: table.name)}
         names = Counter(table.name for table in tables)
         wrong = [t.name for t in tables if names[t.name] > 1 or (t.stamps_ns[1:] < t.stamps_ns[:-1]).any()]
         if wrong:
@@ -132,7 +103,7 @@ class TableLog(DriveLog):
         for table in tables:
             number = 1 + sum(name.partition("#")[0] == table.name for name in self._tables)
             name = table.name if number == 1 else f"{table.name}#{number}"
-            self._tables[name] = _with_signs(replace(table, name=name))
+            self._tables[name] = replace(table, name=name)
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:

@@ -8,7 +8,8 @@ taken one (its unit, its sign) becomes a check that is undecided. Other candidat
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.table_log import signs_of
+from pdhef_logtool.mapping.channels import signed
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
 from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
@@ -34,6 +35,10 @@ Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 _NAVIGATION = frozenset({"gps", "gnss", "ins", "rtk"})
 #: Words of axes that are the car's, whose sign alone is open.
 _CAR_AXES = frozenset({"lat", "lateral", "long", "longitudinal", "lng", "trans", "transverse", "transversal", "down"})
+#: Controls beside which a steering may be one.
+_PEDALS = frozenset({"throttle", "brake", "gas"})
+#: How the name of a sign differs from that of its magnitude.
+_SIGN = re.compile(r"(?<![A-Za-z0-9])(?:VZ|vorzeichen|sign|sgn)_|_(?:VZ|vorzeichen|sign|sgn)$", re.IGNORECASE)
 #: A topic with more numeric fields than this is no sensor's; looking at its names alone would take long.
 MOST_FIELDS = 3000
 #: Fields that are read at most; the best names first.
@@ -96,6 +101,7 @@ class Field:
     factors : units that it may be in, the likeliest first. fixed : unit and sign are documented.
     section : ``signals`` or ``truth`` by its documentation.
     known : its unit is sure. anchor : it is mapped already. sign : that it is taken with.
+    sign_path : of the field that contains its sign.
     is_weak : values do not decide what it is, so that it is never taken.
     """
 
@@ -116,6 +122,7 @@ class Field:
     doubts: list[str] = field(default_factory=list)
     offset: float = 0.0
     is_weak: bool = False
+    sign_path: str = ""
 
     @property
     def scale(self) -> float:
@@ -173,6 +180,8 @@ class Field:
     def candidate(self, name: str, section: Literal["signals", "truth"], *, taken: bool) -> Candidate:
         """Return the record of the field as a source of a signal."""
         source = SignalSource(name, self.topic.name, self.path, self.stamp, self.scale, self.offset)
+        if self.sign_path:
+            source = replace(source, field=(self.path, self.sign_path), scale=(self.scale, 1.0), combine="signed")
         most = MOST.get(self.meaning.quantity)
         finite = self.seen.values[np.isfinite(self.seen.values)] * self.scale + self.offset
         if most is not None and finite.shape[0] and float(np.abs(finite).max()) > most:
@@ -209,23 +218,32 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
             results += [(topic, role, FieldInfo(path, "number"), meaning, False) for path, meaning in joints]
             continue
         documented_fields = vendors.fields_of(topic.type_name)
-        magnitudes = signs_of({f.path for f in fields})
+        signs = _signs_of({f.path for f in fields})
+        no_values = {*signs.values(), *(signs if topic.encoding == "can" else ())}
         for info in fields:
             if info.kind != "number" or info.path.count("[]") > info.path.endswith("[]") or _is_setpoint(topic, info):
                 continue
-            if info.path in magnitudes:
+            if info.path in no_values:
                 continue
             if info.path in documented_fields:
                 results.append((topic, role, info, documented_fields[info.path].meaning, True))
             elif not documented_fields or info.path.count(".") or vendors.is_export(topic.type_name):
-                meaning = _meaning_by_names(topic, info)
+                meaning = _meaning_by_names(topic, info, {f.path for f in fields})
                 results += [] if meaning is None else [(topic, role, info, meaning, False)]
     return results
 
 
-def _meaning_by_names(topic: TopicInfo, info: FieldInfo) -> Meaning | None:
-    """Return what names give; the third element shows whether an array without a length has axes."""
-    paths = dict.fromkeys((info.path, info.path.replace("[]", "[2]")))
+def _meaning_by_names(topic: TopicInfo, info: FieldInfo, there: Collection[str]) -> Meaning | None:
+    """Return what names give, short ones beside others: g_x beside a_x is a gyro, r beside v_x and v_y a yaw rate.
+
+    The third element shows whether an array without a length has axes.
+    """
+    path = info.path
+    if (gyro := re.fullmatch(r"(.*(?:^|[._]))g([xyz])", path)) and f"{gyro[1]}a{gyro[2]}" in there:
+        path = f"{gyro[1]}gyro_{gyro[2]}"
+    if (rate := re.fullmatch(r"((?:.*\.)?)r", path)) and {f"{rate[1]}vx", f"{rate[1]}vy"} <= set(there):
+        path = f"{rate[1]}yaw_rate"
+    paths = dict.fromkeys((path, path.replace("[]", "[2]")))
     meanings = (meaning_of(topic.name, topic.type_name, path, info.unit) for path in paths)
     return next((meaning for meaning in meanings if meaning is not None), None)
 
@@ -233,6 +251,11 @@ def _meaning_by_names(topic: TopicInfo, info: FieldInfo) -> Meaning | None:
 def _is_setpoint(topic: TopicInfo, info: FieldInfo) -> bool:
     """Return whether a field is a command; ``REF_Speed`` of a topic ``reference`` is measured."""
     return is_command(info.path.removeprefix("REF_") if "reference" in topic.name.lower() else info.path)
+
+
+def _signs_of(paths: Collection[str]) -> dict[str, str]:
+    """Return the paths of signs by those of their magnitudes."""
+    return {m: path for path in paths if (m := _SIGN.sub("", path)) != path and m in paths}
 
 
 def look(
@@ -245,7 +268,8 @@ def look(
     named = sorted(named, key=lambda n: (not n[4], -n[3].strength))[:MOST_READ]
     requests: dict[str, list[str]] = {}
     for topic, _, info, _, _ in named:
-        requests.setdefault(topic.name, []).append(info.path.removesuffix("[]"))
+        sign = _signs_of({f.path for f in log.fields(topic.name, quiet=True)}).get(info.path)
+        requests.setdefault(topic.name, []).extend([info.path.removesuffix("[]"), *([sign] if sign else [])])
     for source in sources:
         if source.can_signal is None:
             paths = requests.setdefault(source.topic, [])
@@ -272,11 +296,16 @@ def _weighable(
             continue
         if role == "sensor" and set(words_of(name)) & _NAVIGATION:
             role = "navigation"
+        sign = _signs_of({f.path for f in fields}).get(name, "")
+        if sign:
+            of_sign = samples[topic.name, sign]
+            values, cells = (signed(getattr(seen, n), getattr(of_sign, n)) for n in ("values", "cells"))
+            seen = replace(seen, values=values, cells=cells)
         factors = _factors(its, seen)
         if its.quantity == "wheel speed" and not factors:  # too large for a speed: rotational
             its = replace(its, quantity="wheel rate")
             factors = _factors(its, seen)
-        item = Field(topic, name, its, role, stamp_of(fields, name), seen, factors)
+        item = Field(topic, name, its, role, stamp_of(fields, name), seen, factors, sign_path=sign)
         if _is_nested_imu(topic, fields, name):
             item.unit_known = True
             item.reasons.append("a nested sensor_msgs/Imu, in SI units")
@@ -285,10 +314,27 @@ def _weighable(
         elif its.scale is not None:
             item.unit_known = True
             item.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")
+        if _is_share(item, fields):
+            item.is_weak = True
+            item.doubts.append(
+                "a share of the largest steering angle, as throttle and brake beside it: it needs a scale"
+            )
         if item.is_downward and not documented:
             item.sign = -1.0
             item.reasons.append("positive downward by its name")
         yield item
+
+
+def _is_share(item: Field, fields: tuple[FieldInfo, ...]) -> bool:
+    """Return whether a steering in [-1, 1] is a control without a unit, as the pedals beside it."""
+    if item.meaning.quantity != "steering" or item.unit_known or item.seen.largest > 1.0:
+        return False
+    if {"angle", "ang"} & set(words_of(item.path)):
+        return False
+    struct = item.path.rpartition(".")[0]
+    return any(
+        _PEDALS & set(words_of(f.path.rpartition(".")[2])) for f in fields if f.path.rpartition(".")[0] == struct
+    )
 
 
 def _is_nested_imu(topic: TopicInfo, fields: tuple[FieldInfo, ...], path: str) -> bool:
@@ -334,8 +380,8 @@ def anchor_of(source: SignalSource, results: Sequence[Field]) -> Field | None:
 def _factors(meaning: Meaning, seen: Seen) -> tuple[tuple[str, float], ...]:
     """Return the units that a field can be in by its range; a unit in its name is the only one."""
     most = MOST.get(meaning.quantity)
-    if meaning.scale is not None:
-        return ((meaning.unit, meaning.scale),)
+    if meaning.scale is not None:  # beyond a car's range it is of another unit than its name gives
+        return () if most is not None and seen.largest * meaning.scale > most else ((meaning.unit, meaning.scale),)
     every = HYPOTHESES.get(meaning.quantity, ())
     largest = seen.largest
     return tuple(u for u in every if most is None or not largest * u[1] > most)

@@ -301,15 +301,26 @@ def _channel(
     return Channel(source.name, unit, source.label, clean.stamps_ns, clean.arrival_ns, clean.values)
 
 
+def signed(magnitude: FloatArray, sign: FloatArray) -> FloatArray:
+    """Return a magnitude [N] that is negative where its sign [N], in a field of its own, is 1."""
+    return np.where(sign > 0.5, -np.abs(magnitude), np.abs(magnitude))
+
+
 def si_values(topic: Columns, source: SignalSource) -> FloatArray:
     """Return ``scale * raw + offset`` of a source: [N], the sum or length of several fields, or [N, k] for a vector."""
-    parts = [np.asarray(topic.fields[p], dtype=np.float64) for p in source.paths]
+    return si_of(source, [np.asarray(topic.fields[p], dtype=np.float64) for p in source.paths])
+
+
+def si_of(source: SignalSource, parts: Sequence[FloatArray]) -> FloatArray:
+    """Return what :func:`si_values` does, of the raw values of the source's fields."""
     raw = parts[0] if len(parts) == 1 else np.stack(parts, axis=1)
     width = source.columns
     n = raw.shape[0]
     if width == 1 and len(parts) > 1 and raw.ndim == 2:
         # Summed one by one: a matrix product may round differently with the number of rows, and windows must join.
         scales = np.broadcast_to(np.asarray(source.scale), len(parts))
+        if source.combine == "signed":
+            return np.asarray(scales[0] * signed(raw[:, 0], raw[:, 1]) + source.offset, dtype=np.float64)
         if source.combine == "norm":
             squares = sum((s * raw[:, i]) ** 2 for i, s in enumerate(scales))
             return np.asarray(np.sqrt(squares) + source.offset, dtype=np.float64)

@@ -231,7 +231,7 @@ def _shape_problem(name: str, model: _SourceTable) -> str:
     columns = VECTOR_COLUMNS.get(name, 1)
     fields = model.field if isinstance(model.field, list) else [model.field]
     if model.combine != "sum" and (columns > 1 or len(fields) < 2):
-        what = {"norm": "length", "root": "root of the sum"}[model.combine]
+        what = {"norm": "length", "root": "root of the sum", "signed": "magnitude and sign"}[model.combine]
         return (
             f'combine = "{model.combine}" is the {what} of two or more fields, '
             f"{name} has {columns} columns of {len(fields)}"

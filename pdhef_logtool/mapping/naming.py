@@ -57,7 +57,8 @@ _SIDES = re.compile(r"(?<=[a-z_])(Fr|Re)([LR])(?![a-z])")
 _CORNER_AT_END = re.compile(
     r"(?<![A-Za-z])(?:[LR][FR]|[FR][LR])(?=[a-z]{2})|(?<=SPEED|speed)(?:[FR][LR]|[fr][lr])(?![A-Za-z])"
 )
-_CORNER_SPEED = re.compile(r"(?:ws|vw|w|v|n)(?=(?:fl|fr|rl|rr)$)")
+#: A wheel or an axis behind a word without a capital between: ``wsfl``, ``accx``.
+_CORNER_SPEED = re.compile(r"(?:ws|vw|w|v|n)(?=(?:fl|fr|rl|rr)$)|(?:acc|accel|gyro?|vel|speed)(?=[xyz]$)")
 
 
 def _unglued(piece: str) -> list[str]:
@@ -125,13 +126,15 @@ def unit_of(leaf: str, kind: str) -> tuple[str, float | None]:
     kind : of quantity, a key of ``UNITS``; units of other kinds are ignored (``g`` of a speed).
     """
     words = [w for w in re.split(r"[^a-z0-9]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", leaf).lower()) if w]
+    # Integers in thousandths (``acc_y_mps2_e3``).
+    power = 10.0 ** -sum(int(w[1:]) for w in words[1:] if re.fullmatch(r"e\d", w))
     text = re.sub(r"(?<=_)sec(?=2|_|$)", "s", "_".join(words).replace("_per_", "_"))
     for phrase, unit in _UNIT_PHRASES:
         if unit in UNITS[kind] and re.search(rf"(^|_){phrase}($|_)", text):
-            return unit, UNITS[kind][unit]
+            return unit, UNITS[kind][unit] * power
     for word in [*reversed(words), *reversed(words_of(leaf))]:
         if word in UNITS[kind] and (len(words) > 1 or len(word) > 2):
-            return word, UNITS[kind][word]
+            return word, UNITS[kind][word] * power
     return "", None
 
 
@@ -146,7 +149,9 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
     outer = (*words_of(topic), *words_of(type_name.rpartition("/")[2].rpartition(".")[2]))
     if not leaf_words or _WORDS["other_devices"] & set(outer):
         return None
-    if _WORDS["not_values"] & set(leaf_words) or _WORDS["not_values"] & set(inner) - {"state", "status", "orientation"}:
+    # A current before other words is the present one, a state before them the topic of an export.
+    own = {w for w in leaf_words[:-1] if w not in ("current", "state", "states", "status")} | {*leaf_words[-1:]}
+    if _WORDS["not_values"] & own or _WORDS["not_values"] & set(inner) - {"state", "status", "orientation"}:
         return None
     index = re.search(r"\[(\d+)\]$", leaf)
     column = None if index is None else int(index[1])

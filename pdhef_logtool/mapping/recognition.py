@@ -10,16 +10,15 @@ from typing import Literal
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
-from pdhef_logtool.logs.table_log import SIGNED, signs_of
 from pdhef_logtool.mapping.can_frames import CanSignalLog, decoded_frames, holds_frames
-from pdhef_logtool.mapping.candidates import Candidate, Role
+from pdhef_logtool.mapping.candidates import MOST, Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.clocks import with_usable_stamps
 from pdhef_logtool.mapping.gnss_signals import RAW_COURSE, gnss_signals, has_heading, receiver_signals
 from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, length_of, speed_over_ground
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
-from pdhef_logtool.mapping.naming import VOCABULARY, is_command
+from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command
 from pdhef_logtool.mapping.navigation import named_gnss, navigation_truth
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
@@ -39,6 +38,12 @@ OWN_PREFIX = "/pdhef/"
 
 PROBE_NS = 2_000_000_000
 PROBE_AT = (0.0, 0.25, 0.5, 0.75, 1.0)
+#: How near to 1 the mean acceleration is where it is in g.
+NEAR_1_G = 0.08
+#: Samples between the positions that give a course, and the least way between them.
+COURSE_SAMPLES, COURSE_M = 10, 0.3
+#: Mean of unit vectors of headings from which on they are of one direction.
+STRAIGHT = 0.95
 
 #: Types whose velocities are in the body frame by convention.
 BODY_TWIST_TYPES = frozenset({"nav_msgs/Odometry", "foxglove.Odometry"})
@@ -47,6 +52,7 @@ IMU_TYPES = frozenset({"sensor_msgs/Imu"})
 FIX_TYPES = frozenset({"sensor_msgs/NavSatFix", "foxglove.LocationFix"})
 #: What a type must have to be what its name gives; of an IMU any of them, of others all.
 _IMU_PATHS = ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z")
+_GRAVITY_PATHS = (*_IMU_PATHS[:2], "linear_acceleration.z")
 _TILT_RATE_PATHS = ("angular_velocity.x", "angular_velocity.y")
 
 
@@ -276,14 +282,10 @@ def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
 
 
 def _why_not_weighed(log: DriveLog, topics: list[tuple[TopicInfo, Role]]) -> Iterator[str]:
-    """Yield why names of fields are not enough: joints of changing order, magnitudes with their sign apart."""
+    """Yield why names of fields are not enough: joints of changing order."""
     for topic, role in topics:
         if is_joints(topic) and role != "command" and not joint_names(log, topic):
             yield f"{topic.name} is not used: the joints or their order differ between messages"
-        paths = {f.path for f in log.fields(topic.name, quiet=True)}
-        for path, sign in signs_of(paths).items():
-            if f"{path}{SIGNED}" not in paths and not is_command(path):
-                yield f"{topic.name}.{path} is not used: it is a magnitude, and {sign} contains its sign"
 
 
 def _map_documented_truth(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
@@ -361,7 +363,11 @@ def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
                 draft.take(draft.signals, name, topic.name, path)
             return
     for topic in topics:
-        if _role(topic) == "navigation" and not _is_well_known(topic) and (named := named_gnss(draft.log, topic)):
+        if (
+            _role(topic) in ("navigation", "sensor")
+            and not _is_well_known(topic)
+            and (named := named_gnss(draft.log, topic))
+        ):
             draft.signals |= named
             return
 
@@ -457,7 +463,7 @@ def _has_its_fields(log: DriveLog, topic: TopicInfo) -> bool:
     """Return whether a topic of a known type can be read as that type; a name alone promises nothing."""
     kind = _type(topic)
     needed = ["latitude", "longitude"] if kind in FIX_TYPES else []
-    needed += [table[kind] for table in (_FIELDS["steering"], _FIELDS["speed"]) if kind in table]
+    needed += [table[kind] for table in (_FIELDS["steering"], _FIELDS["speed"]) if kind in table][:1]
     either = list(_IMU_PATHS) if kind in IMU_TYPES else []
     either += [_twist(topic, "linear", "x")] if kind in TWIST_FIELDS else []
     either += [_join(_FIELDS["pose"][kind], "position.x")] if kind in _FIELDS["pose"] else []
@@ -508,7 +514,13 @@ def _probed_paths(topic: TopicInfo) -> list[str]:
     kind = _type(topic)
     paths: list[str] = []
     if kind in IMU_TYPES:
-        paths += [*_IMU_PATHS, *_TILT_RATE_PATHS, "linear_acceleration_covariance[0]", "angular_velocity_covariance[0]"]
+        paths += [
+            *_IMU_PATHS,
+            *_TILT_RATE_PATHS,
+            _GRAVITY_PATHS[2],
+            "linear_acceleration_covariance[0]",
+            "angular_velocity_covariance[0]",
+        ]
     if kind in TWIST_FIELDS:
         paths += [*(_twist(topic, "linear", axis) for axis in "xyz"), _twist(topic, "angular", "z")]
     if kind in _FIELDS["pose"]:
@@ -524,6 +536,7 @@ def _probed_paths(topic: TopicInfo) -> list[str]:
 
 def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
     imus = [t for t in topics if _type(t) in IMU_TYPES and not _words(t.name) & TRUTH_WORDS]
+    in_g = in_deg = False
     imu = draft.choose(
         "imu",
         imus,
@@ -535,17 +548,25 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
     if draft.is_disowned(imu.name, "linear_acceleration_covariance[0]"):
         draft.notes.append(f"{imu.name} provides no acceleration (covariance -1)")
     else:
-        for name, axis in (("ax_m_s2", "x"), ("ay_m_s2", "y")):
-            path = f"linear_acceleration.{axis}"
+        means = [_mean(draft.values(imu.name, path)) for path in _GRAVITY_PATHS]
+        in_g = abs(abs(means[2]) - 1.0) < NEAR_1_G and np.hypot(*means[:2]) < 3.0 * NEAR_1_G
+        if in_g:
+            fast = np.abs(draft.values(imu.name, "angular_velocity.z"))
+            in_deg = bool(np.isfinite(fast).any()) and float(np.nanquantile(fast, 0.995)) > MOST["rate"]
+            also = ", its rates in deg/s, as no car turns so fast in rad/s" if in_deg else ""
+            reason = f"its accelerations are in g, as gravity is 1{also}; its type's unit is m/s²"
+            draft.doubt("imu", (imu.name,), imu.name, reason)
+        for name, path in zip(("ax_m_s2", "ay_m_s2"), _GRAVITY_PATHS, strict=False):
             if draft.is_given(imu.name, path):
-                draft.take(draft.signals, name, imu.name, path)
+                draft.take(draft.signals, name, imu.name, path, G_M_S2 if in_g else 1.0)
     if draft.is_disowned(imu.name, "angular_velocity_covariance[0]"):
         draft.notes.append(f"{imu.name} provides no angular rate (covariance -1)")
     elif draft.is_given(imu.name, "angular_velocity.z"):
-        draft.take(draft.signals, "yaw_rate_rad_s", imu.name, "angular_velocity.z")
+        scale = float(np.radians(1.0)) if in_deg else 1.0
+        draft.take(draft.signals, "yaw_rate_rad_s", imu.name, "angular_velocity.z", scale)
         for name, axis in (("roll_rate_rad_s", "x"), ("pitch_rate_rad_s", "y")):
             if _span(draft.values(imu.name, f"angular_velocity.{axis}")) > 0.0:  # fillers are constant
-                draft.take(draft.signals, name, imu.name, f"angular_velocity.{axis}")
+                draft.take(draft.signals, name, imu.name, f"angular_velocity.{axis}", scale)
 
 
 def _map_steering(draft: _Draft, topics: list[TopicInfo]) -> None:
@@ -562,11 +583,14 @@ def _map_steering(draft: _Draft, topics: list[TopicInfo]) -> None:
 
 
 def _is_command(topic: TopicInfo) -> bool:
-    return _type(topic).startswith("ackermann_msgs/") or bool(_words(topic.name) & _TOPICS["command"])
+    words = _words(topic.name)
+    is_drive = _type(topic).startswith("ackermann_msgs/") and not words & _TOPICS["measured"]
+    return is_drive or bool(words & _TOPICS["command"])
 
 
 def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
-    reports = [t for t in topics if _type(t) in _FIELDS["speed"]]
+    reports = [t for t in topics if _type(t) in _FIELDS["speed"] and not _is_command(t)]
+    reports = [t for t in reports if has_path(draft.log.fields(t.name), _FIELDS["speed"][_type(t)])]
     twists = []
     for topic in topics:
         if _type(topic) not in TWIST_FIELDS or _is_truth(topic) or _words(topic.name) & _TOPICS["command"]:
@@ -618,6 +642,13 @@ def _truth_group(topic: TopicInfo) -> str:
 def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
     types = set(TWIST_FIELDS) | set(_FIELDS["pose"]) | FIX_TYPES
     candidates = [t for t in topics if _type(t) in types and (_is_truth(t) or _type(t) in FIX_TYPES)]
+    simulated = [t for t in topics if t not in candidates and _is_of_simulator(draft, t)]
+    if simulated and not any(_type(t) in TWIST_FIELDS for t in candidates):
+        candidates += simulated
+        names = ", ".join(t.name for t in simulated)
+        draft.notes.append(
+            f"{names} is taken as ground truth: its name is of a simulator, and it has a lateral velocity"
+        )
     groups = {_truth_group(t) for t in candidates}
     if len(groups) > 1:
         kept = [t for t in candidates if _truth_group(t) == prefer]
@@ -629,6 +660,13 @@ def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
             draft.doubt("ground-truth position", (topic.name,), None, _FIELDS["several_positions"][_type(topic)])
     velocity = _map_truth_velocity(draft, candidates)
     _map_truth_position(draft, candidates, velocity)
+
+
+def _is_of_simulator(draft: _Draft, topic: TopicInfo) -> bool:
+    """Return whether a topic is a simulator's odometry with a lateral velocity, which wheels do not give."""
+    if _type(topic) not in BODY_TWIST_TYPES or not _words(topic.name) & _TOPICS["simulators"]:
+        return False
+    return _span(draft.values(topic.name, _twist(topic, "linear", "y"))) > 0.0
 
 
 def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo | None:
@@ -643,6 +681,14 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
         return None
     forward = draft.values(chosen.name, _twist(chosen, "linear", "x"))
     left = draft.values(chosen.name, _twist(chosen, "linear", "y"))
+    if _is_over_ground(draft, chosen, forward, left):
+        draft.doubt(
+            "ground-truth velocity frame", (chosen.name,), chosen.name, "its twist has the direction of its path"
+        )
+        paths = tuple(_twist(chosen, "linear", a) for a in "xyz")
+        draft.take(draft.truth, "enu_velocity_m_s", chosen.name, paths)
+        draft.take(draft.truth, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
+        return chosen
     body = _looks_like_body_frame(forward, left)
     if _type(chosen) not in BODY_TWIST_TYPES and _words(chosen.name) & NAVIGATION_WORDS and body is not True:
         # Receivers publish their velocity in east, north, up under the same type.
@@ -671,6 +717,26 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
     return chosen
 
 
+def _is_over_ground(draft: _Draft, topic: TopicInfo, x: FloatArray, y: FloatArray) -> bool:
+    """Return whether a twist is in the axes of its pose, as some simulators publish it, and not in the body's."""
+    if not _has_pose(draft, topic):
+        return False
+    base = _FIELDS["pose"][_type(topic)]
+    places = np.stack([draft.values(topic.name, _join(base, f"position.{a}")) for a in "xy"])
+    w, z = (draft.values(topic.name, _join(base, f"orientation.{a}")) for a in "wz")
+    if places.shape[1] <= COURSE_SAMPLES or not w.shape == z.shape == x.shape == y.shape:
+        return False
+    way = places[:, COURSE_SAMPLES:] - places[:, :-COURSE_SAMPLES]
+    middle = slice(COURSE_SAMPLES // 2, -(COURSE_SAMPLES - COURSE_SAMPLES // 2))
+    twist = np.exp(1j * (np.arctan2(y, x)[middle] - np.arctan2(way[1], way[0])))
+    heading = 2.0 * np.arctan2(z, w)[middle]
+    if not abs(np.mean(np.exp(1j * heading))) < STRAIGHT:  # a way straight on does not show it
+        return False
+    moves = np.isfinite(twist) & (np.hypot(*way) > COURSE_M)
+    off_world, off_body = (np.abs(np.angle(t[moves])) for t in (twist, twist * np.exp(1j * heading)))
+    return bool(moves.sum() > COURSE_SAMPLES) and float(np.median(off_world)) < 0.1 < float(np.quantile(off_body, 0.8))
+
+
 def _looks_like_body_frame(forward: FloatArray, left: FloatArray) -> bool | None:
     """Return whether x is the direction of travel in most moving samples; None without motion."""
     with np.errstate(invalid="ignore"):
@@ -694,6 +760,11 @@ def _has_twist(draft: _Draft, topic: TopicInfo) -> bool:
         y = draft.values(topic.name, _join(_FIELDS["pose"][_type(topic)], "position.y"))
         return not (_span(x) > 1.0 or _span(y) > 1.0)
     return True
+
+
+def _mean(values: FloatArray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.mean(finite)) if finite.shape[0] else 0.0
 
 
 def _span(values: FloatArray) -> float:

@@ -15,7 +15,7 @@ VECTOR_COLUMNS: dict[str, int] = {"ecef_position_m": 3, "ecef_velocity_m_s": 3, 
 
 StampUnit: TypeAlias = Literal["ros", "s", "ms", "us", "ns"]
 Clock: TypeAlias = Literal["utc", "device"]
-Combine: TypeAlias = Literal["sum", "norm", "root"]
+Combine: TypeAlias = Literal["sum", "norm", "root", "signed"]
 
 #: Encoding of a frame's bytes in a message: numbers, or a text of digits.
 CanDataEncoding: TypeAlias = Literal["bytes", "hex", "base64"]
@@ -36,7 +36,8 @@ class SignalSource:
 
     A scalar signal of several fields is their sum, each times its own scale: a component of a sensor that is mounted
     askew. With ``combine`` ``norm`` it is the length of their vector, a speed of its components; with ``root`` the root
-    of their sum, a standard deviation of variances.
+    of their sum, a standard deviation of variances; with ``signed`` the first is a magnitude, negative where
+    the second, its sign, is 1.
 
     Attributes
     ----------

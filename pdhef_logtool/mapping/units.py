@@ -114,10 +114,20 @@ def _speeds(fields: Fields) -> None:
         if item.unit_known or item.fixed:
             continue
         for ax in fields.all("acceleration", "x"):
-            relation = fit(fields.pieces.smooth(ax.si), fields.pieces.rate_of(item.seen.cells))
-            if relation is not None and relation.correlation > CLEAR:
-                fields.settle(item, relation.slope, "its rate of change against a_x", 0.25)
+            relation = fit(fields.pieces.smooth(ax.seen.cells), fields.pieces.rate_of(item.seen.cells))
+            if relation is not None and abs(relation.correlation) > CLEAR:
+                _both_by_speeding_up(ax, item, abs(relation.slope))
                 break
+
+
+def _both_by_speeding_up(ax: Field, speed: Field, slope: float) -> None:
+    """Take the units of a_x and of a speed by a_x ≈ v̇ (``slope`` of the raw values), where one combination gives it."""
+    units = itertools.product(ax.factors[:1] if ax.unit_known or ax.fixed else ax.factors, speed.factors)
+    near = [(a[0], v[0]) for a, v in units if abs(slope * a[1] / v[1] - 1.0) < 0.25]
+    for item, unit in zip((ax, speed), near[0], strict=True) if len(near) == 1 else ():
+        if not (item.unit_known or item.fixed):
+            item.use(unit)
+            item.reasons.append(f"unit {unit} by a_x ≈ v̇")
 
 
 def _by_turning(fields: Fields) -> None:

@@ -134,6 +134,8 @@ def _is_wanted(
         return not {"ax_m_s2", "ay_m_s2"} <= set(signals)
     if quantity in ("latitude", "longitude") and not {"lat_deg", "x_m"} & set(truth):  # show the path
         return True
+    if quantity == "rate" and part in ("x", "y"):  # a device's axes are not the car's
+        return "yaw_rate_rad_s" not in signals
     names = names_of(quantity, part)
     steered = {"steer_rad", "steering_wheel_rad"} & set(signals)
     open_ = any(n not in signals and not (n.startswith("steer") and steered) for n in names)
@@ -158,8 +160,11 @@ class _Weighing:
 
     def choose_signals(self, have: set[str]) -> None:
         """Take the best candidate of each signal that is missing."""
+        self._drop_vectors_over_ground()
         usable = [f for f in self.fields.candidates if f.role in ("sensor", "navigation", "device")]
         usable = [f for f in usable if (f.seen.changes or f.fixed) and f.section != "truth"]
+        shares = [f for f in usable if f.meaning.quantity == "steering" and f.is_weak]
+        self.notes += [f"{f.topic.name}.{f.path} is not used: {f.doubts[-1]}" for f in shares]
         elsewhere = {f.meaning.quantity for f in usable if f.topic.name != self.truth_from}
         for item in usable:
             # Sensors of the message with ground truth are taken only if no other message has them.
@@ -169,14 +174,31 @@ class _Weighing:
             if name not in have and not (wheels and quantity == "speed"):
                 self._take(name, [f for f in usable if f.meaning.quantity == quantity and f.meaning.part in part])
         self._one_imu()
+        self._turn_about()
         if not wheels:
             self._wheels(usable)
         if not have & {"steer_rad", "steering_wheel_rad"}:
-            self._steering([f for f in usable if f.meaning.quantity == "steering"])
+            self._steering([f for f in usable if f.meaning.quantity == "steering" and f not in shares])
         self._rate_by_track()
         self._follow()
         for name, item in self.taken.items():
             self._tell(name, item)
+
+    def _drop_vectors_over_ground(self) -> None:
+        """Leave out velocities x, y that are not the body's: x is not where the car goes, or they turn with it."""
+        pieces, rate = self.fields.pieces, next(iter(self.fields.open("rate", "z")), None)
+        for y in [f for f in self.fields.candidates if f.meaning.quantity == "velocity" and f.is_axis and not f.fixed]:
+            beside = (f for f in self.fields.candidates if f.meaning.quantity == "speed" and triad_of(f) == triad_of(y))
+            x = next((f for f in beside if f.meaning.part == "x"), None)
+            if x is None or not (x.seen.changes and y.seen.changes):
+                continue
+            moving = np.hypot(x.si, y.si) > SLOW_M_S
+            ahead = np.mean((x.si > np.abs(y.si))[moving]) if moving.any() else 1.0
+            angle = np.where(moving, np.arctan2(y.si, x.si), np.nan)
+            relation = None if rate is None else fit(np.sin(pieces.rate_of(angle)), pieces.smooth(rate.si))
+            if ahead < 0.6 or (relation is not None and abs(relation.correlation) > CLEAR):
+                self.fields.candidates = [f for f in self.fields.candidates if f is not x and f is not y]
+                self.notes.append(f"{x.topic.name}.{x.path} is not used: its vector is not in the car's axes")
 
     def note_unlabelled(self, topic: str, evidence: str) -> None:
         """Note that the fields of a topic are identified by values alone."""
@@ -254,6 +276,19 @@ class _Weighing:
                 same = [f for f in same if leaf_group(f) == leaf_group(rate) and f.score > self.taken[name].score - 0.2]
                 if same:
                     self.taken[name] = max(same, key=lambda f: f.score)
+
+    def _turn_about(self) -> None:
+        """Take the yaw rate about the axis that a_y ≈ v r shows, where a_y names the car's axis and it a device's."""
+        rate, ay, speed = self.taken.get("yaw_rate_rad_s"), self._chosen("ay_m_s2"), self._speed()
+        if rate is None or ay is None or speed is None or rate.fixed or not rate.is_axis or ay.is_axis:
+            return
+        rates = [f for f in self.fields.candidates if f.meaning.quantity == "rate" and _same_but_axis(f, rate)]
+        fits = [(abs(r.correlation), r.slope, f) for f in rates if (r := self.fields.turning(ay.si, f.si, speed.si))]
+        surest, slope, best = max(fits, key=lambda f: f[0], default=(0.0, 1.0, rate))
+        if best is not rate and surest > 0.9 and all(c < FOLLOWS for c, _, f in fits if f is rate):
+            best.sign = math.copysign(1.0, slope)
+            self.taken["yaw_rate_rad_s"] = best
+            self.notes.append(f"yaw_rate_rad_s is {best.path} of {best.topic.name}, with its sign: it follows a_y / v")
 
     def _wheels(self, usable: Sequence[Field]) -> None:
         wheels = _wheel_set(usable)
@@ -505,6 +540,12 @@ class _Weighing:
 def _has_open_sign(item: Field) -> bool:
     """Return whether neither documentation nor a name gives the sign of a field, and no mounting shows it."""
     return not (item.fixed or item.is_downward) and (item.meaning.quantity == "steering" or not item.is_axis)
+
+
+def _same_but_axis(first: Field, second: Field) -> bool:
+    """Return whether names of one topic differ in the letter of their axis alone."""
+    words = ([w for w in words_of(f.path) if w not in {*"xyz"}] for f in (first, second))
+    return first.topic.name == second.topic.name and next(words) == next(words)
 
 
 def _share_axis(first: Field, second: Field) -> bool:

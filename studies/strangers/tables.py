@@ -86,9 +86,9 @@ def _bare(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
     path.write_text(_text(clock, columns, ["Time", *columns], ","))
 
 
-def _plain(path: Path, stamps: IntArray, columns: dict[str, Any], separator: str = ",") -> None:
+def _plain(path: Path, _: IntArray, columns: dict[str, Any], separator: str = ",") -> None:
     """Write the columns as they are; one of them is the time."""
-    rows = (separator.join(f"{v:.15g}" for v in row) for row in zip(*(v.tolist() for v in columns.values()), strict=True))
+    rows = (separator.join(f"{v:.15g}" for v in row) for row in np.stack(list(columns.values()), 1).tolist())
     path.write_text("\n".join([separator.join(columns), *rows, ""]), encoding="utf-8")
 
 

@@ -410,20 +410,24 @@ def test_a_table_in_long_form_has_a_column_for_each_signal(suffix: str, tmp_path
     np.testing.assert_allclose(read[f"{kind}_2"].fields["gnss"], 2.0 * TIME_S[::10])
 
 
-def test_a_magnitude_and_its_sign_are_a_signed_column(tmp_path: Path) -> None:
+def test_a_magnitude_and_its_sign_are_one_signal(tmp_path: Path) -> None:
     signed = np.sin(TIME_S)
     rows = [f"{t:.2f},{abs(v):.6f},{int(v < 0)},{int(v < 0)}" for t, v in zip(TIME_S, signed, strict=True)]
     path = tmp_path / "a.csv"
     path.write_text("\n".join(["time,ESP_Gierrate [rad/s],ESP_VZ_Gierrate,Other_sign", *rows, ""]))
+    source = inspect_log(path).mapping.signals["yaw_rate_rad_s"]
+    assert (source.field, source.combine) == (("ESP_Gierrate", "ESP_VZ_Gierrate"), "signed")
+
+
+@pytest.mark.parametrize("clock", ["millis", "sensorTimestamp_since1970(s)"])
+def test_a_clock_is_dates_before_times_since_a_start(clock: str, tmp_path: Path) -> None:
+    start = 1.7e9 if "1970" in clock else 0.0
+    factor = 1.0 if "1970" in clock else 1e3
+    rows = [f"{(start + t) * factor:.6f},{100.0 + t:.3f},{v:.4f}" for t, v in zip(TIME_S, SPEED, strict=True)]
+    path = tmp_path / "a.txt"
+    path.write_text("\n".join([f"{clock},gyroTimestamp_sinceReboot(s),speed (km/h)", *rows, ""]))
     with closing(open_log(path)) as log:
-        units = {f.path: f.unit for f in log.fields("csv")}
-        assert units == {
-            "ESP_Gierrate": "rad/s", "ESP_VZ_Gierrate": "", "Other_sign": "", "ESP_Gierrate_signed": "rad/s",
-        }  # fmt: skip
-        read = log.read({"csv": ["ESP_Gierrate", "ESP_Gierrate_signed"]})["csv"]
-    np.testing.assert_allclose(read.fields["ESP_Gierrate_signed"], signed, atol=1e-6)
-    np.testing.assert_allclose(read.fields["ESP_Gierrate"], np.abs(signed), atol=1e-6)
-    assert inspect_log(path).mapping.signals["yaw_rate_rad_s"].field == "ESP_Gierrate_signed"
+        assert log.start_ns == (RELATIVE_NS if start == 0.0 else round(start * 1e9))
 
 
 def test_named_data_of_a_recorder_take_their_name_unit_and_the_clock_beside_them(tmp_path: Path) -> None:

@@ -12,6 +12,8 @@ from fake_drive_log import FakeLog, FakeTopic
 
 from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.mapping import AutoMapping, auto_map, fit_clocks
+from pdhef_logtool.mapping.channels import si_of
+from pdhef_logtool.mapping.mapping_file import mapping_from_dict
 from pdhef_logtool.mapping.naming import meaning_of, unit_of, words_of
 from pdhef_logtool.mapping.vendors import load_vendors
 from pdhef_logtool.records.errors import MappingFileError
@@ -296,11 +298,56 @@ def test_a_magnitude_without_its_sign_is_said() -> None:
     assert "never negative" in checks["yaw_rate_rad_s.candidate"]
 
 
-def test_a_magnitude_whose_sign_is_in_another_field_is_not_taken() -> None:
-    bus = topic(steering_angle_deg=np.abs(RATE), steering_angle_deg_sign=1.0 * (RATE < 0.0))
-    auto = found(bus=bus, **SPEED)
+def test_a_magnitude_takes_its_sign_from_another_field() -> None:
+    bus = topic(steering_angle_deg=np.abs(STEER) / DEG, steering_angle_deg_sign=1.0 * (STEER < 0.0))
+    source = found(bus=bus, imu__data=topic(**imu_fields()), **SPEED).mapping.signals["steer_rad"]
+    assert source.field == ("steering_angle_deg", "steering_angle_deg_sign")
+    raw = [bus.fields[path] for path in source.paths]
+    np.testing.assert_allclose(si_of(source, raw), STEER, atol=1e-9)
+    tables = {
+        "signals": {"steer_rad": {"topic": "/bus", "field": [*source.paths], "scale": [DEG, 1.0], "combine": "signed"}}
+    }
+    assert mapping_from_dict(tables, where="m").signals["steer_rad"].combine == "signed"
+
+
+def test_a_steering_beside_pedals_is_a_share() -> None:
+    auto = found(controls=topic(steer=STEER / 0.5, throttle=0.3 + 0.0 * S), imu__data=topic(**imu_fields()), **SPEED)
     assert not {"steer_rad", "steering_wheel_rad"} & set(auto.mapping.signals)
-    assert any("steering_angle_deg_sign contains its sign" in note for note in auto.mapping.notes)
+    assert any(note.startswith("/controls.steer is not used: a share") for note in auto.mapping.notes)
+
+
+def test_a_velocity_in_the_axes_of_the_world_is_no_speed() -> None:
+    course = np.cumsum(RATE) * 0.01 + 0.3
+    world = {"velocity__linear__x": V * np.cos(course), "velocity__linear__y": V * np.sin(course)}
+    auto = found(car=topic(**world, **imu_fields()))
+    assert not {"vx_m_s", "vy_m_s"} & set(auto.mapping.truth)
+    assert auto.mapping.signals["speed_m_s"].combine == "norm"
+    assert any("not in the car's axes" in note for note in auto.mapping.notes)
+
+
+def test_thousandths_and_values_beyond_a_unit() -> None:
+    assert unit_of("acc_y_mps2_e3", "acceleration") == ("mps2", pytest.approx(1e-3))
+    assert "speed_m_s" not in found(car=topic(speed_mps=1000.0 * V)).mapping.signals
+
+
+def test_short_names_beside_others() -> None:
+    short = {"ax": AX, "ay": AY, "az": G + 0.0 * S, "gx": 0.01 * np.sin(S), "gy": 0.01 * np.cos(S), "gz": RATE}
+    assert taken(found(ins=topic(**short), **SPEED))["yaw_rate_rad_s"] == ("/ins.gz", 1.0)
+    state = {"vx": V, "vy": 0.01 * RATE, "r": RATE, "ax": AX, "ay": AY}
+    assert taken(found(state=topic(**state)))["yaw_rate_rad_s"] == ("/state.r", 1.0)
+
+
+def test_a_yaw_rate_about_another_axis_of_a_device() -> None:
+    rates = {"gyro_x": 0.01 * np.sin(S), "gyro_y": -RATE, "gyro_z": 0.01 * np.cos(S)}
+    auto = found(phone=topic(lateral_acc_mps2=AY, longitudinal_acc_mps2=AX, **rates), **SPEED)
+    assert taken(auto)["yaw_rate_rad_s"] == ("/phone.gyro_y", -1.0)
+
+
+@pytest.mark.parametrize("units", [(G, 1.0 / 3.6), (1.0, 1.0), (1.0, 0.44704)])
+def test_units_of_a_speed_and_an_acceleration_at_once(units: tuple[float, float]) -> None:
+    auto = found(car=topic(accx=2.0 * AX / units[0], speed=(V + np.cumsum(AX) * 0.01) / units[1]))
+    got = taken(auto)
+    assert (got["ax_m_s2"][1], got["speed_m_s"][1]) == pytest.approx(units, rel=1e-4)
 
 
 @pytest.mark.parametrize("speed", [True, False])

@@ -375,3 +375,37 @@ def test_real_drives_map_as_by_hand(shared_dir: Path, drive: str, reference: str
             n: (s.topic, s.field, s.stamp) for n, s in theirs.items() if n not in unmapped
         }
     log.close()
+
+
+def test_a_standard_imu_in_g_and_degrees() -> None:
+    wrong = imu(**{"linear_acceleration.x": 0.01 * np.sin(S), "linear_acceleration.y": 0.1 * np.sin(S)})
+    wrong.fields |= {"linear_acceleration.z": np.ones(N), "angular_velocity.z": 20.0 * np.sin(S)}
+    auto = found({"/imu": wrong})
+    assert auto.mapping.signals["ay_m_s2"].scale == 9.80665
+    assert auto.mapping.signals["yaw_rate_rad_s"].scale == pytest.approx(np.pi / 180.0)
+    assert any("in g" in str(a) and "deg/s" in str(a) for a in auto.ambiguities)
+
+
+def _circle(twist_angle: np.ndarray) -> FakeTopic:
+    """Return an odometry on a circle; ``twist_angle`` is the direction of its twist."""
+    out = odometry(10.0 * np.cos(twist_angle), 10.0 * np.sin(twist_angle))
+    out.fields |= {"pose.pose.position.x": 20.0 * np.sin(0.5 * S), "pose.pose.position.y": -20.0 * np.cos(0.5 * S)}
+    out.fields |= {"pose.pose.orientation.z": np.sin(0.25 * S), "pose.pose.orientation.w": np.cos(0.25 * S)}
+    return out
+
+
+def test_a_twist_in_the_axes_of_the_world_is_a_velocity_over_ground() -> None:
+    assert "enu_velocity_m_s" in found({"/ground_truth/odom": _circle(0.5 * S)}).mapping.truth
+    assert "vx_m_s" in found({"/ground_truth/odom": _circle(0.02 * np.sin(S))}).mapping.truth
+
+
+def test_a_simulators_odometry_with_a_lateral_velocity_is_ground_truth() -> None:
+    assert "vy_m_s" in found({"/carla/hero/odometry": _circle(0.02 * np.sin(S))}).mapping.truth
+    assert "vy_m_s" not in found({"/robot/odometry": _circle(0.02 * np.sin(S))}).mapping.truth
+
+
+def test_a_status_of_a_drive_is_measured() -> None:
+    status = topic("ackermann_msgs/msg/AckermannDriveStamped", drive__steering_angle=S, drive__speed=5 + S)
+    command = topic("ackermann_msgs/msg/AckermannDrive", "", steering_angle=S, speed=5 + S)
+    signals = found({"/drive": command, "/drive_status": status}).mapping.signals
+    assert {signals[n].topic for n in ("steer_rad", "speed_m_s")} == {"/drive_status"}

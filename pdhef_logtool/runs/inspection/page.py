@@ -19,6 +19,7 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 from pdhef_logtool.mapping.candidates import Candidate
+from pdhef_logtool.mapping.channels import si_of
 from pdhef_logtool.mapping.evidence import Pieces, Seen
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.printable import printable
@@ -141,22 +142,12 @@ def _alternative(candidate: Candidate, unit: str, samples: dict[tuple[str, str],
     parts = [samples[key] for path in source.paths if (key := (source.topic, path)) in samples]
     if len(parts) < len(source.paths):
         return
-    cells = _combined(source, [p.cells for p in parts])
+    cells = si_of(source, [p.cells for p in parts])
     low, high = float(np.nanmin(cells, initial=np.inf)), float(np.nanmax(cells, initial=-np.inf))
     figures = _figures(low, high, unit, parts[0].rate_hz, source)
     yield _Card(
         _label(source), f"{candidate.score:.2f}", _sketch(cells), figures, candidate.reason, candidate.doubt
     )  # fmt: skip
-
-
-def _combined(source: SignalSource, cells: Sequence[FloatArray]) -> FloatArray:
-    """Return a source in SI on the grid [M]: its value, the sum of its fields, or the length of its vector."""
-    scales = source.scale if isinstance(source.scale, tuple) else (source.scale,) * len(cells)
-    offset = source.offset if isinstance(source.offset, float) else 0.0
-    scaled = [s * c for s, c in zip(scales, cells, strict=True)]
-    if source.columns == 1 and source.combine == "sum":
-        return np.asarray(sum(scaled) + offset)
-    return np.asarray(np.sqrt(sum(np.square(c) for c in scaled)))
 
 
 def _unused(log: DriveLog, pieces: Pieces, used: set[tuple[str, str]]) -> tuple[list[tuple[str, list[_Card]]], int]:
