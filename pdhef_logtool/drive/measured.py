@@ -21,6 +21,7 @@ WHEEL_SPEEDS = "wheel_speeds"
 #: four, no wheel shows how fast the car was.
 SPIN_SHARE = 0.2
 
+_EAST_NORTH = ("gnss_velocity_east_m_s", "gnss_velocity_north_m_s")
 _TRUTH = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m")
 
 
@@ -133,12 +134,24 @@ def drive_columns(
         if "vy_m_s" in truth and "truth.vy_m_s" in channels:
             channels[CG_VY] = channels["truth.vy_m_s"]
         channels |= {f"truth.{n}": truth[n] for n in ("vy_m_s", "sideslip_rad", "ay_m_s2") if n in truth}
+    channels |= _over_ground(channels)
     columns = columns_on_grid(channels)
+    if set(_EAST_NORTH) <= set(columns):
+        columns["truth.course_rate_rad_s"] = direction_rate(*(columns[n] for n in _EAST_NORTH))
     if "truth.x_m" in columns and "truth.y_m" in columns:
         vx, vy = derivative(columns.pop("truth.x_m")), derivative(columns.pop("truth.y_m"))
         columns["truth.position_speed_m_s"] = np.hypot(vx, vy)
         columns["truth.course_rate_rad_s"] = direction_rate(vx, vy)
     return columns, _speed_of(columns)
+
+
+def _over_ground(channels: Mapping[str, Channel]) -> dict[str, Channel]:
+    """Return speed and course of a receiver as components, which do not jump at ±π."""
+    speed, course = (channels.get(n) for n in ("gnss_speed_m_s", "gnss_course_rad"))
+    if speed is None or course is None or not np.array_equal(speed.stamps_ns, course.stamps_ns):
+        return {}
+    sides = (np.cos(course.values), np.sin(course.values))
+    return {n: replace(speed, name=n, values=speed.values * s) for n, s in zip(_EAST_NORTH, sides, strict=True)}
 
 
 def _speed_of(columns: dict[str, FloatArray]) -> str | None:

@@ -335,7 +335,7 @@ def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relat
     moving = _moving(columns, speed)
     for name in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s"):
         if name in columns:
-            text = f"{name} against the turning of the ground-truth path"
+            text = f"{name} against the turning of the path over ground"
             yaw, gentle = columns[name], gentle_at(columns[name] * speed, moving)
             either = [
                 r

@@ -43,7 +43,7 @@ NEAR_1_G = 0.08
 #: Samples between the positions that give a course, and the least way between them.
 COURSE_SAMPLES, COURSE_M = 10, 0.3
 #: Mean of unit vectors of headings from which on they are of one direction.
-STRAIGHT = 0.95
+STRAIGHT = 0.995
 
 #: Types whose velocities are in the body frame by convention.
 BODY_TWIST_TYPES = frozenset({"nav_msgs/Odometry", "foxglove.Odometry"})
@@ -549,7 +549,7 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
         draft.notes.append(f"{imu.name} provides no acceleration (covariance -1)")
     else:
         means = [_mean(draft.values(imu.name, path)) for path in _GRAVITY_PATHS]
-        in_g = abs(abs(means[2]) - 1.0) < NEAR_1_G and np.hypot(*means[:2]) < 3.0 * NEAR_1_G
+        in_g = abs(abs(means[2]) - 1.0) < NEAR_1_G and np.hypot(*means[:2]) < 0.5 * abs(means[2])
         if in_g:
             fast = np.abs(draft.values(imu.name, "angular_velocity.z"))
             in_deg = bool(np.isfinite(fast).any()) and float(np.nanquantile(fast, 0.995)) > MOST["rate"]

@@ -115,8 +115,10 @@ def _speeds(fields: Fields) -> None:
             continue
         for ax in fields.all("acceleration", "x"):
             relation = fit(fields.pieces.smooth(ax.seen.cells), fields.pieces.rate_of(item.seen.cells))
-            if relation is not None and abs(relation.correlation) > CLEAR:
-                _both_by_speeding_up(ax, item, abs(relation.slope))
+            # With two open units a vector's x, which may be the world's, shows nothing.
+            is_vague = not (ax.unit_known or ax.fixed) and item.is_axis and item.meaning.part == "x"
+            if relation is not None and relation.correlation > CLEAR and not is_vague:
+                _both_by_speeding_up(ax, item, relation.slope)
                 break
 
 
