@@ -28,6 +28,7 @@ from studies.strangers.scoring import Score, look, score_log
 #: What layouts held out gave when they were run for the first time: those now held out, and those that were before.
 FIRST_RUNS = {
     "held_out": "held-out layouts were built last",
+    "repositories": "layouts of files and messages in public repositories were held out before",
     "phones": "layouts of phones, games, makers and plotting tools were held out before",
     "stacks": "layouts of public stacks and loggers were held out before",
     "exports": "layouts of exports and buses were held out before",

@@ -159,7 +159,7 @@ def test_forty_kinds_with_distinct_names_and_pages() -> None:
     own = [*mountings(), *layouts()]
     assert len({r.name for r in own}) == len(own)
     assert len({r.counted_as for r in own}) >= 40
-    assert len(last) == 10
+    assert len(last) == 13
     # A layout is documented by a page, or `what` describes its file or its types; a fault is one of a documented log.
     assert all(r.page.startswith("https://") or (r.page == "" and len(r.what) > 10) for r in own)
     assert sum(r.page != "" for r in own) >= 40
