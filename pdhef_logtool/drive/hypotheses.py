@@ -10,13 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
-from itertools import combinations, count
+from itertools import combinations
 
 import numpy as np
 
 from pdhef_logtool.mapping.naming import G_M_S2
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import FloatArray, IntArray
 
 DEGREE = float(np.pi / 180.0)
 #: Below this correlation a gain gives no information, and above it, it is between the two regressions. It must be so
@@ -101,17 +100,23 @@ class Relation:
         gain = abs(gain) if self.signless else gain
         return size > 0.0 and gain / size >= self.expected[0] and gain * size <= self.expected[1]
 
-    def energy(self, factor: float) -> float:
-        """Return the negative log likelihood of the blocks' gains after multiplying them with ``factor``."""
-        gains = np.array(self.blocks or (self.gain,)) * factor
+    def energies(self, factors: FloatArray) -> FloatArray:
+        """Return the negative log likelihoods [N] of the blocks' gains after multiplying them with each factor [N].
+
+        A factor that is NaN stands for another field: any gain is as likely.
+        """
+        gains = factors[:, None] * (self.blocks or (self.gain,))
         low, high = (math.log(max(e, 1e-12)) for e in self.expected)
         with np.errstate(divide="ignore"):
             size = np.log(np.abs(gains))
         room = -math.log(max(abs(self.correlation), 1e-3))  # between the two regressions
         # Blocks that differ show what changes: sliding, a frequency that tyres do not follow; a unit does not change.
         # A drive without blocks slides for all of it: they would differ by half of what the relation leaves.
-        unknown = 0.5 * math.sqrt(max(0.0, 1.0 - self.correlation**2))
-        apart = float(np.std(size)) if self.blocks and np.isfinite(size).all() else unknown
+        apart = (
+            float(np.std(np.log(np.abs(self.blocks))))
+            if self.blocks and all(self.blocks)
+            else (0.5 * math.sqrt(max(0.0, 1.0 - self.correlation**2)))
+        )
         beyond = np.maximum(np.maximum(low - room - size, size - high - room), 0.0)
         energy = 0.5 * (beyond / math.hypot(EDGE if self.decides_unit else WIDE_EDGE, apart)) ** 2
         if self.decides_unit:
@@ -119,7 +124,8 @@ class Relation:
             off = np.maximum(np.abs(size - middle) - room, 0.0)
             energy += 0.5 * (off / math.hypot(max((high - low) / 6.0, LEAST_WIDTH), apart)) ** 2
         energy = np.minimum(energy, MOST_ENERGY)
-        return float(np.mean(energy if self.signless else np.where(gains > 0.0, energy, MOST_ENERGY)))
+        mean = (energy if self.signless else np.where(gains > 0.0, energy, MOST_ENERGY)).mean(axis=1)
+        return np.where(np.isnan(factors), _ANY_GAIN, mean)
 
     @property
     def evidence(self) -> str:
@@ -191,23 +197,32 @@ def posterior(relations: Sequence[Relation], hypotheses: Sequence[Hypothesis]) -
     touched = {n for r in telling for n in r.powers}
     # With a signal that no relation is about, a mistake is another one of the same likelihood.
     useful = [h for h in hypotheses if h.is_about(touched)]
+    priors = np.array([*(h.energy for h in useful), 0.0])
+    # What each mistake, and at last none, multiplies each relation's gain with.
+    acts = np.ones((len(useful) + 1, len(telling)))
+    for name in touched:
+        factors = np.array([*(h.factors.get(name, 1.0) for h in useful), 1.0])
+        acts *= factors[:, None] ** [r.powers.get(name, 0) for r in telling]
+    looked_up = []
+    for relation, column in zip(telling, acts.T, strict=True):
+        single, index = np.unique(column, return_inverse=True)
+        table = relation.energies(np.outer(single, single).ravel()).reshape(len(single), len(single))
+        looked_up.append((table, index))
 
-    @cache
-    def of_relation(i: int, factor: float) -> float:
-        return _ANY_GAIN if math.isnan(factor) else telling[i].energy(factor)
+    def energies(first: IntArray, second: IntArray) -> FloatArray:
+        return priors[first] + priors[second] + sum(table[i[first], i[second]] for table, i in looked_up)
 
-    priors, acts = [h.energy for h in useful], [[h.acts_on(r) for r in telling] for h in useful]
-    none = [1.0] * len(telling)
-
-    def of_set(*chosen: int) -> float:
-        factors = map(math.prod, zip(none, *(acts[k] for k in chosen), strict=True))
-        return sum(priors[k] for k in chosen) + sum(map(of_relation, count(), factors))
-
-    alone = sorted((of_set(i), i) for i in range(len(useful)))
-    scored: dict[tuple[int, ...], float] = {(): of_set()}
-    scored |= {(i,): energy for energy, i in alone}
-    pairs = {(min(i, j), max(i, j)) for _, i in alone[:BEAM] for j in range(len(useful)) if j != i}
-    scored |= {(i, j): of_set(i, j) for i, j in pairs if useful[i].goes_with(useful[j])}
+    none, every = len(useful), np.arange(len(useful) + 1)
+    alone = energies(every, np.full_like(every, none))
+    scored: dict[tuple[int, ...], float] = {(): alone[none], **{(i,): alone[i] for i in range(none)}}
+    likeliest = np.argsort(alone[:none], kind="stable")[:BEAM].tolist()
+    pairs = [
+        pair
+        for pair in {(min(i, j), max(i, j)) for i in likeliest for j in range(none) if j != i}
+        if useful[pair[0]].goes_with(useful[pair[1]])
+    ]
+    if pairs:
+        scored |= zip(pairs, energies(*np.array(pairs).T).tolist(), strict=True)
     least = min(scored.values())
     weights = {k: math.exp(least - e) for k, e in scored.items() if e < least + 25.0}
     total = sum(weights.values())
