@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from pdhef_logtool.mapping.naming import G_M_S2
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 DEGREE = float(np.pi / 180.0)
 #: Below this correlation a gain gives no information, and above it, it is between the two regressions. It must be so
@@ -165,10 +165,6 @@ class Hypothesis:
         shared = len(self.factors.keys() & names)
         return shared == len(self.factors) or (self.kind == "open sign" and shared > 0)
 
-    def goes_with(self, other: Hypothesis) -> bool:
-        """Return whether both may be true: of different signals, and neither is a foreign factor."""
-        return not self.factors.keys() & other.factors.keys() and "foreign" not in (self.kind, other.kind)
-
     def acts_on(self, relation: Relation) -> float:
         """Return what undoing it multiplies the relation's gain with."""
         return math.prod(f ** relation.powers[n] for n, f in self.factors.items() if n in relation.powers)
@@ -214,20 +210,29 @@ def posterior(relations: Sequence[Relation], hypotheses: Sequence[Hypothesis]) -
 
     none, every = len(useful), np.arange(len(useful) + 1)
     alone = energies(every, np.full_like(every, none))
-    scored: dict[tuple[int, ...], float] = {(): alone[none], **{(i,): alone[i] for i in range(none)}}
-    likeliest = np.argsort(alone[:none], kind="stable")[:BEAM].tolist()
-    pairs = [
-        pair
-        for pair in {(min(i, j), max(i, j)) for i in likeliest for j in range(none) if j != i}
-        if useful[pair[0]].goes_with(useful[pair[1]])
-    ]
-    if pairs:
-        scored |= zip(pairs, energies(*np.array(pairs).T).tolist(), strict=True)
-    least = min(scored.values())
-    weights = {k: math.exp(least - e) for k, e in scored.items() if e < least + 25.0}
+    compatible, pairs = _compatible(useful), [np.empty((0, 2), dtype=np.int64)]
+    for i in np.argsort(alone[:none], kind="stable")[:BEAM]:
+        others = np.flatnonzero(compatible[i])
+        compatible[:, i] = False
+        pairs.append(np.stack([np.minimum(others, i), np.maximum(others, i)], axis=1))
+    paired = np.concatenate(pairs)
+    scored = np.concatenate([alone, energies(*paired.T)])
+    least = float(scored.min())
+    weights = {
+        () if k == none else (k,) if k < none else tuple(paired[k - none - 1].tolist()): math.exp(least - scored[k])
+        for k in np.flatnonzero(scored < least + 25.0).tolist()
+    }
     total = sum(weights.values())
     ordered = sorted(weights.items(), key=lambda x: (-x[1], x[0]))
     return Posterior(tuple((w / total, tuple(useful[i] for i in k)) for k, w in ordered))
+
+
+def _compatible(mistakes: Sequence[Hypothesis]) -> BoolArray:
+    """Return [N, N] which of them may both be true: of different signals, and neither is a foreign factor."""
+    names = sorted({n for h in mistakes for n in h.factors})
+    about = np.array([[n in h.factors for n in names] for h in mistakes], dtype=bool).reshape(len(mistakes), len(names))
+    common = np.array([h.kind != "foreign" for h in mistakes], dtype=bool)
+    return np.outer(common, common) & ~(about @ about.T)
 
 
 def known_hypotheses(
