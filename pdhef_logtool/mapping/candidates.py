@@ -24,7 +24,7 @@ from pdhef_logtool.mapping.joints import is_joints, joint_meanings
 from pdhef_logtool.mapping.naming import UNIT_TEXTS, UNITS, Meaning, is_command, meaning_of, words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
-from pdhef_logtool.records.signals import WHEELS, FloatArray
+from pdhef_logtool.records.signals import FloatArray
 
 #: What the names around a field make of it.
 Role: TypeAlias = Literal["sensor", "navigation", "truth", "estimate", "command", "device"]
@@ -191,21 +191,6 @@ class Field:
         return Candidate(section, source, round(self.score, 2), reason, "; ".join(doubts), taken)
 
 
-def names_of(quantity: str, part: str) -> tuple[str, ...]:
-    """Return the signals that a quantity may be."""
-    if quantity == "acceleration":
-        return {"x": ("ax_m_s2",), "y": ("ay_m_s2",)}.get(part, ())
-    if quantity == "rate":
-        return ("yaw_rate_rad_s",) if part == "z" else ()
-    if quantity == "steering":
-        return {"road": ("steer_rad",), "wheel": ("steering_wheel_rad",)}.get(part, ("steer_rad", "steering_wheel_rad"))
-    if quantity == "speed":
-        return ("speed_m_s",)
-    if quantity in ("wheel speed", "wheel rate") and part in WHEELS:
-        return (f"wheel_speed_{part}_{'m_s' if quantity == 'wheel speed' else 'rad_s'}",)
-    return ()
-
-
 def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendors: Vendors) -> list[Named]:
     """Return the fields whose name or documented type gives them a meaning; the last entry shows a documented one."""
     results = []
@@ -258,6 +243,11 @@ def _signs_of(paths: Collection[str]) -> dict[str, str]:
     return {m: path for path in paths if (m := _SIGN.sub("", path)) != path and m in paths}
 
 
+def _with_sign(magnitude: Seen, sign: Seen) -> Seen:
+    values, cells = signed(magnitude.values, sign.values), signed(magnitude.cells, sign.cells)
+    return replace(magnitude, values=values, cells=cells)
+
+
 def look(
     log: DriveLog, named: Sequence[Named], vendors: Vendors, sources: Sequence[SignalSource]
 ) -> tuple[Pieces, list[Field]]:
@@ -267,16 +257,24 @@ def look(
     """
     named = sorted(named, key=lambda n: (not n[4], -n[3].strength))[:MOST_READ]
     requests: dict[str, list[str]] = {}
+    signs: dict[tuple[str, str], str] = {}
     for topic, _, info, _, _ in named:
-        sign = _signs_of({f.path for f in log.fields(topic.name, quiet=True)}).get(info.path)
-        requests.setdefault(topic.name, []).extend([info.path.removesuffix("[]"), *([sign] if sign else [])])
+        requests.setdefault(topic.name, []).append(info.path.removesuffix("[]"))
+        if sign := _signs_of({f.path for f in log.fields(topic.name, quiet=True)}).get(info.path):
+            requests[topic.name].append(sign)
+            signs[topic.name, info.path] = sign
     for source in sources:
         if source.can_signal is None:
             paths = requests.setdefault(source.topic, [])
             paths += [p for p in source.paths if p not in paths]
     pieces = Pieces(log)
     samples = pieces.read(requests)
+    for (topic, path), sign in signs.items():
+        if (topic, path) in samples:
+            samples[topic, path] = _with_sign(samples[topic, path], samples[topic, sign])
     weighable = [item for entry in named for item in _weighable(log, entry, samples, vendors) if item.factors]
+    for item in weighable:
+        item.sign_path = signs.get((item.topic.name, item.path), "")
     return pieces, weighable + anchors_of(log, sources, samples)
 
 
@@ -296,16 +294,11 @@ def _weighable(
             continue
         if role == "sensor" and set(words_of(name)) & _NAVIGATION:
             role = "navigation"
-        sign = _signs_of({f.path for f in fields}).get(name, "")
-        if sign:
-            of_sign = samples[topic.name, sign]
-            values, cells = (signed(getattr(seen, n), getattr(of_sign, n)) for n in ("values", "cells"))
-            seen = replace(seen, values=values, cells=cells)
         factors = _factors(its, seen)
         if its.quantity == "wheel speed" and not factors:  # too large for a speed: rotational
             its = replace(its, quantity="wheel rate")
             factors = _factors(its, seen)
-        item = Field(topic, name, its, role, stamp_of(fields, name), seen, factors, sign_path=sign)
+        item = Field(topic, name, its, role, stamp_of(fields, name), seen, factors)
         if _is_nested_imu(topic, fields, name):
             item.unit_known = True
             item.reasons.append("a nested sensor_msgs/Imu, in SI units")
@@ -316,9 +309,7 @@ def _weighable(
             item.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")
         if _is_share(item, fields):
             item.is_weak = True
-            item.doubts.append(
-                "a share of the largest steering angle, as throttle and brake beside it: it needs a scale"
-            )
+            item.doubts.append("a share of the largest angle, as throttle and brake beside it: it needs a scale")
         if item.is_downward and not documented:
             item.sign = -1.0
             item.reasons.append("positive downward by its name")
@@ -327,14 +318,10 @@ def _weighable(
 
 def _is_share(item: Field, fields: tuple[FieldInfo, ...]) -> bool:
     """Return whether a steering in [-1, 1] is a control without a unit, as the pedals beside it."""
-    if item.meaning.quantity != "steering" or item.unit_known or item.seen.largest > 1.0:
-        return False
-    if {"angle", "ang"} & set(words_of(item.path)):
-        return False
+    is_open = item.meaning.quantity == "steering" and not item.unit_known and item.seen.largest <= 1.0
     struct = item.path.rpartition(".")[0]
-    return any(
-        _PEDALS & set(words_of(f.path.rpartition(".")[2])) for f in fields if f.path.rpartition(".")[0] == struct
-    )
+    beside = {w for f in fields if f.path.rpartition(".")[0] == struct for w in words_of(f.path.rpartition(".")[2])}
+    return is_open and bool(_PEDALS & beside) and not {"angle", "ang"} & set(words_of(item.path))
 
 
 def _is_nested_imu(topic: TopicInfo, fields: tuple[FieldInfo, ...], path: str) -> bool:

@@ -34,18 +34,13 @@ class Fields:
         every = [f for f in every if f.role not in ("command", "estimate", "truth") or f.anchor]
         return sorted((f for f in every if part is None or f.meaning.part == part), key=lambda f: -f.score)
 
-    def open(self, quantity: str, part: str) -> list[Field]:
+    def open(self, quantity: str, part: str | None = None) -> list[Field]:
         """Return those of a quantity and part that change."""
         return [f for f in self.all(quantity, part) if f.seen.changes]
 
     def best(self, quantity: str) -> Field | None:
         """Return the surest of a quantity that changes."""
-        return next((f for f in self.all(quantity) if f.seen.changes), None)
-
-    def agree(self, a: Field, b: Field) -> bool:
-        """Return whether two fields have the same values."""
-        relation = fit(a.si, b.si)
-        return relation is not None and relation.correlation > 0.97 and 0.9 < relation.slope < 1.1
+        return next(iter(self.open(quantity)), None)
 
     def wheel_mean(self) -> Field | None:
         """Return the wheel speeds' mean as a speed, where their unit is one of speed and known."""
@@ -77,6 +72,12 @@ class Fields:
         if len(near) == 1:
             item.use(near[0])
             item.reasons.append(f"unit {near[0]} by {by}")
+
+
+def agree(a: FloatArray, b: FloatArray) -> bool:
+    """Return whether two fields on the grid [M] have the same values."""
+    relation = fit(a, b)
+    return relation is not None and relation.correlation > 0.97 and 0.9 < relation.slope < 1.1
 
 
 def mean_of(columns: Sequence[FloatArray]) -> FloatArray:

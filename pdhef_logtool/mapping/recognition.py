@@ -537,12 +537,8 @@ def _probed_paths(topic: TopicInfo) -> list[str]:
 def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
     imus = [t for t in topics if _type(t) in IMU_TYPES and not _words(t.name) & TRUTH_WORDS]
     in_g = in_deg = False
-    imu = draft.choose(
-        "imu",
-        imus,
-        lambda t: (bool(_words(t.name) & _TOPICS["device"]),),
-        "an IMU of the vehicle is preferred to one of a camera or lidar",
-    )
+    why = "an IMU of the vehicle is preferred to one of a camera or lidar"
+    imu = draft.choose("imu", imus, lambda t: (bool(_words(t.name) & _TOPICS["device"]),), why)
     if imu is None:
         return
     if draft.is_disowned(imu.name, "linear_acceleration_covariance[0]"):
@@ -595,23 +591,16 @@ def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
     for topic in topics:
         if _type(topic) not in TWIST_FIELDS or _is_truth(topic) or _words(topic.name) & _TOPICS["command"]:
             continue
-        if _words(topic.name) & _TOPICS["estimate"]:
-            draft.doubt(
-                "speed",
-                (topic.name,),
-                None,
-                "its name is that of an estimate, which is neither a sensor nor ground truth",
-            )
-        elif _words(topic.name) & _TOPICS["vehicle"]:
+        words = _words(topic.name)
+        if words & _TOPICS["vehicle"] and not words & _TOPICS["estimate"]:
             twists.append(topic)
-        else:
-            draft.doubt("speed", (topic.name,), None, "its name is neither that of a speed sensor nor of ground truth")
-    chosen = draft.choose(
-        "speed",
-        [*reports, *twists],
-        lambda t: (_type(t) not in _FIELDS["speed"],),
-        "a velocity report is preferred to an odometry or a twist",
-    )
+            continue
+        neither = "that of a speed sensor nor of ground truth"
+        if words & _TOPICS["estimate"]:
+            neither = "a sensor's nor ground truth's, but an estimate's"
+        draft.doubt("speed", (topic.name,), None, f"its name is neither {neither}")
+    why = "a velocity report is preferred to an odometry or a twist"
+    chosen = draft.choose("speed", [*reports, *twists], lambda t: (_type(t) not in _FIELDS["speed"],), why)
     if chosen is None:
         return
     kind = _type(chosen)

@@ -9,7 +9,7 @@ import numpy as np
 
 from pdhef_logtool.mapping.candidates import LEAST_SCORE, Field, leaf_group, triad_of
 from pdhef_logtool.mapping.evidence import fit, ratio, spread
-from pdhef_logtool.mapping.fields import CLEAR, EXCITED_A_M_S2, Fields, mean_of
+from pdhef_logtool.mapping.fields import CLEAR, EXCITED_A_M_S2, Fields
 from pdhef_logtool.mapping.naming import G_M_S2
 from pdhef_logtool.mapping.path import path_speed
 from pdhef_logtool.records.checks import Check
@@ -29,13 +29,8 @@ _SECOND_CHOICE = ("raw", "uncomp", "delta", "error", "offset", "relative")
 
 def decide_units(fields: Fields) -> None:
     """Decide units that no name gives: gravity first, then one quantity against another."""
-    _by_gravity(fields)
-    _rank(fields)
-    _speeds(fields)
-    _by_turning(fields)
-    _by_wheel_rates(fields)
-    _by_speeding_up(fields)
-    _by_siblings(fields)
+    for decide in (_by_gravity, _rank, _speeds, _by_speeding_up, _by_turning, _by_speeding_up, _by_siblings):
+        decide(fields)
 
 
 def _by_gravity(fields: Fields) -> None:
@@ -69,24 +64,6 @@ def _say_mounting(fields: Fields, z: Field, gravity: FloatArray) -> None:
     fields.checks.append(Check("imu.mounting", "ay_m_s2", "undecided", evidence, remedy))
 
 
-def _by_wheel_rates(fields: Fields) -> None:
-    """Find the unit of a gyro where wheels turn in rad/s and their radius is not known: only one gives a wheel's."""
-    wheels = [f for f in fields.candidates if f.meaning.quantity == "wheel rate" and f.unit_known]
-    if not wheels:
-        return
-    turning = mean_of([f.si for f in wheels])
-    for rate in fields.open("rate", "z"):
-        for ay in fields.open("acceleration", "y")[:2]:
-            relation = fields.turning(ay.si, rate.seen.cells, turning)
-            if rate.unit_known or relation is None or abs(relation.correlation) < CLEAR:
-                continue
-            radii = {unit: abs(relation.slope) / factor for unit, factor in rate.factors}
-            near = [unit for unit, radius_m in radii.items() if RADII_M[0] < radius_m < RADII_M[1]]
-            if len(near) == 1:
-                rate.use(near[0])
-                rate.reasons.append(f"unit {near[0]} by a_y ≈ v r, with wheels of {radii[near[0]]:.2f} m")
-
-
 def _rank(fields: Fields) -> None:
     """Prefer fields of a message that has both accelerations and rates, and the sensor to its copies."""
     kinds: dict[tuple[str, str], set[str]] = {}
@@ -110,37 +87,42 @@ def _speeds(fields: Fields) -> None:
             fields.settle(item, times or 0.0, f"{reference.path} of {reference.topic.name}", 0.08)
         if path is not None:
             fields.settle(item, ratio(path, item.seen.cells, SLOWEST) or 0.0, "the positions' speed", 0.12)
-    for item in fields.all("speed"):
-        if item.unit_known or item.fixed:
+
+
+def _by_speeding_up(fields: Fields) -> None:
+    """Find the units of speeds and of a_x by a_x ≈ v̇, where one combination gives it."""
+    for speed, ax in itertools.product(fields.open("speed"), fields.open("acceleration", "x")):
+        factors = [f.factors[:1] if f.unit_known or f.fixed else f.factors for f in (ax, speed)]
+        # With two open units a vector's x, which may be the world's, shows nothing.
+        if len(factors[0]) > 1 < len(factors[1]) and speed.is_axis and speed.meaning.part == "x":
             continue
-        for ax in fields.all("acceleration", "x"):
-            relation = fit(fields.pieces.smooth(ax.seen.cells), fields.pieces.rate_of(item.seen.cells))
-            # With two open units a vector's x, which may be the world's, shows nothing.
-            is_vague = not (ax.unit_known or ax.fixed) and item.is_axis and item.meaning.part == "x"
-            if relation is not None and relation.correlation > CLEAR and not is_vague:
-                _both_by_speeding_up(ax, item, relation.slope)
-                break
-
-
-def _both_by_speeding_up(ax: Field, speed: Field, slope: float) -> None:
-    """Take the units of a_x and of a speed by a_x ≈ v̇ (``slope`` of the raw values), where one combination gives it."""
-    units = itertools.product(ax.factors[:1] if ax.unit_known or ax.fixed else ax.factors, speed.factors)
-    near = [(a[0], v[0]) for a, v in units if abs(slope * a[1] / v[1] - 1.0) < 0.25]
-    for item, unit in zip((ax, speed), near[0], strict=True) if len(near) == 1 else ():
-        if not (item.unit_known or item.fixed):
-            item.use(unit)
-            item.reasons.append(f"unit {unit} by a_x ≈ v̇")
+        change = fields.pieces.rate_of(speed.seen.cells)
+        relation = fit(fields.pieces.smooth(ax.seen.cells), change)
+        if (
+            relation is None
+            or relation.correlation < CLEAR
+            or not spread(change) * speed.factors[0][1] > EXCITED_A_M_S2
+        ):
+            continue
+        wide = 0.4 if len(factors[1]) == 1 else 0.25  # miles and kilometres are near to one another
+        near = [u for u in itertools.product(*factors) if abs(relation.slope * u[0][1] / u[1][1] - 1.0) < wide]
+        for item, (unit, _) in zip((ax, speed), near[0], strict=True) if len(near) == 1 else ():
+            if not (item.unit_known or item.fixed):
+                item.use(unit)
+                item.reasons.append(f"unit {unit} by a_x ≈ v̇")
 
 
 def _by_turning(fields: Fields) -> None:
     """Find units of a_y, yaw rate and speed by a_y ≈ v r, where one combination alone gives it."""
-    speed = fields.best("speed") or fields.wheel_mean()
+    speed, slopes = fields.best("speed") or fields.wheel_mean(), SLOPES
+    if speed is None:  # wheels that turn in rad/s are as good: the slope is their radius
+        speed, slopes = fields.wheel_turns(), RADII_M
     if speed is None:
         return
     for rate in fields.open("rate", "z")[:4]:
         for ay in fields.open("acceleration", "y")[:4]:
             trio = (ay, rate, speed)
-            units = () if all(f.unit_known for f in trio) else _units_of_turning(fields, trio)
+            units = () if all(f.unit_known for f in trio) else _units_of_turning(fields, trio, slopes)
             for item, unit in zip(trio, units, strict=False):
                 if not item.unit_known and not item.fixed:
                     item.use(unit)
@@ -148,28 +130,15 @@ def _by_turning(fields: Fields) -> None:
                     item.bonus += 0.3 if item.score < LEAST_SCORE else 0.0
 
 
-def _units_of_turning(fields: Fields, trio: tuple[Field, Field, Field]) -> tuple[str, ...]:
-    """Return the units of a_y, yaw rate and speed with a slope near 1; empty where several combinations have one."""
+def _units_of_turning(fields: Fields, trio: tuple[Field, Field, Field], slopes: tuple[float, float]) -> tuple[str, ...]:
+    """Return the units of a_y, yaw rate and speed with such a slope; empty where several combinations have one."""
     fits = []
     for units in itertools.product(*(f.factors[:1] if f.unit_known or f.fixed else f.factors for f in trio)):
         relation = fields.turning(*(f.seen.cells * factor for f, (_, factor) in zip(trio, units, strict=True)))
-        if relation is not None and abs(relation.correlation) > CLEAR and SLOPES[0] < abs(relation.slope) < SLOPES[1]:
+        if relation is not None and abs(relation.correlation) > CLEAR and slopes[0] < abs(relation.slope) < slopes[1]:
             fits.append(units)
     # Combinations that differ in the unit of a_y alone: the first is by convention.
     return tuple(unit for unit, _ in fits[0]) if fits and all(f[1:] == fits[0][1:] for f in fits) else ()
-
-
-def _by_speeding_up(fields: Fields) -> None:
-    speed = fields.best("speed")
-    if speed is None or not (speed.unit_known or speed.fixed):
-        return
-    change = fields.pieces.rate_of(speed.si)
-    for item in fields.open("acceleration", "x"):
-        if item.unit_known or item.fixed or not spread(change) > EXCITED_A_M_S2:
-            continue
-        relation = fit(change, fields.pieces.smooth(item.seen.cells))
-        if relation is not None and abs(relation.correlation) > CLEAR:
-            fields.settle(item, abs(relation.slope), "the speed's rate of change", 0.4)
 
 
 def _by_siblings(fields: Fields) -> None:

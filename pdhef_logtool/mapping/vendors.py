@@ -17,7 +17,7 @@ from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.naming import Meaning
 from pdhef_logtool.mapping.records import VECTOR_COLUMNS, SignalSource
 from pdhef_logtool.records.errors import MappingFileError
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, WHEELS
 from pdhef_logtool.storage.documents import checked, read_toml
 
 #: Names a file like ``vendors.toml`` whose entries come before those that are shipped.
@@ -30,6 +30,8 @@ _QUANTITIES = {
     "vx_m_s": ("speed", "x"), "vy_m_s": ("velocity", "y"), "sideslip_rad": ("sideslip", ""),
     "lat_deg": ("latitude", ""), "lon_deg": ("longitude", ""), "course_rad": ("course", ""), "yaw_rad": ("heading", ""),
     "x_m": ("position", "x"), "y_m": ("position", "y"),
+    **{f"wheel_speed_{w}_m_s": ("wheel speed", w) for w in WHEELS},
+    **{f"wheel_speed_{w}_rad_s": ("wheel rate", w) for w in WHEELS},
 }  # fmt: skip
 
 
@@ -98,11 +100,13 @@ class VendorField:
 
 def meaning_of_signal(name: str) -> Meaning:
     """Return the meaning of a signal or ground-truth quantity."""
-    quantity, part = _QUANTITIES.get(name, ("", ""))
-    if name.startswith("wheel_speed_"):
-        quantity = "wheel rate" if name.endswith("rad_s") else "wheel speed"
-        part = name.removeprefix("wheel_speed_")[:2]
-    return Meaning(quantity, part, 1.0, "", 1.0, "its type is documented")
+    return Meaning(*_QUANTITIES.get(name, ("", "")), 1.0, "", 1.0, "its type is documented")
+
+
+def names_of(quantity: str, part: str, among: Iterable[str] = SIGNAL_UNITS) -> tuple[str, ...]:
+    """Return the signals, or those of ``among``, that a quantity may be."""
+    parts = (part,) if part else {"speed": ("x",), "steering": ("road", "wheel")}.get(quantity, ("",))
+    return tuple(n for n in among if any(_QUANTITIES.get(n) == (quantity, p) for p in parts))
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,22 +23,22 @@ from pdhef_logtool.mapping.candidates import (
     leaf_group,
     look,
     named_fields,
-    names_of,
     triad_of,
 )
 from pdhef_logtool.mapping.checking import has_path
 from pdhef_logtool.mapping.evidence import Fit, fit, is_of_both_signs, is_of_one_sign, ratio, spread
-from pdhef_logtool.mapping.fields import CLEAR, Fields, mean_of
+from pdhef_logtool.mapping.fields import CLEAR, Fields, agree, mean_of
 from pdhef_logtool.mapping.gnss_signals import has_heading
 from pdhef_logtool.mapping.naming import words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.units import RADII_M, decide_units
 from pdhef_logtool.mapping.unlabelled_fields import identified, needs_unlabelled, unlabelled_columns
-from pdhef_logtool.mapping.vendors import Vendors
+from pdhef_logtool.mapping.vendors import Vendors, names_of
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, FloatArray
 
-#: Ground truth quantities that show the path.
+#: Ground truth that fields give one by one, and what shows the path.
+_TRUTH = ("vx_m_s", "vy_m_s", "sideslip_rad", "yaw_rate_rad_s", "lat_deg", "lon_deg", "course_rad", "yaw_rad")
 _POSITIONS = ("lat_deg", "lon_deg", "x_m", "y_m")
 _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
 #: Words of a forward velocity that a lateral one is beside.
@@ -163,8 +163,6 @@ class _Weighing:
         self._drop_vectors_over_ground()
         usable = [f for f in self.fields.candidates if f.role in ("sensor", "navigation", "device")]
         usable = [f for f in usable if (f.seen.changes or f.fixed) and f.section != "truth"]
-        shares = [f for f in usable if f.meaning.quantity == "steering" and f.is_weak]
-        self.notes += [f"{f.topic.name}.{f.path} is not used: {f.doubts[-1]}" for f in shares]
         elsewhere = {f.meaning.quantity for f in usable if f.topic.name != self.truth_from}
         for item in usable:
             # Sensors of the message with ground truth are taken only if no other message has them.
@@ -178,7 +176,7 @@ class _Weighing:
         if not wheels:
             self._wheels(usable)
         if not have & {"steer_rad", "steering_wheel_rad"}:
-            self._steering([f for f in usable if f.meaning.quantity == "steering" and f not in shares])
+            self._steering([f for f in usable if f.meaning.quantity == "steering"])
         self._rate_by_track()
         self._follow()
         for name, item in self.taken.items():
@@ -196,7 +194,10 @@ class _Weighing:
             ahead = np.mean((x.si > np.abs(y.si))[moving]) if moving.any() else 1.0
             angle = np.where(moving, np.arctan2(y.si, x.si), np.nan)
             relation = None if rate is None else fit(np.sin(pieces.rate_of(angle)), pieces.smooth(rate.si))
-            if ahead < 0.6 or (relation is not None and abs(relation.correlation) > CLEAR):
+            turns = relation is not None and abs(relation.correlation) > CLEAR
+            speeds = [f.si for f in self.fields.open("speed") if f is not x]
+            is_length = any(agree(v, np.hypot(x.si, y.si)) and not agree(v, x.si) for v in speeds)
+            if ahead < 0.6 or turns or is_length:
                 self.fields.candidates = [f for f in self.fields.candidates if f is not x and f is not y]
                 self.notes.append(f"{x.topic.name}.{x.path} is not used: its vector is not in the car's axes")
 
@@ -218,7 +219,7 @@ class _Weighing:
         best = good[0]
         if best.meaning.strength < 0.6:
             best.doubts.append("its element of the array is identified by values alone")
-        near = [f for f in good[1:] if f.score > best.score - 0.1 and not self.fields.agree(best, f)]
+        near = [f for f in good[1:] if f.score > best.score - 0.1 and not agree(best.si, f.si)]
         if near:
             best = self._better([best, *near])
         self._choose(name, best, [f for f in (good[0], *near) if f is not best])
@@ -342,6 +343,9 @@ class _Weighing:
         curvature = _curvature(speed, rate, ay)
         judged: list[tuple[float, str, Field]] = []
         for item in candidates:
+            if item.is_weak:
+                self.notes.append(f"{item.topic.name}.{item.path} is not used: {item.doubts[-1]}")
+                continue
             relation = None
             if curvature is not None:
                 relation = fit(self.fields.pieces.smooth(item.seen.cells), self.fields.pieces.smooth(curvature))
@@ -356,7 +360,7 @@ class _Weighing:
         judged.sort(key=lambda j: (-j[0], -j[2].topic.messages, j[2].topic.name, j[2].path))
         _, name, best = judged[0]
         near = [f for score, n, f in judged[1:] if score > judged[0][0] - 0.1 and n == name]
-        self._choose(name, best, [f for f in near if not self.fields.agree(best, f)])
+        self._choose(name, best, [f for f in near if not agree(best.si, f.si)])
 
     def _steering_kind(self, item: Field, relation: Fit | None) -> tuple[str, bool | None]:
         """Return the signal that a steering angle is, and whether it follows the car's turning (None: unknown)."""
@@ -463,8 +467,7 @@ class _Weighing:
         documented, named = _truth_of([f for f in its if f.fixed]), _truth_of(its)
         # Documented fields before names, unless names alone give a sideslip: channels of modules beside a receiver.
         self.truth = named if not documented or _SLIP & set(named) - set(documented) else documented
-        if not self.truth or self._is_of_another_frame(its):
-            self.truth = {}
+        if not self.truth:
             return
         first = its[0]
         if first.role == "sensor" and self.truth.get("yaw_rate_rad_s") is self.taken.get("yaw_rate_rad_s"):
@@ -482,14 +485,6 @@ class _Weighing:
         self.notes.append(f"ground truth is taken from {first.topic.name}, by the names of its fields")
         for name, item in self.truth.items():
             self._tell(f"truth.{name}", item)
-
-    def _is_of_another_frame(self, its: Sequence[Field]) -> bool:
-        """Return whether the x beside a lateral velocity's y is not the speed: the vector is not one of the body."""
-        across, along = self.truth.get("vy_m_s"), self.truth.get("vx_m_s")
-        if across is None or along is None or across.fixed:
-            return False
-        beside = [f for f in its if f.meaning.quantity == "speed" and triad_of(f) == triad_of(across)]
-        return any(f is not along and not self.fields.agree(f, along) for f in beside)
 
     def _truth_turns(self) -> bool:
         """Return whether the yaw rate of the ground truth is the sensor's, up to its sign."""
@@ -666,16 +661,6 @@ def _wheel_unit(
 
 
 def _truth_name(item: Field) -> str:
-    kind, part = item.meaning.quantity, item.meaning.part
-    names = {
-        ("speed", "x"): "vx_m_s",
-        ("speed", ""): "vx_m_s",
-        ("velocity", "y"): "vy_m_s",
-        ("sideslip", ""): "sideslip_rad",
-        ("rate", "z"): "yaw_rate_rad_s",
-        ("latitude", ""): "lat_deg",
-        ("longitude", ""): "lon_deg",
-    }
-    if kind in ("course", "heading"):
-        return {"course": "course_rad", "heading": "yaw_rad"}[kind] if item.fixed else ""
-    return names.get((kind, part), "")
+    if item.meaning.quantity in ("course", "heading") and not item.fixed:
+        return ""
+    return next(iter(names_of(item.meaning.quantity, item.meaning.part, _TRUTH)), "")
