@@ -112,6 +112,10 @@ def mistaken(mapping: Mapping, subject: str, kind: str) -> Mapping | None:
     return replace(mapping, signals=signals, truth=truth, origin="file")
 
 
+def _decided(names: Iterable[str]) -> set[str]:
+    return {f"{n}.{aspect}" for n in names for aspect in ("sign", "unit", "axis")}
+
+
 def verdict(checks: Sequence[Check], members: Sequence[str], subject: str, kind: str, scale: float) -> str:
     """Return what checks state of a mistake, as in the module."""
     related = set(members) | ({"truth.sideslip_rad"} if subject == "truth.vy_m_s" else set())
@@ -128,7 +132,7 @@ def verdict(checks: Sequence[Check], members: Sequence[str], subject: str, kind:
     others = {c.subject for c in checks if c.verdict == "failed" and c.subject not in related}
     if others:
         return "other"
-    decided = [c for c in mine if c.name.endswith((".sign", ".unit", ".axis"))]
+    decided = [c for c in mine if c.name in _decided(related)]
     return "open" if not decided or any(c.verdict == "undecided" for c in decided) else "silent"
 
 
@@ -163,7 +167,7 @@ def _outcome(
     stated = verdict(checks, members, subject, kind, scale if isinstance(scale, float | int) else 1.0)
     if stated == "open":
         aspect = kind if kind == "sign" else "unit"
-        doubts = [c.remedy for c in checks if c.subject in members and c.verdict == "undecided"]
+        doubts = [c.remedy for c in checks if c.verdict == "undecided" and c.name in _decided(members)]
         is_shown = any(f"{m}.{aspect}" in passed for m in members)
         stated = "open" if is_shown or not all(d.startswith("needs ") for d in doubts) else "not checkable"
     shown = tuple(c for c in checks if c.verdict != "passed")
@@ -188,7 +192,7 @@ def drawn_drives(count: int, seed: int, limit_s: float, path: Path, longest_s: f
             return
         name = sorted(MANOEUVRES)[i % len(MANOEUVRES)]
         manoeuvre, drawn = MANOEUVRES[name], int(rng.integers(1, 2**31))
-        car = f"{CLASSES[i // len(MANOEUVRES) % len(CLASSES)]}~{drawn}"
+        car = f"{CLASSES[(i + i // len(MANOEUVRES)) % len(CLASSES)]}~{drawn}"
         speed, friction = manoeuvre.speed_km_h * rng.uniform(*SPEED_FACTORS), float(rng.uniform(*FRICTIONS))
         shorter_s = longest_s if (manoeuvre.duration_s or 0.0) > longest_s else None
         try:

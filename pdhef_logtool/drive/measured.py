@@ -14,6 +14,7 @@ from pdhef_logtool.drive.relations import CG_VY, direction_rate, measured_relati
 from pdhef_logtool.drive.truth import TruthTrack, channel_of
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
+from pdhef_logtool.records.tracks import StateTrack
 
 #: Name of the column that is the mean of the wheel speeds.
 WHEEL_SPEEDS = "wheel_speeds"
@@ -107,7 +108,8 @@ def measure(
     ----------
     derived : ground truth at the CG. vehicle : the default car states nothing. mapping : of the channels, if known.
     """
-    columns, speed_name = drive_columns(signals, truth or {}, derived)
+    place = 0.0 if vehicle is None else vehicle.truth_position_m[0]
+    columns, speed_name = drive_columns(signals, truth or {}, derived, place)
     topics = {n: c.source.split(".")[0] for n, c in signals.items()}
     scales: dict[str, float | tuple[float, ...]] = {}
     if mapping is not None:
@@ -122,9 +124,12 @@ def measure(
 
 
 def drive_columns(
-    signals: Mapping[str, Channel], truth: Mapping[str, Channel], derived: TruthTrack | None
+    signals: Mapping[str, Channel], truth: Mapping[str, Channel], derived: TruthTrack | None, truth_x_m: float = 0.0
 ) -> tuple[dict[str, FloatArray], str | None]:
-    """Return signals and ground truth on one grid, and the name of the column used as the speed."""
+    """Return signals and ground truth on one grid, and the name of the column used as the speed.
+
+    ``truth_x_m``: how far ahead of the CG ground truth is measured.
+    """
     channels = {n: c for n, c in signals.items() if c.values.ndim == 1}
     if derived is not None:
         for name in _TRUTH:
@@ -133,12 +138,27 @@ def drive_columns(
         if "vy_m_s" in truth and "truth.vy_m_s" in channels:
             channels[CG_VY] = channels["truth.vy_m_s"]
         channels |= {f"truth.{n}": truth[n] for n in ("vy_m_s", "sideslip_rad", "ay_m_s2") if n in truth}
+        channels |= _pose_velocity(truth, derived.track, truth_x_m)
     columns = columns_on_grid(channels)
     if "truth.x_m" in columns and "truth.y_m" in columns:
         vx, vy = derivative(columns.pop("truth.x_m")), derivative(columns.pop("truth.y_m"))
         columns["truth.position_speed_m_s"] = np.hypot(vx, vy)
         columns["truth.course_rate_rad_s"] = direction_rate(vx, vy)
     return columns, _speed_of(columns)
+
+
+def _pose_velocity(truth: Mapping[str, Channel], track: StateTrack, x_m: float) -> dict[str, Channel]:
+    """Return the velocities ahead and to the left that positions and heading of one topic have; empty without them."""
+    topics = {truth[n].source.split(".")[0] for n in ("x_m", "y_m", "yaw_rad", "quat_wxyz") if n in truth}
+    known = np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
+    if len(topics) != 1 or not {"x_m", "y_m"} <= truth.keys() or np.count_nonzero(known) < 3:
+        return {}
+    stamps, yaw = track.stamps_ns[known], np.unwrap(track.yaw_rad[known])
+    times = (stamps - stamps[0]) * 1e-9
+    vx, vy, rate = (np.gradient(c, times) for c in (track.x_m[known], track.y_m[known], yaw))
+    ahead, left = np.cos(yaw) * vx + np.sin(yaw) * vy, np.cos(yaw) * vy - np.sin(yaw) * vx + x_m * rate
+    pairs = {"truth.pose_vx_m_s": ahead, "truth.pose_vy_m_s": left, "truth.heading_rate_rad_s": rate}
+    return {n: Channel(n, "", "pose", stamps, stamps, v) for n, v in pairs.items()}
 
 
 def _speed_of(columns: dict[str, FloatArray]) -> str | None:

@@ -22,8 +22,8 @@ FAILS, DOUBTED, CERTAIN, NAMED = 0.85, 0.005, 0.97, 0.05
 UNEXPLAINED = "no unit or sign explains it: the car may slide, a sensor may fail for a while, or the field is another"
 #: What the remedies of mistakes begin with that are certain or suspected.
 SUSPICIONS = ("perhaps ", "no single mistake explains it", UNEXPLAINED)
-_LACKS_WHEELBASE = "needs the wheelbase of a vehicle file, or speeds that only full-size vehicles reach"
-_LACKS_SIDESLIP = "needs sideslip that changes fast"
+_LACKS_WHEELBASE = "the wheelbase of a vehicle file, or speeds that only full-size vehicles reach"
+_LACKS_SIDESLIP = "sideslip that changes fast"
 #: What a drive lacks that shows the sign of a signal and not its unit.
 _LACKS_FOR_UNIT = {
     **dict.fromkeys(("steer_rad", "steering_wheel_rad"), _LACKS_WHEELBASE),
@@ -87,7 +87,9 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
         if wrong > FAILS:
             return checks
         words = " or ".join(dict.fromkeys(h.words + " is another field" * (h.kind == "field") for h in likely))
-        weak = f"needs {_LACKS.get(name, _BENDS)} to rule out that {words}"
+        are_signs = any(h.kind == "sign" for h in likely)
+        lacks = _LACKS.get(name, _BENDS) if are_signs or name not in _LACKS_FOR_UNIT else _LACKS_FOR_UNIT[name]
+        weak = f"needs {lacks} to rule out that {words}"
         return [replace(c, verdict="undecided", remedy=c.remedy if wrong > 0.5 else weak) for c in checks]
     factors = {r.text: math.prod(h.acts_on(r) for h in chosen) for r in relations}
     usable = [r for r in relations if not math.isnan(factors[r.text])]
@@ -101,14 +103,14 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
 
 def _passed(name: str, usable: Sequence[Relation], factors: dict[str, float]) -> list[Check]:
     best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
-    # Radii of wheels and wheelbases differ by more; a speed separates mph from km/h, tyres do not.
-    foreign = () if name.startswith(("steer", "wheel")) else FOREIGN
+    # Radii of wheels differ by more; a speed separates mph from km/h, tyres do not.
+    foreign = () if name.startswith("wheel") else FOREIGN
     units = {f for f, said in units_of(name.removeprefix("truth.")) if said not in ("is in m/s", "is in rad/s")}
     units |= {f**p for f in foreign for p in (1.0, -1.0)}
     units = {f for f in units if name not in _LACKS_FOR_UNIT or max(f, 1.0 / f) > 3.0}
     if any(all(r.accepts(factors[r.text] * f ** r.powers.get(name, 0)) for r in usable) for f in units):
-        lacks = _LACKS_FOR_UNIT.get(name, f"needs {_LACKS.get(name, _BENDS)}")
-        return [SIGN.passed(best.evidence, name), UNIT.undecided(best.evidence, name, lacks)]
+        lacks = _LACKS_FOR_UNIT.get(name, _LACKS.get(name, _BENDS))
+        return [SIGN.passed(best.evidence, name), UNIT.undecided(best.evidence, name, f"needs {lacks}")]
     return [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
 
 
