@@ -8,7 +8,7 @@ spins, or a bank is wrong in some blocks, a unit in all of them. Probabilities a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import combinations, count
@@ -47,6 +47,8 @@ PRIORS |= {"open sign": 1.0}  # that nothing documents: most recorders count to 
 #: angle counts, and an axis of an IMU is turned more often than the sign of a gyro that is read from the right one.
 _OFTEN_WRONG = ("steering_wheel_rad", "steer_rad", "wheels", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 _SELDOM, _SELDOM_STEP = 1.0, 0.3
+#: Of the scales of right mappings one in ten is not that of a unit: raw counts, a ratio, a calibration.
+ODD_SCALE = math.log(10.0)
 #: Likeliest mistakes that are combined with another one; probability of another unit below which it is ruled out;
 #: blocks of a drive whose gains are compared.
 BEAM, RULED_OUT, BLOCKS = 12, 0.01, 8
@@ -189,8 +191,13 @@ class Posterior:
         return sum(p for p, c in self.sets if any(h.kind == "open sign" and name in h.factors for h in c))
 
 
-def posterior(relations: Sequence[Relation], hypotheses: Sequence[Hypothesis]) -> Posterior:
-    """Return the probabilities of sets of at most two hypotheses, given the relations that count."""
+def posterior(
+    relations: Sequence[Relation], hypotheses: Sequence[Hypothesis], scales: Mapping[str, object] | None = None
+) -> Posterior:
+    """Return the probabilities of sets of at most two hypotheses, given the relations that count.
+
+    ``scales``: what the mapping multiplies the signals' raw values with, where known.
+    """
     telling = [r for r in relations if r.tells]
     touched = {n for r in telling for n in r.powers}
     # With a signal that no relation is about, a mistake is another one of the same likelihood.
@@ -200,7 +207,10 @@ def posterior(relations: Sequence[Relation], hypotheses: Sequence[Hypothesis]) -
     def of_relation(i: int, factor: float) -> float:
         return _ANY_GAIN if math.isnan(factor) else telling[i].energy(factor)
 
-    priors, acts = [h.energy for h in useful], [[h.acts_on(r) for r in telling] for h in useful]
+    priors, acts = (
+        [h.energy + _of_scales(h, scales or {}) for h in useful],
+        [[h.acts_on(r) for r in telling] for h in useful],
+    )
     none = [1.0] * len(telling)
 
     def of_set(*chosen: int) -> float:
@@ -220,7 +230,11 @@ def posterior(relations: Sequence[Relation], hypotheses: Sequence[Hypothesis]) -
 
 
 def known_hypotheses(
-    names: Sequence[str], together: Sequence[tuple[str, ...]] = (), open_signs: Sequence[tuple[str, ...]] = ()
+    names: Sequence[str],
+    together: Sequence[tuple[str, ...]] = (),
+    open_signs: Sequence[tuple[str, ...]] = (),
+    *,
+    is_geared: bool = True,
 ) -> list[Hypothesis]:
     """List the mistakes that mappings make with these signals.
 
@@ -228,6 +242,7 @@ def known_hypotheses(
     ----------
     together : signals of one sensor, whose units or signs are wrong together.
     open_signs : signals whose sign nothing documents; those of a group share it. A recorder may turn all of them.
+    is_geared : whether the angle at the steering wheel may be another one than at the road wheels.
     """
     groups = [[n for n in group if n in names] for group in together]
     parts = [part for group in groups for size in range(2, len(group) + 1) for part in combinations(group, size)]
@@ -236,6 +251,9 @@ def known_hypotheses(
     out = [h for part in (*alone, *dict.fromkeys(parts)) for h in _of_part(part)]
     every = tuple(n for group in open_signs for n in group)
     out = [h for h in out if h.kind != "sign" or not h.factors.keys() <= set(every)]
+    if not is_geared:
+        gears = {s * f for s in (1.0, -1.0) for f in (TYPICAL_STEERING_RATIO, 1.0 / TYPICAL_STEERING_RATIO)}
+        out = [h for h in out if gears.isdisjoint(h.factors.values())]
     for part in dict.fromkeys([*open_signs, *([every] if every else [])]):
         out.append(Hypothesis(dict.fromkeys(part, -1.0), f"{_together(part)} count to the right", "open sign"))
     wheels = [(*g,) for g in groups if g and all(n.startswith("wheel_speed") for n in g)]
@@ -294,6 +312,22 @@ def units_of(name: str) -> list[tuple[float, str]]:
     if name.startswith("wheel_speed"):
         return [*of_speeds, (TYPICAL_WHEEL_RADIUS_M, "is in rad/s")]
     return []
+
+
+def _of_scales(mistake: Hypothesis, scales: Mapping[str, object]) -> float:
+    """Return the energy of undoing a mistake in a mapping: its scales should become those of units."""
+    energies = [
+        ODD_SCALE * (_is_odd(name, scale * mistake.factors[name]) - _is_odd(name, scale))
+        for name, scale in scales.items()
+        if isinstance(scale, float | int) and mistake.factors.get(name, math.nan) == mistake.factors.get(name)
+    ]
+    return sum(energies) / max(len(energies), 1)
+
+
+def _is_odd(name: str, scale: float) -> bool:
+    """Return whether no unit of a signal has this scale."""
+    units = (f for f, words in units_of(name.removeprefix("truth.")) if words.startswith("is in") and f not in _TYPICAL)
+    return not any(math.isclose(abs(scale), unit, rel_tol=0.01) for unit in (1.0, *units))
 
 
 def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:

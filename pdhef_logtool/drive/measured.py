@@ -22,6 +22,9 @@ WHEEL_SPEEDS = "wheel_speeds"
 #: four, no wheel shows how fast the car was.
 SPIN_SHARE = 0.2
 
+#: A car with a shorter wheelbase has no driver, and no steering wheel.
+SEATED_WHEELBASE_M = 1.0
+
 _TRUTH = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m")
 
 
@@ -33,6 +36,7 @@ class Measured:
     ----------
     speed_name : the column used as the speed. topics : of the signals, by name.
     scales : by name, those of ground truth with ``truth.``, what the mapping multiplies the raw values with.
+    is_geared : whether the car may have a steering wheel.
     """
 
     columns: Mapping[str, FloatArray]
@@ -40,6 +44,7 @@ class Measured:
     relations: tuple[Relation, ...]
     topics: Mapping[str, str]
     scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
+    is_geared: bool = True
 
     def without_truth(self) -> Measured:
         """Return what the signals alone state."""
@@ -64,7 +69,8 @@ class Measured:
     def posterior(self, *, mounting_is_known: bool, open_signs: Sequence[tuple[str, ...]] = ()) -> Posterior:
         """Return the probabilities of the mistakes that mappings make with these signals."""
         groups = self.groups(mounting_is_known=mounting_is_known)
-        return posterior(self.relations, known_hypotheses(list(self.columns), groups, open_signs))
+        mistakes = known_hypotheses(list(self.columns), groups, open_signs, is_geared=self.is_geared)
+        return posterior(self.relations, mistakes, self.scales)
 
     def agrees(self, name: str, *, mounting_is_known: bool, open_signs: Sequence[tuple[str, ...]] = ()) -> bool:
         """Return whether a signal is wrong by these relations too, if one of them counts."""
@@ -120,7 +126,8 @@ def measure(
     # Two quantities of ground truth that are read from one field agree by themselves.
     read = [[sources[n] for n in r.powers if n in sources] for r in related]
     related = [r for r, fields in zip(related, read, strict=True) if len(set(fields)) == len(fields)]
-    return Measured(columns, speed_name, tuple(related), topics, scales)
+    is_geared = vehicle is None or vehicle.wheelbase_m > SEATED_WHEELBASE_M
+    return Measured(columns, speed_name, tuple(related), topics, scales, is_geared)
 
 
 def drive_columns(

@@ -103,8 +103,8 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
 
 def _passed(name: str, usable: Sequence[Relation], factors: dict[str, float]) -> list[Check]:
     best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
-    # Radii of wheels differ by more; a speed separates mph from km/h, tyres do not.
-    foreign = () if name.startswith("wheel") else FOREIGN
+    # Radii of wheels and wheelbases differ by more; a speed separates mph from km/h, tyres do not.
+    foreign = () if name.startswith(("steer", "wheel")) else FOREIGN
     units = {f for f, said in units_of(name.removeprefix("truth.")) if said not in ("is in m/s", "is in rad/s")}
     units |= {f**p for f in foreign for p in (1.0, -1.0)}
     units = {f for f in units if name not in _LACKS_FOR_UNIT or max(f, 1.0 / f) > 3.0}
