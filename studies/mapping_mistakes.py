@@ -141,10 +141,10 @@ def outcomes(path: Path, vehicle: VehicleParameters, mapping: Mapping | None = N
     log = open_log(path)
     try:
         right = auto_map(log).mapping if mapping is None else mapping
-        passed = {c.name for c in _checks(log, replace(right, origin="file"), vehicle) if c.verdict == "passed"}
+        sound = {c.name: c.verdict for c in _checks(log, replace(right, origin="file"), vehicle)}
         for subject in subjects(right):
             for kind in KINDS:
-                yield from _outcome(log, right, subject, kind, vehicle, passed)
+                yield from _outcome(log, right, subject, kind, vehicle, sound)
     finally:
         log.close()
 
@@ -155,7 +155,7 @@ def _checks(log: DriveLog, mapping: Mapping, vehicle: VehicleParameters) -> tupl
 
 
 def _outcome(
-    log: DriveLog, right: Mapping, subject: str, kind: str, vehicle: VehicleParameters, passed: set[str]
+    log: DriveLog, right: Mapping, subject: str, kind: str, vehicle: VehicleParameters, sound: dict[str, str]
 ) -> Iterator[Outcome]:
     wrong = mistaken(right, subject, kind)
     if wrong is None:
@@ -163,12 +163,13 @@ def _outcome(
     members = _members(right, subject)
     is_refused = bool(contradictions(wrong))
     checks = () if is_refused else _checks(log, wrong, vehicle)
+    checks = tuple(c for c in checks if not c.verdict == sound.get(c.name) == "failed")
     scale = getattr(_source(right, members[0]), "scale", 1.0)
     stated = verdict(checks, members, subject, kind, scale if isinstance(scale, float | int) else 1.0)
     if stated == "open":
         aspect = kind if kind == "sign" else "unit"
         doubts = [c.remedy for c in checks if c.verdict == "undecided" and c.name in _decided(members)]
-        is_shown = any(f"{m}.{aspect}" in passed for m in members)
+        is_shown = any(sound.get(f"{m}.{aspect}") == "passed" for m in members)
         stated = "open" if is_shown or not all(d.startswith("needs ") for d in doubts) else "not checkable"
     shown = tuple(c for c in checks if c.verdict != "passed")
     yield Outcome(Path(str(log.path)).stem, subject, kind, "refused" if is_refused else stated, shown)

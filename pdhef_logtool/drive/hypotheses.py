@@ -317,14 +317,14 @@ def units_of(name: str) -> list[tuple[float, str]]:
 def _of_scales(mistake: Hypothesis, scales: Mapping[str, object]) -> float:
     """Return the energy of undoing a mistake in a mapping: its scales should become those of units."""
     energies = [
-        ODD_SCALE * (_is_odd(name, scale * mistake.factors[name]) - _is_odd(name, scale))
+        ODD_SCALE * (is_odd(name, scale * mistake.factors[name]) - is_odd(name, scale))
         for name, scale in scales.items()
         if isinstance(scale, float | int) and mistake.factors.get(name, math.nan) == mistake.factors.get(name)
     ]
     return sum(energies) / max(len(energies), 1)
 
 
-def _is_odd(name: str, scale: float) -> bool:
+def is_odd(name: str, scale: float) -> bool:
     """Return whether no unit of a signal has this scale."""
     units = (f for f, words in units_of(name.removeprefix("truth.")) if words.startswith("is in") and f not in _TYPICAL)
     return not any(math.isclose(abs(scale), unit, rel_tol=0.01) for unit in (1.0, *units))

@@ -179,15 +179,14 @@ def gentle_at(lateral_m_s2: FloatArray, moving: BoolArray) -> BoolArray:
 
 
 def _moving(columns: Mapping[str, FloatArray], speed: FloatArray) -> BoolArray:
-    """Return where the car drives; by the shape of the speed alone if it is too low and IMU or ground truth move."""
+    """Return where the car drives; by the shape of the speed alone if it is too low, and IMU or other speeds move."""
     moving = moving_at(speed)
     if moving.any():
         return moving
     moves = {"yaw_rate_rad_s": MOVES_RAD_S, "ay_m_s2": MOVES_M_S2, "ax_m_s2": MOVES_M_S2}
     finite = [(columns[n][np.isfinite(columns[n])], least) for n, least in moves.items() if n in columns]
-    is_driven = (
-        any(c.size and c.std() > least for c, least in finite) or moving_at(columns.get("truth.vx_m_s", speed)).any()
-    )
+    others = (c for n, c in columns.items() if n.startswith("wheel_speed_") or n in ("speed_m_s", "truth.vx_m_s"))
+    is_driven = any(c.size and c.std() > least for c, least in finite) or any(moving_at(c).any() for c in others)
     return moving_at(speed, 0.0) if is_driven else moving
 
 
