@@ -273,7 +273,7 @@ def _of_part(part: tuple[str, ...]) -> Iterator[Hypothesis]:
             both = f"{words} {text} and has the wrong sign"
             yield Hypothesis({part[0]: -factor}, both, "sign and unit")
     # A sensor is mounted upside down or backwards, or ground truth has another convention; speeds count ahead.
-    if is_one or not _NEVER_TURNED & set(part):
+    if part != ("truth.position_speed_m_s",) and (is_one or not _NEVER_TURNED & set(part)):  # a size has no sign
         has = "has" if is_one else "have"
         yield Hypothesis(dict.fromkeys(part, -1.0), f"{words} {has} the wrong sign", "sign")
     verb = "are" if words.endswith("speeds") else "is"

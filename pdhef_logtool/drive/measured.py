@@ -157,12 +157,12 @@ def drive_columns(
 def _pose_velocity(truth: Mapping[str, Channel], track: StateTrack, x_m: float) -> dict[str, Channel]:
     """Return the velocities ahead and to the left that positions and heading of one topic have; empty without them."""
     topics = {truth[n].source.split(".")[0] for n in ("x_m", "y_m", "yaw_rad", "quat_wxyz") if n in truth}
-    known = np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
-    if len(topics) != 1 or not {"x_m", "y_m"} <= truth.keys() or np.count_nonzero(known) < 3:
+    usable = np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
+    if len(topics) != 1 or not {"x_m", "y_m"} <= truth.keys() or np.count_nonzero(usable) < 3:
         return {}
-    stamps, yaw = track.stamps_ns[known], np.unwrap(track.yaw_rad[known])
+    stamps, yaw = track.stamps_ns[usable], np.unwrap(track.yaw_rad[usable])
     times = (stamps - stamps[0]) * 1e-9
-    vx, vy, rate = (np.gradient(c, times) for c in (track.x_m[known], track.y_m[known], yaw))
+    vx, vy, rate = (np.gradient(c, times) for c in (track.x_m[usable], track.y_m[usable], yaw))
     ahead, left = np.cos(yaw) * vx + np.sin(yaw) * vy, np.cos(yaw) * vy - np.sin(yaw) * vx + x_m * rate
     pairs = {"truth.pose_vx_m_s": ahead, "truth.pose_vy_m_s": left, "truth.heading_rate_rad_s": rate}
     return {n: Channel(n, "", "pose", stamps, stamps, v) for n, v in pairs.items()}
