@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import permutations, product
 
 import numpy as np
 
@@ -40,9 +41,9 @@ def rotation_text(rotation: FloatArray) -> str:
 
 def nearest_step(rotation: FloatArray) -> FloatArray:
     """Return the multiple of 90 degrees [3, 3] that a rotation is nearest to."""
-    from scipy.spatial.transform import Rotation
-
-    steps = np.rint(Rotation.create_group("O").as_matrix()) + 0.0
+    rows = np.eye(3)[list(permutations(range(3)))]
+    steps = np.concatenate([rows * np.array(signs)[:, None] for signs in product((1.0, -1.0), repeat=3)]) + 0.0
+    steps = steps[np.linalg.det(steps) > 0.0]
     return np.asarray(steps[np.argmax(np.sum(steps * rotation, axis=(1, 2)))])
 
 

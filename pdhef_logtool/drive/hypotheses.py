@@ -11,12 +11,12 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations, count
+from itertools import combinations
 
 import numpy as np
 
 from pdhef_logtool.mapping.naming import G_M_S2
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 DEGREE = float(np.pi / 180.0)
 #: Below this correlation a gain gives no information, and above it, it is between the two regressions. It must be so
@@ -107,17 +107,23 @@ class Relation:
         gain = abs(gain) if self.signless else gain
         return size > 0.0 and gain / size >= self.expected[0] and gain * size <= self.expected[1]
 
-    def energy(self, factor: float) -> float:
-        """Return the negative log likelihood of the blocks' gains after multiplying them with ``factor``."""
-        gains = np.array(self.blocks or (self.gain,)) * factor
+    def energies(self, factors: FloatArray) -> FloatArray:
+        """Return the negative log likelihoods [N] of the blocks' gains after multiplying them with each factor [N].
+
+        A factor that is NaN stands for another field: any gain is as likely.
+        """
+        gains = factors[:, None] * (self.blocks or (self.gain,))
         low, high = (math.log(max(e, 1e-12)) for e in self.expected)
         with np.errstate(divide="ignore"):
             size = np.log(np.abs(gains))
         room = -math.log(max(abs(self.correlation), 1e-3))  # between the two regressions
         # Blocks that differ show what changes: sliding, a frequency that tyres do not follow; a unit does not change.
         # A drive without blocks slides for all of it: they would differ by half of what the relation leaves.
-        unknown = 0.5 * math.sqrt(max(0.0, 1.0 - self.correlation**2))
-        apart = float(np.std(size)) if self.blocks and np.isfinite(size).all() else unknown
+        apart = (
+            float(np.std(np.log(np.abs(self.blocks))))
+            if self.blocks and all(self.blocks)
+            else (0.5 * math.sqrt(max(0.0, 1.0 - self.correlation**2)))
+        )
         beyond = np.maximum(np.maximum(low - room - size, size - high - room), 0.0)
         energy = 0.5 * (beyond / math.hypot(EDGE if self.decides_unit else WIDE_EDGE, apart)) ** 2
         if self.decides_unit:
@@ -125,7 +131,8 @@ class Relation:
             off = np.maximum(np.abs(size - middle) - room, 0.0)
             energy += 0.5 * (off / math.hypot(max((high - low) / 6.0, LEAST_WIDTH), apart)) ** 2
         energy = np.minimum(energy, MOST_ENERGY)
-        return float(np.mean(energy if self.signless else np.where(gains > 0.0, energy, MOST_ENERGY)))
+        mean = (energy if self.signless else np.where(gains > 0.0, energy, MOST_ENERGY)).mean(axis=1)
+        return np.where(np.isnan(factors), _ANY_GAIN, mean)
 
     @property
     def evidence(self) -> str:
@@ -165,10 +172,6 @@ class Hypothesis:
         shared = len(self.factors.keys() & names)
         return shared == len(self.factors) or (self.kind == "open sign" and shared > 0)
 
-    def goes_with(self, other: Hypothesis) -> bool:
-        """Return whether both may be true: of different signals, and neither is a foreign factor."""
-        return not self.factors.keys() & other.factors.keys() and "foreign" not in (self.kind, other.kind)
-
     def acts_on(self, relation: Relation) -> float:
         """Return what undoing it multiplies the relation's gain with."""
         return math.prod(f ** relation.powers[n] for n, f in self.factors.items() if n in relation.powers)
@@ -202,31 +205,46 @@ def posterior(
     touched = {n for r in telling for n in r.powers}
     # With a signal that no relation is about, a mistake is another one of the same likelihood.
     useful = [h for h in hypotheses if h.is_about(touched)]
+    priors = np.array([*(h.energy + _of_scales(h, scales or {}) for h in useful), 0.0])
+    # What each mistake, and at last none, multiplies each relation's gain with.
+    acts = np.ones((len(useful) + 1, len(telling)))
+    for name in touched:
+        factors = np.array([*(h.factors.get(name, 1.0) for h in useful), 1.0])
+        acts *= factors[:, None] ** [r.powers.get(name, 0) for r in telling]
+    looked_up = []
+    for relation, column in zip(telling, acts.T, strict=True):
+        single, index = np.unique(column, return_inverse=True)
+        table = relation.energies(np.outer(single, single).ravel()).reshape(len(single), len(single))
+        looked_up.append((table, index))
 
-    @cache
-    def of_relation(i: int, factor: float) -> float:
-        return _ANY_GAIN if math.isnan(factor) else telling[i].energy(factor)
+    def energies(first: IntArray, second: IntArray) -> FloatArray:
+        return priors[first] + priors[second] + sum(table[i[first], i[second]] for table, i in looked_up)
 
-    priors, acts = (
-        [h.energy + _of_scales(h, scales or {}) for h in useful],
-        [[h.acts_on(r) for r in telling] for h in useful],
-    )
-    none = [1.0] * len(telling)
-
-    def of_set(*chosen: int) -> float:
-        factors = map(math.prod, zip(none, *(acts[k] for k in chosen), strict=True))
-        return sum(priors[k] for k in chosen) + sum(map(of_relation, count(), factors))
-
-    alone = sorted((of_set(i), i) for i in range(len(useful)))
-    scored: dict[tuple[int, ...], float] = {(): of_set()}
-    scored |= {(i,): energy for energy, i in alone}
-    pairs = {(min(i, j), max(i, j)) for _, i in alone[:BEAM] for j in range(len(useful)) if j != i}
-    scored |= {(i, j): of_set(i, j) for i, j in pairs if useful[i].goes_with(useful[j])}
-    least = min(scored.values())
-    weights = {k: math.exp(least - e) for k, e in scored.items() if e < least + 25.0}
+    none, every = len(useful), np.arange(len(useful) + 1)
+    alone = energies(every, np.full_like(every, none))
+    compatible, pairs = _compatible(useful), [np.empty((0, 2), dtype=np.int64)]
+    for i in np.argsort(alone[:none], kind="stable")[:BEAM]:
+        others = np.flatnonzero(compatible[i])
+        compatible[:, i] = False
+        pairs.append(np.stack([np.minimum(others, i), np.maximum(others, i)], axis=1))
+    paired = np.concatenate(pairs)
+    scored = np.concatenate([alone, energies(*paired.T)])
+    least = float(scored.min())
+    weights = {
+        () if k == none else (k,) if k < none else tuple(paired[k - none - 1].tolist()): math.exp(least - scored[k])
+        for k in np.flatnonzero(scored < least + 25.0).tolist()
+    }
     total = sum(weights.values())
     ordered = sorted(weights.items(), key=lambda x: (-x[1], x[0]))
     return Posterior(tuple((w / total, tuple(useful[i] for i in k)) for k, w in ordered))
+
+
+def _compatible(mistakes: Sequence[Hypothesis]) -> BoolArray:
+    """Return [N, N] which of them may both be true: of different signals, and neither is a foreign factor."""
+    names = sorted({n for h in mistakes for n in h.factors})
+    about = np.array([[n in h.factors for n in names] for h in mistakes], dtype=bool).reshape(len(mistakes), len(names))
+    common = np.array([h.kind != "foreign" for h in mistakes], dtype=bool)
+    return np.outer(common, common) & ~(about @ about.T)
 
 
 def known_hypotheses(
@@ -317,17 +335,22 @@ def units_of(name: str) -> list[tuple[float, str]]:
 def _of_scales(mistake: Hypothesis, scales: Mapping[str, object]) -> float:
     """Return the energy of undoing a mistake in a mapping: its scales should become those of units."""
     energies = [
-        ODD_SCALE * (is_odd(name, scale * mistake.factors[name]) - is_odd(name, scale))
-        for name, scale in scales.items()
-        if isinstance(scale, float | int) and mistake.factors.get(name, math.nan) == mistake.factors.get(name)
+        ODD_SCALE * (is_odd(name, scale * factor) - is_odd(name, scale))
+        for name, factor in mistake.factors.items()
+        if isinstance(scale := scales.get(name), float | int) and not math.isnan(factor)
     ]
     return sum(energies) / max(len(energies), 1)
 
 
 def is_odd(name: str, scale: float) -> bool:
     """Return whether no unit of a signal has this scale."""
-    units = (f for f, words in units_of(name.removeprefix("truth.")) if words.startswith("is in") and f not in _TYPICAL)
-    return not any(math.isclose(abs(scale), unit, rel_tol=0.01) for unit in (1.0, *units))
+    return not any(abs(abs(scale) - unit) < 0.01 * unit for unit in _unit_scales(name))
+
+
+@cache
+def _unit_scales(name: str) -> tuple[float, ...]:
+    of_units = units_of(name.removeprefix("truth."))
+    return (1.0, *(f for f, words in of_units if words.startswith("is in") and f not in _TYPICAL))
 
 
 def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
