@@ -43,12 +43,12 @@ MOST_ENERGY, _ANY_GAIN = 20.0, 2.0
 #: another quantity are the slips of templates, and a field that is something else explains any gain.
 PRIORS = {"unit": 5.0, "sign": 5.0, "sign and unit": 9.0, "foreign": 5.7, "field": 14.0, "open": 0.0}
 PRIORS |= {"open sign": 1.0}  # that nothing documents: most recorders count to the left
+#: One in ten scales of right mappings is not that of a unit: raw counts, a ratio, a calibration.
+PRIORS |= {"odd scale": math.log(10.0)}
 #: Of signals that explain a contradiction equally well the first is the likeliest: no standard states how a steering
 #: angle counts, and an axis of an IMU is turned more often than the sign of a gyro that is read from the right one.
 _OFTEN_WRONG = ("steering_wheel_rad", "steer_rad", "wheels", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 _SELDOM, _SELDOM_STEP = 1.0, 0.3
-#: Of the scales of right mappings one in ten is not that of a unit: raw counts, a ratio, a calibration.
-ODD_SCALE = math.log(10.0)
 #: Likeliest mistakes that are combined with another one; probability of another unit below which it is ruled out;
 #: blocks of a drive whose gains are compared.
 BEAM, RULED_OUT, BLOCKS = 12, 0.01, 8
@@ -93,10 +93,9 @@ class Relation:
     @property
     def unrelated(self) -> bool:
         """Return whether the sides move, and not with one another."""
-        if not self.moves or abs(self.correlation) >= UNRELATED_CORRELATION:
-            return False
-        apart = math.atanh(MIN_CORRELATION) - math.atanh(abs(self.correlation))  # Fisher's z
-        return apart * math.sqrt(max(self.samples - 3.0, 0.0)) >= UNRELATED_Z
+        apart = math.atanh(MIN_CORRELATION) - math.atanh(min(abs(self.correlation), MIN_CORRELATION))  # Fisher's z
+        is_sure = apart * math.sqrt(max(self.samples - 3.0, 0.0)) >= UNRELATED_Z
+        return self.moves and is_sure and abs(self.correlation) < UNRELATED_CORRELATION
 
     def accepts(self, factor: float = 1.0) -> bool:
         """Return whether the gain is plausible after multiplying it with ``factor``.
@@ -248,11 +247,7 @@ def _compatible(mistakes: Sequence[Hypothesis]) -> BoolArray:
 
 
 def known_hypotheses(
-    names: Sequence[str],
-    together: Sequence[tuple[str, ...]] = (),
-    open_signs: Sequence[tuple[str, ...]] = (),
-    *,
-    is_geared: bool = True,
+    names: Sequence[str], together: Sequence[tuple[str, ...]] = (), open_signs: Sequence[tuple[str, ...]] = ()
 ) -> list[Hypothesis]:
     """List the mistakes that mappings make with these signals.
 
@@ -260,7 +255,6 @@ def known_hypotheses(
     ----------
     together : signals of one sensor, whose units or signs are wrong together.
     open_signs : signals whose sign nothing documents; those of a group share it. A recorder may turn all of them.
-    is_geared : whether the angle at the steering wheel may be another one than at the road wheels.
     """
     groups = [[n for n in group if n in names] for group in together]
     parts = [part for group in groups for size in range(2, len(group) + 1) for part in combinations(group, size)]
@@ -269,9 +263,6 @@ def known_hypotheses(
     out = [h for part in (*alone, *dict.fromkeys(parts)) for h in _of_part(part)]
     every = tuple(n for group in open_signs for n in group)
     out = [h for h in out if h.kind != "sign" or not h.factors.keys() <= set(every)]
-    if not is_geared:
-        gears = {s * f for s in (1.0, -1.0) for f in (TYPICAL_STEERING_RATIO, 1.0 / TYPICAL_STEERING_RATIO)}
-        out = [h for h in out if gears.isdisjoint(h.factors.values())]
     for part in dict.fromkeys([*open_signs, *([every] if every else [])]):
         out.append(Hypothesis(dict.fromkeys(part, -1.0), f"{_together(part)} count to the right", "open sign"))
     wheels = [(*g,) for g in groups if g and all(n.startswith("wheel_speed") for n in g)]
@@ -335,7 +326,7 @@ def units_of(name: str) -> list[tuple[float, str]]:
 def _of_scales(mistake: Hypothesis, scales: Mapping[str, object]) -> float:
     """Return the energy of undoing a mistake in a mapping: its scales should become those of units."""
     energies = [
-        ODD_SCALE * (is_odd(name, scale * factor) - is_odd(name, scale))
+        PRIORS["odd scale"] * (is_odd(name, scale * factor) - is_odd(name, scale))
         for name, factor in mistake.factors.items()
         if isinstance(scale := scales.get(name), float | int) and not math.isnan(factor)
     ]

@@ -69,7 +69,9 @@ class Measured:
     def posterior(self, *, mounting_is_known: bool, open_signs: Sequence[tuple[str, ...]] = ()) -> Posterior:
         """Return the probabilities of the mistakes that mappings make with these signals."""
         groups = self.groups(mounting_is_known=mounting_is_known)
-        mistakes = known_hypotheses(list(self.columns), groups, open_signs, is_geared=self.is_geared)
+        mistakes = known_hypotheses(list(self.columns), groups, open_signs)
+        if not self.is_geared:
+            mistakes = [h for h in mistakes if h.is_exact or h.kind == "field" or "steer" not in "".join(h.factors)]
         return posterior(self.relations, mistakes, self.scales)
 
     def agrees(self, name: str, *, mounting_is_known: bool, open_signs: Sequence[tuple[str, ...]] = ()) -> bool:
