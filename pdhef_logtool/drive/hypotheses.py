@@ -49,9 +49,8 @@ PRIORS |= {"odd scale": math.log(10.0)}
 #: angle counts, and an axis of an IMU is turned more often than the sign of a gyro that is read from the right one.
 _OFTEN_WRONG = ("steering_wheel_rad", "steer_rad", "wheels", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 _SELDOM, _SELDOM_STEP = 1.0, 0.3
-#: Likeliest mistakes that are combined with another one; probability of another unit below which it is ruled out;
-#: blocks of a drive whose gains are compared.
-BEAM, RULED_OUT, BLOCKS = 12, 0.01, 8
+#: Likeliest mistakes that are combined with another one; blocks of a drive whose gains are compared.
+BEAM, BLOCKS = 12, 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -342,24 +341,6 @@ def is_odd(name: str, scale: float) -> bool:
 def _unit_scales(name: str) -> tuple[float, ...]:
     of_units = units_of(name.removeprefix("truth."))
     return (1.0, *(f for f, words in of_units if words.startswith("is in") and f not in _TYPICAL))
-
-
-def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
-    """Return those of the signals of doubtful unit for which the relations rule out every other unit.
-
-    Each unit is as likely as the others before. The ground-truth v_y has the unit of its v_x.
-    """
-    # Rim speed in m/s and in rad/s look alike where the radius is not known: wheels are never given.
-    names = {n for n in doubted if not n.startswith("wheel_speed")}
-    units = [Hypothesis({n: f}, "", "open") for n in sorted(names) for f, _ in units_of(n.removeprefix("truth."))]
-    probable = posterior(relations, units)
-    telling = [r for r in relations if r.tells]
-    resolved = {
-        n
-        for n in names & {n for h in units for n in h.factors} & {n for r in telling for n in r.powers}
-        if sum(p for p, _ in probable.of(n)) < RULED_OUT and all(r.accepts() for r in telling if n in r.powers)
-    }
-    return resolved | (names & {"truth.vy_m_s"} if "truth.vx_m_s" in resolved else set())
 
 
 def block_gains(reference: FloatArray, measured: FloatArray, blocks: int) -> tuple[float, ...]:
