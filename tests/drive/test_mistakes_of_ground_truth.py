@@ -72,16 +72,19 @@ def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m: float, factor: float) -
         assert checks["truth.vy_m_s.unit"].verdict != "passed"
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize(("mirrored", "antenna_m"), [(False, 0.0), (True, 0.0), (False, 1.5)])
 @pytest.mark.parametrize("factor", [1.0, 3.6, 1.0 / 3.6, -1.0])
-def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(factor: float, mirrored: bool) -> None:
-    """An identity of rigid bodies at any place on any car; a pose counted to the right contradicts nothing."""
+def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(
+    factor: float, mirrored: bool, antenna_m: float
+) -> None:
+    """An identity of rigid bodies; a pose counted to the right, or of an antenna further ahead, contradicts nothing."""
     vehicle = default_vehicle().model_copy(update={"truth_position_m": (1.3, 0.0, 0.0)})
     signals, truth = with_truth(vehicle, 1.0)
     vx, vy, rate = (truth[n].values for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
     yaw, side = np.cumsum(rate) * 0.01, -1.0 if mirrored else 1.0
     pose = {"x_m": np.cumsum(vx * np.cos(yaw) - vy * np.sin(yaw)) * 0.01, "yaw_rad": side * yaw}
-    pose["y_m"] = side * np.cumsum(vx * np.sin(yaw) + vy * np.cos(yaw)) * 0.01
+    pose["y_m"] = side * (np.cumsum(vx * np.sin(yaw) + vy * np.cos(yaw)) * 0.01 + antenna_m * np.sin(yaw))
+    pose["x_m"] += antenna_m * np.cos(yaw)
     truth |= {n: replace(truth["vx_m_s"], name=n, source=f"/ins.{n}", values=v) for n, v in pose.items()}
     truth["vy_m_s"] = replace(truth["vy_m_s"], values=factor * vy)
     derived = derive_truth(truth, truth_position_m=vehicle.truth_position_m)
