@@ -35,7 +35,7 @@ DRIVEN: tuple[tuple[str, float, float | None], ...] = (
     ("sine-with-dwell", 80.0, None),
     ("road", 60.0, 60.0),
 )
-CARS, SEED = 12, 99_005
+CARS, SEED = 30, 99_005
 #: Lowest and highest share of values that a ± with 95 % coverage may have.
 ACCEPTED = (0.90, 0.98)
 _PRINTED = re.compile(r"(-?[\d.]+) \+- ([\d.]+)")

@@ -19,8 +19,9 @@ MIN_STEP_S, MAX_STEP_S = 0.005, 0.05
 #: Far above what rounding does to a rough correlation of signals that vary by all of their power; of such as vary by
 #: less of it than the least share no rough value is given.
 _ROUGH_ERROR, _LEAST_POWER = 1e-10, 1e-4
-#: For the error of a shift: both sides are averaged over so long; blocks of the drive.
-_ERROR_MEAN_S, _ERROR_BLOCKS = 0.2, 10
+#: For the error of a shift: both sides are averaged over so long; blocks of the drive; 1-sigma by stamps and filters of
+#: the two sensors (studies/plus_minus.py).
+_ERROR_MEAN_S, _ERROR_BLOCKS, _RESAMPLING_S = 0.2, 10, 2e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +109,9 @@ def find_shift(grid: CommonGrid, max_shift_s: float) -> Shift:
     best = max(finite, key=lambda k: (exact[k], -k))
     if abs(best) == reach:
         return Shift(best * grid.step_s, exact[best], False)
-    refined = parabolic_peak(*(exact[k] if k in exact else _correlation(grid.a, grid.b, k) for k in _around(best)))
+    refined = parabolic_peak(
+        *(exact[k] if k in exact else _correlation(grid.a, grid.b, k) for k in (best - 1, best, best + 1))
+    )
     return Shift((best + refined) * grid.step_s, exact[best], True)
 
 
@@ -142,7 +145,7 @@ def shift_error(grid: CommonGrid, shift_s: float) -> float:
         if m.any()
     ]
     chance = student(len(blocks)) * float(np.std(blocks, ddof=1)) / math.sqrt(len(blocks))
-    return math.hypot(chance, later - (shift_s - steps * grid.step_s))
+    return math.hypot(chance, later - (shift_s - steps * grid.step_s), _RESAMPLING_S)
 
 
 def has_peak_within(grid: CommonGrid, low_s: float, high_s: float, least: float) -> bool:
@@ -157,10 +160,6 @@ def parabolic_peak(before: float, middle: float, after: float) -> float:
     """Return the place of the vertex of the parabola through values at −1, 0, 1; 0 when it has no maximum."""
     curvature = before - 2.0 * middle + after
     return float(0.5 * (before - after) / curvature) if curvature < 0 else 0.0
-
-
-def _around(shift: int) -> tuple[int, int, int]:
-    return shift - 1, shift, shift + 1
 
 
 def _rough_correlations(a: FloatArray, b: FloatArray, reach: int) -> tuple[FloatArray, FloatArray]:

@@ -108,7 +108,7 @@ class Relation:
     def energies(self, factors: FloatArray) -> FloatArray:
         """Return the negative log likelihoods [N] of the blocks' gains after multiplying them with each factor [N].
 
-        A factor that is NaN stands for another field: any gain is as likely.
+        NaN: another field, whose gain may be any.
         """
         gains = factors[:, None] * (self.blocks or (self.gain,))
         low, high = (math.log(max(e, 1e-12)) for e in self.expected)

@@ -50,7 +50,8 @@ class Measured:
         """Return what the signals alone state."""
         columns = {n: c for n, c in self.columns.items() if not n.startswith("truth.")}
         kept = tuple(r for r in self.relations if not any(n.startswith("truth.") for n in r.powers))
-        return replace(self, columns=columns, speed_name=_own(self.speed_name), relations=kept)
+        speed = None if (self.speed_name or "").startswith("truth.") else self.speed_name
+        return replace(self, columns=columns, speed_name=speed, relations=kept)
 
     def parts(self, vehicle: VehicleParameters | None) -> Iterator[Measured]:
         """Yield what two independent parts of the drive state, each by itself."""
@@ -97,10 +98,6 @@ class Measured:
 
 def _known(vehicle: VehicleParameters | None) -> VehicleParameters | None:
     return None if vehicle in (None, default_vehicle()) else vehicle
-
-
-def _own(speed_name: str | None) -> str | None:
-    return None if speed_name is None or speed_name.startswith("truth.") else speed_name
 
 
 def measure(

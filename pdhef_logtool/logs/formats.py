@@ -36,7 +36,7 @@ class LogFormat:
     title : for messages: ``an MCAP file``.
     opener : ``package.module:function``, which opens a :class:`LogFile` as a log, or as a container of messages, and
         raises LogError for a file that is none of this format.
-    suffixes : by which a search through folders takes files for logs.
+    suffixes : by which a search through folders takes files for logs. named : also, if it is named outright.
     magic : first bytes of every file, or several possible ones; empty: a file is recognised by its suffix.
     needs_suffix : whether files of other formats begin with the same bytes, so that the suffix must match too.
     is_general : whether such files often contain something else: a search through folders ignores them where logs of
@@ -49,11 +49,12 @@ class LogFormat:
     magic: bytes | tuple[bytes, ...] = b""
     needs_suffix: bool = False
     is_general: bool = False
+    named: tuple[str, ...] = ()
 
     def recognises(self, head: bytes, name: str) -> bool:
         """Return, by the first bytes and the name, whether a file is of this format."""
         if self.needs_suffix or not self.magic:
-            return head.startswith(self.magic) and name.lower().endswith(self.suffixes)
+            return head.startswith(self.magic) and name.lower().endswith((*self.suffixes, *self.named))
         return head.startswith(self.magic)
 
     def open(self, file: LogFile) -> DriveLog | Container:
@@ -67,7 +68,7 @@ FORMATS = (
     LogFormat("a ROS 1 bag", f"{__package__}.rosbag1_log:Rosbag1Container.open", (".bag",), ROSBAG1_MAGIC),
     LogFormat("a rosbag2 database", f"{__package__}.rosbag2_sqlite_log:SqliteContainer.open", (".db3",), SQLITE_MAGIC),
     LogFormat("a VBO file", f"{__package__}.text_logs:open_vbo", (".vbo",)),
-    LogFormat("a CSV file", f"{__package__}.text_logs:open_csv", (".csv", ".tsv"), is_general=True),
+    LogFormat("a CSV file", f"{__package__}.text_logs:open_csv", (".csv", ".tsv"), is_general=True, named=(".txt",)),
     LogFormat("a Parquet file", f"{__package__}.array_logs:open_parquet", (".parquet",), b"PAR1", is_general=True),
     LogFormat("a MAT file", f"{__package__}.array_logs:open_mat", (".mat",), b"MATLAB ", is_general=True),
     LogFormat("an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), (b"MDF     ", b"UnFinMF ")),

@@ -56,7 +56,8 @@ def join_ranges(extents: Iterable[Extent], held: Sequence[Extent] = ()) -> list[
     joined: list[Extent] = []
     for start, end in without(extents, held):
         last = joined[-1] if joined else (0, 0)
-        if joined and start - last[1] <= JOINED_GAP_BYTES and not _any_in(held, last[1], start):
+        between = any(low < start and high > last[1] for low, high in held)
+        if joined and start - last[1] <= JOINED_GAP_BYTES and not between:
             joined[-1] = (last[0], end)
         else:
             joined.append((start, end))
@@ -77,10 +78,6 @@ def without(extents: Iterable[Extent], held: Sequence[Extent]) -> list[Extent]:
                 missing.append((missing.pop()[0] if joined else position, stop))
             position = max(position, high)
     return missing
-
-
-def _any_in(held: Sequence[Extent], start: int, end: int) -> bool:
-    return any(low < end and high > start for low, high in held)
 
 
 class RemoteSource(ByteSource):

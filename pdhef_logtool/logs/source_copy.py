@@ -149,7 +149,8 @@ def iterate_copy(
         if cursors:
             _, c, index, _, cursor = heapq.heappop(cursors)
             # Continue in this span until another one can come first.
-            limit_ns = min(cursors[0][0] if cursors else _NEVER_NS, _start_ns(spans, position))
+            next_ns = spans[position][1].start_ns if position < len(spans) else _NEVER_NS
+            limit_ns = min(cursors[0][0] if cursors else _NEVER_NS, next_ns)
             yield from cursor.take_until(limit_ns, c, channels)
             _push(cursors, c, index, cursor)
 
@@ -157,10 +158,6 @@ def iterate_copy(
 def _push(cursors: list[tuple[int, int, int, int, _Cursor]], c: int, index: int, cursor: _Cursor) -> None:
     if cursor.remaining:
         heapq.heappush(cursors, (cursor.time_ns, c, index, cursor.taken, cursor))
-
-
-def _start_ns(spans: Sequence[tuple[int, Span]], position: int) -> int:
-    return spans[position][1].start_ns if position < len(spans) else _NEVER_NS
 
 
 def _spans_to_copy(

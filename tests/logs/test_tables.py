@@ -386,6 +386,15 @@ def test_a_search_ignores_general_files_beside_logs(tmp_path: Path) -> None:
     assert [log.path.name for log in find_logs([str(tmp_path / "one" / "notes.csv")])] == ["notes.csv"]
 
 
+def test_a_text_table_is_a_log_where_it_is_named_and_not_in_a_search(tmp_path: Path) -> None:
+    data = DIALECTS["tabs"][0]
+    for name in ("drive.csv", "drive.txt", "notes.txt"):
+        (tmp_path / name).write_bytes(data)
+    assert [log.path for log in find_logs([str(tmp_path)])] == [tmp_path / "drive.csv"]
+    with closing(open_log(tmp_path / "drive.txt")) as text, closing(open_log(tmp_path / "drive.csv")) as table:
+        assert [(t.name, t.messages) for t in text.topics] == [(t.name, t.messages) for t in table.topics]
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_a_table_in_long_form_has_a_column_for_each_signal(suffix: str, tmp_path: Path) -> None:
     rows = [(t, "Lat Acc [m/s²]", a) for t, a in zip(TIME_S, AY, strict=True)]

@@ -20,8 +20,8 @@ from pdhef_logtool.records.signals import FloatArray
 AY_GAIN_RANGE = (0.65, 1.3)
 #: Crossfall alone moves an accelerometer by half a metre per second squared.
 LEAST_LATERAL_M_S2 = 0.7
-#: Production gyros have a gain error of 1 %, cheap ones of 3 %.
-GAIN_ERROR = 0.05
+#: Production gyros have a gain error of 1 %, cheap ones of 3 %; 1-sigma by filters of two (studies/plus_minus.py).
+GAIN_ERROR, RESAMPLED_GAIN = 0.05, 0.0015
 #: A sensor's filter and a bus take 10 to 20 ms; at 0.5 Hz, 30 ms are 5 degrees of phase.
 SENSOR_DELAY_S = 0.03
 #: A sensor is mounted elsewhere than the vehicle file gives if the distance is larger, m. Beyond the second value no
@@ -69,7 +69,7 @@ def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
     if rate is not None and gyro is not None:
         everywhere = np.ones(rate.shape[0], np.bool_)
         result = fit(gyro, [rate, derivative(rate), np.ones_like(rate)], everywhere)
-        gain = nothing if result is None else (result[0][0], result[1][0])
+        gain = nothing if result is None else (result[0][0], math.hypot(result[1][0], RESAMPLED_GAIN))
     if vx is not None and vy is not None and rate is not None and ay is not None:
         lateral = derivative(vy) + vx * rate
         slow = running_mean(lateral, round(0.5 * SLOW_S / GRID_S))

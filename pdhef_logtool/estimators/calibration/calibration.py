@@ -55,8 +55,6 @@ EXPORTED_STD = 0.16
 VARIED = 5
 #: Smallest difference of understeer gradients that is reported as a contradiction, rad/(m/s²).
 LEAST_CONTRADICTION = 1.5e-3
-#: 1-sigma of the understeer gradient by the limits of the single-track model, rad/(m/s²) (studies/plus_minus.py).
-UNDERSTEER_STD = 7e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,7 +285,7 @@ def _understeer(
     steps = DERIVATIVE_STEP * np.eye(theta.size)
     slope = np.array([gradient(theta + step) - centre for step in steps]) / DERIVATIVE_STEP
     file = vehicle_file.understeer_gradient_rad_per_m_s2(vehicle_file.assumed_friction)
-    return Understeer(file, centre, math.hypot(math.sqrt(float(slope @ covariance @ slope)), UNDERSTEER_STD))
+    return Understeer(file, centre, math.sqrt(float(slope @ covariance @ slope)))
 
 
 def _refusal(problem: JointProblem, theta: FloatArray, drives: Sequence[Driving]) -> str:
