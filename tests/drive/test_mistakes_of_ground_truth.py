@@ -94,6 +94,14 @@ def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(
     assert factor == 1.0 or f"by {1.0 / factor:.6g}" in checks[failed[0]].remedy
 
 
+def test_an_impossible_yaw_rate_of_ground_truth_does_not_blame_the_gyro() -> None:
+    signals, truth = with_truth(VEHICLE, 1.0)
+    rate = truth["yaw_rate_rad_s"]
+    truth["yaw_rate_rad_s"] = replace(rate, values=2000.0 * rate.values)
+    found = check_drive(signals, truth, derive_truth(truth), VEHICLE)
+    assert {c.subject for c in found if c.verdict == "failed"} == {"truth.yaw_rate_rad_s"}
+
+
 def test_a_pose_whose_heading_is_not_that_of_the_car_states_nothing() -> None:
     signals, truth = with_truth(VEHICLE, 1.0)
     flat = np.zeros_like(truth["vx_m_s"].values)
