@@ -22,9 +22,8 @@ DEGREE = float(np.pi / 180.0)
 #: Below this correlation a gain gives no information, and above it, it is between the two regressions. It must be so
 #: far from chance, by Fisher's z of the independent samples; below so many of them (3 s) nothing is stated.
 MIN_CORRELATION, MIN_CHANCE_Z, MIN_SAMPLES = 0.6, 3.0, 6.0
-#: Two sides that move, and not with one another: another field was mapped. Their correlation is below this, and so many
-#: standard errors of Fisher's z below one that gives information: 24 samples at this correlation.
-UNRELATED_CORRELATION, UNRELATED_Z = 0.25, 2.0
+#: Two sides that move, and not with one another: another field was mapped.
+UNRELATED_CORRELATION = 0.25
 #: Typical values that recognise one quantity recorded as another.
 TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M = 16.0, 0.3
 _TYPICAL = (*(f for t in (TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M) for f in (t, 1.0 / t)),)
@@ -92,9 +91,7 @@ class Relation:
     @property
     def unrelated(self) -> bool:
         """Return whether the sides move, and not with one another."""
-        apart = math.atanh(MIN_CORRELATION) - math.atanh(min(abs(self.correlation), MIN_CORRELATION))  # Fisher's z
-        is_sure = apart * math.sqrt(max(self.samples - 3.0, 0.0)) >= UNRELATED_Z
-        return self.moves and is_sure and abs(self.correlation) < UNRELATED_CORRELATION
+        return self.moves and self.samples >= 4.0 * MIN_SAMPLES and abs(self.correlation) < UNRELATED_CORRELATION
 
     def accepts(self, factor: float = 1.0) -> bool:
         """Return whether the gain is plausible after multiplying it with ``factor``.

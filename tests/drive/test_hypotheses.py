@@ -63,12 +63,6 @@ def test_scales_of_right_mappings_are_those_of_units() -> None:
     assert counts == posterior([between], known_hypotheses(["speed_m_s"]))
 
 
-@pytest.mark.parametrize(("samples", "is_sure"), [(10.0, False), (14.0, True), (200.0, True)])
-def test_sides_that_do_not_move_together_need_samples(samples: float, is_sure: bool) -> None:
-    assert Relation("a_y", TURN, 0.02, 1.0, (0.55, 1.8), samples, moves=True).unrelated is is_sure
-    assert not Relation("a_y", TURN, 0.3, 1.0, (0.55, 1.8), samples, moves=True).unrelated
-
-
 def test_a_model_car_has_no_steering_wheel() -> None:
     signals = drive(3)
     signals["steer_rad"] = replace(signals["steer_rad"], values=signals["steer_rad"].values * 16.0)
