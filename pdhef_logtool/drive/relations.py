@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -37,6 +38,8 @@ COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
 REAR_LEVER_M, REAR_LEVER_TYPICAL_M = (1.0, 12.0), 1.6
 #: Beyond, sideslip times lateral acceleration is no longer small beside the derivative of the speed.
 STRAIGHT_M_S2 = 3.0
+#: Share of its speed that a car drives ahead, if its heading is right.
+AHEAD_SHARE = 0.9
 #: No car reverses for long at more. The sign of a faster speed is known, and not its unit.
 REVERSE_M_S = 10.0
 #: Rim speed over ground speed, 5 % of slip and 5 % of radius; angular over rim speed, wheels of 4 cm to 80 cm radius.
@@ -79,6 +82,7 @@ def measured_relations(
         relations += _speeds(columns, speed_name, speed)
         relations += _wheel_differences(columns, speed_name, speed)
         relations += _courses(columns, speed)
+    relations += _poses(columns)
     twice = (("yaw_rate_rad_s", SAME_RANGE, MOVES_RAD_S), ("ay_m_s2", GAIN_RANGE, MOVES_M_S2))
     for name, expected, moves in twice:
         other, text = f"truth.{name}", f"truth.{name} against {name}"
@@ -175,13 +179,15 @@ def gentle_at(lateral_m_s2: FloatArray, moving: BoolArray) -> BoolArray:
 
 
 def _moving(columns: Mapping[str, FloatArray], speed: FloatArray) -> BoolArray:
-    """Return where the car drives; by the shape of the speed alone if it is too low and the IMU moves."""
+    """Return where the car drives; by the shape of the speed alone if it is too low, and IMU or other speeds move."""
     moving = moving_at(speed)
     if moving.any():
         return moving
     moves = {"yaw_rate_rad_s": MOVES_RAD_S, "ay_m_s2": MOVES_M_S2, "ax_m_s2": MOVES_M_S2}
     finite = [(columns[n][np.isfinite(columns[n])], least) for n, least in moves.items() if n in columns]
-    return moving_at(speed, 0.0) if any(c.size and c.std() > least for c, least in finite) else moving
+    others = (c for n, c in columns.items() if n.startswith("wheel_speed_") or n in ("speed_m_s", "truth.vx_m_s"))
+    is_driven = any(c.size and c.std() > least for c, least in finite) or any(moving_at(c).any() for c in others)
+    return moving_at(speed, 0.0) if is_driven else moving
 
 
 def _lengths(
@@ -346,6 +352,36 @@ def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relat
     return relations
 
 
+def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
+    """Relate the ground-truth v_y and sideslip to what positions and heading of the same device give.
+
+    The frame of a pose may be mirrored: heading and course then turn against the yaw rates, and if only some do, the
+    sign is not known.
+    """
+    if not {"truth.pose_vx_m_s", "truth.pose_vy_m_s"} <= columns.keys():
+        return []
+    ahead, left, turning = (columns[f"truth.{n}"] for n in ("pose_vx_m_s", "pose_vy_m_s", "heading_rate_rad_s"))
+    moving = moving_at(ahead)
+    speed = np.where(moving, np.hypot(ahead, left), np.nan)
+    if median_known(ahead / speed) < AHEAD_SHARE:
+        return []  # the heading is not that of the car
+    yaws = [columns[n] for n in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns]
+    turns = [r for yaw in yaws for r in compare("", {}, turning, yaw, moving, GAIN_RANGE) if r.tells]
+    signs = {math.copysign(1.0, r.gain) for r in turns}
+    sign, is_known = min(signs, default=1.0), len(signs) == 1 and len(turns) == 2
+    relations = []
+    for name, expected, powers in (
+        ("truth.vy_m_s", left, {"truth.vy_m_s": 1, "truth.position_speed_m_s": -1}),
+        ("truth.sideslip_rad", left / speed, {"truth.sideslip_rad": 1}),
+    ):
+        if name in columns:
+            sides = (f"{name} against ground-truth positions and heading", powers, sign * expected, columns[name])
+            # Velocity and position may be of two places of the car, which turn about one another.
+            apart = _partial(*sides, [turning, np.ones_like(turning)], moving, SAME_RANGE)
+            relations += _best([*compare(*sides, moving, SAME_RANGE), *apart])
+    return [replace(r, signless=not is_known) for r in relations]
+
+
 def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:
     """Return how fast the direction of a velocity turns, rad/s [N]; NaN where it is slow: noise turns it."""
     ax, ay = derivative(vx), derivative(vy)
@@ -407,7 +443,10 @@ def _axle_sideslips(
     if subject == "truth.sideslip_rad":
         with np.errstate(divide="ignore", invalid="ignore"):
             expected /= speed
-    return compare(text, {subject: 1, "ay_m_s2": -1}, expected, sideslip, gentle, KNOWN_LENGTH)
+    low, high = KNOWN_LENGTH
+    # Files that give no place of ground truth mean the CG: it may be at any axle.
+    high *= max(1.0, vehicle.wheelbase_m / (2.0 * max(lever, 1e-3)))
+    return compare(text, {subject: 1, "ay_m_s2": -1}, expected, sideslip, gentle, (low, high))
 
 
 def _partial(

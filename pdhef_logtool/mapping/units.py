@@ -1,4 +1,4 @@
-"""Units that no name gives: by gravity, by other speeds, by a_y ≈ v r and by a_x ≈ v̇."""
+"""Units that no name gives: by gravity, by other speeds and by a_y ≈ v r."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import math
 import numpy as np
 
 from pdhef_logtool.mapping.candidates import LEAST_SCORE, Field, leaf_group, triad_of
-from pdhef_logtool.mapping.evidence import fit, ratio, spread
-from pdhef_logtool.mapping.fields import CLEAR, EXCITED_A_M_S2, Fields, mean_of
+from pdhef_logtool.mapping.evidence import fit, ratio
+from pdhef_logtool.mapping.fields import CLEAR, Fields
 from pdhef_logtool.mapping.naming import G_M_S2
 from pdhef_logtool.mapping.path import path_speed
 from pdhef_logtool.records.checks import Check
@@ -33,8 +33,6 @@ def decide_units(fields: Fields) -> None:
     _rank(fields)
     _speeds(fields)
     _by_turning(fields)
-    _by_wheel_rates(fields)
-    _by_speeding_up(fields)
     _by_siblings(fields)
 
 
@@ -67,24 +65,6 @@ def _say_mounting(fields: Fields, z: Field, gravity: FloatArray) -> None:
     evidence = f"gravity is along {sense}{along} of {triad_of(z)}, not along +z: its axes are not the car's"
     remedy = 'turn them in a mapping file, or --waive "imu.mounting"'
     fields.checks.append(Check("imu.mounting", "ay_m_s2", "undecided", evidence, remedy))
-
-
-def _by_wheel_rates(fields: Fields) -> None:
-    """Find the unit of a gyro where wheels turn in rad/s and their radius is not known: only one gives a wheel's."""
-    wheels = [f for f in fields.candidates if f.meaning.quantity == "wheel rate" and f.unit_known]
-    if not wheels:
-        return
-    turning = mean_of([f.si for f in wheels])
-    for rate in fields.open("rate", "z"):
-        for ay in fields.open("acceleration", "y")[:2]:
-            relation = fields.turning(ay.si, rate.seen.cells, turning)
-            if rate.unit_known or relation is None or abs(relation.correlation) < CLEAR:
-                continue
-            radii = {unit: abs(relation.slope) / factor for unit, factor in rate.factors}
-            near = [unit for unit, radius_m in radii.items() if RADII_M[0] < radius_m < RADII_M[1]]
-            if len(near) == 1:
-                rate.use(near[0])
-                rate.reasons.append(f"unit {near[0]} by a_y ≈ v r, with wheels of {radii[near[0]]:.2f} m")
 
 
 def _rank(fields: Fields) -> None:
@@ -145,19 +125,6 @@ def _units_of_turning(fields: Fields, trio: tuple[Field, Field, Field]) -> tuple
             fits.append(units)
     # Combinations that differ in the unit of a_y alone: the first is by convention.
     return tuple(unit for unit, _ in fits[0]) if fits and all(f[1:] == fits[0][1:] for f in fits) else ()
-
-
-def _by_speeding_up(fields: Fields) -> None:
-    speed = fields.best("speed")
-    if speed is None or not (speed.unit_known or speed.fixed):
-        return
-    change = fields.pieces.rate_of(speed.si)
-    for item in fields.open("acceleration", "x"):
-        if item.unit_known or item.fixed or not spread(change) > EXCITED_A_M_S2:
-            continue
-        relation = fit(change, fields.pieces.smooth(item.seen.cells))
-        if relation is not None and abs(relation.correlation) > CLEAR:
-            fields.settle(item, abs(relation.slope), "the speed's rate of change", 0.4)
 
 
 def _by_siblings(fields: Fields) -> None:
