@@ -1,22 +1,25 @@
 """Eight kinds of mistakes in a mapping x every signal: how many are named with the right remedy.
 
 ``python -m studies.mapping_mistakes [LOG ...]`` counts them over logs, by default the sample logs;
-``--sound COUNT SEED SECONDS`` counts failed checks and corrections over sound simulated drives instead: all manoeuvres,
-random cars of three classes, hills and banks included, for so much processor time at most. A mistake is *named* if a
-failed check of its signal has the factor or the axis that undoes it in its remedy, *refused* if a mapping file with it
-is, *stopped* if a check of its signal fails with another remedy, *open* if the checks of its signal are undecided,
-*silent* if they pass, and *other* if another signal fails instead.
+``--simulated COUNT SEED SECONDS`` counts them over simulated drives: all manoeuvres, random cars of three classes,
+hills and banks included, every second one with its vehicle file, for so much processor time at most; ``--sound COUNT
+SEED SECONDS`` counts failed checks and corrections of such drives instead. A mistake is *named* if a failed check of
+its signal has the factor or the axis that undoes it in its remedy, *refused* if a mapping file with it is, *stopped* if
+a check of its signal fails with another remedy, *silent* if its checks pass, and *other* if another signal fails
+instead. If they are undecided it is *not checkable* where each states what the drive lacks, and the right mapping does
+not pass either; else *open*.
 """
 
 from __future__ import annotations
 
+import itertools
 import re
 import sys
 import tempfile
 import time
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,6 +35,7 @@ from pdhef_logtool.mapping.mapping_file import contradictions
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import PdhefError
+from studies.drawn_cars import FIT_FRICTION, fit_vehicle
 from studies.peers.drives import PEER_DRIVES, mapping_of, vehicle_of
 from truthsim.drive import simulate_drive, write_drive
 from truthsim.manoeuvres import MANOEUVRES
@@ -108,6 +112,10 @@ def mistaken(mapping: Mapping, subject: str, kind: str) -> Mapping | None:
     return replace(mapping, signals=signals, truth=truth, origin="file")
 
 
+def _decided(names: Iterable[str]) -> set[str]:
+    return {f"{n}.{aspect}" for n in names for aspect in ("sign", "unit", "axis")}
+
+
 def verdict(checks: Sequence[Check], members: Sequence[str], subject: str, kind: str, scale: float) -> str:
     """Return what checks state of a mistake, as in the module."""
     related = set(members) | ({"truth.sideslip_rad"} if subject == "truth.vy_m_s" else set())
@@ -124,7 +132,7 @@ def verdict(checks: Sequence[Check], members: Sequence[str], subject: str, kind:
     others = {c.subject for c in checks if c.verdict == "failed" and c.subject not in related}
     if others:
         return "other"
-    decided = [c for c in mine if c.name.endswith((".sign", ".unit", ".axis"))]
+    decided = [c for c in mine if c.name in _decided(related)]
     return "open" if not decided or any(c.verdict == "undecided" for c in decided) else "silent"
 
 
@@ -133,93 +141,137 @@ def outcomes(path: Path, vehicle: VehicleParameters, mapping: Mapping | None = N
     log = open_log(path)
     try:
         right = auto_map(log).mapping if mapping is None else mapping
+        sound = {c.name: c.verdict for c in _checks(log, replace(right, origin="file"), vehicle)}
         for subject in subjects(right):
             for kind in KINDS:
-                yield from _outcome(log, right, subject, kind, vehicle)
+                yield from _outcome(log, right, subject, kind, vehicle, sound)
     finally:
         log.close()
 
 
-def _outcome(log: DriveLog, right: Mapping, subject: str, kind: str, vehicle: VehicleParameters) -> Iterator[Outcome]:
+def _checks(log: DriveLog, mapping: Mapping, vehicle: VehicleParameters) -> tuple[Check, ...]:
+    span_ns = (log.start_ns, log.end_ns)
+    return survey_log(log, mapping, fit_clocks(log, mapping, *span_ns), span_ns, vehicle).checks
+
+
+def _outcome(
+    log: DriveLog, right: Mapping, subject: str, kind: str, vehicle: VehicleParameters, sound: dict[str, str]
+) -> Iterator[Outcome]:
     wrong = mistaken(right, subject, kind)
     if wrong is None:
         return
-    span_ns, members = (log.start_ns, log.end_ns), _members(right, subject)
+    members = _members(right, subject)
     is_refused = bool(contradictions(wrong))
-    checks = () if is_refused else survey_log(log, wrong, fit_clocks(log, wrong, *span_ns), span_ns, vehicle).checks
+    checks = () if is_refused else _checks(log, wrong, vehicle)
+    checks = tuple(c for c in checks if not c.verdict == sound.get(c.name) == "failed")
     scale = getattr(_source(right, members[0]), "scale", 1.0)
     stated = verdict(checks, members, subject, kind, scale if isinstance(scale, float | int) else 1.0)
+    if stated == "open":
+        aspect = kind if kind == "sign" else "unit"
+        doubts = [c.remedy for c in checks if c.verdict == "undecided" and c.name in _decided(members)]
+        is_shown = any(sound.get(f"{m}.{aspect}") == "passed" for m in members)
+        stated = "open" if is_shown or not all(d.startswith("needs ") for d in doubts) else "not checkable"
     shown = tuple(c for c in checks if c.verdict != "passed")
     yield Outcome(Path(str(log.path)).stem, subject, kind, "refused" if is_refused else stated, shown)
 
 
-#: Cars of the sound drives, each in random variants; their speeds over a manoeuvre's own, friction, and longest drive.
+#: Cars of the simulated drives, each in random variants; their speeds over a manoeuvre's own, friction, longest drive.
 CLASSES = ("sedan", "suv", "hatchback")
 SPEED_FACTORS, FRICTIONS, LONGEST_S = (0.7, 1.1), (0.4, 1.0), 60.0
 
 
-def sound_drives(count: int, seed: int, limit_s: float) -> Counter[str]:
-    """Count drives, those with a failed check and those with a correction; print the checks of both.
+def drawn_drives(count: int, seed: int, limit_s: float, path: Path, longest_s: float) -> Iterator[tuple[str, str]]:
+    """Simulate drives, write each to ``path`` and yield it in words and its car.
 
     Parameters
     ----------
-    limit_s : of processor time.
+    limit_s : of processor time. longest_s : of a drive, s.
     """
+    rng, drives = np.random.default_rng(seed), 0
+    for i in itertools.count():
+        if drives >= count or time.process_time() > limit_s:
+            return
+        name = sorted(MANOEUVRES)[i % len(MANOEUVRES)]
+        manoeuvre, drawn = MANOEUVRES[name], int(rng.integers(1, 2**31))
+        car = f"{CLASSES[(i + i // len(MANOEUVRES)) % len(CLASSES)]}~{drawn}"
+        speed, friction = manoeuvre.speed_km_h * rng.uniform(*SPEED_FACTORS), float(rng.uniform(*FRICTIONS))
+        shorter_s = longest_s if (manoeuvre.duration_s or 0.0) > longest_s else None
+        try:
+            drive = simulate_drive(
+                name, speed_km_h=speed, friction=friction, seed=drawn, duration_s=shorter_s,
+                vehicle=choose_vehicle(car), vehicle_name=car,
+            )  # fmt: skip
+        except PdhefError:  # it would spin, or the course is too fast for this car
+            continue
+        path.unlink(missing_ok=True)
+        write_drive(drive, path, steering_wheel=drives % 4 > 1)
+        drives += 1
+        yield f"{name} {car} {speed:.1f} km/h, friction {friction:.2f}", car
+
+
+def sound_drives(count: int, seed: int, limit_s: float) -> Counter[str]:
+    """Count simulated drives, those with a failed check and those with a correction; print the checks of both."""
     counts: Counter[str] = Counter()
-    rng = np.random.default_rng(seed)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.mcap"
-        while counts["drives"] < count and time.process_time() < limit_s:
-            i = counts["drives"] + counts["not simulated"]
-            name = sorted(MANOEUVRES)[i % len(MANOEUVRES)]
-            manoeuvre, drawn = MANOEUVRES[name], int(rng.integers(1, 2**31))
-            car = f"{CLASSES[i // len(MANOEUVRES) % len(CLASSES)]}~{drawn}"
-            speed, friction = manoeuvre.speed_km_h * rng.uniform(*SPEED_FACTORS), float(rng.uniform(*FRICTIONS))
-            longest_s = min(manoeuvre.duration_s or LONGEST_S, LONGEST_S)
-            shorter_s = longest_s if (manoeuvre.duration_s or 0.0) > LONGEST_S else None
-            try:
-                drive = simulate_drive(
-                    name, speed_km_h=speed, friction=friction, seed=drawn, duration_s=shorter_s,
-                    vehicle=choose_vehicle(car), vehicle_name=car,
-                )  # fmt: skip
-            except PdhefError:  # it would spin, or the course is too fast for this car
-                counts["not simulated"] += 1
-                continue
-            path.unlink(missing_ok=True)
-            write_drive(drive, path)
+        for words, _ in drawn_drives(count, seed, limit_s, path, LONGEST_S):
             log = open_log(path)
-            mapping = auto_map(log).mapping
-            clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
-            checks = survey_log(log, mapping, clocks, (log.start_ns, log.end_ns)).checks
+            checks = _checks(log, auto_map(log).mapping, default_vehicle())
             log.close()
             failed = [c for c in checks if c.verdict == "failed"]
             counts += Counter({"drives": 1, "with a failed check": bool(failed)})
             counts["corrected"] += any(c.name.endswith(".corrected") for c in failed)
             for check in failed:
-                print(f"{name} {car} {speed:.1f} km/h, friction {friction:.2f}: {check.name}: {check.evidence}")
+                print(f"{words}: {check.name}: {check.evidence}")
+    return counts
+
+
+def count_outcomes(found: Iterable[Outcome], *, verbose: bool) -> Counter[str]:
+    """Count outcomes by verdict and print those that are not named."""
+    counts: Counter[str] = Counter()
+    for outcome in found:
+        counts[outcome.verdict] += 1
+        if outcome.verdict not in ("named", "refused"):
+            print(f"{outcome.log} {outcome.signal} {outcome.kind}: {outcome.verdict}", flush=True)
+            for check in outcome.checks if verbose else ():
+                print(f"    {check.verdict} {check.name}: {check.evidence}; {check.remedy}")
+    return counts
+
+
+def simulated_mistakes(count: int, seed: int, limit_s: float, *, verbose: bool) -> Counter[str]:
+    """Count the outcomes over simulated drives."""
+    counts: Counter[str] = Counter()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "drive.mcap"
+        for i, (words, car) in enumerate(drawn_drives(count, seed, limit_s, path, 1.5 * LONGEST_S)):
+            vehicle = fit_vehicle(choose_vehicle(car), FIT_FRICTION, default_vehicle()) if i % 2 else default_vehicle()
+            of_drive = count_outcomes(outcomes(path, vehicle), verbose=verbose)
+            print(f"{words}, {'with' if i % 2 else 'without'} a vehicle file: {dict(of_drive)}", flush=True)
+            counts += of_drive
     return counts
 
 
 def main(arguments: Sequence[str]) -> int:
     """Count the outcomes over logs and print those that are not named."""
     warnings.simplefilter("error", RuntimeWarning)
-    if arguments[:1] == ["--sound"]:
-        of_sound = sound_drives(int(arguments[1]), int(arguments[2]), float(arguments[3]))
+    verbose, words = "-v" in arguments, [a for a in arguments if a != "-v"]
+    if words[:1] == ["--sound"]:
+        of_sound = sound_drives(int(words[1]), int(words[2]), float(words[3]))
         print(", ".join(f"{n} {what}" for what, n in of_sound.items()))
         return 0
-    samples = Path(__file__).parents[1] / "sample_logs"
     counts: Counter[str] = Counter()
-    for path in [Path(a) for a in arguments if a != "-v"] or [samples / f"{name}.mcap" for name in SAMPLES]:
+    if words[:1] == ["--simulated"]:
+        counts, words = simulated_mistakes(int(words[1]), int(words[2]), float(words[3]), verbose=verbose), []
+    else:
+        samples = Path(__file__).parents[1] / "sample_logs"
+        words = words or [str(samples / f"{name}.mcap") for name in SAMPLES]
+    for path in map(Path, words):
         peer = next((d for d in PEER_DRIVES if d.log == path.name), None)
         vehicle = path.parent / ("vehicle_mu03.toml" if path.stem == "sweep" else "vehicle.toml")
         car = Car.load(vehicle).vehicle if vehicle.exists() else default_vehicle()
         car = car if peer is None else vehicle_of(peer, path.parent)
-        for found in outcomes(path, car, None if peer is None else mapping_of(peer, path.parent)):
-            counts[found.verdict] += 1
-            if found.verdict not in ("named", "refused"):
-                print(f"{found.log} {found.signal} {found.kind}: {found.verdict}")
-                for check in found.checks if "-v" in arguments else ():
-                    print(f"    {check.verdict} {check.name}: {check.evidence}; {check.remedy}")
+        mapping = None if peer is None else mapping_of(peer, path.parent)
+        counts += count_outcomes(outcomes(path, car, mapping), verbose=verbose)
     total = counts.total()
     print(f"{total} mistakes: " + ", ".join(f"{n} {v} ({n / total:.1%})" for v, n in counts.most_common()))
     return 0

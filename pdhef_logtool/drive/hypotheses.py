@@ -8,8 +8,9 @@ spins, or a bank is wrong in some blocks, a unit in all of them. Probabilities a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -41,13 +42,14 @@ MOST_ENERGY, _ANY_GAIN = 20.0, 2.0
 #: another quantity are the slips of templates, and a field that is something else explains any gain.
 PRIORS = {"unit": 5.0, "sign": 5.0, "sign and unit": 9.0, "foreign": 5.7, "field": 14.0, "open": 0.0}
 PRIORS |= {"open sign": 1.0}  # that nothing documents: most recorders count to the left
+#: One in ten scales of right mappings is not that of a unit: raw counts, a ratio, a calibration.
+PRIORS |= {"odd scale": math.log(10.0)}
 #: Of signals that explain a contradiction equally well the first is the likeliest: no standard states how a steering
 #: angle counts, and an axis of an IMU is turned more often than the sign of a gyro that is read from the right one.
 _OFTEN_WRONG = ("steering_wheel_rad", "steer_rad", "wheels", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 _SELDOM, _SELDOM_STEP = 1.0, 0.3
-#: Likeliest mistakes that are combined with another one; probability of another unit below which it is ruled out;
-#: blocks of a drive whose gains are compared.
-BEAM, RULED_OUT, BLOCKS = 12, 0.01, 8
+#: Likeliest mistakes that are combined with another one; blocks of a drive whose gains are compared.
+BEAM, BLOCKS = 12, 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,13 +189,18 @@ class Posterior:
         return sum(p for p, c in self.sets if any(h.kind == "open sign" and name in h.factors for h in c))
 
 
-def posterior(relations: Sequence[Relation], hypotheses: Sequence[Hypothesis]) -> Posterior:
-    """Return the probabilities of sets of at most two hypotheses, given the relations that count."""
+def posterior(
+    relations: Sequence[Relation], hypotheses: Sequence[Hypothesis], scales: Mapping[str, object] | None = None
+) -> Posterior:
+    """Return the probabilities of sets of at most two hypotheses, given the relations that count.
+
+    ``scales``: what the mapping multiplies the signals' raw values with, where known.
+    """
     telling = [r for r in relations if r.tells]
     touched = {n for r in telling for n in r.powers}
     # With a signal that no relation is about, a mistake is another one of the same likelihood.
     useful = [h for h in hypotheses if h.is_about(touched)]
-    priors = np.array([*(h.energy for h in useful), 0.0])
+    priors = np.array([*(h.energy + _of_scales(h, scales or {}) for h in useful), 0.0])
     # What each mistake, and at last none, multiplies each relation's gain with.
     acts = np.ones((len(useful) + 1, len(telling)))
     for name in touched:
@@ -206,7 +213,8 @@ def posterior(relations: Sequence[Relation], hypotheses: Sequence[Hypothesis]) -
         looked_up.append((table, index))
 
     def energies(first: IntArray, second: IntArray) -> FloatArray:
-        return priors[first] + priors[second] + sum(table[i[first], i[second]] for table, i in looked_up)
+        of_relations = sum(table[i[first], i[second]] for table, i in looked_up)
+        return np.asarray(priors[first] + priors[second] + of_relations)
 
     none, every = len(useful), np.arange(len(useful) + 1)
     alone = energies(every, np.full_like(every, none))
@@ -232,7 +240,7 @@ def _compatible(mistakes: Sequence[Hypothesis]) -> BoolArray:
     names = sorted({n for h in mistakes for n in h.factors})
     about = np.array([[n in h.factors for n in names] for h in mistakes], dtype=bool).reshape(len(mistakes), len(names))
     common = np.array([h.kind != "foreign" for h in mistakes], dtype=bool)
-    return np.outer(common, common) & ~(about @ about.T)
+    return np.asarray(np.outer(common, common) & ~(about @ about.T))
 
 
 def known_hypotheses(
@@ -271,7 +279,7 @@ def _of_part(part: tuple[str, ...]) -> Iterator[Hypothesis]:
             both = f"{words} {text} and has the wrong sign"
             yield Hypothesis({part[0]: -factor}, both, "sign and unit")
     # A sensor is mounted upside down or backwards, or ground truth has another convention; speeds count ahead.
-    if is_one or not _NEVER_TURNED & set(part):
+    if part != ("truth.position_speed_m_s",) and (is_one or not _NEVER_TURNED & set(part)):  # a size has no sign
         has = "has" if is_one else "have"
         yield Hypothesis(dict.fromkeys(part, -1.0), f"{words} {has} the wrong sign", "sign")
     verb = "are" if words.endswith("speeds") else "is"
@@ -287,7 +295,8 @@ _NEVER_TURNED = frozenset({"speed_m_s", "steer_rad", "steering_wheel_rad"})
 def _together(names: Sequence[str]) -> str:
     """Return signals in words; the wheel speeds and their mean as one."""
     wheels = [n for n in names if n.startswith("wheel_speed")]
-    return "wheel speeds" if len(wheels) == len(names) > 2 else " and ".join(names)
+    shown = ["truth.x_m or truth.y_m" if n == "truth.y_m" else n for n in names]  # which one, the path does not show
+    return "wheel speeds" if len(wheels) == len(names) > 2 else " and ".join(shown)
 
 
 def units_of(name: str) -> list[tuple[float, str]]:
@@ -312,22 +321,25 @@ def units_of(name: str) -> list[tuple[float, str]]:
     return []
 
 
-def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
-    """Return those of the signals of doubtful unit for which the relations rule out every other unit.
+def _of_scales(mistake: Hypothesis, scales: Mapping[str, object]) -> float:
+    """Return the energy of undoing a mistake in a mapping: its scales should become those of units."""
+    energies = [
+        PRIORS["odd scale"] * (is_odd(name, scale * factor) - is_odd(name, scale))
+        for name, factor in mistake.factors.items()
+        if isinstance(scale := scales.get(name), float | int) and not math.isnan(factor)
+    ]
+    return sum(energies) / max(len(energies), 1)
 
-    Each unit is as likely as the others before. The ground-truth v_y has the unit of its v_x.
-    """
-    # Rim speed in m/s and in rad/s look alike where the radius is not known: wheels are never given.
-    names = {n for n in doubted if not n.startswith("wheel_speed")}
-    units = [Hypothesis({n: f}, "", "open") for n in sorted(names) for f, _ in units_of(n.removeprefix("truth."))]
-    probable = posterior(relations, units)
-    telling = [r for r in relations if r.tells]
-    resolved = {
-        n
-        for n in names & {n for h in units for n in h.factors} & {n for r in telling for n in r.powers}
-        if sum(p for p, _ in probable.of(n)) < RULED_OUT and all(r.accepts() for r in telling if n in r.powers)
-    }
-    return resolved | (names & {"truth.vy_m_s"} if "truth.vx_m_s" in resolved else set())
+
+def is_odd(name: str, scale: float) -> bool:
+    """Return whether no unit of a signal has this scale."""
+    return not any(abs(abs(scale) - unit) < 0.01 * unit for unit in _unit_scales(name))
+
+
+@cache
+def _unit_scales(name: str) -> tuple[float, ...]:
+    of_units = units_of(name.removeprefix("truth."))
+    return (1.0, *(f for f, words in of_units if words.startswith("is in") and f not in _TYPICAL))
 
 
 def block_gains(reference: FloatArray, measured: FloatArray, blocks: int) -> tuple[float, ...]:

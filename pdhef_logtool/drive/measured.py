@@ -10,10 +10,19 @@ import numpy as np
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.columns import columns_on_grid, derivative, halves, median_known, moving_at
 from pdhef_logtool.drive.hypotheses import Posterior, Relation, known_hypotheses, posterior
-from pdhef_logtool.drive.relations import CG_VY, direction_rate, measured_relations
+from pdhef_logtool.drive.relations import (
+    CG_VY,
+    COURSE_RATE,
+    GNSS_COURSE_RATE,
+    POSITION_VX,
+    POSITION_VY,
+    direction_rate,
+    measured_relations,
+)
 from pdhef_logtool.drive.truth import TruthTrack, channel_of
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
+from pdhef_logtool.records.tracks import StateTrack
 
 #: Name of the column that is the mean of the wheel speeds.
 WHEEL_SPEEDS = "wheel_speeds"
@@ -22,6 +31,9 @@ WHEEL_SPEEDS = "wheel_speeds"
 SPIN_SHARE = 0.2
 
 _EAST_NORTH = ("gnss_velocity_east_m_s", "gnss_velocity_north_m_s")
+#: A car with a shorter wheelbase has no driver, and no steering wheel.
+SEATED_WHEELBASE_M = 1.0
+
 _TRUTH = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m")
 
 
@@ -33,6 +45,7 @@ class Measured:
     ----------
     speed_name : the column used as the speed. topics : of the signals, by name.
     scales : by name, those of ground truth with ``truth.``, what the mapping multiplies the raw values with.
+    is_geared : whether the car may have a steering wheel.
     """
 
     columns: Mapping[str, FloatArray]
@@ -40,6 +53,7 @@ class Measured:
     relations: tuple[Relation, ...]
     topics: Mapping[str, str]
     scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
+    is_geared: bool = True
 
     def without_truth(self) -> Measured:
         """Return what the signals alone state."""
@@ -65,7 +79,10 @@ class Measured:
     def posterior(self, *, mounting_is_known: bool, open_signs: Sequence[tuple[str, ...]] = ()) -> Posterior:
         """Return the probabilities of the mistakes that mappings make with these signals."""
         groups = self.groups(mounting_is_known=mounting_is_known)
-        return posterior(self.relations, known_hypotheses(list(self.columns), groups, open_signs))
+        mistakes = known_hypotheses(list(self.columns), groups, open_signs)
+        if not self.is_geared:
+            mistakes = [h for h in mistakes if h.is_exact or h.kind == "field" or "steer" not in "".join(h.factors)]
+        return posterior(self.relations, mistakes, self.scales)
 
     def agrees(self, name: str, *, mounting_is_known: bool, open_signs: Sequence[tuple[str, ...]] = ()) -> bool:
         """Return whether a signal is wrong by these relations too, if one of them counts."""
@@ -105,7 +122,8 @@ def measure(
     ----------
     derived : ground truth at the CG. vehicle : the default car states nothing. mapping : of the channels, if known.
     """
-    columns, speed_name = drive_columns(signals, truth or {}, derived)
+    place = 0.0 if vehicle is None else vehicle.truth_position_m[0]
+    columns, speed_name = drive_columns(signals, truth or {}, derived, place)
     topics = {n: c.source.split(".")[0] for n, c in signals.items()}
     scales: dict[str, float | tuple[float, ...]] = {}
     if mapping is not None:
@@ -116,13 +134,17 @@ def measure(
     # Two quantities of ground truth that are read from one field agree by themselves.
     read = [[sources[n] for n in r.powers if n in sources] for r in related]
     related = [r for r, fields in zip(related, read, strict=True) if len(set(fields)) == len(fields)]
-    return Measured(columns, speed_name, tuple(related), topics, scales)
+    is_geared = vehicle is None or vehicle.wheelbase_m > SEATED_WHEELBASE_M
+    return Measured(columns, speed_name, tuple(related), topics, scales, is_geared)
 
 
 def drive_columns(
-    signals: Mapping[str, Channel], truth: Mapping[str, Channel], derived: TruthTrack | None
+    signals: Mapping[str, Channel], truth: Mapping[str, Channel], derived: TruthTrack | None, truth_x_m: float = 0.0
 ) -> tuple[dict[str, FloatArray], str | None]:
-    """Return signals and ground truth on one grid, and the name of the column used as the speed."""
+    """Return signals and ground truth on one grid, and the name of the column used as the speed.
+
+    ``truth_x_m``: how far ahead of the CG ground truth is measured.
+    """
     channels = {n: c for n, c in signals.items() if c.values.ndim == 1}
     if derived is not None:
         for name in _TRUTH:
@@ -131,14 +153,15 @@ def drive_columns(
         if "vy_m_s" in truth and "truth.vy_m_s" in channels:
             channels[CG_VY] = channels["truth.vy_m_s"]
         channels |= {f"truth.{n}": truth[n] for n in ("vy_m_s", "sideslip_rad", "ay_m_s2") if n in truth}
+        channels |= _pose_velocity(truth, derived.track, truth_x_m)
     channels |= _over_ground(channels)
     columns = columns_on_grid(channels)
     if set(_EAST_NORTH) <= set(columns):
-        columns["truth.course_rate_rad_s"] = direction_rate(*(columns[n] for n in _EAST_NORTH))
+        columns[GNSS_COURSE_RATE] = direction_rate(*(columns[n] for n in _EAST_NORTH))
     if "truth.x_m" in columns and "truth.y_m" in columns:
         vx, vy = derivative(columns.pop("truth.x_m")), derivative(columns.pop("truth.y_m"))
-        columns["truth.position_speed_m_s"] = np.hypot(vx, vy)
-        columns["truth.course_rate_rad_s"] = direction_rate(vx, vy)
+        columns |= {POSITION_VX: vx, POSITION_VY: vy, "truth.position_speed_m_s": np.hypot(vx, vy)}
+        columns[COURSE_RATE] = direction_rate(vx, vy)
     return columns, _speed_of(columns)
 
 
@@ -149,6 +172,20 @@ def _over_ground(channels: Mapping[str, Channel]) -> dict[str, Channel]:
         return {}
     sides = (np.cos(course.values), np.sin(course.values))
     return {n: replace(speed, name=n, values=speed.values * s) for n, s in zip(_EAST_NORTH, sides, strict=True)}
+
+
+def _pose_velocity(truth: Mapping[str, Channel], track: StateTrack, x_m: float) -> dict[str, Channel]:
+    """Return the velocities ahead and to the left that positions and heading of one topic have; empty without them."""
+    topics = {truth[n].source.split(".")[0] for n in ("x_m", "y_m", "yaw_rad", "quat_wxyz") if n in truth}
+    usable = np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
+    if len(topics) != 1 or not {"x_m", "y_m"} <= truth.keys() or np.count_nonzero(usable) < 3:
+        return {}
+    stamps, yaw = track.stamps_ns[usable], np.unwrap(track.yaw_rad[usable])
+    times = (stamps - stamps[0]) * 1e-9
+    vx, vy, rate = (np.gradient(c, times) for c in (track.x_m[usable], track.y_m[usable], yaw))
+    ahead, left = np.cos(yaw) * vx + np.sin(yaw) * vy, np.cos(yaw) * vy - np.sin(yaw) * vx + x_m * rate
+    pairs = {"truth.pose_vx_m_s": ahead, "truth.pose_vy_m_s": left, "truth.heading_rate_rad_s": rate}
+    return {n: Channel(n, "", "pose", stamps, stamps, v) for n, v in pairs.items()}
 
 
 def _speed_of(columns: dict[str, FloatArray]) -> str | None:

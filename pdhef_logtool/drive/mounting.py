@@ -34,7 +34,6 @@ from pdhef_logtool.drive.frames import (
     placed_rotation,
     rotation_text,
 )
-from pdhef_logtool.drive.hypotheses import units_told
 from pdhef_logtool.drive.measured import Measured, measure
 from pdhef_logtool.drive.other_fields import with_other_fields
 from pdhef_logtool.drive.relations import gentle_at, steering_references, yaw_references
@@ -436,13 +435,14 @@ class Survey:
             f"{c.subject}.sign" for c in drive_checks if c.verdict != "passed"
         }
         doubted = {c.name.removesuffix(".candidate") for c in self.mapping.checks if "unit" in c.evidence}
-        resolved = units_told(self.measured.relations, doubted)
         for check in self.mapping.checks:
             signal = check.name.removesuffix(".candidate")
             if check.name == "imu.mounting" and self.mounting is not None and self.mounting.confident:
                 continue
-            # A doubt about a unit stays unless the drive rules out all others: a gain that passes is wider than some.
-            if f"{signal}.sign" not in passed or (signal in doubted and signal not in resolved):
+            # Rim speed in m/s and in rad/s look alike where the radius is not known. v_y has the unit of its v_x.
+            unit = f"{signal.replace('truth.vy', 'truth.vx')}.unit"
+            is_resolved = unit in passed and not signal.startswith("wheel")
+            if f"{signal}.sign" not in passed or (signal in doubted and not is_resolved):
                 yield check
 
 

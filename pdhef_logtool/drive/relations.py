@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.columns import derivative, independent_samples, median_known, moving_at
+from pdhef_logtool.drive.columns import derivative, fit, independent_samples, median_known, moving_at
 from pdhef_logtool.drive.hypotheses import BLOCKS, MIN_CORRELATION, MIN_SAMPLES, Relation, block_gains
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
@@ -19,6 +20,12 @@ SEPARABLE = 0.15
 #: Column of the ground-truth v_y at the CG, where v_y itself is mapped and is a column as mapped: the lever's part of a
 #: v_y at the CG would hide its unit.
 CG_VY = "truth.vy_m_s at the CG"
+#: Column of the turning of the ground-truth path, under the name of the position whose sign it has.
+COURSE_RATE = "truth.y_m"
+#: Column of the turning of a receiver's velocity over ground.
+GNSS_COURSE_RATE = "gnss_course_rate_rad_s"
+#: Columns of the velocity along the axes of the ground-truth positions.
+POSITION_VX, POSITION_VY = "truth.position_vx_m_s", "truth.position_vy_m_s"
 #: One of two sides that moves by more must move the other. Crossfall and grade alone move an accelerometer by less (5 %
 #: are 0.5 m/s^2), and noise of 1 Hz bandwidth moves a gyro by less.
 MOVES_M_S2 = 1.0
@@ -37,6 +44,8 @@ COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
 REAR_LEVER_M, REAR_LEVER_TYPICAL_M = (1.0, 12.0), 1.6
 #: Beyond, sideslip times lateral acceleration is no longer small beside the derivative of the speed.
 STRAIGHT_M_S2 = 3.0
+#: Share of its speed that a car drives ahead, if its heading is right.
+AHEAD_SHARE = 0.9
 #: No car reverses for long at more. The sign of a faster speed is known, and not its unit.
 REVERSE_M_S = 10.0
 #: Rim speed over ground speed, 5 % of slip and 5 % of radius; angular over rim speed, wheels of 4 cm to 80 cm radius.
@@ -79,6 +88,7 @@ def measured_relations(
         relations += _speeds(columns, speed_name, speed)
         relations += _wheel_differences(columns, speed_name, speed)
         relations += _courses(columns, speed)
+    relations += _poses(columns)
     twice = (("yaw_rate_rad_s", SAME_RANGE, MOVES_RAD_S), ("ay_m_s2", GAIN_RANGE, MOVES_M_S2))
     for name, expected, moves in twice:
         other, text = f"truth.{name}", f"truth.{name} against {name}"
@@ -175,13 +185,15 @@ def gentle_at(lateral_m_s2: FloatArray, moving: BoolArray) -> BoolArray:
 
 
 def _moving(columns: Mapping[str, FloatArray], speed: FloatArray) -> BoolArray:
-    """Return where the car drives; by the shape of the speed alone if it is too low and the IMU moves."""
+    """Return where the car drives; by the shape of the speed alone if it is too low, and IMU or other speeds move."""
     moving = moving_at(speed)
     if moving.any():
         return moving
     moves = {"yaw_rate_rad_s": MOVES_RAD_S, "ay_m_s2": MOVES_M_S2, "ax_m_s2": MOVES_M_S2}
     finite = [(columns[n][np.isfinite(columns[n])], least) for n, least in moves.items() if n in columns]
-    return moving_at(speed, 0.0) if any(c.size and c.std() > least for c, least in finite) else moving
+    others = (c for n, c in columns.items() if n.startswith("wheel_speed_") or n in ("speed_m_s", "truth.vx_m_s"))
+    is_driven = any(c.size and c.std() > least for c, least in finite) or any(moving_at(c).any() for c in others)
+    return moving_at(speed, 0.0) if is_driven else moving
 
 
 def _lengths(
@@ -272,7 +284,7 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
 
 def yaw_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
     """Return other measurements of the yaw rate than the gyro's, to any factor; steering has no certain sign."""
-    references = [(n, columns[n]) for n in ("truth.course_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns]
+    references = [(n, columns[n]) for n in (COURSE_RATE, GNSS_COURSE_RATE, "truth.yaw_rate_rad_s") if n in columns]
     return references + ([] if speed_name is None else _axle_differences(columns, columns[speed_name]))
 
 
@@ -324,10 +336,11 @@ def _scaled_to(wheel: FloatArray, speed: FloatArray, moving: BoolArray) -> Float
 
 
 def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relation]:
-    """Relate the yaw rates to the rate of the ground-truth course over ground."""
-    course = columns.get("truth.course_rate_rad_s")
-    if course is None:
+    """Relate the yaw rates to the rate of the course over ground, of the ground truth or else of a receiver."""
+    path = next((n for n in (COURSE_RATE, GNSS_COURSE_RATE) if n in columns), "")
+    if not path or any(map(is_misscaled, position_factors(columns))):
         return []
+    course, signs = columns[path], {COURSE_RATE: -1} if path == COURSE_RATE else {}
     turnings = [course]
     if "truth.vx_m_s" in columns and "truth.vy_m_s" in columns:  # in a spin the sideslip turns as well
         turnings.append(course - direction_rate(columns["truth.vx_m_s"], columns["truth.vy_m_s"]))
@@ -340,10 +353,63 @@ def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relat
             either = [
                 r
                 for turning in turnings
-                for r in compare(text, {name: 1}, turning, yaw, moving, GAIN_RANGE, moves=MOVES_RAD_S, gentle=gentle)
+                for r in compare(
+                    text, {name: 1, **signs}, turning, yaw, moving, GAIN_RANGE, moves=MOVES_RAD_S, gentle=gentle
+                )
             ]
             relations += _best(either)
     return relations
+
+
+def position_factors(columns: Mapping[str, FloatArray]) -> tuple[float, float]:
+    """Return what the scales of the ground-truth x and y are to be multiplied with; NaN where the drive shows none.
+
+    v_x² + v_y² = a² ẋ² + b² ẏ². A car that drives along one axis shows only its scale.
+    """
+    vx, vy = columns.get("truth.vx_m_s"), columns.get(CG_VY, columns.get("truth.vy_m_s"))
+    if vx is None or POSITION_VX not in columns:
+        return math.nan, math.nan
+    squares = [columns[n] ** 2 for n in (POSITION_VX, POSITION_VY)]
+    result = fit(vx**2 if vy is None else vx**2 + vy**2, squares, moving_at(vx))
+    if result is None:
+        return math.nan, math.nan
+    x, y = (math.sqrt(s) if s > 4.0 * e else math.nan for s, e in zip(*result[:2], strict=True))
+    return x, y
+
+
+def is_misscaled(factor: float) -> bool:
+    """Return whether a factor of a position is another unit: feet are 3.3 times off."""
+    return factor < 0.6 or factor > 1.7
+
+
+def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
+    """Relate the ground-truth v_y and sideslip to what positions and heading of the same device give.
+
+    The frame of a pose may be mirrored: heading and course then turn against the yaw rates, and if only some do, the
+    sign is not known.
+    """
+    if "truth.pose_vx_m_s" not in columns or any(map(is_misscaled, position_factors(columns))):
+        return []
+    ahead, left, turning = (columns[f"truth.{n}"] for n in ("pose_vx_m_s", "pose_vy_m_s", "heading_rate_rad_s"))
+    moving = moving_at(ahead)
+    speed = np.where(moving, np.hypot(ahead, left), np.nan)
+    if median_known(ahead / speed) < AHEAD_SHARE:
+        return []  # the heading is not that of the car
+    yaws = [columns[n] for n in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns]
+    turns = [r for yaw in yaws for r in compare("", {}, turning, yaw, moving, GAIN_RANGE) if r.tells]
+    signs = {math.copysign(1.0, r.gain) for r in turns}
+    sign, is_known = min(signs, default=1.0), len(signs) == 1 and len(turns) == 2
+    relations = []
+    for name, expected, powers in (
+        ("truth.vy_m_s", left, {"truth.vy_m_s": 1, "truth.position_speed_m_s": -1}),
+        ("truth.sideslip_rad", left / speed, {"truth.sideslip_rad": 1}),
+    ):
+        if name in columns:
+            sides = (f"{name} against ground-truth positions and heading", powers, sign * expected, columns[name])
+            # Velocity and position may be of two places of the car, which turn about one another.
+            apart = _partial(*sides, [turning, np.ones_like(turning)], moving, SAME_RANGE)
+            relations += _best([*compare(*sides, moving, SAME_RANGE), *apart])
+    return [replace(r, signless=not is_known) for r in relations]
 
 
 def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:
@@ -407,7 +473,10 @@ def _axle_sideslips(
     if subject == "truth.sideslip_rad":
         with np.errstate(divide="ignore", invalid="ignore"):
             expected /= speed
-    return compare(text, {subject: 1, "ay_m_s2": -1}, expected, sideslip, gentle, KNOWN_LENGTH)
+    low, high = KNOWN_LENGTH
+    # Files that give no place of ground truth mean the CG: it may be at any axle.
+    high *= max(1.0, vehicle.wheelbase_m / (2.0 * max(lever, 1e-3)))
+    return compare(text, {subject: 1, "ay_m_s2": -1}, expected, sideslip, gentle, (low, high))
 
 
 def _partial(

@@ -1,4 +1,4 @@
-"""Units that no name gives: by gravity, by other speeds, by a_y ≈ v r and by a_x ≈ v̇."""
+"""Units that no name gives: by gravity, by other speeds and by a_y ≈ v r."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import math
 import numpy as np
 
 from pdhef_logtool.mapping.candidates import LEAST_SCORE, Field, leaf_group, triad_of
-from pdhef_logtool.mapping.evidence import fit, ratio, spread
-from pdhef_logtool.mapping.fields import CLEAR, EXCITED_A_M_S2, Fields
+from pdhef_logtool.mapping.evidence import fit, ratio
+from pdhef_logtool.mapping.fields import CLEAR, Fields
 from pdhef_logtool.mapping.naming import G_M_S2
 from pdhef_logtool.mapping.path import path_speed
 from pdhef_logtool.records.checks import Check
@@ -29,8 +29,12 @@ _SECOND_CHOICE = ("raw", "uncomp", "delta", "error", "offset", "relative")
 
 def decide_units(fields: Fields) -> None:
     """Decide units that no name gives: gravity first, then one quantity against another."""
-    for decide in (_by_gravity, _rank, _speeds, _by_speeding_up, _by_turning, _by_speeding_up, _by_siblings):
-        decide(fields)
+    _by_gravity(fields)
+    _rank(fields)
+    _speeds(fields)
+    _by_speeding_up(fields)
+    _by_turning(fields)
+    _by_siblings(fields)
 
 
 def _by_gravity(fields: Fields) -> None:
@@ -96,16 +100,10 @@ def _by_speeding_up(fields: Fields) -> None:
         # With two open units a vector's x, which may be the world's, shows nothing.
         if len(factors[0]) > 1 < len(factors[1]) and speed.is_axis and speed.meaning.part == "x":
             continue
-        change = fields.pieces.rate_of(speed.seen.cells)
-        relation = fit(fields.pieces.smooth(ax.seen.cells), change)
-        if (
-            relation is None
-            or relation.correlation < CLEAR
-            or not spread(change) * speed.factors[0][1] > EXCITED_A_M_S2
-        ):
+        relation = fit(fields.pieces.smooth(ax.seen.cells), fields.pieces.rate_of(speed.seen.cells))
+        if relation is None or relation.correlation < CLEAR:
             continue
-        wide = 0.4 if len(factors[1]) == 1 else 0.25  # miles and kilometres are near to one another
-        near = [u for u in itertools.product(*factors) if abs(relation.slope * u[0][1] / u[1][1] - 1.0) < wide]
+        near = [u for u in itertools.product(*factors) if abs(relation.slope * u[0][1] / u[1][1] - 1.0) < 0.25]
         for item, (unit, _) in zip((ax, speed), near[0], strict=True) if len(near) == 1 else ():
             if not (item.unit_known or item.fixed):
                 item.use(unit)
@@ -114,15 +112,13 @@ def _by_speeding_up(fields: Fields) -> None:
 
 def _by_turning(fields: Fields) -> None:
     """Find units of a_y, yaw rate and speed by a_y ≈ v r, where one combination alone gives it."""
-    speed, slopes = fields.best("speed") or fields.wheel_mean(), SLOPES
-    if speed is None:  # wheels that turn in rad/s are as good: the slope is their radius
-        speed, slopes = fields.wheel_turns(), RADII_M
+    speed = fields.best("speed") or fields.wheel_mean()
     if speed is None:
         return
     for rate in fields.open("rate", "z")[:4]:
         for ay in fields.open("acceleration", "y")[:4]:
             trio = (ay, rate, speed)
-            units = () if all(f.unit_known for f in trio) else _units_of_turning(fields, trio, slopes)
+            units = () if all(f.unit_known for f in trio) else _units_of_turning(fields, trio)
             for item, unit in zip(trio, units, strict=False):
                 if not item.unit_known and not item.fixed:
                     item.use(unit)
@@ -130,12 +126,12 @@ def _by_turning(fields: Fields) -> None:
                     item.bonus += 0.3 if item.score < LEAST_SCORE else 0.0
 
 
-def _units_of_turning(fields: Fields, trio: tuple[Field, Field, Field], slopes: tuple[float, float]) -> tuple[str, ...]:
-    """Return the units of a_y, yaw rate and speed with such a slope; empty where several combinations have one."""
+def _units_of_turning(fields: Fields, trio: tuple[Field, Field, Field]) -> tuple[str, ...]:
+    """Return the units of a_y, yaw rate and speed with a slope near 1; empty where several combinations have one."""
     fits = []
     for units in itertools.product(*(f.factors[:1] if f.unit_known or f.fixed else f.factors for f in trio)):
         relation = fields.turning(*(f.seen.cells * factor for f, (_, factor) in zip(trio, units, strict=True)))
-        if relation is not None and abs(relation.correlation) > CLEAR and slopes[0] < abs(relation.slope) < slopes[1]:
+        if relation is not None and abs(relation.correlation) > CLEAR and SLOPES[0] < abs(relation.slope) < SLOPES[1]:
             fits.append(units)
     # Combinations that differ in the unit of a_y alone: the first is by convention.
     return tuple(unit for unit, _ in fits[0]) if fits and all(f[1:] == fits[0][1:] for f in fits) else ()

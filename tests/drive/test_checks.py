@@ -14,7 +14,6 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.checks import check_drive
 from pdhef_logtool.drive.columns import columns_on_grid
-from pdhef_logtool.drive.hypotheses import units_told
 from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.mounting import truth_latency
 from pdhef_logtool.drive.truth import LatencyEstimate, booked_on_the_late, derive_truth
@@ -430,17 +429,14 @@ def test_a_wheel_that_spins_and_a_gain_that_is_close_are_undecided() -> None:
     assert verdicts(checks, "undecided") == {f"{wheel.name}.unit"}
 
 
-def test_a_unit_is_told_where_the_drive_rules_out_all_others() -> None:
-    relations = measure(drive(3)).relations
-    assert units_told(relations, {"speed_m_s", "yaw_rate_rad_s"}) == {"speed_m_s", "yaw_rate_rad_s"}
-    assert units_told(relations, {"steer_rad"}) == {"steer_rad"}
+def test_a_unit_passes_where_the_drive_rules_out_all_others() -> None:
+    units = verdicts(check_drive(drive(3)), "passed")
+    assert units >= {"speed_m_s.unit", "yaw_rate_rad_s.unit", "steer_rad.unit"}
     slow = {n: replace(c, values=0.25 * c.values) if "speed" in n else c for n, c in drive(3).items()}
     slow |= {n: replace(slow[n], values=0.25 * slow[n].values) for n in ("yaw_rate_rad_s", "ax_m_s2")}
     slow["ay_m_s2"] = replace(slow["ay_m_s2"], values=slow["ay_m_s2"].values / 16.0)
-    told = units_told(measure(slow).relations, {"steer_rad"})
-    assert told == set(), "a model car's wheel turns like a car's steering wheel"
-    wheels = {n: c for n, c in drive(3).items() if n.startswith("wheel_speed_rl") or n == "yaw_rate_rad_s"}
-    assert units_told(measure(wheels).relations, {"wheel_speed_rl_m_s"}) == set()
+    units = verdicts(check_drive(slow), "passed")
+    assert "steer_rad.unit" not in units, "a model car's wheel turns like a car's steering wheel"
 
 
 def test_a_steering_sensor_that_never_moves_is_no_steering() -> None:

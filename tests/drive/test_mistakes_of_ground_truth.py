@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.checks import check_drive
 from pdhef_logtool.drive.checks.by_relations import SUSPICIONS
+from pdhef_logtool.drive.checks.running import misread_channels
 from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.other_fields import with_other_fields
 from pdhef_logtool.drive.truth import derive_truth
@@ -72,6 +73,65 @@ def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m: float, factor: float) -
         assert checks["truth.vy_m_s.unit"].verdict != "passed"
 
 
+@pytest.mark.parametrize(("mirrored", "antenna_m"), [(False, 0.0), (True, 0.0), (False, 1.5)])
+@pytest.mark.parametrize("factor", [1.0, 3.6, 1.0 / 3.6, -1.0])
+def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(
+    factor: float, mirrored: bool, antenna_m: float
+) -> None:
+    """An identity of rigid bodies; a pose counted to the right, or of an antenna further ahead, contradicts nothing."""
+    vehicle = default_vehicle().model_copy(update={"truth_position_m": (1.3, 0.0, 0.0)})
+    signals, truth = with_truth(vehicle, 1.0)
+    vx, vy, rate = (truth[n].values for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
+    yaw, side = np.cumsum(rate) * 0.01, -1.0 if mirrored else 1.0
+    pose = {"x_m": np.cumsum(vx * np.cos(yaw) - vy * np.sin(yaw)) * 0.01, "yaw_rad": side * yaw}
+    pose["y_m"] = side * (np.cumsum(vx * np.sin(yaw) + vy * np.cos(yaw)) * 0.01 + antenna_m * np.sin(yaw))
+    pose["x_m"] += antenna_m * np.cos(yaw)
+    truth |= {n: replace(truth["vx_m_s"], name=n, source=f"/ins.{n}", values=v) for n, v in pose.items()}
+    truth["vy_m_s"] = replace(truth["vy_m_s"], values=factor * vy)
+    derived = derive_truth(truth, truth_position_m=vehicle.truth_position_m)
+    checks = {c.name: c for c in check_drive(signals, truth, derived, vehicle) if c.subject == "truth.vy_m_s"}
+    failed = [n for n, c in checks.items() if c.verdict == "failed"]
+    assert failed == ([] if factor == 1.0 else ["truth.vy_m_s.sign" if factor < 0.0 else "truth.vy_m_s.unit"])
+    assert factor == 1.0 or f"by {1.0 / factor:.6g}" in checks[failed[0]].remedy
+
+
+def test_an_impossible_yaw_rate_of_ground_truth_does_not_blame_the_gyro() -> None:
+    signals, truth = with_truth(VEHICLE, 1.0)
+    rate = truth["yaw_rate_rad_s"]
+    truth["yaw_rate_rad_s"] = replace(rate, values=2000.0 * rate.values)
+    found = check_drive(signals, truth, derive_truth(truth), VEHICLE)
+    assert {c.subject for c in found if c.verdict == "failed"} == {"truth.yaw_rate_rad_s"}
+
+
+def test_a_pose_whose_heading_is_not_that_of_the_car_states_nothing() -> None:
+    signals, truth = with_truth(VEHICLE, 1.0)
+    flat = np.zeros_like(truth["vx_m_s"].values)
+    pose = {"x_m": np.cumsum(truth["vx_m_s"].values) * 0.01, "y_m": flat, "yaw_rad": flat + 0.5 * np.pi}
+    truth |= {n: replace(truth["vx_m_s"], name=n, source=f"/ins.{n}", values=v) for n, v in pose.items()}
+    relations = measure(signals, truth, derive_truth(truth), VEHICLE).relations
+    assert not [r for r in relations if "positions and heading" in r.text]
+
+
+def test_ground_truth_may_be_at_any_axle_of_a_car_whose_cg_is_far_back() -> None:
+    """A file without the place of ground truth means the CG; the lever of its front axle is no other unit."""
+    back = VEHICLE.model_copy(update={"cg_to_rear_axle_m": 0.8, "cg_to_front_axle_m": 1.8})
+    signals, truth = with_truth(back, 1.0)
+    (axle,) = (r for r in measure(signals, truth, derive_truth(truth), back).relations if r.text == TEXT)
+    assert axle.expected[1] > (0.8 + 1.8) / 0.8
+
+
+@pytest.mark.parametrize("others", ["ground truth", "wheels"])
+def test_a_speed_that_hardly_moves_is_compared_with_others_that_do(others: str) -> None:
+    """A steady drive: the IMU does not move, and 15 m/s over 57.3 is walking speed."""
+    steady = drive(3, calm=True)
+    speed = steady["speed_m_s"]
+    signals = {n: c for n, c in steady.items() if n == "wheel_speed_rl_m_s" and others == "wheels"}
+    signals["speed_m_s"] = replace(speed, values=speed.values / 57.2958)
+    truth = {} if len(signals) > 1 else {"vx_m_s": replace(speed, name="vx_m_s")}
+    relations = measure(signals, truth, derive_truth(truth) if truth else None).relations
+    assert any(r.tells and not r.accepts() for r in relations if "speed_m_s" in r.powers)
+
+
 @pytest.mark.parametrize("factor", [57.2958, 1.0 / 57.2958, 9.80665])
 def test_a_wrong_speed_does_not_make_the_steering_wrong(factor: float) -> None:
     signals = {n: c for n, c in drive(3).items() if not n.startswith("wheel")}
@@ -119,3 +179,25 @@ def test_suspicions_ask_for_another_field_and_weak_ones_do_not() -> None:
         checks = [Check("steer_rad.unit", "steer_rad", "undecided", "a gain", remedy)]
         found = with_other_fields(checks, mapping, lambda _: (), lambda: other)
         assert [c.name for c in found if c.verdict == "failed"] == (["steer_rad.axis"] if is_named else [])
+
+
+@pytest.mark.parametrize(("name", "factor"), [("x_m", 1e-3), ("y_m", 3.2808), ("x_m", -1.0), ("y_m", -1.0), ("", 1.0)])
+def test_a_wrong_scale_or_sign_of_a_position_is_named_and_the_position_not_used(name: str, factor: float) -> None:
+    signals, truth = with_truth(VEHICLE, 1.0)
+    vx, vy, rate = (truth[n].values for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
+    yaw = np.cumsum(rate) * 0.01
+    pose = {
+        "x_m": np.cumsum(vx * np.cos(yaw) - vy * np.sin(yaw)),
+        "y_m": np.cumsum(vx * np.sin(yaw) + vy * np.cos(yaw)),
+    }
+    scales = {n: factor if n == name else 1.0 for n in pose}
+    truth |= {n: replace(truth["vx_m_s"], name=n, values=0.01 * scales[n] * v) for n, v in pose.items()}
+    checks = check_drive(signals, truth, derive_truth(truth), VEHICLE)
+    failed = {c.name: c.remedy for c in checks if c.verdict == "failed" and c.subject.startswith("truth.")}
+    expected = "" if not name else "truth.y_m.sign" if factor < 0.0 else f"truth.{name}.scale"
+    assert list(failed) == [n for n in [expected] if n]
+    if expected:
+        named = float(failed[expected].partition(" by ")[2].partition(",")[0])
+        assert named == pytest.approx(1.0 / factor, rel=0.05)
+        assert factor > 0.0 or "truth.x_m or truth.y_m" in failed[expected]
+        assert set(misread_channels(checks)) == {expected.rpartition(".")[0]}

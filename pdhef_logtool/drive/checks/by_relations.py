@@ -22,8 +22,8 @@ FAILS, DOUBTED, CERTAIN, NAMED = 0.85, 0.005, 0.97, 0.05
 UNEXPLAINED = "no unit or sign explains it: the car may slide, a sensor may fail for a while, or the field is another"
 #: What the remedies of mistakes begin with that are certain or suspected.
 SUSPICIONS = ("perhaps ", "no single mistake explains it", UNEXPLAINED)
-_LACKS_WHEELBASE = "needs the wheelbase of a vehicle file, or speeds that only full-size vehicles reach"
-_LACKS_SIDESLIP = "needs sideslip that changes fast"
+_LACKS_WHEELBASE = "the wheelbase of a vehicle file, or speeds that only full-size vehicles reach"
+_LACKS_SIDESLIP = "sideslip that changes fast"
 #: What a drive lacks that shows the sign of a signal and not its unit.
 _LACKS_FOR_UNIT = {
     **dict.fromkeys(("steer_rad", "steering_wheel_rad"), _LACKS_WHEELBASE),
@@ -87,7 +87,8 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
         if wrong > FAILS:
             return checks
         words = " or ".join(dict.fromkeys(h.words + " is another field" * (h.kind == "field") for h in likely))
-        weak = f"needs {_LACKS.get(name, _BENDS)} to rule out that {words}"
+        are_units = not any(h.kind == "sign" for h in likely)
+        weak = f"{_lacks(name, for_unit=are_units)} to rule out that {words}"
         return [replace(c, verdict="undecided", remedy=c.remedy if wrong > 0.5 else weak) for c in checks]
     factors = {r.text: math.prod(h.acts_on(r) for h in chosen) for r in relations}
     usable = [r for r in relations if not math.isnan(factors[r.text])]
@@ -107,12 +108,12 @@ def _passed(name: str, usable: Sequence[Relation], factors: dict[str, float]) ->
     units |= {f**p for f in foreign for p in (1.0, -1.0)}
     units = {f for f in units if name not in _LACKS_FOR_UNIT or max(f, 1.0 / f) > 3.0}
     if any(all(r.accepts(factors[r.text] * f ** r.powers.get(name, 0)) for r in usable) for f in units):
-        lacks = _LACKS_FOR_UNIT.get(name, f"needs {_LACKS.get(name, _BENDS)}")
+        lacks = _lacks(name, for_unit=True)
         return [SIGN.passed(best.evidence, name), UNIT.undecided(best.evidence, name, lacks)]
     return [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
 
 
-_JUDGED_TRUTH = (*(f"truth.{n}" for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2")),)
+_JUDGED_TRUTH = (*(f"truth.{n}" for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2", "y_m")),)
 
 
 def _is_cleared(name: str, unrelated: Relation, relations: Sequence[Relation]) -> bool:
@@ -156,13 +157,17 @@ _ASPECTS = {"sign": ("sign",), "unit": ("unit",), "foreign": ("unit",), "sign an
 
 
 def _not_excited(name: str, relations: Sequence[Relation]) -> Check:
-    lacks = _LACKS.get(name, _BENDS)
     if not relations:
         evidence = "no other signal of the log is related to it"
     else:
         best = max(relations, key=lambda r: abs(r.correlation))
         evidence = f"{best.text}: correlation {best.correlation:.2f} over {best.samples:.0f} independent samples"
-    return SIGN.undecided(evidence, name, f"needs {lacks}")
+    return SIGN.undecided(evidence, name, _lacks(name))
+
+
+def _lacks(name: str, *, for_unit: bool = False) -> str:
+    lacks = _LACKS.get(name, _BENDS)
+    return f"needs {_LACKS_FOR_UNIT.get(name, lacks) if for_unit else lacks}"
 
 
 SIGN = CheckKind(

@@ -111,8 +111,9 @@ class CheckedDrive:
 
     @property
     def wrong(self) -> set[str]:
-        """The signals that relations show to be wrong."""
-        return {c.subject for c in self.related if c.verdict == "failed"}
+        """The signals that relations, or their size, show to be wrong."""
+        sizes = (c for c in self.judged if c.name.endswith(".magnitude"))
+        return {c.subject for c in (*self.related, *sizes) if c.verdict == "failed"}
 
     def once(self, make: Callable[[CheckedDrive], _T]) -> _T:
         """Return what ``make`` returns for this drive; it is called once."""

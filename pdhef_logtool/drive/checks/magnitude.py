@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind
-from pdhef_logtool.drive.hypotheses import units_of
+from pdhef_logtool.drive.hypotheses import FOREIGN, is_odd, units_of
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS
 
@@ -49,12 +49,15 @@ def _checks(drive: CheckedDrive) -> Iterator[Check]:
 
 
 def _remedy(drive: CheckedDrive, name: str, large: float, most: float) -> str:
-    units = [(f, words) for f, words in units_of(name.removeprefix("truth.")) if large * f < 0.5 * most]
+    scale = drive.measured.scales.get(name, 1.0)
+    number = scale if isinstance(scale, float | int) else 1.0
+    units = units_of(name.removeprefix("truth."))
+    units += [(1.0 / f, f"is off by a factor of {f:.4g}") for f in FOREIGN if not is_odd(name, number / f)]
+    units = [(f, words) for f, words in units if large * f < 0.5 * most]
     counts = "these may be raw counts of a converter: multiply by its resolution"
     if not units:
         return f"the field is no {name.removeprefix('truth.')} in SI units; {counts}"
-    factor, words = max(units)
-    scale = drive.measured.scales.get(name, 1.0)
+    factor, words = max(units, key=lambda unit: (not is_odd(name, number * unit[0]), unit[0]))
     line = f"scale = {scale * factor:.6g}" if isinstance(scale, float | int) else f"{factor:.6g} times its scale"
     return f"perhaps it {words}: {line} in the mapping; or {counts}"
 
